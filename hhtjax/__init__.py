@@ -1,0 +1,19 @@
+"""hhtjax: differentiable, functional time integrators for multibody dynamics."""
+
+from hhtjax import scenes as scenes
+from hhtjax.identify import fit as fit
+from hhtjax.sampled import sampled as sampled
+from hhtjax.simulate import interpolate as interpolate
+from hhtjax.simulate import simulate as simulate
+from hhtjax.steppers.explicit import rk4 as rk4
+from hhtjax.steppers.generalized_alpha import bossak as bossak
+from hhtjax.steppers.generalized_alpha import generalized_alpha as generalized_alpha
+from hhtjax.steppers.generalized_alpha import hht as hht
+from hhtjax.steppers.generalized_alpha import newmark as newmark
+from hhtjax.steppers.implicit_euler import implicit_euler as implicit_euler
+from hhtjax.steppers.kim2019 import kim_hht as kim_hht
+from hhtjax.steppers.kim2019 import kim_implicit_euler as kim_implicit_euler
+from hhtjax.system import LinearSystem as LinearSystem
+from hhtjax.system import System as System
+
+__version__ = "0.1.0"

@@ -1,0 +1,61 @@
+"""Frozen descriptions: hashable under jit, and pytrees whose arrays are data."""
+
+import jax
+import numpy as np
+
+
+def is_array(x):
+    """Arrays, NumPy scalars and tracers are data; Python numbers are part of the program."""
+    return isinstance(x, (jax.Array, np.ndarray, np.generic))
+
+
+def is_concrete(x):
+    """False for a tracer, whose value is not known while a function is being traced."""
+    return not isinstance(x, jax.core.Tracer)
+
+
+def _fingerprint(x):
+    if not is_array(x):
+        return x
+    x = np.asarray(x)
+    return x.shape, x.dtype.str, x.tobytes()
+
+
+class Description:
+    """Base of systems and steppers, which say what to compute and hold no state.
+
+    A subclass is a frozen dataclass with `eq=False`. Arrays among its fields (a constant mass
+    matrix, an `alpha` that is being differentiated) are leaves of the pytree; functions, Python
+    numbers and strings are static. Two descriptions are equal, and hash alike, when all fields are.
+    """
+
+    def __init_subclass__(cls):
+        jax.tree_util.register_pytree_node_class(cls)
+
+    def tree_flatten(self):
+        """Arrays as leaves, everything else as static data."""
+        leaves, structure = jax.tree.flatten(vars(self))
+        data = [x for x in leaves if is_array(x)]
+        static = tuple(None if is_array(x) else x for x in leaves)
+        return data, (structure, static)
+
+    @classmethod
+    def tree_unflatten(cls, aux, data):
+        """Inverse of `tree_flatten`; validates nothing, because JAX also calls it with placeholders."""
+        structure, static = aux
+        data = iter(data)
+        fields = jax.tree.unflatten(structure, [next(data) if x is None else x for x in static])
+        self = object.__new__(cls)
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        return self
+
+    def __eq__(self, other):
+        return type(self) is type(other) and self._key() == other._key()
+
+    def __hash__(self):
+        return hash((type(self), self._key()))
+
+    def _key(self):
+        leaves, structure = jax.tree.flatten(vars(self))
+        return structure, tuple(_fingerprint(x) for x in leaves)

@@ -1,0 +1,92 @@
+"""Small dense solves that XLA can fuse; LAPACK above a size.
+
+A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
+up to `UNROLLED` unknowns the elimination is written out as array operations.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.linalg import lu_factor, lu_solve
+
+UNROLLED = 8
+
+
+def solve(A, b):
+    """x with A x = b, for A (n, n) and b (n,), differentiable in both.
+
+    LU with partial pivoting: unrolled for n <= 8, LAPACK above. A singular A gives inf or NaN.
+
+    >>> import jax.numpy as jnp
+    >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
+    [2.0, 1.0]
+    """
+    return factorize(A)(b)
+
+
+def matvec(A, x):
+    """A x for a full A (n, n), or a diagonal one (n,); elementwise for n <= 8, so that XLA can fuse it."""
+    if A.ndim == 1:
+        return A * x
+    if A.shape[-1] > UNROLLED:
+        return A @ x
+    return sum(A[:, j] * x[j] for j in range(1, A.shape[-1])) + A[:, 0] * x[0]
+
+
+def factorize(A):
+    """The function b -> A^-1 b, with A factorised once; differentiable in A and b.
+
+    Derivatives follow from A dx = db - dA x and reuse the factors.
+    """
+    if A.shape[-1] <= UNROLLED:
+        factors, substitute = _lu(lax.stop_gradient(A)), _substitute
+    else:
+        factors, substitute = lu_factor(lax.stop_gradient(A)), lu_solve
+
+    def apply(b):
+        return lax.custom_linear_solve(
+            lambda x: matvec(A, x),
+            b,
+            solve=lambda _, y: substitute(factors, y, trans=0),
+            transpose_solve=lambda _, y: substitute(factors, y, trans=1),
+        )
+
+    return apply
+
+
+def _lu(A):
+    """L below the diagonal and U on and above it, and the order of the rows: A[order] = L U."""
+    n = A.shape[0]
+    order = jnp.arange(n)
+    row, column = order[:, None], order[None, :]
+    for k in range(n - 1):
+        largest, pivot = jnp.abs(A[k, k]), jnp.asarray(k, order.dtype)
+        for i in range(k + 1, n):  # scalars rather than argmax: a reduction would end the fusion
+            candidate = jnp.abs(A[i, k])
+            larger = candidate > largest
+            largest, pivot = jnp.where(larger, candidate, largest), jnp.where(larger, i, pivot)
+        exchange = jnp.where(row[:, 0] == k, pivot, jnp.where(row[:, 0] == pivot, k, row[:, 0]))
+        A, order = A[exchange], order[exchange]
+        factor = jnp.where(row > k, A[:, k : k + 1] / A[k, k], 0)
+        A = jnp.where(column > k, A - factor * A[k : k + 1], jnp.where((column == k) & (row > k), factor, A))
+    return A, order
+
+
+def _substitute(factors, b, trans):
+    """x with L U x = b[order]; for trans=1, x with x[order] = z and (L U)^T z = b."""
+    LU, order = factors
+    n = LU.shape[0]
+    i = jnp.arange(n)
+    x = b if trans else b[order]
+    if not trans:
+        for k in range(n - 1):
+            x = x - jnp.where(i > k, LU[:, k] * x[k], 0)
+        for k in reversed(range(n)):
+            pivot = x[k] / LU[k, k]
+            x = jnp.where(i == k, pivot, x - jnp.where(i < k, LU[:, k] * pivot, 0))
+        return x
+    for k in range(n):
+        pivot = x[k] / LU[k, k]
+        x = jnp.where(i == k, pivot, x - jnp.where(i > k, LU[k] * pivot, 0))
+    for k in reversed(range(1, n)):
+        x = x - jnp.where(i < k, LU[k] * x[k], 0)
+    return jnp.sum(jnp.where(order[:, None] == i[None, :], x[:, None], 0), axis=0)

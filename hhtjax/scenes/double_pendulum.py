@@ -1,0 +1,61 @@
+"""The double pendulum of Kim et al. (2019), Sec. 4, with joint springs and dampers.
+
+q = (q1, q2): angles of the two links from the horizontal, rad. Massless links of lengths l (m), point
+masses m (kg) at their ends, joint stiffness k (N m/rad) and damping c (N m s/rad), gravity g (m/s^2).
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import Scene
+from hhtjax.system import System
+
+GRAVITY = 9.80665
+
+
+def mass(q, params):
+    """M = [[l1^2 (m1 + m2), l1 l2 m2 cos(q1 - q2)], [., l2^2 m2]]."""
+    (m1, m2), (l1, l2) = params["m"], params["l"]
+    coupling = l1 * l2 * m2 * jnp.cos(q[0] - q[1])
+    return jnp.array([[l1**2 * (m1 + m2), coupling], [coupling, l2**2 * m2]])
+
+
+def weight_and_inertia(q, v, params):
+    """Q without the joint torques."""
+    (m1, m2), (l1, l2), g = params["m"], params["l"], params["g"]
+    coupling = l1 * l2 * m2 * jnp.sin(q[0] - q[1])
+    return jnp.array(
+        [
+            -l1 * (m1 + m2) * g * jnp.cos(q[0]) - coupling * v[1] ** 2,
+            -l2 * m2 * g * jnp.cos(q[1]) + coupling * v[0] ** 2,
+        ]
+    )
+
+
+def joint_torques(q, v, params):
+    """Torque of each joint's spring and damper, both at rest at q = 0."""
+    (k1, k2), (c1, c2) = params["k"], params["c"]
+    return -k1 * q[0] - c1 * v[0], -k2 * (q[1] - q[0]) - c2 * (v[1] - v[0])
+
+
+def force_as_printed(q, v, t, params):
+    """Q as Kim et al. computed it: joint 2 acts on link 2 without a reaction on link 1."""
+    return weight_and_inertia(q, v, params) + jnp.array(joint_torques(q, v, params))
+
+
+def force(q, v, t, params):
+    """Q with the reaction of joint 2 on link 1."""
+    first, second = joint_torques(q, v, params)
+    return weight_and_inertia(q, v, params) + jnp.array([first - second, second])
+
+
+def free() -> Scene:
+    """No springs, no dampers: chaotic, conservative."""
+    params = {"m": (1.0, 1.0), "l": (1.0, 1.5), "k": (0.0, 0.0), "c": (0.0, 0.0), "g": GRAVITY}
+    return Scene(System(mass, force), params, jnp.zeros(2), jnp.zeros(2), 10.0)
+
+
+def stiff(as_printed=False) -> Scene:
+    """Stiff joints, the second one damped by 10000 N m s/rad; as_printed: the paper's torques."""
+    params = {"m": (10.0, 1.0), "l": (1.0, 1.5), "k": (400.0, 300.0), "c": (15.0, 10000.0), "g": GRAVITY}
+    system = System(mass, force_as_printed if as_printed else force)
+    return Scene(system, params, jnp.zeros(2), jnp.zeros(2), 8.0)

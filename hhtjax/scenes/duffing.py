@@ -1,0 +1,51 @@
+"""One degree of freedom: m w + c v + k q + k2 q^2 + k3 q^3 = u(t) + offset, Duffing's oscillator."""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import Scene
+from hhtjax.system import System
+
+
+def mass(q, params):
+    """M = [m]."""
+    return jnp.asarray(params["m"], q.dtype).reshape(1)
+
+
+def restoring(q, v, params):
+    """-(c v + k q + k2 q^2 + k3 q^3)."""
+    return -(params["c"] * v + q * (params["k"] + q * (params["k2"] + q * params["k3"])))
+
+
+def force(q, v, t, params):
+    """Q with a harmonic input, u = amplitude cos(frequency t)."""
+    return restoring(q, v, params) + params["amplitude"] * jnp.cos(params["frequency"] * t)
+
+
+def sampled_force(q, v, t, params):
+    """Q with a measured input: params is a pair (parameters, u), u made by `hhtjax.sampled`."""
+    params, u = params
+    return restoring(q, v, params) + u(t) + params["offset"]
+
+
+def sampled_mass(q, params):
+    """M for `sampled_force`."""
+    return mass(q, params[0])
+
+
+def driven() -> Scene:
+    """A hardening oscillator driven near its resonance (SI units)."""
+    params = {"m": 1.0, "c": 0.2, "k": 1.0, "k2": 0.0, "k3": 1.0, "amplitude": 0.8, "frequency": 1.3}
+    return Scene(System(mass, force), params, jnp.array([0.5]), jnp.array([0.0]), 10.0)
+
+
+def hardening_spring() -> Scene:
+    """A stiff hardening spring let go, 100 q + 10^4 q^3: where the predictor form fails first."""
+    params = {"m": 1.0, "c": 0.0, "k": 100.0, "k2": 0.0, "k3": 1e4, "amplitude": 0.0, "frequency": 0.0}
+    return Scene(System(mass, force), params, jnp.array([1.0]), jnp.array([0.0]), 2.0)
+
+
+def measured(params, u, q0, v0, duration) -> Scene:
+    """An oscillator under a sampled input u, from q0 (a number) and v0."""
+    return Scene(
+        System(sampled_mass, sampled_force), (params, u), jnp.reshape(q0, (1,)), jnp.reshape(v0, (1,)), duration
+    )

@@ -1,0 +1,15 @@
+"""A scene: a system with everything that a run needs besides a stepper and a step size."""
+
+from typing import Any, NamedTuple
+
+from hhtjax.system import LinearSystem, System
+
+
+class Scene(NamedTuple):
+    """system; params; q0, v0: initial position and velocity; duration in s."""
+
+    system: System | LinearSystem
+    params: Any
+    q0: Any
+    v0: Any
+    duration: float

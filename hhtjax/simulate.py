@@ -1,0 +1,290 @@
+"""The run: one scan over the steps, what it saves, and what it says about itself."""
+
+import sys
+import warnings
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from hhtjax.checkpointing import checkpointed_scan
+from hhtjax.description import is_array, is_concrete
+from hhtjax.steppers.stepper import Info, Stepper, require_number
+from hhtjax.system import LinearSystem, System, describe, flatten
+
+
+class SimulationError(RuntimeError):
+    """A run in which a step failed; raised by `Solution.check`."""
+
+
+class PrecisionWarning(UserWarning):
+    """The run is in single precision."""
+
+
+class Failure(NamedTuple):
+    """The first step that failed. step: its number, from 1, or 0 if none did; newton: True if Newton's
+    iteration failed while the state was still finite."""
+
+    step: Any
+    newton: Any
+
+
+class Solution(NamedTuple):
+    """A trajectory at its saved times, the start included.
+
+    t: (K + 1,). q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1.
+    multipliers: None without constraints. dt: the step size.
+    info: `Info` for each of the K intervals between saved times: largest residual, number of Newton
+    iterations, all converged; None where the method has nothing to tell.
+    failure: the first step that failed, as data; `check` turns it into an error.
+    """
+
+    t: Any
+    q: Any
+    v: Any
+    acceleration: Any
+    multipliers: Any
+    dt: Any
+    info: Info
+    failure: Failure
+
+    def check(self):
+        """Raises `SimulationError` naming the first bad step and why; silent when all is well.
+
+        For a batch made by vmap, names the first bad member. Not to be called inside jit.
+        """
+        if not is_concrete(self.failure.step):
+            raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
+        steps, newton, dt, start = (np.asarray(x) for x in (*self.failure, self.dt, self.t[..., 0]))
+        if not steps.any():
+            return
+        member = tuple(int(i) for i in np.argwhere(steps)[0])
+        step, newton, dt, start = (np.broadcast_to(x, steps.shape)[member] for x in (steps, newton, dt, start))
+        which = (
+            f"member {', '.join(map(str, member))} ({np.count_nonzero(steps)} of {steps.size} failed), "
+            if member
+            else ""
+        )
+        why = (
+            "Newton's iteration did not converge; the state is still finite. Take a smaller dt, "
+            "or more max_iterations, or a larger tolerance"
+            if newton
+            else "the state is not finite. Take a smaller dt, or another linearize=, or a method that damps"
+        )
+        raise SimulationError(f"simulate: {which}step {step} (to t = {start + step * dt:.6g}) failed: {why}.")
+
+
+def simulate(system, stepper, q0, v0, params=None, *, dt, num_steps, t0=0.0, save_every=1, progress=False) -> Solution:
+    """Steps `system` from (q0, v0) at t0, num_steps times by dt.
+
+    Args:
+        system: a `System` or `LinearSystem`.
+        stepper: `hht()`, `rk4()`, ...
+        q0, v0: position and velocity, pytrees of the same structure; float32 or float64, integers become
+            the default float type.
+        params: any pytree, handed to the functions of the system.
+        dt: step size, positive. num_steps: number of steps.
+        save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
+            start and the end only, and stores no path.
+        progress: show a bar on stderr, also under jit.
+
+    Returns:
+        A `Solution`. Nothing raises while the steps run: call `solution.check()`.
+
+    Differentiable, forward and reverse, in dt, t0, params, q0, v0 and the numbers of the stepper; reverse
+    mode computes the steps again, in blocks, and its memory grows with the square root of num_steps.
+    Compiled once for each system, stepper, structure, num_steps and save_every; a new dt, q0 or params
+    costs no compilation.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind, shape, structure or value. Values are checked
+            unless they are tracers.
+        NotImplementedError: the system has a constraint.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: -params["k"] * q)
+    >>> solution = hhtjax.simulate(
+    ...     spring, hhtjax.hht(alpha=-0.05), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0},
+    ...     dt=1e-3, num_steps=1000, save_every=250)
+    >>> solution.check()
+    >>> [round(float(q), 4) for q in solution.q[:, 0]]                       # cos(2 t)
+    [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
+    """
+    if not isinstance(system, (System, LinearSystem)):
+        raise TypeError(f"simulate: `system` must be a System or LinearSystem; received {system!r}.")
+    if not isinstance(stepper, Stepper):
+        raise TypeError(f"simulate: `stepper` must be a stepper such as hht(); received {stepper!r}.")
+    for name, value in (("num_steps", num_steps), ("save_every", save_every)):
+        if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"simulate: `{name}` must be a positive integer; received {value!r}.")
+    if num_steps % save_every:
+        raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
+    require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    require_number("simulate", "t0", t0, np.isfinite, "be finite")
+    q0, v0 = _initial_values(q0, v0)
+    return _simulate(
+        system, stepper, q0, v0, params, dt, t0, num_steps=int(num_steps), save_every=int(save_every), progress=progress
+    )
+
+
+@partial(jax.jit, static_argnames=("num_steps", "save_every", "progress"))
+def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every, progress):
+    flat, q, v = flatten("simulate", system, q0, v0, t0, params)
+    dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
+    take_step = stepper.bind(flat, params, dt)
+
+    def step(carry):
+        state, count, failure = carry
+        state, info = take_step(state)
+        count = count + 1
+        state = state._replace(t=t0 + count.astype(dt.dtype) * dt)  # no rounding piles up
+        if progress:
+            _show_progress(count, num_steps)
+        return (state, count, _first_failure(failure, count, state, info)), info
+
+    def interval(carry, _):
+        if save_every == 1:
+            carry, info = step(carry)
+        else:
+            (carry, info), _ = checkpointed_scan(joined_step, (carry, no_info), save_every)
+        state = carry[0]
+        return carry, ((state.t, state.q, state.v, state.w), info)
+
+    def joined_step(carry, _):
+        carry, info = carry
+        carry, new = step(carry)
+        return (carry, _join(info, new)), None
+
+    start = stepper.begin(flat, q, v, t0, params, dt)
+    no_info = _no_info(jax.eval_shape(take_step, start)[1])
+    failure = Failure(jnp.zeros((), jnp.int32), jnp.array(False))
+    (_, _, failure), (path, info) = checkpointed_scan(
+        interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every
+    )
+    t, q, v, w = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), (start.t, start.q, start.v, start.w), path)
+    q, v, w = (jax.vmap(flat.unravel)(x) for x in (q, v, w))
+    return Solution(t, q, v, w, None, dt, info, failure)
+
+
+def _first_failure(failure, count, state, info):
+    finite = jnp.all(jnp.isfinite(state.q) & jnp.isfinite(state.v))
+    failed = ~finite if info.converged is None else ~(finite & info.converged)
+    first = failed & (failure.step == 0)
+    return Failure(jnp.where(first, count, failure.step), jnp.where(first, finite, failure.newton))
+
+
+def _no_info(shapes):
+    """What `_join` leaves unchanged."""
+    if shapes.residual is None:
+        return Info()
+    return Info(jnp.zeros((), shapes.residual.dtype), jnp.zeros((), shapes.iterations.dtype), jnp.array(True))
+
+
+def _join(info, new):
+    """Info of several steps as one: largest residual, number of iterations, all converged."""
+    if new.residual is None:
+        return info
+    return Info(
+        jnp.maximum(info.residual, new.residual), info.iterations + new.iterations, info.converged & new.converged
+    )
+
+
+def _initial_values(q0, v0):
+    """q0 and v0 as arrays of one float dtype, checked."""
+    structures = [jax.tree.structure(x) for x in (q0, v0)]
+    if structures[0] != structures[1]:
+        raise ValueError(
+            f"simulate: `v0` must be a pytree structured like q0, {structures[0]}; received {structures[1]}."
+        )
+    if not jax.tree.leaves(q0):
+        raise ValueError(f"simulate: `q0` must hold at least one number; received {q0!r}.")
+    for name, values in (("q0", q0), ("v0", v0)):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
+            where = f"`{name}{jax.tree_util.keystr(path)}`"
+            if not (is_array(leaf) or isinstance(leaf, (int, float, complex))) or isinstance(leaf, bool):
+                raise TypeError(f"simulate: {where} must be an array or a number; received {leaf!r}.")
+            dtype = jnp.result_type(leaf)
+            if not (jnp.issubdtype(dtype, jnp.integer) or dtype in (jnp.float32, jnp.float64)):
+                raise TypeError(f"simulate: {where} must be float32 or float64; received {dtype}.")
+            if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
+                raise ValueError(f"simulate: {where} must be finite; received {leaf!r}.")
+    shapes = [[jnp.shape(x) for x in jax.tree.leaves(y)] for y in (q0, v0)]
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"simulate: `v0` must have the shapes of q0, {describe(q0)}; received {describe(v0)}.")
+    dtypes = {jnp.result_type(x) for x in jax.tree.leaves((q0, v0)) if is_array(x)}
+    floats = {x for x in dtypes if jnp.issubdtype(x, jnp.floating)}
+    if len(floats) > 1:
+        raise TypeError(f"simulate: `q0` and `v0` must share one dtype; received {describe(q0)} and {describe(v0)}.")
+    dtype = floats.pop() if floats else jnp.result_type(float)
+    if dtype == jnp.float32:
+        warnings.warn(
+            "simulate: in float32 expect about 4 correct digits at best, fewer on stiff systems and small steps: "
+            "for float64 call jax.config.update('jax_enable_x64', True) before creating arrays.",
+            PrecisionWarning,
+            stacklevel=3,
+        )
+    return (jax.tree.map(lambda x: jnp.asarray(x, dtype), values) for values in (q0, v0))
+
+
+def _show_progress(count, num_steps):
+    """A bar on stderr, about a hundred times in a run."""
+    every = max(1, num_steps // 100)
+
+    def show(count):
+        done = int(count) * 40 // num_steps
+        end = "\n" if int(count) == num_steps else ""
+        print(f"\r[{'#' * done:<40}] step {int(count)} of {num_steps}", end=end, file=sys.stderr, flush=True)
+
+    due = (count % every == 0) | (count == num_steps)
+    lax.cond(due, lambda: jax.debug.callback(show, count), lambda: None)
+
+
+class Interpolant(NamedTuple):
+    """Position and velocity at the times asked for, with these as leading axis."""
+
+    q: Any
+    v: Any
+
+
+def interpolate(solution, times) -> Interpolant:
+    """Dense output: q and v at arbitrary times inside the run, differentiable in all.
+
+    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration). Their
+    error is O(H^4), H the spacing of the saved times.
+
+    Args:
+        solution: of one run (vmap this function for a batch).
+        times: scalar or array, inside [solution.t[0], solution.t[-1]] up to rounding.
+
+    Raises:
+        ValueError: a time outside the run. For tracers the result is NaN there.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> ball = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: 0 * q - 9.81)
+    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.array([0.0]), jnp.array([10.0]), dt=0.1, num_steps=10)
+    >>> round(float(hhtjax.interpolate(run, 0.25).q[0]), 5)                 # 10 t - 9.81 t^2/2
+    2.19344
+    """
+    t = solution.t
+    times = jnp.asarray(times, t.dtype)
+    start, end, H = t[0], t[-1], t[1] - t[0]
+    slack = 16 * jnp.finfo(t.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
+    outside = ~((times >= start - slack) & (times <= end + slack))
+    if is_concrete(outside) and np.any(outside):
+        bad = np.asarray(times)[np.asarray(outside)].flat[0]
+        raise ValueError(f"interpolate: `times` must lie in [{start:.6g}, {end:.6g}]; received {bad:.6g}.")
+    i = jnp.clip(jnp.floor((times - start) / H).astype(jnp.int32), 0, t.shape[0] - 2)
+    x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
+
+    def hermite(y, slope):
+        s = x.reshape(x.shape + (1,) * (y.ndim - 1))
+        y0, y1, d0, d1 = y[i], y[i + 1], H * slope[i], H * slope[i + 1]
+        rise = y1 - y0
+        return y0 + s * (d0 + s * (3 * rise - 2 * d0 - d1 + s * (d0 + d1 - 2 * rise)))
+
+    return Interpolant(
+        jax.tree.map(hermite, solution.q, solution.v), jax.tree.map(hermite, solution.v, solution.acceleration)
+    )

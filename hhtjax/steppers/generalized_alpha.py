@@ -1,0 +1,338 @@
+"""The generalised-alpha family: one residual, coefficients as data, with and without iterations.
+
+State (q, v, w, a) with w the acceleration and a the algorithmic one (Arnold and Bruls 2007):
+
+    q1 = q + h v + h^2 [(1/2 - beta) a + beta a1]
+    v1 = v + h [(1 - gamma) a + gamma a1]
+    (1 - alpha_m) a1 + alpha_m a = (1 - alpha_f) w1 + alpha_f w
+    r(w1) = M(q1) w1 - Q(q1, v1, t1) = 0
+
+Second order for every alpha, for M(q) and for explicit time. (The form printed in the literature,
+M(q1) a1 = (1 + alpha) Q1 - alpha Q0, is first order once M depends on q and alpha is not 0.)
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple, TypedDict, Unpack
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.description import is_concrete
+from hhtjax.linear_solve import factorize
+from hhtjax.linear_solve import solve as dense_solve
+from hhtjax.steppers.stepper import Info, State, Stepper, require_number
+
+LINEARIZATIONS = ("predictor", "held", "state", "auto")
+HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
+
+
+class Coefficients(NamedTuple):
+    """alpha_m, alpha_f, beta, gamma of the formulas above; numbers, or tracers to differentiate."""
+
+    alpha_m: Any
+    alpha_f: Any
+    beta: Any
+    gamma: Any
+
+
+class Options(NamedTuple):
+    """How the residual is solved; `hht` documents the fields."""
+
+    iterations: int | None = 1
+    linearize: str | None = None
+    tolerance: float = 1e-10
+    max_iterations: int = 20
+    start: str = "corrected"
+    solve: Callable = dense_solve
+
+
+class Keywords(TypedDict, total=False):
+    """The same, as the keyword arguments of the constructors."""
+
+    iterations: int | None
+    linearize: str | None
+    tolerance: float
+    max_iterations: int
+    start: str
+    solve: Callable
+
+
+def advance(c, s, dt, w):
+    """Everything at t + dt as an affine function of the new acceleration w."""
+    a = ((1 - c.alpha_f) * w + c.alpha_f * s.w - c.alpha_m * s.a) / (1 - c.alpha_m)
+    q = s.q + dt * s.v + dt**2 * ((0.5 - c.beta) * s.a + c.beta * a)
+    v = s.v + dt * ((1 - c.gamma) * s.a + c.gamma * a)
+    return State(s.t + dt, q, v, w, a)
+
+
+def residual(system, params, s):
+    """M(q) w - Q(q, v, t): zero on the trajectory."""
+    return system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
+
+
+def linearized_solve(r, path, w, solve, at=None):
+    """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)).
+
+    One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
+    """
+    start, along = jax.linearize(path, w)
+    point = start if at is None else at
+    value, tangent = jax.linearize(r, point)
+    J = jax.vmap(lambda e: tangent(along(e)), out_axes=1)(jnp.eye(w.size, dtype=w.dtype))
+    if at is not None:
+        value = value + tangent(jax.tree.map(jnp.subtract, start, point))
+    return w - solve(J, value)
+
+
+def linearization_point(system, params, s, predicted, where):
+    """The state at t1 about which the non-iterative step expands r; None for the predictor itself."""
+    if where == "predictor":
+        return None
+    if where == "state":
+        return s._replace(t=predicted.t)
+    held = s._replace(t=predicted.t, q=s.q + (predicted.t - s.t) * s.v)
+    if where == "held":
+        return held
+    M = system.mass(s.q, params)
+    D = M if M.ndim == 1 else jnp.diagonal(M)
+    r_predicted, r_held = (residual(system, params, x) for x in (predicted, held))
+    limit = jnp.maximum(jnp.sum(r_held**2 / D), HELD_THRESHOLD**2 * jnp.sum(D * s.w**2))
+    use_predictor = jnp.sum(r_predicted**2 / D) <= limit
+    return jax.tree.map(partial(jnp.where, use_predictor), predicted, held)
+
+
+def newton(r, path, w, solve, tolerance, max_iterations):
+    """Newton on r(path(w)) until max|r| <= tolerance, or until a correction is lost in rounding.
+
+    Differentiated by the implicit-function theorem, forward and reverse.
+    """
+
+    def lost_in_rounding(before, after):
+        limit = 2 * jnp.finfo(after.dtype).eps * jnp.max(jnp.abs(after))
+        return jnp.max(jnp.abs(after - before)) <= limit
+
+    def search(f, w):
+        def unfinished(carry):
+            _, value, iterations, converged = carry
+            return ~converged & (iterations < max_iterations) & jnp.all(jnp.isfinite(value))
+
+        def improve(carry):
+            w0, value, iterations, _ = carry
+            w1 = w0 - solve(jax.jacfwd(f)(w0), value)
+            value, s0, s1 = f(w1), path(w0), path(w1)
+            stuck = lost_in_rounding(s0.q, s1.q) & lost_in_rounding(s0.v, s1.v)
+            return w1, value, iterations + 1, stuck | jnp.all(jnp.abs(value) <= tolerance)
+
+        value = f(w)
+        begin = w, value, jnp.zeros((), jnp.int32), jnp.all(jnp.abs(value) <= tolerance)
+        w, value, iterations, converged = lax.while_loop(unfinished, improve, begin)
+        return w, Info(jnp.max(jnp.abs(value)), iterations, converged)
+
+    def tangent_solve(g, y):
+        return solve(jax.vmap(g, out_axes=1)(jnp.eye(y.size, dtype=y.dtype)), y)
+
+    return lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
+
+
+@dataclass(frozen=True, eq=False)
+class GeneralizedAlpha(Stepper):
+    """A method of the family; made by `hht`, `newmark`, `bossak` and `generalized_alpha`."""
+
+    coefficients: Coefficients
+    order: int
+    options: Options
+
+    def begin(self, system, q, v, t, params, dt):
+        """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""
+        c = self.coefficients
+
+        def acceleration(q, v, t):
+            return system.acceleration(q, v, t, params, self.options.solve)
+
+        shift = c.alpha_m - c.alpha_f
+        if self.options.start == "simple" or (is_concrete(shift) and shift == 0):
+            w = acceleration(q, v, t)
+            return State(t, q, v, w, w)
+        w, tangent = jax.linearize(acceleration, q, v, t)
+        return State(t, q, v, w, w + shift * dt * tangent(v, w, jnp.ones_like(t)))
+
+    def advance(self, s, dt, w):
+        """State at t + dt, given its acceleration."""
+        return advance(self.coefficients, s, dt, w)
+
+    def bind(self, system, params, dt):
+        """The step; for a linear system its matrix is factorised here, once."""
+        r = partial(residual, system, params)
+        options = self.options
+        solve, where = options.solve, options.linearize
+        if system.linear:
+            where = "predictor"  # all points of linearisation are one
+            if solve is dense_solve:
+                zero = jnp.zeros(system.size, dt.dtype)
+                rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
+                solve_once = factorize(jax.jacfwd(lambda w: r(self.advance(rest, dt, w)))(zero))
+
+                def solve(A, b):  # A is this same matrix
+                    return solve_once(b)
+
+        def step(s):
+            path = partial(self.advance, s, dt)
+            if options.iterations is None:
+                w, info = newton(r, path, s.w, solve, options.tolerance, options.max_iterations)
+                return path(w), info
+            at = linearization_point(system, params, s, path(s.w), where)
+            w = linearized_solve(r, path, s.w, solve, at)
+            for _ in range(options.iterations - 1):
+                w = linearized_solve(r, path, w, solve)
+            s1 = path(w)
+            if where == "state" and options.iterations == 1:  # refresh: the acceleration of the new state
+                w = system.acceleration(s1.q, s1.v, s1.t, params, solve)
+                s1 = s1._replace(w=w, a=path(w).a)
+            return s1, Info()
+
+        return step
+
+
+def hht(alpha=-0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+    """HHT-alpha, by default non-iterative: one Jacobian, one factorisation, one solve per step.
+
+        alpha_m = 0,  alpha_f = -alpha,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
+
+    Order 2. A-stable on linear systems; spectral radius at infinite frequency (1 + alpha)/(1 - alpha).
+    alpha = 0 is the trapezoidal rule, without damping and the least robust choice.
+
+    Args:
+        alpha: in [-1/3, 0]; a number, or a tracer to differentiate.
+        iterations: 1, non-iterative; k, that many Newton iterations; None, Newton until `tolerance`.
+        linearize: the point about which the first solve expands M w - Q at t1.
+            "predictor": q, v for constant acceleration. Smooth in all arguments, so the one for fitting.
+                Fails first on stiffening springs, nonlinear dampers and friction.
+            "held": q + h v with v held. Smooth, the most bounded, less accurate on smooth motion.
+            "state": (q, v, w) at t, the acceleration then refreshed by M w1 = Q1 (Kim's step made second
+                order). Good with friction and dampers; loses accuracy on a stiff slow manifold, and costs
+                a second factorisation, of M.
+            "auto": predictor, or held where its residual is the smaller one and matters. Two residuals.
+                The map jumps by O(h^3) where the choice changes.
+            The default is "auto" for one iteration and "predictor" for more.
+        tolerance: on the max-norm of the residual M w - Q, in units of force (iterations=None only).
+            A correction lost in rounding ends the iteration too.
+        max_iterations: Newton iterations before a step counts as failed (iterations=None only).
+        start: "corrected", a0 = w0 + (alpha_m - alpha_f) h dw/dt, second order from the first step;
+            "simple", a0 = w0.
+        solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU.
+
+    Raises:
+        ValueError, TypeError: an argument out of its range or of the wrong kind.
+
+    References:
+        Hilber, Hughes, Taylor (1977); Kim et al. (2019), Eq. 1-2, 8-14; Arnold, Bruls (2007), Eq. 3.
+
+    >>> import hhtjax
+    >>> hhtjax.hht(alpha=-0.1).coefficients.gamma
+    0.6
+    >>> hhtjax.hht(alpha=0.2)
+    Traceback (most recent call last):
+    ValueError: hht: `alpha` must lie in [-1/3, 0]; received 0.2.
+    """
+    alpha = require_number("hht", "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")
+    return _member("hht", Coefficients(0.0, -alpha, (1 - alpha) ** 2 / 4, 0.5 - alpha), 2, options)
+
+
+def newmark(beta=0.25, gamma=0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+    """Newmark(beta, gamma): alpha_m = alpha_f = 0. The default is the trapezoidal rule.
+
+    Order 2 for gamma = 1/2, else 1 (and gamma > 1/2 damps). A-stable for 2 beta >= gamma >= 1/2.
+
+    Args:
+        beta: in (0, 1]; gamma: in [1/2, 1].
+        **options: those of `hht`.
+
+    References:
+        Newmark (1959); Cardona, Geradin (1989), Eq. 36.
+
+    >>> import hhtjax
+    >>> hhtjax.newmark().order, hhtjax.newmark(beta=0.3025, gamma=0.6).order
+    (2, 1)
+    """
+    beta = require_number("newmark", "beta", beta, lambda x: 0 < x <= 1, "lie in (0, 1]")
+    gamma = require_number("newmark", "gamma", gamma, lambda x: 0.5 <= x <= 1, "lie in [1/2, 1]")
+    order = 2 if is_concrete(gamma) and gamma == 0.5 else 1
+    return _member("newmark", Coefficients(0.0, 0.0, beta, gamma), order, options)
+
+
+def bossak(alpha=-0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+    """Bossak (Wood, Bossak, Zienkiewicz): HHT's weighting put on the inertia instead of the forces.
+
+        alpha_m = alpha,  alpha_f = 0,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
+
+    Order 2. A-stable. Spectral radius at infinite frequency (1 + alpha)/(1 - alpha).
+
+    Args:
+        alpha: in [-1, 0].
+        **options: those of `hht`.
+
+    References:
+        Wood, Bossak, Zienkiewicz (1980); Cardona, Geradin (1989), Sec. 2.
+
+    >>> import hhtjax
+    >>> hhtjax.bossak(alpha=-0.1).coefficients.alpha_m
+    -0.1
+    """
+    alpha = require_number("bossak", "alpha", alpha, lambda x: -1 <= x <= 0, "lie in [-1, 0]")
+    return _member("bossak", Coefficients(alpha, 0.0, (1 - alpha) ** 2 / 4, 0.5 - alpha), 2, options)
+
+
+def generalized_alpha(rho_inf=0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+    """Chung and Hulbert's generalised-alpha: least low-frequency damping for a given one at infinity.
+
+        alpha_m = (2 rho - 1)/(rho + 1),  alpha_f = rho/(rho + 1),
+        beta = (1 - alpha_m + alpha_f)^2/4,  gamma = 1/2 - alpha_m + alpha_f
+
+    Order 2. A-stable.
+
+    Args:
+        rho_inf: rho, the spectral radius at infinite frequency, in [0, 1].
+        **options: those of `hht`.
+
+    References:
+        Chung, Hulbert (1993); Arnold, Bruls (2007).
+
+    >>> import hhtjax
+    >>> hhtjax.generalized_alpha(rho_inf=1.0).coefficients
+    Coefficients(alpha_m=0.5, alpha_f=0.5, beta=0.25, gamma=0.5)
+    """
+    rho = require_number("generalized_alpha", "rho_inf", rho_inf, lambda x: 0 <= x <= 1, "lie in [0, 1]")
+    alpha_m, alpha_f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
+    shift = alpha_f - alpha_m
+    return _member("generalized_alpha", Coefficients(alpha_m, alpha_f, (1 + shift) ** 2 / 4, 0.5 + shift), 2, options)
+
+
+def _member(caller, coefficients, order, keywords):
+    return GeneralizedAlpha(coefficients, order, check_options(caller, Options(**keywords)))
+
+
+def check_options(caller, options):
+    """The options with the default of `linearize` filled in, or an error that names what is wrong."""
+    iterations, linearize, tolerance, max_iterations, start, solve = options
+    if iterations is not None and (not isinstance(iterations, int) or isinstance(iterations, bool) or iterations < 1):
+        raise ValueError(f"{caller}: `iterations` must be a positive integer or None; received {iterations!r}.")
+    if linearize is None:
+        linearize = "auto" if iterations == 1 else "predictor"
+    if linearize not in LINEARIZATIONS:
+        raise ValueError(f"{caller}: `linearize` must be one of {', '.join(LINEARIZATIONS)}; received {linearize!r}.")
+    if iterations is None and linearize != "predictor":
+        raise ValueError(
+            f"{caller}: with iterations=None, Newton starts from the predictor: leave `linearize` out; "
+            f"received {linearize!r}."
+        )
+    require_number(caller, "tolerance", tolerance, lambda x: x > 0, "be positive")
+    if not isinstance(max_iterations, int) or isinstance(max_iterations, bool) or max_iterations < 1:
+        raise ValueError(f"{caller}: `max_iterations` must be a positive integer; received {max_iterations!r}.")
+    if start not in ("corrected", "simple"):
+        raise ValueError(f'{caller}: `start` must be "corrected" or "simple"; received {start!r}.')
+    if not callable(solve):
+        raise TypeError(f"{caller}: `solve` must be a function solve(A, b); received {solve!r}.")
+    return options._replace(linearize=linearize)

@@ -1,0 +1,34 @@
+"""Fully implicit Euler: the generalised-alpha machinery with another update."""
+
+from dataclasses import dataclass
+
+from hhtjax.linear_solve import solve as dense_solve
+from hhtjax.steppers.generalized_alpha import Coefficients, GeneralizedAlpha, Options, check_options
+from hhtjax.steppers.stepper import State
+
+
+@dataclass(frozen=True, eq=False)
+class ImplicitEuler(GeneralizedAlpha):
+    """Implicit Euler; made by `implicit_euler`."""
+
+    def advance(self, s, dt, w):
+        """v1 = v + h w1, q1 = q + h v1."""
+        v = s.v + dt * w
+        return State(s.t + dt, s.q + dt * v, v, w, w)
+
+
+def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=dense_solve) -> ImplicitEuler:
+    """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), solved by Newton.
+
+    Order 1, L-stable, strongly damping: the reference for robustness, not for accuracy.
+
+    Args:
+        iterations: None, Newton until `tolerance`; k, that many Newton iterations.
+        tolerance, max_iterations, solve: as in `hht`.
+
+    >>> import hhtjax
+    >>> hhtjax.implicit_euler().order
+    1
+    """
+    options = Options(iterations, "predictor", tolerance, max_iterations, "simple", solve)
+    return ImplicitEuler(Coefficients(0.0, 0.0, 1.0, 1.0), 1, check_options("implicit_euler", options))

@@ -1,0 +1,90 @@
+"""What every stepper shares: the state it carries, what it reports, and how it is called."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.description import Description, is_array, is_concrete
+from hhtjax.system import flatten
+
+
+class State(NamedTuple):
+    """What the next step needs.
+
+    t: time; q: position; v: velocity; w: acceleration, w = M^-1 Q on the trajectory;
+    a: algorithmic acceleration of the generalised-alpha recursion, None where a method has none.
+    """
+
+    t: Any
+    q: Any
+    v: Any
+    w: Any
+    a: Any = None
+
+
+class Info(NamedTuple):
+    """What a step tells about itself; None where a method has nothing to tell.
+
+    residual: max-norm of M w - Q at the accepted iterate, in units of force.
+    iterations: number of Newton iterations.
+    converged: whether they met the tolerance.
+    """
+
+    residual: Any = None
+    iterations: Any = None
+    converged: Any = None
+
+
+class Stepper(Description):
+    """Base of all steppers. A family implements `order`, `begin` and `bind`, on vectors.
+
+    `init` and `step` wrap them for pytrees, for those who write their own loop:
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: {"x": -4.0 * q["x"]})
+    >>> stepper = hhtjax.hht(alpha=-0.05)
+    >>> state = stepper.init(spring, {"x": 1.0}, {"x": 0.0}, None, dt=1e-2)
+    >>> state, info = stepper.step(spring, state, None, dt=1e-2)
+    >>> round(float(state.q["x"]), 4)
+    0.9998
+    """
+
+    order: int  # of convergence of q and v in dt
+
+    def begin(self, system, q, v, t, params, dt) -> State:
+        """State at the initial time, for a `FlatSystem`."""
+        raise NotImplementedError
+
+    def bind(self, system, params, dt):
+        """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
+        raise NotImplementedError
+
+    def init(self, system, q0, v0, params, dt, t0=0.0) -> State:
+        """State at t0, from position q0 and velocity v0."""
+        flat, q, v = flatten("init", system, q0, v0, t0, params)
+        dt, t0 = (jnp.asarray(x, q.dtype) for x in (dt, t0))
+        return _unravel(flat, self.begin(flat, q, v, t0, params, dt))
+
+    def step(self, system, state, params, dt) -> tuple[State, Info]:
+        """State one step dt after `state`, and what the step tells about itself."""
+        flat, q, v = flatten("step", system, state.q, state.v, state.t, params)
+        w, a = ravel_pytree(state.w)[0], None if state.a is None else ravel_pytree(state.a)[0]
+        step = self.bind(flat, params, jnp.asarray(dt, q.dtype))
+        state, info = step(State(jnp.asarray(state.t, q.dtype), q, v, w, a))
+        return _unravel(flat, state), info
+
+
+def _unravel(flat, state):
+    fields = {name: flat.unravel(x) for name, x in state._asdict().items() if name != "t" and x is not None}
+    return state._replace(**fields)
+
+
+def require_number(caller, name, value, valid, expectation):
+    """The value as it is, if it is a real scalar within its range; a tracer passes unchecked."""
+    real = isinstance(value, (int, float)) or (is_array(value) and jnp.isrealobj(value) and value.dtype != bool)
+    if not real or isinstance(value, bool) or jnp.ndim(value) != 0:
+        raise TypeError(f"{caller}: `{name}` must be a real number; received {value!r}.")
+    if is_concrete(value) and not valid(value):
+        raise ValueError(f"{caller}: `{name}` must {expectation}; received {value}.")
+    return value
