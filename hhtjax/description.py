@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 
 def is_array(x):
@@ -11,7 +12,7 @@ def is_array(x):
 
 def is_concrete(x):
     """False for a tracer, whose value is not known while a function is being traced."""
-    return not isinstance(x, jax.core.Tracer)
+    return not isinstance(x, Tracer)
 
 
 def _fingerprint(x):

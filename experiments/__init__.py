@@ -1,0 +1,1 @@
+"""Experiments: one folder for each question, run by `python -m experiments NAME`."""

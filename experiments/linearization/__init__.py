@@ -1,0 +1,1 @@
+"""Which point of linearisation serves the non-iterative step best."""

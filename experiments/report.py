@@ -1,0 +1,68 @@
+"""What all experiments share: progress, tables, figures and JSON, written to one folder."""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+# Okabe and Ito's colours, told apart by colour-blind readers
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+plt.rcParams.update(
+    {
+        "figure.constrained_layout.use": True,
+        "figure.dpi": 130,
+        "axes.prop_cycle": plt.cycler(color=COLOURS),
+        "axes.grid": True,
+        "grid.alpha": 0.3,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "legend.frameon": False,
+        "font.size": 9,
+    }
+)
+
+
+class Report:
+    """Collects what an experiment has to show."""
+
+    def __init__(self, name: str, out: Path):
+        self.name, self.out = name, out
+        self.start = time.perf_counter()
+        self.written: list[Path] = []
+        out.mkdir(parents=True, exist_ok=True)
+
+    def progress(self, text: str):
+        """A line on stderr with the time since the start."""
+        print(f"[{time.perf_counter() - self.start:6.1f} s] {text}", file=sys.stderr, flush=True)
+
+    def table(self, header, rows):
+        """A table on stdout; numbers to four digits."""
+        cells = [[x if isinstance(x, str) else f"{x:.4g}" for x in row] for row in rows]
+        widths = [max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))]
+        for row in [list(header), ["-" * w for w in widths], *cells]:
+            print("  ".join(x.rjust(w) if i else x.ljust(w) for i, (x, w) in enumerate(zip(row, widths, strict=True))))
+        print(flush=True)
+
+    def figure(self, name: str, figure):
+        """Saves a figure as NAME.png."""
+        path = self.out / f"{name}.png"
+        figure.savefig(path)
+        plt.close(figure)
+        self.written.append(path)
+
+    def numbers(self, values: dict):
+        """Saves numbers as JSON, named after the experiment."""
+        path = self.out / f"{self.name}.json"
+        path.write_text(json.dumps(values, indent=1) + "\n")
+        self.written.append(path)
+
+    def close(self):
+        """Says where everything is."""
+        print("Written:", *(f"  {path}" for path in self.written), sep="\n", flush=True)
