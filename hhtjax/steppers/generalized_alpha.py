@@ -129,12 +129,14 @@ def newton(r, path, w, solve, tolerance, max_iterations):
         value = f(w)
         begin = w, value, jnp.zeros((), jnp.int32), jnp.all(jnp.abs(value) <= tolerance)
         w, value, iterations, converged = lax.while_loop(unfinished, improve, begin)
-        return w, Info(jnp.max(jnp.abs(value)), iterations, converged)
+        # as floats: custom_root cannot differentiate past integers
+        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype))
 
     def tangent_solve(g, y):
         return solve(jax.vmap(g, out_axes=1)(jnp.eye(y.size, dtype=y.dtype)), y)
 
-    return lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
+    w, (size, iterations, converged) = lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
+    return w, Info(size, iterations.astype(jnp.int32), converged > 0)
 
 
 @dataclass(frozen=True, eq=False)

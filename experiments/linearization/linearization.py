@@ -1,0 +1,272 @@
+"""Which point of linearisation should be the default of the non-iterative step: bounded, accurate, how accurate.
+
+Every scene is run with every method, alpha and step size, and each run is a cell:
+
+    bounded    finite, and never ten times as far from q0 as the reference gets
+    accurate   RMS error of q below 5 % of the RMS of the reference's motion about its mean
+    ratio      error / error of the converged method, a geometric mean over the cells where the latter is accurate
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import ListedColormap, LogNorm
+from matplotlib.patches import Patch
+from scipy.integrate import solve_ivp
+
+from experiments.linearization.scenes import cases
+from hhtjax import hht
+
+ALPHAS = (0.0, -0.05, -0.3)
+METHODS = {
+    "converged": {"iterations": None},
+    "predictor": {"linearize": "predictor"},
+    "held": {"linearize": "held"},
+    "state": {"linearize": "state"},
+    "auto": {"linearize": "auto"},
+}
+HALVINGS = 10  # step sizes: so many, each half the one before
+SAMPLES = 64  # times at which q is compared; the coarsest runs hit a part of them
+ACCURATE = 0.05
+FARTHEST = 10.0
+
+
+class Reference(NamedTuple):
+    """q: at the sample times, (SAMPLES, n); motion: its RMS about its mean; reach: its largest distance from q0."""
+
+    q: np.ndarray
+    motion: float
+    reach: float
+
+
+class Outcome(NamedTuple):
+    """What one method does on one scene; arrays (step sizes, alphas)."""
+
+    error: np.ndarray
+    bounded: np.ndarray
+    newton_failed: np.ndarray
+
+    @property
+    def accurate(self):
+        """Where q is right."""
+        return self.bounded & (self.error < ACCURATE)
+
+
+@partial(jax.jit, static_argnames="method")
+def simulate_all(scene, num_steps, method):
+    """For each alpha: q at the sample times, its largest distance from q0, number of failed Newton iterations.
+
+    A loop with a traced num_steps, not `hhtjax.simulate`, so that all step sizes share one compilation.
+    """
+    dt = scene.duration / num_steps
+    steps_between = jnp.maximum(1, num_steps // SAMPLES)
+
+    def simulate_one(alpha):
+        stepper = hht(alpha, **METHODS[method])
+
+        def step(i, carry):
+            state, path, farthest, failures = carry
+            state, info = stepper.step(scene.system, state, scene.params, dt)
+            path = path.at[i // steps_between].set(state.q)  # the last one to write is the one on time
+            farthest = jnp.maximum(farthest, jnp.max(jnp.abs(state.q - scene.q0)))
+            return state, path, farthest, failures + (0 if info.converged is None else ~info.converged)
+
+        start = stepper.init(scene.system, scene.q0, scene.v0, scene.params, dt)
+        path = jnp.zeros((SAMPLES, scene.q0.size))
+        return jax.lax.fori_loop(0, num_steps, step, (start, path, 0.0, 0))[1:]
+
+    return jax.vmap(simulate_one)(jnp.array(ALPHAS))
+
+
+def solve_reference(case) -> Reference:
+    """The motion by scipy with tight tolerances."""
+    system, params, q0, v0, duration = case.scene
+    n = q0.size
+
+    @jax.jit
+    def rate(t, y):
+        q, v = y[:n], y[n:]
+        M = system.mass(q, params) if callable(system.mass) else system.mass
+        Q = system.force(q, v, t, params)
+        return jnp.concatenate([v, Q / M if M.ndim == 1 else jnp.linalg.solve(M, Q)])
+
+    jacobian: dict[str, Any] = {"jac": jax.jit(jax.jacfwd(rate, 1))} if case.solver == "Radau" else {}
+    times = np.linspace(0, duration, SAMPLES + 1)
+    run = solve_ivp(
+        lambda t, y: np.asarray(rate(t, y)),
+        (0, duration),
+        np.concatenate([q0, v0]),
+        case.solver,
+        times,
+        rtol=1e-10,
+        atol=1e-12,
+        **jacobian,
+    )
+    q = run.y[:n].T
+    return Reference(q[1:], rms(q - q.mean(axis=0), (0, 1)), np.abs(q - q0).max())
+
+
+def rms(x, axis):
+    """Root mean square; inf where x is too large to be squared."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.sqrt(np.mean(x**2, axis=axis))
+
+
+def relative_error(path, num_steps, reference):
+    """RMS error of q at the sample times that the run hits, over the RMS of the motion."""
+    hit = min(num_steps, SAMPLES)
+    every = SAMPLES // hit
+    return rms(path[:, :hit] - reference.q[every - 1 :: every], (1, 2)) / reference.motion
+
+
+def assess(case, method, sizes, reference) -> Outcome:
+    """One method on one scene."""
+    errors, bounded, failures = [], [], []
+    for num_steps in sizes:
+        path, farthest, failed = (np.asarray(x) for x in simulate_all(case.scene, num_steps, method))
+        errors.append(relative_error(path, num_steps, reference))
+        bounded.append(farthest <= FARTHEST * reference.reach)  # false for NaN
+        failures.append(failed > 0)
+    return Outcome(np.array(errors), np.array(bounded), np.array(failures))
+
+
+def check_reference(case, sizes, reference):
+    """Difference between scipy and the converged method with eight times the most steps."""
+    num_steps = 8 * sizes[-1]
+    path, _, _ = simulate_all(case.scene, num_steps, "converged")
+    return relative_error(np.asarray(path), num_steps, reference)[0]
+
+
+def error_ratios(outcome, converged):
+    """Error over that of the converged method, where that one is accurate; an error beyond 100 % counts as 100 %."""
+    error = np.nan_to_num(outcome.error, nan=1.0).clip(max=1.0)
+    return (error / converged.error)[converged.accurate]
+
+
+def geometric_mean(x):
+    """NaN for nothing."""
+    return float(np.exp(np.mean(np.log(x)))) if len(x) else float("nan")
+
+
+def select_alpha(outcome, i) -> Outcome:
+    """The cells of one alpha."""
+    return Outcome(*(x[:, i] for x in outcome))
+
+
+def summary_rows(outcomes):
+    """Method, alpha, bounded %, accurate %, ratio, over all scenes."""
+    rows = []
+    for method in METHODS:
+        for i, alpha in enumerate(ALPHAS):
+            here = [select_alpha(x[method], i) for x in outcomes.values()]
+            converged = [select_alpha(x["converged"], i) for x in outcomes.values()]
+            ratios = np.concatenate([error_ratios(x, y) for x, y in zip(here, converged, strict=True)])
+            bounded, accurate = (100 * np.mean([getattr(x, name) for x in here]) for name in ("bounded", "accurate"))
+            rows.append([method, alpha, bounded, accurate, geometric_mean(ratios)])
+    return rows
+
+
+def scene_rows(outcomes):
+    """For each scene and method: cells bounded / accurate, and the ratio."""
+    rows = []
+    for name, by_method in outcomes.items():
+        converged = by_method["converged"]
+        cells = [
+            f"{x.bounded.sum()}/{x.accurate.sum()}  {geometric_mean(error_ratios(x, converged)):6.2f}"
+            for x in by_method.values()
+        ]
+        rows.append([name, *cells, f"{converged.newton_failed.sum()}"])
+    return rows
+
+
+def cell_figure(outcomes):
+    """Every cell: scenes down, methods across; in each block the step shrinks to the right."""
+    colours = ("#000000", "#F2CF8D", "#0072B2")  # also apart in grey: black, light, middle
+    labels = ("unbounded", "bounded, error above 5 %", "error below 5 %")
+    figure, axes = plt.subplots(figsize=(7.4, 0.9 + 0.42 * len(outcomes)))
+    columns = len(next(iter(outcomes.values()))["converged"].error)
+    for row, by_method in enumerate(outcomes.values()):
+        for column, outcome in enumerate(by_method.values()):
+            grade = outcome.bounded.astype(int) + outcome.accurate
+            x, y = (columns + 1) * column + np.arange(columns + 1), 4 * row + np.arange(4)
+            style = {"cmap": ListedColormap(colours), "vmin": 0, "vmax": 2, "edgecolor": "white", "linewidth": 0.4}
+            axes.pcolormesh(x, y, grade.T, **style)
+    axes.set_xticks((columns + 1) * np.arange(len(METHODS)) + columns / 2, METHODS)
+    axes.set_yticks(4 * np.arange(len(outcomes)) + 1.5, outcomes)
+    axes.invert_yaxis()
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0)
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+    axes.set_xlabel(f"In each block: step size halved from column to column; rows: α = {', '.join(map(str, ALPHAS))}")
+    handles = [Patch(color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    return figure
+
+
+def ratio_figure(outcomes):
+    """Error over that of the converged method, for each scene."""
+    methods = list(METHODS)[1:]
+    table = np.array([[geometric_mean(error_ratios(x[m], x["converged"])) for m in methods] for x in outcomes.values()])
+    figure, axes = plt.subplots(figsize=(5.6, 0.9 + 0.3 * len(outcomes)))
+    image = axes.imshow(table, aspect="auto", cmap="PuOr_r", norm=LogNorm(1 / 30, 30))
+    for (row, column), value in np.ndenumerate(table):
+        strong = abs(np.log10(value)) > 1 if np.isfinite(value) else False
+        text = f"{value:.2f}" if np.isfinite(value) else "none accurate"
+        axes.text(column, row, text, ha="center", va="center", color="white" if strong else "black", fontsize=8)
+    axes.set_xticks(range(len(methods)), methods)
+    axes.set_yticks(range(len(outcomes)), outcomes)
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0)
+    axes.grid(False)
+    figure.colorbar(image, label="error / error of the converged method")
+    return figure
+
+
+def to_json(outcomes, sizes, checks, rows):
+    """Everything that the tables and figures show, with three digits."""
+
+    def rounded(x):
+        return [[float(f"{y:.3g}") if np.isfinite(y) else None for y in row] for row in x]
+
+    return {
+        "alphas": ALPHAS,
+        "summary": [dict(zip(("method", "alpha", "bounded", "accurate", "ratio"), row, strict=True)) for row in rows],
+        "scenes": {
+            name: {
+                "num_steps": sizes[name],
+                "reference_check": float(checks[name]),
+                "error": {method: rounded(x.error) for method, x in by_method.items()},
+                "bounded": {method: x.bounded.tolist() for method, x in by_method.items()},
+            }
+            for name, by_method in outcomes.items()
+        },
+    }
+
+
+def run(report, fast):
+    """All scenes, methods, alphas and step sizes."""
+    outcomes, sizes, checks = {}, {}, {}
+    for case in cases():
+        if fast and not case.fast:
+            continue
+        steps = [case.fewest * 2**i for i in range(HALVINGS)][:: 2 if fast else 1]
+        reference = solve_reference(case)
+        outcomes[case.name] = {method: assess(case, method, steps, reference) for method in METHODS}
+        sizes[case.name], checks[case.name] = steps, check_reference(case, steps, reference)
+        report.progress(
+            f"{case.name}: reference and converged HHT with {8 * steps[-1]} steps differ by {checks[case.name]:.1e}"
+        )
+    cells = len(ALPHAS) * len(next(iter(sizes.values())))
+    rows = summary_rows(outcomes)
+    print(f"All scenes. Cells in %; ratio: error over that of the converged method.\n")
+    report.table(["method", "alpha", "bounded %", "accurate %", "ratio"], rows)
+    print(f"By scene: cells bounded/accurate of {cells}, ratio; cells in which a Newton iteration failed.\n")
+    report.table(["scene", *METHODS, "failed"], scene_rows(outcomes))
+    report.figure("linearization_cells", cell_figure(outcomes))
+    report.figure("linearization_ratio", ratio_figure(outcomes))
+    report.numbers(to_json(outcomes, sizes, checks, rows))

@@ -1,0 +1,163 @@
+"""Forward mode = reverse mode = central differences, for every stepper and every kind of argument."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from zoo import PROBLEMS, STEPPERS
+
+import hhtjax
+
+DAMPING = {
+    "hht": lambda x, **options: hhtjax.hht(alpha=x, **options),
+    "bossak": lambda x, **options: hhtjax.bossak(alpha=x, **options),
+    "generalized_alpha": lambda x, **options: hhtjax.generalized_alpha(rho_inf=x, **options),
+    "kim_hht": lambda x, **_: hhtjax.kim_hht(alpha=x),
+}
+
+
+def tight(stepper):
+    """Newton to rounding, where there is one: central differences see its tolerance."""
+    if getattr(stepper, "options", None) is None:
+        return stepper
+    return replace(stepper, options=stepper.options._replace(tolerance=1e-13))
+
+
+def check_gradient(loss, arguments):
+    """Compares the three derivatives of loss(arguments), a pytree of numbers."""
+    x0, unravel = ravel_pytree(arguments)
+
+    @jax.jit
+    def f(x):
+        return loss(unravel(x))
+
+    reverse = jax.jit(jax.grad(f))(x0)
+    forward = jax.jit(jax.jacfwd(f))(x0)
+    size = np.maximum(np.abs(forward), 1e-3 * np.max(np.abs(forward)))
+    assert np.all(np.isfinite(forward))
+    assert np.max(np.abs(reverse - forward) / size) < 1e-10
+    for i, value in enumerate(x0):
+        h = 1e-4 * (abs(value) or 1.0)
+
+        def at(shift, i=i):
+            return f(x0.at[i].add(shift))
+
+        # fourth order, so that truncation and rounding both stay below 1e-7
+        central = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
+        assert abs(central - forward[i]) < 1e-6 * size[i], (i, central, forward[i])
+
+
+def path_loss(problem, stepper, num_steps, save_every):
+    """A loss of the whole path, of positions, velocities and accelerations."""
+
+    def loss(arguments):
+        params, q0, v0, dt, t0 = arguments
+        path = hhtjax.simulate(
+            problem.system, stepper, q0, v0, params, dt=dt, t0=t0, num_steps=num_steps, save_every=save_every
+        )
+        return jnp.sum(path.q**2) + 0.3 * jnp.sum(path.v**2) + 0.1 * jnp.sum(path.acceleration**2) + jnp.sum(path.t)
+
+    return loss
+
+
+@pytest.mark.parametrize("name", STEPPERS)
+def test_gradients_on_the_duffing_oscillator(name):
+    problem = PROBLEMS["forced Duffing"]
+    arguments = problem.params, problem.q0, problem.v0, 0.02, 0.1
+    check_gradient(path_loss(problem, tight(STEPPERS[name]), 40, 1), arguments)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hht auto", "hht state", "hht converged", "kim_hht"])
+def test_gradients_on_the_forced_double_pendulum(name):
+    problem = PROBLEMS["forced double pendulum"]
+    arguments = problem.params, problem.q0, problem.v0, 0.02, 0.1
+    check_gradient(path_loss(problem, tight(STEPPERS[name]), 40, 40), arguments)
+
+
+@pytest.mark.parametrize("iterations", [1, None])
+@pytest.mark.parametrize(("name", "value"), [("hht", -0.1), ("bossak", -0.1), ("generalized_alpha", 0.7)])
+def test_gradient_with_respect_to_the_numerical_damping(name, value, iterations):
+    problem = PROBLEMS["forced Duffing"]
+
+    def loss(x):
+        stepper = DAMPING[name](x, linearize="predictor", iterations=iterations, tolerance=1e-13)
+        path = hhtjax.simulate(problem.system, stepper, problem.q0, problem.v0, problem.params, dt=0.05, num_steps=40)
+        return jnp.sum(path.q**2)
+
+    check_gradient(loss, jnp.asarray(value))
+
+
+def test_gradient_with_respect_to_kims_alpha():
+    problem = PROBLEMS["forced Duffing"]
+
+    def loss(alpha):
+        stepper = hhtjax.kim_hht(alpha)
+        path = hhtjax.simulate(problem.system, stepper, problem.q0, problem.v0, problem.params, dt=0.05, num_steps=40)
+        return jnp.sum(path.q**2)
+
+    check_gradient(loss, jnp.asarray(-0.1))
+
+
+@pytest.mark.parametrize("num_steps", [32, 33, 127, 480])
+def test_nested_checkpointing_changes_no_gradient(num_steps):
+    """Against the same steps under one plain scan."""
+    problem = PROBLEMS["forced Duffing"]
+    stepper = hhtjax.hht(linearize="predictor")
+
+    def nested(k):
+        params = {**problem.params, "k": k}
+        path = hhtjax.simulate(problem.system, stepper, problem.q0, problem.v0, params, dt=0.01, num_steps=num_steps)
+        return jnp.sum(path.q**2)
+
+    def plain(k):
+        params = {**problem.params, "k": k}
+        state = stepper.init(problem.system, problem.q0, problem.v0, params, 0.01)
+
+        def step(state, _):
+            state, _ = stepper.step(problem.system, state, params, 0.01)
+            return state, state.q
+
+        _, q = jax.lax.scan(step, state, None, num_steps)
+        return jnp.sum(problem.q0**2) + jnp.sum(q**2)
+
+    for derivative in (jax.grad, jax.jacfwd):
+        assert float(jax.jit(derivative(nested))(1.0)) == pytest.approx(float(jax.jit(derivative(plain))(1.0)), rel=1e-11)
+
+
+def test_second_derivative_through_the_converged_step():
+    problem = PROBLEMS["forced Duffing"]
+    stepper = hhtjax.hht(alpha=-0.1, iterations=None, tolerance=1e-13)
+
+    def loss(k):
+        params = {**problem.params, "k": k}
+        path = hhtjax.simulate(problem.system, stepper, problem.q0, problem.v0, params, dt=0.05, num_steps=20)
+        return jnp.sum(path.q**2)
+
+    gradient = jax.jit(jax.grad(loss))
+    central = (gradient(1.0 + 1e-4) - gradient(1.0 - 1e-4)) / 2e-4
+    assert float(jax.jit(jax.jacfwd(jax.grad(loss)))(1.0)) == pytest.approx(float(central), rel=1e-6)
+
+
+def test_memory_of_reverse_mode_grows_with_the_square_root():
+    """By XLA's own count; the saved path itself is left out by keeping the end only."""
+    scene = hhtjax.scenes.double_pendulum.stiff()
+
+    def temporaries(num_steps):
+        def loss(k):
+            params = {**scene.params, "k": k}
+            stepper = hhtjax.hht(linearize="predictor")
+            end = hhtjax.simulate(
+                scene.system, stepper, scene.q0, scene.v0, params, dt=1e-4, num_steps=num_steps, save_every=num_steps
+            )
+            return jnp.sum(end.q[-1] ** 2)
+
+        compiled = jax.jit(jax.grad(loss)).lower((400.0, 300.0)).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    small, large = temporaries(1000), temporaries(100_000)
+    assert large < 10 * 2 * small
+    assert large < 1e6

@@ -1,0 +1,92 @@
+"""Problems with references, and the table of steppers that the generic tests run over."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import hhtjax
+from hhtjax.scenes import double_pendulum, duffing
+
+
+class Problem(NamedTuple):
+    """A system with parameters, initial values and a duration short enough for q to stay predictable."""
+
+    system: Any
+    params: Any
+    q0: Any
+    v0: Any
+    duration: float
+
+
+def forced(q, v, t, params):
+    """Double pendulum with springs, dampers and a torque on each joint that depends on time."""
+    return double_pendulum.force(q, v, t, params) + jnp.array([3.0 * jnp.sin(5.0 * t), 2.0 * jnp.cos(3.0 * t)])
+
+
+def _double_pendulum():
+    scene = double_pendulum.free()
+    return Problem(scene.system, scene.params, jnp.array([0.3, -0.2]), jnp.array([0.5, -1.0]), 1.0)
+
+
+def _forced_double_pendulum():
+    params = {"m": (1.5, 1.0), "l": (1.0, 1.5), "k": (20.0, 10.0), "c": (0.5, 0.3), "g": double_pendulum.GRAVITY}
+    system = hhtjax.System(double_pendulum.mass, forced)
+    return Problem(system, params, jnp.array([0.3, -0.2]), jnp.array([0.5, -1.0]), 1.0)
+
+
+def _forced_duffing():
+    scene = duffing.driven()
+    return Problem(scene.system, scene.params, scene.q0, jnp.array([0.3]), 2.0)
+
+
+PROBLEMS = {
+    "double pendulum": _double_pendulum(),
+    "forced Duffing": _forced_duffing(),
+    "forced double pendulum": _forced_double_pendulum(),
+}
+
+STEPPERS = {
+    "hht auto": hhtjax.hht(alpha=-0.05),
+    "hht predictor": hhtjax.hht(alpha=-0.1, linearize="predictor"),
+    "hht held": hhtjax.hht(alpha=-0.1, linearize="held"),
+    "hht state": hhtjax.hht(alpha=-0.1, linearize="state"),
+    "hht twice": hhtjax.hht(alpha=-0.1, iterations=2),
+    "hht converged": hhtjax.hht(alpha=-0.1, iterations=None),
+    "newmark": hhtjax.newmark(linearize="predictor"),
+    "bossak": hhtjax.bossak(alpha=-0.1, linearize="predictor"),
+    "generalized_alpha": hhtjax.generalized_alpha(rho_inf=0.8, linearize="predictor"),
+    "kim_hht": hhtjax.kim_hht(alpha=-0.1),
+    "kim_implicit_euler": hhtjax.kim_implicit_euler(),
+    "implicit_euler": hhtjax.implicit_euler(),
+    "rk4": hhtjax.rk4(),
+}
+
+
+@cache
+def reference(name):
+    """q at the end of a problem, by SciPy's DOP853 at a tolerance of 1e-12."""
+    problem = PROBLEMS[name]
+    n = problem.q0.size
+
+    @jax.jit
+    def rate(t, y):
+        q, v = y[:n], y[n:]
+        M = problem.system.mass(q, problem.params)
+        Q = problem.system.force(q, v, t, problem.params)
+        return jnp.concatenate([v, Q / M if M.ndim == 1 else jnp.linalg.solve(M, Q)])
+
+    y0 = np.concatenate([problem.q0, problem.v0])
+    run = solve_ivp(lambda t, y: np.asarray(rate(t, y)), (0.0, problem.duration), y0, "DOP853", rtol=1e-12, atol=1e-13)
+    return run.y[:n, -1]
+
+
+def run(problem, stepper, num_steps, **options):
+    """The problem from start to end in num_steps steps."""
+    system, params, q0, v0, duration = problem
+    return hhtjax.simulate(
+        system, stepper, q0, v0, params, dt=duration / num_steps, num_steps=num_steps, **options
+    )
