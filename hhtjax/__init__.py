@@ -1,8 +1,11 @@
 """hhtjax: differentiable, functional time integrators for multibody dynamics."""
 
 from hhtjax import scenes as scenes
+from hhtjax.identify import IdentifiabilityWarning as IdentifiabilityWarning
 from hhtjax.identify import fit as fit
 from hhtjax.sampled import sampled as sampled
+from hhtjax.simulate import PrecisionWarning as PrecisionWarning
+from hhtjax.simulate import SimulationError as SimulationError
 from hhtjax.simulate import interpolate as interpolate
 from hhtjax.simulate import simulate as simulate
 from hhtjax.steppers.explicit import rk4 as rk4

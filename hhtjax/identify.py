@@ -199,6 +199,7 @@ def levenberg_marquardt(f, x, tolerance, max_iterations, progress):
     lam shrinks by 8 when a step lowers the cost and grows by 6 when it does not.
     """
     eps = jnp.finfo(x.dtype).eps
+    running = jnp.asarray(RUNNING, jnp.int32)
 
     def look(x):
         r, J = _with_jacobian(f, x)
@@ -223,13 +224,14 @@ def levenberg_marquardt(f, x, tolerance, max_iterations, progress):
         lower = new.cost < now.cost
         lam = jnp.where(lower, lam / 8, lam * 6)
         iteration = iteration + 1
-        small_change = (predicted <= tolerance * now.cost) & (jnp.abs(now.cost - new.cost) <= tolerance * now.cost)
-        small_step = jnp.all(jnp.abs(step) <= tolerance * (jnp.abs(now.x) + tolerance)) & (lower | (lam <= 1))
+        honest = lower | (lam <= 1)  # a step is also small, and changes little, because lam is large
+        flat = (predicted <= tolerance * now.cost) & (jnp.abs(now.cost - new.cost) <= tolerance * now.cost)
+        short = jnp.all(jnp.abs(step) <= tolerance * (jnp.abs(now.x) + tolerance))
         best = jax.tree.map(partial(jnp.where, lower), new, now)
-        code = jnp.where(iteration == max_iterations, LIMIT, RUNNING)
+        code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(~lower & (lam > 1 / eps), STUCK, code)
-        code = jnp.where(small_step, STEP, code)
-        code = jnp.where(small_change, COST, code)
+        code = jnp.where(honest & short, STEP, code)
+        code = jnp.where(honest & flat, COST, code)
         code = jnp.where(_gradient_cosine(best) <= tolerance, GRADIENT, code)
         history = History(history.cost.at[iteration].set(best.cost), history.damping.at[iteration].set(lam))
         if progress:
@@ -240,7 +242,7 @@ def levenberg_marquardt(f, x, tolerance, max_iterations, progress):
     lam = jnp.asarray(1e-3, x.dtype)
     empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
     history = History(empty.at[0].set(start.cost), empty.at[0].set(lam))
-    code = jnp.where(_gradient_cosine(start) <= tolerance, GRADIENT, RUNNING)
+    code = jnp.where(_gradient_cosine(start) <= tolerance, GRADIENT, running)
     code = jnp.where(jnp.isfinite(start.cost), code, BAD_START)
     carry = start, lam, jnp.zeros((), jnp.int32), history, code
     best, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
@@ -256,6 +258,7 @@ def _gradient_cosine(trial):
 def descend(f, x, optimizer, tolerance, max_iterations, progress, patience=5):
     """An optax optimiser on 1/2 sum f(x)^2; returns the best point it saw."""
     optimizer = optax.with_extra_args_support(optimizer)
+    running = jnp.asarray(RUNNING, jnp.int32)
 
     def cost(x):
         return jnp.sum(f(x) ** 2) / 2
@@ -269,7 +272,7 @@ def descend(f, x, optimizer, tolerance, max_iterations, progress, patience=5):
         best = jax.tree.map(partial(jnp.where, value < best[1]), (x, value), best)
         history = History(history.cost.at[iteration].set(value), None)
         quiet = jnp.where(jnp.abs(before - value) <= tolerance * value, quiet + 1, 0)
-        code = jnp.where(iteration == max_iterations, LIMIT, RUNNING)
+        code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(quiet >= patience, COST, code)
         code = jnp.where(jnp.all(gradient == 0), GRADIENT, code)
         code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
@@ -283,7 +286,7 @@ def descend(f, x, optimizer, tolerance, max_iterations, progress, patience=5):
     infinity = jnp.asarray(jnp.inf, x.dtype)
     history = History(jnp.full(max_iterations + 1, jnp.nan, x.dtype), None)
     zero = jnp.zeros((), jnp.int32)
-    carry = x, optimizer.init(x), (x, infinity), infinity, zero, zero, history, jnp.asarray(RUNNING)
+    carry = x, optimizer.init(x), (x, infinity), infinity, zero, zero, history, running
     _, _, (x, _), _, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
     return x, history, iterations, code
 

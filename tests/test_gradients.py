@@ -125,7 +125,9 @@ def test_nested_checkpointing_changes_no_gradient(num_steps):
         return jnp.sum(problem.q0**2) + jnp.sum(q**2)
 
     for derivative in (jax.grad, jax.jacfwd):
-        assert float(jax.jit(derivative(nested))(1.0)) == pytest.approx(float(jax.jit(derivative(plain))(1.0)), rel=1e-11)
+        assert float(jax.jit(derivative(nested))(1.0)) == pytest.approx(
+            float(jax.jit(derivative(plain))(1.0)), rel=1e-11
+        )
 
 
 def test_second_derivative_through_the_converged_step():

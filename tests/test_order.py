@@ -21,6 +21,7 @@ FAMILIES = {
 FORMS = {
     "converged": {"iterations": None, "tolerance": 1e-12},
     **{name: {"linearize": name} for name in ("predictor", "held", "state", "auto")},
+    "auto, corrected start": {"linearize": "auto", "start": "corrected"},
 }
 STEPS = 200, 400
 

@@ -87,6 +87,4 @@ def reference(name):
 def run(problem, stepper, num_steps, **options):
     """The problem from start to end in num_steps steps."""
     system, params, q0, v0, duration = problem
-    return hhtjax.simulate(
-        system, stepper, q0, v0, params, dt=duration / num_steps, num_steps=num_steps, **options
-    )
+    return hhtjax.simulate(system, stepper, q0, v0, params, dt=duration / num_steps, num_steps=num_steps, **options)

@@ -45,7 +45,7 @@ class Options(NamedTuple):
     linearize: str | None = None
     tolerance: float = 1e-10
     max_iterations: int = 20
-    start: str = "corrected"
+    start: str = "simple"
     solve: Callable = dense_solve
 
 
@@ -104,15 +104,18 @@ def linearization_point(system, params, s, predicted, where):
     return jax.tree.map(partial(jnp.where, use_predictor), predicted, held)
 
 
-def newton(r, path, w, solve, tolerance, max_iterations):
-    """Newton on r(path(w)) until max|r| <= tolerance, or until a correction is lost in rounding.
+def newton(r, path, s, solve, tolerance, max_iterations):
+    """Newton on r(path(w)) from s.w, until max|r| <= tolerance or a correction is lost in rounding.
 
     Differentiated by the implicit-function theorem, forward and reverse.
     """
 
-    def lost_in_rounding(before, after):
-        limit = 2 * jnp.finfo(after.dtype).eps * jnp.max(jnp.abs(after))
-        return jnp.max(jnp.abs(after - before)) <= limit
+    def lost_in_rounding(s0, s1):
+        """Whether q, and h v, change by less than they are rounded to."""
+        h = s1.t - s.t
+        size = jnp.maximum(jnp.max(jnp.abs(s1.q)), h * jnp.max(jnp.abs(s1.v)))
+        change = jnp.maximum(jnp.max(jnp.abs(s1.q - s0.q)), h * jnp.max(jnp.abs(s1.v - s0.v)))
+        return change <= 4 * jnp.finfo(s.w.dtype).eps * size
 
     def search(f, w):
         def unfinished(carry):
@@ -122,9 +125,9 @@ def newton(r, path, w, solve, tolerance, max_iterations):
         def improve(carry):
             w0, value, iterations, _ = carry
             w1 = w0 - solve(jax.jacfwd(f)(w0), value)
-            value, s0, s1 = f(w1), path(w0), path(w1)
-            stuck = lost_in_rounding(s0.q, s1.q) & lost_in_rounding(s0.v, s1.v)
-            return w1, value, iterations + 1, stuck | jnp.all(jnp.abs(value) <= tolerance)
+            value = f(w1)
+            converged = jnp.all(jnp.abs(value) <= tolerance) | lost_in_rounding(path(w0), path(w1))
+            return w1, value, iterations + 1, converged
 
         value = f(w)
         begin = w, value, jnp.zeros((), jnp.int32), jnp.all(jnp.abs(value) <= tolerance)
@@ -135,7 +138,7 @@ def newton(r, path, w, solve, tolerance, max_iterations):
     def tangent_solve(g, y):
         return solve(jax.vmap(g, out_axes=1)(jnp.eye(y.size, dtype=y.dtype)), y)
 
-    w, (size, iterations, converged) = lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
+    w, (size, iterations, converged) = lax.custom_root(lambda w: r(path(w)), s.w, search, tangent_solve, has_aux=True)
     return w, Info(size, iterations.astype(jnp.int32), converged > 0)
 
 
@@ -183,7 +186,7 @@ class GeneralizedAlpha(Stepper):
         def step(s):
             path = partial(self.advance, s, dt)
             if options.iterations is None:
-                w, info = newton(r, path, s.w, solve, options.tolerance, options.max_iterations)
+                w, info = newton(r, path, s, solve, options.tolerance, options.max_iterations)
                 return path(w), info
             at = linearization_point(system, params, s, path(s.w), where)
             w = linearized_solve(r, path, s.w, solve, at)
@@ -210,20 +213,24 @@ def hht(alpha=-0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         alpha: in [-1/3, 0]; a number, or a tracer to differentiate.
         iterations: 1, non-iterative; k, that many Newton iterations; None, Newton until `tolerance`.
         linearize: the point about which the first solve expands M w - Q at t1.
-            "predictor": q, v for constant acceleration. Smooth in all arguments, so the one for fitting.
-                Fails first on stiffening springs, nonlinear dampers and friction.
-            "held": q + h v with v held. Smooth, the most bounded, less accurate on smooth motion.
+            "predictor": q, v for constant acceleration. Smooth in all arguments, so the one for fitting,
+                and for steps that resolve the motion. Fails first at large steps: on stiffening springs,
+                nonlinear dampers, chaotic links.
+            "held": q + h v with v held. Smooth, the most bounded, 1.5 to 1.7 times the error on average.
             "state": (q, v, w) at t, the acceleration then refreshed by M w1 = Q1 (Kim's step made second
-                order). Good with friction and dampers; loses accuracy on a stiff slow manifold, and costs
-                a second factorisation, of M.
+                order). Best with nonlinear dampers; loses two digits on a stiff slow manifold, fails at
+                contacts, and costs a second factorisation, of M.
             "auto": predictor, or held where its residual is the smaller one and matters. Two residuals.
                 The map jumps by O(h^3) where the choice changes.
-            The default is "auto" for one iteration and "predictor" for more.
+            The default is "auto" for one iteration and "predictor" for more: over 14 scenes, 10 steps and 3
+            alphas, auto stayed bounded in 89 % of the runs, predictor in 79, held in 92, the converged
+            method in 89; auto and predictor are equally accurate (`python -m experiments linearization`).
         tolerance: on the max-norm of the residual M w - Q, in units of force (iterations=None only).
             A correction lost in rounding ends the iteration too.
         max_iterations: Newton iterations before a step counts as failed (iterations=None only).
-        start: "corrected", a0 = w0 + (alpha_m - alpha_f) h dw/dt, second order from the first step;
-            "simple", a0 = w0.
+        start: "simple", a0 = w0; "corrected", a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order
+            value. q, v and w are of order 2 with both; only a needs the correction, which blows up when
+            h exceeds the fastest time scale of the system.
         solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU.
 
     Raises:

@@ -1,0 +1,251 @@
+"""Least squares: known parameters recovered, uncertainty, stop reasons, and every complaint."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from scipy.optimize import least_squares
+
+import hhtjax
+from hhtjax.identify import BAD_START, REASONS
+
+t = jnp.linspace(0.0, 2.0, 60)
+TRUE = {"a": 3.0, "decay": jnp.array([0.5, 2.0])}
+
+
+def model(params):
+    return params["a"] * jnp.exp(-params["decay"][0] * t) + jnp.exp(-params["decay"][1] * t)
+
+
+def decay_residuals(params):
+    return {"signal": model(params) - model(TRUE), "nothing": jnp.zeros((2, 3))}
+
+
+START = {"a": 1.0, "decay": jnp.array([0.2, 4.0])}
+
+
+def oscillator(params, num_steps=200):
+    """Position of a damped oscillator, by the non-iterative step."""
+    system = hhtjax.System(jnp.array([1.0]), lambda q, v, t, params: -params["c"] * v - params["k"] * q)
+    stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
+    run = hhtjax.simulate(system, stepper, jnp.array([1.0]), jnp.array([0.0]), params, dt=0.05, num_steps=num_steps)
+    return run.q[:, 0]
+
+
+@pytest.fixture
+def _promotion():
+    """optax itself does not compute under strict promotion."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+@pytest.mark.usefixtures("_promotion")
+@pytest.mark.parametrize(
+    "optimizer", [None, optax.adam(0.05), optax.lbfgs()], ids=["Levenberg-Marquardt", "adam", "lbfgs"]
+)
+def test_known_parameters_are_found(optimizer):
+    tolerance = 1e-8 if optimizer is None else 1e-12
+    result = hhtjax.fit(decay_residuals, START, optimizer, max_iterations=2000, tolerance=tolerance)
+    assert jax.tree.structure(result.params) == jax.tree.structure(START)
+    assert float(result.params["a"]) == pytest.approx(3.0, rel=1e-3)
+    np.testing.assert_allclose(result.params["decay"], TRUE["decay"], rtol=3e-3)
+    assert result.residual["nothing"].shape == (2, 3)
+    assert np.all(np.isfinite(result.history.cost))
+    assert result.history.cost.shape == (int(result.iterations) + 1,)
+    assert float(result.cost) <= float(result.history.cost[0])
+
+
+@pytest.mark.usefixtures("_promotion")
+@pytest.mark.parametrize("optimizer", [None, optax.lbfgs()], ids=["Levenberg-Marquardt", "lbfgs"])
+def test_stiffness_and_damping_through_the_non_iterative_step(optimizer):
+    measured = oscillator({"k": 4.0, "c": 0.3})
+    result = hhtjax.fit(lambda p: oscillator(p) - measured, {"k": 5.0, "c": 0.6}, optimizer)
+    assert result.converged
+    assert float(result.params["k"]) == pytest.approx(4.0, rel=1e-5)
+    assert float(result.params["c"]) == pytest.approx(0.3, rel=1e-4)
+
+
+def test_estimate_and_standard_errors_equal_scipys():
+    noise = 0.01 * np.random.default_rng(0).normal(size=t.size)
+
+    def residuals(params):
+        return model(params) - model(TRUE) - noise
+
+    result = hhtjax.fit(residuals, START)
+    scipys = least_squares(lambda x: residuals({"a": x[0], "decay": x[1:]}), [1.0, 0.2, 4.0], xtol=1e-14, ftol=1e-14)
+    np.testing.assert_allclose([result.params["a"], *result.params["decay"]], scipys.x, rtol=1e-5)
+    covariance = 2 * scipys.cost / (t.size - 3) * np.linalg.inv(scipys.jac.T @ scipys.jac)
+    np.testing.assert_allclose(result.covariance, covariance, rtol=1e-3)
+    errors = [result.standard_errors["a"], *result.standard_errors["decay"]]
+    np.testing.assert_allclose(errors, np.sqrt(np.diag(covariance)), rtol=1e-3)
+
+
+def test_standard_error_is_the_scatter_of_the_estimates():
+    """Over 300 noise records at once: fit works under vmap."""
+    noise = 0.002 * jax.random.normal(jax.random.key(0), (300, t.size))
+
+    def estimate(noise):
+        result = hhtjax.fit(lambda p: model(p) - model(TRUE) - noise, START)
+        return result.params, result.standard_errors, result.converged
+
+    params, errors, converged = jax.jit(jax.vmap(estimate))(noise)
+    assert converged.all()
+    assert float(params["a"].std() / errors["a"].mean()) == pytest.approx(1, abs=0.12)
+    np.testing.assert_allclose(params["decay"].std(axis=0) / errors["decay"].mean(axis=0), 1, atol=0.15)
+
+
+@pytest.mark.usefixtures("_promotion")
+def test_scale_sets_the_steps_of_an_optax_optimiser():
+    def residuals(params):
+        return (jnp.stack([params["small"] * 1e6, params["large"]]) - 1.0) * jnp.ones(2)
+
+    start = {"small": 0.0, "large": 0.0}
+    scaled = hhtjax.fit(
+        residuals, start, optax.adam(0.05), scale={"small": 1e-6, "large": 1.0}, max_iterations=500, covariance=False
+    )
+    assert scaled.covariance is None
+    assert float(scaled.params["small"]) == pytest.approx(1e-6, rel=1e-2)
+    assert float(scaled.params["large"]) == pytest.approx(1.0, rel=1e-2)
+
+
+def test_no_retrace_on_the_second_call():
+    calls = []
+
+    def residuals(params):
+        calls.append(1)
+        return decay_residuals(params)
+
+    hhtjax.fit(residuals, START)
+    count = len(calls)
+    hhtjax.fit(residuals, {"a": 2.0, "decay": jnp.array([0.3, 3.0])})
+    assert len(calls) == count
+
+
+def test_float32_stays_float32():
+    start = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), START)
+    data = model(TRUE).astype(jnp.float32)
+    time = t.astype(jnp.float32)
+
+    def residuals(params):
+        return params["a"] * jnp.exp(-params["decay"][0] * time) + jnp.exp(-params["decay"][1] * time) - data
+
+    result = hhtjax.fit(residuals, start)
+    assert result.params["a"].dtype == result.cost.dtype == result.covariance.dtype == jnp.float32
+    assert float(result.params["a"]) == pytest.approx(3.0, rel=1e-2)
+
+
+def test_reasons_for_stopping():
+    assert hhtjax.fit(decay_residuals, START).reason.startswith("converged")
+    early = hhtjax.fit(decay_residuals, START, max_iterations=2)
+    assert early.reason == "stopped: max_iterations reached"
+    assert not early.converged
+    assert early.history.cost.shape == (3,)
+    at_minimum = hhtjax.fit(lambda p: (p - 1.0) * jnp.ones(3), 1.0)
+    assert at_minimum.iterations == 0
+    assert at_minimum.reason == "converged: the gradient vanishes to within tolerance"
+    wrong = hhtjax.fit(lambda p: (2 * jax.lax.stop_gradient(p) - p) * jnp.ones(2), 1.0)  # derivative of -p
+    assert wrong.reason == "stopped: no step lowers the cost"
+
+
+def test_a_step_into_nowhere_is_taken_back():
+    """The full step leaves the domain of the logarithm: it counts as one that does not lower the cost."""
+    result = hhtjax.fit(lambda p: jnp.stack([jnp.log(p) + 3.0, jnp.log(p) + 3.0]), 5.0)
+    assert result.converged
+    assert float(result.params) == pytest.approx(np.exp(-3.0), rel=1e-6)
+
+
+def test_undetermined_parameters_are_named():
+    def residuals(params):
+        return {"r": params["a"] * params["b"] * t - 2.0 * t + params["c"] - 1.0}
+
+    with pytest.warns(hhtjax.IdentifiabilityWarning, match=r"params\['a'\], params\['b'\]: the Jacobian .* lacks rank"):
+        result = hhtjax.fit(
+            residuals,
+            {
+                "a": 1.0,
+                "b": 1.5,
+                "c": 0.3,
+            },
+        )
+    assert float(result.params["a"] * result.params["b"]) == pytest.approx(2.0, rel=1e-6)
+    assert np.isinf(result.standard_errors["a"])
+    assert np.isfinite(result.standard_errors["c"])
+    assert not np.isnan(result.covariance).any()
+    with pytest.warns(hhtjax.IdentifiabilityWarning, match=r"params\['unused'\]\[1\]: "):
+        hhtjax.fit(lambda p: p["used"] - t, {"used": 0.0, "unused": jnp.ones(2)}, scale=None)
+
+
+def test_as_many_residuals_as_parameters():
+    with pytest.warns(hhtjax.IdentifiabilityWarning, match="as many residuals as parameters"):
+        result = hhtjax.fit(lambda p: p - jnp.array([1.0, 2.0]), jnp.zeros(2))
+    np.testing.assert_allclose(result.params, [1.0, 2.0])
+    assert np.isinf(result.standard_errors).all()
+
+
+def test_a_bad_start_inside_jit_is_a_flag():
+    result = jax.jit(lambda x: hhtjax.fit(lambda p: jnp.log(p) * jnp.ones(2), x))(-1.0)
+    assert result.code == BAD_START
+    assert not result.converged
+    assert REASONS[BAD_START] == result.reason
+
+
+def test_progress_goes_to_stderr(capfd):
+    result = hhtjax.fit(decay_residuals, START, progress=True)
+    jax.effects_barrier()
+    lines = capfd.readouterr().err.strip().splitlines()
+    assert len(lines) == int(result.iterations)
+    assert lines[0].startswith("fit: iteration 1, cost ")
+
+
+GOOD = jnp.zeros(4)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: hhtjax.fit(3, 1.0), TypeError, r"`residuals` must be a function residuals\(params\); received 3"),
+        (lambda: hhtjax.fit(lambda p: GOOD, 1.0, "adam"), TypeError, "`optimizer` must be an optax .* received 'adam'"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {}), ValueError, "`params0` must hold at least one number; received {}"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": 1j}), TypeError, r"`params0\['k'\]` must be a real .* received 1j"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": "1"}), TypeError, r"`params0\['k'\]` must be a real .* received '1'"),
+        (lambda: hhtjax.fit(lambda p: GOOD, jnp.ones(2, complex)), TypeError, "`params0` must be real; received compl"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": jnp.nan}), ValueError, r"`params0\['k'\]` must be finite; .* nan"),
+        (lambda: hhtjax.fit(lambda p: GOOD, 1.0, max_iterations=0), ValueError, "`max_iterations` .* received 0"),
+        (lambda: hhtjax.fit(lambda p: GOOD, 1.0, tolerance=-1.0), ValueError, "`tolerance` must be positive; .* -1.0"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": 1.0}, scale=2.0), ValueError, "`scale` must be a pytree structured"),
+        (
+            lambda: hhtjax.fit(lambda p: GOOD, {"k": 1.0}, scale={"k": 0.0}),
+            ValueError,
+            r"`scale\['k'\]` must be positive; received 0.0",
+        ),
+        (
+            lambda: hhtjax.fit(lambda p: GOOD, jnp.ones(2), scale=jnp.ones(3)),
+            ValueError,
+            r"`scale` must have the shape of its parameter, \(2,\); received \(3,\)",
+        ),
+        (
+            lambda: hhtjax.fit(lambda p: p[:2], jnp.ones(3)),
+            ValueError,
+            "`residuals` must return at least as many numbers as there are parameters, 3; received 2",
+        ),
+        (
+            lambda: hhtjax.fit(lambda p: jax.lax.complex(p, p) * jnp.ones(4, complex), 1.0),
+            TypeError,
+            "`residuals` must return real floats; .* complex",
+        ),
+        (
+            lambda: hhtjax.fit(lambda p: {"a": GOOD, "b": jnp.log(p) * jnp.ones(3)}, -1.0),
+            ValueError,
+            r"`residuals` must be finite at params0; received nan at residuals\['b'\]\[0\] \(3 of 7 entries\)",
+        ),
+        (
+            lambda: hhtjax.fit(lambda p: jnp.sqrt(p) * jnp.ones(3), 0.0),
+            ValueError,
+            "received a finite residual with a derivative that is not finite",
+        ),
+    ],
+)
+def test_bad_input_is_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

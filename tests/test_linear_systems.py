@@ -1,0 +1,150 @@
+"""Algebra that must hold exactly: linear systems, where every form of a method is the same map."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+
+FAMILIES = {
+    "trapezoidal": (hhtjax.newmark, {}, (0.0, 0.0, 0.25, 0.5)),
+    "hht(0)": (hhtjax.hht, {"alpha": 0.0}, (0.0, 0.0, 0.25, 0.5)),
+    "hht(-.05)": (hhtjax.hht, {"alpha": -0.05}, (0.0, 0.05, 1.05**2 / 4, 0.55)),
+    "hht(-.3)": (hhtjax.hht, {"alpha": -0.3}, (0.0, 0.3, 1.3**2 / 4, 0.8)),
+    "bossak(-.1)": (hhtjax.bossak, {"alpha": -0.1}, (-0.1, 0.0, 1.1**2 / 4, 0.6)),
+    "generalized_alpha(.5)": (hhtjax.generalized_alpha, {"rho_inf": 0.5}, (0.0, 1 / 3, (4 / 3) ** 2 / 4, 5 / 6)),
+}
+FORMS = [{"linearize": x} for x in ("predictor", "held", "state", "auto")] + [{"iterations": 2}, {"iterations": None}]
+
+
+def closed_form(coefficients, m, c, k, h):
+    """The step as a matrix on (q, v, w, a): four linear equations in the four new values."""
+    am, af, beta, gamma = coefficients
+    new = np.array(
+        [
+            [1, 0, 0, -beta * h**2],
+            [0, 1, 0, -gamma * h],
+            [k, c, m, 0],
+            [0, 0, -(1 - af), 1 - am],
+        ]
+    )
+    old = np.array([[1, h, 0, (0.5 - beta) * h**2], [0, 1, 0, (1 - gamma) * h], [0, 0, 0, 0], [0, 0, af, -am]])
+    return np.linalg.solve(new, old)
+
+
+def by_autodiff(stepper, system, h, params=None):
+    """The same matrix, as the Jacobian of the library's own step."""
+
+    def step(x):
+        state = stepper.init(system, x[:1], x[1:2], params, h)
+        state = state._replace(q=x[:1], v=x[1:2], w=x[2:3], a=x[3:])
+        state, _ = stepper.step(system, state, params, h)
+        return jnp.concatenate([state.q, state.v, state.w, state.a])
+
+    return jax.jacfwd(step)(jnp.array([0.3, -0.2, 0.1, 0.4]))
+
+
+@pytest.mark.parametrize("form", FORMS, ids=str)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_form_has_the_closed_form_amplification_matrix(family, form):
+    make, arguments, coefficients = FAMILIES[family]
+    m, c, k, h = 2.0, 0.6, 50.0, 0.3
+    system = hhtjax.System(jnp.array([m]), lambda q, v, t, params: -c * v - k * q)
+    exact = closed_form(coefficients, m, c, k, h)
+    if form == {"linearize": "state"}:
+        exact[2] = -(k * exact[0] + c * exact[1]) / m  # the refreshed acceleration obeys the equation of motion
+    np.testing.assert_allclose(by_autodiff(make(**arguments, **form), system, h), exact, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_linear_system_factorised_once_takes_the_same_step(family):
+    make, arguments, coefficients = FAMILIES[family]
+    m, c, k, h = 2.0, 0.6, 50.0, 0.3
+    system = hhtjax.LinearSystem(jnp.array([m]), jnp.array([c]), lambda params: jnp.array([params]))
+    exact = closed_form(coefficients, m, c, k, h)
+    np.testing.assert_allclose(by_autodiff(make(**arguments), system, h, k), exact, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("family", "radius"), [("hht(-.05)", 0.95 / 1.05), ("hht(-.3)", 0.7 / 1.3), ("bossak(-.1)", 0.9 / 1.1)]
+)
+def test_spectral_radius_at_infinity(family, radius):
+    make, arguments, _ = FAMILIES[family]
+    system = hhtjax.System(jnp.array([1.0]), lambda q, v, t, params: -1e14 * q)
+    A = by_autodiff(make(**arguments, linearize="predictor"), system, 1.0)
+    assert max(abs(np.linalg.eigvals(A))) == pytest.approx(radius, rel=1e-6)
+
+
+def test_trapezoidal_rule_conserves_the_energy_of_an_oscillator():
+    system = hhtjax.LinearSystem(jnp.array([1.0]), None, jnp.array([1e4]))
+    path = hhtjax.simulate(system, hhtjax.hht(alpha=0.0), jnp.array([1.0]), jnp.array([0.0]), dt=0.05, num_steps=10_000)
+    energy = path.v[:, 0] ** 2 / 2 + 1e4 * path.q[:, 0] ** 2 / 2
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
+
+
+def matrices(n):
+    rng = np.random.default_rng(1)
+    K = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    return np.diag(rng.uniform(1, 2, n)) + 0.1, 0.02 * K + 0.01 * np.eye(n), 40 * K
+
+
+@pytest.mark.parametrize("n", [3, 12])
+@pytest.mark.parametrize("form", [{}, {"iterations": None, "tolerance": 1e-11}], ids=str)
+def test_linear_system_equals_the_general_one(n, form):
+    """With a load, on a dict, and in its gradient with respect to a stiffness and the load."""
+    M, C, K = matrices(n)
+    direction = jnp.linspace(0.0, 1.0, n)
+
+    def load(t, params):
+        return {"x": params["f"] * jnp.sin(3 * t) * direction}
+
+    def force(q, v, t, params):
+        return {"x": load(t, params)["x"] - C @ v["x"] - params["k"] * (jnp.asarray(K) @ q["x"])}
+
+    linear = hhtjax.LinearSystem(M, C, lambda params: params["k"] * jnp.asarray(K), load)
+    general = hhtjax.System(M, force)
+    zero = {"x": jnp.zeros(n)}
+
+    def end(params, system):
+        stepper = hhtjax.hht(alpha=-0.1, **form)
+        return hhtjax.simulate(system, stepper, zero, zero, params, dt=0.01, num_steps=100).q["x"][-1]
+
+    params = {"f": 2.0, "k": 1.3}
+    np.testing.assert_allclose(end(params, linear), end(params, general), rtol=1e-9)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        ours, theirs = (derivative(end)(params, system) for system in (linear, general))
+        for name in params:
+            np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-7, atol=1e-12)
+
+
+def test_diagonal_and_missing_matrices_equal_the_full_ones():
+    n = 3
+    K = jnp.array([4.0, 9.0, 16.0])
+    ends = [
+        hhtjax.simulate(
+            hhtjax.LinearSystem(M, C, stiffness), hhtjax.hht(), jnp.ones(n), jnp.zeros(n), dt=0.05, num_steps=40
+        ).q[-1]
+        for M, C, stiffness in (
+            (jnp.ones(n), None, K),
+            (jnp.eye(n), jnp.zeros((n, n)), jnp.diag(K)),
+            (lambda params: jnp.eye(n), jnp.zeros(n), lambda params: K),
+        )
+    ]
+    for end in ends[1:]:
+        np.testing.assert_allclose(end, ends[0], rtol=1e-12)
+
+
+def test_a_linear_system_is_factorised_outside_the_loop():
+    """Counted in the jaxpr of the run: one LU, and it stands outside every scan."""
+    n = 12
+    M, C, K = matrices(n)
+    system = hhtjax.LinearSystem(M, C, K)
+
+    def end(q0):
+        return hhtjax.simulate(system, hhtjax.hht(), q0, jnp.zeros(n), dt=0.01, num_steps=1000, save_every=1000).q[-1]
+
+    text = jax.jit(end).lower(jnp.zeros(n)).compile().as_text()
+    loops = [part for part in text.split("\n\n") if "lapack_dgetrf" in part and "ENTRY" not in part]
+    assert "lapack_dgetrf" in text
+    assert not loops

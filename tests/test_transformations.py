@@ -1,0 +1,143 @@
+"""jit = eager, vmap = loop, dtypes and trees kept: for every stepper."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from zoo import PROBLEMS, STEPPERS, run
+
+import hhtjax
+
+every_stepper = pytest.mark.parametrize("name", STEPPERS)
+
+
+@every_stepper
+def test_jit_equals_eager(name):
+    problem = PROBLEMS["forced double pendulum"]
+    compiled = run(problem, STEPPERS[name], 3)
+    with jax.disable_jit():
+        state = STEPPERS[name].init(problem.system, problem.q0, problem.v0, problem.params, problem.duration / 3)
+        for _ in range(3):
+            state, _ = STEPPERS[name].step(problem.system, state, problem.params, problem.duration / 3)
+    np.testing.assert_allclose(compiled.q[-1], state.q, rtol=1e-10)
+    np.testing.assert_allclose(compiled.acceleration[-1], state.w, rtol=1e-9)
+    assert float(compiled.t[-1]) == pytest.approx(float(state.t), rel=1e-14)
+
+
+@every_stepper
+def test_vmap_equals_loop(name):
+    """Over the stiffness, the start, the step size, and the numerical damping where there is one."""
+    problem = PROBLEMS["forced Duffing"]
+    stiffness, start, dts = jnp.array([0.5, 1.0, 2.0]), jnp.array([[0.1], [0.5], [-0.4]]), jnp.array([0.02, 0.05, 0.1])
+
+    def end(k, q0, dt):
+        params = {**problem.params, "k": k}
+        path = hhtjax.simulate(problem.system, STEPPERS[name], q0, problem.v0, params, dt=dt, num_steps=30)
+        return path.q[-1], path.failure.step
+
+    batch, failures = jax.jit(jax.vmap(end))(stiffness, start, dts)
+    assert not failures.any()
+    loop = [end(k, q0, dt)[0] for k, q0, dt in zip(stiffness, start, dts, strict=True)]
+    np.testing.assert_allclose(batch, jnp.stack(loop), rtol=1e-11)
+
+
+def test_vmap_over_alpha_equals_loop():
+    problem = PROBLEMS["forced Duffing"]
+    alphas = jnp.array([0.0, -0.1, -0.3])
+    batch = jax.vmap(lambda alpha: run(problem, hhtjax.hht(alpha), 50).q[-1])(alphas)
+    loop = [run(problem, hhtjax.hht(float(alpha)), 50).q[-1] for alpha in alphas]
+    np.testing.assert_allclose(batch, jnp.stack(loop), rtol=1e-11)
+    assert abs(batch[0] - batch[2]) > 1e-6
+
+
+@every_stepper
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_dtype_is_kept(name, dtype):
+    problem = PROBLEMS["forced Duffing"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", category=hhtjax.PrecisionWarning)
+        path = hhtjax.simulate(
+            problem.system,
+            STEPPERS[name],
+            problem.q0.astype(dtype),
+            problem.v0.astype(dtype),
+            problem.params,
+            dt=0.02,
+            num_steps=100,
+        )
+    path.check()
+    assert {x.dtype for x in (path.t, path.q, path.v, path.acceleration, path.dt)} == {jnp.dtype(dtype)}
+    np.testing.assert_allclose(path.q, run(problem._replace(duration=2.0), STEPPERS[name], 100).q, atol=1e-4)
+
+
+@every_stepper
+def test_trees_are_kept_and_rows_follow_the_sorted_keys(name):
+    """A dict whose keys sort differently from their insertion, against the same system on a vector."""
+
+    def vector_force(q, v, t, params):
+        return jnp.array([-4.0 * q[0] - jnp.sin(q[1]), -9.0 * q[1] - 0.5 * v[1] - jnp.sin(q[0])])
+
+    def tree_force(q, v, t, params):
+        x, y = q["b"], q["a"]["x"]
+        return {"b": -9.0 * x - 0.5 * v["b"] - jnp.sin(y[0]), "a": {"x": -4.0 * y - jnp.sin(x)}}
+
+    M = jnp.array([[2.0, 0.3], [0.3, 1.0]])  # rows: a.x, b
+    vector = hhtjax.System(lambda q, params: M + 0.1 * q[0] * q[1], vector_force)
+    q0 = {"b": jnp.asarray(0.2), "a": {"x": jnp.array([0.5])}}
+    v0 = {"b": jnp.asarray(-1.0), "a": {"x": jnp.array([0.0])}}
+    tree = hhtjax.System(lambda q, params: M + 0.1 * q["a"]["x"][0] * q["b"], tree_force)
+    ours = hhtjax.simulate(tree, STEPPERS[name], q0, v0, dt=0.02, num_steps=30)
+    flat = hhtjax.simulate(vector, STEPPERS[name], jnp.array([0.5, 0.2]), jnp.array([0.0, -1.0]), dt=0.02, num_steps=30)
+    for x in (ours.q, ours.v, ours.acceleration):
+        assert jax.tree.structure(x) == jax.tree.structure(q0)
+    assert ours.q["a"]["x"].shape == (31, 1)
+    assert ours.q["b"].shape == (31,)
+    np.testing.assert_allclose(ours.q["a"]["x"][:, 0], flat.q[:, 0], rtol=1e-10)
+    np.testing.assert_allclose(ours.q["b"], flat.q[:, 1], rtol=1e-10)
+
+
+@every_stepper
+def test_a_diagonal_mass_equals_the_full_one(name):
+    def force(q, v, t, params):
+        return -jnp.array([[2.0, -1.0], [-1.0, 2.0]]) @ q - 0.1 * q**3
+
+    q0, v0 = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
+    ends = [
+        hhtjax.simulate(hhtjax.System(mass, force), STEPPERS[name], q0, v0, dt=0.05, num_steps=20).q[-1]
+        for mass in (
+            jnp.array([2.0, 3.0]),
+            jnp.diag(jnp.array([2.0, 3.0])),
+            lambda q, params: jnp.array([2.0, 3.0]),
+            lambda q, params: jnp.diag(jnp.array([2.0, 3.0])),
+        )
+    ]
+    for end in ends[1:]:
+        np.testing.assert_allclose(end, ends[0], rtol=1e-12)
+
+
+def test_more_unknowns_than_are_unrolled():
+    """n = 12 through LAPACK, with a coupled mass, against its modes."""
+    n = 12
+    K = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    M = np.eye(n) + 0.1 * np.ones((n, n))
+    system = hhtjax.System(M, lambda q, v, t, params: -jnp.asarray(K) @ q)
+    q0 = jnp.zeros(n).at[0].set(1.0)
+    path = hhtjax.simulate(system, hhtjax.hht(alpha=-0.05), q0, jnp.zeros(n), dt=1e-3, num_steps=2000)
+    values, vectors = np.linalg.eig(np.linalg.solve(M, K))
+    exact = (vectors * np.cos(np.sqrt(values) * 2.0)) @ np.linalg.solve(vectors, np.asarray(q0))
+    np.testing.assert_allclose(path.q[-1], exact, atol=1e-6)
+
+
+def test_a_users_solve_is_used():
+    calls = []
+
+    def solve(A, b):
+        calls.append(A.shape)
+        return jnp.linalg.solve(A, b)
+
+    problem = PROBLEMS["forced double pendulum"]
+    ours = run(problem, hhtjax.hht(solve=solve), 10)
+    assert set(calls) == {(2, 2)}
+    np.testing.assert_allclose(ours.q, run(problem, hhtjax.hht(), 10).q, rtol=1e-12)
