@@ -1,0 +1,110 @@
+"""Silverbox: the measured record with its official split, or a generated one of the same shape.
+
+T. Wigren, J. Schoukens, "Three free data sets for development and benchmarking in nonlinear system
+identification", ECC 2013, pp. 2933-2938. The data are public but not ours to redistribute.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import hhtjax
+from hhtjax.scenes import duffing
+
+SAMPLING_RATE = 1e7 / 2**14  # Hz
+WASHOUT = 50  # samples at the start of each set that serve to find the initial state and are not scored
+SHA256 = "ae62d5a91230c10f76e6dd02c8a4fac3c9d4d8a95fbf50e87cb0c4885003e0f1"
+HOW_TO_GET_IT = (
+    "download SNLS80mV.csv of the Silverbox benchmark from nonlinearbenchmark.org into a folder silverbox/ "
+    "and set the environment variable HHTJAX_DATA to the folder that holds silverbox/"
+)
+GENERATED = {"m": 5.4e-6, "c": 2.2e-4, "k": 1.0, "k2": -0.03, "k3": 4.0, "offset": -5e-3}
+NOISE = 3e-4  # V, standard deviation
+
+
+class Record(NamedTuple):
+    """Uniform samples of input u and output y, in V."""
+
+    u: np.ndarray
+    y: np.ndarray
+
+
+class Silverbox(NamedTuple):
+    """Training and test records; measured says where they come from."""
+
+    train: Record
+    tests: dict[str, Record]
+    measured: bool
+
+
+def load(fast: bool) -> Silverbox:
+    """The measured record where it is found, else a generated one; fast: a part of each set."""
+    path = data_folder() / "silverbox" / "SNLS80mV.csv"
+    measured = path.is_file()
+    u, y = read(path) if measured else generate()
+    train_end = 40650 + int(0.75 * (127400 - 40650))
+    tests = {"arrow_full": (100, 40575), "arrow_no_extrapolation": (100, 32100), "multisine": (train_end, 127400)}
+
+    def cut(start, end):
+        end = min(end, start + 4000) if fast else end
+        return Record(u[start:end], y[start:end])
+
+    return Silverbox(cut(40650, train_end), {name: cut(*ends) for name, ends in tests.items()}, measured)
+
+
+def data_folder() -> Path:
+    """HHTJAX_DATA, or shared/data beside the checkout."""
+    beside = Path(__file__).resolve().parents[3] / "shared" / "data"
+    return Path(os.environ.get("HHTJAX_DATA") or beside)
+
+
+def read(path: Path):
+    """Both columns of the file, checked against its published hash."""
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != SHA256:
+        raise ValueError(f"{path} is not the Silverbox record (its SHA-256 differs): {HOW_TO_GET_IT}.")
+    table = np.genfromtxt(content.decode().splitlines(), delimiter=",", skip_header=1, usecols=(0, 1))
+    return table.T
+
+
+def generate():
+    """A record of the same length: an arrow of growing noise, then bursts of it, through a known oscillator.
+
+    Simulated with 32 steps per sample, four times finer than the fit.
+    """
+    rng = np.random.default_rng(0)
+    size, cutoff = 127400, 200.0
+    spectrum = np.fft.rfft(rng.normal(size=size))
+    spectrum[np.fft.rfftfreq(size, 1 / SAMPLING_RATE) > cutoff] = 0
+    u = np.fft.irfft(spectrum, size)
+    amplitude = np.full(size, 0.055)
+    amplitude[:40650] = np.linspace(0.0, 0.09, 40650)
+    u = amplitude * u / u.std()
+    y = np.asarray(simulate(GENERATED, {"y": 0.0, "v": 0.0}, u, substeps=32, alpha=0.0))
+    return u, y + NOISE * rng.normal(size=size)
+
+
+def simulate(params, start, u, substeps, alpha):
+    """Output at the samples of the input u, in V, by the non-iterative step."""
+    dt = 1 / SAMPLING_RATE
+    scene = duffing.measured(params, hhtjax.sampled(u, dt), start["y"], start["v"], dt * (len(u) - 1))
+    # the predictor form is smooth in the parameters
+    solution = hhtjax.simulate(
+        scene.system,
+        hhtjax.hht(alpha, linearize="predictor"),
+        scene.q0,
+        scene.v0,
+        scene.params,
+        dt=dt / substeps,
+        num_steps=(len(u) - 1) * substeps,
+        save_every=substeps,
+    )
+    return solution.q[:, 0]
+
+
+def first_state(record: Record):
+    """Position and velocity of the first sample, by differences: a start for the fit of the initial state."""
+    return {"y": float(record.y[0]), "v": float(record.y[1] - record.y[0]) * SAMPLING_RATE}

@@ -1,0 +1,819 @@
+"""What the library says to wrong arguments and about failed steps, and that right arguments of every kind pass."""
+
+import inspect
+import re
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from hhtjax import LinearSystem, System, interpolate, simulate
+from hhtjax.simulate import PrecisionWarning, SimulationError
+
+NAN, INF = float("nan"), float("inf")
+ONE, ZERO = np.ones(1), np.zeros(1)
+EYE = np.eye(2)
+COMPLEX = np.array([1j])
+
+STEPPERS = {
+    "rk4": hhtjax.rk4(),
+    "hht": hhtjax.hht(alpha=-0.05),
+    "hht held": hhtjax.hht(alpha=-0.1, linearize="held"),
+    "hht state": hhtjax.hht(alpha=-0.1, linearize="state"),
+    "hht twice": hhtjax.hht(alpha=-0.1, iterations=2),
+    "hht converged": hhtjax.hht(alpha=-0.1, iterations=None, tolerance=1e-5),
+    "newmark": hhtjax.newmark(),
+    "bossak": hhtjax.bossak(),
+    "generalized_alpha": hhtjax.generalized_alpha(),
+    "implicit_euler": hhtjax.implicit_euler(tolerance=1e-5),
+    "kim_hht": hhtjax.kim_hht(),
+    "kim_implicit_euler": hhtjax.kim_implicit_euler(),
+}
+
+
+def pull(q, v, t, params):
+    """Springs of stiffness 4 on every coordinate."""
+    return jax.tree.map(lambda x: -4.0 * x, q)
+
+
+def push(q, v, t, params):
+    """A force that drives q to infinity in finite time."""
+    return params * q**3
+
+
+def bounded(q, v, t, params):
+    """A force that is not a number beyond q = 1."""
+    return jnp.sqrt(1 - q)
+
+
+def lagrangian(q, v, t, params):
+    """Of `pull`, with unit masses."""
+    return 0.5 * jnp.sum(v**2) - 2.0 * jnp.sum(q**2)
+
+
+class Unhashable:
+    """A function that cannot be a key of JAX's cache."""
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __call__(self, *args):
+        return args[0]
+
+    def __repr__(self):
+        return "Unhashable()"
+
+
+SPRING = System(ONE, pull)
+BLOW_UP = System(ONE, push)
+
+
+def run(system=SPRING, stepper=STEPPERS["rk4"], q0=ONE, v0=ZERO, params=None, dt=0.1, num_steps=4, **options):
+    """A short run, of which the tests spoil one argument."""
+    return simulate(system, stepper, q0, v0, params, dt=dt, num_steps=num_steps, **options)
+
+
+def check_message(error, message, call):
+    """`message` must be part of the text of the error that call() raises."""
+    with pytest.raises(error, match=re.escape(message)):
+        call()
+
+
+# ---------------------------------------------------------------------------------------------- systems
+
+NOT_A_MATRIX = [
+    (TypeError, "must be a function or an array; received 'steel'", "steel"),
+    (TypeError, "must be a function or an array; received {'a': 1}", {"a": 1}),
+    (TypeError, "must be a function or an array; received [[1, 2], [3]]", [[1, 2], [3]]),
+    (TypeError, "must be real; received an array of complex128", COMPLEX),
+    (TypeError, "must be real; received an array of bool", np.array([True])),
+    (TypeError, "must be real; received an array of <U1", np.array(["a"])),
+    (ValueError, "must have shape (n, n), or (n,) for a diagonal; received shape (2, 3)", np.ones((2, 3))),
+    (ValueError, "must have shape (n, n), or (n,) for a diagonal; received shape (2, 2, 2)", np.ones((2, 2, 2))),
+    (ValueError, "must be finite; received array([nan])", np.array([NAN])),
+    (ValueError, "must be finite; received array([inf])", np.array([INF])),
+    (TypeError, "must be hashable, because it is static under jit; received Unhashable()", Unhashable()),
+]
+
+
+@pytest.mark.parametrize(("error", "message", "value"), NOT_A_MATRIX)
+def test_constant_matrices_are_checked(error, message, value):
+    check_message(error, f"System: `mass` {message}", lambda: System(value, pull))
+    for name in "MCK":
+        check_message(
+            error, f"LinearSystem: `{name}` {message}", lambda name=name: LinearSystem(**{"M": ONE, name: value})
+        )
+
+
+@pytest.mark.parametrize("value", [["1", "2"], [True, False], [1j, 2.0]])
+def test_lists_of_other_things_than_real_numbers_are_no_matrix(value):
+    for name, make in (("mass", lambda: System(value, pull)), ("K", lambda: LinearSystem(ONE, K=value))):
+        with pytest.raises(TypeError, match=f"`{name}` must be"):
+            make()
+
+
+def test_a_missing_mass_is_named():
+    check_message(TypeError, "System: `mass` must be a function or an array; received None", lambda: System(None, pull))
+    check_message(
+        TypeError, "LinearSystem: `M` must be a function or an array; received None", lambda: LinearSystem(None)
+    )
+
+
+NOT_A_FUNCTION = [
+    ("System", "force", "force(q, v, t, params)", lambda x: System(ONE, x)),
+    ("System", "constraint", "constraint(q, t, params)", lambda x: System(ONE, pull, x)),
+    ("LinearSystem", "force", "force(t, params)", lambda x: LinearSystem(ONE, force=x)),
+    ("System.from_lagrangian", "lagrangian", "lagrangian(q, v, t, params)", lambda x: System.from_lagrangian(x)),
+    ("System.from_lagrangian", "force", "force(q, v, t, params)", lambda x: System.from_lagrangian(lagrangian, x)),
+]
+
+
+@pytest.mark.parametrize("value", [3, "pull", np.ones(2)], ids=repr)
+@pytest.mark.parametrize(("caller", "name", "signature", "call"), NOT_A_FUNCTION)
+def test_functions_of_a_system_are_checked(caller, name, signature, call, value):
+    message = f"{caller}: `{name}` must be a function {signature}; received {value!r}."
+    check_message(TypeError, message, lambda: call(value))
+
+
+@pytest.mark.parametrize(("caller", "name", "signature", "call"), NOT_A_FUNCTION)
+def test_functions_of_a_system_must_be_hashable(caller, name, signature, call):
+    message = f"{caller}: `{name}` must be hashable, because it is static under jit; received Unhashable()."
+    check_message(TypeError, message, lambda: call(Unhashable()))
+
+
+@pytest.mark.parametrize("call", [lambda: System(ONE, None), lambda: System.from_lagrangian(None)])
+def test_none_is_no_force_and_no_lagrangian(call):
+    with pytest.raises(TypeError, match=r"`(force|lagrangian)` must be a function .*; received None"):
+        call()
+
+
+# ---------------------------------------------------------------------------------------------- steppers
+
+COEFFICIENTS = [
+    (hhtjax.hht, "alpha", "lie in [-1/3, 0]", (-0.34, 0.1)),
+    (hhtjax.bossak, "alpha", "lie in [-1, 0]", (-1.1, 0.1)),
+    (hhtjax.generalized_alpha, "rho_inf", "lie in [0, 1]", (-0.1, 1.1)),
+    (hhtjax.newmark, "beta", "lie in (0, 1]", (0, 1.1)),
+    (hhtjax.newmark, "gamma", "lie in [1/2, 1]", (0.4, 1.1)),
+    (hhtjax.kim_hht, "alpha", "lie in [-1/3, 0]", (-0.34, 0.1)),
+]
+TOLERANCES = [
+    (hhtjax.hht, "tolerance", "be positive", (0, -1e-10)),
+    (hhtjax.implicit_euler, "tolerance", "be positive", (0, -1e-10)),
+]
+
+
+@pytest.mark.parametrize(("make", "name", "expectation", "outside"), COEFFICIENTS + TOLERANCES)
+def test_coefficients_out_of_range(make, name, expectation, outside):
+    for value in (*outside, NAN, -INF):
+        message = f"{make.__name__}: `{name}` must {expectation}; received {value}."
+        check_message(ValueError, message, lambda value=value: make(**{name: value}))
+    check_message(ValueError, f"must {expectation}; received {-INF}.", lambda: make(**{name: jnp.array(-INF)}))
+
+
+@pytest.mark.parametrize("value", ["a", None, True, 1j, [0.0], np.zeros(1), np.array(True), np.array(1j)], ids=repr)
+@pytest.mark.parametrize(("make", "name", "expectation", "outside"), COEFFICIENTS + TOLERANCES)
+def test_coefficients_that_are_no_real_number(make, name, expectation, outside, value):
+    message = f"{make.__name__}: `{name}` must be a real number; received {value!r}."
+    check_message(TypeError, message, lambda: make(**{name: value}))
+
+
+def test_a_coefficient_that_is_an_array_of_text():
+    with pytest.raises(TypeError, match="hht: `alpha` must be a real number; received"):
+        hhtjax.hht(alpha=np.array("a"))
+
+
+@pytest.mark.parametrize(
+    ("make", "ends"),
+    [
+        (lambda x: hhtjax.hht(alpha=x), (-1 / 3, 0)),
+        (lambda x: hhtjax.bossak(alpha=x), (-1, 0)),
+        (lambda x: hhtjax.generalized_alpha(rho_inf=x), (0, 1)),
+        (lambda x: hhtjax.newmark(beta=x), (1e-3, 1)),
+        (lambda x: hhtjax.newmark(gamma=x), (0.5, 1)),
+        (lambda x: hhtjax.kim_hht(alpha=x), (-1 / 3, 0)),
+    ],
+)
+def test_the_ends_of_the_ranges_belong_to_them(make, ends):
+    for value in (*ends, np.float64(ends[0]), jnp.array(ends[1], jnp.float64)):
+        assert make(value).order in (1, 2)
+
+
+OPTIONS = [
+    ("iterations", ValueError, "must be a positive integer or None", (0, -1, 1.0, True, "1")),
+    ("linearize", ValueError, "must be one of predictor, held, state, auto", ("tangent", 3, ["auto"])),
+    ("max_iterations", ValueError, "must be a positive integer", (0, -1, 1.5, True, None)),
+    ("start", ValueError, 'must be "corrected" or "simple"', ("exact", None, 3)),
+    ("solve", TypeError, "must be a function solve(A, b)", (None, 3, "lu")),
+]
+MAKERS = [hhtjax.hht, hhtjax.newmark, hhtjax.bossak, hhtjax.generalized_alpha, hhtjax.implicit_euler]
+
+
+@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize(("name", "error", "expectation", "values"), OPTIONS)
+def test_options_are_checked(make, name, error, expectation, values):
+    if make is hhtjax.implicit_euler and name not in inspect.signature(make).parameters:
+        with pytest.raises(TypeError, match=f"implicit_euler.* unexpected keyword argument '{name}'"):
+            make(**{name: values[0]})
+        return
+    for value in values:
+        message = f"{make.__name__}: `{name}` {expectation}; received {value!r}."
+        check_message(error, message, lambda value=value: make(**{name: value}))
+
+
+@pytest.mark.parametrize("where", ["held", "state", "auto"])
+def test_newton_until_tolerance_starts_from_the_predictor(where):
+    message = f"hht: with iterations=None, Newton starts from the predictor: leave `linearize` out; received {where!r}."
+    check_message(ValueError, message, lambda: hhtjax.hht(iterations=None, linearize=where))
+    assert hhtjax.hht(iterations=None, linearize="predictor") == hhtjax.hht(iterations=None)
+    assert hhtjax.hht(iterations=2, linearize=where).options.linearize == where
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_an_unknown_option_is_named_with_its_constructor(make):
+    with pytest.raises(TypeError, match=f"{make.__name__}.*'alpah'"):
+        make(alpah=-0.1)
+
+
+def test_a_solve_must_be_hashable():
+    with pytest.raises(TypeError, match=r"hht: `solve` must be hashable.*; received Unhashable\(\)"):
+        hhtjax.hht(solve=Unhashable())
+
+
+# ---------------------------------------------------------------------------------------------- simulate
+
+REAL = "must be a real number; received"
+INTEGER = "must be a positive integer; received"
+ARGUMENTS = [
+    (TypeError, "`system` must be a System or LinearSystem; received 3.", {"system": 3}),
+    (TypeError, "`system` must be a System or LinearSystem; received <class", {"system": System}),
+    (TypeError, "`stepper` must be a stepper such as hht(); received 3.", {"stepper": 3}),
+    (TypeError, "`stepper` must be a stepper such as hht(); received <function hht", {"stepper": hhtjax.hht}),
+    *((ValueError, f"`dt` must be positive and finite; received {x}.", {"dt": x}) for x in (0, 0.0, -1, -0.1, NAN)),
+    *((ValueError, f"`dt` must be positive and finite; received {x}.", {"dt": x}) for x in (INF, -INF)),
+    (ValueError, "`dt` must be positive and finite; received -0.5.", {"dt": jnp.array(-0.5)}),
+    *((TypeError, f"`dt` {REAL} {x!r}.", {"dt": x}) for x in ("fast", None, True, 1j, [0.1], np.array([0.1]))),
+    *((ValueError, f"`t0` must be finite; received {x}.", {"t0": x}) for x in (NAN, INF, -INF)),
+    *((TypeError, f"`t0` {REAL} {x!r}.", {"t0": x}) for x in ("now", None, True, 1j, np.array([0.1]))),
+    *(
+        (ValueError, f"`num_steps` {INTEGER} {x!r}.", {"num_steps": x})
+        for x in (0, -1, 4.0, True, None, "4", np.array(4))
+    ),
+    *((ValueError, f"`save_every` {INTEGER} {x!r}.", {"save_every": x}) for x in (0, -1, 2.0, True, None)),
+    *((ValueError, f"`save_every` must divide num_steps=4; received {x}.", {"save_every": x}) for x in (3, 8)),
+]
+
+
+@pytest.mark.parametrize(("error", "message", "arguments"), ARGUMENTS)
+def test_arguments_of_simulate_are_checked(error, message, arguments):
+    check_message(error, f"simulate: {message}", lambda: run(**arguments))
+
+
+A, B = jax.tree.structure({"a": 0.0}), jax.tree.structure({"b": 0.0})
+LEAF, LIST = jax.tree.structure(0.0), jax.tree.structure([0.0])
+SINGLE = ONE.astype(np.float32)
+INITIAL_VALUES = [
+    (ValueError, f"`v0` must be a pytree structured like q0, {A}; received {B}.", {"a": 1.0}, {"b": 1.0}),
+    (ValueError, f"`v0` must be a pytree structured like q0, {LEAF}; received {LIST}.", 1.0, [1.0]),
+    (ValueError, "`v0` must be a pytree structured like q0", ONE, None),
+    (ValueError, "`q0` must hold at least one number; received {}.", {}, {}),
+    (ValueError, "`q0` must hold at least one number; received None.", None, None),
+    (ValueError, "`q0` must hold at least one number; received ().", (), ()),
+    (ValueError, "`v0` must have the shapes of q0, shape (1,) float64; received shape (2,) float64.", ONE, np.ones(2)),
+    (ValueError, "`v0` must have the shapes of q0, shape (1,) float64; received shape () float64.", ONE, 0.0),
+    (
+        ValueError,
+        "`v0` must have the shapes of q0, ['a']: shape (1,) float64; received ['a']: shape (2,) float64.",
+        {"a": ONE},
+        {"a": np.ones(2)},
+    ),
+    (TypeError, "`q0` must be float32 or float64; received complex128.", COMPLEX, ZERO),
+    (TypeError, "`v0` must be float32 or float64; received complex128.", ONE, COMPLEX),
+    (TypeError, "`q0` must be float32 or float64; received complex128.", 1j, 0.0),
+    (TypeError, "`q0` must be an array or a number; received True.", True, 0.0),
+    (TypeError, "`q0` must be float32 or float64; received bool.", np.array([True]), ZERO),
+    (TypeError, "`q0` must be float32 or float64; received float16.", ONE.astype(np.float16), ZERO.astype(np.float16)),
+    (TypeError, "`q0` must be float32 or float64; received bfloat16.", jnp.ones(1, jnp.bfloat16), ZERO),
+    (TypeError, "`q0` must be an array or a number; received 'left'.", "left", 0.0),
+    (TypeError, "`v0['a'][1]` must be an array or a number; received 'slow'.", {"a": [1.0, 1.0]}, {"a": [0.0, "slow"]}),
+    (ValueError, "`q0` must be finite; received array([nan]).", np.array([NAN]), ZERO),
+    (ValueError, "`v0` must be finite; received -inf.", 0.0, -INF),
+    (ValueError, "`q0['a']['b']` must be finite; received nan.", {"a": {"b": NAN}}, {"a": {"b": 0.0}}),
+    (
+        TypeError,
+        "`q0` and `v0` must share one dtype; received shape (1,) float32 and shape (1,) float64.",
+        SINGLE,
+        ZERO,
+    ),
+    (
+        TypeError,
+        "`q0` and `v0` must share one dtype; received ['a']: shape (1,) float32, ['b']: shape (1,) float64",
+        {"a": SINGLE, "b": ONE},
+        {"a": SINGLE, "b": ONE},
+    ),
+]
+
+
+@pytest.mark.parametrize(("error", "message", "q0", "v0"), INITIAL_VALUES)
+def test_initial_values_are_checked(error, message, q0, v0):
+    check_message(error, f"simulate: {message}", lambda: run(q0=q0, v0=v0))
+
+
+@pytest.mark.parametrize("q0", [np.zeros(0), {"a": np.zeros((0, 3))}], ids=repr)
+def test_arrays_without_entries_are_no_initial_values(q0):
+    with pytest.raises(ValueError, match="simulate: `q0` must hold at least one number; received"):
+        run(q0=q0, v0=q0)
+
+
+@pytest.mark.parametrize("q0", [np.array(["a"]), np.array([1.0], object)], ids=repr)
+def test_arrays_of_no_numbers_are_no_initial_values(q0):
+    with pytest.raises(TypeError, match=r"simulate: `q0` must be .*; received"):
+        run(q0=q0, v0=ZERO)
+
+
+# ------------------------------------------------------------------------- what the functions of a system return
+
+MASS_SHAPE = "`mass` must give an array of shape (1, 1), or (1,) for a diagonal; received"
+FORCE_LIKE = "`force` must return a pytree like v0, shape (1,) float64; received"
+RESULTS = [
+    (ValueError, f"{MASS_SHAPE} shape (3,) float64.", System(np.ones(3), pull)),
+    (ValueError, f"{MASS_SHAPE} shape (2, 2) float64.", System(EYE, pull)),
+    (ValueError, f"{MASS_SHAPE} shape (3,) float64.", System(lambda q, params: jnp.ones(3), pull)),
+    (ValueError, f"{MASS_SHAPE} [0]: shape () float64.", System(lambda q, params: [1.0], pull)),
+    (ValueError, f"{MASS_SHAPE} ['m']: shape (1,) float64.", System(lambda q, params: {"m": jnp.ones(1)}, pull)),
+    (ValueError, f"{MASS_SHAPE} nothing.", System(lambda q, params: None, pull)),
+    (ValueError, f"{MASS_SHAPE} shape (2, 2) float64.", LinearSystem(EYE)),
+    (ValueError, f"{MASS_SHAPE} shape (2,) float64.", LinearSystem(lambda params: jnp.ones(2))),
+    (ValueError, f"{FORCE_LIKE} shape (2,) float64.", System(ONE, lambda q, v, t, params: jnp.ones(2))),
+    (ValueError, f"{FORCE_LIKE} shape () float64.", System(ONE, lambda q, v, t, params: -q[0])),
+    (ValueError, f"{FORCE_LIKE} ['x']: shape (1,) float64.", System(ONE, lambda q, v, t, params: {"x": q})),
+    (ValueError, f"{FORCE_LIKE} [0]: shape (1,) float64.", System(ONE, lambda q, v, t, params: (q,))),
+    (ValueError, f"{FORCE_LIKE} nothing.", System(ONE, lambda q, v, t, params: None)),
+]
+
+
+@pytest.mark.parametrize(("error", "message", "system"), RESULTS)
+def test_shapes_of_mass_and_force_are_checked(error, message, system):
+    check_message(error, f"simulate: {message}", lambda: run(system))
+    check_message(error, f"init: {message}", lambda: STEPPERS["hht"].init(system, ONE, ZERO, None, dt=0.1))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "complex128", "bool"])
+@pytest.mark.parametrize("name", ["mass", "force"])
+def test_dtypes_of_mass_and_force_are_checked(name, dtype):
+    def mass(q, params):
+        return jnp.ones(1, dtype if name == "mass" else q.dtype)
+
+    def force(q, v, t, params):
+        return jnp.ones(1, dtype if name == "force" else q.dtype)
+
+    message = f"simulate: `{name}` returned {dtype} for a state of float64; give params, and arrays made inside"
+    check_message(TypeError, message, lambda: run(System(mass, force)))
+
+
+@pytest.mark.parametrize("name", ["mass", "force"])
+def test_a_double_result_for_a_single_state_is_named(name):
+    def mass(q, params):
+        return jnp.ones(1, params["mass"].dtype)
+
+    def force(q, v, t, params):
+        return -params["force"] * q.astype(params["force"].dtype)
+
+    params = {"mass": SINGLE, "force": SINGLE, name: ONE}
+    message = f"simulate: `{name}` returned float64 for a state of float32; give params"
+    with pytest.warns(PrecisionWarning), pytest.raises(TypeError, match=re.escape(message)):
+        run(System(mass, force), q0=SINGLE, v0=0 * SINGLE, params=params)
+
+
+@pytest.mark.parametrize("name", ["C", "K"])
+@pytest.mark.parametrize("matrix", [np.eye(3), np.ones(3), lambda params: jnp.eye(3), lambda params: {"a": 1.0}])
+def test_matrices_of_a_linear_system_must_fit_its_size(name, matrix):
+    with pytest.raises((TypeError, ValueError), match=rf"`{name}` must .*\(2, 2\), or \(2,\).*; received"):
+        run(LinearSystem(EYE, **{name: matrix}), q0=np.ones(2), v0=np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("load", "received"),
+    [
+        (lambda t, params: {"a": jnp.ones(2)}, "['a']: shape (2,) float64"),
+        (lambda t, params: (jnp.ones(1), jnp.ones(1)), "[0]: shape (1,) float64, [1]: shape (1,) float64"),
+        (lambda t, params: jnp.ones(3), "shape (3,) float64"),
+        (lambda t, params: jnp.ones((2, 1)), "shape (2, 1) float64"),
+        (lambda t, params: 1.0, "shape () float64"),
+    ],
+)
+def test_the_load_of_a_linear_system_must_be_like_v0(load, received):
+    message = f"`force` must return a pytree like v0, shape (2,) float64; received {received}"
+    check_message(ValueError, message, lambda: run(LinearSystem(EYE, force=load), q0=np.ones(2), v0=np.zeros(2)))
+
+
+@pytest.mark.parametrize("name", ["mass", "force"])
+def test_an_error_inside_mass_or_force_keeps_its_kind_and_says_where(name):
+    def fail(q, *args):
+        return args[-1]["k"] * q
+
+    system = System(fail, pull) if name == "mass" else System(ONE, fail)
+    with pytest.raises(KeyError, match="k") as caught:
+        run(system, params={"stiffness": 1.0})
+    notes = " ".join(caught.value.__notes__)
+    assert f"simulate: raised while tracing `{name}` with shape (1,) float64" in notes
+    assert "['stiffness']: shape () float64" in notes
+
+
+def test_a_constraint_is_not_solved_yet():
+    system = System(ONE, pull, constraint=lambda q, t, params: q)
+    message = "`constraint` is not solved yet"
+    check_message(NotImplementedError, f"simulate: {message}", lambda: run(system))
+    check_message(NotImplementedError, f"init: {message}", lambda: STEPPERS["rk4"].init(system, ONE, ZERO, None, 0.1))
+
+
+@pytest.mark.parametrize(("q0", "v0"), [(ONE, np.zeros(2)), ({"a": 1.0}, {"b": 1.0})])
+def test_init_checks_that_v0_is_like_q0(q0, v0):
+    with pytest.raises(ValueError, match=r"init: `v0` must .* q0.*; received"):
+        STEPPERS["hht"].init(SPRING, q0, v0, None, dt=0.1)
+
+
+def test_init_takes_integers_as_simulate_does():
+    state = STEPPERS["hht"].init(SPRING, np.array([1]), np.array([0]), None, dt=0.1)
+    assert state.q.dtype == state.v.dtype == state.w.dtype == jnp.float64
+    assert state.w[0] == -4.0
+
+
+def test_step_names_itself():
+    state = STEPPERS["hht"].init(SPRING, ONE, ZERO, None, dt=0.1)
+    wrong = System(ONE, lambda q, v, t, params: (q,))
+    check_message(ValueError, f"step: {FORCE_LIKE} [0]", lambda: STEPPERS["hht"].step(wrong, state, None, dt=0.1))
+
+
+# ---------------------------------------------------------------------------------------------- interpolate
+
+
+@pytest.mark.parametrize(
+    ("times", "received"),
+    [(1.9, "1.9"), (2.41, "2.41"), ([2.1, 2.5, 3.0], "2.5"), (NAN, "nan"), (INF, "inf"), (-3, "-3")],
+)
+def test_interpolate_refuses_times_outside_the_run(times, received):
+    solution = run(t0=2.0)
+    message = f"interpolate: `times` must lie in [2, 2.4]; received {received}."
+    check_message(ValueError, message, lambda: interpolate(solution, times))
+
+
+def test_interpolate_takes_the_ends_up_to_rounding_and_gives_nan_for_tracers_outside():
+    solution = run(t0=2.0)
+    ends = np.array([2.0 - 4e-16, 2.4 + 9e-16])
+    assert np.allclose(interpolate(solution, ends).q, solution.q[np.array([0, -1])], rtol=1e-14)
+    q = jax.jit(lambda times: interpolate(solution, times).q)(np.array([1.9, 2.1, 2.5]))
+    assert np.isnan(q[:, 0]).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("times", ["noon", None, 1j], ids=repr)
+def test_interpolate_names_times_that_are_no_numbers(times):
+    with pytest.raises((TypeError, ValueError), match=r"interpolate: `times` must .*; received"):
+        interpolate(run(), times)
+
+
+def test_interpolate_refuses_a_batch_of_runs():
+    batch = jax.vmap(lambda q0: run(q0=q0))(jnp.ones((3, 1)))
+    with pytest.raises(ValueError, match=r"interpolate: `solution` must .*; received"):
+        interpolate(batch, 0.1)
+
+
+# ---------------------------------------------------------------------------------------------- check
+
+
+def first_not_finite(path):
+    """Number of the first step after which something is not finite, from a path that holds every step; 0 if none."""
+    finite = np.isfinite(np.concatenate([path.q, path.v, path.acceleration], axis=1)).all(axis=1)
+    return 0 if finite.all() else int(np.argmin(finite))
+
+
+BREAKING = [(push, "rk4")] + [
+    (bounded, name) for name in ("rk4", "hht", "hht held", "hht state", "hht twice", "kim_hht", "kim_implicit_euler")
+]
+
+
+@pytest.mark.parametrize(("force", "name"), BREAKING)
+def test_check_names_the_first_step_that_is_not_finite(force, name):
+    arguments = System(ONE, force), STEPPERS[name], 0.2 * ONE, ONE, 4000.0
+    step = first_not_finite(run(*arguments, num_steps=20))
+    assert 1 < step < 20
+    assert step % 5 != 0
+    for save_every in (1, 5, 20):
+        solution = run(*arguments, t0=3.0, num_steps=20, save_every=save_every)
+        message = f"simulate: step {step} (to t = {3 + 0.1 * step:.6g}) failed: the state is not finite."
+        check_message(SimulationError, message, solution.check)
+
+
+def test_check_is_silent_when_all_is_well():
+    for stepper in (STEPPERS["rk4"], STEPPERS["hht converged"]):
+        assert run(stepper=stepper).check() is None
+    assert jax.vmap(lambda q0: run(q0=q0))(jnp.ones((3, 1))).check() is None
+
+
+def test_check_names_the_bad_member_of_a_batch():
+    """Members differ in dt, t0 and stiffness; the times in the message are those of the bad one."""
+
+    def member(k, dt, t0, save_every=1):
+        return run(BLOW_UP, params=k, dt=dt, t0=t0, num_steps=20, save_every=save_every)
+
+    k, dt, t0 = jnp.array([1e-3, 1e3, 1e-3]), jnp.array([0.1, 0.04, 0.2]), jnp.array([0.0, 2.0, 0.0])
+    steps = [first_not_finite(member(*x)) for x in zip(k, dt, t0, strict=True)]
+    assert steps[0] == steps[2] == 0
+    assert 1 < steps[1] < 20
+    time = f"{2 + 0.04 * steps[1]:.6g}"
+    message = f"member 1 (1 of 3 failed), step {steps[1]} (to t = {time}) failed: the state is not finite."
+    for save_every in (1, 5):
+        batch = jax.vmap(lambda *x, save_every=save_every: member(*x, save_every))(k, dt, t0)
+        check_message(SimulationError, message, batch.check)
+
+
+def test_check_names_the_first_of_several_bad_members_in_two_axes():
+    k = jnp.array([[1e-3, 1e-3, 1e3], [1e3, 1e-3, 1e-3]])
+    batch = jax.vmap(jax.vmap(lambda k: run(BLOW_UP, params=k, num_steps=20)))(k)
+    step = first_not_finite(run(BLOW_UP, params=1e3, num_steps=20))
+    check_message(SimulationError, f"simulate: member 0, 2 (2 of 6 failed), step {step} (to t = ", batch.check)
+
+
+def kick(q, v, t, params):
+    """A spring with a blow around t = 0.7 and t = 1.1, too hard for two iterations."""
+    struck = (jnp.abs(t - 0.7) < 0.01) | (jnp.abs(t - 1.1) < 0.01)
+    return -q + jnp.where(struck, -params * q**3, jnp.zeros_like(q))
+
+
+KICKED = System(ONE, kick)
+TWO_ITERATIONS = hhtjax.hht(iterations=None, max_iterations=2)
+
+
+def first_unbalanced(path, params):
+    """Number of the first step after which M w - Q exceeds Newton's tolerance; from a path that holds every step."""
+    Q = jax.vmap(lambda q, v, t: kick(q, v, t, params))(path.q, path.v, path.t)
+    unbalanced = np.max(np.abs(path.acceleration - Q), axis=1) > 1e-9
+    return int(np.argmax(unbalanced)), int(unbalanced.sum())
+
+
+def test_check_names_the_first_failed_newton_iteration():
+    path = run(KICKED, TWO_ITERATIONS, params=1e3, num_steps=16)
+    step, failures = first_unbalanced(path, 1e3)
+    assert failures == 2  # both blows; the steps between them and after them succeed
+    assert 1 < step < 16
+    assert step % 4 != 0
+    assert np.isfinite(path.q).all()
+    message = f"step {step} (to t = {0.1 * step:.6g}) failed: Newton's iteration did not converge; the state is still"
+    for save_every in (1, 4, 16):
+        solution = run(KICKED, TWO_ITERATIONS, params=1e3, num_steps=16, save_every=save_every)
+        check_message(SimulationError, f"simulate: {message}", solution.check)
+
+    def member(k):
+        return run(KICKED, TWO_ITERATIONS, params=k, num_steps=16, save_every=4)
+
+    batch = jax.vmap(member)(jnp.array([0.0, 0.0, 1e3]))
+    check_message(SimulationError, f"simulate: member 2 (1 of 3 failed), {message}", batch.check)
+
+
+def test_a_failed_newton_iteration_is_named_before_what_follows_it():
+    """Newton fails at t = 0.7; later the force is not a number."""
+
+    def force(q, v, t, params):
+        return kick(q, v, t, 1e3) + jnp.where(t > 1.15, jnp.nan * q, jnp.zeros_like(q))
+
+    solution = run(System(ONE, force), hhtjax.hht(iterations=None, max_iterations=2), num_steps=16)
+    check_message(SimulationError, "step 7 (to t = 0.7) failed: Newton's iteration did not converge", solution.check)
+
+
+def test_an_acceleration_that_is_not_finite_is_a_failure():
+    """q and v are finite at the end, its acceleration is not: the force is defined for q < 1.05 only."""
+    system = System(ONE, lambda q, v, t, params: jnp.sqrt(1.05 - q))
+    solution = run(system, STEPPERS["hht state"], ZERO, ONE, dt=0.2, num_steps=4)
+    assert not np.isfinite(solution.acceleration[-1]).all()
+    check_message(SimulationError, "simulate: step 4 (to t = 0.8) failed", solution.check)
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.vmap], ids=["jit", "vmap"])
+def test_check_refuses_tracers(transform):
+    def inside(q0):
+        run(q0=q0).check()
+        return q0
+
+    message = "check: the solution is a tracer: call check() outside jit, vmap and grad."
+    check_message(TypeError, message, lambda: transform(inside)(jnp.ones((2, 1)) if transform is jax.vmap else ONE))
+
+
+@pytest.mark.parametrize("name", ["dt", "t0", "params"])
+def test_check_inside_grad_refuses_or_names_the_step(name):
+    """Whether a step failed has no derivative, so grad alone leaves it known."""
+
+    def inside(x):
+        solution = run(BLOW_UP, **{"params": 1e3, "num_steps": 20, name: x})
+        solution.check()
+        return jnp.sum(solution.q)
+
+    with pytest.raises((TypeError, SimulationError), match=r"^(check: the solution is a tracer|simulate: step 4 )"):
+        jax.grad(inside)({"dt": 0.1, "t0": 0.0, "params": 1e3}[name])
+
+
+# ---------------------------------------------------------------------------------------------- tracers
+
+TRACED = {"dt": 0.1, "t0": 0.3, "q0": np.array([0.7]), "v0": np.array([-0.4]), "params": 2.5, "alpha": -0.1}
+
+
+def hard_spring(q, v, t, params):
+    """Depends on everything."""
+    return -params * jnp.sin(q) - 0.1 * v + jnp.cos(2 * t)
+
+
+HARD_SPRING = System(ONE, hard_spring)
+
+
+def outcome(alpha, **arguments):
+    """A number that depends on all arguments of a run."""
+    solution = run(HARD_SPRING, hhtjax.hht(alpha=alpha, linearize="predictor"), num_steps=8, **arguments)
+    return jnp.sum(solution.q**2) + jnp.sum(solution.v) + jnp.sum(solution.t * solution.acceleration[:, 0])
+
+
+def test_all_arguments_may_be_tracers_of_jit():
+    assert np.allclose(jax.jit(lambda x: outcome(**x))(TRACED), outcome(**TRACED), rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("names", [tuple(TRACED), ("dt",), ("t0", "v0")], ids=" ".join)
+def test_arguments_may_be_tracers_of_vmap(names):
+    batch = {name: jnp.stack([jnp.asarray(TRACED[name]), 0.9 * jnp.asarray(TRACED[name])]) for name in names}
+    results = jax.vmap(lambda x: outcome(**{**TRACED, **x}))(batch)
+    for i in range(2):
+        member = {name: x[i] for name, x in batch.items()}
+        assert np.allclose(results[i], outcome(**{**TRACED, **member}), rtol=1e-13, atol=0)
+    assert results[0] != results[1]
+
+
+def test_all_arguments_may_be_tracers_of_grad():
+    gradient = jax.grad(lambda x: outcome(**x))(TRACED)
+    for name, value in TRACED.items():
+        h = 1e-5
+        change = outcome(**{**TRACED, name: value + h}) - outcome(**{**TRACED, name: value - h})
+        assert np.allclose(gradient[name], change / (2 * h), rtol=1e-6, atol=1e-7), name
+
+
+@pytest.mark.parametrize("arguments", [{"dt": -0.1}, {"dt": 0.0}, {"q0": np.array([INF])}, {"t0": NAN}], ids=repr)
+def test_values_of_tracers_are_not_checked_but_their_failure_is_seen(arguments):
+    ((name, value),) = arguments.items()
+    system = System(ONE, lambda q, v, t, params: -q + t)
+    solution = jax.jit(lambda x: run(system, **{name: x}))(value)
+    if name == "dt":
+        assert solution.check() is None
+        assert solution.t[-1] == 4 * value
+    else:
+        check_message(SimulationError, "simulate: step 1 (to t = ", solution.check)
+
+
+@pytest.mark.parametrize("name", ["dt", "t0"])
+def test_shapes_of_tracers_are_checked(name):
+    with pytest.raises(TypeError, match=f"simulate: `{name}` must be a real number; received "):
+        jax.jit(lambda x: run(**{name: x}))(jnp.ones(2))
+    with pytest.raises(TypeError, match="hht: `alpha` must be a real number; received "):
+        jax.jit(lambda x: outcome(**{**TRACED, "alpha": x}))(jnp.ones(2))
+
+
+# ---------------------------------------------------------------------------------------------- dtypes
+
+
+def float_dtypes(solution):
+    """Dtypes of all numbers in a solution, but those that count."""
+    return {x.dtype.name for x in jax.tree.leaves(solution) if jnp.issubdtype(x.dtype, jnp.inexact)}
+
+
+def run_and_catch(**arguments):
+    """A run, and the warnings it gave."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solution = run(**arguments)
+    return solution, caught
+
+
+@pytest.mark.parametrize("name", STEPPERS)
+def test_float32_stays_float32_and_warns_once_a_call(name):
+    for _ in range(2):  # a cached compilation warns too
+        solution, caught = run_and_catch(stepper=STEPPERS[name], q0=SINGLE, v0=0 * SINGLE, save_every=2)
+        assert float_dtypes(solution) == {"float32"}
+        assert [x.category for x in caught] == [PrecisionWarning]
+        assert caught[0].filename == run.__code__.co_filename
+        assert re.match(
+            r"simulate: in float32 expect about 4 correct digits .* jax.config.update\('jax_enable_x64', True\)",
+            str(caught[0].message),
+        )
+        assert np.isclose(solution.q[-1, 0], np.cos(0.8), atol=0.3)
+
+
+@pytest.mark.parametrize("name", STEPPERS)
+def test_float64_stays_float64_and_does_not_warn(name):
+    solution, caught = run_and_catch(stepper=STEPPERS[name], save_every=2)
+    assert float_dtypes(solution) == {"float64"}
+    assert caught == []
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        System([1.0], pull),
+        System(np.eye(1), pull),
+        System(np.array([1]), pull),
+        System(lambda q, params: 1.0, pull),
+        System.from_lagrangian(lagrangian),
+        LinearSystem([1.0], C=[0.0], K=[4.0]),
+        LinearSystem(np.eye(1), K=np.array([4.0])),
+        LinearSystem(np.array([1]), K=np.array([[4]])),
+        LinearSystem(lambda params: jnp.ones(1, jnp.float32), K=np.array([4.0])),
+    ],
+)
+def test_constants_of_a_system_take_the_dtype_of_the_state(system):
+    """In float32 and, where nothing in the system is single, in float64."""
+    single, _ = run_and_catch(system=system, stepper=STEPPERS["newmark"], q0=SINGLE, v0=0 * SINGLE)
+    assert float_dtypes(single) == {"float32"}
+    expected = run(stepper=STEPPERS["newmark"])
+    assert np.allclose(single.q, expected.q, atol=1e-6)
+    if not (isinstance(system, LinearSystem) and callable(system.M)):
+        double = run(system, STEPPERS["newmark"])
+        assert float_dtypes(double) == {"float64"}
+        assert np.allclose(double.q, expected.q, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("number", "dtype"), [(np.float32, np.float64), (jnp.float64, np.float32), (np.float64, np.float32)]
+)
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda x: {"stepper": hhtjax.hht(alpha=-x)},
+        lambda x: {"stepper": hhtjax.kim_hht(alpha=-x)},
+        lambda x: {"stepper": hhtjax.hht(alpha=-0.125, iterations=None, tolerance=x)},
+        lambda x: {"dt": x, "t0": x},
+    ],
+    ids=["alpha", "kim alpha", "tolerance", "dt"],
+)
+def test_numbers_of_any_precision_take_the_dtype_of_the_state(make, number, dtype):
+    """1/8 is exact in both precisions, so the run must be that of the Python number."""
+    solution, _ = run_and_catch(**{"q0": ONE.astype(dtype), "v0": ZERO.astype(dtype), **make(number(0.125))})
+    expected, _ = run_and_catch(**{"q0": ONE.astype(dtype), "v0": ZERO.astype(dtype), **make(0.125)})
+    assert float_dtypes(solution) == {np.dtype(dtype).name}
+    assert np.allclose(solution.q, expected.q, rtol=4 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize(
+    ("q0", "v0", "dtype"),
+    [
+        (1, 0, "float64"),
+        (1.0, 0, "float64"),
+        (np.array([1]), np.array([0]), "float64"),
+        (np.array([1], np.int8), np.array([0], np.uint8), "float64"),
+        (jnp.array([1]), np.array([0.0]), "float64"),
+        (np.array([1]), np.zeros(1, np.float32), "float32"),
+        (np.float32(1), 0.0, "float32"),
+        (np.float64(1), 0, "float64"),
+        ({"a": 1, "b": [1.0, np.ones(2)]}, {"a": 0, "b": [0.0, np.zeros(2)]}, "float64"),
+        ((1, np.float32(1)), (0, 0), "float32"),
+    ],
+    ids=repr,
+)
+def test_integers_numbers_and_numpy_arrays_are_initial_values(q0, v0, dtype):
+    """Integers and Python numbers take the float type of the others, or the default one."""
+    size = sum(np.size(x) for x in jax.tree.leaves(q0))
+    solution, caught = run_and_catch(system=System(np.ones(size), pull), q0=q0, v0=v0)
+    assert float_dtypes(solution) == {dtype}
+    assert len(caught) == (dtype == "float32")
+    assert jax.tree.structure(solution.q) == jax.tree.structure(solution.v) == jax.tree.structure(q0)
+    for x, start in zip(jax.tree.leaves(solution.q), jax.tree.leaves(q0), strict=True):
+        assert x.shape == (5, *np.shape(start))
+        assert np.allclose(x[-1], np.cos(0.8), atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["rk4", "hht state", "kim_hht"])
+@pytest.mark.parametrize(
+    "system",
+    [
+        System(lambda q, params: jnp.array(2.0), lambda q, v, t, params: -8.0 * q),
+        System(lambda q, params: 2.0, lambda q, v, t, params: -8.0 * q),
+        System(lambda q, params: jnp.array([2.0]), lambda q, v, t, params: -8.0 * q),
+        System(lambda q, params: jnp.array([[2.0]]), lambda q, v, t, params: -8.0 * q),
+        System(np.array([2.0]), lambda q, v, t, params: -8.0 * q),
+        System(np.array([[2.0]]), lambda q, v, t, params: -8.0 * q),
+        LinearSystem([2.0], K=[8.0]),
+    ],
+)
+def test_a_scalar_coordinate_is_a_vector_of_one(system, name):
+    solution = run(system, STEPPERS[name], 1.0, 0.0)
+    expected = run(stepper=STEPPERS[name])
+    assert solution.q.shape == solution.v.shape == solution.acceleration.shape == (5,)
+    assert np.allclose(solution.q, expected.q[:, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: System(np.array(2.0), lambda q, v, t, params: -8.0 * q),
+        lambda: System(2.0, lambda q, v, t, params: -8.0 * q),
+        lambda: LinearSystem(lambda params: jnp.array(2.0), K=lambda params: jnp.array(8.0)),
+        lambda: LinearSystem(lambda params: 2.0, K=lambda params: 8.0),
+    ],
+)
+def test_a_scalar_coordinate_may_have_scalar_coefficients(make):
+    assert np.allclose(run(make(), q0=1.0, v0=0.0).q, run().q[:, 0], rtol=1e-12)

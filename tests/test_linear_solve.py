@@ -1,0 +1,278 @@
+"""Small dense solves: against NumPy in value, and against jnp.linalg.solve in every derivative."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hhtjax.linear_solve import UNROLLED, factorize, matvec, solve
+
+SIZES = range(1, 13)
+
+
+def random_matrix(n, seed=0):
+    """A random matrix, and a right-hand side."""
+    rng = np.random.default_rng([n, seed])
+    return rng.standard_normal((n, n)), rng.standard_normal(n)
+
+
+def zero_diagonal(n):
+    """A random matrix with zeros where elimination without pivoting would divide."""
+    A, b = random_matrix(n, 1)
+    return (A if n == 1 else A - np.diag(np.diag(A))), b
+
+
+def permuted(n):
+    """A well conditioned triangular matrix with its rows in random order: every pivot must be looked for."""
+    A, b = random_matrix(n, 2)
+    order = np.random.default_rng(n).permutation(n)
+    return (np.triu(A, 1) * 0.3 + np.diag(1.0 + np.arange(n)))[order], b
+
+
+def cyclic(n):
+    """A permutation that moves every row, scaled: exact in floating point."""
+    return np.roll(np.diag(2.0 ** np.arange(n)), 1, axis=0), np.arange(1.0, n + 1)
+
+
+def equal_pivots(n):
+    """All candidates for the first pivot of equal size and of both signs."""
+    A, b = random_matrix(n, 3)
+    A[:, 0] = np.where(np.arange(n) % 2, -1.0, 1.0)
+    return A, b
+
+
+def bad_rows(n):
+    """Rows whose sizes differ by up to 1e12, as of coordinates in different units."""
+    A, b = random_matrix(n, 4)
+    scale = 10.0 ** np.linspace(-6, 6, n)
+    return A * scale[:, None], b * scale
+
+
+def bad_columns(n):
+    """Unknowns whose sizes differ by up to 1e12."""
+    A, b = random_matrix(n, 5)
+    return A * 10.0 ** np.linspace(6, -6, n), b
+
+
+def spd(n):
+    """Symmetric positive definite, as a mass matrix."""
+    A, b = random_matrix(n, 6)
+    return A @ A.T + np.eye(n), b
+
+
+compiled = jax.jit(solve)
+KINDS = [random_matrix, zero_diagonal, permuted, cyclic, equal_pivots, bad_rows, bad_columns, spd]
+
+
+def backward_error(A, x, b):
+    """Largest relative change of a row of A and b that makes x exact (Skeel)."""
+    return np.max(np.abs(A @ x - b) / (np.abs(A) @ np.abs(x) + np.abs(b)))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_solutions(n):
+    """Backward stable row by row where rows are alike, and as good as LAPACK where they are not."""
+    for kind in KINDS:
+        A, b = kind(n)
+        x, lapack = np.asarray(compiled(A, b)), np.linalg.solve(A, b)
+        assert x.dtype == np.float64
+        assert backward_error(A, x, b) <= max(1e-14, 10 * backward_error(A, lapack, b)), kind.__name__
+        size = np.abs(np.linalg.inv(A)) @ (np.abs(A) @ np.abs(lapack))
+        assert np.all(np.abs(x - lapack) <= 1e-13 * size), kind.__name__
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_a_scaled_permutation_is_solved_exactly(n):
+    A, b = cyclic(n)
+    assert np.array_equal(A @ np.asarray(compiled(A, b)), b)
+
+
+@pytest.mark.parametrize("n", [2, 5, 8])
+def test_the_largest_pivot_is_taken_and_not_just_a_nonzero_one(n):
+    """Without the exchange of rows a pivot of 1e-20 would lose the solution."""
+    A, b = random_matrix(n)
+    A[0, 0] = 1e-20
+    assert np.allclose(compiled(A, b), np.linalg.solve(A, b), rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 4, 8, 9])
+def test_float32_stays_float32(n):
+    A, b = spd(n)
+    x = compiled(A.astype(np.float32), b.astype(np.float32))
+    assert x.dtype == jnp.float32
+    assert backward_error(A, np.asarray(x, float), b) < 1e-6
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8, 9, 12])
+def test_a_singular_matrix_gives_no_number(n):
+    A, b = random_matrix(n)
+    A[:, -1] = 0
+    assert not np.all(np.isfinite(compiled(A, b)))
+    assert not np.any(np.isfinite(compiled(0 * A, b)))
+
+
+@pytest.mark.parametrize("n", [1, 4, 9])
+def test_under_vmap(n):
+    matrices = np.stack([kind(n)[0] for kind in KINDS[:5]])
+    vectors = np.stack([kind(n)[1] for kind in KINDS[:5]])
+    expected = np.stack([np.linalg.solve(A, b) for A, b in zip(matrices, vectors, strict=True)])
+    batch = jax.jit(jax.vmap(solve))(matrices, vectors)
+    assert np.allclose(batch, expected, rtol=1e-10, atol=1e-12)
+    one_matrix = jax.jit(lambda A, b: jax.vmap(factorize(A))(b))(matrices[0], vectors)
+    assert np.allclose(one_matrix, np.linalg.solve(matrices[0], vectors.T).T, rtol=1e-10, atol=1e-12)
+    one_vector = jax.jit(jax.vmap(solve, in_axes=(0, None)))(matrices, vectors[0])
+    assert np.allclose(one_vector, [np.linalg.solve(A, vectors[0]) for A in matrices], rtol=1e-10, atol=1e-12)
+
+
+# ---------------------------------------------------------------------------------------------- derivatives
+
+
+def curved(solver):
+    """A function of A and b with second derivatives of all kinds."""
+    return lambda A, b: jnp.sum(jnp.sin(solver(A, b)))
+
+
+def jnp_solve(A, b):
+    """The reference."""
+    return jnp.linalg.solve(A, b)
+
+
+def all_gradients(A, b):
+    """With respect to A and b: reverse, forward, and the reference."""
+    return (
+        jax.grad(curved(solve), argnums=(0, 1))(A, b),
+        jax.jacfwd(curved(solve), argnums=(0, 1))(A, b),
+        jax.grad(curved(jnp_solve), argnums=(0, 1))(A, b),
+    )
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 8, 9, 12])
+def test_gradients(n):
+    """Forward = reverse = those of jnp.linalg.solve."""
+    derivatives = jax.jit(all_gradients)
+    for kind in (zero_diagonal, permuted, spd):
+        for reverse, forward, expected in zip(*derivatives(*kind(n)), strict=True):
+            size = np.max(np.abs(expected))
+            assert size > 0
+            assert np.max(np.abs(reverse - forward)) < 1e-11 * size, kind.__name__
+            assert np.max(np.abs(reverse - expected)) < 1e-11 * size, kind.__name__
+
+
+@pytest.mark.parametrize("n", [3, 9])
+def test_gradients_under_vmap(n):
+    arguments = [np.stack(x) for x in zip(zero_diagonal(n), permuted(n), spd(n), strict=True)]
+    for reverse, forward, expected in zip(*jax.jit(jax.vmap(all_gradients))(*arguments), strict=True):
+        assert np.allclose(reverse, forward, rtol=1e-10, atol=1e-12)
+        assert np.allclose(reverse, expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("n", "outer", "inner"),
+    [
+        (2, jax.jacfwd, jax.jacfwd),
+        (2, jax.jacrev, jax.jacrev),
+        (3, jax.jacfwd, jax.jacrev),
+        (3, jax.jacrev, jax.jacfwd),
+        (9, jax.jacfwd, jax.jacrev),
+    ],
+)
+def test_second_derivatives(n, outer, inner):
+    """In all four combinations of modes, those of jnp.linalg.solve."""
+    A, b = permuted(n)
+
+    def hessian(solver):
+        return outer(inner(lambda x: curved(solver)(A + x[0] * A.T + x[1] ** 2, b + x[1])))
+
+    H, expected = jax.jit(lambda x: (hessian(solve)(x), hessian(jnp_solve)(x)))(jnp.array([0.1, 0.2]))
+    assert np.all(np.abs(expected) > 1e-3)
+    assert np.max(np.abs(H - expected)) < 1e-11 * np.max(np.abs(expected))
+
+
+# ---------------------------------------------------------------------------------------------- factorize
+
+
+def count_primitives(function, *args):
+    """How often each primitive occurs in the program of a function, inner programs included."""
+    counts = {}
+
+    def visit(jaxpr):
+        for equation in jaxpr.eqns:
+            counts[equation.primitive.name] = counts.get(equation.primitive.name, 0) + 1
+            for inner in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "jaxpr") or hasattr(x, "eqns")):
+                if hasattr(inner, "jaxpr"):
+                    visit(inner.jaxpr)
+                elif hasattr(inner, "eqns"):
+                    visit(inner)
+
+    visit(jax.make_jaxpr(function)(*args).jaxpr)
+    return counts
+
+
+@pytest.mark.parametrize("n", [1, UNROLLED, UNROLLED + 1])
+def test_one_factorisation_serves_many_right_hand_sides(n):
+    A, b = zero_diagonal(n)
+
+    def many(A, b):
+        apply = factorize(A)
+        return apply(b) + apply(2 * b) + apply(jnp.sin(b))
+
+    expected = np.linalg.solve(A, 3 * b + np.sin(b))
+    assert np.allclose(jax.jit(many)(A, b), expected, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [4, UNROLLED, UNROLLED + 1, 12])
+def test_the_factors_are_computed_once_also_for_derivatives(n):
+    """Only the search for pivots takes absolute values in the unrolled LU; only LAPACK's LU is called lu."""
+    A, b = zero_diagonal(n)
+
+    def many(A, b):
+        apply = factorize(A)
+        return jnp.sum(apply(b) * apply(jnp.sin(b)))
+
+    name, once = ("abs", (n - 1) + n * (n - 1) // 2) if n <= UNROLLED else ("lu", 1)
+    for function in (many, jax.grad(many, argnums=(0, 1)), jax.jacfwd(many, argnums=(0, 1))):
+        assert count_primitives(function, A, b)[name] == once
+
+
+@pytest.mark.parametrize("n", [3, 9])
+def test_derivatives_through_one_factorisation_used_twice(n):
+    """A enters through both applications, one of them inside the other."""
+    A, b = permuted(n)
+
+    def twice(A, b):
+        apply = factorize(A)
+        return jnp.sum(jnp.sin(apply(apply(b))))
+
+    def reference(A, b):
+        return jnp.sum(jnp.sin(jnp.linalg.solve(A, jnp.linalg.solve(A, b))))
+
+    expected = jax.grad(reference, argnums=(0, 1))(A, b)
+    for derivative in (jax.grad, jax.jacfwd):
+        for x, y in zip(jax.jit(derivative(twice, argnums=(0, 1)))(A, b), expected, strict=True):
+            assert np.max(np.abs(x - y)) < 1e-11 * np.max(np.abs(y))
+
+
+# ---------------------------------------------------------------------------------------------- matvec
+
+
+@jax.jit
+def products(A, x):
+    """A x; its diagonal version; two of them by vmap; and its derivatives with respect to x and A."""
+    return (
+        matvec(A, x),
+        matvec(jnp.diagonal(A), x),
+        jax.vmap(matvec)(jnp.stack([A, 2 * A]), jnp.stack([x, x])),
+        jax.jacfwd(matvec, argnums=1)(A, x),
+        jax.grad(lambda A: jnp.sum(matvec(A, x)))(A),
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [1, 2, 5, UNROLLED, UNROLLED + 1, 12])
+def test_products(n, dtype):
+    A, x = (y.astype(dtype) for y in random_matrix(n))
+    expected = A @ x, np.diag(A) * x, np.stack([A @ x, 2 * A @ x]), A, np.broadcast_to(x, (n, n))
+    for y, z in zip(products(A, x), expected, strict=True):
+        assert y.dtype == dtype
+        assert y.shape == z.shape
+        assert np.max(np.abs(y - z)) < 100 * np.finfo(dtype).eps
