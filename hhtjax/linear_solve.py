@@ -4,6 +4,9 @@ A call to LAPACK costs a microsecond on the CPU, several times a whole step of a
 up to `UNROLLED` unknowns the elimination is written out as array operations.
 """
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
@@ -11,16 +14,20 @@ from jax.scipy.linalg import lu_factor, lu_solve
 UNROLLED = 8
 
 
-def solve(A, b):
-    """x with A x = b, for A (n, n) and b (n,), differentiable in both.
+def solve_map(f, b, factorize):
+    """x with f(x) = b, for a linear map f of (n,) to (n,); `factorize` as below.
 
-    LU with partial pivoting: unrolled for n <= 8, LAPACK above. A singular A gives inf or NaN.
-
-    >>> import jax.numpy as jnp
-    >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
-    [2.0, 1.0]
+    The matrix of f only serves to find x. Derivatives pass through f itself, f(dx) = db - df(x): one
+    direction, where differentiating the matrix would take n.
     """
-    return factorize(A)(b)
+    A = jax.vmap(f, out_axes=1)(jnp.eye(b.size, dtype=b.dtype))
+    return _solve(f, b, factorize(A))
+
+
+def _solve(f, b, inverse):
+    return lax.custom_linear_solve(
+        f, b, solve=lambda _, y: inverse(y, trans=0), transpose_solve=lambda _, y: inverse(y, trans=1)
+    )
 
 
 def matvec(A, x):
@@ -33,24 +40,33 @@ def matvec(A, x):
 
 
 def factorize(A):
-    """The function b -> A^-1 b, with A factorised once; differentiable in A and b.
-
-    Derivatives follow from A dx = db - dA x and reuse the factors.
-    """
+    """The function (b, trans) -> A^-1 b, or A^-T b for trans=1, with A factorised once; constant to autodiff."""
+    A = lax.stop_gradient(A)
     if A.shape[-1] <= UNROLLED:
-        factors, substitute = _lu(lax.stop_gradient(A)), _substitute
-    else:
-        factors, substitute = lu_factor(lax.stop_gradient(A)), lu_solve
+        return partial(_substitute, _lu(A))
+    return partial(lu_solve, lu_factor(A))
 
-    def apply(b):
-        return lax.custom_linear_solve(
-            lambda x: matvec(A, x),
-            b,
-            solve=lambda _, y: substitute(factors, y, trans=0),
-            transpose_solve=lambda _, y: substitute(factors, y, trans=1),
-        )
 
-    return apply
+def factorize_with(solve):
+    """The same from a function solve(A, b), which need not be differentiable."""
+
+    def factorize(A):
+        A = lax.stop_gradient(A)
+        return lambda b, trans: solve(A.T if trans else A, b)
+
+    return factorize
+
+
+def solve(A, b, factorize=factorize):
+    """x with A x = b, for A (n, n) and b (n,), differentiable in both.
+
+    LU with partial pivoting: unrolled for n <= 8, LAPACK above. A singular A gives inf or NaN.
+
+    >>> import jax.numpy as jnp
+    >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
+    [2.0, 1.0]
+    """
+    return _solve(lambda x: matvec(A, x), b, factorize(A))
 
 
 def _lu(A):

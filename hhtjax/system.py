@@ -10,8 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import Description, is_array, is_concrete
-from hhtjax.linear_solve import matvec
-from hhtjax.linear_solve import solve as dense_solve
+from hhtjax.linear_solve import factorize, matvec, solve
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,10 +184,10 @@ class FlatSystem(NamedTuple):
         """M(q) w."""
         return matvec(self.mass(q, params), w)
 
-    def acceleration(self, q, v, t, params, solve=dense_solve):
+    def acceleration(self, q, v, t, params, factorize=factorize):
         """w = M(q)^-1 Q(q, v, t)."""
         M, Q = self.mass(q, params), self.force(q, v, t, params)
-        return Q / M if M.ndim == 1 else solve(M, Q)
+        return Q / M if M.ndim == 1 else solve(M, Q, factorize)
 
 
 def flatten(caller, system, q0, v0, t0, params):

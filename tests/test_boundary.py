@@ -344,8 +344,6 @@ RESULTS = [
     (ValueError, f"{MASS_SHAPE} [0]: shape () float64.", System(lambda q, params: [1.0], pull)),
     (ValueError, f"{MASS_SHAPE} ['m']: shape (1,) float64.", System(lambda q, params: {"m": jnp.ones(1)}, pull)),
     (ValueError, f"{MASS_SHAPE} nothing.", System(lambda q, params: None, pull)),
-    (ValueError, f"{MASS_SHAPE} shape (2, 2) float64.", LinearSystem(EYE)),
-    (ValueError, f"{MASS_SHAPE} shape (2,) float64.", LinearSystem(lambda params: jnp.ones(2))),
     (ValueError, f"{FORCE_LIKE} shape (2,) float64.", System(ONE, lambda q, v, t, params: jnp.ones(2))),
     (ValueError, f"{FORCE_LIKE} shape () float64.", System(ONE, lambda q, v, t, params: -q[0])),
     (ValueError, f"{FORCE_LIKE} ['x']: shape (1,) float64.", System(ONE, lambda q, v, t, params: {"x": q})),
@@ -387,11 +385,11 @@ def test_a_double_result_for_a_single_state_is_named(name):
         run(System(mass, force), q0=SINGLE, v0=0 * SINGLE, params=params)
 
 
-@pytest.mark.parametrize("name", ["C", "K"])
+@pytest.mark.parametrize("name", ["M", "C", "K"])
 @pytest.mark.parametrize("matrix", [np.eye(3), np.ones(3), lambda params: jnp.eye(3), lambda params: {"a": 1.0}])
 def test_matrices_of_a_linear_system_must_fit_its_size(name, matrix):
     with pytest.raises((TypeError, ValueError), match=rf"`{name}` must .*\(2, 2\), or \(2,\).*; received"):
-        run(LinearSystem(EYE, **{name: matrix}), q0=np.ones(2), v0=np.zeros(2))
+        run(LinearSystem(**{"M": EYE, name: matrix}), q0=np.ones(2), v0=np.zeros(2))
 
 
 @pytest.mark.parametrize(
@@ -609,7 +607,9 @@ def test_check_inside_grad_refuses_or_names_the_step(name):
         solution.check()
         return jnp.sum(solution.q)
 
-    with pytest.raises((TypeError, SimulationError), match=r"^(check: the solution is a tracer|simulate: step 4 )"):
+    with pytest.raises(
+        (TypeError, SimulationError), match=rf"^(check: the solution is a tracer|simulate: step {step} )"
+    ):
         jax.grad(inside)({"dt": 0.1, "t0": 0.0, "params": 1e3}[name])
 
 

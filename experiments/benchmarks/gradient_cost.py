@@ -7,6 +7,7 @@ the loop as one kernel (see experiments/__main__.py) unless XLA_FLAGS says other
 
 import os
 import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +46,8 @@ def measure(num_steps, save_every, repeats):
         start = time.perf_counter()
         compiled = jax.jit(function, static_argnums=(1, 2)).lower(x, num_steps, save_every).compile()
         row[f"{name}_compile_s"] = time.perf_counter() - start
-        row[f"{name}_temporary_bytes"] = compiled.memory_analysis().temp_size_in_bytes
+        memory: Any = compiled.memory_analysis()
+        row[f"{name}_temporary_bytes"] = memory.temp_size_in_bytes
         times = []
         for _ in range(repeats):
             start = time.perf_counter()
@@ -95,7 +97,8 @@ def run(report: Report, fast: bool):
 
 def slope(rows):
     """Exponent of the growth of temporary memory."""
-    return float(np.polyfit(*np.log([[row[x] for row in rows] for x in ("steps", "gradient_temporary_bytes")]), 1)[0])
+    steps, bytes_ = (np.log([row[x] for row in rows]) for x in ("steps", "gradient_temporary_bytes"))
+    return float(np.polyfit(steps, bytes_, 1)[0])
 
 
 def plot(report: Report, rows):

@@ -7,6 +7,7 @@ and k3 carry the unit of u over that of their power of y and t.
 
 import time
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -88,7 +89,7 @@ def run(report: Report, fast: bool):
     print("Standard errors assume white residuals; these are coloured, and the true ones about 4 times as large.")
     print("The gain of the input is fixed to 1: a common factor of all parameters cannot be identified.\n")
 
-    scores = {"train": (np.asarray(result.residual + sets.train.y), rmse(result.residual), None)}
+    scores: dict[str, Any] = {"train": (np.asarray(result.residual + sets.train.y), rmse(result.residual), None)}
     for name, record in sets.tests.items():
         scores[name] = score(params, record, SUBSTEPS, 0.0)
         report.progress(f"{name}: {scores[name][1]:.4f} mV")

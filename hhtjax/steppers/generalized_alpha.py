@@ -21,8 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description import is_concrete
-from hhtjax.linear_solve import factorize
-from hhtjax.linear_solve import solve as dense_solve
+from hhtjax.linear_solve import factorize, factorize_with, solve_map
 from hhtjax.steppers.stepper import Info, State, Stepper, require_number
 
 LINEARIZATIONS = ("predictor", "held", "state", "auto")
@@ -46,7 +45,7 @@ class Options(NamedTuple):
     tolerance: float = 1e-10
     max_iterations: int = 20
     start: str = "simple"
-    solve: Callable = dense_solve
+    solve: Callable | None = None
 
 
 class Keywords(TypedDict, total=False):
@@ -57,7 +56,7 @@ class Keywords(TypedDict, total=False):
     tolerance: float
     max_iterations: int
     start: str
-    solve: Callable
+    solve: Callable | None
 
 
 def advance(c, s, dt, w):
@@ -73,7 +72,7 @@ def residual(system, params, s):
     return system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
 
 
-def linearized_solve(r, path, w, solve, at=None):
+def linearized_solve(r, path, w, factorize, at=None):
     """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)).
 
     One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
@@ -81,10 +80,9 @@ def linearized_solve(r, path, w, solve, at=None):
     start, along = jax.linearize(path, w)
     point = start if at is None else at
     value, tangent = jax.linearize(r, point)
-    J = jax.vmap(lambda e: tangent(along(e)), out_axes=1)(jnp.eye(w.size, dtype=w.dtype))
     if at is not None:
         value = value + tangent(jax.tree.map(jnp.subtract, start, point))
-    return w - solve(J, value)
+    return w - solve_map(lambda dw: tangent(along(dw)), value, factorize)
 
 
 def linearization_point(system, params, s, predicted, where):
@@ -104,7 +102,7 @@ def linearization_point(system, params, s, predicted, where):
     return jax.tree.map(partial(jnp.where, use_predictor), predicted, held)
 
 
-def newton(r, path, s, solve, tolerance, max_iterations):
+def newton(r, path, s, factorize, tolerance, max_iterations):
     """Newton on r(path(w)) from s.w, until max|r| <= tolerance or a correction is lost in rounding.
 
     Differentiated by the implicit-function theorem, forward and reverse.
@@ -124,7 +122,7 @@ def newton(r, path, s, solve, tolerance, max_iterations):
 
         def improve(carry):
             w0, value, iterations, _ = carry
-            w1 = w0 - solve(jax.jacfwd(f)(w0), value)
+            w1 = w0 - factorize(jax.jacfwd(f)(w0))(value, trans=0)
             value = f(w1)
             converged = jnp.all(jnp.abs(value) <= tolerance) | lost_in_rounding(path(w0), path(w1))
             return w1, value, iterations + 1, converged
@@ -136,7 +134,7 @@ def newton(r, path, s, solve, tolerance, max_iterations):
         return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype))
 
     def tangent_solve(g, y):
-        return solve(jax.vmap(g, out_axes=1)(jnp.eye(y.size, dtype=y.dtype)), y)
+        return solve_map(g, y, factorize)
 
     w, (size, iterations, converged) = lax.custom_root(lambda w: r(path(w)), s.w, search, tangent_solve, has_aux=True)
     return w, Info(size, iterations.astype(jnp.int32), converged > 0)
@@ -155,7 +153,7 @@ class GeneralizedAlpha(Stepper):
         c = self.coefficients
 
         def acceleration(q, v, t):
-            return system.acceleration(q, v, t, params, self.options.solve)
+            return system.acceleration(q, v, t, params, self.factorize)
 
         shift = c.alpha_m - c.alpha_f
         if self.options.start == "simple" or (is_concrete(shift) and shift == 0):
@@ -163,6 +161,11 @@ class GeneralizedAlpha(Stepper):
             return State(t, q, v, w, w)
         w, tangent = jax.linearize(acceleration, q, v, t)
         return State(t, q, v, w, w + shift * dt * tangent(v, w, jnp.ones_like(t)))
+
+    @property
+    def factorize(self):
+        """A -> (b, trans) -> A^-1 b: the library's LU, or the user's solve."""
+        return factorize if self.options.solve is None else factorize_with(self.options.solve)
 
     def advance(self, s, dt, w):
         """State at t + dt, given its acceleration."""
@@ -172,29 +175,28 @@ class GeneralizedAlpha(Stepper):
         """The step; for a linear system its matrix is factorised here, once."""
         r = partial(residual, system, params)
         options = self.options
-        solve, where = options.solve, options.linearize
+        factorize, where = self.factorize, options.linearize
         if system.linear:
             where = "predictor"  # all points of linearisation are one
-            if solve is dense_solve:
-                zero = jnp.zeros(system.size, dt.dtype)
-                rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
-                solve_once = factorize(jax.jacfwd(lambda w: r(self.advance(rest, dt, w)))(zero))
+            zero = jnp.zeros(system.size, dt.dtype)
+            rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
+            inverse = self.factorize(jax.jacfwd(lambda w: r(self.advance(rest, dt, w)))(zero))
 
-                def solve(A, b):  # A is this same matrix
-                    return solve_once(b)
+            def factorize(A):  # A is this same matrix
+                return inverse
 
         def step(s):
             path = partial(self.advance, s, dt)
             if options.iterations is None:
-                w, info = newton(r, path, s, solve, options.tolerance, options.max_iterations)
+                w, info = newton(r, path, s, factorize, options.tolerance, options.max_iterations)
                 return path(w), info
             at = linearization_point(system, params, s, path(s.w), where)
-            w = linearized_solve(r, path, s.w, solve, at)
+            w = linearized_solve(r, path, s.w, factorize, at)
             for _ in range(options.iterations - 1):
-                w = linearized_solve(r, path, w, solve)
+                w = linearized_solve(r, path, w, factorize)
             s1 = path(w)
             if where == "state" and options.iterations == 1:  # refresh: the acceleration of the new state
-                w = system.acceleration(s1.q, s1.v, s1.t, params, solve)
+                w = system.acceleration(s1.q, s1.v, s1.t, params, factorize)
                 s1 = s1._replace(w=w, a=path(w).a)
             return s1, Info()
 
@@ -231,7 +233,7 @@ def hht(alpha=-0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         start: "simple", a0 = w0; "corrected", a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order
             value. q, v and w are of order 2 with both; only a needs the correction, which blows up when
             h exceeds the fastest time scale of the system.
-        solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU.
+        solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU. Need not be differentiable.
 
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.
@@ -342,6 +344,6 @@ def check_options(caller, options):
         raise ValueError(f"{caller}: `max_iterations` must be a positive integer; received {max_iterations!r}.")
     if start not in ("corrected", "simple"):
         raise ValueError(f'{caller}: `start` must be "corrected" or "simple"; received {start!r}.')
-    if not callable(solve):
-        raise TypeError(f"{caller}: `solve` must be a function solve(A, b); received {solve!r}.")
+    if solve is not None and not callable(solve):
+        raise TypeError(f"{caller}: `solve` must be a function solve(A, b) or None; received {solve!r}.")
     return options._replace(linearize=linearize)

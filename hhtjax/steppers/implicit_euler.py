@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-from hhtjax.linear_solve import solve as dense_solve
 from hhtjax.steppers.generalized_alpha import Coefficients, GeneralizedAlpha, Options, check_options
 from hhtjax.steppers.stepper import State
 
@@ -17,7 +16,7 @@ class ImplicitEuler(GeneralizedAlpha):
         return State(s.t + dt, s.q + dt * v, v, w, w)
 
 
-def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=dense_solve) -> ImplicitEuler:
+def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=None) -> ImplicitEuler:
     """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), solved by Newton.
 
     Order 1, L-stable, strongly damping: the reference for robustness, not for accuracy.

@@ -1,0 +1,189 @@
+"""The run: what it saves, dense output, the progress bar, Lagrangian systems."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from zoo import PROBLEMS, STEPPERS, run
+
+import hhtjax
+from hhtjax.checkpointing import checkpointed_scan
+from hhtjax.scenes import double_pendulum
+
+DUFFING = PROBLEMS["forced Duffing"]
+
+
+@pytest.mark.parametrize("save_every", [1, 2, 7, 70, 210])
+@pytest.mark.parametrize("name", ["hht auto", "hht converged"])
+def test_saving_less_saves_a_part_of_the_same_path(name, save_every):
+    every = run(DUFFING, STEPPERS[name], 210)
+    some = run(DUFFING, STEPPERS[name], 210, save_every=save_every)
+    assert some.q.shape == (210 // save_every + 1, 1)
+    for field in ("t", "q", "v", "acceleration"):
+        np.testing.assert_allclose(getattr(some, field), getattr(every, field)[::save_every], rtol=1e-12)
+    if name == "hht converged":
+        np.testing.assert_array_equal(some.info.iterations, every.info.iterations.reshape(-1, save_every).sum(axis=1))
+        np.testing.assert_allclose(some.info.residual, every.info.residual.reshape(-1, save_every).max(axis=1))
+        assert some.info.converged.all()
+    else:
+        assert some.info.residual is None
+
+
+def test_the_start_is_the_first_saved_time():
+    path = run(DUFFING, hhtjax.hht(), 10, t0=3.0)
+    np.testing.assert_allclose(path.t, 3.0 + 0.2 * np.arange(11), rtol=1e-15)
+    np.testing.assert_array_equal(path.q[0], DUFFING.q0)
+    np.testing.assert_array_equal(path.v[0], DUFFING.v0)
+    np.testing.assert_allclose(path.acceleration[0], DUFFING.system.force(DUFFING.q0, DUFFING.v0, 3.0, DUFFING.params))
+
+
+def test_acceleration_obeys_the_equation_of_motion():
+    path = run(DUFFING, hhtjax.hht(alpha=-0.3, iterations=None), 100)
+    force = jax.vmap(lambda q, v, t: DUFFING.system.force(q, v, t, DUFFING.params))(path.q, path.v, path.t)
+    np.testing.assert_allclose(path.acceleration, force, atol=1e-9)
+
+
+def test_times_do_not_drift_in_float32():
+    q0 = jnp.zeros(1, jnp.float32)
+    with pytest.warns(hhtjax.PrecisionWarning):
+        path = hhtjax.simulate(
+            DUFFING.system, hhtjax.hht(), q0, q0, DUFFING.params, dt=1e-3, num_steps=100_000, save_every=10_000
+        )
+    np.testing.assert_allclose(path.t, np.linspace(0, 100, 11), rtol=2e-7)
+
+
+@pytest.mark.parametrize("length", [1, 2, 31, 32, 33, 101, 499, 500, 1009])
+def test_nested_scan_equals_a_plain_one(length):
+    def body(x, _):
+        return x * 1.01 + 1.0, jnp.stack([x, 2 * x])
+
+    ours = checkpointed_scan(body, jnp.asarray(0.5), length)
+    plain = jax.lax.scan(body, jnp.asarray(0.5), None, length)
+    for a, b in zip(ours, plain, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
+def test_dense_output_is_of_order_four():
+    """Between samples of an exact run: x = cos 2t."""
+    spring = hhtjax.System(jnp.array([1.0]), lambda q, v, t, params: -4.0 * q)
+    times = jnp.linspace(0.0, 1.0, 201)
+
+    def error(intervals):
+        path = hhtjax.simulate(
+            spring,
+            hhtjax.rk4(),
+            jnp.array([1.0]),
+            jnp.array([0.0]),
+            dt=1e-3,
+            num_steps=1000,
+            save_every=1000 // intervals,
+        )
+        between = hhtjax.interpolate(path, times)
+        return np.array(
+            [
+                np.max(np.abs(between.q[:, 0] - np.cos(2 * times))),
+                np.max(np.abs(between.v[:, 0] + 2 * np.sin(2 * times))),
+            ]
+        )
+
+    np.testing.assert_allclose(np.log2(error(10) / error(20)), 4, atol=0.15)
+
+
+def test_dense_output_meets_the_saved_states_and_keeps_trees():
+    q0 = {"b": jnp.asarray(0.2), "a": jnp.array([[0.5, 0.1]])}
+    v0 = jax.tree.map(jnp.zeros_like, q0)
+    system = hhtjax.System(jnp.ones(3), lambda q, v, t, params: jax.tree.map(lambda x: -x, q))
+    path = hhtjax.simulate(system, hhtjax.hht(), q0, v0, dt=0.1, num_steps=20, save_every=2)
+    at_nodes = hhtjax.interpolate(path, path.t)
+    for ours, saved in ((at_nodes.q, path.q), (at_nodes.v, path.v)):
+        assert jax.tree.structure(ours) == jax.tree.structure(q0)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-14), ours, saved)
+    assert hhtjax.interpolate(path, 0.33).q["a"].shape == (1, 2)
+    assert hhtjax.interpolate(path, jnp.zeros((3, 4))).q["a"].shape == (3, 4, 1, 2)
+
+
+def test_dense_output_is_differentiable():
+    """In the times, where the derivative of q is close to v, and in a parameter."""
+    path = run(DUFFING, hhtjax.hht(), 2000)
+    times = jnp.array([0.123, 0.777])
+    slopes = jax.jacfwd(lambda t: hhtjax.interpolate(path, t).q[:, 0])(times)
+    np.testing.assert_allclose(np.diag(slopes), hhtjax.interpolate(path, times).v[:, 0], atol=1e-6)
+
+    def late(k):
+        problem = DUFFING._replace(params={**DUFFING.params, "k": k})
+        return hhtjax.interpolate(run(problem, hhtjax.hht(), 200), 0.777).q[0]
+
+    central = (late(1.0 + 1e-5) - late(1.0 - 1e-5)) / 2e-5
+    assert float(jax.grad(late)(1.0)) == pytest.approx(float(central), rel=1e-7)
+    assert float(jax.jacfwd(late)(1.0)) == pytest.approx(float(central), rel=1e-7)
+
+
+def test_dense_output_outside_a_traced_run_is_nan():
+    path = run(DUFFING, hhtjax.hht(), 20)
+    values = jax.jit(lambda t: hhtjax.interpolate(path, t).q[:, 0])(jnp.array([-0.1, 1.0, 2.1]))
+    np.testing.assert_array_equal(np.isnan(values), [True, False, True])
+
+
+def test_progress_changes_neither_result_nor_gradient(capfd):
+    def loss(k, progress):
+        problem = DUFFING._replace(params={**DUFFING.params, "k": k})
+        return jnp.sum(run(problem, hhtjax.hht(), 300, progress=progress).q ** 2)
+
+    assert float(jax.jit(loss, static_argnums=1)(1.0, True)) == float(jax.jit(loss, static_argnums=1)(1.0, False))
+    jax.effects_barrier()
+    shown = capfd.readouterr().err
+    assert "step 300 of 300" in shown
+    assert "step 3 of 300" in shown
+    assert len(shown.split("\r")) == 101  # a hundred times, no oftener
+    for derivative in (jax.grad, jax.jacfwd):
+        assert float(derivative(loss)(1.0, True)) == float(derivative(loss)(1.0, False))
+    batch = jax.vmap(loss, in_axes=(0, None))(jnp.array([1.0, 2.0]), True)
+    np.testing.assert_array_equal(batch, jax.vmap(loss, in_axes=(0, None))(jnp.array([1.0, 2.0]), False))
+
+
+def pendulum_lagrangian(q, v, t, params):
+    """The double pendulum of `scenes.double_pendulum` from its energies."""
+    (m1, m2), (l1, l2), g = params["m"], params["l"], params["g"]
+    velocity1 = l1 * v[0] * jnp.stack([-jnp.sin(q[0]), jnp.cos(q[0])])
+    velocity2 = velocity1 + l2 * v[1] * jnp.stack([-jnp.sin(q[1]), jnp.cos(q[1])])
+    height1 = l1 * jnp.sin(q[0])
+    kinetic = m1 * jnp.sum(velocity1**2) / 2 + m2 * jnp.sum(velocity2**2) / 2
+    springs = params["k"][0] * q[0] ** 2 / 2 + params["k"][1] * (q[1] - q[0]) ** 2 / 2
+    return kinetic - m1 * g * height1 - m2 * g * (height1 + l2 * jnp.sin(q[1])) - springs
+
+
+def dampers(q, v, t, params):
+    first, second = double_pendulum.joint_torques(0 * q, v, params)
+    return jnp.stack([first - second, second])
+
+
+def test_lagrangian_system_equals_the_one_by_hand():
+    problem = PROBLEMS["forced double pendulum"]
+    derived = hhtjax.System.from_lagrangian(pendulum_lagrangian, dampers)
+    by_hand = hhtjax.System(double_pendulum.mass, double_pendulum.force)
+    q, v = jnp.array([0.4, -0.7]), jnp.array([1.2, -0.5])
+    np.testing.assert_allclose(derived.mass(q, problem.params), by_hand.mass(q, problem.params), rtol=1e-14)
+    for t in (0.0, 2.0):
+        expected = by_hand.force(q, v, t, problem.params)
+        np.testing.assert_allclose(derived.force(q, v, t, problem.params), expected, rtol=1e-13)
+    ends = [run(problem._replace(system=system), hhtjax.hht(), 50).q[-1] for system in (derived, by_hand)]
+    np.testing.assert_allclose(*ends, rtol=1e-11)
+
+
+def test_lagrangian_system_on_a_dict_with_explicit_time():
+    """A mass on a spring whose end is moved: L = m x'^2/2 - k (x - u(t))^2/2, and a charged term x' t."""
+
+    def lagrangian(q, v, t, params):
+        return params["m"] * v["x"] ** 2 / 2 - params["k"] * (q["x"] - jnp.sin(t)) ** 2 / 2 + v["x"] * t**2 * q["x"]
+
+    params = {"m": 2.0, "k": 3.0}
+    derived = hhtjax.System.from_lagrangian(lagrangian)
+    # d/dt (m x' + t^2 x) - (-k (x - sin t) + x' t^2) = m x'' + 2 t x + k (x - sin t)
+    by_hand = hhtjax.System(
+        jnp.array([2.0]), lambda q, v, t, p: {"x": -2 * t * q["x"] - p["k"] * (q["x"] - jnp.sin(t))}
+    )
+    ends = [
+        hhtjax.simulate(system, hhtjax.hht(), {"x": 0.1}, {"x": 1.0}, params, dt=0.02, num_steps=50).q["x"]
+        for system in (derived, by_hand)
+    ]
+    np.testing.assert_allclose(*ends, rtol=1e-12)
