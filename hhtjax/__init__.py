@@ -4,7 +4,6 @@ from hhtjax import scenes as scenes
 from hhtjax.identify import IdentifiabilityWarning as IdentifiabilityWarning
 from hhtjax.identify import fit as fit
 from hhtjax.sampled import sampled as sampled
-from hhtjax.simulate import PrecisionWarning as PrecisionWarning
 from hhtjax.simulate import SimulationError as SimulationError
 from hhtjax.simulate import interpolate as interpolate
 from hhtjax.simulate import simulate as simulate
@@ -17,6 +16,7 @@ from hhtjax.steppers.implicit_euler import implicit_euler as implicit_euler
 from hhtjax.steppers.kim2019 import kim_hht as kim_hht
 from hhtjax.steppers.kim2019 import kim_implicit_euler as kim_implicit_euler
 from hhtjax.system import LinearSystem as LinearSystem
+from hhtjax.system import PrecisionWarning as PrecisionWarning
 from hhtjax.system import System as System
 
 __version__ = "0.1.0"

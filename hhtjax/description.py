@@ -1,6 +1,7 @@
 """Frozen descriptions: hashable under jit, and pytrees whose arrays are data."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -13,6 +14,13 @@ def is_array(x):
 def is_concrete(x):
     """False for a tracer, whose value is not known while a function is being traced."""
     return not isinstance(x, Tracer)
+
+
+def is_real(x):
+    """A real number, or an array of them; no booleans, text, objects or complex numbers."""
+    if is_array(x):
+        return jnp.issubdtype(x.dtype, jnp.floating) or jnp.issubdtype(x.dtype, jnp.integer)
+    return isinstance(x, (int, float)) and not isinstance(x, bool)
 
 
 def _fingerprint(x):

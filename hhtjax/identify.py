@@ -148,7 +148,7 @@ def fit(
 def _fit(residuals, params0, scale, tolerance, optimizer, max_iterations, covariance, progress):
     p0, unravel = ravel_pytree(params0)
     scale, _ = ravel_pytree(scale)
-    tolerance = jnp.maximum(jnp.asarray(tolerance, p0.dtype), 10 * jnp.finfo(p0.dtype).eps)
+    tolerance = jnp.maximum(jnp.asarray(tolerance, p0.dtype), 10 * float(jnp.finfo(p0.dtype).eps))
 
     def f(x):
         r = residuals(unravel(scale * x))
@@ -198,7 +198,7 @@ def levenberg_marquardt(f, x, tolerance, max_iterations, progress):
 
     lam shrinks by 8 when a step lowers the cost and grows by 6 when it does not.
     """
-    eps = jnp.finfo(x.dtype).eps
+    eps = float(jnp.finfo(x.dtype).eps)
     running = jnp.asarray(RUNNING, jnp.int32)
 
     def look(x):
@@ -297,7 +297,7 @@ def _covariance(J, r):
     norms = jnp.linalg.norm(J, axis=0)
     column = jnp.where(norms == 0, 1, norms)
     _, s, Vt = jnp.linalg.svd(jnp.linalg.qr(J / column[None, :], mode="r"))
-    seen = s > 10 * m * jnp.finfo(J.dtype).eps * s[0]
+    seen = s > 10 * m * float(jnp.finfo(J.dtype).eps) * s[0]
     undetermined = jnp.any(~seen[:, None] & (jnp.abs(Vt) > 1e-6), axis=0)
     if m == p:  # nothing left to estimate the variance from
         undetermined = jnp.ones(p, bool)

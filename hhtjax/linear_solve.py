@@ -40,7 +40,7 @@ def matvec(A, x):
 
 
 def factorize(A):
-    """The function (b, trans) -> A^-1 b, or A^-T b for trans=1, with A factorised once; constant to autodiff."""
+    """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff."""
     A = lax.stop_gradient(A)
     if A.shape[-1] <= UNROLLED:
         return partial(_substitute, _lu(A))
@@ -52,7 +52,7 @@ def factorize_with(solve):
 
     def factorize(A):
         A = lax.stop_gradient(A)
-        return lambda b, trans: solve(A.T if trans else A, b)
+        return lambda b, trans=0: solve(A.T if trans else A, b)
 
     return factorize
 
@@ -87,7 +87,7 @@ def _lu(A):
     return A, order
 
 
-def _substitute(factors, b, trans):
+def _substitute(factors, b, trans=0):
     """x with L U x = b[order]; for trans=1, x with x[order] = z and (L U)^T z = b."""
     LU, order = factors
     n = LU.shape[0]

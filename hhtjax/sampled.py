@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import is_concrete
+from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.steppers.stepper import require_number
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("polynomials", "dt", "t0"), meta_fields=())
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sampled:
     """Piecewise polynomial through uniform samples, called with t; made by `sampled`."""
 
@@ -25,9 +25,11 @@ class Sampled:
     def __call__(self, t):
         """Value at time t, a scalar or an array; outside the samples, the nearest end value."""
         intervals, terms = self.polynomials.shape[:2]
-        x = jnp.clip((jnp.asarray(t, self.dt.dtype) - self.t0) / self.dt, 0, intervals)
-        i = jnp.minimum(x.astype(jnp.int32), intervals - 1)
-        x = (x - i.astype(x.dtype)).astype(self.polynomials.dtype)
+        x = (jnp.asarray(t).astype(self.dt.dtype) - self.t0) / self.dt
+        i = jnp.clip(jnp.floor(x), 0, intervals - 1)
+        x = x - i
+        x = jnp.where(x < 0, 0, jnp.where(x > 1, 1, x))  # at the ends the slope is the one inside
+        i = i.astype(jnp.int32)
         x = x.reshape(x.shape + (1,) * (self.polynomials.ndim - 2))
         coefficients = jnp.moveaxis(self.polynomials[i], jnp.ndim(t), 0)
         value = coefficients[-1]
@@ -60,13 +62,14 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
     """
     if order not in (1, 3):
         raise ValueError(f"sampled: `order` must be 1 (linear) or 3 (cubic); received {order!r}.")
-    values = jnp.asarray(values)
-    if jnp.issubdtype(values.dtype, jnp.complexfloating) or not jnp.issubdtype(values.dtype, jnp.number):
+    values = values if is_array(values) else np.asarray(values)
+    if not is_real(values) or values.dtype == jnp.float16:
         raise TypeError(f"sampled: `values` must be real numbers; received an array of {values.dtype}.")
+    values = jnp.asarray(values)
     if not jnp.issubdtype(values.dtype, jnp.floating):
         values = values.astype(jnp.result_type(float))
     needed = order + 1
-    if values.ndim == 0 or values.shape[0] < needed:
+    if values.ndim == 0 or values.shape[0] < needed or values.size == 0:
         raise ValueError(
             f"sampled: `values` must hold at least {needed} samples for order={order}; received shape {values.shape}."
         )
@@ -83,7 +86,7 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
         slope = _spline_slopes(rise)
         left, right = slope[:-1], slope[1:]
         polynomials = jnp.stack([values[:-1], left, 3 * rise - 2 * left - right, left + right - 2 * rise], axis=1)
-    return Sampled(polynomials, jnp.asarray(dt, values.dtype), jnp.asarray(t0, values.dtype))
+    return Sampled(polynomials, *(jnp.asarray(x).astype(values.dtype) for x in (dt, t0)))
 
 
 def _spline_slopes(rise):

@@ -1,7 +1,6 @@
 """The run: one scan over the steps, what it saves, and what it says about itself."""
 
 import sys
-import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,17 +10,13 @@ import numpy as np
 from jax import lax
 
 from hhtjax.checkpointing import checkpointed_scan
-from hhtjax.description import is_array, is_concrete
+from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.steppers.stepper import Info, Stepper, require_number
-from hhtjax.system import LinearSystem, System, describe, flatten
+from hhtjax.system import LinearSystem, System, flatten, initial_values
 
 
 class SimulationError(RuntimeError):
     """A run in which a step failed; raised by `Solution.check`."""
-
-
-class PrecisionWarning(UserWarning):
-    """The run is in single precision."""
 
 
 class Failure(NamedTuple):
@@ -56,18 +51,15 @@ class Solution(NamedTuple):
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
-        if not is_concrete(self.failure.step):
+        if not all(is_concrete(x) for x in (*self.failure, self.dt, self.t)):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
-        steps, newton, dt, start = (np.asarray(x) for x in (*self.failure, self.dt, self.t[..., 0]))
+        steps = np.asarray(self.failure.step)
         if not steps.any():
             return
         member = tuple(int(i) for i in np.argwhere(steps)[0])
-        step, newton, dt, start = (np.broadcast_to(x, steps.shape)[member] for x in (steps, newton, dt, start))
-        which = (
-            f"member {', '.join(map(str, member))} ({np.count_nonzero(steps)} of {steps.size} failed), "
-            if member
-            else ""
-        )
+        step, newton, dt, start = (np.asarray(x)[member] for x in (*self.failure, self.dt, self.t[..., 0]))
+        failed = f"({np.count_nonzero(steps)} of {steps.size} failed)"
+        which = f"member {', '.join(map(str, member))} {failed}, " if member else ""
         why = (
             "Newton's iteration did not converge; the state is still finite. Take a smaller dt, "
             "or more max_iterations, or a larger tolerance"
@@ -124,7 +116,8 @@ def simulate(system, stepper, q0, v0, params=None, *, dt, num_steps, t0=0.0, sav
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
-    q0, v0 = _initial_values(q0, v0)
+    q0, v0 = initial_values("simulate", q0, v0)
+    dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew
     return _simulate(
         system, stepper, q0, v0, params, dt, t0, num_steps=int(num_steps), save_every=int(save_every), progress=progress
     )
@@ -134,6 +127,7 @@ def simulate(system, stepper, q0, v0, params=None, *, dt, num_steps, t0=0.0, sav
 def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every, progress):
     flat, q, v = flatten("simulate", system, q0, v0, t0, params)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
+    stepper = stepper.astype(q.dtype)
     take_step = stepper.bind(flat, params, dt)
 
     def step(carry):
@@ -170,7 +164,7 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
 
 
 def _first_failure(failure, count, state, info):
-    finite = jnp.all(jnp.isfinite(state.q) & jnp.isfinite(state.v))
+    finite = jnp.all(jnp.isfinite(state.q) & jnp.isfinite(state.v) & jnp.isfinite(state.w))
     failed = ~finite if info.converged is None else ~(finite & info.converged)
     first = failed & (failure.step == 0)
     return Failure(jnp.where(first, count, failure.step), jnp.where(first, finite, failure.newton))
@@ -190,43 +184,6 @@ def _join(info, new):
     return Info(
         jnp.maximum(info.residual, new.residual), info.iterations + new.iterations, info.converged & new.converged
     )
-
-
-def _initial_values(q0, v0):
-    """q0 and v0 as arrays of one float dtype, checked."""
-    structures = [jax.tree.structure(x) for x in (q0, v0)]
-    if structures[0] != structures[1]:
-        raise ValueError(
-            f"simulate: `v0` must be a pytree structured like q0, {structures[0]}; received {structures[1]}."
-        )
-    if not jax.tree.leaves(q0):
-        raise ValueError(f"simulate: `q0` must hold at least one number; received {q0!r}.")
-    for name, values in (("q0", q0), ("v0", v0)):
-        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
-            where = f"`{name}{jax.tree_util.keystr(path)}`"
-            if not (is_array(leaf) or isinstance(leaf, (int, float, complex))) or isinstance(leaf, bool):
-                raise TypeError(f"simulate: {where} must be an array or a number; received {leaf!r}.")
-            dtype = jnp.result_type(leaf)
-            if not (jnp.issubdtype(dtype, jnp.integer) or dtype in (jnp.float32, jnp.float64)):
-                raise TypeError(f"simulate: {where} must be float32 or float64; received {dtype}.")
-            if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
-                raise ValueError(f"simulate: {where} must be finite; received {leaf!r}.")
-    shapes = [[jnp.shape(x) for x in jax.tree.leaves(y)] for y in (q0, v0)]
-    if shapes[0] != shapes[1]:
-        raise ValueError(f"simulate: `v0` must have the shapes of q0, {describe(q0)}; received {describe(v0)}.")
-    dtypes = {jnp.result_type(x) for x in jax.tree.leaves((q0, v0)) if is_array(x)}
-    floats = {x for x in dtypes if jnp.issubdtype(x, jnp.floating)}
-    if len(floats) > 1:
-        raise TypeError(f"simulate: `q0` and `v0` must share one dtype; received {describe(q0)} and {describe(v0)}.")
-    dtype = floats.pop() if floats else jnp.result_type(float)
-    if dtype == jnp.float32:
-        warnings.warn(
-            "simulate: in float32 expect about 4 correct digits at best, fewer on stiff systems and small steps: "
-            "for float64 call jax.config.update('jax_enable_x64', True) before creating arrays.",
-            PrecisionWarning,
-            stacklevel=3,
-        )
-    return (jax.tree.map(lambda x: jnp.asarray(x, dtype), values) for values in (q0, v0))
 
 
 def _show_progress(count, num_steps):
@@ -269,9 +226,14 @@ def interpolate(solution, times) -> Interpolant:
     2.19344
     """
     t = solution.t
-    times = jnp.asarray(times, t.dtype)
+    if t.ndim != 1:
+        raise ValueError(f"interpolate: `solution` must be of one run (vmap over a batch); received t of {t.shape}.")
+    times = times if is_array(times) else np.asarray(times)
+    if not is_real(times):
+        raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
+    times = jnp.asarray(times).astype(t.dtype)
     start, end, H = t[0], t[-1], t[1] - t[0]
-    slack = 16 * jnp.finfo(t.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
+    slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
     outside = ~((times >= start - slack) & (times <= end + slack))
     if is_concrete(outside) and np.any(outside):
         bad = np.asarray(times)[np.asarray(outside)].flat[0]

@@ -1,5 +1,6 @@
 """What is simulated: M(q) w = Q(q, v, t), described by plain functions of pytrees."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import Description, is_array, is_concrete
+from hhtjax.description import Description, is_array, is_concrete, is_real
 from hhtjax.linear_solve import factorize, matvec, solve
 
 
@@ -51,11 +52,11 @@ class System(Description):
     constraint: Callable | None = None
 
     def __post_init__(self):
-        _require_function("System", "force", self.force, "force(q, v, t, params)")
+        require_function("System", "force", self.force, "force(q, v, t, params)")
         if self.constraint is not None:
-            _require_function("System", "constraint", self.constraint, "constraint(q, t, params)")
+            require_function("System", "constraint", self.constraint, "constraint(q, t, params)")
         if callable(self.mass):
-            _require_function("System", "mass", self.mass, "mass(q, params)")
+            require_function("System", "mass", self.mass, "mass(q, params)")
         else:
             object.__setattr__(self, "mass", _constant_matrix("System", "mass", self.mass))
 
@@ -77,9 +78,9 @@ class System(Description):
         >>> float(spring.force(0.1, 0.0, 0.0, {"m": 2.0, "k": 30.0}))
         -3.0
         """
-        _require_function("System.from_lagrangian", "lagrangian", lagrangian, "lagrangian(q, v, t, params)")
+        require_function("System.from_lagrangian", "lagrangian", lagrangian, "lagrangian(q, v, t, params)")
         if force is not None:
-            _require_function("System.from_lagrangian", "force", force, "force(q, v, t, params)")
+            require_function("System.from_lagrangian", "force", force, "force(q, v, t, params)")
         return cls(_LagrangianMass(lagrangian), _LagrangianForce(lagrangian, force))
 
 
@@ -146,12 +147,12 @@ class LinearSystem(Description):
             if matrix is None and name != "M":
                 pass
             elif callable(matrix):
-                _require_function("LinearSystem", name, matrix, f"{name}(params)")
+                require_function("LinearSystem", name, matrix, f"{name}(params)")
             else:
                 matrix = _constant_matrix("LinearSystem", name, matrix)
             object.__setattr__(self, name, matrix)
         if force is not None:
-            _require_function("LinearSystem", "force", force, "force(t, params)")
+            require_function("LinearSystem", "force", force, "force(t, params)")
         object.__setattr__(self, "load", force)
 
     constraint = None
@@ -167,7 +168,7 @@ class LinearSystem(Description):
         Q = jnp.zeros_like(v) if self.load is None else ravel_pytree(self.load(t, params))[0]
         for matrix, x in ((self.C, v), (self.K, q)):
             if matrix is not None:
-                Q = Q - matvec(matrix(params) if callable(matrix) else jnp.asarray(matrix, x.dtype), x)
+                Q = Q - matvec(_as_matrix(matrix(params) if callable(matrix) else matrix, x.dtype), x)
         return unravel(Q)
 
 
@@ -190,6 +191,47 @@ class FlatSystem(NamedTuple):
         return Q / M if M.ndim == 1 else solve(M, Q, factorize)
 
 
+class PrecisionWarning(UserWarning):
+    """The state is in single precision."""
+
+
+def initial_values(caller, q0, v0):
+    """q0 and v0 as arrays of one float dtype, checked."""
+    if not sum(np.size(x) for x in jax.tree.leaves(q0)):
+        raise ValueError(f"{caller}: `q0` must hold at least one number; received {q0!r}.")
+    structure = jax.tree.structure(q0)
+    if jax.tree.structure(v0) != structure:
+        raise ValueError(
+            f"{caller}: `v0` must be a pytree structured like q0, {structure}; received {jax.tree.structure(v0)}."
+        )
+    dtypes = set()
+    for name, values in (("q0", q0), ("v0", v0)):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
+            where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
+            if not is_array(leaf) and (isinstance(leaf, bool) or not isinstance(leaf, (int, float, complex))):
+                raise TypeError(f"{where} must be an array or a number; received {leaf!r}.")
+            dtype = leaf.dtype if is_array(leaf) else np.result_type(leaf)
+            if not is_real(leaf) or dtype in (jnp.float16, jnp.bfloat16):
+                raise TypeError(f"{where} must be float32 or float64; received {dtype}.")
+            if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
+                raise ValueError(f"{where} must be finite; received {leaf!r}.")
+            if is_array(leaf) and jnp.issubdtype(dtype, jnp.floating):
+                dtypes.add(jnp.result_type(leaf))  # what JAX makes of it: float32 without x64
+    if jax.tree.map(jnp.shape, q0) != jax.tree.map(jnp.shape, v0):
+        raise ValueError(f"{caller}: `v0` must have the shapes of q0, {describe(q0)}; received {describe(v0)}.")
+    if len(dtypes) > 1:
+        raise TypeError(f"{caller}: `q0` and `v0` must share one dtype; received {describe(q0)} and {describe(v0)}.")
+    dtype = dtypes.pop() if dtypes else jnp.result_type(float)
+    if dtype == jnp.float32:
+        warnings.warn(
+            f"{caller}: in float32 expect about 4 correct digits at best, fewer on stiff systems and small steps: "
+            "for float64 call jax.config.update('jax_enable_x64', True) before creating arrays.",
+            PrecisionWarning,
+            stacklevel=3,
+        )
+    return (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0))
+
+
 def flatten(caller, system, q0, v0, t0, params):
     """The system on vectors, and q0, v0 as vectors: the one place where pytrees are ravelled.
 
@@ -204,31 +246,57 @@ def flatten(caller, system, q0, v0, t0, params):
             "use minimal coordinates and constraint=None."
         )
 
-    M = _evaluate(caller, "mass", system.mass, q0, params) if callable(system.mass) else system.mass
-    if not hasattr(M, "shape") or M.shape not in ((n, n), (n,), *(((),) if n == 1 else ())):
-        raise ValueError(
-            f"{caller}: `mass` must give an array of shape ({n}, {n}), or ({n},) for a diagonal; "
-            f"received {describe(M)}."
-        )
-    Q = _evaluate(caller, "force", system.force, q0, v0, t0, params)
+    if isinstance(system, LinearSystem):
+        for name in ("M", "C", "K"):
+            matrix = getattr(system, name)
+            if matrix is not None:
+                _check_matrix(caller, name, matrix, n, dtype, params)
+    else:
+        _check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
+    if isinstance(system, LinearSystem) and system.load is not None:
+        Q = _evaluate(caller, "force", system.load, t0, params)
+    else:
+        Q = _evaluate(caller, "force", system.force, q0, v0, t0, params)
     if jax.tree.structure(Q) != jax.tree.structure(v0) or jax.tree.map(jnp.shape, Q) != jax.tree.map(jnp.shape, v0):
         raise ValueError(f"{caller}: `force` must return a pytree like v0, {describe(v0)}; received {describe(Q)}.")
-    for name, value in (("mass", M if callable(system.mass) else ()), ("force", Q)):
-        found = jnp.result_type(dtype, *jax.tree.leaves(value))
-        if found != dtype:
-            raise TypeError(
-                f"{caller}: `{name}` returned {found} for a state of {dtype}; give params, and arrays made "
-                f"inside `{name}`, the dtype of q0, or q0 and v0 the dtype of params."
-            )
+    _check_dtype(caller, "force", Q, dtype)
 
     def mass(q, params):
         M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
-        return jnp.atleast_1d(jnp.asarray(M, dtype))
+        return _as_matrix(M, dtype)
 
     def force(q, v, t, params):
         return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0].astype(dtype)
 
     return FlatSystem(mass, force, n, isinstance(system, LinearSystem), unravel), q, v
+
+
+def _as_matrix(value, dtype):
+    """(n, n) or (n,), of the dtype of the state; a scalar is the matrix of one degree of freedom."""
+    return jnp.atleast_1d(jnp.asarray(value)).astype(dtype)
+
+
+def _check_matrix(caller, name, matrix, n, dtype, *args):
+    """A constant matrix, or the result of a function, of a shape that fits n and a dtype that fits the state."""
+    value = _evaluate(caller, name, matrix, *args) if callable(matrix) else matrix
+    shapes = [(n, n), (n,)] + [()] * (n == 1)
+    if not (hasattr(value, "shape") and value.shape in shapes):
+        raise ValueError(
+            f"{caller}: `{name}` must give an array of shape ({n}, {n}), or ({n},) for a diagonal; "
+            f"received {describe(value)}."
+        )
+    if callable(matrix):
+        _check_dtype(caller, name, value, dtype)
+
+
+def _check_dtype(caller, name, value, dtype):
+    for leaf in jax.tree.leaves(value):
+        found = jnp.result_type(leaf)
+        if found != dtype and not leaf.weak_type and not jnp.issubdtype(found, jnp.integer):
+            raise TypeError(
+                f"{caller}: `{name}` returned {found} for a state of {dtype}; give params, and arrays made "
+                f"inside `{name}`, the dtype of q0, or q0 and v0 the dtype of params."
+            )
 
 
 def _evaluate(caller, name, function, *args):
@@ -250,7 +318,7 @@ def describe(x):
     return ", ".join(words) or "nothing"
 
 
-def _require_function(caller, name, value, signature):
+def require_function(caller, name, value, signature):
     if not callable(value):
         raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
     try:
@@ -262,13 +330,19 @@ def _require_function(caller, name, value, signature):
         ) from None
 
 
-def _constant_matrix(caller, name, value):
+def _constant_matrix(caller, name, received):
     try:
-        value = value if is_array(value) else np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise TypeError(f"{caller}: `{name}` must be a function or an array; received {value!r}.") from None
-    if not jnp.issubdtype(value.dtype, jnp.number) or jnp.issubdtype(value.dtype, jnp.complexfloating):
-        raise TypeError(f"{caller}: `{name}` must be real; received an array of {value.dtype}.")
+        value = received if is_array(received) else np.asarray(received)
+    except ValueError:  # a ragged list
+        value = np.asarray(None)
+    if not is_real(value):
+        if is_array(received) or (isinstance(received, (list, tuple)) and value.ndim):
+            raise TypeError(f"{caller}: `{name}` must be real; received an array of {value.dtype}.")
+        raise TypeError(f"{caller}: `{name}` must be a function or an array; received {received!r}.")
+    if not is_array(received):
+        value = value.astype(float)
+    if value.ndim == 0:
+        value = value.reshape(1)
     if value.ndim not in (1, 2) or value.shape[0] != value.shape[-1]:
         raise ValueError(
             f"{caller}: `{name}` must have shape (n, n), or (n,) for a diagonal; received shape {value.shape}."

