@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hhtjax.linear_solve import UNROLLED, factorize, matvec, solve
+from hhtjax.linear_solve import UNROLLED, factorize, factorize_with, matvec, solve, solve_map
 
 SIZES = range(1, 13)
 
@@ -212,16 +212,20 @@ def count_primitives(function, *args):
     return counts
 
 
-@pytest.mark.parametrize("n", [3, UNROLLED + 1])
-def test_one_factorisation_serves_many_right_hand_sides(n):
+FACTORS = [(factorize, 3), (factorize, UNROLLED + 1), (factorize_with(jnp_solve), 3)]
+
+
+@pytest.mark.parametrize(("factors", "n"), FACTORS)
+def test_one_factorisation_serves_many_right_hand_sides_and_the_transpose(factors, n):
     A, b = zero_diagonal(n)
 
     def many(A, b):
-        apply = factorize(A)
-        return apply(b) + apply(2 * b) + apply(jnp.sin(b))
+        inverse = factors(A)
+        return inverse(b) + inverse(jnp.sin(b)), inverse(b, trans=1)
 
-    expected = np.linalg.solve(A, 3 * b + np.sin(b))
-    assert np.allclose(jax.jit(many)(A, b), expected, rtol=1e-11, atol=1e-12)
+    plain, transposed = jax.jit(many)(A, b)
+    assert np.allclose(plain, np.linalg.solve(A, b + np.sin(b)), rtol=1e-11, atol=1e-12)
+    assert np.allclose(transposed, np.linalg.solve(A.T, b), rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [4, UNROLLED + 1])
@@ -230,35 +234,60 @@ def test_the_factors_are_computed_once_also_for_derivatives(n):
     A, b = zero_diagonal(n)
 
     def many(A, b):
-        apply = factorize(A)
-        return jnp.sum(apply(b) * apply(jnp.sin(b)))
+        inverse = factorize(A)
+        return jnp.sum(inverse(b) * inverse(jnp.sin(b)))
 
     name, once = ("abs", (n - 1) + n * (n - 1) // 2) if n <= UNROLLED else ("lu", 1)
-    for function in (many, jax.grad(many, argnums=(0, 1)), jax.jacfwd(many, argnums=(0, 1))):
-        assert count_primitives(function, A, b)[name] == once
+    assert count_primitives(many, A, b)[name] == once
+    assert count_primitives(jax.grad(many, argnums=1), A, b)[name] == once
+    for derivative in (jax.grad, jax.jacfwd):
+        assert count_primitives(derivative(curved(solve), argnums=(0, 1)), A, b)[name] == once
 
 
-def test_derivatives_through_one_factorisation_used_twice():
-    """A enters through both applications, one of them inside the other."""
-    A, b = permuted(2)
-
-    def twice(A, b):
-        apply = factorize(A)
-        return jnp.sum(jnp.sin(apply(apply(b))))
-
-    def reference(A, b):
-        return jnp.sum(jnp.sin(jnp.linalg.solve(A, jnp.linalg.solve(A, b))))
+@pytest.mark.parametrize("n", [3, 9])
+def test_the_matrix_of_factors_is_constant_to_autodiff_and_the_right_hand_side_is_not(n):
+    A, b = permuted(n)
 
     def derivatives(A, b):
         return (
-            jax.grad(reference, argnums=(0, 1))(A, b),
-            jax.grad(twice, argnums=(0, 1))(A, b),
-            jax.jacfwd(twice, argnums=(0, 1))(A, b),
+            jax.grad(lambda A: jnp.sum(factorize(A)(b)))(A),
+            jax.jacfwd(lambda b: factorize(A)(b))(b),
+            jax.jacrev(lambda b: factorize(A)(b))(b),
         )
 
-    for expected, reverse, forward in zip(*jax.jit(derivatives)(A, b), strict=True):
-        assert np.max(np.abs(reverse - expected)) < 1e-11 * np.max(np.abs(expected))
-        assert np.max(np.abs(forward - expected)) < 1e-11 * np.max(np.abs(expected))
+    zero, forward, reverse = jax.jit(derivatives)(A, b)
+    assert np.all(zero == 0)
+    assert np.allclose(forward, np.linalg.inv(A), rtol=1e-12, atol=1e-13)
+    assert np.allclose(reverse, np.linalg.inv(A), rtol=1e-12, atol=1e-13)
+
+
+# ---------------------------------------------------------------------------------------------- solve_map
+
+
+@pytest.mark.parametrize(("factors", "n"), FACTORS)
+def test_a_linear_map_is_solved_and_differentiated_through_the_map(factors, n):
+    """The matrix serves to find x only: derivatives with respect to what the map depends on come through the map."""
+    A, b = permuted(n)
+
+    def by_map(scale, b):
+        return jnp.sum(jnp.sin(solve_map(lambda x: matvec(A + scale * A.T, x), b, factors)))
+
+    def by_matrix(scale, b):
+        return jnp.sum(jnp.sin(jnp.linalg.solve(A + scale * A.T, b)))
+
+    def derivatives(scale, b):
+        return (
+            (
+                by_map(scale, b),
+                jax.grad(by_map, argnums=(0, 1))(scale, b),
+                jax.jacfwd(by_map, argnums=(0, 1))(scale, b),
+            ),
+            (by_matrix(scale, b), *2 * (jax.grad(by_matrix, argnums=(0, 1))(scale, b),)),
+        )
+
+    found, expected = jax.jit(derivatives)(0.1, b)
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert np.allclose(x, y, rtol=1e-10, atol=1e-12)
 
 
 # ---------------------------------------------------------------------------------------------- matvec

@@ -70,7 +70,7 @@ def simulate_all(scene, num_steps, method):
     steps_between = jnp.maximum(1, num_steps // SAMPLES)
 
     def simulate_one(corrected, alpha):
-        stepper = hht(alpha, **METHODS[method])
+        stepper = hht(alpha, start="corrected", **METHODS[method])
 
         def step(i, carry):
             state, path, farthest, failures = carry
