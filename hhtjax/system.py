@@ -210,7 +210,7 @@ def initial_values(caller, q0, v0):
             where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
             if not is_array(leaf) and (isinstance(leaf, bool) or not isinstance(leaf, (int, float, complex))):
                 raise TypeError(f"{where} must be an array or a number; received {leaf!r}.")
-            dtype = leaf.dtype if is_array(leaf) else np.result_type(leaf)
+            dtype = getattr(leaf, "dtype", None) or np.result_type(leaf)
             if not is_real(leaf) or dtype in (jnp.float16, jnp.bfloat16):
                 raise TypeError(f"{where} must be float32 or float64; received {dtype}.")
             if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
@@ -292,7 +292,8 @@ def _check_matrix(caller, name, matrix, n, dtype, *args):
 def _check_dtype(caller, name, value, dtype):
     for leaf in jax.tree.leaves(value):
         found = jnp.result_type(leaf)
-        if found != dtype and not leaf.weak_type and not jnp.issubdtype(found, jnp.integer):
+        number = jnp.issubdtype(found, jnp.integer) or (leaf.weak_type and jnp.issubdtype(found, jnp.floating))
+        if found != dtype and not number:
             raise TypeError(
                 f"{caller}: `{name}` returned {found} for a state of {dtype}; give params, and arrays made "
                 f"inside `{name}`, the dtype of q0, or q0 and v0 the dtype of params."

@@ -464,7 +464,7 @@ def test_interpolate_refuses_times_outside_the_run(times, received):
 def test_interpolate_takes_the_ends_up_to_rounding_and_gives_nan_for_tracers_outside():
     solution = run(t0=2.0)
     ends = np.array([2.0 - 4e-16, 2.4 + 9e-16])
-    assert np.allclose(interpolate(solution, ends).q, solution.q[np.array([0, -1])], rtol=1e-14)
+    assert np.allclose(interpolate(solution, ends).q, np.asarray(solution.q)[[0, -1]], rtol=1e-14)
     q = jax.jit(lambda times: interpolate(solution, times).q)(np.array([1.9, 2.1, 2.5]))
     assert np.isnan(q[:, 0]).tolist() == [True, False, True]
 
@@ -490,7 +490,7 @@ def first_not_finite(path):
     return 0 if finite.all() else int(np.argmin(finite))
 
 
-BREAKING = [(push, "rk4")] + [(bounded, name) for name in ("rk4", "hht", "hht state", "kim_implicit_euler")]
+BREAKING = [(push, "rk4")] + [(bounded, name) for name in ("rk4", "hht state", "kim_implicit_euler")]
 
 
 @pytest.mark.parametrize(("force", "name"), BREAKING)
@@ -506,8 +506,7 @@ def test_check_names_the_first_step_that_is_not_finite(force, name):
 
 
 def test_check_is_silent_when_all_is_well():
-    for stepper in (STEPPERS["rk4"], STEPPERS["hht converged"]):
-        assert run(stepper=stepper).check() is None
+    assert run().check() is None
     assert jax.vmap(lambda q0: run(q0=q0))(jnp.ones((3, 1))).check() is None
 
 
@@ -547,8 +546,8 @@ TWO_ITERATIONS = hhtjax.hht(iterations=None, max_iterations=2)
 
 def first_unbalanced(path, params):
     """Number of the first step after which M w - Q exceeds Newton's tolerance; from a path that holds every step."""
-    Q = jax.vmap(lambda q, v, t: kick(q, v, t, params))(path.q, path.v, path.t)
-    unbalanced = np.max(np.abs(path.acceleration - Q), axis=1) > 1e-9
+    Q = jax.jit(jax.vmap(kick, in_axes=(0, 0, 0, None)))(path.q, path.v, path.t, params)
+    unbalanced = np.max(np.abs(np.asarray(path.acceleration) - np.asarray(Q)), axis=1) > 1e-9
     return int(np.argmax(unbalanced)), int(unbalanced.sum())
 
 
@@ -637,13 +636,12 @@ def test_all_arguments_may_be_tracers_of_jit():
     assert np.allclose(jax.jit(lambda x: outcome(**x))(TRACED), outcome(**TRACED), rtol=1e-13, atol=0)
 
 
-@pytest.mark.parametrize("names", [tuple(TRACED), ("dt",)], ids=" ".join)
-def test_arguments_may_be_tracers_of_vmap(names):
-    batch = {name: jnp.stack([jnp.asarray(TRACED[name]), 0.9 * jnp.asarray(TRACED[name])]) for name in names}
-    results = jax.vmap(lambda x: outcome(**{**TRACED, **x}))(batch)
+def test_all_arguments_may_be_tracers_of_vmap():
+    batch = {name: np.stack([value, 0.9 * np.asarray(value)]) for name, value in TRACED.items()}
+    f = jax.jit(lambda x: outcome(**x))
+    results = jax.jit(jax.vmap(f))(batch)
     for i in range(2):
-        member = {name: x[i] for name, x in batch.items()}
-        assert np.allclose(results[i], outcome(**{**TRACED, **member}), rtol=1e-13, atol=0)
+        assert np.allclose(results[i], f({name: x[i] for name, x in batch.items()}), rtol=1e-13, atol=0)
     assert results[0] != results[1]
 
 

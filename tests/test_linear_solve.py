@@ -152,21 +152,20 @@ def all_gradients(A, b):
     )
 
 
-@pytest.mark.parametrize("n", [1, 3, 6, 9])
+@pytest.mark.parametrize("n", [1, 5, 9])
 def test_gradients(n):
     """Forward = reverse = those of jnp.linalg.solve."""
     derivatives = jax.jit(all_gradients)
     for kind in (zero_diagonal, permuted, spd):
-        for reverse, forward, expected in zip(*derivatives(*kind(n)), strict=True):
+        for reverse, forward, expected in zip(*jax.device_get(derivatives(*kind(n))), strict=True):
             size = np.max(np.abs(expected))
             assert size > 0
             assert np.max(np.abs(reverse - forward)) < 1e-11 * size, kind.__name__
             assert np.max(np.abs(reverse - expected)) < 1e-11 * size, kind.__name__
 
 
-@pytest.mark.parametrize("n", [2, 9])
-def test_gradients_under_vmap(n):
-    arguments = [np.stack(x) for x in zip(zero_diagonal(n), permuted(n), spd(n), strict=True)]
+def test_gradients_under_vmap():
+    arguments = [np.stack(x) for x in zip(zero_diagonal(3), permuted(3), spd(3), strict=True)]
     for reverse, forward, expected in zip(*jax.jit(jax.vmap(all_gradients))(*arguments), strict=True):
         assert np.allclose(reverse, forward, rtol=1e-10, atol=1e-12)
         assert np.allclose(reverse, expected, rtol=1e-10, atol=1e-12)
@@ -175,7 +174,6 @@ def test_gradients_under_vmap(n):
 @pytest.mark.parametrize(
     ("n", "outer", "inner"),
     [
-        (2, jax.jacrev, jax.jacrev),
         (2, jax.jacfwd, jax.jacrev),
         (9, jax.jacrev, jax.jacfwd),
     ],
@@ -310,7 +308,7 @@ def products(A, x):
 def test_products(n, dtype):
     A, x = (y.astype(dtype) for y in random_matrix(n))
     expected = A @ x, np.diag(A) * x, np.stack([A @ x, 2 * A @ x]), A, np.broadcast_to(x, (n, n))
-    for y, z in zip(products(A, x), expected, strict=True):
+    for y, z in zip(jax.device_get(products(A, x)), expected, strict=True):
         assert y.dtype == dtype
         assert y.shape == z.shape
         assert np.max(np.abs(y - z)) < 100 * np.finfo(dtype).eps
