@@ -320,6 +320,7 @@ def describe(x):
 
 
 def require_function(caller, name, value, signature):
+    """An error unless `value` can be called, and is hashable, as a static argument of jit has to be."""
     if not callable(value):
         raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
     try:

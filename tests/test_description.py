@@ -53,6 +53,7 @@ ONE, TWO = np.ones(1), np.full(1, 2.0)
 DESCRIPTIONS = {
     "mass 1": lambda: System(np.ones(1), pull),
     "mass 2": lambda: System(np.full(1, 2.0), pull),
+    "mass 1 read as an integer": lambda: System(np.ones(1).view(np.int64), pull),
     "mass matrix": lambda: System(np.ones((1, 1)), pull),
     "mass of two": lambda: System(np.ones(2), pull),
     "float32 mass": lambda: System(np.ones(1, np.float32), pull),
