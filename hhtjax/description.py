@@ -43,9 +43,12 @@ class Description:
 
     def tree_flatten(self):
         """Arrays as leaves, everything else as static data."""
-        leaves, structure = jax.tree.flatten(vars(self))
-        data = [x for x in leaves if is_array(x)]
-        static = tuple(None if is_array(x) else x for x in leaves)
+        leaves, structure = self._flatten()
+        places = vars(self).get("_places")  # of the arrays, where JAX has put something else in
+        if places is None or len(places) != len(leaves):
+            places = tuple(map(is_array, leaves))
+        data = [x for x, here in zip(leaves, places, strict=True) if here]
+        static = tuple(None if here else x for x, here in zip(leaves, places, strict=True))
         return data, (structure, static)
 
     @classmethod
@@ -55,9 +58,12 @@ class Description:
         data = iter(data)
         fields = jax.tree.unflatten(structure, [next(data) if x is None else x for x in static])
         self = object.__new__(cls)
-        for name, value in fields.items():
+        for name, value in (*fields.items(), ("_places", tuple(x is None for x in static))):
             object.__setattr__(self, name, value)
         return self
+
+    def _flatten(self):
+        return jax.tree.flatten({name: value for name, value in vars(self).items() if name != "_places"})
 
     def __eq__(self, other):
         return type(self) is type(other) and self._key() == other._key()
@@ -66,5 +72,5 @@ class Description:
         return hash((type(self), self._key()))
 
     def _key(self):
-        leaves, structure = jax.tree.flatten(vars(self))
+        leaves, structure = self._flatten()
         return structure, tuple(_fingerprint(x) for x in leaves)
