@@ -220,5 +220,6 @@ def plot_step_sizes(report: Report, rows):
         axis.set_xlabel("steps per sample")
         axis.set_ylabel(label)
     axes[0].set_yticks([0.3, 0.5, 1.0, 2.0, 3.0])
+    axes[1].set_yticks([0.05, 0.1, 0.2, 0.5, 1.0])
     axes[0].legend()
     report.figure("silverbox_step_size", figure)
