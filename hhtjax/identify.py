@@ -17,10 +17,9 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from hhtjax import least_squares
-from hhtjax.description import is_array, is_concrete
+from hhtjax.boundary import require_function, require_number
+from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.least_squares import BAD_START, COST, GRADIENT, REASONS, STEP, History
-from hhtjax.steppers.stepper import require_number
-from hhtjax.system import require_function
 
 
 class IdentifiabilityWarning(UserWarning):
@@ -191,10 +190,9 @@ def _parameters(params0, scale):
 
 
 def _check_real(where, leaf):
-    kinds = (jnp.floating, jnp.integer)
     if not (is_array(leaf) or isinstance(leaf, (int, float))) or isinstance(leaf, bool):
         raise TypeError(f"fit: {where} must be a real number or array; received {leaf!r}.")
-    if not any(jnp.issubdtype(jnp.result_type(leaf), kind) for kind in kinds):
+    if not is_real(leaf):
         raise TypeError(f"fit: {where} must be real; received {jnp.result_type(leaf)}.")
     if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
         raise ValueError(f"fit: {where} must be finite; received {leaf}.")

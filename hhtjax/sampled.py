@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.boundary import require_number
 from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.steppers.stepper import require_number
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("polynomials", "dt", "t0"), meta_fields=())

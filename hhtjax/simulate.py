@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpointed_scan
 from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.steppers.stepper import Info, Stepper, require_number
+from hhtjax.steppers.stepper import Info, Stepper
 from hhtjax.system import LinearSystem, System, flatten, initial_values
 
 

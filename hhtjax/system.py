@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from hhtjax.boundary import require_function
 from hhtjax.description import Description, is_array, is_concrete, is_real
 from hhtjax.linear_solve import factorize, matvec, solve
 
@@ -317,19 +318,6 @@ def describe(x):
         what = f"shape {jnp.shape(leaf)} {jnp.result_type(leaf)}" if known else repr(leaf)
         words.append(f"{jax.tree_util.keystr(path)}: {what}" if path else what)
     return ", ".join(words) or "nothing"
-
-
-def require_function(caller, name, value, signature):
-    """An error unless `value` can be called, and is hashable, as a static argument of jit has to be."""
-    if not callable(value):
-        raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
-    try:
-        hash(value)
-    except TypeError:
-        raise TypeError(
-            f"{caller}: `{name}` must be hashable, because it is static under jit; received {value!r}. "
-            "Pass arrays through params."
-        ) from None
 
 
 def _constant_matrix(caller, name, received):

@@ -20,10 +20,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.boundary import require_function, require_number
 from hhtjax.description import is_concrete
 from hhtjax.linear_solve import factorize, factorize_with, solve_map
-from hhtjax.steppers.stepper import Info, State, Stepper, require_number
-from hhtjax.system import require_function
+from hhtjax.steppers.stepper import Info, State, Stepper
 
 LINEARIZATIONS = ("predictor", "held", "state", "auto")
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred

@@ -10,9 +10,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from hhtjax.boundary import require_number
 from hhtjax.description import is_concrete
 from hhtjax.linear_solve import solve
-from hhtjax.steppers.stepper import Info, State, Stepper, require_number
+from hhtjax.steppers.stepper import Info, State, Stepper
 
 
 def linearize_at_state(system, params, s):

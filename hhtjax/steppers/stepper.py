@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import Description, is_concrete, is_real
+from hhtjax.description import Description
 from hhtjax.system import flatten, initial_values
 
 
@@ -84,12 +84,3 @@ class Stepper(Description):
 def _unravel(flat, state):
     fields = {name: flat.unravel(x) for name, x in state._asdict().items() if name != "t" and x is not None}
     return state._replace(**fields)
-
-
-def require_number(caller, name, value, valid, expectation):
-    """The value as it is, if it is a real scalar within its range; a tracer passes unchecked."""
-    if not is_real(value) or jnp.ndim(value) != 0:
-        raise TypeError(f"{caller}: `{name}` must be a real number; received {value!r}.")
-    if is_concrete(value) and not valid(value):
-        raise ValueError(f"{caller}: `{name}` must {expectation}; received {value}.")
-    return value

@@ -1,0 +1,27 @@
+"""Checks of arguments that every floor makes: they name the caller, the argument, and what was received."""
+
+import jax.numpy as jnp
+
+from hhtjax.description import is_concrete, is_real
+
+
+def require_number(caller, name, value, valid, expectation):
+    """The value as it is, if it is a real scalar within its range; a tracer passes unchecked."""
+    if not is_real(value) or jnp.ndim(value) != 0:
+        raise TypeError(f"{caller}: `{name}` must be a real number; received {value!r}.")
+    if is_concrete(value) and not valid(value):
+        raise ValueError(f"{caller}: `{name}` must {expectation}; received {value}.")
+    return value
+
+
+def require_function(caller, name, value, signature):
+    """An error unless `value` can be called, and is hashable, as a static argument of jit has to be."""
+    if not callable(value):
+        raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
+    try:
+        hash(value)
+    except TypeError:
+        raise TypeError(
+            f"{caller}: `{name}` must be hashable, because it is static under jit; received {value!r}. "
+            "Pass arrays through params."
+        ) from None
