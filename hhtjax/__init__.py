@@ -1,6 +1,7 @@
 """hhtjax: differentiable, functional time integrators for multibody dynamics."""
 
 from hhtjax import scenes as scenes
+from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
 from hhtjax.identify import IdentifiabilityWarning as IdentifiabilityWarning
 from hhtjax.identify import fit as fit
 from hhtjax.sampled import sampled as sampled
@@ -13,10 +14,11 @@ from hhtjax.steppers.generalized_alpha import generalized_alpha as generalized_a
 from hhtjax.steppers.generalized_alpha import hht as hht
 from hhtjax.steppers.generalized_alpha import newmark as newmark
 from hhtjax.steppers.implicit_euler import implicit_euler as implicit_euler
+from hhtjax.steppers.kim2019 import conventional_hht as conventional_hht
 from hhtjax.steppers.kim2019 import kim_hht as kim_hht
 from hhtjax.steppers.kim2019 import kim_implicit_euler as kim_implicit_euler
+from hhtjax.system import FirstOrderSystem as FirstOrderSystem
 from hhtjax.system import LinearSystem as LinearSystem
-from hhtjax.system import PrecisionWarning as PrecisionWarning
 from hhtjax.system import System as System
 
 __version__ = "0.1.0"

@@ -12,8 +12,9 @@ from jax import lax
 from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpointed_scan
 from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.steppers.stepper import Info, Stepper
-from hhtjax.system import LinearSystem, System, flatten, initial_values
+from hhtjax.flat_system import flatten, initial_values
+from hhtjax.steppers.stepper import Info, Stepper, public
+from hhtjax.system import FirstOrderSystem, LinearSystem, System
 
 
 class SimulationError(RuntimeError):
@@ -31,7 +32,8 @@ class Failure(NamedTuple):
 class Solution(NamedTuple):
     """A trajectory at its saved times, the start included.
 
-    t: (K + 1,). q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1.
+    t: (K + 1,). q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order
+    system y, y' and None.
     multipliers: None without constraints. dt: the step size.
     info: `Info` for each of the K intervals between saved times: largest residual, number of Newton
     iterations, all converged; None where the method has nothing to tell.
@@ -70,14 +72,16 @@ class Solution(NamedTuple):
         raise SimulationError(f"simulate: {which}step {step} (to t = {start + step * dt:.6g}) failed: {why}.")
 
 
-def simulate(system, stepper, q0, v0, params=None, *, dt, num_steps, t0=0.0, save_every=1, progress=False) -> Solution:
+def simulate(
+    system, stepper, q0, v0=None, params=None, *, dt, num_steps, t0=0.0, save_every=1, progress=False
+) -> Solution:
     """Steps `system` from (q0, v0) at t0, num_steps times by dt.
 
     Args:
-        system: a `System` or `LinearSystem`.
+        system: a `System`, `LinearSystem` or `FirstOrderSystem`.
         stepper: `hht()`, `rk4()`, ...
         q0, v0: position and velocity, pytrees of the same structure; float32 or float64, integers become
-            the default float type.
+            the default float type. A `FirstOrderSystem` has y0 in the place of q0, and no v0.
         params: any pytree, handed to the functions of the system.
         dt: step size, positive. num_steps: number of steps.
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
@@ -106,8 +110,8 @@ def simulate(system, stepper, q0, v0, params=None, *, dt, num_steps, t0=0.0, sav
     >>> [round(float(q), 4) for q in solution.q[:, 0]]                       # cos(2 t)
     [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
     """
-    if not isinstance(system, (System, LinearSystem)):
-        raise TypeError(f"simulate: `system` must be a System or LinearSystem; received {system!r}.")
+    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
+        raise TypeError(f"simulate: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
     if not isinstance(stepper, Stepper):
         raise TypeError(f"simulate: `stepper` must be a stepper such as hht(); received {stepper!r}.")
     for name, value in (("num_steps", num_steps), ("save_every", save_every)):
@@ -117,7 +121,7 @@ def simulate(system, stepper, q0, v0, params=None, *, dt, num_steps, t0=0.0, sav
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
-    q0, v0 = initial_values("simulate", q0, v0)
+    q0, v0 = initial_values("simulate", system, q0, v0)
     dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew
     return _simulate(
         system, stepper, q0, v0, params, dt, t0, num_steps=int(num_steps), save_every=int(save_every), progress=progress
@@ -136,6 +140,8 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
         state, info = take_step(state)
         count = count + 1
         state = state._replace(t=t0 + count.astype(dt.dtype) * dt)  # no rounding piles up
+        if flat.first_order:
+            state = state._replace(q=q)  # stays zero
         if progress:
             _show_progress(count, num_steps)
         return (state, count, _first_failure(failure, count, state, info)), info
@@ -145,8 +151,7 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
             carry, info = step(carry)
         else:
             (carry, info), _ = checkpointed_scan(joined_step, (carry, no_info), save_every)
-        state = carry[0]
-        return carry, ((state.t, state.q, state.v, state.w), info)
+        return carry, (public(flat, carry[0])[:4], info)
 
     def joined_step(carry, _):
         carry, info = carry
@@ -159,8 +164,8 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
     (_, _, failure), (path, info) = checkpointed_scan(
         interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every
     )
-    t, q, v, w = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), (start.t, start.q, start.v, start.w), path)
-    q, v, w = (jax.vmap(flat.unravel)(x) for x in (q, v, w))
+    t, *path = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), public(flat, start)[:4], path)
+    q, v, w = (None if x is None else jax.vmap(flat.unravel)(x) for x in path)
     return Solution(t, q, v, w, None, dt, info, failure)
 
 
@@ -201,7 +206,7 @@ def _show_progress(count, num_steps):
 
 
 class Interpolant(NamedTuple):
-    """Position and velocity at the times asked for, with these as leading axis."""
+    """Position and velocity at the times asked for, with these as leading axis; of a first-order system y and None."""
 
     q: Any
     v: Any
@@ -248,6 +253,6 @@ def interpolate(solution, times) -> Interpolant:
         rise = y1 - y0
         return y0 + s * (d0 + s * (3 * rise - 2 * d0 - d1 + s * (d0 + d1 - 2 * rise)))
 
-    return Interpolant(
-        jax.tree.map(hermite, solution.q, solution.v), jax.tree.map(hermite, solution.v, solution.acceleration)
-    )
+    first_order = solution.acceleration is None
+    v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)
+    return Interpolant(jax.tree.map(hermite, solution.q, solution.v), v)

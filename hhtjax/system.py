@@ -1,9 +1,8 @@
-"""What is simulated: M(q) w = Q(q, v, t), described by plain functions of pytrees."""
+"""What is simulated: M(q) w = Q(q, v, t), or y' = f(y, t), described by plain functions of pytrees."""
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.boundary import require_function
 from hhtjax.description import Description, is_array, is_concrete, is_real
-from hhtjax.linear_solve import factorize, matvec, solve
+from hhtjax.linear_solve import matvec
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,155 +168,50 @@ class LinearSystem(Description):
         Q = jnp.zeros_like(v) if self.load is None else ravel_pytree(self.load(t, params))[0]
         for matrix, x in ((self.C, v), (self.K, q)):
             if matrix is not None:
-                Q = Q - matvec(_as_matrix(matrix(params) if callable(matrix) else matrix, x.dtype), x)
+                Q = Q - matvec(as_matrix(matrix(params) if callable(matrix) else matrix, x.dtype), x)
         return unravel(Q)
 
 
-class FlatSystem(NamedTuple):
-    """A system on vectors q (n,) and v (n,), as the steppers see it; made by `flatten`."""
+@dataclass(frozen=True, eq=False)
+class FirstOrderSystem(Description):
+    """The first-order system  y' = f(y, t), for every stepper: y takes the place of the velocity, with M = 1.
 
-    mass: Callable  # q, params -> (n, n), or (n,) for a diagonal
-    force: Callable  # q, v, t, params -> (n,)
-    size: int  # n
-    linear: bool  # the residual is affine in (q, v, w), with constant coefficients
-    unravel: Callable  # (n,) -> pytree structured like q and v
+    `simulate` takes y0 as q0, no v0, and returns y as `solution.q`, y' as `solution.v`, no acceleration. On it
 
-    def inertia(self, q, w, params):
-        """M(q) w."""
-        return matvec(self.mass(q, params), w)
+        hht(alpha), hht(alpha, iterations=None)     order 2 for every alpha (Jansen, Whiting, Hulbert 2000)
+        kim_hht(alpha)                              y1 = y + h f/(1 - theta h f_y),  theta = (1/2 - alpha)(1 + alpha):
+                                                    order 2 only where theta = 1/2, at alpha = 0, without explicit time
+        implicit_euler(), rk4()                     what their names say
 
-    def acceleration(self, q, v, t, params, factorize=factorize):
-        """w = M(q)^-1 Q(q, v, t)."""
-        M, Q = self.mass(q, params), self.force(q, v, t, params)
-        return Q / M if M.ndim == 1 else solve(M, Q, factorize)
+    Args:
+        rate: f, `rate(y, t, params)`, a pytree structured like y.
 
+    Raises:
+        TypeError: `rate` is not a hashable function.
 
-class PrecisionWarning(UserWarning):
-    """The state is in single precision."""
+    References:
+        Kim et al. (2019), Eq. 15-22; Jansen, Whiting, Hulbert, Comput. Methods Appl. Mech. Eng. 190 (2000).
 
+    Example: the highly damped equation of Kim et al., Sec. 3.2, with half the step that explicit Euler could take.
 
-def initial_values(caller, q0, v0):
-    """q0 and v0 as arrays of one float dtype, checked."""
-    if not sum(np.size(x) for x in jax.tree.leaves(q0)):
-        raise ValueError(f"{caller}: `q0` must hold at least one number; received {q0!r}.")
-    structure = jax.tree.structure(q0)
-    if jax.tree.structure(v0) != structure:
-        raise ValueError(
-            f"{caller}: `v0` must be a pytree structured like q0, {structure}; received {jax.tree.structure(v0)}."
-        )
-    dtypes = set()
-    for name, values in (("q0", q0), ("v0", v0)):
-        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
-            where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
-            if not is_array(leaf) and (isinstance(leaf, bool) or not isinstance(leaf, (int, float, complex))):
-                raise TypeError(f"{where} must be an array or a number; received {leaf!r}.")
-            dtype = getattr(leaf, "dtype", None) or np.result_type(leaf)
-            if not is_real(leaf) or dtype in (jnp.float16, jnp.bfloat16):
-                raise TypeError(f"{where} must be float32 or float64; received {dtype}.")
-            if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
-                raise ValueError(f"{where} must be finite; received {leaf!r}.")
-            if is_array(leaf) and jnp.issubdtype(dtype, jnp.floating):
-                dtypes.add(jnp.result_type(leaf))  # what JAX makes of it: float32 without x64
-    if jax.tree.map(jnp.shape, q0) != jax.tree.map(jnp.shape, v0):
-        raise ValueError(f"{caller}: `v0` must have the shapes of q0, {describe(q0)}; received {describe(v0)}.")
-    if len(dtypes) > 1:
-        raise TypeError(f"{caller}: `q0` and `v0` must share one dtype; received {describe(q0)} and {describe(v0)}.")
-    dtype = dtypes.pop() if dtypes else jnp.result_type(float)
-    if dtype == jnp.float32:
-        warnings.warn(
-            f"{caller}: in float32 expect about 4 correct digits at best, fewer on stiff systems and small steps: "
-            "for float64 call jax.config.update('jax_enable_x64', True) before creating arrays.",
-            PrecisionWarning,
-            stacklevel=3,
-        )
-    return (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0))
-
-
-def flatten(caller, system, q0, v0, t0, params):
-    """The system on vectors, and q0, v0 as vectors: the one place where pytrees are ravelled.
-
-    Runs while tracing, so it checks shapes and structures and costs nothing at run time.
+    >>> import jax.numpy as jnp, hhtjax
+    >>> decay = hhtjax.FirstOrderSystem(lambda y, t, params: -params["rate"] * y)
+    >>> run = hhtjax.simulate(
+    ...     decay, hhtjax.kim_hht(alpha=0.0), jnp.array(1.0), params={"rate": 1000.0}, dt=1e-3, num_steps=3)
+    >>> [round(float(y), 6) for y in run.q]                                   # powers of 1/3; e^-1 = 0.367879
+    [1.0, 0.333333, 0.111111, 0.037037]
     """
-    q, unravel = ravel_pytree(q0)
-    v, _ = ravel_pytree(v0)
-    n, dtype = q.size, q.dtype
-    if system.constraint is not None:
-        raise NotImplementedError(
-            f"{caller}: `constraint` is not solved yet: there is no stepper for Phi(q, t) = 0 in this version; "
-            "use minimal coordinates and constraint=None."
-        )
 
-    if isinstance(system, LinearSystem):
-        for name in ("M", "C", "K"):
-            matrix = getattr(system, name)
-            if matrix is not None:
-                _check_matrix(caller, name, matrix, n, dtype, params)
-    else:
-        _check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
-    if isinstance(system, LinearSystem) and system.load is not None:
-        Q = _evaluate(caller, "force", system.load, t0, params)
-    else:
-        Q = _evaluate(caller, "force", system.force, q0, v0, t0, params)
-    if jax.tree.structure(Q) != jax.tree.structure(v0) or jax.tree.map(jnp.shape, Q) != jax.tree.map(jnp.shape, v0):
-        raise ValueError(f"{caller}: `force` must return a pytree like v0, {describe(v0)}; received {describe(Q)}.")
-    _check_dtype(caller, "force", Q, dtype)
+    rate: Callable
+    constraint = None
 
-    def mass(q, params):
-        M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
-        return _as_matrix(M, dtype)
-
-    def force(q, v, t, params):
-        return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0].astype(dtype)
-
-    return FlatSystem(mass, force, n, isinstance(system, LinearSystem), unravel), q, v
+    def __post_init__(self):
+        require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")
 
 
-def _as_matrix(value, dtype):
+def as_matrix(value, dtype):
     """(n, n) or (n,), of the dtype of the state; a scalar is the matrix of one degree of freedom."""
     return jnp.atleast_1d(jnp.asarray(value)).astype(dtype)
-
-
-def _check_matrix(caller, name, matrix, n, dtype, *args):
-    """A constant matrix, or the result of a function, of a shape that fits n and a dtype that fits the state."""
-    value = _evaluate(caller, name, matrix, *args) if callable(matrix) else matrix
-    shapes = [(n, n), (n,)] + [()] * (n == 1)
-    if not (hasattr(value, "shape") and value.shape in shapes):
-        raise ValueError(
-            f"{caller}: `{name}` must give an array of shape ({n}, {n}), or ({n},) for a diagonal; "
-            f"received {describe(value)}."
-        )
-    if callable(matrix):
-        _check_dtype(caller, name, value, dtype)
-
-
-def _check_dtype(caller, name, value, dtype):
-    for leaf in jax.tree.leaves(value):
-        found = jnp.result_type(leaf)
-        number = jnp.issubdtype(found, jnp.integer) or (leaf.weak_type and jnp.issubdtype(found, jnp.floating))
-        if found != dtype and not number:
-            raise TypeError(
-                f"{caller}: `{name}` returned {found} for a state of {dtype}; give params, and arrays made "
-                f"inside `{name}`, the dtype of q0, or q0 and v0 the dtype of params."
-            )
-
-
-def _evaluate(caller, name, function, *args):
-    """Shape of function(*args); `name` is added to what the function raises."""
-    try:
-        return jax.eval_shape(function, *args)
-    except Exception as error:
-        error.add_note(f"{caller}: raised while tracing `{name}` with " + ", ".join(describe(x) for x in args) + ".")
-        raise
-
-
-def describe(x):
-    """A pytree in words: path, shape and dtype of each leaf."""
-    words = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(x):
-        known = hasattr(leaf, "shape") or isinstance(leaf, (int, float, complex))
-        what = f"shape {jnp.shape(leaf)} {jnp.result_type(leaf)}" if known else repr(leaf)
-        words.append(f"{jax.tree_util.keystr(path)}: {what}" if path else what)
-    return ", ".join(words) or "nothing"
 
 
 def _constant_matrix(caller, name, received):

@@ -244,8 +244,8 @@ def test_a_solve_must_be_hashable():
 REAL = "must be a real number; received"
 INTEGER = "must be a positive integer; received"
 ARGUMENTS = [
-    (TypeError, "`system` must be a System or LinearSystem; received 3.", {"system": 3}),
-    (TypeError, "`system` must be a System or LinearSystem; received <class", {"system": System}),
+    (TypeError, "`system` must be a System, LinearSystem or FirstOrderSystem; received 3.", {"system": 3}),
+    (TypeError, "`system` must be a System, LinearSystem or FirstOrderSystem; received <class", {"system": System}),
     (TypeError, "`stepper` must be a stepper such as hht(); received 3.", {"stepper": 3}),
     (TypeError, "`stepper` must be a stepper such as hht(); received <function hht", {"stepper": hhtjax.hht}),
     *((ValueError, f"`dt` must be positive and finite; received {x}.", {"dt": x}) for x in (0, 0.0, -1, -0.1, NAN)),

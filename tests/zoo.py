@@ -60,6 +60,7 @@ STEPPERS = {
     "bossak": hhtjax.bossak(alpha=-0.1, linearize="predictor"),
     "generalized_alpha": hhtjax.generalized_alpha(rho_inf=0.8, linearize="predictor"),
     "kim_hht": hhtjax.kim_hht(alpha=-0.1),
+    "conventional_hht": hhtjax.conventional_hht(alpha=-0.1),
     "kim_implicit_euler": hhtjax.kim_implicit_euler(),
     "implicit_euler": hhtjax.implicit_euler(),
     "rk4": hhtjax.rk4(),

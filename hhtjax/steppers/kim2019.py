@@ -1,4 +1,4 @@
-"""The two non-iterative steps of Kim et al. (2019), literally, for comparison and reproduction.
+"""The three steps of Kim et al. (2019), literally, for comparison and reproduction.
 
 M. Kim et al., J. Mech. Sci. Tech. 33(3), 2019, 1087-1096. For work, use `hht`: it is second order
 where these are not.
@@ -12,7 +12,8 @@ import jax.numpy as jnp
 
 from hhtjax.boundary import require_number
 from hhtjax.description import is_concrete
-from hhtjax.linear_solve import solve
+from hhtjax.linear_solve import factorize, solve
+from hhtjax.steppers.generalized_alpha import Options, check_options, newton
 from hhtjax.steppers.stepper import Info, State, Stepper
 
 
@@ -60,6 +61,42 @@ class KimHHT(Stepper):
 
 
 @dataclass(frozen=True, eq=False)
+class ConventionalHHT(Stepper):
+    """The method Kim's step departs from; made by `conventional_hht`."""
+
+    alpha: Any
+    order: int
+    fictive_time: bool
+    options: Options
+
+    def begin(self, system, q, v, t, params, dt):
+        """a_0 = M^-1 Q."""
+        return State(t, q, v, system.acceleration(q, v, t, params))
+
+    def bind(self, system, params, dt):
+        """Eq. 5-7, with Eq. 1 for q1 and v1. The field w of the state holds a."""
+        alpha = self.alpha
+        beta, gamma = (1 - alpha) ** 2 / 4, 0.5 - alpha
+        late = (1 + alpha) * dt if self.fictive_time else dt
+
+        def step(s):
+            Q0 = system.force(s.q, s.v, s.t, params)
+
+            def path(a):
+                q = s.q + dt * s.v + dt**2 * ((0.5 - beta) * s.w + beta * a)
+                return State(s.t + dt, q, s.v + dt * ((1 - gamma) * s.w + gamma * a), a)
+
+            def r(s1):
+                Q1 = system.force(s1.q, s1.v, s.t + late, params)
+                return system.inertia(s1.q, s1.w, params) - (1 + alpha) * Q1 + alpha * Q0
+
+            a, info = newton(r, path, s, factorize, self.options.tolerance, self.options.max_iterations)
+            return path(a), info
+
+        return step
+
+
+@dataclass(frozen=True, eq=False)
 class KimImplicitEuler(Stepper):
     """Kim's baseline; made by `kim_implicit_euler`."""
 
@@ -101,8 +138,35 @@ def kim_hht(alpha=0.0) -> KimHHT:
     >>> hhtjax.kim_hht(alpha=0.0).order, hhtjax.kim_hht(alpha=-0.1).order
     (2, 1)
     """
-    alpha = require_number("kim_hht", "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")
-    return KimHHT(alpha, 2 if is_concrete(alpha) and alpha == 0 else 1)
+    alpha = _require_alpha("kim_hht", alpha)
+    return KimHHT(alpha, _order(alpha))
+
+
+def conventional_hht(alpha=0.0, fictive_time=True, tolerance=1e-10, max_iterations=20) -> ConventionalHHT:
+    """The conventional, iterative HHT-alpha of Kim et al. (2019), Eq. 1-7, as printed.
+
+        M(q1) a1 = (1 + alpha) Q(q1, v1, t~) - alpha Q(q, v, t),   t~ = t + (1 + alpha) h,
+
+    solved by Newton, q1 and v1 being Newmark's. Order 2 for constant M and forces without explicit time;
+    else 1, for every alpha but 0: M(q1) multiplies an acceleration of the time t + (1 + alpha) h, and the
+    weights and t~ count alpha twice. `hht(alpha, iterations=None)` is the method without these faults.
+
+    Args:
+        alpha: in [-1/3, 0].
+        fictive_time: False for t~ = t + h, the form of Cardona and Geradin (1989), Eq. 79.
+        tolerance, max_iterations: as in `hht`.
+
+    `solution.acceleration` holds a, which belongs to the time t + alpha h.
+
+    >>> import hhtjax
+    >>> hhtjax.conventional_hht(alpha=0.0).order, hhtjax.conventional_hht(alpha=-0.1).order
+    (2, 1)
+    """
+    alpha = _require_alpha("conventional_hht", alpha)
+    if not isinstance(fictive_time, bool):
+        raise TypeError(f"conventional_hht: `fictive_time` must be True or False; received {fictive_time!r}.")
+    options = check_options("conventional_hht", Options(None, None, tolerance, max_iterations))
+    return ConventionalHHT(alpha, _order(alpha), fictive_time, options)
 
 
 def kim_implicit_euler() -> KimImplicitEuler:
@@ -118,3 +182,11 @@ def kim_implicit_euler() -> KimImplicitEuler:
     1
     """
     return KimImplicitEuler()
+
+
+def _require_alpha(caller, alpha):
+    return require_number(caller, "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")
+
+
+def _order(alpha):
+    return 2 if is_concrete(alpha) and alpha == 0 else 1

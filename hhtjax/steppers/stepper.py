@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import Description
-from hhtjax.system import flatten, initial_values
+from hhtjax.flat_system import flatten, initial_values
 
 
 class State(NamedTuple):
@@ -15,6 +15,7 @@ class State(NamedTuple):
 
     t: time; q: position; v: velocity; w: acceleration, w = M^-1 Q on the trajectory;
     a: algorithmic acceleration of the generalised-alpha recursion, None where a method has none.
+    Of a first-order system: q: y; v: y'; w: None; a: algorithmic y'.
     """
 
     t: Any
@@ -66,8 +67,8 @@ class Stepper(Description):
         return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), self)
 
     def init(self, system, q0, v0, params, dt, t0=0.0) -> State:
-        """State at t0, from position q0 and velocity v0."""
-        q0, v0 = initial_values("init", q0, v0)
+        """State at t0, from position q0 and velocity v0 (None for a `FirstOrderSystem`)."""
+        q0, v0 = initial_values("init", system, q0, v0)
         flat, q, v = flatten("init", system, q0, v0, t0, params)
         dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
         return _unravel(flat, self.astype(q.dtype).begin(flat, q, v, t0, params, dt))
@@ -75,12 +76,19 @@ class Stepper(Description):
     def step(self, system, state, params, dt) -> tuple[State, Info]:
         """State one step dt after `state`, and what the step tells about itself."""
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params)
-        w, a = ravel_pytree(state.w)[0], None if state.a is None else ravel_pytree(state.a)[0]
+        w = ravel_pytree(state.v if flat.first_order else state.w)[0]
+        a = None if state.a is None else ravel_pytree(state.a)[0]
         step = self.astype(q.dtype).bind(flat, params, jnp.asarray(dt).astype(q.dtype))
         state, info = step(State(state.t, q, v, w, a))
         return _unravel(flat, state), info
 
 
+def public(flat, state):
+    """The state as its user sees it: y and y' of a first-order system are q and v, and it has no w."""
+    return state._replace(q=state.v, v=state.w, w=None) if flat.first_order else state
+
+
 def _unravel(flat, state):
+    state = public(flat, state)
     fields = {name: flat.unravel(x) for name, x in state._asdict().items() if name != "t" and x is not None}
     return state._replace(**fields)
