@@ -1,0 +1,1 @@
+"""Kim et al. (2019): reproduced, corrected, and charted."""

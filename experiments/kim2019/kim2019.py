@@ -1,0 +1,32 @@
+"""Kim et al. (2019): every table and figure beside the printed values, and what the paper does not say."""
+
+from experiments.kim2019 import alpha, linear, order, repaired, stability, tables, timing
+from experiments.report import Report
+
+PARTS = {
+    "stability": stability,
+    "linear": linear,
+    "tables": tables,
+    "timing": timing,
+    "alpha": alpha,
+    "order": order,
+    "repaired": repaired,
+}
+
+
+def rounded(x):
+    """Floats to seven digits, which keeps the committed JSON small."""
+    if isinstance(x, dict):
+        return {key: rounded(value) for key, value in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [rounded(value) for value in x]
+    return float(f"{x:.7g}") if isinstance(x, float) else x
+
+
+def run(report: Report, fast: bool):
+    """All parts, one after the other; README.md beside this file is made from the JSON by `page`."""
+    numbers = {}
+    for name, part in PARTS.items():
+        report.progress(f"part {name}: {(part.__doc__ or '').splitlines()[0]}")
+        numbers[name] = part.run(report, fast)
+    report.numbers(rounded(numbers))

@@ -1,0 +1,66 @@
+"""What the paper does not say (3): the repaired non-iterative forms are of order two, one better than converged."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from experiments.kim2019 import pendulum
+from experiments.report import COLOURS, MARKERS
+
+METHODS = ("conventional HHT", "non-iterative HHT", "converged", "refreshed", "predictor", "auto")
+SHOWN = (0.0, -0.05, -0.1, -0.3)
+
+
+def run(report, fast):
+    """RMS errors of q1 over step size and alpha; order at the fine end; ratios to the converged method."""
+    sizes = pendulum.FAST_STEP_SIZES if fast else pendulum.STEP_SIZES
+    numbers, rows = [], []
+    for scene in ("free",) if fast else ("free", "stiff"):
+        errors = {m: np.array([pendulum.rms_errors(scene, m, h)[0][:, 0] for h in sizes]) for m in METHODS}
+        for alpha in SHOWN:
+            k = pendulum.ALPHAS.index(alpha)
+            for method in METHODS:
+                error = errors[method][:, k]
+                entry = {
+                    "scene": scene,
+                    "alpha": alpha,
+                    "method": method,
+                    "rms_error_q1_rad": error.tolist(),
+                    "order": float(np.log(error[1] / error[0]) / np.log(sizes[1] / sizes[0])),
+                    "error_over_converged": (error / errors["converged"][:, k]).tolist(),
+                }
+                numbers.append(entry)
+                if alpha in (0.0, -0.3):
+                    shown = [sizes.index(h) for h in (1e-3, 1e-2, 1e-1)]
+                    ratios = np.array(entry["error_over_converged"])[shown]
+                    rows.append([f"{scene}, {alpha:g}", method, entry["order"], *error[shown], *ratios])
+        report.progress(
+            f"{scene} pendulum: {len(METHODS)} methods, {len(sizes)} step sizes, {len(pendulum.ALPHAS)} alphas"
+        )
+    print("RMS error of q1 (rad) at h = 1e-3, 1e-2, 1e-1 s, and the same over the converged method's")
+    report.table(["scene, alpha", "method", "order", "1e-3", "1e-2", "1e-1", "ratio", "ratio", "ratio"], rows)
+    report.figure("kim2019_repaired", figure(sizes, numbers))
+    return {"step_sizes_s": list(sizes), "entries": numbers}
+
+
+def figure(sizes, numbers):
+    """Error against step size: rows scenes, columns alpha."""
+    scenes, alphas = sorted({n["scene"] for n in numbers}), (0.0, -0.05, -0.3)
+    drawn, panels = plt.subplots(
+        len(scenes), 3, figsize=(10, 3.1 * len(scenes)), sharex=True, sharey="row", squeeze=False
+    )
+    for axes, (scene, alpha) in zip(panels.flat, ((s, a) for s in scenes for a in alphas), strict=True):
+        for entry in numbers:
+            if (entry["scene"], entry["alpha"]) == (scene, alpha):
+                j = METHODS.index(entry["method"])
+                old = entry["method"] in METHODS[:2]
+                label = f"{entry['method']}, as printed" if old else f"hht, {entry['method']}"
+                style = {"color": COLOURS[j], "marker": MARKERS[j], "ms": 4, "lw": 1, "ls": ":" if old else "-"}
+                axes.loglog(sizes, entry["rms_error_q1_rad"], label=label, **style)
+        axes.set_title(f"{scene} double pendulum, $\\alpha$ = {alpha:g}", fontsize=9)
+        axes.set_ylim(top=10)
+    for axes in panels[-1]:
+        axes.set_xlabel("step size h (s)")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("RMS error of $q_1$ (rad)")
+    panels[0, 0].legend(fontsize=7)
+    return drawn
