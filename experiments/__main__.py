@@ -13,6 +13,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_small_wh
 
 EXPERIMENTS = {
     "silverbox": "identification.silverbox",
+    "kim2019": "kim2019.kim2019",
     "linearization": "linearization.linearization",
     "gradient_cost": "benchmarks.gradient_cost",
 }

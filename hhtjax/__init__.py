@@ -17,6 +17,7 @@ from hhtjax.steppers.implicit_euler import implicit_euler as implicit_euler
 from hhtjax.steppers.kim2019 import conventional_hht as conventional_hht
 from hhtjax.steppers.kim2019 import kim_hht as kim_hht
 from hhtjax.steppers.kim2019 import kim_implicit_euler as kim_implicit_euler
+from hhtjax.steppers.splitting import operator_splitting as operator_splitting
 from hhtjax.system import FirstOrderSystem as FirstOrderSystem
 from hhtjax.system import LinearSystem as LinearSystem
 from hhtjax.system import System as System

@@ -63,6 +63,7 @@ STEPPERS = {
     "conventional_hht": hhtjax.conventional_hht(alpha=-0.1),
     "kim_implicit_euler": hhtjax.kim_implicit_euler(),
     "implicit_euler": hhtjax.implicit_euler(),
+    "operator_splitting": hhtjax.operator_splitting(alpha=-0.1),
     "rk4": hhtjax.rk4(),
 }
 

@@ -1,6 +1,8 @@
 """Kim et al. (2019): every table and figure beside the printed values, and what the paper does not say."""
 
-from experiments.kim2019 import alpha, linear, order, repaired, stability, tables, timing
+import math
+
+from experiments.kim2019 import alpha, arm, linear, order, repaired, splitting, stability, tables, timing, vehicle
 from experiments.report import Report
 
 PARTS = {
@@ -11,16 +13,21 @@ PARTS = {
     "alpha": alpha,
     "order": order,
     "repaired": repaired,
+    "splitting": splitting,
+    "vehicle": vehicle,
+    "arm": arm,
 }
 
 
 def rounded(x):
-    """Floats to seven digits, which keeps the committed JSON small."""
+    """Floats to seven digits, which keeps the committed JSON small; None for those that are not finite."""
     if isinstance(x, dict):
         return {key: rounded(value) for key, value in x.items()}
     if isinstance(x, (list, tuple)):
         return [rounded(value) for value in x]
-    return float(f"{x:.7g}") if isinstance(x, float) else x
+    if isinstance(x, float):
+        return float(f"{x:.7g}") if math.isfinite(x) else None
+    return x
 
 
 def run(report: Report, fast: bool):

@@ -16,6 +16,7 @@ class State(NamedTuple):
     t: time; q: position; v: velocity; w: acceleration, w = M^-1 Q on the trajectory;
     a: algorithmic acceleration of the generalised-alpha recursion, None where a method has none.
     Of a first-order system: q: y; v: y'; w: None; a: algorithmic y'.
+    memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
 
     t: Any
@@ -23,6 +24,7 @@ class State(NamedTuple):
     v: Any
     w: Any
     a: Any = None
+    memory: Any = None
 
 
 class Info(NamedTuple):
@@ -79,7 +81,7 @@ class Stepper(Description):
         w = ravel_pytree(state.v if flat.first_order else state.w)[0]
         a = None if state.a is None else ravel_pytree(state.a)[0]
         step = self.astype(q.dtype).bind(flat, params, jnp.asarray(dt).astype(q.dtype))
-        state, info = step(State(state.t, q, v, w, a))
+        state, info = step(State(state.t, q, v, w, a, state.memory))
         return _unravel(flat, state), info
 
 
@@ -90,5 +92,6 @@ def public(flat, state):
 
 def _unravel(flat, state):
     state = public(flat, state)
-    fields = {name: flat.unravel(x) for name, x in state._asdict().items() if name != "t" and x is not None}
+    fields = {name: getattr(state, name) for name in ("q", "v", "w", "a")}
+    fields = {name: flat.unravel(x) for name, x in fields.items() if x is not None}
     return state._replace(**fields)
