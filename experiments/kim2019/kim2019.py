@@ -1,6 +1,9 @@
 """Kim et al. (2019): every table and figure beside the printed values, and what the paper does not say."""
 
 import math
+import os
+
+import jax
 
 from experiments.kim2019 import alpha, arm, linear, order, repaired, splitting, stability, tables, timing, vehicle
 from experiments.report import Report
@@ -32,7 +35,7 @@ def rounded(x):
 
 def run(report: Report, fast: bool):
     """All parts, one after the other; README.md beside this file is made from the JSON by `page`."""
-    numbers = {}
+    numbers: dict = {"machine": f"{os.cpu_count()} cores ({jax.devices()[0].device_kind}), jax {jax.__version__}"}
     for name, part in PARTS.items():
         report.progress(f"part {name}: {(part.__doc__ or '').splitlines()[0]}")
         numbers[name] = part.run(report, fast)

@@ -8,8 +8,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jax import jvp
 
-from experiments.report import COLOURS
-from hhtjax import System, conventional_hht, hht, kim_hht, rk4, simulate
+from experiments.report import COLOURS, side_by_side
+from hhtjax import System, conventional_hht, hht, kim_hht, rk4
 from hhtjax.linear_solve import solve
 from hhtjax.scenes import double_pendulum
 
@@ -71,14 +71,18 @@ METHODS = {  # name: (alpha -> stepper, M e; None for a method of order two)
 }
 
 
+def run_to_end(system, stepper, params, num_steps):
+    """(q, v) after DURATION."""
+    dt = DURATION / num_steps
+    start = stepper.init(system, Q0, V0, params, dt)
+    state = jax.lax.fori_loop(0, num_steps, lambda i, s: stepper.step(system, s, params, dt)[0], start)
+    return jnp.concatenate([state.q, state.v])
+
+
 @partial(jax.jit, static_argnames="method")
 def end(method, alpha, params, num_steps):
     """(q, v) at the end; num_steps traced, so that one compilation serves all."""
-    dt = DURATION / num_steps
-    stepper = METHODS[method][0](alpha)
-    start = stepper.init(SYSTEM, Q0, V0, params, dt)
-    state = jax.lax.fori_loop(0, num_steps, lambda i, s: stepper.step(SYSTEM, s, params, dt)[0], start)
-    return jnp.concatenate([state.q, state.v])
+    return run_to_end(SYSTEM, METHODS[method][0](alpha), params, num_steps)
 
 
 @partial(jax.jit, static_argnames="defect")
@@ -90,17 +94,8 @@ def modified(defect, alpha, params, h):
         Q = force(q, v, t, params)
         return Q if defect is None else Q + h * defect(alpha, q, v, solve(mass(q, params), Q), t, params)
 
-    run = simulate(
-        System(lambda q, everything: mass(q, everything[0]), perturbed),
-        rk4(),
-        Q0,
-        V0,
-        (params, alpha, h),
-        dt=DURATION / REFERENCE_STEPS,
-        num_steps=REFERENCE_STEPS,
-        save_every=REFERENCE_STEPS,
-    )
-    return jnp.concatenate([run.q[-1], run.v[-1]])
+    system = System(lambda q, everything: mass(q, everything[0]), perturbed)
+    return run_to_end(system, rk4(), (params, alpha, h), REFERENCE_STEPS)
 
 
 def order(steps, errors):
@@ -109,6 +104,7 @@ def order(steps, errors):
     return float(-np.diff(np.log(errors[kept]))[0] / np.diff(np.log(np.array(steps)[kept]))[0])
 
 
+SHOWN = ("conventional HHT, Eq. 5 with t~", "non-iterative HHT, Eq. 13", "hht, refreshed")
 CASES = {  # name: alpha, varying mass, explicit time
     "M(q), explicit time": (-0.1, 1.0, 1.0),
     "M(q)": (-0.1, 1.0, 0.0),
@@ -119,13 +115,25 @@ CASES = {  # name: alpha, varying mass, explicit time
 }
 
 
+def compile_all(methods):
+    """Compiles everything, on all cores."""
+    params = PARAMS | {"varying_mass": 1.0, "drive": 1.0}
+    defects = dict.fromkeys(METHODS[method][1] for method in methods)
+    side_by_side(
+        [partial(end, method, -0.1, params, STEPS[0]) for method in methods]
+        + [partial(modified, defect, -0.1, params, 0.01) for defect in defects]
+    )
+
+
 def run(report, fast):
     """For each case and method: order against the exact and against the modified motion."""
     steps = STEPS[::3] if fast else STEPS
+    methods = SHOWN if fast else tuple(METHODS)
+    compile_all(methods)
     curves = {}
     for case, (alpha, varying, drive) in list(CASES.items())[: 1 if fast else None]:
         params = PARAMS | {"varying_mass": varying, "drive": drive}
-        for method in METHODS:
+        for method in methods:
             rows, defect = [], METHODS[method][1]
             exact = modified(None, alpha, params, 0.0)
             for num_steps in steps:
@@ -163,8 +171,7 @@ def figure(steps, curves):
     case = next(iter(CASES))
     drawn, panels = plt.subplots(1, 3, figsize=(10, 3.5), sharey=True)
     h = DURATION / steps
-    shown = ("conventional HHT, Eq. 5 with t~", "non-iterative HHT, Eq. 13", "hht, refreshed")
-    for axes, method in zip(panels, shown, strict=True):
+    for axes, method in zip(panels, SHOWN, strict=True):
         error, predicted, rest = curves[case, method].T
         axes.loglog(h, error, "o", color=COLOURS[0], label="error")
         if predicted.max() > 1e-9:

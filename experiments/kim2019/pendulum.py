@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from experiments.report import side_by_side
 from hhtjax import conventional_hht, hht, kim_hht, kim_implicit_euler, rk4, simulate
 from hhtjax.scenes import double_pendulum
 
@@ -63,6 +64,13 @@ def rms_errors(scene, method, dt):
     num_steps, stride = round(SCENES[scene].duration / dt), round(dt / FINEST)
     errors = _rms_errors(SCENES[scene], reference(scene), jnp.array(ALPHAS), dt, num_steps, stride, method=method)
     return tuple(np.asarray(x) for x in errors)
+
+
+def compile_all(scenes, methods):
+    """Compiles `rms_errors` for these, on all cores."""
+    for scene in scenes:
+        reference(scene)
+    side_by_side([partial(rms_errors, scene, method, STEP_SIZES[-2]) for scene in scenes for method in methods])
 
 
 @partial(jax.jit, static_argnames="method")

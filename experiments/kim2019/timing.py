@@ -46,7 +46,7 @@ def run(report, fast):
     sizes = pendulum.FAST_STEP_SIZES if fast else pendulum.STEP_SIZES
     numbers = []
     for scene in ("free",) if fast else ("stiff", "free"):
-        for method in METHODS[:4] if fast else METHODS:
+        for method in METHODS[::2][:2] if fast else METHODS:
             for h in sizes:
                 errors, iterations = pendulum.rms_errors(scene, method, h)
                 seconds = seconds_per_run(scene, method, h, 20_000 if fast else 100_000)

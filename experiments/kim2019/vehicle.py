@@ -173,7 +173,7 @@ def static_loads(params):
 
 def lowest_load(scene, times, q):
     """The smallest wheel load of the ride, in N: below zero the tyres would pull."""
-    change = jax.vmap(vehicle.tyre, (0, 0, None))(q[:, 3:], times, scene.params)
+    change = jax.jit(jax.vmap(vehicle.tyre, (0, 0, None)))(q[:, 3:], times, scene.params)
     return float(np.min(static_loads(scene.params) + change))
 
 
