@@ -115,25 +115,26 @@ def error_figure(sizes, errors):
     return figure
 
 
+def trajectories(scene, dt, every):
+    """One solution for each method."""
+    system, params, q0, v0, duration = pendulum.SCENES[scene]
+    run = partial(simulate, dt=dt, num_steps=round(duration / dt), save_every=every)
+    steppers = (pendulum.METHODS[method](0.0) for method in printed.COLUMNS)
+    return side_by_side([partial(run, system, stepper, q0, v0, params) for stepper in steppers])
+
+
 def trajectory_figure(dt, scenes):
     """Figs. 6 and 8: both angles with the three methods and the reference."""
     figure, panels = plt.subplots(2, len(scenes), figsize=(3.7 * len(scenes), 4.4), sharex="col", squeeze=False)
     styles = ({"ls": "-.", "lw": 2.2}, {"ls": "--", "lw": 1.8}, {"ls": ":", "lw": 1.8})
     for column, scene in enumerate(scenes):
-        system, params, q0, v0, duration = pendulum.SCENES[scene]
-        num_steps = round(duration / dt)
-        every = num_steps // 400
+        duration = pendulum.SCENES[scene].duration
+        every = round(duration / dt) // 400
         reference = np.asarray(pendulum.reference(scene))[:: every * round(dt / pendulum.FINEST)]
         for angle in (0, 1):
             axes = panels[angle, column]
             axes.plot(np.linspace(0, duration, len(reference)), reference[:, angle], "k", lw=0.9, label="reference")
-
-        def simulate_with(method):
-            stepper = pendulum.METHODS[method](0.0)
-            return simulate(system, stepper, q0, v0, params, dt=dt, num_steps=num_steps, save_every=every)
-
-        paths = side_by_side([partial(simulate_with, method) for method in printed.COLUMNS])
-        for j, (method, path) in enumerate(zip(printed.COLUMNS, paths, strict=True)):
+        for j, (method, path) in enumerate(zip(printed.COLUMNS, trajectories(scene, dt, every), strict=True)):
             path.check()
             for angle in (0, 1):
                 panels[angle, column].plot(path.t, path.q[:, angle], color=COLOURS[j], label=method, **styles[j])
