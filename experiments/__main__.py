@@ -8,7 +8,9 @@ import sys
 from pathlib import Path
 
 # Lets XLA:CPU compile the loop over the steps into one kernel: two to eight times faster. It checks itself
-# whether it can. The flag has to be there before JAX starts, so it belongs to a program, not to a library.
+# whether it can. Flags have to be there before JAX starts, so they belong to a program, not to a library; and to the
+# processes it starts.
+os.environ["JAX_ENABLE_X64"] = "1"
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000")
 
 EXPERIMENTS = {
@@ -49,11 +51,8 @@ def main(arguments: list[str]) -> int:
         print(f"Unknown experiment {options.name!r}.\n{listing()}", file=sys.stderr)
         return 2
 
-    import jax
-
     from experiments.report import Report
 
-    jax.config.update("jax_enable_x64", True)
     for name in EXPERIMENTS if options.name == "all" else [options.name]:
         module = importlib.import_module(f"experiments.{EXPERIMENTS[name]}")
         report = Report(name, options.out)

@@ -33,7 +33,7 @@ METHODS = {
     "RK4": hhtjax.rk4(),
 }
 NON_ITERATIVE = "HHT, predictor"
-IN_FAST = NON_ITERATIVE, "RK4"
+IN_FAST = (NON_ITERATIVE,)
 STEP_SIZES = (  # s, divisors of 2 s
     *(0.05, 0.025, 0.02, 0.016, 0.0125, 0.01, 0.008, 0.00625, 0.005, 0.004, 0.0025),
     *(2e-3, 1.6e-3, 1e-3, 5e-4, 2.5e-4, 1e-4),
@@ -239,7 +239,7 @@ def run(report, fast):
         "duration_s": scene.duration,
         "step_sizes_s": STEP_SIZES,
         "lowest_wheel_load_N": load,
-        "reference_check_mm": float(measured["RK4"][0, -1]),
+        "reference_check_mm": None if fast else float(measured["RK4"][0, -1]),
         "pinned_to_one_core": pinned,
         "simulate_real_time_factor": by_library,
         "methods": summary,
