@@ -46,7 +46,7 @@ def amplification(z, alpha, *, method):
 
     z = jnp.stack([z.real, z.imag], axis=-1)
     A = jnp.vectorize(lambda z: jax.jacfwd(step)(jnp.zeros(4), z), signature="(2)->(4,4)")(z)
-    return A[..., ::2, ::2] + 1j * A[..., 1::2, ::2]
+    return jax.lax.complex(A[..., ::2, ::2], A[..., 1::2, ::2])
 
 
 def characteristic(z, method, alpha):

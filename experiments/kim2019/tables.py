@@ -26,7 +26,7 @@ def run(report, fast):
             rows = [pendulum.rms_errors(scene, method, h)[0][0] for h in sizes]  # alpha = 0
             errors[scene, method] = np.array(rows)  # (step size, angle)
         report.progress(f"{scene} pendulum: {len(sizes)} step sizes, {len(printed.COLUMNS)} methods")
-    numbers = {"step_sizes_s": list(sizes)}
+    numbers: dict = {"step_sizes_s": list(sizes)}
     entries = []
     for scene, table in (("stiff", "Table 2"), ("free", "Table 5")):
         if scene in scenes:

@@ -204,7 +204,7 @@ class GeneralizedAlpha(Stepper):
         return step
 
 
-def hht(alpha=-0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """HHT-alpha, by default non-iterative: one Jacobian, one factorisation, one solve per step.
 
         alpha_m = 0,  alpha_f = -alpha,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -253,7 +253,7 @@ def hht(alpha=-0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     return _member("hht", Coefficients(0.0, -alpha, (1 - alpha) ** 2 / 4, 0.5 - alpha), 2, options)
 
 
-def newmark(beta=0.25, gamma=0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Newmark(beta, gamma): alpha_m = alpha_f = 0. The default is the trapezoidal rule.
 
     Order 2 for gamma = 1/2, else 1 (and gamma > 1/2 damps). A-stable for 2 beta >= gamma >= 1/2.
@@ -275,7 +275,7 @@ def newmark(beta=0.25, gamma=0.5, **options: Unpack[Keywords]) -> GeneralizedAlp
     return _member("newmark", Coefficients(0.0, 0.0, beta, gamma), order, options)
 
 
-def bossak(alpha=-0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Bossak (Wood, Bossak, Zienkiewicz): HHT's weighting put on the inertia instead of the forces.
 
         alpha_m = alpha,  alpha_f = 0,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -297,7 +297,7 @@ def bossak(alpha=-0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     return _member("bossak", Coefficients(alpha, 0.0, (1 - alpha) ** 2 / 4, 0.5 - alpha), 2, options)
 
 
-def generalized_alpha(rho_inf=0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Chung and Hulbert's generalised-alpha: least low-frequency damping for a given one at infinity.
 
         alpha_m = (2 rho - 1)/(rho + 1),  alpha_f = rho/(rho + 1),

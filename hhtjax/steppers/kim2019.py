@@ -119,7 +119,7 @@ class KimImplicitEuler(Stepper):
         return step
 
 
-def kim_hht(alpha=0.0) -> KimHHT:
+def kim_hht(alpha: Any = 0.0) -> KimHHT:
     """The non-iterative HHT-alpha step of Kim et al. (2019), Eq. 8-14, as printed.
 
         Jq = (1 + alpha) Q_q - (M a)_q,   Jv = (1 + alpha) Q_v                 at (q, v, t)
@@ -142,7 +142,7 @@ def kim_hht(alpha=0.0) -> KimHHT:
     return KimHHT(alpha, _order(alpha))
 
 
-def conventional_hht(alpha=0.0, fictive_time=True, tolerance=1e-10, max_iterations=20) -> ConventionalHHT:
+def conventional_hht(alpha: Any = 0.0, fictive_time=True, tolerance=1e-10, max_iterations=20) -> ConventionalHHT:
     """The conventional, iterative HHT-alpha of Kim et al. (2019), Eq. 1-7, as printed.
 
         M(q1) a1 = (1 + alpha) Q(q1, v1, t~) - alpha Q(q, v, t),   t~ = t + (1 + alpha) h,

@@ -68,7 +68,7 @@ class OperatorSplitting(Stepper):
         return step
 
 
-def operator_splitting(alpha=-0.05, modified=False) -> OperatorSplitting:
+def operator_splitting(alpha: Any = -0.05, modified=False) -> OperatorSplitting:
     """The alpha-operator-splitting method: one solve in a step, no Jacobian but the one at the start.
 
         q~ = q + h v + h^2 (1/2 - beta) a,   v~ = v + h (1 - gamma) a,   beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
