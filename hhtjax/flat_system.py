@@ -27,6 +27,8 @@ class FlatSystem(NamedTuple):
     linear: bool  # the residual is affine in (q, v, w), with constant coefficients
     first_order: bool
     unravel: Callable  # (n,) -> pytree structured like q and v
+    constraint: Callable | None = None  # q, t, params -> (m,)
+    num_constraints: int = 0  # m
 
     def inertia(self, q, w, params):
         """M(q) w."""
@@ -101,11 +103,12 @@ def flatten(caller, system, q0, v0, t0, params):
         return FlatSystem(lambda q, params: jnp.ones(n, dtype), rate, n, False, True, unravel), jnp.zeros_like(q), q
 
     v, _ = ravel_pytree(v0)
+    constraint, m = None, 0
     if system.constraint is not None:
-        raise NotImplementedError(
-            f"{caller}: `constraint` is not solved yet: there is no stepper for Phi(q, t) = 0 in this version; "
-            "use minimal coordinates and constraint=None."
-        )
+        m = _count_constraints(caller, system.constraint, n, dtype, q0, t0, params)
+
+        def constraint(q, t, params):
+            return jnp.asarray(system.constraint(unravel(q), t, params)).astype(dtype)
 
     if isinstance(system, LinearSystem):
         for name in ("M", "C", "K"):
@@ -127,7 +130,7 @@ def flatten(caller, system, q0, v0, t0, params):
     def force(q, v, t, params):
         return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0].astype(dtype)
 
-    return FlatSystem(mass, force, n, isinstance(system, LinearSystem), False, unravel), q, v
+    return FlatSystem(mass, force, n, isinstance(system, LinearSystem), False, unravel, constraint, m), q, v
 
 
 def _check_matrix(caller, name, matrix, n, dtype, *args):
@@ -141,6 +144,18 @@ def _check_matrix(caller, name, matrix, n, dtype, *args):
         )
     if callable(matrix):
         _check_dtype(caller, name, value, dtype)
+
+
+def _count_constraints(caller, constraint, n, dtype, *args):
+    """m, for a constraint that returns (m,) with m <= n."""
+    value = _evaluate(caller, "constraint", constraint, *args)
+    if not hasattr(value, "shape") or len(value.shape) != 1 or not 1 <= value.shape[0] <= n:
+        raise ValueError(
+            f"{caller}: `constraint` must return an array (m,) with 1 <= m <= {n}, the number of coordinates; "
+            f"received {describe(value)}."
+        )
+    _check_dtype(caller, "constraint", value, dtype)
+    return value.shape[0]
 
 
 def _check_like(caller, name, value, like, reference, dtype):

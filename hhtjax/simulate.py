@@ -34,7 +34,7 @@ class Solution(NamedTuple):
 
     t: (K + 1,). q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order
     system y, y' and None.
-    multipliers: None without constraints. dt: the step size.
+    multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L. dt: the step size.
     info: `Info` for each of the K intervals between saved times: largest residual, number of Newton
     iterations, all converged; None where the method has nothing to tell.
     failure: the first step that failed, as data; `check` turns it into an error.
@@ -146,12 +146,16 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
             _show_progress(count, num_steps)
         return (state, count, _first_failure(failure, count, state, info)), info
 
+    def saved(state):
+        state = public(flat, state)
+        return state.t, state.q, state.v, state.w, state.L
+
     def interval(carry, _):
         if save_every == 1:
             carry, info = step(carry)
         else:
             (carry, info), _ = checkpointed_scan(joined_step, (carry, no_info), save_every)
-        return carry, (public(flat, carry[0])[:4], info)
+        return carry, (saved(carry[0]), info)
 
     def joined_step(carry, _):
         carry, info = carry
@@ -164,13 +168,15 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
     (_, _, failure), (path, info) = checkpointed_scan(
         interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every
     )
-    t, *path = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), public(flat, start)[:4], path)
+    t, *path, L = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(start), path)
     q, v, w = (None if x is None else jax.vmap(flat.unravel)(x) for x in path)
-    return Solution(t, q, v, w, None, dt, info, failure)
+    return Solution(t, q, v, w, L, dt, info, failure)
 
 
 def _first_failure(failure, count, state, info):
     finite = jnp.all(jnp.isfinite(state.q) & jnp.isfinite(state.v) & jnp.isfinite(state.w))
+    if state.L is not None:
+        finite = finite & jnp.all(jnp.isfinite(state.L))
     failed = ~finite if info.converged is None else ~(finite & info.converged)
     first = failed & (failure.step == 0)
     return Failure(jnp.where(first, count, failure.step), jnp.where(first, finite, failure.newton))
@@ -178,18 +184,14 @@ def _first_failure(failure, count, state, info):
 
 def _no_info(shapes):
     """What `_join` leaves unchanged."""
-    if shapes.residual is None:
-        return Info()
-    return Info(jnp.zeros((), shapes.residual.dtype), jnp.zeros((), shapes.iterations.dtype), jnp.array(True))
+    return Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
 
 
 def _join(info, new):
-    """Info of several steps as one: largest residual, number of iterations, all converged."""
-    if new.residual is None:
-        return info
-    return Info(
-        jnp.maximum(info.residual, new.residual), info.iterations + new.iterations, info.converged & new.converged
-    )
+    """Info of several steps as one: largest residuals, number of iterations, all converged."""
+    join = {"iterations": jnp.add, "converged": jnp.logical_and}
+    pairs = {name: (x, getattr(new, name)) for name, x in info._asdict().items() if x is not None}
+    return info._replace(**{name: join.get(name, jnp.maximum)(*pair) for name, pair in pairs.items()})
 
 
 def _show_progress(count, num_steps):

@@ -18,11 +18,12 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from hhtjax.boundary import require_function, require_number
 from hhtjax.description import is_concrete
-from hhtjax.linear_solve import factorize, factorize_with, solve_map
+from hhtjax.linear_solve import factorize, factorize_with
+from hhtjax.steppers.constrained import begin_constrained, bind_constrained
+from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import Info, State, Stepper
 
 LINEARIZATIONS = ("predictor", "held", "state", "auto")
@@ -45,7 +46,8 @@ class Options(NamedTuple):
     linearize: str | None = None
     tolerance: float = 1e-10
     max_iterations: int = 20
-    start: str = "simple"
+    start: str | None = None
+    formulation: str = "ggl"
     solve: Callable | None = None
 
 
@@ -56,7 +58,8 @@ class Keywords(TypedDict, total=False):
     linearize: str | None
     tolerance: float
     max_iterations: int
-    start: str
+    start: str | None
+    formulation: str
     solve: Callable | None
 
 
@@ -71,19 +74,6 @@ def advance(c, s, dt, w):
 def residual(system, params, s):
     """M(q) w - Q(q, v, t): zero on the trajectory."""
     return system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
-
-
-def linearized_solve(r, path, w, factorize, at=None):
-    """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)).
-
-    One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
-    """
-    start, along = jax.linearize(path, w)
-    point = start if at is None else at
-    value, tangent = jax.linearize(r, point)
-    if at is not None:
-        value = value + tangent(jax.tree.map(jnp.subtract, start, point))
-    return w - solve_map(lambda dw: tangent(along(dw)), value, factorize)
 
 
 def linearization_point(system, params, s, predicted, where):
@@ -103,44 +93,6 @@ def linearization_point(system, params, s, predicted, where):
     return jax.tree.map(partial(jnp.where, use_predictor), predicted, held)
 
 
-def newton(r, path, s, factorize, tolerance, max_iterations):
-    """Newton on r(path(w)) from s.w, until max|r| <= tolerance or a correction is lost in rounding.
-
-    Differentiated by the implicit-function theorem, forward and reverse.
-    """
-
-    def lost_in_rounding(s0, s1):
-        """Whether q, and h v, change by less than they are rounded to."""
-        h = s1.t - s.t
-        size = jnp.maximum(jnp.max(jnp.abs(s1.q)), h * jnp.max(jnp.abs(s1.v)))
-        change = jnp.maximum(jnp.max(jnp.abs(s1.q - s0.q)), h * jnp.max(jnp.abs(s1.v - s0.v)))
-        return change <= 4 * float(jnp.finfo(s.w.dtype).eps) * size
-
-    def search(f, w):
-        def unfinished(carry):
-            _, value, iterations, converged = carry
-            return ~converged & (iterations < max_iterations) & jnp.all(jnp.isfinite(value))
-
-        def improve(carry):
-            w0, value, iterations, _ = carry
-            w1 = w0 - factorize(jax.jacfwd(f)(w0))(value, trans=0)
-            value = f(w1)
-            converged = jnp.all(jnp.abs(value) <= tolerance) | lost_in_rounding(path(w0), path(w1))
-            return w1, value, iterations + 1, converged
-
-        value = f(w)
-        begin = w, value, jnp.zeros((), jnp.int32), jnp.all(jnp.abs(value) <= tolerance)
-        w, value, iterations, converged = lax.while_loop(unfinished, improve, begin)
-        # as floats: custom_root cannot differentiate past integers
-        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype))
-
-    def tangent_solve(g, y):
-        return solve_map(g, y, factorize)
-
-    w, (size, iterations, converged) = lax.custom_root(lambda w: r(path(w)), s.w, search, tangent_solve, has_aux=True)
-    return w, Info(size, iterations.astype(jnp.int32), converged > 0)
-
-
 @dataclass(frozen=True, eq=False)
 class GeneralizedAlpha(Stepper):
     """A method of the family; made by `hht`, `newmark`, `bossak` and `generalized_alpha`."""
@@ -149,15 +101,19 @@ class GeneralizedAlpha(Stepper):
     order: int
     options: Options
 
+    solves_constraints = True
+
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""
         c = self.coefficients
+        if system.num_constraints:
+            return begin_constrained(self, system, q, v, t, params, dt)
 
         def acceleration(q, v, t):
             return system.acceleration(q, v, t, params, self.factorize)
 
         shift = c.alpha_m - c.alpha_f
-        if self.options.start == "simple" or (is_concrete(shift) and shift == 0):
+        if self.options.start != "corrected" or (is_concrete(shift) and shift == 0):
             w = acceleration(q, v, t)
             return State(t, q, v, w, w)
         w, tangent = jax.linearize(acceleration, q, v, t)
@@ -174,6 +130,8 @@ class GeneralizedAlpha(Stepper):
 
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""
+        if system.num_constraints:
+            return bind_constrained(self, system, params, dt)
         r = partial(residual, system, params)
         options = self.options
         factorize, where = self.factorize, options.linearize
@@ -189,7 +147,7 @@ class GeneralizedAlpha(Stepper):
         def step(s):
             path = partial(self.advance, s, dt)
             if options.iterations is None:
-                w, info = newton(r, path, s, factorize, options.tolerance, options.max_iterations)
+                w, info = newton(r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
                 return path(w), info
             at = linearization_point(system, params, s, path(s.w), where)
             w = linearized_solve(r, path, s.w, factorize, at)
@@ -233,7 +191,10 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         max_iterations: Newton iterations before a step counts as failed (iterations=None only).
         start: "simple", a0 = w0; "corrected", a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order
             value. q, v and w are of order 2 with both; only a needs the correction, which blows up when
-            h exceeds the fastest time scale of the system.
+            h exceeds the fastest time scale of the system. Default: simple; corrected with constraints.
+        formulation: of constraints. "ggl": Phi = 0 and dPhi/dt = 0, by one more multiplier for each (Gear,
+            Gupta, Leimkuhler 1985); "index3": Phi = 0 alone. With constraints the one linearisation is at
+            the predictor.
         solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU. Need not be differentiable.
 
     Raises:
@@ -331,7 +292,7 @@ def _member(caller, coefficients, order, keywords):
 
 def check_options(caller, options):
     """The options with the default of `linearize` filled in, or an error that names what is wrong."""
-    iterations, linearize, tolerance, max_iterations, start, solve = options
+    iterations, linearize, tolerance, max_iterations, start, formulation, solve = options
     if iterations is not None and (not isinstance(iterations, int) or isinstance(iterations, bool) or iterations < 1):
         raise ValueError(f"{caller}: `iterations` must be a positive integer or None; received {iterations!r}.")
     if linearize is None:
@@ -346,8 +307,10 @@ def check_options(caller, options):
     require_number(caller, "tolerance", tolerance, lambda x: x > 0, "be positive")
     if not isinstance(max_iterations, int) or isinstance(max_iterations, bool) or max_iterations < 1:
         raise ValueError(f"{caller}: `max_iterations` must be a positive integer; received {max_iterations!r}.")
-    if start not in ("corrected", "simple"):
+    if start not in (None, "corrected", "simple"):
         raise ValueError(f'{caller}: `start` must be "corrected" or "simple"; received {start!r}.')
+    if formulation not in ("ggl", "index3"):
+        raise ValueError(f'{caller}: `formulation` must be "ggl" or "index3"; received {formulation!r}.')
     if solve is not None:
         require_function(caller, "solve", solve, "solve(A, b)")
     return options._replace(linearize=linearize)

@@ -29,5 +29,5 @@ def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=No
     >>> hhtjax.implicit_euler().order
     1
     """
-    options = Options(iterations, "predictor", tolerance, max_iterations, "simple", solve)
+    options = Options(iterations, "predictor", tolerance, max_iterations, "simple", solve=solve)
     return ImplicitEuler(Coefficients(0.0, 0.0, 1.0, 1.0), 1, check_options("implicit_euler", options))

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from hhtjax.boundary import require_number
 from hhtjax.description import is_concrete
 from hhtjax.linear_solve import factorize, solve
-from hhtjax.steppers.generalized_alpha import Options, check_options, newton
+from hhtjax.steppers.generalized_alpha import Options, check_options
+from hhtjax.steppers.newton import newton
 from hhtjax.steppers.stepper import Info, State, Stepper
 
 
@@ -90,7 +91,7 @@ class ConventionalHHT(Stepper):
                 Q1 = system.force(s1.q, s1.v, s.t + late, params)
                 return system.inertia(s1.q, s1.w, params) - (1 + alpha) * Q1 + alpha * Q0
 
-            a, info = newton(r, path, s, factorize, self.options.tolerance, self.options.max_iterations)
+            a, info = newton(r, path, s.w, s, factorize, self.options.tolerance, self.options.max_iterations)
             return path(a), info
 
         return step

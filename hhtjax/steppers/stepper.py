@@ -15,6 +15,7 @@ class State(NamedTuple):
 
     t: time; q: position; v: velocity; w: acceleration, w = M^-1 Q on the trajectory;
     a: algorithmic acceleration of the generalised-alpha recursion, None where a method has none.
+    L: multipliers (m,) of constraints, None without.
     Of a first-order system: q: y; v: y'; w: None; a: algorithmic y'.
     memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
@@ -24,6 +25,7 @@ class State(NamedTuple):
     v: Any
     w: Any
     a: Any = None
+    L: Any = None
     memory: Any = None
 
 
@@ -33,11 +35,14 @@ class Info(NamedTuple):
     residual: max-norm of M w - Q at the accepted iterate, in units of force.
     iterations: number of Newton iterations.
     converged: whether they met the tolerance.
+    constraint: max-norm of Phi at the end of the step; constraint_rate: of dPhi/dt.
     """
 
     residual: Any = None
     iterations: Any = None
     converged: Any = None
+    constraint: Any = None
+    constraint_rate: Any = None
 
 
 class Stepper(Description):
@@ -55,6 +60,7 @@ class Stepper(Description):
     """
 
     order: int  # of convergence of q and v in dt
+    solves_constraints = False
 
     def begin(self, system, q, v, t, params, dt) -> State:
         """State at the initial time, for a `FlatSystem`."""
@@ -81,7 +87,7 @@ class Stepper(Description):
         w = ravel_pytree(state.v if flat.first_order else state.w)[0]
         a = None if state.a is None else ravel_pytree(state.a)[0]
         step = self.astype(q.dtype).bind(flat, params, jnp.asarray(dt).astype(q.dtype))
-        state, info = step(State(state.t, q, v, w, a, state.memory))
+        state, info = step(State(state.t, q, v, w, a, state.L, state.memory))
         return _unravel(flat, state), info
 
 

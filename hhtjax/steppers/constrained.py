@@ -1,0 +1,80 @@
+"""The generalised-alpha step with constraints, in index-3 form and stabilised (GGL).
+
+The residual of the step gets the rows of the constraints, scaled so that all are of one size for every h:
+
+    r(w1, L1, eta) = [ M(q1) w1 - Q1 - B1^T L1;  Phi(q1, t1)/(beta h^2);  (B1 v1 + Phi_t)/(gamma h) ]
+    q1 = (Newmark's) - beta h^2 M_n^-1 B_n^T eta
+
+Index 3 has neither the last row nor eta. With both, velocities satisfy their constraint too, and the spectrum at
+infinite frequency has no Jordan block: multipliers do not grow even for the trapezoidal rule.
+
+C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13, 1985; A. Cardona, M. Geradin, Computers & Structures 33,
+1989; M. Arnold, O. Bruls, Multibody Syst. Dyn. 18, 2007.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.constraints import acceleration_and_multipliers, reaction, violation
+from hhtjax.linear_solve import solve
+from hhtjax.steppers.newton import linearized_solve, newton
+from hhtjax.steppers.stepper import Info, State
+
+
+def begin_constrained(method, system, q, v, t, params, dt):
+    """w0 and L0 of the index-1 system, and a0 of second order, without which L is of first."""
+    c = method.coefficients
+
+    def start(q, v, t):
+        return acceleration_and_multipliers(system, q, v, t, params, method.factorize)
+
+    if method.options.start == "simple":
+        w, L = start(q, v, t)
+        return State(t, q, v, w, w, L)
+    (w, L), tangent = jax.linearize(start, q, v, t)
+    rate, _ = tangent(v, w, jnp.ones_like(t))
+    return State(t, q, v, w, w + (c.alpha_m - c.alpha_f) * dt * rate, L)
+
+
+def report(system, params, s, info):
+    """What the step tells, and by how much it violates the constraints."""
+    position, rate = violation(system, s.q, s.v, s.t, params)
+    return info._replace(constraint=jnp.max(jnp.abs(position)), constraint_rate=jnp.max(jnp.abs(rate)))
+
+
+def bind_constrained(method, system, params, dt):
+    """The step: one Newton step from the predictor (w, L, 0), or Newton until done."""
+    c, options, factorize = method.coefficients, method.options, method.factorize
+    n, m = system.size, system.num_constraints
+    ggl = options.formulation == "ggl"
+
+    def r(s):
+        force = system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
+        position, rate = violation(system, s.q, s.v, s.t, params)
+        rows = [force - reaction(system, s.q, s.t, params, s.L), position / (c.beta * dt**2)]
+        return jnp.concatenate(rows + [rate / (c.gamma * dt)] * ggl)
+
+    def step(s):
+        M = system.mass(s.q, params)
+        inverse = (lambda b: b / M) if M.ndim == 1 else partial(solve, M, factorize=factorize)
+
+        def path(z):
+            s1 = method.advance(s, dt, z[:n])._replace(L=z[n : n + m])
+            if not ggl:
+                return s1
+            shift = inverse(reaction(system, s.q, s.t, params, z[n + m :]))
+            return s1._replace(q=s1.q - c.beta * dt**2 * shift)
+
+        z = jnp.concatenate([s.w, s.L] + [jnp.zeros(m, s.q.dtype)] * ggl)
+        if options.iterations is None:
+            z, info = newton(r, path, z, s, factorize, options.tolerance, options.max_iterations)
+        else:
+            for _ in range(options.iterations):
+                z = linearized_solve(r, path, z, factorize)
+            info = Info()
+        s1 = path(z)
+        return s1, report(system, params, s1, info)
+
+    return step
