@@ -1,6 +1,7 @@
 """hhtjax: differentiable, functional time integrators for multibody dynamics."""
 
 from hhtjax import scenes as scenes
+from hhtjax.constraints import consistent_initial as consistent_initial
 from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
 from hhtjax.identify import IdentifiabilityWarning as IdentifiabilityWarning
 from hhtjax.identify import fit as fit

@@ -6,10 +6,21 @@ A multiplier L_i is the reaction that constraint i exerts along its own gradient
 units of length. (The IVP test set writes -B^T lambda: its multipliers are the negatives of these.)
 """
 
+import math
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 
+from hhtjax.description import is_concrete
+from hhtjax.flat_system import flatten, initial_values
 from hhtjax.linear_solve import factorize, solve_map
+
+MAX_ITERATIONS = 50
+RANK_TOLERANCE = 1e-9  # singular value of the scaled B below which rows count as dependent
+CONSISTENT = 1e-6  # relative distance of initial values from consistent ones that passes
 
 
 def violation(system, q, v, t, params):
@@ -48,3 +59,133 @@ def acceleration_and_multipliers(system, q, v, t, params, factorize=factorize):
     """w and L at a state that satisfies Phi = 0 and dPhi/dt = 0."""
     Q = system.force(q, v, t, params)
     return saddle_point(system, q, t, params, Q, -curvature(system, q, v, t, params), factorize)
+
+
+class ConsistentInitial(NamedTuple):
+    """q, v, acceleration: pytrees like q0; multipliers: (m,); converged: whether Newton reached Phi(q) = 0."""
+
+    q: Any
+    v: Any
+    acceleration: Any
+    multipliers: Any
+    converged: Any
+
+
+def consistent_initial(system, q0, v0, params=None, t0=0.0) -> ConsistentInitial:
+    """The values nearest to q0 and v0 that satisfy the constraints, with the acceleration and multipliers there.
+
+        min |q - q0|_M with Phi(q, t0) = 0,     min |v - v0|_M with B v + Phi_t = 0,     |x|_M^2 = x^T M x
+
+    M at q0 for the first, at q for the second. Then M w = Q + B^T L with the second time derivative of Phi zero.
+
+    Args:
+        system: a `System` with a constraint. q0, v0, params, t0: as in `simulate`.
+
+    Differentiable, forward and reverse. Newton for q from q0: start near. Under jit nothing raises, and
+    `converged` tells.
+
+    Raises:
+        ValueError: constraints that depend on each other (or on no coordinate) at q0, or no q found.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> pendulum = hhtjax.System(
+    ...     mass=jnp.ones(2),
+    ...     force=lambda q, v, t, params: jnp.array([0.0, -9.81]),
+    ...     constraint=lambda q, t, params: jnp.array([jnp.sqrt(jnp.sum(q**2)) - 2.0]))
+    >>> start = hhtjax.consistent_initial(pendulum, jnp.array([0.0, -2.1]), jnp.array([1.0, 0.3]))
+    >>> [round(float(x), 6) for x in (*start.q, *start.v, *start.multipliers)]        # m v^2/l + m g in tension
+    [0.0, -2.0, 1.0, 0.0, -10.31]
+    """
+    if getattr(system, "constraint", None) is None:
+        raise ValueError("consistent_initial: `system` must have a constraint.")
+    q0, v0 = initial_values("consistent_initial", system, q0, v0)
+    flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params)
+    t = jnp.asarray(t0).astype(q.dtype)
+    B = jax.jacrev(lambda q: flat.constraint(q, t, params))(q)
+    if is_concrete(B):
+        require_independent("consistent_initial", np.asarray(B))
+    q, converged = nearest_position(flat, q, t, params)
+    if is_concrete(converged) and not converged:
+        left = np.abs(np.asarray(flat.constraint(q, t, params))).max()
+        raise ValueError(
+            f"consistent_initial: no q with Phi(q, t) = 0 found near `q0`; {left:.3g} is left of it. Start nearer."
+        )
+    v = v + correction(flat, q, t, params, -violation(flat, q, v, t, params)[1])
+    w, L = acceleration_and_multipliers(flat, q, v, t, params)
+    return ConsistentInitial(*(flat.unravel(x) for x in (q, v, w)), L, converged)
+
+
+def correction(system, q, t, params, rows):
+    """The x with B x = rows that is smallest in the norm of M."""
+    return saddle_point(system, q, t, params, jnp.zeros_like(q), rows)[0]
+
+
+def nearest_position(system, q0, t, params):
+    """q on Phi = 0 nearest to q0 in the norm of M(q0), by Newton, and whether that converged."""
+    n, eps = system.size, float(jnp.finfo(q0.dtype).eps)
+    z0 = jnp.concatenate([q0, jnp.zeros(system.num_constraints, q0.dtype)])
+
+    def f(z):
+        q, mu = z[:n], z[n:]
+        pull = system.inertia(q0, q - q0, params) - reaction(system, q, t, params, mu)
+        return jnp.concatenate([pull, system.constraint(q, t, params)])
+
+    def search(f, z):
+        def unfinished(carry):
+            z, change, iterations = carry
+            return (change > 16 * eps * (1 + jnp.max(jnp.abs(z[:n])))) & (iterations < MAX_ITERATIONS)
+
+        def improve(carry):
+            z, _, iterations = carry
+            dz = factorize(jax.jacfwd(f)(z))(f(z), trans=0)
+            return z - dz, jnp.max(jnp.abs(dz[:n])), iterations + 1
+
+        z, change, _ = lax.while_loop(unfinished, improve, (z, jnp.asarray(jnp.inf, z.dtype), 0))
+        return z, change
+
+    z, change = lax.custom_root(f, z0, search, lambda g, y: solve_map(g, y, factorize), has_aux=True)
+    return z[:n], change <= math.sqrt(eps) * (1 + jnp.max(jnp.abs(z[:n])))
+
+
+def require_independent(caller, B):
+    """An error that names the rows of B that depend on each other."""
+    size = np.linalg.norm(B, axis=1)
+    empty = np.flatnonzero(~(np.isfinite(size) & (size > 0))).tolist()
+    if empty:
+        raise ValueError(
+            f"{caller}: `constraint` rows {empty} have no gradient in q at the start, or not a finite one."
+        )
+    left, values, _ = np.linalg.svd(B / size[:, None])
+    dependent = left[:, values < RANK_TOLERANCE]
+    if dependent.size:
+        rows = np.flatnonzero(np.abs(dependent).max(axis=1) > 1e-6).tolist()
+        rank = len(values) - dependent.shape[1]
+        raise ValueError(
+            f"{caller}: `constraint` rows {rows} depend on each other at the start (rank {rank} of {len(values)}): "
+            "drop the redundant ones."
+        )
+
+
+@jax.jit
+def examine(system, q0, v0, t0, params):
+    """B, and for Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not."""
+    flat, q, v = flatten("simulate", system, q0, v0, t0, params)
+    t = jnp.asarray(t0).astype(q.dtype)
+    B = jax.jacrev(lambda q: flat.constraint(q, t, params))(q)
+    both = violation(flat, q, v, t, params)
+    return B, [(jnp.max(jnp.abs(x)), jnp.max(jnp.abs(correction(flat, q, t, params, x)))) for x in both]
+
+
+def require_consistent(caller, system, q0, v0, t0, params):
+    """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
+    if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params)))):
+        return
+    B, found = examine(system, q0, v0, t0, params)
+    require_independent(caller, np.asarray(B))
+    for name, meaning, x, (violated, distance) in zip(("q0", "v0"), ("Phi", "dPhi/dt"), (q0, v0), found, strict=True):
+        size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(x))
+        if not distance <= CONSISTENT * (1 + size):
+            raise ValueError(
+                f"{caller}: `{name}` violates the constraint: max|{meaning}| = {violated:.3g}, {distance:.3g} away "
+                "from consistent values; hhtjax.consistent_initial gives them."
+            )

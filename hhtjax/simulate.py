@@ -11,9 +11,10 @@ from jax import lax
 
 from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpointed_scan
+from hhtjax.constraints import require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.flat_system import flatten, initial_values
-from hhtjax.steppers.stepper import Info, Stepper, public
+from hhtjax.steppers.stepper import Info, Stepper, public, require_constrained
 from hhtjax.system import FirstOrderSystem, LinearSystem, System
 
 
@@ -97,9 +98,9 @@ def simulate(
     costs no compilation.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind, shape, structure or value. Values are checked
-            unless they are tracers.
-        NotImplementedError: the system has a constraint.
+        TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate
+            a constraint. Values are checked unless they are tracers.
+        NotImplementedError: the system has a constraint, and the stepper cannot solve one.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: -params["k"] * q)
@@ -122,6 +123,9 @@ def simulate(
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
     q0, v0 = initial_values("simulate", system, q0, v0)
+    require_constrained("simulate", system, stepper)
+    if system.constraint is not None:
+        require_consistent("simulate", system, q0, v0, t0, params)
     dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew
     return _simulate(
         system, stepper, q0, v0, params, dt, t0, num_steps=int(num_steps), save_every=int(save_every), progress=progress

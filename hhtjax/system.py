@@ -23,8 +23,8 @@ class System(Description):
             Shape (n, n), symmetric positive definite, or (n,) for a diagonal. Its rows follow
             `jax.flatten_util.ravel_pytree(v)`; for a dict that is the order of the *sorted* keys.
         force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v.
-        constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,). Accepted, not yet solved:
-            `simulate` raises `NotImplementedError`.
+        constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), m <= n, rows independent. Then
+            M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.
 
     q and v are pytrees of the same structure and shapes; n is their number of entries. Any consistent
     units do. A System is frozen and hashable; constant arrays in it are leaves of a pytree.

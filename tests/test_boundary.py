@@ -423,10 +423,9 @@ def test_an_error_inside_mass_or_force_keeps_its_kind_and_says_where(name):
     assert "['stiffness']: shape () float64" in notes
 
 
-def test_a_constraint_is_not_solved_yet():
+def test_a_constraint_is_refused_where_it_would_be_ignored():
     system = System(ONE, pull, constraint=lambda q, t, params: q)
-    message = "`constraint` is not solved yet"
-    check_message(NotImplementedError, f"simulate: {message}", lambda: run(system))
+    message = "RK4 cannot solve the `constraint`; use hht()"
     check_message(NotImplementedError, f"init: {message}", lambda: STEPPERS["rk4"].init(system, ONE, ZERO, None, 0.1))
 
 

@@ -22,7 +22,7 @@ def linearized_solve(r, path, w, factorize, at=None):
 
 
 def newton(r, path, w, s, factorize, tolerance, max_iterations):
-    """Newton on r(path(w)) from w until max|r| <= tolerance or a correction is lost in rounding; s: where the step starts.
+    """Newton on r(path(w)) from w until max|r| <= tolerance or a correction is lost in rounding; s: the state before.
 
     Differentiated by the implicit-function theorem, forward and reverse.
     """

@@ -76,6 +76,7 @@ class Stepper(Description):
 
     def init(self, system, q0, v0, params, dt, t0=0.0) -> State:
         """State at t0, from position q0 and velocity v0 (None for a `FirstOrderSystem`)."""
+        require_constrained("init", system, self)
         q0, v0 = initial_values("init", system, q0, v0)
         flat, q, v = flatten("init", system, q0, v0, t0, params)
         dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
@@ -89,6 +90,14 @@ class Stepper(Description):
         step = self.astype(q.dtype).bind(flat, params, jnp.asarray(dt).astype(q.dtype))
         state, info = step(State(state.t, q, v, w, a, state.L, state.memory))
         return _unravel(flat, state), info
+
+
+def require_constrained(caller, system, stepper):
+    """An error for a constraint that the stepper would ignore."""
+    if system.constraint is not None and not stepper.solves_constraints:
+        raise NotImplementedError(
+            f"{caller}: {type(stepper).__name__} cannot solve the `constraint`; use hht() or another of its family."
+        )
 
 
 def public(flat, state):

@@ -1,0 +1,70 @@
+"""A row of N four-bar loops in natural coordinates: one degree of freedom, and N + 1 where all bars are horizontal.
+
+N + 1 cranks stand on pivots A_i = (i l, 0), i = 0 ... N, and N couplers join their ends B_i in a row. All bars are
+slender and uniform, of the length l (m) and the mass m (kg); gravity g (m/s^2) acts along -y.
+
+q (N + 1, 2): the points B_i, in m. Phi (2 N + 1,): (length^2 - l^2)/2 of the cranks, then of the couplers. When the
+cranks lie along the x axis, so do the couplers, and the rank of B = dPhi/dq falls from 2 N + 1 to N + 1: the
+multipliers are not unique there, and the loops could fold. Twice per turn the benchmark passes through such a position.
+
+While no loop folds, all cranks are at one angle a from the x axis, and
+
+    ((N + 1)/3 + N) l a'' = -((N + 1)/2 + N) g cos a
+
+References:
+    Bayo, Avello, Nonlinear Dynamics 5 (1994), 209-231; Gonzalez, Dopico, Lugris, Cuadrado, Multibody Syst. Dyn. 16
+    (2006), 179-190: benchmark A02, "N four-bar mechanism".
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.boundary import require_number
+from hhtjax.scenes.scene import Scene
+from hhtjax.system import System
+
+GRAVITY = 9.81
+
+
+def couplers(q):
+    """(N + 1, N + 1): 1 where a coupler joins B_i and B_j."""
+    upper = jnp.eye(len(q), k=1, dtype=q.dtype)
+    return upper + upper.T
+
+
+def mass(q, params):
+    """M, constant: a bar contributes m/6 [[2, 1], [1, 2]] to its two ends, in x and in y."""
+    joined = couplers(q)
+    bars = jnp.sum(joined, axis=0) + 1
+    return jnp.kron(params["m"] / 6 * (joined + 2 * jnp.diag(bars)), jnp.eye(2, dtype=q.dtype))
+
+
+def force(q, v, t, params):
+    """Q: half of each bar's weight at each of its ends."""
+    bars = jnp.sum(couplers(q), axis=0) + 1
+    weight = params["m"] * params["g"] / 2 * bars
+    return jnp.stack([jnp.zeros_like(weight), -weight], axis=1)
+
+
+def constraint(q, t, params):
+    """Phi: cranks, then couplers."""
+    pivots = params["l"] * jnp.arange(len(q), dtype=q.dtype)
+    cranks = q - jnp.stack([pivots, jnp.zeros_like(pivots)], axis=1)
+    bars = jnp.concatenate([cranks, jnp.diff(q, axis=0)])
+    return (jnp.sum(bars**2, axis=1) - params["l"] ** 2) / 2
+
+
+def four_bars(loops=2) -> Scene:
+    """N = loops squares of 1 m bars of 1 kg, whose upper row starts at 1 m/s.
+
+    Raises:
+        TypeError, ValueError: loops is no positive integer.
+
+    >>> four_bars(loops=2).q0.tolist()
+    [[0.0, 1.0], [1.0, 1.0], [2.0, 1.0]]
+    """
+    require_number("four_bars", "loops", loops, lambda n: n >= 1 and float(n).is_integer(), "be a positive integer")
+    along = jnp.arange(int(loops) + 1, dtype=jnp.result_type(float))
+    ones = jnp.ones_like(along)
+    params = {"m": 1.0, "l": 1.0, "g": GRAVITY}
+    q0, v0 = jnp.stack([along, ones], axis=1), jnp.stack([ones, jnp.zeros_like(ones)], axis=1)
+    return Scene(System(mass, force, constraint), params, q0, v0, 10.0)

@@ -1,0 +1,88 @@
+"""One simple pendulum in three formulations: a rod as a constraint, a stiff spring in its place, and one angle.
+
+A point mass m (kg) at the distance l (m) from the origin, under gravity g (m/s^2) along -y. It starts at its lowest
+point with a horizontal velocity, by default as in Cardona, Geradin (1989), Sec. 4.1, as far as their figure is legible.
+
+    cartesian   q = (x, y)    m w = m g + B^T L,  Phi = (x^2 + y^2 - l^2)/2 = 0; the tension of the rod is -l L
+    elastic     q = (x, y)    m w = m g - k (r - l) (x, y)/r,  r = sqrt(x^2 + y^2)
+    minimal     q = (angle from the lowest point,)    m l^2 w = -m g l sin q
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.boundary import require_number
+from hhtjax.scenes.scene import Scene
+from hhtjax.system import System
+
+GRAVITY = 9.81
+DURATION = 1.0
+
+
+def point_mass(q, params):
+    """M = diag(m, m)."""
+    return jnp.full(2, params["m"], q.dtype)
+
+
+def weight(q, v, t, params):
+    """Q = (0, -m g)."""
+    return jnp.array([0.0, -params["m"] * params["g"]], q.dtype)
+
+
+def rod(q, t, params):
+    """Phi = (x^2 + y^2 - l^2)/2."""
+    return (jnp.sum(q**2, keepdims=True) - params["l"] ** 2) / 2
+
+
+def weight_and_spring(q, v, t, params):
+    """Q with a spring of stiffness k (N/m) and rest length l between the origin and the mass."""
+    r = jnp.sqrt(jnp.sum(q**2))
+    return weight(q, v, t, params) - params["k"] * (r - params["l"]) / r * q
+
+
+def inertia(q, params):
+    """M = [m l^2]."""
+    return jnp.full(1, params["m"] * params["l"] ** 2, q.dtype)
+
+
+def moment_of_weight(q, v, t, params):
+    """Q = [-m g l sin q]."""
+    return -params["m"] * params["g"] * params["l"] * jnp.sin(q)
+
+
+def cartesian(speed=2.505, length=0.5) -> Scene:
+    """The rod as a constraint. speed: at the lowest point, in m/s. length: of the rod, in m.
+
+    Raises:
+        TypeError, ValueError: speed is no finite number, length no positive one. So in `elastic` and `minimal`.
+    """
+    params = _params("cartesian", speed, length)
+    return Scene(System(point_mass, weight, rod), params, jnp.array([0.0, -length]), jnp.array([speed, 0.0]), DURATION)
+
+
+def elastic(k=1e6, speed=2.505, length=0.5) -> Scene:
+    """A spring of stiffness k (N/m) instead of the rod, whose motion it tends to as 1/k.
+
+    It starts stretched by as much as carries the weight and turns the mass, k (r - l) = m (g + speed^2/r), so the
+    spring hardly vibrates. The frequency of such a vibration is sqrt(k/m).
+
+    Raises:
+        TypeError, ValueError: as in `cartesian`, and where k is no positive number.
+    """
+    params = _params("elastic", speed, length)
+    params["k"] = require_number("elastic", "k", k, lambda x: 0 < x < np.inf, "be positive and finite")
+    b = k * length + params["m"] * GRAVITY
+    r = (b + jnp.sqrt(b**2 + 4 * k * params["m"] * speed**2)) / (2 * k)
+    return Scene(System(point_mass, weight_and_spring), params, jnp.array([0.0, -r]), jnp.array([speed, 0.0]), DURATION)
+
+
+def minimal(speed=2.505, length=0.5) -> Scene:
+    """The same motion as `cartesian` in one angle: (x, y) = l (sin q, -cos q)."""
+    params = _params("minimal", speed, length)
+    return Scene(System(inertia, moment_of_weight), params, jnp.zeros(1), jnp.array([speed / length]), DURATION)
+
+
+def _params(caller, speed, length):
+    require_number(caller, "speed", speed, np.isfinite, "be finite")
+    require_number(caller, "length", length, lambda x: 0 < x < np.inf, "be positive and finite")
+    return {"m": 1.0, "l": length, "g": GRAVITY}

@@ -1,0 +1,62 @@
+"""A planar slider-crank: a crank on a fixed pivot, a connecting rod, and a slider on the x axis. SI units.
+
+q = (crank angle, rod angle, slider position): angles from the x axis in rad, x in m. The slider is at
+x = l1 cos q1 + l2 cos q2, the joint of crank and rod at l1 (cos q1, sin q1).
+
+Crank and rod are slender and uniform, of lengths l (2,) with l1 < l2; m (3,): masses of crank, rod and slider. Gravity
+g acts along -y. A spring k and a damper c act on the slider, the spring at rest at x = rest; a moment on the crank.
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import Scene
+from hhtjax.system import System
+
+GRAVITY = 9.80665
+
+
+def mass(q, params):
+    """M = [[(m1/3 + m2) l1^2, m2 l1 l2 cos(q1 - q2)/2, 0], [., m2 l2^2/3, 0], [0, 0, m3]]."""
+    (m1, m2, m3), (l1, l2) = params["m"], params["l"]
+    coupling = m2 * l1 * l2 / 2 * jnp.cos(q[0] - q[1])
+    return jnp.array([[(m1 / 3 + m2) * l1**2, coupling, 0.0], [coupling, m2 * l2**2 / 3, 0.0], [0.0, 0.0, m3]], q.dtype)
+
+
+def force(q, v, t, params):
+    """Q: weight, inertia forces, the moment, the spring and the damper."""
+    (m1, m2, _), (l1, l2), g = params["m"], params["l"], params["g"]
+    coupling = m2 * l1 * l2 / 2 * jnp.sin(q[0] - q[1])
+    return jnp.array(
+        [
+            params["moment"] - (m1 / 2 + m2) * g * l1 * jnp.cos(q[0]) - coupling * v[1] ** 2,
+            -m2 / 2 * g * l2 * jnp.cos(q[1]) + coupling * v[0] ** 2,
+            -params["k"] * (q[2] - params["rest"]) - params["c"] * v[2],
+        ]
+    )
+
+
+def constraint(q, t, params):
+    """Phi = (l1 cos q1 + l2 cos q2 - x, l1 sin q1 + l2 sin q2)."""
+    l1, l2 = params["l"]
+    return jnp.array(
+        [l1 * jnp.cos(q[0]) + l2 * jnp.cos(q[1]) - q[2], l1 * jnp.sin(q[0]) + l2 * jnp.sin(q[1])],
+    )
+
+
+def free() -> Scene:
+    """No spring, no damper, no moment: the crank, stretched out at first, turns on from 20 rad/s."""
+    return _turning(20.0)
+
+
+def driven() -> Scene:
+    """From rest, stretched out: a moment of 5 N m on the crank, a spring and a damper on the slider."""
+    return _turning(0.0, moment=5.0, k=100.0, c=20.0)
+
+
+def _turning(speed, **loads):
+    """Stretched out, q = (0, 0, l1 + l2), with the crank at `speed`, rad/s."""
+    l1, l2 = 0.15, 0.45
+    params = {"m": (0.5, 1.0, 0.8), "l": (l1, l2), "g": GRAVITY, "rest": l2}
+    params |= {"moment": 0.0, "k": 0.0, "c": 0.0} | loads
+    v0 = jnp.array([speed, -speed * l1 / l2, 0.0])
+    return Scene(System(mass, force, constraint), params, jnp.array([0.0, 0.0, l1 + l2]), v0, 1.0)

@@ -1,0 +1,407 @@
+"""The constrained scenes: consistent starts, references, energy, singular positions, gradients; by no stepper of ours.
+
+They are solved in index-1 form, [M -B^T; B 0] [w; L] = [Q; -gamma], where gamma is the second time derivative of Phi
+without B w. As an ODE that keeps Phi = 0 to the accuracy of SciPy's integrator.
+"""
+
+import json
+import re
+from functools import cache, partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.integrate import solve_ivp
+from test_gradients import check_gradient
+
+from hhtjax.scenes import four_bars, pendulum, slider_crank, squeezer
+
+SCENES = {
+    "squeezer": squeezer.squeezer(),
+    "pendulum": pendulum.cartesian(),
+    "elastic pendulum": pendulum.elastic(1e4),
+    "minimal pendulum": pendulum.minimal(),
+    "free slider-crank": slider_crank.free(),
+    "driven slider-crank": slider_crank.driven(),
+    "one four-bar": four_bars.four_bars(loops=1),
+    "four bars": four_bars.four_bars(),
+    "five four-bars": four_bars.four_bars(loops=5),
+}
+CONSTRAINED = [name for name, scene in SCENES.items() if scene.system.constraint]
+CONSERVATIVE = [name for name in SCENES if "driven" not in name]
+UPRIGHT = 0.65  # s: the first singular position of the four bars comes after 0.71 s
+
+
+@cache
+def read(name):
+    """Reference states, a dict of arrays over time; and the whole file."""
+    data = json.loads((Path(__file__).parent / "data" / f"{name}.json").read_text())
+    return {key: np.array([state[key] for state in data["states"]]) for key in data["states"][0]}, data
+
+
+def flat(scene):
+    """M, Q and Phi as functions of vectors, M in full, and vectors q0 and v0."""
+    system, _, q0, v0, _ = scene
+    vector, unravel = ravel_pytree(q0)
+
+    def mass(q, params):
+        M = system.mass(unravel(q), params)
+        return jnp.diag(M) if M.ndim == 1 else M
+
+    def force(q, v, t, params):
+        return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0]
+
+    def constraint(q, t, params):
+        return system.constraint(unravel(q), t, params) if system.constraint else jnp.zeros(0)
+
+    return mass, force, constraint, vector, ravel_pytree(v0)[0]
+
+
+def index_1(scene, params, q, v, t=0.0):
+    """w and L."""
+    mass, force, constraint, _, _ = flat(scene)
+
+    def rate(q, t):
+        return jax.jvp(partial(constraint, params=params), (q, t), (v, 1.0))[1]
+
+    gamma = jax.jvp(rate, (q, t), (v, 1.0))[1]
+    B = jax.jacfwd(constraint)(q, t, params)
+    M, Q = mass(q, params), force(q, v, t, params)
+    K = jnp.block([[M, -B.T], [B, jnp.zeros((gamma.size, gamma.size))]])
+    wL = jnp.linalg.solve(K, jnp.concatenate([Q, -gamma]))
+    return wL[: q.size], wL[q.size :]
+
+
+@cache
+def path(name, times):
+    """q and v, (times, n)."""
+    scene = SCENES[name]
+    _, _, _, q0, v0 = flat(scene)
+
+    @jax.jit
+    def rate(t, y):
+        q, v = jnp.split(y, 2)
+        return jnp.concatenate([v, index_1(scene, scene.params, q, v, t)[0]])
+
+    y0 = np.concatenate([q0, v0])
+    run = solve_ivp(lambda t, y: np.asarray(rate(t, y)), (0, max(times)), y0, "DOP853", times, rtol=1e-11, atol=1e-12)
+    q, v = np.split(run.y.T, 2, axis=1)
+    return q, v
+
+
+def times(name):
+    return tuple(np.linspace(0, UPRIGHT if "four" in name else SCENES[name].duration, 25))
+
+
+def states(scene, number=20):
+    """Random q and v about the start, (number, n); they close no loops."""
+    q0 = flat(scene)[3]
+    q, v = np.random.default_rng(0).normal(size=(2, number, q0.size))
+    return np.asarray(q0) + q, v
+
+
+def bodies(name, q, params):
+    """Uniform bars: masses, and both ends (bars, 2); a point mass is one of no length."""
+    if "slider" in name:
+        l1, l2 = params["l"]
+        joint = l1 * jnp.array([jnp.cos(q[0]), jnp.sin(q[0])])
+        end, slider = joint + l2 * jnp.array([jnp.cos(q[1]), jnp.sin(q[1])]), jnp.array([q[2], 0.0])
+        return jnp.array(params["m"]), jnp.array([jnp.zeros(2), joint, slider]), jnp.array([joint, end, slider])
+    if "four" in name:
+        B = q.reshape(-1, 2)
+        A = params["l"] * jnp.stack([jnp.arange(len(B), dtype=float), jnp.zeros(len(B))], axis=1)
+        return params["m"], jnp.concatenate([A, B[:-1]]), jnp.concatenate([B, B[1:]])
+    point = jnp.array([params["l"] * jnp.sin(q[0]), -params["l"] * jnp.cos(q[0])]) if "minimal" in name else q
+    return params["m"], point[None], point[None]
+
+
+def kinetic_energy(name, q, v, params):
+    """Of `bodies`: Simpson's rule, exact for a bar."""
+
+    def ends(q):
+        return bodies(name, q, params)[1:]
+
+    (u1, u2), (m, *_) = jax.jvp(ends, (q,), (v,))[1], bodies(name, q, params)
+    return jnp.sum(m / 6 * jnp.sum(u1**2 + (u1 + u2) ** 2 + u2**2, axis=1)) / 2
+
+
+def potential_energy(name, q, params):
+    """Of weights and springs, and of a constant moment."""
+    p = params
+    if name == "squeezer":
+        sd, sc, gamma = p["sd"], p["sc"], q[2]
+        x = p["B"][0] + sd * jnp.cos(gamma) + sc * jnp.sin(gamma) - p["C"][0]
+        y = p["B"][1] + sd * jnp.sin(gamma) - sc * jnp.cos(gamma) - p["C"][1]
+        return p["c0"] / 2 * (jnp.hypot(x, y) - p["l0"]) ** 2 - p["moment"] * q[0]
+    m, start, end = bodies(name, q, params)
+    V = p["g"] * jnp.sum(m * (start + end)[:, 1] / 2)
+    if "slider" in name:
+        V += p["k"] / 2 * (q[2] - p["rest"]) ** 2 - p["moment"] * q[0]
+    if "elastic" in name:
+        V += p["k"] / 2 * (jnp.hypot(*q) - p["l"]) ** 2
+    return V
+
+
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_start_is_consistent(name):
+    _, _, constraint, q0, v0 = flat(SCENES[name])
+    Phi, rate = jax.jvp(partial(constraint, params=SCENES[name].params), (q0, 0.0), (v0, 1.0))
+    assert np.max(np.abs(Phi)) < 1e-12
+    assert np.max(np.abs(rate)) < 1e-12
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_mass_is_symmetric_and_positive_definite(name):
+    scene = SCENES[name]
+    M = np.asarray(jax.jit(jax.vmap(flat(scene)[0], (0, None)))(states(scene)[0], scene.params))
+    np.testing.assert_array_equal(M, np.swapaxes(M, 1, 2))
+    assert np.min(np.linalg.eigvalsh(M)) > 1e-3 * np.min(np.diagonal(M, axis1=1, axis2=2))
+
+
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "squeezer"])
+def test_mass_is_that_of_uniform_bars(name):
+    """v.M v/2 is the kinetic energy of the bodies."""
+    scene = SCENES[name]
+
+    @jax.jit
+    @jax.vmap
+    def energies(q, v):
+        return v @ flat(scene)[0](q, scene.params) @ v / 2, kinetic_energy(name, q, v, scene.params)
+
+    np.testing.assert_allclose(*energies(*states(scene)), rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_power_balance(name):
+    """v.(Q + (dM/dt) v/2) is what weights, springs, the moment and the damper do: the inertia forces do no work."""
+    scene = SCENES[name]
+    mass, force, *_ = flat(scene)
+
+    @jax.jit
+    @jax.vmap
+    def powers(q, v):
+        kinetic = jax.jvp(lambda q: v @ mass(q, scene.params) @ v / 2, (q,), (v,))[1]
+        potential = jax.jvp(lambda q: potential_energy(name, q, scene.params), (q,), (v,))[1]
+        damper = scene.params["c"] * v[2] ** 2 if "slider" in name else 0.0
+        return v @ force(q, v, 0.0, scene.params) + kinetic, -potential - damper
+
+    done, given = powers(*states(scene))
+    assert np.max(np.abs(done - given)) < 1e-12 * np.max(np.abs(given))
+
+
+@pytest.mark.parametrize("name", CONSERVATIVE)
+def test_energy_is_conserved_and_loops_stay_closed(name):
+    scene = SCENES[name]
+    mass, _, constraint, *_ = flat(scene)
+
+    @jax.jit
+    @jax.vmap
+    def measure(q, v):
+        T, V = v @ mass(q, scene.params) @ v / 2, potential_energy(name, q, scene.params)
+        return T, T + V, constraint(q, 0.0, scene.params)
+
+    T, energy, Phi = measure(*path(name, times(name)))
+    assert np.max(T) > 1.2 * np.min(T)  # it moves
+    assert np.max(np.abs(energy - energy[0])) < 1e-9 * np.max(T)
+    assert not Phi.size or np.max(np.abs(Phi)) < 1e-10
+
+
+def test_squeezer_accelerations_and_multipliers():
+    """At all reference states, the start included. Their multipliers have the opposite sign."""
+    states, _ = read("squeezer")
+    scene = SCENES["squeezer"]
+    solve = jax.jit(jax.vmap(partial(index_1, scene), (None, 0, 0)))
+    w, L = solve(scene.params, states["q"], states["v"])
+    for x, exact in (w, states["a"]), (L, -states["lambda"]):
+        error = np.max(np.abs(x - exact), axis=1) / np.max(np.abs(exact), axis=1)
+        assert np.max(error) < 1e-12
+
+    # it starts in a dead centre, where the moment meets the inertia of crank and coupler alone
+    doubled, _ = solve(squeezer.squeezer(moment=0.066).params, states["q"], states["v"])
+    np.testing.assert_allclose(doubled[0], 2 * w[0], atol=1e-8)
+
+
+def test_squeezer_reaches_the_reference():
+    states, data = read("squeezer")
+    every = slice(None, None, 4)
+    q, v = (x[every] for x in path("squeezer", times("squeezer")))
+    np.testing.assert_allclose(times("squeezer")[every], states["t"], rtol=1e-15)
+    assert np.all(states["q"][0] == SCENES["squeezer"].q0)
+    assert np.max(np.abs(q - states["q"])) < 1e-9
+    assert np.max(np.abs(v - states["v"])) < 1e-6
+    assert np.max(np.abs(q[-1] - data["published"]["q"])) < 1e-8
+
+
+def test_pendulum_accelerations_and_multiplier():
+    states, _ = read("constrained_pendulum")
+    scene = SCENES["pendulum"]
+    w, L = jax.jit(jax.vmap(partial(index_1, scene, scene.params)))(states["q"], states["v"])
+    np.testing.assert_allclose(w, states["a"], atol=1e-13)
+    np.testing.assert_allclose(L[:, 0], states["multiplier"], rtol=1e-13)
+
+
+def test_pendulum_in_two_coordinates_and_in_one():
+    states, _ = read("constrained_pendulum")
+    until = states["t"] <= 2
+    states = {key: x[until] for key, x in states.items()}
+    q, v = path("pendulum", tuple(states["t"]))
+    angle, rate = path("minimal pendulum", tuple(states["t"]))
+    for x, exact in (q, "q"), (v, "v"), (angle[:, 0], "theta"), (rate[:, 0], "omega"):
+        assert np.max(np.abs(x - states[exact])) < 1e-9
+
+
+def test_elastic_pendulum_follows_the_rod_and_hardly_vibrates():
+    """Its distance from the rod's motion falls with 1/k, and its spring carries the tension of the motion it makes."""
+    name, g = "elastic pendulum", pendulum.GRAVITY
+    rod, _ = path("pendulum", times(name))
+    q, v = path(name, times(name))
+    r = np.hypot(*q.T)
+    tension = (-g * q[:, 1] + v[:, 0] ** 2 + v[:, 1] ** 2) / r
+    stretch = r - SCENES[name].params["l"]
+    assert 1e-3 < np.max(np.abs(q - rod)) < 1e-2
+    assert np.max(stretch) > 2e-3
+    assert np.max(np.abs(stretch - tension / SCENES[name].params["k"])) < 0.01 * np.max(stretch)
+
+    _, _, _, q0, v0 = flat(pendulum.elastic(1e9))
+    assert np.max(np.abs(q0 - SCENES["pendulum"].q0)) < 1e-7
+    assert np.all(v0 == SCENES["pendulum"].v0)
+
+
+@pytest.mark.parametrize("name", ["free slider-crank", "driven slider-crank"])
+def test_slider_crank_closes_over_full_turns(name):
+    l1, l2 = SCENES[name].params["l"]
+    q, v = path(name, times(name))
+    angle = q[:, 0]
+    assert angle[-1] - angle[0] > 2 * np.pi
+    root = np.sqrt(l2**2 - (l1 * np.sin(angle)) ** 2)
+    slope = -l1 * np.sin(angle) * (1 + l1 * np.cos(angle) / root)
+    assert np.max(np.abs(q[:, 2] - (l1 * np.cos(angle) + root))) < 1e-10
+    assert np.max(np.abs(v[:, 2] - slope * v[:, 0])) < 1e-8
+
+
+def parallel(loops, angle, rate):
+    """Four bars with all cranks at one angle, flat q and v."""
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    pivots = np.stack([np.arange(loops + 1.0), np.zeros(loops + 1)], axis=1)
+    return (pivots + along).ravel(), np.tile(rate * across, loops + 1)
+
+
+def angular_acceleration(loops, angle):
+    """((N + 1)/3 + N) l a'' = -((N + 1)/2 + N) g cos a."""
+    return -((loops + 1) / 2 + loops) / ((loops + 1) / 3 + loops) * four_bars.GRAVITY * np.cos(angle)
+
+
+@pytest.mark.parametrize(("name", "loops"), [("one four-bar", 1), ("four bars", 2), ("five four-bars", 5)])
+def test_four_bars_have_one_degree_of_freedom(name, loops):
+    """Angular acceleration of the cranks all around, and their motion from the start."""
+    scene = SCENES[name]
+    solve = jax.jit(partial(index_1, scene, scene.params))
+    for angle in np.linspace(0.1, 6.1, 9):
+        q, v = parallel(loops, angle, rate=-2.0)
+        along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        w = angular_acceleration(loops, angle) * across - 4.0 * along
+        assert np.max(np.abs(solve(q, v)[0] - np.tile(w, loops + 1))) < 1e-10
+
+    def rate(t, y):
+        return y[1], angular_acceleration(loops, y[0])
+
+    angle = solve_ivp(rate, (0, UPRIGHT), (np.pi / 2, -1.0), "DOP853", times(name), rtol=1e-12, atol=1e-13).y[0]
+    exact = np.array([parallel(loops, a, 0.0)[0] for a in angle])
+    assert 0 < angle[-1] < 0.5
+    assert np.max(np.abs(path(name, times(name))[0] - exact)) < 1e-9
+
+
+@pytest.mark.parametrize(("name", "loops"), [("one four-bar", 1), ("four bars", 2), ("five four-bars", 5)])
+def test_four_bars_lose_rank_where_all_bars_align(name, loops):
+    """From 2 N + 1 to N + 1."""
+    scene = SCENES[name]
+    constraint = flat(scene)[2]
+    jacobian = jax.jit(jax.jacfwd(lambda q: constraint(q, 0.0, scene.params)))
+    for angle, rank in (np.pi / 2, 2 * loops + 1), (0.3, 2 * loops + 1), (0.0, loops + 1), (np.pi, loops + 1):
+        q, _ = parallel(loops, angle, 0.0)
+        assert np.max(np.abs(constraint(q, 0.0, scene.params))) < 1e-15
+        assert np.linalg.matrix_rank(jacobian(q), tol=1e-12) == rank
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["squeezer", "pendulum", "elastic pendulum", "driven slider-crank", "four bars"])
+def test_gradients_in_all_params(name):
+    """Of M, Q, Phi, and of the accelerations and multipliers they give, at a random state, in factors of the params."""
+    scene = SCENES[name]
+    mass, force, constraint, *_ = flat(scene)
+    q, v = (jnp.asarray(x[0]) for x in states(scene))
+
+    def measures(params):
+        M, Q, Phi = mass(q, params), force(q, v, 0.0, params), constraint(q, 0.0, params)
+        return ravel_pytree((M, Q, Phi, index_1(scene, params, q, v)))[0]
+
+    size = np.abs(measures(scene.params))
+    weight = np.random.default_rng(1).normal(size=size.size) / np.where(size > 0, size, 1.0)
+
+    def loss(factors):
+        return weight @ measures(jax.tree.map(jnp.multiply, factors, scene.params))
+
+    factors = jax.tree.map(jnp.ones_like, scene.params)
+    check_gradient(loss, factors)
+    gradient = ravel_pytree(jax.jit(jax.grad(loss))(factors))[0]
+    assert np.all(np.abs(gradient) > 1e-6 * np.max(np.abs(gradient)))  # each of them matters
+
+
+def test_a_pendulum_of_any_length_starts_consistently():
+    """Traced lengths, speeds and stiffnesses: the gap of the loop does not depend on the length."""
+
+    def gap(length):
+        scene = pendulum.cartesian(length=length)
+        _, _, constraint, q0, _ = flat(scene)
+        return constraint(q0, 0.0, scene.params)[0]
+
+    def radial_force(k):
+        """Of weight, spring and inertia at the start of an elastic pendulum."""
+        scene = pendulum.elastic(k, speed=3.0, length=0.7)
+        return scene.system.force(scene.q0, scene.v0, 0.0, scene.params)[1] + scene.v0[0] ** 2 / scene.q0[1]
+
+    for function, x in (gap, 0.8), (radial_force, 100.0):
+        assert abs(float(function(x))) < 1e-12
+        assert abs(float(jax.jit(jax.grad(function))(x))) < 1e-12
+    rate = jax.grad(lambda length: pendulum.minimal(3.0, length).v0[0])(0.5)
+    assert float(rate) == pytest.approx(-3.0 / 0.5**2)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_single_precision_is_kept(name):
+    system, params, q, v, _ = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), SCENES[name])
+    t = jnp.float32(0)
+    assert jax.eval_shape(system.mass, q, params).dtype == jnp.float32
+    assert jax.eval_shape(system.force, q, v, t, params).dtype == jnp.float32
+    assert system.constraint is None or jax.eval_shape(system.constraint, q, t, params).dtype == jnp.float32
+
+
+def test_params_are_no_part_of_the_program():
+    """Scenes that differ in their params share one system, and so one compilation."""
+    assert squeezer.squeezer(0.05).system == SCENES["squeezer"].system
+    assert SCENES["driven slider-crank"].system == SCENES["free slider-crank"].system
+    assert SCENES["five four-bars"].system == SCENES["four bars"].system
+
+
+@pytest.mark.parametrize(
+    ("constructor", "arguments", "error", "message"),
+    [
+        (squeezer.squeezer, {"moment": np.nan}, ValueError, "squeezer: `moment` must be finite; received nan."),
+        (squeezer.squeezer, {"moment": "1"}, TypeError, "squeezer: `moment` must be a real number; received '1'."),
+        (pendulum.cartesian, {"length": 0.0}, ValueError, "cartesian: `length` must be positive and finite; received"),
+        (pendulum.minimal, {"length": np.inf}, ValueError, "minimal: `length` must be positive and finite; received"),
+        (pendulum.minimal, {"speed": np.nan}, ValueError, "minimal: `speed` must be finite; received nan."),
+        (pendulum.elastic, {"speed": [1.0]}, TypeError, "elastic: `speed` must be a real number; received [1.0]."),
+        (pendulum.elastic, {"k": -1.0}, ValueError, "elastic: `k` must be positive and finite; received -1.0."),
+        (four_bars.four_bars, {"loops": 0}, ValueError, "four_bars: `loops` must be a positive integer; received 0."),
+        (four_bars.four_bars, {"loops": 1.5}, ValueError, "four_bars: `loops` must be a positive integer; received"),
+        (four_bars.four_bars, {"loops": np.inf}, ValueError, "four_bars: `loops` must be a positive integer; received"),
+        (four_bars.four_bars, {"loops": "2"}, TypeError, "four_bars: `loops` must be a real number; received '2'."),
+    ],
+)
+def test_bad_arguments(constructor, arguments, error, message):
+    with pytest.raises(error, match=re.escape(message)):
+        constructor(**arguments)

@@ -1,0 +1,285 @@
+"""Constraints: orders, drift, multipliers, the squeezer, consistent starts, gradients, and what bad input gets."""
+
+import json
+import re
+from functools import cache, partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from test_gradients import check_gradient
+
+import hhtjax
+from hhtjax.constraints import acceleration_and_multipliers, violation
+from hhtjax.flat_system import flatten
+from hhtjax.scenes import squeezer
+
+SQUEEZER = json.loads((Path(__file__).parent / "data" / "squeezer.json").read_text())
+PARAMS = {"m": jnp.array([2.0, 1.0]), "l": 0.8, "k": 30.0, "c": 0.4}
+Q0 = jnp.array([0.0, np.arcsin((0.1 - 0.2 * 0.3**2) / 0.8), 0.3])
+GUESS = jnp.array([0.0, 0.5, -0.4])
+DURATION = 1.0
+FORMS = [("index3", 1), ("index3", None), ("ggl", 1), ("ggl", None)]
+
+
+def mass(q, params):
+    """A cart, a pendulum on it, and a wheel whose inertia depends on its angle."""
+    (m1, m2), length = params["m"], params["l"]
+    coupling, wheel = m2 * length * jnp.cos(q[1]), 0.5 * (1 + 0.3 * jnp.sin(q[2]) ** 2)
+    return jnp.array([[m1 + m2, coupling, 0.0], [coupling, m2 * length**2, 0.0], [0.0, 0.0, wheel]])
+
+
+def force(q, v, t, params):
+    m2, length = params["m"][1], params["l"]
+    cart = m2 * length * jnp.sin(q[1]) * v[1] ** 2 - params["k"] * q[0] - params["c"] * v[0] + 2 * jnp.sin(4 * t)
+    pendulum = -m2 * 9.81 * length * jnp.sin(q[1]) - 0.1 * v[1]
+    wheel = -5 * q[2] - 0.15 * jnp.sin(q[2]) * jnp.cos(q[2]) * v[2] ** 2 + jnp.cos(t)
+    return jnp.array([cart, pendulum, wheel])
+
+
+def constraint(q, t, params):
+    """The tip of the pendulum follows a given motion, which the wheel shifts."""
+    return jnp.array([q[0] + params["l"] * jnp.sin(q[1]) + 0.2 * q[2] ** 2 - 0.3 * jnp.sin(2 * t) - 0.1])
+
+
+SLIDER = hhtjax.System(mass, force, constraint)
+
+
+@cache
+def start():
+    return hhtjax.consistent_initial(SLIDER, Q0, GUESS, PARAMS)
+
+
+@cache
+def reference():
+    """(q, v, L, w) at the end, by SciPy on the index-1 system."""
+    flat, _, _ = flatten("test", SLIDER, Q0, GUESS, 0.0, PARAMS)
+
+    @jax.jit
+    def solve(t, y):
+        return acceleration_and_multipliers(flat, y[:3], y[3:], jnp.asarray(t), PARAMS)
+
+    def rate(t, y):
+        return np.concatenate([y[3:], solve(t, y)[0]])
+
+    y0 = np.concatenate([start().q, start().v])
+    y = solve_ivp(rate, (0.0, DURATION), y0, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    w, L = solve(DURATION, y)
+    return y[:3], y[3:], np.asarray(L), np.asarray(w)
+
+
+def run(num_steps, stepper, params=PARAMS, **options):
+    q0, v0 = start().q, start().v
+    dt = DURATION / num_steps
+    return hhtjax.simulate(SLIDER, stepper, q0, v0, params, dt=dt, num_steps=num_steps, **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("alpha", [0.0, -0.1, -0.3])
+@pytest.mark.parametrize(("formulation", "iterations"), FORMS)
+def test_order_two_in_positions_velocities_accelerations_and_multipliers(formulation, iterations, alpha):
+    stepper = hhtjax.hht(jnp.asarray(alpha), formulation=formulation, iterations=iterations)
+    errors = []
+    for n in (100, 200):
+        path = run(n, stepper)
+        path.check()
+        ends = (path.q, path.v, path.multipliers, path.acceleration)
+        errors.append([np.abs(x[-1] - y).max() for x, y in zip(ends, reference(), strict=True)])
+    slopes = np.log2(np.array(errors[0]) / np.array(errors[1]))
+    np.testing.assert_allclose(slopes[:2], 2, atol=0.15)
+    if (formulation, alpha) == ("index3", 0.0):  # the trapezoidal rule: an undamped oscillation of L and w
+        assert errors[1][2] > 0.1
+    else:
+        np.testing.assert_allclose(slopes[2:], 2, atol=0.15)
+
+
+@pytest.mark.slow
+def test_order_of_the_drift():
+    """Of Phi at least 5 without iterations, of dPhi/dt at least 4 with GGL; with index 3 that one is of order 2."""
+    for formulation, orders in (("index3", (5, 2)), ("ggl", (5, 4))):
+        drift = []
+        for n in (25, 50):
+            info = run(n, hhtjax.hht(-0.1, formulation=formulation), save_every=n).info
+            drift.append([info.constraint[0], info.constraint_rate[0]])
+        slopes = np.log2(np.array(drift[0]) / np.array(drift[1]))
+        assert np.all(slopes > np.array(orders) - 0.3), (formulation, slopes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("formulation", "h", "bar"),
+    [("ggl", 2e-4, 6e-2), ("ggl", 1e-4, 1.2e-2), ("ggl", 5e-5, 2.6e-3), ("ggl", 1e-5, 1e-4), ("index3", 1e-4, 1.31e-2)],
+)
+def test_squeezer_without_iterations(formulation, h, bar):
+    """t = 0.03 s, alpha = -0.1: at most the errors that theory.md, section 5, has for the converged method."""
+    system, params, q0, v0, duration = squeezer.squeezer()
+    num_steps = round(duration / h)
+    stepper = hhtjax.hht(-0.1, formulation=formulation)
+    path = hhtjax.simulate(system, stepper, q0, v0, params, dt=h, num_steps=num_steps, save_every=num_steps)
+    path.check()
+    end = SQUEEZER["states"][-1]
+    assert end["t"] == pytest.approx(duration)
+    assert np.abs(path.q[-1] - np.array(end["q"])).max() <= bar
+
+
+@pytest.mark.parametrize("formulation", ["index3", "ggl"])
+def test_multipliers_of_a_pendulum(formulation):
+    """In the unit of force, for a Phi in units of length: minus the tension m (g cos + v^2/l)."""
+    length = 0.5
+    system = hhtjax.System(
+        jnp.ones(2),
+        lambda q, v, t, params: jnp.array([0.0, -9.81]),
+        lambda q, t, params: jnp.array([jnp.sqrt(jnp.sum(q**2)) - length]),
+    )
+    stepper = hhtjax.hht(-0.1, formulation=formulation)
+    path = hhtjax.simulate(system, stepper, jnp.array([0.0, -length]), jnp.array([2.505, 0.0]), dt=1e-4, num_steps=2000)
+    path.check()
+    tension = -9.81 * path.q[:, 1] / length + jnp.sum(path.v**2, axis=1) / length
+    np.testing.assert_allclose(path.multipliers[:, 0], -tension, rtol=1e-4)
+    energy = 0.5 * jnp.sum(path.v**2, axis=1) + 9.81 * path.q[:, 1]
+    np.testing.assert_allclose(energy, energy[0], atol=1e-5)
+
+
+def test_a_linear_solve_of_the_users_own():
+    def by_numpy(A, b):
+        return jnp.linalg.solve(A, b)
+
+    ours, theirs = (run(20, hhtjax.hht(-0.1, solve=solve)).q for solve in (None, by_numpy))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-13)
+
+
+def test_redundant_constraints_by_least_squares():
+    """The same constraint twice: half of the multiplier each, and the same motion."""
+
+    def twice(q, t, params):
+        return jnp.tile(constraint(q, t, params), 2)
+
+    def least_squares(A, b):
+        return jnp.linalg.pinv(A, rtol=1e-10) @ b
+
+    system = hhtjax.System(mass, force, twice)
+    with pytest.raises(ValueError, match=r"simulate: `constraint` rows \[0, 1\] depend on each other .*rank 1 of 2"):
+        hhtjax.simulate(system, hhtjax.hht(), start().q, start().v, PARAMS, dt=0.01, num_steps=1)
+    stepper = hhtjax.hht(-0.1, solve=least_squares)
+
+    @jax.jit  # where nothing raises
+    def redundant(q0):
+        return hhtjax.simulate(system, stepper, q0, start().v, PARAMS, dt=0.02, num_steps=20)
+
+    path, single = (
+        redundant(start().q),
+        hhtjax.simulate(SLIDER, hhtjax.hht(-0.1), start().q, start().v, PARAMS, dt=0.02, num_steps=20),
+    )
+    np.testing.assert_allclose(path.q, single.q, atol=1e-9)
+    np.testing.assert_allclose(path.multipliers.sum(axis=1), single.multipliers[:, 0], rtol=1e-6)
+
+
+def test_consistent_initial_is_nearest_and_consistent():
+    off = hhtjax.consistent_initial(SLIDER, Q0 + 0.05, GUESS, PARAMS, t0=0.2)
+    assert bool(off.converged)
+    flat, q, v = flatten("test", SLIDER, off.q, off.v, 0.2, PARAMS)
+    t = jnp.asarray(0.2)
+    np.testing.assert_allclose(violation(flat, q, v, t, PARAMS), 0, atol=1e-13)
+    B = jax.jacfwd(lambda q: constraint(q, t, PARAMS))(q)[0]
+    for moved, M in ((q - Q0 - 0.05, mass(Q0 + 0.05, PARAMS)), (v - GUESS, mass(q, PARAMS))):
+        reactionary = M @ moved  # parallel to B^T: no direction along the constraint is left
+        np.testing.assert_allclose(reactionary, B * (reactionary @ B) / (B @ B), atol=1e-10)
+    w, L = acceleration_and_multipliers(flat, q, v, t, PARAMS)
+    np.testing.assert_allclose(off.acceleration, w, rtol=1e-12)
+    np.testing.assert_allclose(off.multipliers, L, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("formulation", "iterations"), [("index3", 1), ("ggl", 1), ("ggl", None)])
+def test_gradients(formulation, iterations):
+    """Of a loss of the whole path, through the projection of the start: stiffness, damping, length, v0 and dt."""
+
+    def loss(arguments):
+        k, c, length, v0, dt = arguments
+        params = PARAMS | {"k": k, "c": c, "l": length}
+        begin = hhtjax.consistent_initial(SLIDER, Q0, v0, params)
+        stepper = hhtjax.hht(-0.1, formulation=formulation, iterations=iterations, tolerance=1e-13)
+        path = hhtjax.simulate(SLIDER, stepper, begin.q, begin.v, params, dt=dt, num_steps=12)
+        return jnp.sum(path.q**2) + 0.1 * jnp.sum(path.v**2) + 1e-3 * jnp.sum(path.multipliers**2)
+
+    check_gradient(loss, (30.0, 0.4, 0.8, GUESS, 0.02))
+
+
+def test_batches_equal_loops_and_pytrees_equal_vectors():
+    def end(k, q0):
+        path = hhtjax.simulate(SLIDER, hhtjax.hht(-0.1), q0, start().v, PARAMS | {"k": k}, dt=0.01, num_steps=5)
+        return path.q[-1], path.multipliers[-1]
+
+    stiffness = jnp.array([10.0, 30.0])
+    batch = jax.jit(jax.vmap(end, (0, None)))(stiffness, start().q)
+    for i, k in enumerate(stiffness):
+        for x, y in zip(batch, end(k, start().q), strict=True):
+            np.testing.assert_allclose(x[i], y, rtol=1e-11)
+
+    def vector(tree):
+        return jnp.concatenate([tree["cart"][None], tree["swing"]])
+
+    def tree_of(x):
+        return {"cart": x[0], "swing": x[1:]}
+
+    system = hhtjax.System(
+        lambda q, params: mass(vector(q), params),
+        lambda q, v, t, params: tree_of(force(vector(q), vector(v), t, params)),
+        lambda q, t, params: constraint(vector(q), t, params),
+    )
+    q0, v0 = tree_of(start().q), tree_of(start().v)
+    tree = hhtjax.simulate(system, hhtjax.hht(-0.1), q0, v0, PARAMS, dt=0.01, num_steps=5)
+    flat = hhtjax.simulate(SLIDER, hhtjax.hht(-0.1), start().q, start().v, PARAMS, dt=0.01, num_steps=5)
+    np.testing.assert_allclose(tree.q["swing"], flat.q[:, 1:], rtol=1e-12)
+    np.testing.assert_allclose(tree.multipliers, flat.multipliers, rtol=1e-12)
+
+
+simulate = partial(hhtjax.simulate, dt=0.01, num_steps=1)
+
+
+def constrained(phi):
+    return hhtjax.System(jnp.ones(2), lambda q, v, t, params: -q, phi)
+
+
+def run_from(phi, q0, v0):
+    return lambda: simulate(constrained(phi), hhtjax.hht(), jnp.array(q0), jnp.array(v0))
+
+
+def project(phi):
+    return lambda: hhtjax.consistent_initial(constrained(phi), jnp.ones(2), jnp.ones(2))
+
+
+def level(q, t, params):
+    return q[:1] - 1.0
+
+
+ONE, ZERO = (1.0, 1.0), (0.0, 0.0)
+AWAY = "1 away from consistent values; hhtjax.consistent_initial gives them."
+SHAPE = "simulate: `constraint` must return an array (m,) with 1 <= m <= 2"
+BAD = [
+    (SHAPE, run_from(lambda q, t, params: q[0], ONE, ONE)),
+    (SHAPE, run_from(lambda q, t, params: jnp.tile(q, 2), ONE, ONE)),
+    (f"simulate: `q0` violates the constraint: max|Phi| = 1, {AWAY}", run_from(level, (2.0, 2.0), ZERO)),
+    (f"simulate: `v0` violates the constraint: max|dPhi/dt| = 1, {AWAY}", run_from(level, ONE, ONE)),
+    (
+        "simulate: `constraint` rows [1] have no gradient in q",
+        run_from(lambda q, t, params: jnp.array([q[0] - 1.0, 0.0 * t]), ONE, ZERO),
+    ),
+    ("consistent_initial: no q with Phi(q, t) = 0 found", project(lambda q, t, params: q[:1] ** 2 + 1.0)),
+    ("consistent_initial: `system` must have a constraint", project(None)),
+    ('hht: `formulation` must be "ggl" or "index3"', lambda: hhtjax.hht(formulation="index2")),
+]
+
+
+@pytest.mark.parametrize(("message", "call"), BAD, ids=lambda x: x[:40] if isinstance(x, str) else "")
+def test_bad_input(message, call):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call()
+
+
+@pytest.mark.parametrize("name", ["kim_hht", "rk4"])
+def test_other_steppers_refuse(name):
+    with pytest.raises(NotImplementedError, match=r"simulate: .* cannot solve the `constraint`; use hht\(\)"):
+        simulate(constrained(level), getattr(hhtjax, name)(), jnp.ones(2), jnp.zeros(2))
