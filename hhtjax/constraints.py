@@ -99,20 +99,28 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0) -> ConsistentInitial
     if getattr(system, "constraint", None) is None:
         raise ValueError("consistent_initial: `system` must have a constraint.")
     q0, v0 = initial_values("consistent_initial", system, q0, v0)
+    start, B, left = _consistent_initial(system, q0, v0, params, t0)
+    if all(map(is_concrete, jax.tree.leaves((start, B)))):
+        require_independent("consistent_initial", np.asarray(B))
+        if not start.converged:
+            raise ValueError(
+                f"consistent_initial: no q with Phi(q, t) = 0 found near `q0`: {left:.3g} is left of it. Start nearer."
+            )
+    return start
+
+
+@jax.jit
+def _consistent_initial(system, q0, v0, params, t0):
+    """The result, B at q0, and max|Phi| at the end."""
     flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params)
     t = jnp.asarray(t0).astype(q.dtype)
-    B = jax.jacrev(lambda q: flat.constraint(q, t, params))(q)
-    if is_concrete(B):
-        require_independent("consistent_initial", np.asarray(B))
+    B = jax.jacrev(flat.constraint)(q, t, params)
     q, converged = nearest_position(flat, q, t, params)
-    if is_concrete(converged) and not converged:
-        left = np.abs(np.asarray(flat.constraint(q, t, params))).max()
-        raise ValueError(
-            f"consistent_initial: no q with Phi(q, t) = 0 found near `q0`; {left:.3g} is left of it. Start nearer."
-        )
+    left = jnp.max(jnp.abs(flat.constraint(q, t, params)))
     v = v + correction(flat, q, t, params, -violation(flat, q, v, t, params)[1])
     w, L = acceleration_and_multipliers(flat, q, v, t, params)
-    return ConsistentInitial(*(flat.unravel(x) for x in (q, v, w)), L, converged)
+    q, v, w = (flat.unravel(x) for x in (q, v, w))
+    return ConsistentInitial(q, v, w, L, converged), B, left
 
 
 def correction(system, q, t, params, rows):
@@ -171,7 +179,7 @@ def examine(system, q0, v0, t0, params):
     """B, and for Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not."""
     flat, q, v = flatten("simulate", system, q0, v0, t0, params)
     t = jnp.asarray(t0).astype(q.dtype)
-    B = jax.jacrev(lambda q: flat.constraint(q, t, params))(q)
+    B = jax.jacrev(flat.constraint)(q, t, params)
     both = violation(flat, q, v, t, params)
     return B, [(jnp.max(jnp.abs(x)), jnp.max(jnp.abs(correction(flat, q, t, params, x)))) for x in both]
 

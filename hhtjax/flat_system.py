@@ -2,7 +2,8 @@
 
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ class FlatSystem(NamedTuple):
     linear: bool  # the residual is affine in (q, v, w), with constant coefficients
     first_order: bool
     unravel: Callable  # (n,) -> pytree structured like q and v
-    constraint: Callable | None = None  # q, t, params -> (m,)
+    constraint: Any = None  # q, t, params -> (m,); None without
     num_constraints: int = 0  # m
 
     def inertia(self, q, w, params):
@@ -106,9 +107,7 @@ def flatten(caller, system, q0, v0, t0, params):
     constraint, m = None, 0
     if system.constraint is not None:
         m = _count_constraints(caller, system.constraint, n, dtype, q0, t0, params)
-
-        def constraint(q, t, params):
-            return jnp.asarray(system.constraint(unravel(q), t, params)).astype(dtype)
+        constraint = partial(_flat_constraint, system.constraint, unravel, dtype)
 
     if isinstance(system, LinearSystem):
         for name in ("M", "C", "K"):
@@ -131,6 +130,10 @@ def flatten(caller, system, q0, v0, t0, params):
         return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0].astype(dtype)
 
     return FlatSystem(mass, force, n, isinstance(system, LinearSystem), False, unravel, constraint, m), q, v
+
+
+def _flat_constraint(constraint, unravel, dtype, q, t, params):
+    return jnp.asarray(constraint(unravel(q), t, params)).astype(dtype)
 
 
 def _check_matrix(caller, name, matrix, n, dtype, *args):
