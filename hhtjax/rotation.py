@@ -1,0 +1,205 @@
+"""Finite rotations, for one rotation at a time; jax.vmap for batches.
+
+R (3, 3) takes material components to spatial ones; Rdot = R hat(Om), Om the material angular velocity in rad/s.
+psi (3,), in rad, is a rotation vector: a turn by the angle |psi| about psi. With P = hat(psi), t = |psi| and x = t^2:
+
+    exp  R    = I + a P + b P^2      a = sin t / t          b = (1 - cos t) / t^2
+         T    = I - b P + c P^2      c = (t - sin t) / t^3
+         T^-1 = I + P/2 + d P^2      d = (1 - (t/2) cot(t/2)) / t^2
+
+a, b, c and d are analytic in x, and computed so that values and derivatives, forward and reverse, are right at psi = 0
+too. Every function keeps the dtype, but integers become floats, and raises TypeError for what is not an array of real
+numbers, ValueError for another shape.
+
+Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
+"""
+
+from math import factorial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.boundary import require_number
+from hhtjax.description import is_array, is_real
+from hhtjax.linear_solve import matvec
+
+GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
+)
+TERMS = range(11)
+SERIES = (  # a, b, c and e = (2 b - a) / x in powers of -x: to rounding for x < 1, third derivatives too
+    [1 / factorial(2 * k + 1) for k in TERMS],
+    [1 / factorial(2 * k + 2) for k in TERMS],
+    [1 / factorial(2 * k + 3) for k in TERMS],
+    [(k + 1) / (k + 2) / factorial(2 * k + 3) for k in TERMS],
+)
+ARCTANGENT = [1 / (2 * k + 1) for k in range(16)]  # arctan(z) / z in powers of -z^2: likewise for z < 1/4
+
+
+def hat(x):
+    """The matrix (3, 3) of the cross product with x (3,): hat(x) y = x cross y.
+
+    >>> print(hat(jnp.array([1.0, 2.0, 3.0])))
+    [[ 0. -3.  2.]
+     [ 3.  0. -1.]
+     [-2.  1.  0.]]
+    """
+    x = _real("hat", "x", x, (3,))
+    return jnp.sum(x[:, None, None] * jnp.asarray(GENERATORS, x.dtype), axis=0)
+
+
+def vee(X):
+    """The inverse of `hat`: x (3,) with hat(x) = X; if X (3, 3) is not skew, that of (X - X^T)/2.
+
+    >>> print(vee(hat(jnp.array([1.0, 2.0, 3.0]))))
+    [1. 2. 3.]
+    """
+    X = _real("vee", "X", X, (3, 3))
+    return jnp.sum(X[None, :, :] * jnp.asarray(GENERATORS, X.dtype), axis=(1, 2)) / 2
+
+
+def exp(psi):
+    """R (3, 3) = I + a P + b P^2, the rotation by psi (3,), in rad (Rodrigues); orthogonal to rounding.
+
+    >>> print((exp(jnp.array([0.0, 0.0, jnp.pi / 2])) @ jnp.array([1.0, 0.0, 0.0])).round(6) + 0.0)
+    [0. 1. 0.]
+    """
+    psi = _real("exp", "psi", psi, (3,))
+    a, b, _, _ = coefficients(jnp.sum(psi**2))
+    return _polynomial(psi, a, b)
+
+
+def log(R):
+    """psi (3,), in rad, with exp(psi) = R and |psi| <= pi, for a rotation R (3, 3). Accurate to rounding at all angles.
+
+    At |psi| = pi, where psi and -psi are the same rotation, the largest component of the result is positive if R is
+    exactly symmetric; otherwise rounding in R decides. Derivatives are right for changes of R that keep it a rotation:
+    d log(R exp(eps)) = T^-1(psi) d eps at eps = 0. At pi they are those of the result, towards smaller angles.
+
+    From the quaternion q of R by the largest column of 4 q q^T (Bar-Itzhack, J. Guidance 23 (2000) 1085-1087).
+
+    >>> print(log(exp(jnp.array([0.0, 0.0, 3.0]))))
+    [0. 0. 3.]
+    """
+    R = _real("log", "R", R, (3, 3))
+    trace, v = jnp.trace(R), vee(R - R.T)
+    block = R + R.T + (1 - trace) * jnp.eye(3, dtype=R.dtype)
+    products = jnp.block([[(1 + trace)[None, None], v[None, :]], [v[:, None], block]])  # 4 q q^T
+    q = products[jnp.argmax(jnp.diag(products))]  # a multiple of the quaternion
+    q = jnp.where(q[0] < 0, -q, q)
+    q0, q = q[0], q[1:]
+
+    y = jnp.sum(q**2)
+    small = 16 * y < q0**2  # an angle below 0.49
+    near = jnp.where(small, q0, 1)
+    far = jnp.sqrt(jnp.where(small, 1, y))
+    series = _power_series(ARCTANGENT, jnp.where(small, -y, 0) / near**2) / near
+    return 2 * jnp.where(small, series, jnp.arctan2(far, q0) / far) * q
+
+
+def tangent(psi):
+    """T (3, 3) = I - b P + c P^2 for psi (3,), in rad: Om = T psidot is the rate of R0 exp(psi), for any constant R0.
+
+    T^T takes moments from material components to those that work on psi. det T = 2 b, so T is singular at 2 pi.
+
+    >>> psi = jnp.array([0.0, 0.0, 2.0])
+    >>> print(tangent(psi) @ psi)                              # about a fixed axis, Om = psidot
+    [0. 0. 2.]
+    """
+    psi = _real("tangent", "psi", psi, (3,))
+    _, b, c, _ = coefficients(jnp.sum(psi**2))
+    return _polynomial(psi, -b, c)
+
+
+def inverse_tangent(psi):
+    """T^-1 (3, 3) = I + P/2 + d P^2 for psi (3,), in rad: psidot = T^-1 Om.
+
+    It grows without bound towards |psi| = 2 pi, where T is singular: there the result is inf, NaN or only rounding.
+
+    >>> psi = jnp.array([0.3, -0.2, 0.1])
+    >>> print((inverse_tangent(psi) @ tangent(psi)).round(6) + 0.0)
+    [[1. 0. 0.]
+     [0. 1. 0.]
+     [0. 0. 1.]]
+    """
+    psi = _real("inverse_tangent", "psi", psi, (3,))
+    d = coefficients(jnp.sum(psi**2))[-1]
+    return _polynomial(psi, 0.5, d)
+
+
+def tangent_rate(psi, psidot):
+    """Tdot psidot (3,), in rad/s^2, while psi (3,) changes by psidot (3,), in rad/s: Omdot = T psiddot + Tdot psidot.
+
+    >>> print(tangent_rate(jnp.zeros(3), jnp.array([1.0, 2.0, 3.0])))
+    [0. 0. 0.]
+    """
+    psi, psidot = _real("tangent_rate", "psi", psi, (3,)), _real("tangent_rate", "psidot", psidot, (3,))
+    return jax.jvp(lambda psi: matvec(tangent(psi), psidot), (psi,), (psidot,))[1]
+
+
+def orthonormalize(R):
+    """R (3, 3) with its distance from the nearest rotation squared: one step R (3 I - R^T R)/2 of Newton and Schulz.
+
+    For products of many rotations, whose rounding errors add up. At a rotation, its derivative takes dR to the part
+    that is tangent to the rotations.
+
+    >>> round(float(orthonormalize(1.01 * jnp.eye(3))[0, 0]), 4)
+    0.9998
+    """
+    R = _real("orthonormalize", "R", R, (3, 3))
+    return R - _product(R, _product(R.T, R) - jnp.eye(3, dtype=R.dtype)) / 2
+
+
+def is_rotation(R, tolerance):
+    """Whether R (3, 3) has no entry of R^T R - I beyond the tolerance, and det R > 0; a boolean array, traceable.
+
+    >>> bool(is_rotation(exp(jnp.ones(3)), 1e-6)), bool(is_rotation(-jnp.eye(3), 1e-6))
+    (True, False)
+    """
+    R = _real("is_rotation", "R", R, (3, 3))
+    require_number("is_rotation", "tolerance", tolerance, lambda x: x >= 0, "not be negative")
+    error = jnp.max(jnp.abs(_product(R.T, R) - jnp.eye(3, dtype=R.dtype)))
+    return (error <= tolerance) & (jnp.linalg.det(R) > 0)
+
+
+def coefficients(x):
+    """a, b, c and d at x = |psi|^2, a scalar >= 0: their power series for x < 1, their definitions beyond.
+
+    >>> [round(1 / float(f)) for f in coefficients(jnp.array(0.0))]
+    [1, 2, 6, 12]
+    """
+    small = x < 1
+    near, x = jnp.where(small, -x, 0), jnp.where(small, 1, x)  # both finite in the branch not taken, for derivatives
+    t = jnp.sqrt(x)
+    a, b = jnp.sin(t) / t, 2 * (jnp.sin(t / 2) / t) ** 2  # 1 - cos t would cancel towards 2 pi
+    far = a, b, (1 - a) / x, (2 * b - a) / x
+    a, b, c, e = (jnp.where(small, _power_series(s, near), f) for s, f in zip(SERIES, far, strict=True))
+    return a, b, c, e / (2 * b)
+
+
+def _power_series(coefficients, x):
+    value = jnp.full_like(x, coefficients[-1])
+    for c in reversed(coefficients[:-1]):
+        value = value * x + c
+    return value
+
+
+def _polynomial(psi, f, g):
+    """I + f P + g P^2."""
+    eye = jnp.eye(3, dtype=psi.dtype)
+    return eye + f * hat(psi) + g * (psi[:, None] * psi[None, :] - jnp.sum(psi**2) * eye)
+
+
+def _product(A, B):
+    """A B elementwise: XLA fuses it, and keeps float32 at full precision on every device."""
+    return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
+
+
+def _real(caller, name, x, shape):
+    """x as an array of floats, if it is real and has this shape; checked while tracing."""
+    if not is_array(x) or not is_real(x):
+        raise TypeError(f"{caller}: `{name}` must be an array of real numbers; received {x!r}.")
+    if x.shape != shape:
+        raise ValueError(f"{caller}: `{name}` must have shape {shape}; received {x.shape}.")
+    return jnp.asarray(x, None if jnp.issubdtype(x.dtype, jnp.floating) else jnp.result_type(float))

@@ -1,0 +1,351 @@
+"""Rotations: values against SciPy and exact series, derivatives against each other, differences and identities."""
+
+from fractions import Fraction
+from functools import cache
+from itertools import permutations
+from math import comb, factorial, perm, pi
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from jax import lax
+from scipy.spatial.transform import Rotation
+
+from hhtjax.rotation import (
+    coefficients,
+    exp,
+    hat,
+    inverse_tangent,
+    is_rotation,
+    log,
+    orthonormalize,
+    tangent,
+    tangent_rate,
+    vee,
+)
+
+EPS = np.finfo(float).eps
+EYE = np.eye(3)
+AXES = np.concatenate([EYE, -EYE, Rotation.random(6, rng=1).as_matrix()[:, 0]])
+ANGLES = 0.0, 1e-160, 1e-12, 1e-8, 1e-5, 1e-3, 0.489, 0.491, 0.999, 1.001, 2.0, 3.0  # rad; the branches meet inside
+VECTORS = np.concatenate([angle * AXES for angle in ANGLES])
+NEAR_PI = np.concatenate([angle * AXES for angle in (pi - 1e-3, pi - 1e-6, pi - 1e-9, pi - 1e-12)])
+LONG = np.concatenate([angle * AXES for angle in (pi, 4.0, 6.0, 7.0, 20.0)])
+ALL = np.concatenate([VECTORS, NEAR_PI, LONG])
+VECTOR_FUNCTIONS = hat, exp, tangent, inverse_tangent
+FUNCTIONS = *VECTOR_FUNCTIONS, vee, log, orthonormalize
+ORDERS = 1, 2, pytest.param(3, marks=pytest.mark.slow)  # of derivatives
+
+
+@cache
+def batched(f):
+    return jax.jit(jax.vmap(f))
+
+
+def cross(x):
+    """NumPy's cross product as a matrix."""
+    return np.cross(x, -EYE)
+
+
+def turns(psi):
+    return Rotation.from_rotvec(psi).as_matrix()
+
+
+def transposed(A):
+    return np.swapaxes(A, -1, -2)
+
+
+def close(x, y, tolerance):
+    np.testing.assert_allclose(x, y, rtol=0, atol=tolerance)
+
+
+def exact_coefficients(x, derivative):
+    """a, b, c and d, or a derivative of them with respect to x, from rational series: exact to rounding."""
+    x, terms = Fraction(x), range(40)
+
+    def value(series, n):
+        return sum((-1) ** k * c * perm(k, n) * x ** (k - n) for k, c in enumerate(series) if k >= n)
+
+    a, b, c = ([Fraction(1, factorial(2 * k + n)) for k in terms] for n in (1, 2, 3))
+    e = [a - 2 * b for a, b in zip(a[1:], b[1:], strict=True)]  # of (2 b - a)/x
+    d = []
+    for n in range(derivative + 1):  # Leibniz on 2 b d = e
+        d.append((value(e, n) / 2 - sum(comb(n, i) * value(b, i) * d[n - i] for i in range(1, n + 1))) / value(b, 0))
+    return [float(f) for f in (*(value(f, derivative) for f in (a, b, c)), d[-1])]
+
+
+X = np.concatenate([[0.0], np.geomspace(1e-16, 0.9, 40), 1 + np.linspace(-1e-9, 1e-9, 5), np.linspace(1.1, 36.0, 40)])
+
+
+def test_coefficients():
+    """Relative errors: of a up to 2.4 rad, short of its root at pi, and of the others up to 6 rad."""
+    exact = np.array([exact_coefficients(x, 0) for x in X]).T
+    error = np.abs(np.array(batched(coefficients)(X)) / exact - 1)
+    assert np.all(error[0, X < 2.4**2] < 5e-15)
+    assert np.all(error[1:] < 5e-15)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_derivatives_of_coefficients(order):
+    """Forward, with relative errors of the series and absolute ones beyond; and reverse, of a random combination."""
+    weights = np.random.default_rng(order).uniform(-1, 1, 4)
+    forward, backward = coefficients, lambda x: sum(w * f for w, f in zip(weights, coefficients(x), strict=True))
+    for _ in range(order):
+        forward, backward = jax.jacfwd(forward), jax.grad(backward)
+    exact = np.array([exact_coefficients(x, order) for x in X]).T
+    error = np.abs(np.array(batched(forward)(X)) - exact)
+    assert np.all(error < np.where(X < 1, 1e-13 * np.abs(exact), 1e-14))
+    close(batched(backward)(X), weights @ exact, 1e-14)
+
+
+def test_hat_is_the_cross_product_and_vee_its_inverse():
+    x, y = np.random.default_rng(0).standard_normal((2, 3))
+    np.testing.assert_array_equal(hat(x), cross(x))
+    close(hat(x) @ y, np.cross(x, y), 2 * EPS)
+    np.testing.assert_array_equal(vee(hat(x)), x)
+    close(vee(hat(x) + np.outer(y, y)), x, 4 * EPS)
+
+
+def test_exp_is_the_matrix_exponential():
+    R = batched(exp)(ALL)
+    close(R, turns(ALL), 4e-15)
+    close(R, scipy.linalg.expm(np.array([cross(psi) for psi in ALL])), 1e-13)
+
+
+@pytest.mark.parametrize(("longest", "roundings"), [(1.0, 4), (10.0, 16)])
+def test_exp_is_orthogonal_to_rounding(longest, roundings):
+    psi = np.random.default_rng(2).uniform(-1, 1, (20000, 3)) * longest / np.sqrt(3)
+    R = np.asarray(batched(exp)(psi))
+    eye = np.broadcast_to(EYE, R.shape)
+    close(transposed(R) @ R, eye, roundings * EPS)
+    close(R @ batched(exp)(-psi), eye, roundings * EPS)
+    assert np.all(np.linalg.det(R) > 0)
+
+
+def test_tangent_is_the_integral_of_exp():
+    """T(psi) = integral over s from 0 to 1 of exp(-s psi), by Gauss' rule."""
+    s, weights = np.polynomial.legendre.leggauss(40)
+    integral = sum(w / 2 * turns(-(1 + s) / 2 * ALL) for s, w in zip(s, weights, strict=True))
+    close(batched(tangent)(ALL), integral, 4e-15)
+
+
+def test_identities():
+    """T psi = T^T psi = psi, R T = T^T, T T^-1 = I."""
+    R, T, inverse = (np.asarray(batched(f)(ALL)) for f in (exp, tangent, inverse_tangent))
+    close(np.einsum("pij,pj->pi", T, ALL), ALL, 2e-14)
+    close(np.einsum("pji,pj->pi", T, ALL), ALL, 2e-14)
+    close(R @ T, transposed(T), 4e-15)
+    close(T @ inverse, np.broadcast_to(EYE, T.shape), 2e-14)
+
+
+def test_inverse_tangent_has_a_pole_at_two_pi():
+    for gap in (1e-2, 1e-4, 1e-6):
+        half = pi - gap / 2
+        norm = np.linalg.norm(inverse_tangent(jnp.array([0.0, 2 * half, 0.0])))
+        assert norm == pytest.approx(np.sqrt(1 + 2 * (half / np.sin(gap / 2)) ** 2), rel=1e-8)
+    at_pole = np.linalg.norm(inverse_tangent(jnp.array([0.0, 2 * pi, 0.0])))
+    assert not at_pole < 1e14
+
+
+def test_log_undoes_exp_with_relative_accuracy():
+    psi = np.concatenate([VECTORS, NEAR_PI])
+    error = np.linalg.norm(batched(log)(batched(exp)(psi)) - psi, axis=1)
+    assert np.all(error <= 4 * EPS * np.linalg.norm(psi, axis=1))
+
+
+def test_log_of_random_rotations():
+    R = Rotation.random(20000, rng=3)
+    close(batched(log)(R.as_matrix()), R.as_rotvec(), 6e-15)
+
+
+def test_log_at_pi():
+    """Of the two vectors the one whose largest component is positive, where the matrix is exactly symmetric."""
+    R = 2 * AXES[:, :, None] * AXES[:, None, :] - EYE
+    largest = np.take_along_axis(AXES, np.argmax(np.abs(AXES), axis=1)[:, None], axis=1)
+    close(batched(log)(R), pi * AXES * np.sign(largest), 4e-15)
+    rounded = batched(exp)(pi * AXES)
+    close(batched(exp)(batched(log)(rounded)), rounded, 4e-15)
+
+
+@cache
+def forward(f, order):
+    """All derivatives of this order: f's shape, then (3,) for each."""
+    for _ in range(order):
+        f = jax.jacfwd(f)
+    return batched(f)
+
+
+def reverse(f, weights):
+    """In reverse mode all through: the gradient of f . weights[0], of that . weights[1], and so on."""
+    for w in weights:
+        f = jax.grad(lambda x, f=f, w=w: jnp.sum(w * f(x)))
+    return batched(f)
+
+
+def contract(derivative, weights):
+    """What `reverse` gives, from all derivatives (points, ...)."""
+    for w in weights:
+        axes = range(1, 1 + w.ndim)
+        derivative = np.tensordot(derivative, w, (axes, range(w.ndim)))
+    return derivative
+
+
+def random_weights(shape, order):
+    rng = np.random.default_rng(order)
+    return [rng.uniform(-1, 1, shape), *rng.uniform(-1, 1, (order - 1, 3))]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("f", [exp, tangent, inverse_tangent])
+def test_derivatives(f, order):
+    """Forward mode, reverse mode, and fourth-order central differences of the derivative before."""
+    h, weights = 1e-3, random_weights((3, 3), order)
+    derivative, before = np.asarray(forward(f, order)(VECTORS)), forward(f, order - 1)
+
+    def difference(step):
+        return before(VECTORS + step) - before(VECTORS - step)
+
+    differences = [(8 * difference(h * e) - difference(2 * h * e)) / (12 * h) for e in EYE]
+    close(derivative, np.stack(differences, axis=-1), 1e-11)
+    close(reverse(f, weights)(VECTORS), contract(derivative, weights), 1e-13)
+
+
+@pytest.mark.parametrize("f", [exp, tangent, inverse_tangent])
+def test_derivatives_of_long_vectors_are_finite(f):
+    """The series, not taken there, would overflow."""
+    psi = np.array([3000.0, -1000.0, 2000.0], np.float32)
+    for derivative in (jax.jacfwd(f), jax.jacrev(f)):
+        assert np.all(np.isfinite(jax.jit(derivative)(psi)))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    ("f", "factors"), [(exp, (1, 1, 1)), (tangent, (-1 / 2, 1 / 3, -1 / 4)), (inverse_tangent, (1 / 2, 1 / 6, 0))]
+)
+def test_derivatives_at_zero(f, factors, order):
+    """Those of I + the sum over k of factors[k - 1] P^k / k!."""
+    P = [cross(e) for e in EYE]
+    exact = np.zeros((3, 3) + (3,) * order)
+    for directions in np.ndindex((3,) * order):
+        products = [np.linalg.multi_dot([EYE, *(P[i] for i in p), EYE]) for p in permutations(directions)]
+        exact[:, :, *directions] = factors[order - 1] * np.mean(products, axis=0)
+    at_zero = forward(f, order)(VECTORS)[np.linalg.norm(VECTORS, axis=1) < 1e-100]
+    close(at_zero, np.broadcast_to(exact, at_zero.shape), 1e-15)
+
+
+@pytest.mark.parametrize("order", [1, *(pytest.param(order, marks=pytest.mark.slow) for order in (2, 3))])
+def test_derivatives_of_log(order):
+    """log(exp(psi)) = psi: the first derivative is I and the next ones are 0."""
+
+    def identity(psi):
+        return log(exp(psi))
+
+    psi, weights = np.concatenate([VECTORS, NEAR_PI]), random_weights(3, order)
+    exact = np.broadcast_to(EYE if order == 1 else np.zeros((3,) * (order + 1)), (len(psi),) + (3,) * (order + 1))
+    close(forward(identity, order)(psi), exact, 1e-14 * 10 ** (order - 1))
+    close(reverse(identity, weights)(psi), contract(exact, weights), 1e-14 * 10 ** (order - 1))
+
+
+def test_derivative_of_log_is_the_inverse_tangent():
+    """d log(R exp(eps)) = T^-1(psi) d eps at eps = 0; at pi too, where psi is what log returns."""
+    R = batched(exp)(np.concatenate([VECTORS, NEAR_PI, pi * AXES]))
+    derivative = batched(lambda R: jax.jacrev(lambda eps: log(R @ exp(eps)))(jnp.zeros(3)))
+    close(derivative(R), batched(inverse_tangent)(batched(log)(R)), 1e-14)
+
+
+def test_rates_along_a_motion():
+    """Rdot = R hat(T psidot), and T psiddot + Tdot psidot is the rate of Om = vee(R^T Rdot)."""
+
+    def rate(f):
+        return lambda t: jax.jvp(f, (t,), (1.0,))[1]
+
+    def motion(psi, psidot, psiddot):
+        def R(t):
+            return exp(psi + t * psidot + t**2 / 2 * psiddot)
+
+        return rate(R)(0.0), rate(lambda t: vee(R(t).T @ rate(R)(t)))(0.0)
+
+    psidot, psiddot = np.random.default_rng(4).standard_normal((2, *VECTORS.shape))
+    Rdot, Omdot = jax.jit(jax.vmap(motion))(VECTORS, psidot, psiddot)
+    R, T = batched(exp)(VECTORS), np.asarray(batched(tangent)(VECTORS))
+    close(Rdot, R @ batched(hat)(np.einsum("pij,pj->pi", T, psidot)), 1e-14)
+    close(Omdot, np.einsum("pij,pj->pi", T, psiddot) + jax.vmap(tangent_rate)(VECTORS, psidot), 1e-13)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize(
+    ("change", "corrected", "bound"), [(0.0, False, 1e6), (1.0, False, 1e4), (0.0, True, 4), (1.0, True, 4)]
+)
+def test_a_million_compositions(change, corrected, bound, dtype):
+    """R^T R - I, in units of rounding: grows with n for a constant increment, else with n^(1/2); not if corrected."""
+    psi = jnp.asarray([0.003, -0.005, 0.007], dtype)
+
+    def turn(i, R):
+        R = R @ exp(psi * (1 + dtype(change) * jnp.sin(i.astype(dtype))))
+        return orthonormalize(R) if corrected else R
+
+    R = np.asarray(jax.jit(lambda R: lax.fori_loop(0, 10**6, turn, R))(jnp.eye(3, dtype=dtype)), float)
+    close(R.T @ R, EYE, bound * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-5])
+def test_orthonormalize_squares_the_distance(size):
+    R = batched(exp)(LONG) + size * np.random.default_rng(5).uniform(-1, 1, (len(LONG), 3, 3))
+    U, _, V = np.linalg.svd(R)
+    close(batched(orthonormalize)(R), U @ V, 6 * size**2)
+
+
+def test_derivative_of_orthonormalize_is_the_tangent_part():
+    R = exp(jnp.array([0.4, -2.0, 1.0]))
+    dR = np.random.default_rng(6).standard_normal((3, 3))
+    material = R.T @ dR
+    close(jax.jvp(orthonormalize, (R,), (dR,))[1], R @ (material - material.T) / 2, 1e-14)
+
+
+@pytest.mark.parametrize("check", [is_rotation, jax.jit(is_rotation)])
+def test_is_rotation(check):
+    R = exp(jnp.array([0.4, -2.0, 1.0]))
+    assert check(R, 1e-15)
+    assert check(R + 1e-7, 1e-6)
+    for wrong in (R + 1e-5, -R, R[:, jnp.array([1, 0, 2])], R * jnp.nan):
+        assert not check(wrong, 1e-6)
+
+
+@pytest.mark.parametrize("f", FUNCTIONS)
+def test_dtype_is_kept(f):
+    of_vector = f in VECTOR_FUNCTIONS
+    for psi in (1e-3 * AXES[-1], LONG[-1]):
+        x = psi if of_vector else turns(psi)
+        single = x.astype(np.float32)
+        for g in (f, jax.jacfwd(f), jax.jacrev(f)):
+            assert jax.eval_shape(g, single).dtype == np.float32
+        np.testing.assert_allclose(f(single), f(x), rtol=0, atol=1e-5)
+    integers = np.eye(3, dtype=int)[0] if of_vector else np.eye(3, dtype=int)
+    np.testing.assert_array_equal(f(integers), f(integers.astype(float)))
+
+
+@pytest.mark.parametrize("f", FUNCTIONS)
+def test_vmap_is_a_loop(f):
+    x = VECTORS if f in VECTOR_FUNCTIONS else turns(VECTORS)
+    close(batched(f)(x), [jax.jit(f)(xi) for xi in x], 1e-15)
+
+
+@pytest.mark.parametrize("f", [*FUNCTIONS, tangent_rate, is_rotation])
+def test_bad_input_is_named(f):
+    shape = (3,) if f in VECTOR_FUNCTIONS or f is tangent_rate else (3, 3)
+    others = {tangent_rate: (np.zeros(3),), is_rotation: (1e-6,)}.get(f, ())
+    for wrong in ((4,), (1, 3), (), (3, 4), (2, 3, 3)):
+        with pytest.raises(ValueError, match=rf"^{f.__name__}: `\w+` must have shape .*; received \("):
+            jax.eval_shape(lambda x: f(x, *others), jnp.zeros(wrong))
+    for wrong in ([0.0, 0.0, 0.0], None, "psi", np.zeros(shape, complex), np.zeros(shape, bool)):
+        with pytest.raises(TypeError, match=rf"^{f.__name__}: `\w+` must be an array of real numbers; received "):
+            f(wrong, *others)
+
+
+def test_bad_rate_and_tolerance_are_named():
+    with pytest.raises(ValueError, match=r"^tangent_rate: `psidot` must have shape \(3,\); received \(4,\)\.$"):
+        tangent_rate(np.zeros(3), np.zeros(4))
+    with pytest.raises(ValueError, match=r"^is_rotation: `tolerance` must not be negative; received -1"):
+        is_rotation(EYE, -1.0)
