@@ -289,6 +289,12 @@ def test_bad_input(message, call):
         call()
 
 
+@pytest.mark.parametrize("where", ["held", "state"])
+def test_other_points_of_linearisation_are_refused(where):
+    with pytest.raises(ValueError, match=f"hht: with constraints, leave `linearize` out.*; received {where!r}"):
+        simulate(constrained(level), hhtjax.hht(linearize=where), jnp.ones(2), jnp.zeros(2))
+
+
 @pytest.mark.parametrize("name", ["kim_hht", "rk4"])
 def test_other_steppers_refuse(name):
     with pytest.raises(NotImplementedError, match=r"simulate: .* cannot solve the `constraint`; use hht\(\)"):

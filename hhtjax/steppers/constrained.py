@@ -25,7 +25,9 @@ from hhtjax.steppers.stepper import Info, State
 
 def begin_constrained(method, system, q, v, t, params, dt):
     """w0 and L0 of the index-1 system, and a0 of second order, without which L is of first."""
-    c = method.coefficients
+    c, where = method.coefficients, method.options.linearize
+    if where in ("held", "state"):
+        raise ValueError(f"hht: with constraints, leave `linearize` out: it is at the predictor; received {where!r}.")
 
     def start(q, v, t):
         return acceleration_and_multipliers(system, q, v, t, params, method.factorize)
