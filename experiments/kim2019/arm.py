@@ -1,7 +1,6 @@
 """The methods on a six-axis arm: two formulations of it, error against step size and time."""
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import jax
@@ -10,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from experiments.report import COLOURS, MARKERS
+from experiments.report import COLOURS, MARKERS, side_by_side
 from hhtjax import hht, kim_hht, kim_implicit_euler
 from hhtjax.scenes import arm
 
@@ -44,10 +43,12 @@ def path(scene, num_steps, stepper):
 
 
 def compile_paths(scenes):
-    """`path` compiled for each of {name: (scene, stepper)}, two at a time."""
-    with ThreadPoolExecutor(2) as pool:
-        programs = pool.map(lambda x: path.lower(x[0], SAMPLES, x[1]).compile(), scenes.values())
-        return dict(zip(scenes, programs, strict=True))
+    """`path` compiled for each of {name: (scene, stepper)}."""
+
+    def compile_one(scene, stepper):
+        return path.lower(scene, SAMPLES, stepper).compile()
+
+    return dict(zip(scenes, side_by_side([partial(compile_one, *x) for x in scenes.values()]), strict=True))
 
 
 def seconds(function, *arguments, repeats):

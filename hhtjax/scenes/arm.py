@@ -16,13 +16,11 @@ from jax import lax
 
 from hhtjax.boundary import require_number
 from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.rotation import GENERATORS
 from hhtjax.scenes.scene import Scene
 from hhtjax.system import System
 
 GRAVITY = 9.80665
-GENERATORS = np.array(  # skew(a) = a_x G_x + a_y G_y + a_z G_z
-    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
-)
 
 
 def product(A, B):

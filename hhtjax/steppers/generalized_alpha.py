@@ -210,7 +210,7 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     Traceback (most recent call last):
     ValueError: hht: `alpha` must lie in [-1/3, 0]; received 0.2.
     """
-    alpha = require_number("hht", "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")
+    alpha = require_alpha("hht", alpha)
     return _member("hht", Coefficients(0.0, -alpha, (1 - alpha) ** 2 / 4, 0.5 - alpha), 2, options)
 
 
@@ -281,6 +281,11 @@ def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> Genera
     alpha_m, alpha_f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
     shift = alpha_f - alpha_m
     return _member("generalized_alpha", Coefficients(alpha_m, alpha_f, (1 + shift) ** 2 / 4, 0.5 + shift), 2, options)
+
+
+def require_alpha(caller, alpha):
+    """HHT's alpha as it is, if it lies in its range."""
+    return require_number(caller, "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")
 
 
 def _member(caller, coefficients, order, keywords):

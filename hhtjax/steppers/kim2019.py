@@ -10,10 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hhtjax.boundary import require_number
 from hhtjax.description import is_concrete
 from hhtjax.linear_solve import factorize, solve
-from hhtjax.steppers.generalized_alpha import Options, check_options
+from hhtjax.steppers.generalized_alpha import Options, check_options, require_alpha
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.stepper import Info, State, Stepper
 
@@ -139,7 +138,7 @@ def kim_hht(alpha: Any = 0.0) -> KimHHT:
     >>> hhtjax.kim_hht(alpha=0.0).order, hhtjax.kim_hht(alpha=-0.1).order
     (2, 1)
     """
-    alpha = _require_alpha("kim_hht", alpha)
+    alpha = require_alpha("kim_hht", alpha)
     return KimHHT(alpha, _order(alpha))
 
 
@@ -163,7 +162,7 @@ def conventional_hht(alpha: Any = 0.0, fictive_time=True, tolerance=1e-10, max_i
     >>> hhtjax.conventional_hht(alpha=0.0).order, hhtjax.conventional_hht(alpha=-0.1).order
     (2, 1)
     """
-    alpha = _require_alpha("conventional_hht", alpha)
+    alpha = require_alpha("conventional_hht", alpha)
     if not isinstance(fictive_time, bool):
         raise TypeError(f"conventional_hht: `fictive_time` must be True or False; received {fictive_time!r}.")
     options = check_options("conventional_hht", Options(None, None, tolerance, max_iterations))
@@ -183,10 +182,6 @@ def kim_implicit_euler() -> KimImplicitEuler:
     1
     """
     return KimImplicitEuler()
-
-
-def _require_alpha(caller, alpha):
-    return require_number(caller, "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")
 
 
 def _order(alpha):

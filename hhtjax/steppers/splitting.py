@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.boundary import require_number
 from hhtjax.description import is_concrete
 from hhtjax.linear_solve import matvec, solve
+from hhtjax.steppers.generalized_alpha import require_alpha
 from hhtjax.steppers.stepper import Info, State, Stepper
 
 
@@ -104,7 +104,7 @@ def operator_splitting(alpha: Any = -0.05, modified=False) -> OperatorSplitting:
     >>> hhtjax.operator_splitting(alpha=-0.1).order, hhtjax.operator_splitting(alpha=-0.1, modified=True).order
     (2, 1)
     """
-    alpha = require_number("operator_splitting", "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")
+    alpha = require_alpha("operator_splitting", alpha)
     if not isinstance(modified, bool):
         raise TypeError(f"operator_splitting: `modified` must be True or False; received {modified!r}.")
     order = 2 if not modified or (is_concrete(alpha) and alpha == 0) else 1
