@@ -1,5 +1,7 @@
 """hhtjax: differentiable, functional time integrators for multibody dynamics."""
 
+from hhtjax import analysis as analysis
+from hhtjax import rotation as rotation
 from hhtjax import scenes as scenes
 from hhtjax.constraints import consistent_initial as consistent_initial
 from hhtjax.flat_system import PrecisionWarning as PrecisionWarning

@@ -7,6 +7,7 @@ units of length. (The IVP test set writes -B^T lambda: its multipliers are the n
 """
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,16 +17,15 @@ from jax import lax
 
 from hhtjax.description import is_concrete
 from hhtjax.flat_system import flatten, initial_values
-from hhtjax.linear_solve import factorize, solve_map
+from hhtjax.linear_solve import RANK_TOLERANCE, UNROLLED, factorize, factorize_least_squares, matvec, solve_map
 
 MAX_ITERATIONS = 50
-RANK_TOLERANCE = 1e-9  # singular value of the scaled B below which rows count as dependent
 CONSISTENT = 1e-6  # relative distance of initial values from consistent ones that passes
 
 
 def violation(system, q, v, t, params):
     """Phi, and dPhi/dt = B v + Phi_t: (m,) each."""
-    return jax.jvp(lambda q, t: system.constraint(q, t, params), (q, t), (v, jnp.ones_like(t)))
+    return jax.jvp(lambda q, t: system.constraint(q, t, params), (q, t), (system.rate(q, v), jnp.ones_like(t)))
 
 
 def curvature(system, q, v, t, params):
@@ -34,22 +34,32 @@ def curvature(system, q, v, t, params):
     def rate(q, t):
         return violation(system, q, v, t, params)[1]
 
-    return jax.jvp(rate, (q, t), (v, jnp.ones_like(t)))[1]
+    return jax.jvp(rate, (q, t), (system.rate(q, v), jnp.ones_like(t)))[1]
 
 
 def reaction(system, q, t, params, L):
     """B^T L: (n,)."""
-    return jax.vjp(lambda q: system.constraint(q, t, params), q)[1](L)[0]
+    _, pull = jax.vjp(lambda q: system.constraint(q, t, params), q)
+    return pull_back(system, q, pull(L)[0])
+
+
+def pull_back(system, q, gradient):
+    """The force (n,) of a gradient with respect to q: the same, and the material moment for rotations."""
+    if not system.blocks:
+        return gradient
+    zero = jnp.zeros(system.size, q.dtype)
+    return jax.linear_transpose(lambda v: system.rate(q, v), zero)(gradient)[0]
 
 
 def saddle_point(system, q, t, params, force, rows, factorize=factorize):
     """(x, L) with M x - B^T L = force and B x = rows: the index-1 system for accelerations, and all projections."""
     n = system.size
-    _, B = jax.linearize(lambda q: system.constraint(q, t, params), q)
+    _, tangent = jax.linearize(lambda q: system.constraint(q, t, params), q)
 
     def f(z):
         x, L = z[:n], z[n:]
-        return jnp.concatenate([system.inertia(q, x, params) - reaction(system, q, t, params, L), B(x)])
+        reactions = reaction(system, q, t, params, L)
+        return jnp.concatenate([system.inertia(q, x, params) - reactions, tangent(system.rate(q, x))])
 
     z = solve_map(f, jnp.concatenate([force, rows]), factorize)
     return z[:n], z[n:]
@@ -71,7 +81,7 @@ class ConsistentInitial(NamedTuple):
     converged: Any
 
 
-def consistent_initial(system, q0, v0, params=None, t0=0.0) -> ConsistentInitial:
+def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None) -> ConsistentInitial:
     """The values nearest to q0 and v0 that satisfy the constraints, with the acceleration and multipliers there.
 
         min |q - q0|_M with Phi(q, t0) = 0,     min |v - v0|_M with B v + Phi_t = 0,     |x|_M^2 = x^T M x
@@ -80,6 +90,7 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0) -> ConsistentInitial
 
     Args:
         system: a `System` with a constraint. q0, v0, params, t0: as in `simulate`.
+        redundant: "least_squares" for constraints that may depend on each other, as in `hht`.
 
     Differentiable, forward and reverse. Newton for q from q0: start near. Under jit nothing raises, and
     `converged` tells.
@@ -98,10 +109,12 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0) -> ConsistentInitial
     """
     if getattr(system, "constraint", None) is None:
         raise ValueError("consistent_initial: `system` must have a constraint.")
+    check_redundant("consistent_initial", redundant)
     q0, v0 = initial_values("consistent_initial", system, q0, v0)
-    start, B, left = _consistent_initial(system, q0, v0, params, t0)
+    start, B, left = _consistent_initial(system, q0, v0, params, t0, redundant)
     if all(map(is_concrete, jax.tree.leaves((start, B)))):
-        require_independent("consistent_initial", np.asarray(B))
+        if redundant is None:
+            require_independent("consistent_initial", np.asarray(B))
         if not start.converged:
             raise ValueError(
                 f"consistent_initial: no q with Phi(q, t) = 0 found near `q0`: {left:.3g} is left of it. Start nearer."
@@ -109,39 +122,59 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0) -> ConsistentInitial
     return start
 
 
-@jax.jit
-def _consistent_initial(system, q0, v0, params, t0):
+def check_redundant(caller, redundant):
+    """An error for what is no value of `redundant`."""
+    if redundant not in (None, "least_squares"):
+        raise ValueError(f'{caller}: `redundant` must be None or "least_squares"; received {redundant!r}.')
+
+
+def factorize_constrained(n, redundant):
+    """The factorisation for n coordinates and their multipliers."""
+    return factorize if redundant is None else factorize_least_squares(n)
+
+
+@partial(jax.jit, static_argnames="redundant")
+def _consistent_initial(system, q0, v0, params, t0, redundant):
     """The result, B at q0, and max|Phi| at the end."""
     flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params)
+    factorize = factorize_constrained(flat.size, redundant)
     t = jnp.asarray(t0).astype(q.dtype)
-    B = jax.jacrev(flat.constraint)(q, t, params)
-    q, converged = nearest_position(flat, q, t, params)
+    B = jacobian(flat, q, t, params)
+    q, converged = nearest_position(flat, q, t, params, factorize)
     left = jnp.max(jnp.abs(flat.constraint(q, t, params)))
-    v = v + correction(flat, q, t, params, -violation(flat, q, v, t, params)[1])
-    w, L = acceleration_and_multipliers(flat, q, v, t, params)
-    q, v, w = (flat.unravel(x) for x in (q, v, w))
-    return ConsistentInitial(q, v, w, L, converged), B, left
+    v = v + correction(flat, q, t, params, -violation(flat, q, v, t, params)[1], factorize)
+    w, L = acceleration_and_multipliers(flat, q, v, t, params, factorize)
+    v, w = (flat.unravel_rates(x) for x in (v, w))
+    return ConsistentInitial(flat.unravel(q), v, w, L, converged), B, left
 
 
-def correction(system, q, t, params, rows):
+def correction(system, q, t, params, rows, factorize):
     """The x with B x = rows that is smallest in the norm of M."""
-    return saddle_point(system, q, t, params, jnp.zeros_like(q), rows)[0]
+    return saddle_point(system, q, t, params, jnp.zeros(system.size, q.dtype), rows, factorize)[0]
 
 
-def nearest_position(system, q0, t, params):
-    """q on Phi = 0 nearest to q0 in the norm of M(q0), by Newton, and whether that converged."""
+def jacobian(system, q, t, params):
+    """B: (m, n)."""
+    rows = jnp.eye(system.num_constraints, dtype=q.dtype)
+    return jax.vmap(lambda L: reaction(system, q, t, params, L))(rows)
+
+
+def nearest_position(system, q0, t, params, factorize):
+    """q on Phi = 0, its displacement from q0 smallest in the norm of M(q0), by Newton, and whether that converged."""
     n, eps = system.size, float(jnp.finfo(q0.dtype).eps)
-    z0 = jnp.concatenate([q0, jnp.zeros(system.num_constraints, q0.dtype)])
+    z0 = jnp.zeros(n + system.num_constraints, q0.dtype)
 
     def f(z):
-        q, mu = z[:n], z[n:]
-        pull = system.inertia(q0, q - q0, params) - reaction(system, q, t, params, mu)
-        return jnp.concatenate([pull, system.constraint(q, t, params)])
+        x, mu = z[:n], z[n:]
+        Phi, pull = jax.vjp(lambda x: system.constraint(system.move(q0, x), t, params), x)
+        return jnp.concatenate([system.inertia(q0, x, params) - pull(mu)[0], Phi])
+
+    size = jnp.max(jnp.abs(q0))
 
     def search(f, z):
         def unfinished(carry):
             z, change, iterations = carry
-            return (change > 16 * eps * (1 + jnp.max(jnp.abs(z[:n])))) & (iterations < MAX_ITERATIONS)
+            return (change > 16 * eps * (1 + size + jnp.max(jnp.abs(z[:n])))) & (iterations < MAX_ITERATIONS)
 
         def improve(carry):
             z, _, iterations = carry
@@ -152,7 +185,7 @@ def nearest_position(system, q0, t, params):
         return z, change
 
     z, change = lax.custom_root(f, z0, search, lambda g, y: solve_map(g, y, factorize), has_aux=True)
-    return z[:n], change <= math.sqrt(eps) * (1 + jnp.max(jnp.abs(z[:n])))
+    return system.move(q0, z[:n]), change <= math.sqrt(eps) * (1 + size + jnp.max(jnp.abs(z[:n])))
 
 
 def require_independent(caller, B):
@@ -170,26 +203,50 @@ def require_independent(caller, B):
         rank = len(values) - dependent.shape[1]
         raise ValueError(
             f"{caller}: `constraint` rows {rows} depend on each other at the start (rank {rank} of {len(values)}): "
-            "drop the redundant ones."
+            'drop the redundant ones, or keep them with redundant="least_squares".'
         )
 
 
-@jax.jit
-def examine(system, q0, v0, t0, params):
+def dependent_row(B):
+    """Number, from 1, of the first row of B (m, n) that depends on those above it, to a part in 1e6; 0 for none.
+
+    The pivots of an elimination on the cosines between the rows: sin^2 of the angle to the span of the rows above.
+    """
+    m, limit = B.shape[0], 1e4 * float(jnp.finfo(B.dtype).eps)
+    size = jnp.sqrt(jnp.sum(B**2, axis=1, keepdims=True))
+    B = B / jnp.where(size == 0, 1, size)
+    G = jax.vmap(lambda row: matvec(B, row))(B) if max(B.shape) <= UNROLLED else B @ B.T
+
+    def eliminate(k, G):
+        return G - jnp.where(jnp.arange(m) > k, G[:, k] / jnp.maximum(G[k, k], limit), 0)[:, None] * G[k][None, :]
+
+    if m <= UNROLLED:
+        for k in range(m - 1):
+            G = eliminate(k, G)
+    else:
+        G = lax.fori_loop(0, m - 1, eliminate, G)
+    dependent = jnp.diagonal(G) < limit
+    return jnp.min(jnp.where(dependent, jnp.arange(1, m + 1), m + 1)) % (m + 1)
+
+
+@partial(jax.jit, static_argnames="redundant")
+def examine(system, q0, v0, t0, params, redundant):
     """B, and for Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not."""
     flat, q, v = flatten("simulate", system, q0, v0, t0, params)
     t = jnp.asarray(t0).astype(q.dtype)
-    B = jax.jacrev(flat.constraint)(q, t, params)
+    B = jacobian(flat, q, t, params)
     both = violation(flat, q, v, t, params)
-    return B, [(jnp.max(jnp.abs(x)), jnp.max(jnp.abs(correction(flat, q, t, params, x)))) for x in both]
+    away = partial(correction, flat, q, t, params, factorize=factorize_constrained(flat.size, redundant))
+    return B, [(jnp.max(jnp.abs(x)), jnp.max(jnp.abs(away(x)))) for x in both]
 
 
-def require_consistent(caller, system, q0, v0, t0, params):
+def require_consistent(caller, system, q0, v0, t0, params, redundant=None):
     """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params)))):
         return
-    B, found = examine(system, q0, v0, t0, params)
-    require_independent(caller, np.asarray(B))
+    B, found = examine(system, q0, v0, t0, params, redundant)
+    if redundant is None:
+        require_independent(caller, np.asarray(B))
     for name, meaning, x, (violated, distance) in zip(("q0", "v0"), ("Phi", "dPhi/dt"), (q0, v0), found, strict=True):
         size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(x))
         if not distance <= CONSISTENT * (1 + size):

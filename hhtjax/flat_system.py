@@ -10,16 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from hhtjax import kinematics
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.linear_solve import factorize, matvec, solve
 from hhtjax.system import FirstOrderSystem, LinearSystem, as_matrix
 
+ORTHOGONAL = 1e-6  # largest entry of R^T R - I that passes for a rotation; 100 roundings in float32
+
 
 class FlatSystem(NamedTuple):
-    """A system on vectors q (n,) and v (n,), as the steppers see it; made by `flatten`.
+    """A system on vectors q and v (n,), as the steppers see it; made by `flatten`.
 
-    A first-order system is one whose force depends on its velocity y alone. Its position is nobody's
-    business, and stays zero.
+    q is (n,) too, but for rotations, of which it holds the matrices. A first-order system is one whose force
+    depends on its velocity y alone. Its position is nobody's business, and stays zero.
     """
 
     mass: Callable  # q, params -> (n, n), or (n,) for a diagonal
@@ -27,9 +30,11 @@ class FlatSystem(NamedTuple):
     size: int  # n
     linear: bool  # the residual is affine in (q, v, w), with constant coefficients
     first_order: bool
-    unravel: Callable  # (n,) -> pytree structured like q and v
+    unravel: Callable  # vector -> pytree structured like q
+    unravel_rates: Callable  # (n,) -> pytree structured like v
     constraint: Any = None  # q, t, params -> (m,); None without
     num_constraints: int = 0  # m
+    blocks: tuple = ()  # where the rotations are; empty without
 
     def inertia(self, q, w, params):
         """M(q) w."""
@@ -39,6 +44,18 @@ class FlatSystem(NamedTuple):
         """w = M(q)^-1 Q(q, v, t)."""
         M, Q = self.mass(q, params), self.force(q, v, t, params)
         return Q / M if M.ndim == 1 else solve(M, Q, factorize)
+
+    def move(self, q, x):
+        """q displaced by x (n,): q + x, and R exp(x) for rotations."""
+        return kinematics.move(self.blocks, q, x) if self.blocks else q + x
+
+    def rate(self, q, v):
+        """qdot: v, and R hat(v) for rotations."""
+        return kinematics.rate(self.blocks, q, v) if self.blocks else v
+
+    def tidy(self, state):
+        """The state at the end of a step, its rotations orthogonal to rounding."""
+        return state._replace(q=kinematics.orthonormalize(self.blocks, state.q)) if self.blocks else state
 
 
 class PrecisionWarning(UserWarning):
@@ -72,8 +89,14 @@ def initial_values(caller, system, q0, v0):
                 raise ValueError(f"{where} must be finite; received {leaf!r}.")
             if is_array(leaf) and jnp.issubdtype(dtype, jnp.floating):
                 dtypes.add(jnp.result_type(leaf))  # what JAX makes of it: float32 without x64
-    if jax.tree.map(jnp.shape, q0) != jax.tree.map(jnp.shape, v0):
-        raise ValueError(f"{caller}: `v0` must have the shapes of q0, {describe(q0)}; received {describe(v0)}.")
+    for (path, q), v in zip(jax.tree_util.tree_leaves_with_path(q0), jax.tree.leaves(v0), strict=True):
+        if kinematics.is_rotation(jnp.shape(q), jnp.shape(v)):
+            _require_rotations(f"{caller}: `q0{jax.tree_util.keystr(path)}`", q)
+        elif jnp.shape(q) != jnp.shape(v):
+            raise ValueError(
+                f"{caller}: `v0` must have the shapes of q0, {describe(q0)}, but (3,) for a rotation (3, 3); "
+                f"received {describe(v0)}."
+            )
     if len(dtypes) > 1:
         raise TypeError(f"{caller}: `q0` and `v0` must share one dtype; received {describe(q0)} and {describe(v0)}.")
     dtype = dtypes.pop() if dtypes else jnp.result_type(float)
@@ -86,6 +109,22 @@ def initial_values(caller, system, q0, v0):
         )
     q0, v0 = (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0))
     return q0, None if first_order else v0
+
+
+def _require_rotations(where, R):
+    """An error for matrices that are not orthogonal, or are reflections; tracers pass."""
+    if not is_concrete(R):
+        return
+    R = np.asarray(R)
+    tolerance = max(ORTHOGONAL, 100 * np.finfo(R.dtype).eps) if R.dtype.kind == "f" else ORTHOGONAL
+    error = np.max(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)))
+    if error > tolerance:
+        raise ValueError(
+            f"{where} must be a rotation, because its velocity has 3 components; received a matrix R whose "
+            f"R^T R differs from I by {error:.3g}: hhtjax.rotation.exp(psi) gives rotations."
+        )
+    if np.any(np.linalg.det(R) < 0):
+        raise ValueError(f"{where} must be a rotation; received a reflection, det R = -1.")
 
 
 def flatten(caller, system, q0, v0, t0, params):
@@ -101,9 +140,18 @@ def flatten(caller, system, q0, v0, t0, params):
         def rate(q, v, t, params):
             return ravel_pytree(system.rate(unravel(v), t, params))[0].astype(dtype)
 
-        return FlatSystem(lambda q, params: jnp.ones(n, dtype), rate, n, False, True, unravel), jnp.zeros_like(q), q
+        def mass(q, params):
+            return jnp.ones(n, dtype)
 
-    v, _ = ravel_pytree(v0)
+        return FlatSystem(mass, rate, n, False, True, unravel, unravel), jnp.zeros_like(q), q
+
+    v, unravel_rates = ravel_pytree(v0)
+    n, blocks = v.size, kinematics.layout(q0, v0)
+    if blocks and (isinstance(system, LinearSystem) or getattr(system.mass, "is_lagrangian", False)):
+        raise NotImplementedError(
+            f"{caller}: rotations in `q0` need a System(mass, force): they are no linear coordinates, and "
+            "from_lagrangian knows no others."
+        )
     constraint, m = None, 0
     if system.constraint is not None:
         m = _count_constraints(caller, system.constraint, n, dtype, q0, t0, params)
@@ -127,9 +175,10 @@ def flatten(caller, system, q0, v0, t0, params):
         return as_matrix(M, dtype)
 
     def force(q, v, t, params):
-        return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0].astype(dtype)
+        return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, params))[0].astype(dtype)
 
-    return FlatSystem(mass, force, n, isinstance(system, LinearSystem), False, unravel, constraint, m), q, v
+    linear = isinstance(system, LinearSystem)
+    return FlatSystem(mass, force, n, linear, False, unravel, unravel_rates, constraint, m, blocks), q, v
 
 
 def _flat_constraint(constraint, unravel, dtype, q, t, params):

@@ -12,6 +12,9 @@ from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
 UNROLLED = 8
+RANK_TOLERANCE = (
+    1e-9  # relative size of a singular value below which columns count as dependent; 100 roundings in float32
+)
 
 
 def solve_map(f, b, factorize):
@@ -53,6 +56,31 @@ def factorize_with(solve):
     def factorize(A):
         A = lax.stop_gradient(A)
         return lambda b, trans=0: solve(A.T if trans else A, b)
+
+    return factorize
+
+
+def factorize_least_squares(n):
+    """The same for A = [[M, -B^T], [B, 0]] whose B may have lost rank: the least-squares solution of least norm.
+
+    The first n unknowns and equations are measured by the diagonal of A, all others alike.
+    """
+
+    def factorize(A):
+        A = lax.stop_gradient(A)
+        tolerance = max(RANK_TOLERANCE, 100 * float(jnp.finfo(A.dtype).eps))
+        d = jnp.abs(jnp.diagonal(A)[:n])
+        first = 1 / jnp.sqrt(jnp.where(d == 0, 1, d))
+        rest = 1 / jnp.max(jnp.abs(first[:, None] * A[:n, n:]))
+        scale = jnp.concatenate([first, jnp.full(A.shape[0] - n, rest)])
+        U, s, Vt = jnp.linalg.svd(scale[:, None] * A * scale[None, :])
+        inverse = jnp.where(s > tolerance * s[0], 1 / s, 0)
+
+        def apply(b, trans=0):
+            left, right = (Vt.T, U.T) if trans else (U, Vt)
+            return scale * (right.T @ (inverse * (left.T @ (scale * b))))
+
+        return apply
 
     return factorize
 

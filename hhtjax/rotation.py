@@ -3,37 +3,34 @@
 R (3, 3) takes material components to spatial ones; Rdot = R hat(Om), Om the material angular velocity in rad/s.
 psi (3,), in rad, is a rotation vector: a turn by the angle |psi| about psi. With P = hat(psi), t = |psi| and x = t^2:
 
-    exp  R    = I + a P + b P^2      a = sin t / t          b = (1 - cos t) / t^2
-         T    = I - b P + c P^2      c = (t - sin t) / t^3
+    exp  R    = I + c1 P + c2 P^2    c1 = sin t / t         c2 = (1 - cos t) / t^2
+         T    = I - c2 P + c3 P^2    c3 = (t - sin t) / t^3
          T^-1 = I + P/2 + d P^2      d = (1 - (t/2) cot(t/2)) / t^2
 
-a, b, c and d are analytic in x, and computed so that values and derivatives, forward and reverse, are right at psi = 0
-too. Every function keeps the dtype, but integers become floats, and raises TypeError for what is not an array of real
-numbers, ValueError for another shape.
+c1, c2 and c3 are functions of Stumpff, ck = 1/k! - x/(k + 2)! + x^2/(k + 4)! - ..., with
+
+    c(k) = 1/k! - x c(k + 2),        dc(k)/dx = (k c(k + 2) - c(k + 1))/2
+
+Analytic in x, and computed so that values and derivatives, forward and reverse, are right at psi = 0 too. Every
+function keeps the dtype, but integers become floats, and raises TypeError for what is not an array of real numbers,
+ValueError for another shape.
 
 Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """
 
 from math import factorial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.boundary import require_number
 from hhtjax.description import is_array, is_real
-from hhtjax.linear_solve import matvec
 
 GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
 )
-TERMS = range(11)
-SERIES = (  # a, b, c and e = (2 b - a) / x in powers of -x: to rounding for x < 1, third derivatives too
-    [1 / factorial(2 * k + 1) for k in TERMS],
-    [1 / factorial(2 * k + 2) for k in TERMS],
-    [1 / factorial(2 * k + 3) for k in TERMS],
-    [(k + 1) / (k + 2) / factorial(2 * k + 3) for k in TERMS],
-)
+TERMS = range(11)  # of c4 and c5: to rounding for x < 1, third derivatives too
+C4, C5 = ([1 / factorial(2 * j + k) for j in TERMS] for k in (4, 5))
 ARCTANGENT = [1 / (2 * k + 1) for k in range(16)]  # arctan(z) / z in powers of -z^2: likewise for z < 1/4
 
 
@@ -60,14 +57,14 @@ def vee(X):
 
 
 def exp(psi):
-    """R (3, 3) = I + a P + b P^2, the rotation by psi (3,), in rad (Rodrigues); orthogonal to rounding.
+    """R (3, 3) = I + c1 P + c2 P^2, the rotation by psi (3,), in rad (Rodrigues); orthogonal to rounding.
 
     >>> print((exp(jnp.array([0.0, 0.0, jnp.pi / 2])) @ jnp.array([1.0, 0.0, 0.0])).round(6) + 0.0)
     [0. 1. 0.]
     """
     psi = _real("exp", "psi", psi, (3,))
-    a, b, _, _ = coefficients(jnp.sum(psi**2))
-    return _polynomial(psi, a, b)
+    c1, c2, *_ = coefficients(jnp.sum(psi**2))
+    return _polynomial(psi, c1, c2)
 
 
 def log(R):
@@ -99,17 +96,17 @@ def log(R):
 
 
 def tangent(psi):
-    """T (3, 3) = I - b P + c P^2 for psi (3,), in rad: Om = T psidot is the rate of R0 exp(psi), for any constant R0.
+    """T (3, 3) = I - c2 P + c3 P^2 for psi (3,), in rad: Om = T psidot is the rate of R0 exp(psi), for any constant R0.
 
-    T^T takes moments from material components to those that work on psi. det T = 2 b, so T is singular at 2 pi.
+    T^T takes moments from material components to those that work on psi. det T = 2 c2, so T is singular at 2 pi.
 
     >>> psi = jnp.array([0.0, 0.0, 2.0])
     >>> print(tangent(psi) @ psi)                              # about a fixed axis, Om = psidot
     [0. 0. 2.]
     """
     psi = _real("tangent", "psi", psi, (3,))
-    _, b, c, _ = coefficients(jnp.sum(psi**2))
-    return _polynomial(psi, -b, c)
+    _, c2, c3, *_ = coefficients(jnp.sum(psi**2))
+    return _polynomial(psi, -c2, c3)
 
 
 def inverse_tangent(psi):
@@ -124,18 +121,22 @@ def inverse_tangent(psi):
      [0. 0. 1.]]
     """
     psi = _real("inverse_tangent", "psi", psi, (3,))
-    d = coefficients(jnp.sum(psi**2))[-1]
-    return _polynomial(psi, 0.5, d)
+    return _polynomial(psi, 0.5, inverse_coefficient(jnp.sum(psi**2)))
 
 
 def tangent_rate(psi, psidot):
     """Tdot psidot (3,), in rad/s^2, while psi (3,) changes by psidot (3,), in rad/s: Omdot = T psiddot + Tdot psidot.
 
+        Tdot psidot = xdot (-dc2/dx P + dc3/dx P^2) psidot + c3 psidot x (psi x psidot),    xdot = 2 psi.psidot
+
     >>> print(tangent_rate(jnp.zeros(3), jnp.array([1.0, 2.0, 3.0])))
     [0. 0. 0.]
     """
     psi, psidot = _real("tangent_rate", "psi", psi, (3,)), _real("tangent_rate", "psidot", psidot, (3,))
-    return jax.jvp(lambda psi: matvec(tangent(psi), psidot), (psi,), (psidot,))[1]
+    _, _, c3, c4, c5 = coefficients(jnp.sum(psi**2))
+    first = cross(psi, psidot)
+    stretch = (c3 - 2 * c4) * first + (3 * c5 - c4) * cross(psi, first)  # half of xdot has gone into the derivatives
+    return jnp.sum(psi * psidot) * stretch + c3 * cross(psidot, first)
 
 
 def orthonormalize(R):
@@ -148,7 +149,7 @@ def orthonormalize(R):
     0.9998
     """
     R = _real("orthonormalize", "R", R, (3, 3))
-    return R - _product(R, _product(R.T, R) - jnp.eye(3, dtype=R.dtype)) / 2
+    return R - product(R, product(R.T, R) - jnp.eye(3, dtype=R.dtype)) / 2
 
 
 def is_rotation(R, tolerance):
@@ -159,23 +160,48 @@ def is_rotation(R, tolerance):
     """
     R = _real("is_rotation", "R", R, (3, 3))
     require_number("is_rotation", "tolerance", tolerance, lambda x: x >= 0, "not be negative")
-    error = jnp.max(jnp.abs(_product(R.T, R) - jnp.eye(3, dtype=R.dtype)))
+    error = jnp.max(jnp.abs(product(R.T, R) - jnp.eye(3, dtype=R.dtype)))
     return (error <= tolerance) & (jnp.linalg.det(R) > 0)
 
 
-def coefficients(x):
-    """a, b, c and d at x = |psi|^2, a scalar >= 0: their power series for x < 1, their definitions beyond.
+def product(A, B):
+    """A B (3, 3) elementwise: XLA fuses it, and keeps float32 at full precision on every device.
 
-    >>> [round(1 / float(f)) for f in coefficients(jnp.array(0.0))]
-    [1, 2, 6, 12]
+    >>> print(product(hat(jnp.array([1.0, 0.0, 0.0])), jnp.eye(3))[2])
+    [0. 1. 0.]
+    """
+    return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
+
+
+def cross(x, y):
+    """x cross y, for (3,) each; of scalars, which XLA fuses better than the gathers of jnp.cross."""
+    (a, b, c), (d, e, f) = x, y
+    return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d])
+
+
+def coefficients(x):
+    """c1, ..., c5 at x = |psi|^2, a scalar >= 0: power series and recursion down for x < 1, definitions and up beyond.
+
+    >>> [round(1 / float(c)) for c in coefficients(jnp.array(0.0))]
+    [1, 2, 6, 24, 120]
     """
     small = x < 1
-    near, x = jnp.where(small, -x, 0), jnp.where(small, 1, x)  # both finite in the branch not taken, for derivatives
+    y, x = jnp.where(small, x, 0), jnp.where(small, 1, x)  # both finite in the branch not taken, for derivatives
+    c4, c5 = _power_series(C4, -y), _power_series(C5, -y)
+    c2, c3 = 0.5 - y * c4, 1 / 6 - y * c5
+    near = 1 - y * c3, c2, c3, c4, c5
     t = jnp.sqrt(x)
-    a, b = jnp.sin(t) / t, 2 * (jnp.sin(t / 2) / t) ** 2  # 1 - cos t would cancel towards 2 pi
-    far = a, b, (1 - a) / x, (2 * b - a) / x
-    a, b, c, e = (jnp.where(small, _power_series(s, near), f) for s, f in zip(SERIES, far, strict=True))
-    return a, b, c, e / (2 * b)
+    c1, c2 = jnp.sin(t) / t, 2 * (jnp.sin(t / 2) / t) ** 2  # 1 - cos t would cancel towards 2 pi
+    c3, c4 = (1 - c1) / x, (0.5 - c2) / x
+    far = c1, c2, c3, c4, (1 / 6 - c3) / x
+    return tuple(jnp.where(small, n, f) for n, f in zip(near, far, strict=True))
+
+
+def inverse_coefficient(x):
+    """d = (c3 - 2 c4)/(2 c2) = (2 c2 - c1)/(2 c2 x): the one without cancellation at 0, the other at 2 pi."""
+    c1, c2, c3, c4, _ = coefficients(x)
+    small = x < 1
+    return jnp.where(small, c3 - 2 * c4, (2 * c2 - c1) / jnp.where(small, 1, x)) / (2 * c2)
 
 
 def _power_series(coefficients, x):
@@ -189,11 +215,6 @@ def _polynomial(psi, f, g):
     """I + f P + g P^2."""
     eye = jnp.eye(3, dtype=psi.dtype)
     return eye + f * hat(psi) + g * (psi[:, None] * psi[None, :] - jnp.sum(psi**2) * eye)
-
-
-def _product(A, B):
-    """A B elementwise: XLA fuses it, and keeps float32 at full precision on every device."""
-    return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
 
 def _real(caller, name, x, shape):

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax import kinematics
 from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpointed_scan
 from hhtjax.constraints import require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.flat_system import flatten, initial_values
-from hhtjax.steppers.stepper import Info, Stepper, public, require_constrained
+from hhtjax.steppers.stepper import Info, Stepper, public, require_capable
 from hhtjax.system import FirstOrderSystem, LinearSystem, System
 
 
@@ -24,10 +25,12 @@ class SimulationError(RuntimeError):
 
 class Failure(NamedTuple):
     """The first step that failed. step: its number, from 1, or 0 if none did; newton: True if Newton's
-    iteration failed while the state was still finite."""
+    iteration failed while the state was still finite; row: number, from 1, of the constraint that came to depend
+    on those before it, 0 if none did, None without constraints."""
 
     step: Any
     newton: Any
+    row: Any = None
 
 
 class Solution(NamedTuple):
@@ -55,19 +58,23 @@ class Solution(NamedTuple):
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
-        if not all(is_concrete(x) for x in (*self.failure, self.dt, self.t)):
+        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t)))):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         steps = np.asarray(self.failure.step)
         if not steps.any():
             return
         member = tuple(int(i) for i in np.argwhere(steps)[0])
-        step, newton, dt, start = (np.asarray(x)[member] for x in (*self.failure, self.dt, self.t[..., 0]))
+        row = 0 if self.failure.row is None else np.asarray(self.failure.row)[member]
+        step, newton, dt, start = (np.asarray(x)[member] for x in (*self.failure[:2], self.dt, self.t[..., 0]))
         failed = f"({np.count_nonzero(steps)} of {steps.size} failed)"
         which = f"member {', '.join(map(str, member))} {failed}, " if member else ""
         why = (
             "Newton's iteration did not converge; the state is still finite. Take a smaller dt, "
             "or more max_iterations, or a larger tolerance"
             if newton
+            else f"row {row - 1} of the constraint depends on the rows before it: the position is singular. Give the "
+            'stepper redundant="least_squares", or formulate the constraint anew'
+            if row
             else "the state is not finite. Take a smaller dt, or another linearize=, or a method that damps"
         )
         raise SimulationError(f"simulate: {which}step {step} (to t = {start + step * dt:.6g}) failed: {why}.")
@@ -123,9 +130,9 @@ def simulate(
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
     q0, v0 = initial_values("simulate", system, q0, v0)
-    require_constrained("simulate", system, stepper)
+    require_capable("simulate", system, stepper, q0, v0)
     if system.constraint is not None:
-        require_consistent("simulate", system, q0, v0, t0, params)
+        require_consistent("simulate", system, q0, v0, t0, params, stepper.redundant)
     dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew
     return _simulate(
         system, stepper, q0, v0, params, dt, t0, num_steps=int(num_steps), save_every=int(save_every), progress=progress
@@ -168,22 +175,31 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
 
     start = stepper.begin(flat, q, v, t0, params, dt)
     no_info = _no_info(jax.eval_shape(take_step, start)[1])
-    failure = Failure(jnp.zeros((), jnp.int32), jnp.array(False))
+    failure = Failure(jnp.zeros((), jnp.int32), jnp.array(False), no_info.dependent_row)
     (_, _, failure), (path, info) = checkpointed_scan(
         interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every
     )
-    t, *path, L = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(start), path)
-    q, v, w = (None if x is None else jax.vmap(flat.unravel)(x) for x in path)
+    t, q, *rates, L = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(start), path)
+    q = jax.vmap(flat.unravel)(q)
+    v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in rates)
     return Solution(t, q, v, w, L, dt, info, failure)
 
 
 def _first_failure(failure, count, state, info):
-    finite = jnp.all(jnp.isfinite(state.q) & jnp.isfinite(state.v) & jnp.isfinite(state.w))
-    if state.L is not None:
-        finite = finite & jnp.all(jnp.isfinite(state.L))
-    failed = ~finite if info.converged is None else ~(finite & info.converged)
+    """The failure so far, or this step's."""
+    finite = jnp.all(jnp.isfinite(state.v) & jnp.isfinite(state.w))
+    for x in (state.q, state.L):
+        if x is not None:
+            finite = finite & jnp.all(jnp.isfinite(x))
+    failed, newton, row = ~finite, finite, failure.row
+    if info.converged is not None:
+        failed = failed | ~info.converged
+    if info.dependent_row is not None:
+        failed, newton = failed | (info.dependent_row > 0), newton & (info.dependent_row == 0)
     first = failed & (failure.step == 0)
-    return Failure(jnp.where(first, count, failure.step), jnp.where(first, finite, failure.newton))
+    if info.dependent_row is not None:
+        row = jnp.where(first, info.dependent_row, failure.row)
+    return Failure(jnp.where(first, count, failure.step), jnp.where(first, newton, failure.newton), row)
 
 
 def _no_info(shapes):
@@ -221,8 +237,8 @@ class Interpolant(NamedTuple):
 def interpolate(solution, times) -> Interpolant:
     """Dense output: q and v at arbitrary times inside the run, differentiable in all.
 
-    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration). Their
-    error is O(H^4), H the spacing of the saved times.
+    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration); for a rotation, of
+    the rotation vector from the saved one before. Their error is O(H^4), H the spacing of the saved times.
 
     Args:
         solution: of one run (vmap this function for a batch).
@@ -255,10 +271,14 @@ def interpolate(solution, times) -> Interpolant:
 
     def hermite(y, slope):
         s = x.reshape(x.shape + (1,) * (y.ndim - 1))
-        y0, y1, d0, d1 = y[i], y[i + 1], H * slope[i], H * slope[i + 1]
-        rise = y1 - y0
-        return y0 + s * (d0 + s * (3 * rise - 2 * d0 - d1 + s * (d0 + d1 - 2 * rise)))
+        return y[i] + kinematics.hermite(y[i + 1] - y[i], H * slope[i], H * slope[i + 1], s)
+
+    def position(q, v):
+        if not kinematics.is_rotation(q.shape, v.shape):
+            return hermite(q, v)
+        s = x.reshape(x.shape + (1,) * (v.ndim - 1))
+        return kinematics.interpolate_rotation(q[i], q[i + 1], H * v[i], H * v[i + 1], s)
 
     first_order = solution.acceleration is None
     v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)
-    return Interpolant(jax.tree.map(hermite, solution.q, solution.v), v)
+    return Interpolant(jax.tree.map(position, solution.q, solution.v), v)

@@ -26,7 +26,9 @@ class System(Description):
         constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), m <= n, rows independent. Then
             M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.
 
-    q and v are pytrees of the same structure and shapes; n is their number of entries. Any consistent
+    q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
+    leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
+    leaf of v, Rdot = R hat(Om); its rows of M and Q are moments in material components. Any consistent
     units do. A System is frozen and hashable; constant arrays in it are leaves of a pytree.
 
     Raises:
@@ -89,6 +91,7 @@ class _LagrangianMass:
     """M(q) = d2L/dv2. A class and not a closure, so that equal Lagrangians give equal systems."""
 
     lagrangian: Callable
+    is_lagrangian = True  # knows no rotations
 
     def __call__(self, q, params):
         zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))

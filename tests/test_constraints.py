@@ -15,7 +15,7 @@ from test_gradients import check_gradient
 import hhtjax
 from hhtjax.constraints import acceleration_and_multipliers, violation
 from hhtjax.flat_system import flatten
-from hhtjax.scenes import Scene, squeezer
+from hhtjax.scenes import Scene, four_bars, squeezer
 
 SQUEEZER = json.loads((Path(__file__).parent / "data" / "squeezer.json").read_text())
 PARAMS = {"m": jnp.array([2.0, 1.0]), "l": 0.8, "k": 30.0, "c": 0.4}
@@ -165,24 +165,53 @@ def test_redundant_constraints_by_least_squares():
     def twice(q, t, params):
         return jnp.tile(constraint(q, t, params), 2)
 
-    def least_squares(A, b):
-        return jnp.linalg.pinv(A, rtol=1e-10) @ b
-
     system = hhtjax.System(mass, force, twice)
     with pytest.raises(ValueError, match=r"simulate: `constraint` rows \[0, 1\] depend on each other .*rank 1 of 2"):
         hhtjax.simulate(system, hhtjax.hht(), start().q, start().v, PARAMS, dt=0.01, num_steps=1)
-    stepper = hhtjax.hht(-0.1, solve=least_squares)
-
-    @jax.jit  # where nothing raises
-    def redundant(q0):
-        return hhtjax.simulate(system, stepper, q0, start().v, PARAMS, dt=0.02, num_steps=20)
-
+    begin = hhtjax.consistent_initial(system, Q0, GUESS, PARAMS, redundant="least_squares")
+    np.testing.assert_allclose(begin.q, start().q, atol=1e-13)
+    np.testing.assert_allclose(begin.multipliers, start().multipliers[0] / 2, rtol=1e-10)
     path, single = (
-        redundant(start().q),
-        hhtjax.simulate(SLIDER, hhtjax.hht(-0.1), start().q, start().v, PARAMS, dt=0.02, num_steps=20),
+        hhtjax.simulate(s, hhtjax.hht(-0.1, redundant=how), begin.q, begin.v, PARAMS, dt=0.02, num_steps=20)
+        for s, how in ((system, "least_squares"), (SLIDER, None))
     )
+    path.check()
     np.testing.assert_allclose(path.q, single.q, atol=1e-9)
     np.testing.assert_allclose(path.multipliers.sum(axis=1), single.multipliers[:, 0], rtol=1e-6)
+
+
+def test_a_singular_position_on_the_way_is_named():
+    """Rows that become parallel at t = 1: the run says at which step, and which row; least squares goes on."""
+
+    def crossing(q, t, params):
+        return jnp.array([q[0] - t, q[1] * (q[0] - 1) + q[0] - t])
+
+    system = hhtjax.System(jnp.ones(3), lambda q, v, t, params: jnp.array([0.0, 0.0, -9.81]), crossing)
+    q0, v0 = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0])
+    for stepper in (hhtjax.hht(), hhtjax.hht(redundant="least_squares")):
+        run = hhtjax.simulate(system, stepper, q0, v0, dt=0.125, num_steps=12, save_every=6)
+        if stepper.redundant:
+            run.check()
+            np.testing.assert_allclose(run.q[-1], [1.5, 0, -9.81 * 1.5**2 / 2], atol=1e-9)
+        else:
+            with pytest.raises(hhtjax.SimulationError, match=r"step 8 .*failed: row 1 of the constraint depends on"):
+                run.check()
+
+
+@pytest.mark.slow
+def test_four_bars_through_their_singular_position():
+    """Twice per turn the rank falls from 5 to 3: least squares keeps to the exact motion of one angle."""
+    scene = four_bars.four_bars(loops=2)
+    stepper = hhtjax.hht(-0.1, redundant="least_squares")
+    run = hhtjax.simulate(*[scene.system, stepper, *scene[2:4], scene.params], dt=2e-3, num_steps=500, save_every=25)
+    run.check()
+    rate = -(1.5 + 2) * 9.81 / (1 + 2)
+    exact = solve_ivp(
+        lambda t, y: [y[1], rate * np.cos(y[0])], (0, 1.0), [np.pi / 2, -1.0], "DOP853", run.t, rtol=1e-12
+    )
+    angle = np.unwrap(np.arctan2(run.q[:, 0, 1], run.q[:, 0, 0]))
+    assert angle[-1] < -1.0  # it has fallen through
+    np.testing.assert_allclose(angle, exact.y[0], atol=2e-3)
 
 
 def test_consistent_initial_is_nearest_and_consistent():

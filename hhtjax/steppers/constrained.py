@@ -17,7 +17,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from hhtjax.constraints import acceleration_and_multipliers, reaction, violation
+from hhtjax.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
 from hhtjax.linear_solve import solve
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import Info, State
@@ -25,30 +25,33 @@ from hhtjax.steppers.stepper import Info, State
 
 def begin_constrained(method, system, q, v, t, params, dt):
     """w0 and L0 of the index-1 system, and a0 of second order, without which L is of first."""
-    c, where = method.coefficients, method.options.linearize
+    where = method.options.linearize
     if where in ("held", "state"):
         raise ValueError(f"hht: with constraints, leave `linearize` out: it is at the predictor; received {where!r}.")
 
     def start(q, v, t):
-        return acceleration_and_multipliers(system, q, v, t, params, method.factorize)
+        return acceleration_and_multipliers(system, q, v, t, params, method.factorize_for(system))
 
     if method.options.start == "simple":
         w, L = start(q, v, t)
         return State(t, q, v, w, w, L)
     (w, L), tangent = jax.linearize(start, q, v, t)
-    rate, _ = tangent(v, w, jnp.ones_like(t))
-    return State(t, q, v, w, w + (c.alpha_m - c.alpha_f) * dt * rate, L)
+    wdot, _ = tangent(system.rate(q, v), w, jnp.ones_like(t))
+    return State(t, q, v, w, method.corrected(system, v, w, wdot, dt), L)
 
 
-def report(system, params, s, info):
-    """What the step tells, and by how much it violates the constraints."""
+def report(method, system, params, s, info):
+    """What the step tells, by how much it violates the constraints, and whether these still are independent."""
     position, rate = violation(system, s.q, s.v, s.t, params)
-    return info._replace(constraint=jnp.max(jnp.abs(position)), constraint_rate=jnp.max(jnp.abs(rate)))
+    info = info._replace(constraint=jnp.max(jnp.abs(position)), constraint_rate=jnp.max(jnp.abs(rate)))
+    if method.redundant is not None:
+        return info
+    return info._replace(dependent_row=dependent_row(jacobian(system, s.q, s.t, params)))
 
 
 def bind_constrained(method, system, params, dt):
     """The step: one Newton step from the predictor (w, L, 0), or Newton until done."""
-    c, options, factorize = method.coefficients, method.options, method.factorize
+    c, options, factorize = method.coefficients, method.options, method.factorize_for(system)
     n, m = system.size, system.num_constraints
     ggl = options.formulation == "ggl"
 
@@ -60,14 +63,12 @@ def bind_constrained(method, system, params, dt):
 
     def step(s):
         M = system.mass(s.q, params)
-        inverse = (lambda b: b / M) if M.ndim == 1 else partial(solve, M, factorize=factorize)
+        inverse = (lambda b: b / M) if M.ndim == 1 else partial(solve, M, factorize=method.factorize)
 
         def path(z):
-            s1 = method.advance(s, dt, z[:n])._replace(L=z[n : n + m])
-            if not ggl:
-                return s1
-            shift = inverse(reaction(system, s.q, s.t, params, z[n + m :]))
-            return s1._replace(q=s1.q - c.beta * dt**2 * shift)
+            w, L, eta = z[:n], z[n : n + m], z[n + m :]
+            shift = c.beta * dt**2 * inverse(reaction(system, s.q, s.t, params, eta)) if ggl else None
+            return method.arrive(system, s, dt, w, shift)._replace(L=L)
 
         z = jnp.concatenate([s.w, s.L] + [jnp.zeros(m, s.q.dtype)] * ggl)
         if options.iterations is None:
@@ -76,7 +77,7 @@ def bind_constrained(method, system, params, dt):
             for _ in range(options.iterations):
                 z = linearized_solve(r, path, z, factorize)
             info = Info()
-        s1 = path(z)
-        return s1, report(system, params, s1, info)
+        s1 = system.tidy(path(z))
+        return s1, report(method, system, params, s1, info)
 
     return step

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 from hhtjax.steppers.generalized_alpha import Coefficients, GeneralizedAlpha, Options, check_options
-from hhtjax.steppers.stepper import State
 
 
 @dataclass(frozen=True, eq=False)
@@ -11,9 +10,9 @@ class ImplicitEuler(GeneralizedAlpha):
     """Implicit Euler; made by `implicit_euler`."""
 
     def advance(self, s, dt, w):
-        """v1 = v + h w1, q1 = q + h v1."""
+        """v1 = v + h w1, x = h v1."""
         v = s.v + dt * w
-        return State(s.t + dt, s.q + dt * v, v, w, w)
+        return dt * v, v, w, w
 
 
 def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=None) -> ImplicitEuler:

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from hhtjax import kinematics
 from hhtjax.description import is_concrete
 from hhtjax.linear_solve import factorize, solve
 from hhtjax.steppers.generalized_alpha import Options, check_options, require_alpha
@@ -69,6 +70,8 @@ class ConventionalHHT(Stepper):
     fictive_time: bool
     options: Options
 
+    solves_rotations = True
+
     def begin(self, system, q, v, t, params, dt):
         """a_0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
@@ -83,15 +86,21 @@ class ConventionalHHT(Stepper):
             Q0 = system.force(s.q, s.v, s.t, params)
 
             def path(a):
-                q = s.q + dt * s.v + dt**2 * ((0.5 - beta) * s.w + beta * a)
-                return State(s.t + dt, q, s.v + dt * ((1 - gamma) * s.w + gamma * a), a)
+                x = dt * s.v + dt**2 * ((0.5 - beta) * s.w + beta * a)
+                v = s.v + dt * ((1 - gamma) * s.w + gamma * a)
+                if system.blocks:
+                    v, a, _ = kinematics.end_of_chart(system.blocks, x, v, a, a)
+                return State(s.t + dt, system.move(s.q, x), v, a, memory=x)
 
             def r(s1):
                 Q1 = system.force(s1.q, s1.v, s.t + late, params)
-                return system.inertia(s1.q, s1.w, params) - (1 + alpha) * Q1 + alpha * Q0
+                now = system.inertia(s1.q, s1.w, params) - (1 + alpha) * Q1
+                if system.blocks:  # both terms in components that work on the rate of x; for Q0 that is so already
+                    now = kinematics.pull_back(system.blocks, s1.memory, now)
+                return now + alpha * Q0
 
             a, info = newton(r, path, s.w, s, factorize, self.options.tolerance, self.options.max_iterations)
-            return path(a), info
+            return system.tidy(path(a)._replace(memory=None)), info
 
         return step
 
@@ -150,6 +159,13 @@ def conventional_hht(alpha: Any = 0.0, fictive_time=True, tolerance=1e-10, max_i
     solved by Newton, q1 and v1 being Newmark's. Order 2 for constant M and forces without explicit time;
     else 1, for every alpha but 0: M(q1) multiplies an acceleration of the time t + (1 + alpha) h, and the
     weights and t~ count alpha twice. `hht(alpha, iterations=None)` is the method without these faults.
+
+    With rotations it is the step of Cardona and Geradin (1989), Eq. 73-81: in the chart of the rotation vector psi from
+    R, forces of different times are compared as those that work on psidot,
+
+        T(psi)^T [J A1 - (1 + alpha) Q1] + alpha Q = 0
+
+    which is of order 1 too, for every alpha but 0, unless J is spherical.
 
     Args:
         alpha: in [-1/3, 0].

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from hhtjax import kinematics
 from hhtjax.description import Description
 from hhtjax.flat_system import flatten, initial_values
 
@@ -36,6 +37,7 @@ class Info(NamedTuple):
     iterations: number of Newton iterations.
     converged: whether they met the tolerance.
     constraint: max-norm of Phi at the end of the step; constraint_rate: of dPhi/dt.
+    dependent_row: number, from 1, of the first constraint that depends on those before it; 0 while B has full rank.
     """
 
     residual: Any = None
@@ -43,6 +45,7 @@ class Info(NamedTuple):
     converged: Any = None
     constraint: Any = None
     constraint_rate: Any = None
+    dependent_row: Any = None
 
 
 class Stepper(Description):
@@ -61,6 +64,8 @@ class Stepper(Description):
 
     order: int  # of convergence of q and v in dt
     solves_constraints = False
+    solves_rotations = False
+    redundant: str | None = None  # how constraints that depend on each other are solved
 
     def begin(self, system, q, v, t, params, dt) -> State:
         """State at the initial time, for a `FlatSystem`."""
@@ -76,8 +81,8 @@ class Stepper(Description):
 
     def init(self, system, q0, v0, params, dt, t0=0.0) -> State:
         """State at t0, from position q0 and velocity v0 (None for a `FirstOrderSystem`)."""
-        require_constrained("init", system, self)
         q0, v0 = initial_values("init", system, q0, v0)
+        require_capable("init", system, self, q0, v0)
         flat, q, v = flatten("init", system, q0, v0, t0, params)
         dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
         return _unravel(flat, self.astype(q.dtype).begin(flat, q, v, t0, params, dt))
@@ -92,11 +97,16 @@ class Stepper(Description):
         return _unravel(flat, state), info
 
 
-def require_constrained(caller, system, stepper):
-    """An error for a constraint that the stepper would ignore."""
+def require_capable(caller, system, stepper, q0, v0):
+    """An error for a constraint or a rotation that the stepper does not know."""
+    name = type(stepper).__name__
     if system.constraint is not None and not stepper.solves_constraints:
         raise NotImplementedError(
-            f"{caller}: {type(stepper).__name__} cannot solve the `constraint`; use hht() or another of its family."
+            f"{caller}: {name} cannot solve the `constraint`; use hht() or another of its family."
+        )
+    if v0 is not None and not stepper.solves_rotations and kinematics.layout(q0, v0):
+        raise NotImplementedError(
+            f"{caller}: {name} cannot move the rotations in `q0`; use hht() or another of its family."
         )
 
 
@@ -107,6 +117,6 @@ def public(flat, state):
 
 def _unravel(flat, state):
     state = public(flat, state)
-    fields = {name: getattr(state, name) for name in ("q", "v", "w", "a")}
-    fields = {name: flat.unravel(x) for name, x in fields.items() if x is not None}
-    return state._replace(**fields)
+    rates = {name: getattr(state, name) for name in ("v", "w", "a")}
+    rates = {name: flat.unravel_rates(x) for name, x in rates.items() if x is not None}
+    return state._replace(q=flat.unravel(state.q), **rates)

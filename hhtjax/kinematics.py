@@ -1,0 +1,117 @@
+"""Positions that hold rotations: how a displacement moves them, and what becomes of its rates.
+
+A leaf R (..., 3, 3) of q whose leaf of v is Om (..., 3) is a rotation, Rdot = R hat(Om); of all other leaves, qdot = v.
+A displacement x (n,) is like v: on a rotation it is the rotation vector of the increment.
+
+    q (+) x = q + x,  or  R exp(x)
+
+In chart form the recursion of a step runs on the rotation vector psi from R_n, with psidot and psiddot, and
+
+    Om = T(psi) psidot,    A = T(psi) psiddot + Tdot psidot
+
+give the angular velocity and acceleration at its end (Cardona, Geradin 1989, Eq. 69-71). In Lie form they take the
+place of psidot and psiddot.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax import rotation
+from hhtjax.linear_solve import matvec
+
+
+class Block(NamedTuple):
+    """Neighbouring coordinates: plain ones, or rotations, with 9 numbers in q and 3 in v for each."""
+
+    is_rotation: bool
+    q: slice
+    v: slice
+
+
+def layout(q0, v0):
+    """The blocks of the flat vectors of q0 and v0; empty where there is no rotation."""
+    blocks, nq, nv = [], 0, 0
+    for R, Om in zip(jax.tree.leaves(q0), jax.tree.leaves(v0), strict=True):
+        q, v = slice(nq, nq + R.size), slice(nv, nv + Om.size)
+        blocks.append(Block(is_rotation(R.shape, Om.shape), q, v))
+        nq, nv = q.stop, v.stop
+    return tuple(blocks) if any(block.is_rotation for block in blocks) else ()
+
+
+def is_rotation(q_shape, v_shape):
+    """Whether leaves of these shapes are rotations (..., 3, 3) with their angular velocities (..., 3)."""
+    return q_shape[-2:] == (3, 3) and v_shape == q_shape[:-1]
+
+
+def move(blocks, q, x):
+    """q (+) x."""
+    return _each(blocks, jnp.add, lambda R, psi: rotation.product(R, rotation.exp(psi)), q, x)
+
+
+def rate(blocks, q, v):
+    """qdot: linear in v."""
+    return _each(blocks, lambda q, v: v, lambda R, Om: rotation.product(R, rotation.hat(Om)), q, v)
+
+
+def orthonormalize(blocks, q):
+    """q with the rounding errors of its rotations squared."""
+    return _each(blocks, lambda q: q, rotation.orthonormalize, q)
+
+
+def pull_back(blocks, x, Q):
+    """The force that works on the rate of the displacement x: Q, and T(x)^T Q for rotations."""
+    return _each(blocks, lambda Q, x: Q, lambda Q, psi: matvec(rotation.tangent(psi).T, Q), Q, x)
+
+
+def chart_jerk(blocks, v, w, wdot):
+    """Third rate of the displacement at x = 0: that of v, and for rotations wdot + Om x w/2."""
+    return _each(blocks, lambda wdot, v, w: wdot, lambda wdot, Om, w: wdot + rotation.cross(Om, w) / 2, wdot, v, w)
+
+
+def end_of_chart(blocks, x, v, w, a):
+    """Velocity, acceleration and algorithmic acceleration, from first and second rates of the displacement x."""
+
+    def velocity(v, psi):
+        return matvec(rotation.tangent(psi), v)
+
+    def acceleration(w, psi, v):
+        return matvec(rotation.tangent(psi), w) + rotation.tangent_rate(psi, v)
+
+    w, a = (_each(blocks, lambda w, x, v: w, acceleration, y, x, v) for y in (w, a))
+    return _each(blocks, lambda v, x: v, velocity, v, x), w, a
+
+
+def hermite(rise, d0, d1, s):
+    """The cubic in s from 0 at 0 to `rise` at 1, with slopes d0 and d1 there."""
+    return s * (d0 + s * (3 * rise - 2 * d0 - d1 + s * (d0 + d1 - 2 * rise)))
+
+
+def interpolate_rotation(R0, R1, d0, d1, s):
+    """R0 exp(psi(s)) with the cubic psi that ends in R1; d0, d1 (..., 3): angular velocities times the interval."""
+
+    def between(R0, R1, d0, d1, s):
+        psi = rotation.log(rotation.product(R0.T, R1))
+        slope = matvec(rotation.inverse_tangent(psi), d1)
+        return rotation.product(R0, rotation.exp(hermite(psi, d0, slope, s)))
+
+    shape = R0.shape
+    s = jnp.broadcast_to(s, d0.shape)
+    R = jax.vmap(between)(*(y.reshape(-1, 3, 3) for y in (R0, R1)), *(y.reshape(-1, 3) for y in (d0, d1, s)))
+    return R.reshape(shape)
+
+
+def _each(blocks, plain, turn, *vectors):
+    """`plain` on the plain blocks of vectors like q or like v, `turn` on each rotation, joined again."""
+    length = blocks[-1].q.stop  # of q, longer than v
+    parts = []
+    for block in blocks:
+        pieces = [y[block.q if y.size == length else block.v] for y in vectors]
+        if block.is_rotation:
+            shapes = [(-1, 3, 3) if y.size == length else (-1, 3) for y in vectors]
+            pieces = [y.reshape(shape) for y, shape in zip(pieces, shapes, strict=True)]
+            parts.append(jax.vmap(turn)(*pieces).ravel())
+        else:
+            parts.append(plain(*pieces))
+    return jnp.concatenate(parts)

@@ -1,0 +1,95 @@
+"""The spinning top of Cardona, Geradin (1989), Sec. 4.2: a disk on a massless rod that turns freely about the origin.
+
+The disk, of mass m (kg) and radius a (m), sits at the distance l (m) along material axis 2, about which it spins.
+Gravity g (m/s^2) is along -z. Om is the material angular velocity (rad/s), I the inertia about the disk's centre,
+J = I + m l^2 diag(1, 0, 1) that about the origin (kg m^2).
+
+    minimal      q = R            J A = l e2 x R^T (-m g e3) - Om x J Om
+    constrained  q = {R, x}       m xddot = -m g e3 + L,   I A = -Om x I Om - l e2 x R^T L,   Phi = x - l R e2 = 0
+
+The first needs 3 unknowns a step and the second 9, or 12 when stabilised. L (N) is the force of the rod on the disk.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.boundary import require_number
+from hhtjax.linear_solve import matvec
+from hhtjax.rotation import cross
+from hhtjax.scenes.scene import Scene
+from hhtjax.system import System
+
+DURATION = 0.5
+
+
+def disk_inertia(params):
+    """I = m a^2/4 diag(1, 2, 1)."""
+    quarter = params["m"] * params["a"] ** 2 / 4
+    return jnp.array([quarter, 2 * quarter, quarter])
+
+
+def inertia(q, params):
+    """J, a diagonal."""
+    offset = params["m"] * params["l"] ** 2
+    return disk_inertia(params) + jnp.array([offset, 0.0, offset], q.dtype)
+
+
+def weight(params):
+    """-m g e3, in spatial components."""
+    return jnp.array([0.0, 0.0, -params["m"] * params["g"]])
+
+
+def moment(R, Om, t, params):
+    """l e2 x R^T (-m g e3) - Om x J Om."""
+    arm = jnp.array([0.0, params["l"], 0.0])
+    return cross(arm, matvec(R.T, weight(params))) - cross(Om, inertia(R, params) * Om)
+
+
+def mass(q, params):
+    """The diagonal of M: I and m."""
+    return jnp.concatenate([disk_inertia(params), jnp.full(3, params["m"], q["x"].dtype)])
+
+
+def force(q, v, t, params):
+    """Gyroscopic moment and weight."""
+    Om = v["R"]
+    return {"R": -cross(Om, disk_inertia(params) * Om), "x": weight(params)}
+
+
+def rod(q, t, params):
+    """Phi = x - l R e2, in m."""
+    return q["x"] - params["l"] * q["R"][:, 1]
+
+
+def minimal(spin=150.0, inclination=0.0) -> Scene:
+    """The top as a rotation alone.
+
+    It starts with its rod horizontal, along y, turning about the vertical at just the rate that takes it through its
+    lowest point: Om = spin (0, 1, -2 a^2/(a^2 + 4 l^2)).
+
+    Args:
+        spin: about the rod, in rad/s. inclination: of the rod above the horizontal, in rad.
+
+    Raises:
+        TypeError, ValueError: an argument is no finite number.
+    """
+    params, R, Om = _start("minimal", spin, inclination)
+    return Scene(System(inertia, moment), params, R, Om, DURATION)
+
+
+def constrained(spin=150.0, inclination=0.0) -> Scene:
+    """The same as a free disk, its centre held by the rod: 6 coordinates, 3 constraints. Arguments as in `minimal`."""
+    params, R, Om = _start("constrained", spin, inclination)
+    arm = params["l"] * jnp.array([0.0, 1.0, 0.0])
+    q0 = {"R": R, "x": matvec(R, arm)}
+    return Scene(System(mass, force, rod), params, q0, {"R": Om, "x": matvec(R, cross(Om, arm))}, DURATION)
+
+
+def _start(caller, spin, inclination):
+    require_number(caller, "spin", spin, np.isfinite, "be finite")
+    require_number(caller, "inclination", inclination, np.isfinite, "be finite")
+    a, length = 0.25, 1.0
+    c, s = np.cos(inclination), np.sin(inclination)
+    R = jnp.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    Om = spin * jnp.array([0.0, 1.0, -2 * a**2 / (a**2 + 4 * length**2)])
+    return {"m": 15.0, "a": a, "l": length, "g": 9.81}, R, Om

@@ -1,0 +1,371 @@
+"""Rotations in a step: orders, references, gradients, orthogonality, dense output, and what bad input gets."""
+
+import json
+import re
+from functools import cache, partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+from test_gradients import check_gradient
+
+import hhtjax
+from hhtjax.rotation import cross, hat
+from hhtjax.scenes import body_chain, top
+
+E1, E3 = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
+ARM, TIP = np.array([0.1, -0.05, 0.3]), np.array([0.05, 0.2, 0.6])
+J = np.array([[0.4, 0.05, -0.03], [0.05, 0.7, 0.08], [-0.03, 0.08, 0.9]])
+PARAMS = {"m": jnp.array(2.0), "cart": jnp.array(1.5), "k": jnp.array(30.0), "c": jnp.array(0.4)}
+PARAMS |= {"J": jnp.asarray(J), "tip": jnp.asarray(TIP)}
+R0 = Rotation.from_rotvec([0.4, -0.3, 0.8]).as_matrix()
+OM0 = np.array([1.0, 2.0, -1.5])
+DURATION = 1.0
+
+
+def mass(q, params):
+    """A cart on a rail along x that carries a body on a ball joint, with its centre of mass at ARM."""
+    m, arm = params["m"], jnp.asarray(ARM)
+    about_joint = params["J"] - m * hat(arm) @ hat(arm)
+    coupling = m * jnp.cross(arm, q["R"][0])  # of the body's rate with the cart's: -m (R hat(arm))^T e1
+    return jnp.block([[about_joint, coupling[:, None]], [coupling[None, :], (m + params["cart"])[None, None]]])
+
+
+def force(q, v, t, params):
+    (R, s), (Om, rate), m, arm = (q["R"], q["s"]), (v["R"], v["s"]), params["m"], jnp.asarray(ARM)
+    centripetal = m * cross(Om, cross(Om, arm))
+    moment = cross(arm, R.T @ jnp.array([0.0, 0.0, -9.81 * m]) - centripetal) - cross(Om, params["J"] @ Om)
+    drive = jnp.array([0.5, -1.0, 0.3]) * jnp.cos(3 * t) - 0.1 * Om
+    along = -jnp.sum(R[0] * centripetal) - params["k"] * s - params["c"] * rate + 2 * jnp.sin(4 * t)
+    return {"R": moment + drive, "s": along}
+
+
+def constraint(q, t, params):
+    """The height of the tip is a given motion, which the cart shifts."""
+    height = jnp.sum(q["R"][2] * params["tip"])
+    return height[None] + 0.2 * q["s"] ** 2 - 0.55 - 0.05 * jnp.sin(2 * t)
+
+
+FREE, HELD = hhtjax.System(mass, force), hhtjax.System(mass, force, constraint)
+
+
+@cache
+def start(constrained):
+    q0, v0 = {"R": jnp.asarray(R0), "s": jnp.array([0.1])}, {"R": jnp.asarray(OM0), "s": jnp.array([0.5])}
+    if not constrained:
+        return q0, v0
+    return hhtjax.consistent_initial(HELD, q0, v0, PARAMS)[:2]
+
+
+def numpy_acceleration(R, s, Om, rate, t, constrained):
+    """A, the cart's acceleration, and L; written once more, on arrays."""
+    m, cart, k, c = (float(PARAMS[x]) for x in ("m", "cart", "k", "c"))
+    a = np.cross(ARM, -np.eye(3))
+    row = -m * (R @ a)[0]
+    M = np.block([[J - m * a @ a, row[:, None]], [row, m + cart]])
+    centripetal = np.cross(Om, np.cross(Om, ARM))
+    moment = np.cross(ARM, R.T @ [0, 0, -9.81 * m]) - m * np.cross(ARM, centripetal) - np.cross(Om, J @ Om)
+    moment += np.array([0.5, -1.0, 0.3]) * np.cos(3 * t) - 0.1 * Om
+    Q = np.append(moment, -m * E1 @ R @ centripetal - k * s - c * rate + 2 * np.sin(4 * t))
+    if not constrained:
+        return np.linalg.solve(M, Q), np.zeros(0)
+    B = np.append(np.cross(TIP, R.T @ E3), 0.4 * s)
+    gamma = E3 @ R @ np.cross(Om, np.cross(Om, TIP)) + 0.4 * rate**2 + 0.2 * np.sin(2 * t)
+    wL = np.linalg.solve(np.block([[M, -B[:, None]], [B, 0.0]]), np.append(Q, -gamma))
+    return wL[:4], wL[4:]
+
+
+@cache
+def reference(constrained):
+    """(R, s), (Om, rate), w and L at the end, by SciPy on R and Om as they are."""
+    (q0, v0) = start(constrained)
+
+    def unpack(y):
+        return y[:9].reshape(3, 3), y[9], y[10:13], y[13]
+
+    def derivative(t, y):
+        R, _, Om, rate = unpack(y)
+        w, _ = numpy_acceleration(*unpack(y), t, constrained)
+        return np.concatenate([(R @ np.cross(Om, -np.eye(3))).ravel(), [rate], w])
+
+    y0 = np.concatenate([np.ravel(q0["R"]), q0["s"], v0["R"], v0["s"]])
+    y = solve_ivp(derivative, (0.0, DURATION), y0, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    return y[:10], y[10:], *numpy_acceleration(*unpack(y), DURATION, constrained)
+
+
+def check_order(make, constrained, alpha, expected):
+    """The slopes of the errors in q, v, w and L; `make` builds the stepper from alpha."""
+    end, errors = final_state(make, constrained), []
+    for num_steps in (400, 800):
+        s = end(alpha, num_steps)
+        values = [np.concatenate([np.ravel(x["R"]), x["s"]]) for x in (s.q, s.v, s.w)] + [s.L] * constrained
+        errors.append([np.max(np.abs(x - y)) for x, y in zip(values, reference(constrained), strict=False)])
+        np.testing.assert_allclose(s.q["R"].T @ s.q["R"], np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(np.log2(np.array(errors[0]) / np.array(errors[1])), expected, atol=0.15)
+
+
+@cache
+def final_state(make, constrained):
+    """State at the end, as a function of alpha and the number of steps, compiled once."""
+    system, (q0, v0) = (HELD if constrained else FREE), start(constrained)
+
+    @jax.jit
+    def end(alpha, num_steps):
+        stepper, dt = make(alpha), DURATION / num_steps
+        begin = stepper.init(system, q0, v0, PARAMS, dt)
+        return jax.lax.fori_loop(0, num_steps, lambda _, s: stepper.step(system, s, PARAMS, dt)[0], begin)
+
+    return end
+
+
+FREE_FORMS = {
+    "chart": partial(hhtjax.hht, linearize="predictor", start="corrected"),
+    "lie": partial(hhtjax.hht, linearize="predictor", kinematics="lie"),
+    "auto": hhtjax.hht,
+    "state": partial(hhtjax.hht, linearize="state"),
+    "converged": partial(hhtjax.hht, iterations=None, tolerance=1e-12),
+    "bossak": partial(hhtjax.bossak, linearize="held"),
+}
+HELD_FORMS = {
+    "ggl": hhtjax.hht,
+    "ggl, lie": partial(hhtjax.hht, kinematics="lie"),
+    "index 3": partial(hhtjax.hht, formulation="index3"),
+    "converged": partial(hhtjax.hht, iterations=None, tolerance=1e-12),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FREE_FORMS)
+def test_order(form):
+    """2 in position, velocity and acceleration, for a full inertia, M(q) and explicit time."""
+    for alpha in (0.0, -0.05, -0.3):
+        check_order(FREE_FORMS[form], False, jnp.asarray(alpha), 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", HELD_FORMS)
+def test_order_with_a_moving_constraint(form):
+    """2, in the multiplier too."""
+    for alpha in (-0.05, -0.3):
+        check_order(HELD_FORMS[form], True, jnp.asarray(alpha), 2)
+
+
+@pytest.mark.slow
+def test_literal_step_is_of_first_order():
+    """Cardona and Geradin's projection of the forces by T^-T: order 1 for alpha other than 0."""
+    literal = partial(hhtjax.conventional_hht, fictive_time=False, tolerance=1e-12)
+    check_order(literal, False, jnp.asarray(0.0), 2)
+    check_order(literal, False, jnp.asarray(-0.3), 1)
+
+
+def read_top():
+    states = json.loads((Path(__file__).parent / "data" / "spinning_top.json").read_text())["states"]
+    return {state["t"]: state for state in states}
+
+
+@cache
+def constrained_top():
+    """100 steps of 5 ms, as in the paper; one solve each, of 12 unknowns."""
+    scene = top.constrained()
+    return hhtjax.simulate(scene.system, hhtjax.hht(-0.05), *scene[2:4], scene.params, dt=0.005, num_steps=100)
+
+
+def test_constrained_top():
+    """Within 6 mm of the exact place of the disk at 0.5 s, after 12 turns; rod and rate of the rod kept."""
+    run = constrained_top()
+    run.check()
+    exact = read_top()[0.5]
+    assert np.max(np.abs(run.q["x"][-1] - np.array(exact["x_disk"]))) < 6e-3
+    assert np.max(np.abs(run.q["x"] - run.q["R"][:, :, 1])) < 1e-4
+    assert np.max(np.abs(run.info.constraint_rate)) < 0.02
+    acceleration = np.array(exact["xacc_disk"]) + 9.81 * E3
+    np.testing.assert_allclose(run.multipliers[-1], 15.0 * acceleration, atol=15 * 0.5)
+
+
+def test_minimal_top():
+    """The same motion without a constraint, at a step that resolves the fast forward nutation; order 2 in x."""
+    scene, exact = top.minimal(), read_top()[0.1]
+
+    @jax.jit
+    def miss(num_steps):
+        stepper, dt = hhtjax.hht(-0.05, linearize="predictor"), 0.1 / num_steps
+        start = stepper.init(scene.system, scene.q0, scene.v0, scene.params, dt)
+        step = partial(stepper.step, scene.system, params=scene.params, dt=dt)
+        end = jax.lax.fori_loop(0, num_steps, lambda _, s: step(s)[0], start)
+        return jnp.max(jnp.abs(end.q[:, 1] - jnp.array(exact["x_disk"])))
+
+    coarse, fine = miss(200), miss(400)
+    assert fine < 2e-3
+    np.testing.assert_allclose(np.log2(coarse / fine), 2, atol=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kinematics", ["chart", "lie"])
+def test_rotations_stay_orthogonal(kinematics):
+    """To rounding after a million steps; the energy of a free body wanders by the square of the step."""
+    inertia, dt, num_steps = jnp.array([1.0, 2.0, 3.5]), 0.01, 1_000_000
+    free = hhtjax.System(inertia, lambda q, Om, t, params: -cross(Om, inertia * Om))
+    stepper = hhtjax.hht(0.0, linearize="predictor", kinematics=kinematics)
+    Om0 = jnp.array([0.3, 1.0, 0.2])
+    run = hhtjax.simulate(free, stepper, jnp.eye(3), Om0, dt=dt, num_steps=num_steps, save_every=num_steps // 100)
+    run.check()
+    R, Om = np.array(run.q), np.array(run.v)
+    assert np.max(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3))) < 1e-14
+    energy = Om**2 @ np.array(inertia)
+    assert np.max(np.abs(energy / energy[0] - 1)) < 1e-4
+
+
+@pytest.mark.slow
+def test_body_chain():
+    """Three rods on spherical joints: energy and the vertical momentum kept to second order, joints closed."""
+    scene = body_chain.body_chain()
+    errors = []
+    for num_steps in (500, 1000):
+        dt = 1.0 / num_steps
+        run = hhtjax.simulate(
+            scene.system, hhtjax.hht(-0.05), *scene[2:4], scene.params, dt=dt, num_steps=num_steps, save_every=10
+        )
+        run.check()
+        inertia, m, g = body_chain.inertia(scene.params), scene.params["m"], scene.params["g"]
+        R, x, Om, v = run.q["R"], run.q["x"], run.v["R"], run.v["x"]
+        energy = np.sum(inertia * Om**2, (1, 2)) / 2 + m * np.sum(v**2, (1, 2)) / 2 + m * g * np.sum(x[..., 2], 1)
+        spin = np.sum(np.einsum("tnij,tnj->tni", R, inertia * Om) + m * np.cross(x, v), 1)[:, 2]
+        errors.append([np.max(np.abs(y - y[0])) for y in (energy, spin)])
+        assert np.max(run.info.constraint) < 1e-8
+        np.testing.assert_allclose(run.multipliers[:, 2].max() > 3 * m * g, True)
+    slopes = np.log2(np.array(errors[0]) / np.array(errors[1]))
+    assert np.all(slopes > 1.85)
+    assert errors[1][0] < 1e-3 * 3 * m * g
+
+
+def test_leaves_of_several_rotations():
+    """Two bodies in one leaf (2, 3, 3) move like two leaves (3, 3)."""
+
+    def separate(q, v, t, params):
+        return [
+            cross(jnp.array([0.0, 0.1, 0.0]), R.T @ jnp.asarray(E3)) - cross(Om, jnp.asarray(params) * Om)
+            for R, Om in zip(q, v, strict=True)
+        ]
+
+    def joined(q, v, t, params):
+        return jnp.stack(separate(list(q), list(v), t, params))
+
+    inertia = jnp.array([1.0, 2.0, 3.0])
+    q0, v0 = [jnp.asarray(R0), jnp.eye(3)], [jnp.asarray(OM0), jnp.zeros(3)]
+    ends = [
+        hhtjax.simulate(
+            hhtjax.System(jnp.tile(inertia, 2), force), hhtjax.hht(), q, v, np.array([1.0, 2, 3]), dt=0.01, num_steps=20
+        )
+        for force, q, v in ((separate, q0, v0), (joined, jnp.stack(q0), jnp.stack(v0)))
+    ]
+    assert ends[1].q.shape == (21, 2, 3, 3)
+    for i in (0, 1):
+        np.testing.assert_allclose(ends[1].q[:, i], ends[0].q[i], atol=1e-14)
+        np.testing.assert_allclose(ends[1].v[:, i], ends[0].v[i], atol=1e-14)
+
+
+@pytest.mark.parametrize("constrained", [False, True])
+@pytest.mark.parametrize("Om0", [OM0, np.zeros(3)], ids=["turning", "from rest"])
+def test_gradients(constrained, Om0):
+    """Forward = reverse = central: mass, inertia, a length in the constraint, v0, dt; at zero rotation, from rest."""
+    system = HELD if constrained else FREE
+    q0, v0 = {"R": jnp.eye(3), "s": jnp.array([0.1])}, {"R": jnp.asarray(Om0), "s": jnp.zeros(1)}
+    if constrained:
+        q0 = hhtjax.consistent_initial(system, q0, v0, PARAMS).q
+
+    def loss(x):
+        params = PARAMS | {"m": PARAMS["m"] * x["m"], "J": PARAMS["J"] * x["J"], "tip": PARAMS["tip"] * x["tip"]}
+        begin = q0, v0 | {"R": v0["R"] + x["Om"]}
+        if constrained:
+            begin = hhtjax.consistent_initial(system, *begin, params)[:2]
+        stepper = hhtjax.hht(-0.05, linearize="predictor" if not constrained else None)
+        run = hhtjax.simulate(system, stepper, *begin, params, dt=0.02 * x["dt"], num_steps=20)
+        parts = run.q["R"] * jnp.arange(9.0).reshape(3, 3), run.v["R"], *([run.multipliers] if constrained else [])
+        return sum(jnp.sum(jnp.mean(y, 0) ** 2) for y in parts)
+
+    one = jnp.array(1.0)
+    check_gradient(loss, {"m": one, "J": one, "tip": one, "dt": one, "Om": jnp.zeros(3)})
+
+
+def test_dense_output():
+    """Between saved times R is a rotation, right to the fourth order of their spacing."""
+    scene = top.minimal(spin=20.0)
+    stepper = hhtjax.hht(linearize="predictor")
+    fine = hhtjax.simulate(scene.system, stepper, *scene[2:4], scene.params, dt=1e-3, num_steps=32)
+    errors = []
+    for every in (8, 16):
+        coarse = fine._replace(**{name: getattr(fine, name)[::every] for name in ("t", "q", "v", "acceleration")})
+        middle = slice(every // 2, None, every)
+        R, Om = hhtjax.interpolate(coarse, fine.t[middle])
+        np.testing.assert_allclose(np.swapaxes(R, 1, 2) @ R, np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-14)
+        errors.append([np.max(np.abs(R - fine.q[middle])), np.max(np.abs(Om - fine.v[middle]))])
+        np.testing.assert_allclose(hhtjax.interpolate(coarse, coarse.t).q, coarse.q, atol=1e-13)
+    assert np.all(np.log2(np.array(errors[1]) / np.array(errors[0])) > 3.6)
+
+
+def test_float32_and_batches():
+    """The dtype is kept; a batch is its members."""
+    inertia = np.array([1.0, 2.0, 3.0], np.float32)
+    free = hhtjax.System(inertia, lambda q, Om, t, params: -cross(Om, inertia * Om))
+
+    def run(Om0):
+        return hhtjax.simulate(free, hhtjax.hht(), jnp.eye(3, dtype=jnp.float32), Om0, dt=0.01, num_steps=10)
+
+    Om0 = jnp.asarray([[1.0, 0.5, 0.2], [0.0, 0.0, 0.0]], jnp.float32)
+    with pytest.warns(hhtjax.PrecisionWarning):
+        batch, first = jax.vmap(run)(Om0), run(Om0[0])
+    assert batch.q.dtype == batch.v.dtype == first.acceleration.dtype == jnp.float32
+    np.testing.assert_allclose(batch.q[0], first.q, atol=1e-6)
+    np.testing.assert_allclose(batch.q[1], np.tile(np.eye(3), (11, 1, 1)), atol=0)
+
+
+def test_bad_input():
+    scene = top.minimal()
+
+    def simulate(q0=scene.q0, v0=scene.v0, stepper=None, system=scene.system):
+        stepper = hhtjax.hht() if stepper is None else stepper
+        return hhtjax.simulate(system, stepper, q0, v0, scene.params, dt=0.01, num_steps=1)
+
+    bad = "must be a rotation, because its velocity has 3 components; received a matrix R whose R^T R differs from I by"
+    for error, message, call in (
+        (ValueError, f"simulate: `q0` {bad} 0.0201", lambda: simulate(1.01 * jnp.eye(3))),
+        (
+            ValueError,
+            "simulate: `q0` must be a rotation; received a reflection, det R = -1",
+            lambda: simulate(-jnp.eye(3)),
+        ),
+        (ValueError, "but (3,) for a rotation (3, 3); received shape (2,)", lambda: simulate(v0=jnp.zeros(2))),
+        (
+            NotImplementedError,
+            "simulate: RK4 cannot move the rotations in `q0`",
+            lambda: simulate(stepper=hhtjax.rk4()),
+        ),
+        (NotImplementedError, "KimHHT cannot move", lambda: simulate(stepper=hhtjax.kim_hht())),
+        (NotImplementedError, "need a System(mass, force)", lambda: simulate(system=hhtjax.LinearSystem(jnp.ones(3)))),
+        (
+            NotImplementedError,
+            "from_lagrangian",
+            lambda: simulate(system=hhtjax.System.from_lagrangian(lambda q, v, t, p: jnp.sum(v**2))),
+        ),
+        (
+            ValueError,
+            'hht: `kinematics` must be "chart" or "lie"; received',
+            lambda: hhtjax.hht(kinematics="quaternion"),
+        ),
+    ):
+        with pytest.raises(error, match=re.escape(message)):
+            call()
+
+
+def test_inconsistent_velocity():
+    """Of the rod of the top, named with its size and with the way out."""
+    scene = top.constrained()
+    v0 = scene.v0 | {"x": scene.v0["x"] + 0.1}
+    with pytest.raises(ValueError, match=r"`v0` violates the constraint: max\|dPhi/dt\| = 0\.1, .*consistent_initial"):
+        hhtjax.simulate(scene.system, hhtjax.hht(), scene.q0, v0, scene.params, dt=0.01, num_steps=1)
+    mended = hhtjax.consistent_initial(scene.system, scene.q0, v0, scene.params)
+    np.testing.assert_allclose(np.cross(scene.q0["R"] @ mended.v["R"], mended.q["x"]), mended.v["x"], atol=1e-12)
