@@ -16,6 +16,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_small_wh
 EXPERIMENTS = {
     "silverbox": "identification.silverbox",
     "kim2019": "kim2019.kim2019",
+    "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",
     "linearization": "linearization.linearization",
     "gradient_cost": "benchmarks.gradient_cost",
 }
@@ -30,8 +31,8 @@ def summary(module: str) -> str:
 
 def listing() -> str:
     """The experiments, a line each."""
-    lines = [f"  {name:<16}{summary(module)}" for name, module in EXPERIMENTS.items()]
-    return "\n".join(["Experiments:", *lines, f"  {'all':<16}Every one of them.", "", USAGE])
+    lines = [f"  {name:<21}{summary(module)}" for name, module in EXPERIMENTS.items()]
+    return "\n".join(["Experiments:", *lines, f"  {'all':<21}Every one of them.", "", USAGE])
 
 
 USAGE = "python -m experiments NAME [--fast] [--out DIR]"

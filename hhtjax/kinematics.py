@@ -73,14 +73,15 @@ def chart_jerk(blocks, v, w, wdot):
 def end_of_chart(blocks, x, v, w, a):
     """Velocity, acceleration and algorithmic acceleration, from first and second rates of the displacement x."""
 
-    def velocity(v, psi):
-        return matvec(rotation.tangent(psi), v)
+    def turn(psi, psidot, w, a):
+        T, convective = rotation.tangent(psi), rotation.tangent_rate(psi, psidot)
+        return matvec(T, psidot), matvec(T, w) + convective, matvec(T, a) + convective
 
-    def acceleration(w, psi, v):
-        return matvec(rotation.tangent(psi), w) + rotation.tangent_rate(psi, v)
-
-    w, a = (_each(blocks, lambda w, x, v: w, acceleration, y, x, v) for y in (w, a))
-    return _each(blocks, lambda v, x: v, velocity, v, x), w, a
+    ends = []
+    for block in blocks:
+        pieces = [y[block.v] for y in (x, v, w, a)]
+        ends.append(_turned(turn, *(y.reshape(-1, 3) for y in pieces)) if block.is_rotation else pieces[1:])
+    return tuple(jnp.concatenate([y.ravel() for y in parts]) for parts in zip(*ends, strict=True))
 
 
 def hermite(rise, d0, d1, s):
@@ -110,8 +111,12 @@ def _each(blocks, plain, turn, *vectors):
         pieces = [y[block.q if y.size == length else block.v] for y in vectors]
         if block.is_rotation:
             shapes = [(-1, 3, 3) if y.size == length else (-1, 3) for y in vectors]
-            pieces = [y.reshape(shape) for y, shape in zip(pieces, shapes, strict=True)]
-            parts.append(jax.vmap(turn)(*pieces).ravel())
+            parts.append(_turned(turn, *(y.reshape(shape) for y, shape in zip(pieces, shapes, strict=True))).ravel())
         else:
             parts.append(plain(*pieces))
     return jnp.concatenate(parts)
+
+
+def _turned(turn, *arrays):
+    """`turn` on each of several rotations; on a single one without vmap, which leaves less to compile."""
+    return turn(*(y[0] for y in arrays)) if len(arrays[0]) == 1 else jax.vmap(turn)(*arrays)

@@ -144,7 +144,7 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
     flat, q, v = flatten("simulate", system, q0, v0, t0, params)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
     stepper = stepper.astype(q.dtype)
-    take_step = stepper.bind(flat, params, dt)
+    take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)  # traced once, wherever it is called
 
     def step(carry):
         state, count, failure = carry

@@ -3,19 +3,9 @@
 import json
 from pathlib import Path
 
+from experiments.page import find, table
+
 HERE = Path(__file__).parent
-
-
-def table(header, rows):
-    """A table in Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
-
-
-def find(entries, **keys):
-    """The one entry with these values."""
-    (entry,) = (e for e in entries if all(e[key] == value for key, value in keys.items()))
-    return entry
 
 
 def rms_table(name, entries):

@@ -1,0 +1,60 @@
+"""An experiment in parts: one after the other, or, in the smoke run, groups of them in processes side by side.
+
+A part is a module with `run(report, fast)`, which returns its numbers.
+"""
+
+import importlib
+import io
+import math
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import redirect_stdout
+
+import jax
+
+
+def rounded(x):
+    """Floats to seven digits, which keeps the committed JSON small; None for those that are not finite."""
+    if isinstance(x, dict):
+        return {key: rounded(value) for key, value in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [rounded(value) for value in x]
+    if isinstance(x, float):
+        return float(f"{x:.7g}") if math.isfinite(x) else None
+    return x
+
+
+def run_parts(report, modules, fast):
+    """{part: its numbers}."""
+    numbers = {}
+    for module in modules:
+        name = module.__name__.rpartition(".")[2]
+        report.progress(f"part {name}: {(module.__doc__ or '').splitlines()[0]}")
+        numbers[name] = module.run(report, fast)
+    return numbers
+
+
+def run_group(report, names):
+    """The same in a process of its own, fast: numbers, what it printed, and the files it wrote."""
+    with redirect_stdout(io.StringIO()) as text:
+        numbers = run_parts(report, map(importlib.import_module, names), fast=True)
+    return numbers, text.getvalue(), report.written
+
+
+def run_experiment(report, groups, fast):
+    """All parts: one after the other, so that times are undisturbed; the smoke run in as many processes as cores.
+
+    groups: lists of parts that share what they compute.
+    """
+    numbers: dict = {"machine": f"{os.cpu_count()} cores ({jax.devices()[0].device_kind}), jax {jax.__version__}"}
+    if fast:
+        names = [[module.__name__ for module in group] for group in groups]
+        with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as pool:
+            for found, text, written in pool.map(run_group, [report] * len(names), names):
+                numbers |= found
+                report.written += written
+                print(text, end="")
+    else:
+        numbers |= run_parts(report, [module for group in groups for module in group], fast)
+    report.numbers(rounded(numbers))
