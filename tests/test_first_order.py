@@ -71,7 +71,7 @@ def test_order_with_explicit_time(name):
 @pytest.mark.parametrize(("alpha", "expected"), [(0.0, 2), (-0.05, 1), (-0.3, 1)])
 def test_kims_step_is_of_order_two_only_where_theta_is_one_half(alpha, expected):
     assert hhtjax.kim_hht(alpha).order == expected
-    assert order(AUTONOMOUS, hhtjax.kim_hht(jnp.asarray(alpha)), (2000, 4000)) == pytest.approx(expected, abs=0.15)
+    assert order(AUTONOMOUS, hhtjax.kim_hht(alpha), (2000, 4000)) == pytest.approx(expected, abs=0.15)
 
 
 def test_kims_step_is_of_order_one_with_explicit_time_even_there():

@@ -94,10 +94,9 @@ def run(problem, stepper, num_steps, **options):
 
 
 def as_data(stepper):
-    """The same stepper with its coefficients as arrays, so that the whole family is compiled once."""
-    if not hasattr(stepper, "coefficients"):
-        return stepper
-    return replace(stepper, coefficients=jax.tree.map(jnp.asarray, stepper.coefficients))
+    """The same stepper with its coefficients, or alpha, as arrays, so that a family is compiled once."""
+    numbers = {name: getattr(stepper, name) for name in ("coefficients", "alpha") if hasattr(stepper, name)}
+    return replace(stepper, **jax.tree.map(jnp.asarray, numbers))
 
 
 @jax.jit
