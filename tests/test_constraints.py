@@ -18,10 +18,12 @@ from hhtjax.flat_system import flatten
 from hhtjax.scenes import Scene, four_bars, squeezer
 
 SQUEEZER = json.loads((Path(__file__).parent / "data" / "squeezer.json").read_text())
-PARAMS = {"m": jnp.array([2.0, 1.0]), "l": 0.8, "k": 30.0, "c": 0.4}
+# arrays all, so that runs with others in their place share a compilation
+PARAMS = {"m": jnp.array([2.0, 1.0]), **{name: jnp.array(x) for name, x in (("l", 0.8), ("k", 30.0), ("c", 0.4))}}
 Q0 = jnp.array([0.0, np.arcsin((0.1 - 0.2 * 0.3**2) / 0.8), 0.3])
 GUESS = jnp.array([0.0, 0.5, -0.4])
 DURATION = 1.0
+HHT = hhtjax.hht(-0.1)
 FORMS = [("index3", 1), ("index3", None), ("ggl", 1), ("ggl", None)]
 
 
@@ -71,10 +73,11 @@ def reference():
     return y[:3], y[3:], np.asarray(L), np.asarray(w)
 
 
-def run(num_steps, stepper, params=PARAMS, **options):
-    q0, v0 = start().q, start().v
-    dt = DURATION / num_steps
-    return hhtjax.simulate(SLIDER, stepper, q0, v0, params, dt=dt, num_steps=num_steps, **options)
+def run(system=SLIDER, q0=None, stiffness=PARAMS["k"], stepper=HHT):
+    """20 steps, compiled once for all stiffnesses."""
+    begin = start()
+    q0, params = begin.q if q0 is None else q0, PARAMS | {"k": stiffness}
+    return hhtjax.simulate(system, stepper, q0, begin.v, params, dt=0.01, num_steps=20)
 
 
 @partial(jax.jit, static_argnames=("formulation", "iterations"))
@@ -155,8 +158,8 @@ def test_a_linear_solve_of_the_users_own():
     def by_numpy(A, b):
         return jnp.linalg.solve(A, b)
 
-    ours, theirs = (run(20, hhtjax.hht(-0.1, solve=solve)).q for solve in (None, by_numpy))
-    np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-13)
+    theirs = run(stepper=hhtjax.hht(-0.1, solve=by_numpy))
+    np.testing.assert_allclose(run().q, theirs.q, rtol=1e-11, atol=1e-13)
 
 
 def test_redundant_constraints_by_least_squares():
@@ -167,14 +170,11 @@ def test_redundant_constraints_by_least_squares():
 
     system = hhtjax.System(mass, force, twice)
     with pytest.raises(ValueError, match=r"simulate: `constraint` rows \[0, 1\] depend on each other .*rank 1 of 2"):
-        hhtjax.simulate(system, hhtjax.hht(), start().q, start().v, PARAMS, dt=0.01, num_steps=1)
+        run(system)
     begin = hhtjax.consistent_initial(system, Q0, GUESS, PARAMS, redundant="least_squares")
     np.testing.assert_allclose(begin.q, start().q, atol=1e-13)
     np.testing.assert_allclose(begin.multipliers, start().multipliers[0] / 2, rtol=1e-10)
-    path, single = (
-        hhtjax.simulate(s, hhtjax.hht(-0.1, redundant=how), begin.q, begin.v, PARAMS, dt=0.02, num_steps=20)
-        for s, how in ((system, "least_squares"), (SLIDER, None))
-    )
+    path, single = run(system, stepper=hhtjax.hht(-0.1, redundant="least_squares")), run()
     path.check()
     np.testing.assert_allclose(path.q, single.q, atol=1e-9)
     np.testing.assert_allclose(path.multipliers.sum(axis=1), single.multipliers[:, 0], rtol=1e-6)
@@ -215,16 +215,22 @@ def test_four_bars_through_their_singular_position():
 
 
 def test_consistent_initial_is_nearest_and_consistent():
-    off = hhtjax.consistent_initial(SLIDER, Q0 + 0.05, GUESS, PARAMS, t0=0.2)
-    assert bool(off.converged)
-    flat, q, v = flatten("test", SLIDER, off.q, off.v, 0.2, PARAMS)
-    t = jnp.asarray(0.2)
-    np.testing.assert_allclose(violation(flat, q, v, t, PARAMS), 0, atol=1e-13)
-    B = jax.jacfwd(lambda q: constraint(q, t, PARAMS))(q)[0]
-    for moved, M in ((q - Q0 - 0.05, mass(Q0 + 0.05, PARAMS)), (v - GUESS, mass(q, PARAMS))):
-        reactionary = M @ moved  # parallel to B^T: no direction along the constraint is left
-        np.testing.assert_allclose(reactionary, B * (reactionary @ B) / (B @ B), atol=1e-10)
-    w, L = acceleration_and_multipliers(flat, q, v, t, PARAMS)
+    far, t = np.asarray(Q0) + 0.05, jnp.asarray(0.2)
+
+    @jax.jit
+    def project():
+        off = hhtjax.consistent_initial(SLIDER, far, GUESS, PARAMS, t0=t)
+        flat, q, v = flatten("test", SLIDER, off.q, off.v, t, PARAMS)
+        B = jax.jacfwd(lambda q: constraint(q, t, PARAMS))(q)[0]
+        reactionary = mass(far, PARAMS) @ (q - far), mass(q, PARAMS) @ (v - GUESS)
+        wL = acceleration_and_multipliers(flat, q, v, t, PARAMS)
+        return off, B, reactionary, violation(flat, q, v, t, PARAMS), wL
+
+    off, B, reactionary, left, (w, L) = jax.device_get(project())
+    assert off.converged
+    np.testing.assert_allclose(left, 0, atol=1e-13)
+    for x in reactionary:  # parallel to B^T: no direction along the constraint is left
+        np.testing.assert_allclose(x, B * (x @ B) / (B @ B), atol=1e-10)
     np.testing.assert_allclose(off.acceleration, w, rtol=1e-12)
     np.testing.assert_allclose(off.multipliers, L, rtol=1e-12)
 
@@ -247,18 +253,18 @@ def test_gradients(formulation, iterations):
 
 @pytest.mark.slow
 def test_batches_equal_loops_and_pytrees_equal_vectors():
-    def end(k, q0):
-        path = hhtjax.simulate(SLIDER, hhtjax.hht(-0.1), q0, start().v, PARAMS | {"k": k}, dt=0.01, num_steps=5)
+    def end(k):
+        path = run(stiffness=k)
         return path.q[-1], path.multipliers[-1]
 
     stiffness = jnp.array([10.0, 30.0])
-    batch = jax.jit(jax.vmap(end, (0, None)))(stiffness, start().q)
+    batch = jax.jit(jax.vmap(end))(stiffness)
     for i, k in enumerate(stiffness):
-        for x, y in zip(batch, end(k, start().q), strict=True):
+        for x, y in zip(batch, end(k), strict=True):
             np.testing.assert_allclose(x[i], y, rtol=1e-11)
 
     def vector(tree):
-        return jnp.concatenate([tree["cart"][None], tree["swing"]])
+        return jnp.append(tree["cart"], tree["swing"])
 
     def tree_of(x):
         return {"cart": x[0], "swing": x[1:]}
@@ -269,8 +275,7 @@ def test_batches_equal_loops_and_pytrees_equal_vectors():
         lambda q, t, params: constraint(vector(q), t, params),
     )
     q0, v0 = tree_of(start().q), tree_of(start().v)
-    tree = hhtjax.simulate(system, hhtjax.hht(-0.1), q0, v0, PARAMS, dt=0.01, num_steps=5)
-    flat = hhtjax.simulate(SLIDER, hhtjax.hht(-0.1), start().q, start().v, PARAMS, dt=0.01, num_steps=5)
+    tree, flat = hhtjax.simulate(system, hhtjax.hht(-0.1), q0, v0, PARAMS, dt=0.01, num_steps=20), run()
     np.testing.assert_allclose(tree.q["swing"], flat.q[:, 1:], rtol=1e-12)
     np.testing.assert_allclose(tree.multipliers, flat.multipliers, rtol=1e-12)
 

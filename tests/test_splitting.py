@@ -183,7 +183,7 @@ def test_gradients(modified):
 
     def loss(arguments):
         alpha, rest = arguments
-        return path_loss(problem, operator_splitting(alpha, modified), 40, 1)(rest)
+        return path_loss(problem, operator_splitting(alpha, modified), 30, 1)(rest)
 
     check_gradient(loss, (-0.1, (problem.params, problem.q0, problem.v0, 0.02, 0.1)))
 

@@ -1,6 +1,7 @@
 """Problems with references, and the table of steppers that the generic tests run over."""
 
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -90,3 +91,25 @@ def run(problem, stepper, num_steps, **options):
     """The problem from start to end in num_steps steps."""
     system, params, q0, v0, duration = problem
     return hhtjax.simulate(system, stepper, q0, v0, params, dt=duration / num_steps, num_steps=num_steps, **options)
+
+
+def as_data(stepper):
+    """The same stepper with its coefficients, or alpha, as arrays, so that a family is compiled once."""
+    numbers = {name: getattr(stepper, name) for name in ("coefficients", "alpha") if hasattr(stepper, name)}
+    return replace(stepper, **jax.tree.map(jnp.asarray, numbers))
+
+
+@jax.jit
+def end(problem, stepper, num_steps):
+    """State at the end of a problem, and whether all steps converged; compiled once for all numbers of steps."""
+    system, params, q0, v0, duration = problem
+    dt = duration / num_steps
+    step = partial(stepper.step, system, params=params, dt=dt)
+
+    def advance(_, carry):
+        state, converged = carry
+        state, info = step(state)
+        return state, converged & (True if info.converged is None else info.converged)
+
+    start = stepper.init(system, q0, v0, params, dt)
+    return jax.lax.fori_loop(0, num_steps, advance, (start, jnp.array(True)))

@@ -1,0 +1,360 @@
+"""What a run says about failed steps, and that arguments of every kind pass: tracers, numbers, arrays, dtypes."""
+
+import re
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_boundary import INF, NAN, ONE, SINGLE, STEPPERS, ZERO, check_message, lagrangian, pull, run
+
+import hhtjax
+from hhtjax import LinearSystem, PrecisionWarning, SimulationError, System
+
+
+def push(q, v, t, params):
+    """A force that drives q to infinity in finite time."""
+    return params * q**3
+
+
+def bounded(q, v, t, params):
+    """A force that is not a number beyond q = 1."""
+    return jnp.sqrt(1 - q)
+
+
+BLOW_UP = System(ONE, push)
+
+
+# ---------------------------------------------------------------------------------------------- check
+
+
+def first_not_finite(path):
+    """Number of the first step after which something is not finite, from a path that holds every step; 0 if none."""
+    finite = np.isfinite(np.concatenate([path.q, path.v, path.acceleration], axis=1)).all(axis=1)
+    return 0 if finite.all() else int(np.argmin(finite))
+
+
+BREAKING = [(push, "rk4")] + [(bounded, name) for name in ("rk4", "hht state", "kim_implicit_euler")]
+
+
+@pytest.mark.parametrize(("force", "name"), BREAKING)
+def test_check_names_the_first_step_that_is_not_finite(force, name):
+    arguments = System(ONE, force), STEPPERS[name], 0.2 * ONE, ONE, 4000.0
+    step = first_not_finite(run(*arguments, num_steps=20))
+    assert 1 < step < 20
+    assert step % 5 != 0
+    for save_every in (1, 5):
+        solution = run(*arguments, t0=3.0, num_steps=20, save_every=save_every)
+        message = f"simulate: step {step} (to t = {3 + 0.1 * step:.6g}) failed: the state is not finite."
+        check_message(SimulationError, message, solution.check)
+
+
+def test_check_is_silent_when_all_is_well():
+    assert run().check() is None
+    assert jax.vmap(lambda q0: run(q0=q0))(jnp.ones((3, 1))).check() is None
+
+
+def test_check_names_the_bad_member_of_a_batch():
+    """Members differ in dt, t0 and stiffness; the times in the message are those of the bad one."""
+
+    def member(k, dt, t0, save_every=1):
+        return run(BLOW_UP, params=k, dt=dt, t0=t0, num_steps=20, save_every=save_every)
+
+    k, dt, t0 = jnp.array([1e-3, 1e3, 1e-3]), jnp.array([0.1, 0.04, 0.2]), jnp.array([0.0, 2.0, 0.0])
+    steps = [first_not_finite(member(*x)) for x in zip(k, dt, t0, strict=True)]
+    assert steps[0] == steps[2] == 0
+    assert 1 < steps[1] < 20
+    time = f"{2 + 0.04 * steps[1]:.6g}"
+    message = f"member 1 (1 of 3 failed), step {steps[1]} (to t = {time}) failed: the state is not finite."
+    for save_every in (1, 5):
+        batch = jax.vmap(lambda *x, save_every=save_every: member(*x, save_every))(k, dt, t0)
+        check_message(SimulationError, message, batch.check)
+
+
+def test_check_names_the_first_of_several_bad_members_in_two_axes():
+    k = jnp.array([[1e-3, 1e-3, 1e3], [1e3, 1e-3, 1e-3]])
+    batch = jax.vmap(jax.vmap(lambda k: run(BLOW_UP, params=k, num_steps=20)))(k)
+    step = first_not_finite(run(BLOW_UP, params=1e3, num_steps=20))
+    check_message(SimulationError, f"simulate: member 0, 2 (2 of 6 failed), step {step} (to t = ", batch.check)
+
+
+def kick(q, v, t, params):
+    """A spring with a blow around t = 0.7 and t = 1.1, too hard for two iterations."""
+    struck = (jnp.abs(t - 0.7) < 0.01) | (jnp.abs(t - 1.1) < 0.01)
+    return -q + jnp.where(struck, -params * q**3, jnp.zeros_like(q))
+
+
+KICKED = System(ONE, kick)
+TWO_ITERATIONS = hhtjax.hht(iterations=None, max_iterations=2)
+
+
+def first_unbalanced(path, params):
+    """Number of the first step after which M w - Q exceeds Newton's tolerance; from a path that holds every step."""
+    Q = jax.jit(jax.vmap(kick, in_axes=(0, 0, 0, None)))(path.q, path.v, path.t, params)
+    unbalanced = np.max(np.abs(np.asarray(path.acceleration) - np.asarray(Q)), axis=1) > 1e-9
+    return int(np.argmax(unbalanced)), int(unbalanced.sum())
+
+
+def test_check_names_the_first_failed_newton_iteration():
+    path = run(KICKED, TWO_ITERATIONS, params=1e3, num_steps=16)
+    step, failures = first_unbalanced(path, 1e3)
+    assert failures == 2  # both blows; the steps between them and after them succeed
+    assert 1 < step < 16
+    assert step % 4 != 0
+    assert np.isfinite(path.q).all()
+    message = f"step {step} (to t = {0.1 * step:.6g}) failed: Newton's iteration did not converge; the state is still"
+    check_message(SimulationError, f"simulate: {message}", path.check)
+    check_message(SimulationError, message, run(KICKED, TWO_ITERATIONS, params=1e3, num_steps=16, save_every=8).check)
+
+    def member(k):
+        return run(KICKED, TWO_ITERATIONS, params=k, num_steps=16, save_every=4)
+
+    batch = jax.vmap(member)(jnp.array([0.0, 0.0, 1e3]))
+    check_message(SimulationError, f"simulate: member 2 (1 of 3 failed), {message}", batch.check)
+
+
+def test_a_failed_newton_iteration_is_named_before_what_follows_it():
+    """Newton fails at t = 0.7; later the force is not a number."""
+
+    def force(q, v, t, params):
+        return kick(q, v, t, 1e3) + jnp.where(t > 1.15, jnp.nan * q, jnp.zeros_like(q))
+
+    solution = run(System(ONE, force), hhtjax.hht(iterations=None, max_iterations=2), num_steps=16)
+    check_message(SimulationError, "step 7 (to t = 0.7) failed: Newton's iteration did not converge", solution.check)
+
+
+def test_an_acceleration_that_is_not_finite_is_a_failure():
+    """q and v are finite at the end, its acceleration is not: the force is defined for q < 1.05 only."""
+    system = System(ONE, lambda q, v, t, params: jnp.sqrt(1.05 - q))
+    solution = run(system, STEPPERS["hht state"], ZERO, ONE, dt=0.2, num_steps=4)
+    assert not np.isfinite(solution.acceleration[-1]).all()
+    check_message(SimulationError, "simulate: step 4 (to t = 0.8) failed", solution.check)
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.vmap], ids=["jit", "vmap"])
+def test_check_refuses_tracers(transform):
+    def inside(q0):
+        run(q0=q0).check()
+        return q0
+
+    message = "check: the solution is a tracer: call check() outside jit, vmap and grad."
+    check_message(TypeError, message, lambda: transform(inside)(jnp.ones((2, 1)) if transform is jax.vmap else ONE))
+
+
+@pytest.mark.parametrize("name", ["dt", "params"])
+def test_check_inside_grad_refuses_or_names_the_step(name):
+    """Whether a step failed has no derivative, so grad alone leaves it known."""
+    step = first_not_finite(run(BLOW_UP, params=1e3, num_steps=20))
+
+    def inside(x):
+        solution = run(BLOW_UP, **{"params": 1e3, "num_steps": 20, name: x})
+        solution.check()
+        return jnp.sum(solution.q)
+
+    with pytest.raises(
+        (TypeError, SimulationError), match=rf"^(check: the solution is a tracer|simulate: step {step} )"
+    ):
+        jax.grad(inside)({"dt": 0.1, "params": 1e3}[name])
+
+
+# ---------------------------------------------------------------------------------------------- tracers
+
+TRACED = {"dt": 0.1, "t0": 0.3, "q0": np.array([0.7]), "v0": np.array([-0.4]), "params": 2.5, "alpha": np.float64(-0.1)}
+
+
+def hard_spring(q, v, t, params):
+    """Depends on everything."""
+    return -params * jnp.sin(q) - 0.1 * v + jnp.cos(2 * t)
+
+
+HARD_SPRING = System(ONE, hard_spring)
+
+
+def outcome(alpha, **arguments):
+    """A number that depends on all arguments of a run."""
+    solution = run(HARD_SPRING, hhtjax.hht(alpha=alpha, linearize="predictor"), num_steps=8, **arguments)
+    return jnp.sum(solution.q**2) + jnp.sum(solution.v) + jnp.sum(solution.t * solution.acceleration[:, 0])
+
+
+def test_all_arguments_may_be_tracers_of_jit():
+    assert np.allclose(jax.jit(lambda x: outcome(**x))(TRACED), outcome(**TRACED), rtol=1e-13, atol=0)
+
+
+def test_all_arguments_may_be_tracers_of_vmap():
+    batch = {name: np.stack([value, 0.9 * np.asarray(value)]) for name, value in TRACED.items()}
+    f = jax.jit(lambda x: outcome(**x))
+    results = jax.jit(jax.vmap(f))(batch)
+    for i in range(2):
+        assert np.allclose(results[i], f({name: x[i] for name, x in batch.items()}), rtol=1e-13, atol=0)
+    assert results[0] != results[1]
+
+
+def test_all_arguments_may_be_tracers_of_grad():
+    f = jax.jit(lambda x: outcome(**x))
+    gradient = jax.grad(f)(TRACED)
+    for name, value in TRACED.items():
+        h = 1e-5
+        change = f({**TRACED, name: value + h}) - f({**TRACED, name: value - h})
+        assert np.allclose(gradient[name], change / (2 * h), rtol=1e-6, atol=1e-7), name
+
+
+@pytest.mark.parametrize("arguments", [{"dt": -0.1}, {"dt": 0.0}, {"q0": np.array([INF])}, {"t0": NAN}], ids=repr)
+def test_values_of_tracers_are_not_checked_but_their_failure_is_seen(arguments):
+    ((name, value),) = arguments.items()
+    system = System(ONE, lambda q, v, t, params: -q + t)
+    solution = jax.jit(lambda x: run(system, **{name: x}))(value)
+    if name == "dt":
+        assert solution.check() is None
+        assert solution.t[-1] == 4 * value
+    else:
+        check_message(SimulationError, "simulate: step 1 (to t = ", solution.check)
+
+
+@pytest.mark.parametrize("name", ["dt", "t0"])
+def test_shapes_of_tracers_are_checked(name):
+    with pytest.raises(TypeError, match=f"simulate: `{name}` must be a real number; received "):
+        jax.jit(lambda x: run(**{name: x}))(jnp.ones(2))
+    with pytest.raises(TypeError, match="hht: `alpha` must be a real number; received "):
+        jax.jit(lambda x: outcome(**{**TRACED, "alpha": x}))(jnp.ones(2))
+
+
+# ---------------------------------------------------------------------------------------------- dtypes
+
+
+def float_dtypes(solution):
+    """Dtypes of all numbers in a solution, but those that count."""
+    return {x.dtype.name for x in jax.tree.leaves(solution) if jnp.issubdtype(x.dtype, jnp.inexact)}
+
+
+def run_and_catch(**arguments):
+    """A run, and the warnings it gave."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solution = run(**arguments)
+    return solution, caught
+
+
+@pytest.mark.parametrize(
+    "name", ["rk4", "hht state", "hht converged", "generalized_alpha", "kim_hht", "kim_implicit_euler"]
+)
+def test_float32_stays_float32_and_warns_once_a_call(name):
+    for _ in range(2):  # a cached compilation warns too
+        solution, caught = run_and_catch(stepper=STEPPERS[name], q0=SINGLE, v0=0 * SINGLE, save_every=2)
+        assert float_dtypes(solution) == {"float32"}
+        assert [x.category for x in caught] == [PrecisionWarning]
+        assert caught[0].filename == run.__code__.co_filename
+        assert re.match(
+            r"simulate: in float32 expect about 4 correct digits .* jax.config.update\('jax_enable_x64', True\)",
+            str(caught[0].message),
+        )
+        assert np.isclose(solution.q[-1, 0], np.cos(0.8), atol=0.3)
+
+
+@pytest.mark.parametrize("name", ["rk4", "hht", "kim_hht"])
+def test_float64_stays_float64_and_does_not_warn(name):
+    solution, caught = run_and_catch(stepper=STEPPERS[name], save_every=2)
+    assert float_dtypes(solution) == {"float64"}
+    assert caught == []
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        System([1.0], pull),
+        System(np.array([[1]]), pull),
+        System(lambda q, params: 1.0, pull),
+        System.from_lagrangian(lagrangian),
+        LinearSystem([1.0], C=[0.0], K=[4.0]),
+        LinearSystem(np.array([1]), K=np.array([[4]])),
+        LinearSystem(lambda params: jnp.ones(1, jnp.float32), K=np.array([4.0])),
+    ],
+)
+def test_constants_of_a_system_take_the_dtype_of_the_state(system):
+    stepper = STEPPERS["newmark" if isinstance(system, LinearSystem) else "rk4"]
+    single, _ = run_and_catch(system=system, stepper=stepper, q0=SINGLE, v0=0 * SINGLE)
+    assert float_dtypes(single) == {"float32"}
+    assert np.allclose(single.q, run(stepper=stepper).q, atol=1e-6)
+
+
+def test_integer_and_single_constants_do_not_spoil_double_precision():
+    expected = run(stepper=STEPPERS["newmark"])
+    solution = run(LinearSystem(np.array([1]), C=0 * SINGLE, K=np.array([[4]])), STEPPERS["newmark"])
+    assert float_dtypes(solution) == {"float64"}
+    assert np.allclose(solution.q, expected.q, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("make", "number", "dtype"),
+    [
+        (lambda x: {"stepper": hhtjax.hht(alpha=-x)}, np.float32, np.float64),
+        (lambda x: {"stepper": hhtjax.kim_hht(alpha=-x)}, jnp.float64, np.float32),
+        (lambda x: {"stepper": hhtjax.hht(alpha=-0.125, iterations=None, tolerance=x)}, np.float64, np.float32),
+        (lambda x: {"dt": x, "t0": x}, np.float32, np.float64),
+    ],
+    ids=["alpha", "kim alpha", "tolerance", "dt"],
+)
+def test_numbers_of_any_precision_take_the_dtype_of_the_state(make, number, dtype):
+    """1/8 is exact in both precisions, so the run must be that of the Python number."""
+    solution, _ = run_and_catch(**{"q0": ONE.astype(dtype), "v0": ZERO.astype(dtype), **make(number(0.125))})
+    expected, _ = run_and_catch(**{"q0": ONE.astype(dtype), "v0": ZERO.astype(dtype), **make(0.125)})
+    assert float_dtypes(solution) == {np.dtype(dtype).name}
+    assert np.allclose(solution.q, expected.q, rtol=4 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize(
+    ("q0", "v0", "dtype"),
+    [
+        (1, 0, "float64"),
+        (1.0, 0, "float64"),
+        (np.array([1]), np.array([0]), "float64"),
+        (np.array([1], np.int8), np.array([0], np.uint8), "float64"),
+        (jnp.array([1]), np.array([0.0]), "float64"),
+        (np.array([1]), np.zeros(1, np.float32), "float32"),
+        (np.float32(1), 0.0, "float32"),
+        (np.float64(1), 0, "float64"),
+        ({"a": 1, "b": [1.0, np.ones(2)]}, {"a": 0, "b": [0.0, np.zeros(2)]}, "float64"),
+        ((1, np.float32(1)), (0, 0), "float32"),
+    ],
+    ids=repr,
+)
+def test_integers_numbers_and_numpy_arrays_are_initial_values(q0, v0, dtype):
+    """Integers and Python numbers take the float type of the others, or the default one."""
+    size = sum(np.size(x) for x in jax.tree.leaves(q0))
+    solution, caught = run_and_catch(system=System(np.ones(size), pull), q0=q0, v0=v0)
+    assert float_dtypes(solution) == {dtype}
+    assert len(caught) == (dtype == "float32")
+    assert jax.tree.structure(solution.q) == jax.tree.structure(solution.v) == jax.tree.structure(q0)
+    for x, start in zip(jax.tree.leaves(solution.q), jax.tree.leaves(q0), strict=True):
+        assert x.shape == (5, *np.shape(start))
+        assert np.allclose(x[-1], np.cos(0.8), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "mass"),
+    [
+        ("hht state", lambda q, params: jnp.array(2.0)),
+        ("hht state", lambda q, params: jnp.array([[2.0]])),
+        ("hht state", np.array([2.0])),
+        ("kim_hht", lambda q, params: jnp.array(2.0)),
+        ("rk4", lambda q, params: jnp.array([2.0])),
+    ],
+)
+def test_a_scalar_coordinate_is_a_vector_of_one(name, mass):
+    solution = run(System(mass, lambda q, v, t, params: -8.0 * q), STEPPERS[name], 1.0, 0.0)
+    expected = run(stepper=STEPPERS[name])
+    assert solution.q.shape == solution.v.shape == solution.acceleration.shape == (5,)
+    assert np.allclose(solution.q, expected.q[:, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: System(np.array(2.0), lambda q, v, t, params: -8.0 * q),
+        lambda: System(2.0, lambda q, v, t, params: -8.0 * q),
+        lambda: LinearSystem(lambda params: jnp.array(2.0), K=lambda params: jnp.array(8.0)),
+        lambda: LinearSystem(lambda params: 2.0, K=lambda params: 8.0),
+    ],
+)
+def test_a_scalar_coordinate_may_have_scalar_coefficients(make):
+    assert np.allclose(run(make(), q0=1.0, v0=0.0).q, run().q[:, 0], rtol=1e-12)
