@@ -23,7 +23,7 @@ def constrained_hht(alpha, formulation, iterations: int | None = 1, tolerance=1e
 def trace(scene, stepper, h, num_steps, zero):
     """All states of a run, the start included; zero: it starts with w = a = L = 0, consistent or not."""
     start = stepper.init(scene.system, scene.q0, scene.v0, scene.params, h)
-    w, a, L = (jnp.where(zero, 0.0, x) for x in (start.w, start.a, start.L))
+    w, a, L = jax.tree.map(lambda x: jnp.where(zero, 0.0, x), (start.w, start.a, start.L))
     start = start._replace(w=w, a=a, L=L)
 
     def step(state, _):

@@ -150,7 +150,9 @@ def node_figure(times, exact, paths):
         error = np.abs(paths[name][2] - exact[2])[1:].max(axis=1).reshape(-1, 20).max(axis=1)
         style = {"color": colours[name], "marker": MARKERS[i], "ms": 4, "lw": 1, "markevery": (i, 6), "label": name}
         axes[2, 1].semilogy(1e3 * times[20::20], error, **style)
-    axes[2, 1].set(title="all angles", xlabel="time (ms)", ylabel="error of acceleration (rad/s$^2$)", ylim=(None, 1e13))
+    axes[2, 1].set(
+        title="all angles", xlabel="time (ms)", ylabel="error of acceleration (rad/s$^2$)", ylim=(None, 1e13)
+    )
     axes[2, 1].legend(fontsize=7)
     for panel in axes.flat:
         panel.title.set_fontsize(9)

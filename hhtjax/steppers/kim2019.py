@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax import kinematics
+from hhtjax.constraints import acceleration_and_multipliers, reaction
 from hhtjax.description import is_concrete
 from hhtjax.linear_solve import factorize, solve
 from hhtjax.steppers.generalized_alpha import Options, check_options, require_alpha
@@ -70,10 +71,14 @@ class ConventionalHHT(Stepper):
     fictive_time: bool
     options: Options
 
+    solves_constraints = True
     solves_rotations = True
 
     def begin(self, system, q, v, t, params, dt):
-        """a_0 = M^-1 Q."""
+        """a_0 = M^-1 Q, with the reactions of constraints in Q."""
+        if system.num_constraints:
+            a, L = acceleration_and_multipliers(system, q, v, t, params)
+            return State(t, q, v, a, L=L)
         return State(t, q, v, system.acceleration(q, v, t, params))
 
     def bind(self, system, params, dt):
@@ -82,25 +87,35 @@ class ConventionalHHT(Stepper):
         beta, gamma = (1 - alpha) ** 2 / 4, 0.5 - alpha
         late = (1 + alpha) * dt if self.fictive_time else dt
 
-        def step(s):
-            Q0 = system.force(s.q, s.v, s.t, params)
+        n, m = system.size, system.num_constraints
 
-            def path(a):
+        def force(s, t):
+            Q = system.force(s.q, s.v, t, params)
+            return Q + reaction(system, s.q, s.t, params, s.L) if m else Q
+
+        def step(s):
+            Q0 = force(s, s.t)
+
+            def path(z):
+                a = z[:n]
                 x = dt * s.v + dt**2 * ((0.5 - beta) * s.w + beta * a)
                 v = s.v + dt * ((1 - gamma) * s.w + gamma * a)
                 if system.blocks:
                     v, a, _ = kinematics.end_of_chart(system.blocks, x, v, a, a)
-                return State(s.t + dt, system.move(s.q, x), v, a, memory=x)
+                return State(s.t + dt, system.move(s.q, x), v, a, L=z[n:] if m else None, memory=x)
 
             def r(s1):
-                Q1 = system.force(s1.q, s1.v, s.t + late, params)
-                now = system.inertia(s1.q, s1.w, params) - (1 + alpha) * Q1
+                now = system.inertia(s1.q, s1.w, params) - (1 + alpha) * force(s1, s.t + late)
                 if system.blocks:  # both terms in components that work on the rate of x; for Q0 that is so already
                     now = kinematics.pull_back(system.blocks, s1.memory, now)
-                return now + alpha * Q0
+                now = now + alpha * Q0
+                if not m:
+                    return now
+                return jnp.concatenate([now, system.constraint(s1.q, s1.t, params) / (beta * dt**2)])
 
-            a, info = newton(r, path, s.w, s, factorize, self.options.tolerance, self.options.max_iterations)
-            return system.tidy(path(a)._replace(memory=None)), info
+            z = jnp.concatenate([s.w, s.L]) if m else s.w
+            z, info = newton(r, path, z, s, factorize, self.options.tolerance, self.options.max_iterations)
+            return system.tidy(path(z)._replace(memory=None)), info
 
         return step
 
@@ -160,8 +175,9 @@ def conventional_hht(alpha: Any = 0.0, fictive_time=True, tolerance=1e-10, max_i
     else 1, for every alpha but 0: M(q1) multiplies an acceleration of the time t + (1 + alpha) h, and the
     weights and t~ count alpha twice. `hht(alpha, iterations=None)` is the method without these faults.
 
-    With rotations it is the step of Cardona and Geradin (1989), Eq. 73-81: in the chart of the rotation vector psi from
-    R, forces of different times are compared as those that work on psidot,
+    With rotations and constraints it is the step of Cardona and Geradin (1989), Eq. 36 and 73-81: Phi(q1) = 0, with
+    B^T L among the forces; and in the chart of the rotation vector psi from R, forces of different times are compared
+    as those that work on psidot,
 
         T(psi)^T [J A1 - (1 + alpha) Q1] + alpha Q = 0
 

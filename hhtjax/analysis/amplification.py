@@ -1,0 +1,225 @@
+"""What a step does to a linear motion: damping, periods, stability, order. All from the step itself, by autodiff.
+
+The tangent of one step, in increments scaled by the step size h so that its entries stay of order one for every h,
+
+    x = (q, h v, h^2 w, h^2 a, h^2 L, memory),    x1 = A x,
+
+has what a stepper carries: those fields of its `State` that are not None. On the test oscillator
+
+    w = -2 zeta W v - W^2 q,    W = (natural frequency) h,  zeta: damping ratio,  h = 1,
+
+A depends on W and zeta only. A component that no later one depends on adds a column and an eigenvalue of zeros: w of
+the steppers with alpha_f = 0, for example. Without it, A is the matrix on (q, h v, h^2 a) of the literature.
+
+Eigenvalues come from LAPACK, so these functions run on the CPU.
+
+H. Hilber, T. Hughes, R. Taylor, Earthquake Eng. Struct. Dyn. 5, 1977; A. Cardona, M. Geradin, Computers & Structures
+33, 1989, Sec. 2; T. Hughes, The Finite Element Method, 1987, Ch. 9.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax import kinematics
+from hhtjax.analysis.checks import require_real, require_stepper
+from hhtjax.boundary import require_number
+from hhtjax.steppers.stepper import State
+from hhtjax.system import FirstOrderSystem, LinearSystem, System
+
+INFINITE = 1e17  # a frequency whose inverse is lost in rounding, and whose square fits into float32
+
+
+def _oscillator_force(q, v, t, params):
+    c, k = params
+    return -c * v - k * q
+
+
+def _nothing(q, v, t, params):
+    return jnp.zeros_like(v)
+
+
+def _itself(q, t, params):
+    return q
+
+
+def _complex_product(y, t, z):
+    """z y, with y = (Re, Im)."""
+    return jnp.stack([z.real * y[0] - z.imag * y[1], z.imag * y[0] + z.real * y[1]])
+
+
+OSCILLATOR = System(np.ones(1), _oscillator_force)
+CONSTRAINT = System(np.ones(1), _nothing, _itself)
+TEST_EQUATION = FirstOrderSystem(_complex_product)
+
+
+def amplification_matrix(stepper, system, state, params=None, *, dt):
+    """A, the derivative of one step at a state, with respect to x = (q, h v, h^2 w, h^2 a, h^2 L, memory): (k, k).
+
+    Constrained or not: of a nonlinear system it is the tangent of the flow of the step, which near an equilibrium, or
+    for a small dt, tells how perturbations of the run grow. There each constraint adds the eigenvalues of infinite
+    frequency, whatever dt is. Fields that are None are left out, and so is memory that a step hands on unchanged, like
+    the tangent that `operator_splitting` keeps. Of a rotation, q is the displacement: R exp(q).
+
+    Args:
+        stepper, system, params, dt: as in `simulate`.
+        state: a `State`, of `stepper.init` or `stepper.step`.
+
+    Differentiable; goes under jit and vmap.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.LinearSystem(M=jnp.ones(1), K=jnp.full(1, 4.0))
+    >>> euler = hhtjax.implicit_euler()
+    >>> state = euler.init(spring, jnp.zeros(1), jnp.zeros(1), None, dt=0.5)
+    >>> A = hhtjax.analysis.amplification_matrix(euler, spring, state, dt=0.5)
+    >>> print(A[:2, :2])                                             # of (q, h v): 1/(1 + (2 h)^2) [[1, 1], [-1, 1]]
+    [[ 0.5  0.5]
+     [-0.5  0.5]]
+    """
+    require_stepper("amplification_matrix", stepper)
+    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
+        raise TypeError(
+            f"amplification_matrix: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}."
+        )
+    if not isinstance(state, State):
+        raise TypeError(f"amplification_matrix: `state` must be a State, as of stepper.init; received {state!r}.")
+    require_number("amplification_matrix", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    return _amplification_matrix(stepper, system, jax.tree.map(jnp.asarray, state), params, dt)
+
+
+@jax.jit
+def _amplification_matrix(stepper, system, state, params, dt):
+    q, unravel_q = ravel_pytree(state.q)
+    blocks = kinematics.layout(state.q, state.v)
+    x, unravel = ravel_pytree(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))
+
+    def step(state):
+        return stepper.step(system, state, params, dt)[0]
+
+    def increments(x):
+        s = unravel(x)
+        dq, _ = ravel_pytree(s.q)
+        s1 = step(s._replace(t=state.t, q=unravel_q(kinematics.move(blocks, q, dq) if blocks else q + dq)))
+        q1, _ = ravel_pytree(s1.q)
+        return ravel_pytree(s1._replace(t=None, q=_tangent_part(blocks, q1, dq) if blocks else q1))[0]
+
+    h = jnp.asarray(dt).astype(q.dtype)
+    weights = (1, h, h, h, h, 1) if isinstance(system, FirstOrderSystem) else (1, h, h**2, h**2, h**2, 1)
+    sizes = [ravel_pytree(field)[0].size for field in unravel(x)[1:]]
+    scale = jnp.concatenate([jnp.full(n, w, q.dtype) for n, w in zip(sizes, weights, strict=True)])
+    A = scale[:, None] * jax.jacfwd(increments)(x) / scale[None, :]
+    if state.memory is None:
+        return A
+    kept = _carried(step, state, unravel(x))
+    return A[kept][:, kept]
+
+
+def _tangent_part(blocks, q1, like):
+    """A linear function of q1 whose derivative is the displacement of q1, through the transpose of `rate`."""
+    at = jax.lax.stop_gradient(q1)
+    rate = partial(kinematics.rate, blocks, at)
+    transpose = jax.linear_transpose(rate, like)
+    (norms,) = transpose(rate(jnp.ones_like(like)))  # 1, and 2 for rotations
+    return transpose(q1)[0] / norms
+
+
+def _carried(step, state, increments):
+    """Which increments belong to fields that a step changes: (k,), bool."""
+    jaxpr = jax.make_jaxpr(step)(state).jaxpr
+    changed = [after is not before for before, after in zip(jaxpr.invars, jaxpr.outvars, strict=True)]
+    leaves = jax.tree.leaves(increments)
+    return np.concatenate([np.full(x.size, c) for x, c in zip(leaves, changed[1:], strict=True)])  # without t
+
+
+def oscillator_matrix(stepper, frequency, damping=0.0):
+    """A of the test oscillator, on (q, h v, h^2 w, h^2 a, memory) as far as the stepper carries them: (k, k).
+
+    Args:
+        frequency: W = (natural frequency) h, positive; jnp.inf for the limit.
+        damping: zeta, the damping ratio.
+
+    Differentiable; goes under jit and vmap.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value.
+
+    References:
+        Cardona, Geradin (1989), Eq. 36-41. The limit for alpha = 0, on (q, h v, h^2 a), whose powers are Eq. 48:
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> A = hhtjax.analysis.oscillator_matrix(hhtjax.newmark(), jnp.inf)
+    >>> print(A[jnp.ix_(jnp.array([0, 1, 3]), jnp.array([0, 1, 3]))] + 0.0)
+    [[ 0.  0.  0.]
+     [-2. -1.  0.]
+     [-4. -4. -1.]]
+    """
+    require_stepper("oscillator_matrix", stepper)
+    return oscillator_tangent(stepper, *oscillator_params("oscillator_matrix", frequency, damping))
+
+
+@jax.jit
+def oscillator_tangent(stepper, c, k):
+    zero = jnp.zeros(1, c.dtype)
+    state = stepper.init(OSCILLATOR, zero, zero, (c, k), 1.0)
+    return amplification_matrix(stepper, OSCILLATOR, state, (c, k), dt=1.0)
+
+
+def oscillator_params(caller, frequency, damping):
+    """c = 2 zeta W, k = W^2."""
+    W = require_real(caller, "frequency", frequency, lambda x: x > 0, "be positive")
+    zeta = require_real(caller, "damping", damping, np.isfinite, "be finite").astype(W.dtype)
+    W = jnp.minimum(W, INFINITE)
+    return 2 * zeta * W, W**2
+
+
+def constraint_matrix(stepper):
+    """A of one coordinate that a constraint holds, q = 0, on (q, h v, h^2 w, h^2 a, h^2 L): (5, 5), the same for all h.
+
+    On B q, B v, B w, B a any constrained system at an equilibrium has this matrix, once for each constraint. In the
+    index-3 form it is the limit of `oscillator_matrix`, with L = w. For HHT its eigenvalues are
+
+        index3    alpha/(1 + alpha), and -(1 + alpha)/(1 - alpha) twice in one Jordan block: multipliers overshoot,
+                  and grow linearly for alpha = 0
+        ggl       alpha/(1 + alpha), and -(1 - gamma)/gamma = -(1/2 + alpha)/(1/2 - alpha) once
+
+    and zeros.
+
+    Raises:
+        TypeError: no stepper. NotImplementedError: one that cannot solve constraints.
+
+    References:
+        Cardona, Geradin (1989), Eq. 42.
+
+    >>> import hhtjax
+    >>> A = hhtjax.analysis.constraint_matrix(hhtjax.hht(alpha=-0.1, formulation="index3"))
+    >>> [(round(x.value.real, 6) + 0.0, x.blocks) for x in hhtjax.analysis.jordan_structure(A)]
+    [(-0.818182, (2,)), (-0.111111, (1,)), (0.0, (1, 1))]
+    """
+    require_stepper("constraint_matrix", stepper)
+    return _constraint(stepper)
+
+
+@jax.jit
+def _constraint(stepper):
+    zero = jnp.zeros(1)
+    state = stepper.init(CONSTRAINT, zero, zero, None, 1.0)
+    return amplification_matrix(stepper, CONSTRAINT, state, dt=1.0)
+
+
+@jax.jit
+def eigenvalues(stepper, c, k):
+    """Eigenvalues for each c and k, broadcast: (..., size)."""
+    return jnp.vectorize(lambda c, k: jnp.linalg.eigvals(oscillator_tangent(stepper, c, k)), signature="(),()->(n)")(
+        c, k
+    )
+
+
+def oscillator_roots(caller, stepper, frequency, damping):
+    require_stepper(caller, stepper)
+    return eigenvalues(stepper, *oscillator_params(caller, frequency, damping))

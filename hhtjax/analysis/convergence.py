@@ -1,0 +1,89 @@
+"""The order a stepper shows."""
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.analysis.checks import require_stepper
+from hhtjax.boundary import require_number
+from hhtjax.flat_system import initial_values
+
+
+class ObservedOrder(NamedTuple):
+    """dt: step sizes (k,); error: 2-norms of the error of q at the end, or of its change; slope between neighbours."""
+
+    dt: Any
+    error: Any
+    slope: Any
+
+
+def observed_order(
+    system, stepper, q0, v0=None, params=None, *, duration, num_steps, reference=None, t0=0.0
+) -> ObservedOrder:
+    """Order of convergence of q at t0 + duration, from runs with each of `num_steps` steps.
+
+    Args:
+        system, stepper, q0, v0, params, t0: as in `simulate`.
+        duration: s. num_steps: increasing integers, such as (100, 200, 400).
+        reference: q at the end, like q0. Without it, what counts is the change from each run to the next, one number
+            less, with the same slope; num_steps must then be a geometric sequence.
+
+    Returns:
+        An `ObservedOrder`. Slopes are dlog(error)/dlog(dt); they are worth something where dt resolves the motion and
+        the error is well above rounding.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
+    >>> found = hhtjax.analysis.observed_order(
+    ...     spring, hhtjax.rk4(), jnp.ones(1), jnp.zeros(1), duration=1.0, num_steps=(10, 20, 40))
+    >>> print(found.slope.round(2))
+    [3.95]
+    """
+    require_stepper("observed_order", stepper)
+    require_number("observed_order", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    counts, fewest = np.asarray(num_steps), 3 if reference is None else 2
+    if (
+        counts.ndim != 1
+        or counts.dtype.kind != "i"
+        or len(counts) < fewest
+        or counts[0] < 1
+        or np.any(np.diff(counts) < 1)
+    ):
+        raise ValueError(
+            f"observed_order: `num_steps` must be increasing positive integers, {fewest} or more; received {num_steps}."
+        )
+    ratios = counts[1:] / counts[:-1]
+    if reference is None and np.ptp(ratios) > 1e-9:
+        raise ValueError(
+            "observed_order: `num_steps` must be a geometric sequence where there is no `reference`; "
+            f"received {num_steps!r}."
+        )
+    q0, v0 = initial_values("observed_order", system, q0, v0)
+    ends = [
+        np.asarray(_end(system, stepper, q0, v0, params, float(t0), float(duration) / n, n)) for n in counts.tolist()
+    ]
+    if reference is None:
+        error = np.array([np.linalg.norm(x - y) for x, y in pairwise(ends)])
+    else:
+        exact = np.asarray(ravel_pytree(reference)[0])
+        if exact.shape != ends[0].shape:
+            raise ValueError(
+                f"observed_order: `reference` must hold q at the end, {ends[0].size} numbers; received {exact.size}."
+            )
+        error = np.array([np.linalg.norm(x - exact) for x in ends])
+    slope = np.diff(np.log(error)) / -np.log(ratios[: len(error) - 1])
+    return ObservedOrder(float(duration) / counts[: len(error)], error, slope)
+
+
+@jax.jit
+def _end(system, stepper, q0, v0, params, t0, dt, num_steps):
+    """q at the end as a vector; one compilation for all numbers of steps."""
+    state = stepper.init(system, q0, v0, params, dt, t0)
+    state = jax.lax.fori_loop(0, num_steps, lambda _, s: stepper.step(system, s, params, dt)[0], state)
+    return ravel_pytree(state.q)[0]

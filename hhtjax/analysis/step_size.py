@@ -1,0 +1,186 @@
+"""The step size that a system needs: its modes, and what a stepper makes of them."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.analysis.amplification import eigenvalues
+from hhtjax.analysis.checks import require_stepper
+from hhtjax.analysis.oscillator import damping_ratio, period_elongation
+from hhtjax.boundary import require_number
+from hhtjax.constraints import acceleration_and_multipliers, jacobian
+from hhtjax.flat_system import flatten, initial_values
+from hhtjax.steppers.stepper import require_capable
+from hhtjax.system import LinearSystem, System
+
+# of suggest_step_size
+GRID = np.geomspace(1e-5, 1e6, 600)  # |lambda| h
+NYQUIST = 3.0  # |lambda| h beyond which no motion is followed
+STABLE_RADIUS = 1 + 1e-5  # what rounding makes of a double eigenvalue 1 stays below
+RIGID = 1e-7  # |lambda| relative to the largest that counts as zero
+
+
+class Mode(NamedTuple):
+    """A mode of the linearised system, and what the stepper makes of it at the suggested step.
+
+    frequency: |lambda|, natural frequency in rad/s, or rate of a motion that does not oscillate; damping_ratio: -1 for
+    pure growth, 1 for pure decay.
+    largest_dt: up to which the stepper keeps to the tolerance.
+    numerical_damping_ratio, period_elongation: of the discrete mode; NaN where one of the two does not oscillate.
+    resolved: whether the suggested step is below largest_dt.
+    """
+
+    frequency: float
+    damping_ratio: float
+    largest_dt: float
+    numerical_damping_ratio: float
+    period_elongation: float
+    resolved: bool
+
+
+class StepSize(NamedTuple):
+    """dt in s; reason: what limits it; modes: slowest first. As text, a table."""
+
+    dt: float
+    reason: str
+    modes: tuple[Mode, ...]
+
+    def __str__(self):
+        rows = [["rad/s", "damping ratio", "largest dt", "w h", "its damping ratio", "its period", ""]]
+        for mode in self.modes:
+            swings = mode.period_elongation == mode.period_elongation  # no NaN
+            rows.append(
+                [
+                    f"{mode.frequency:.4g}",
+                    f"{mode.damping_ratio:.3g}",
+                    f"{mode.largest_dt:.3g} s",
+                    f"{mode.frequency * self.dt:.3g}",
+                    f"{mode.numerical_damping_ratio:.3g}" if swings else "-",
+                    f"{100 * mode.period_elongation:+.3g} %" if swings else "-",
+                    "resolved" if mode.resolved else "not resolved",
+                ]
+            )
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = ["  ".join(x.rjust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+        return "\n".join([f"dt = {self.dt:.3g} s: {self.reason}", *lines])
+
+
+def suggest_step_size(system, stepper, q0, v0, params=None, *, tolerance=1e-2, highest=None, t0=0.0) -> StepSize:
+    """A step size that resolves the modes of the system linearised at a state, with what each mode then suffers.
+
+    Small motions x about the state obey  M xddot + C xdot + K x = 0,  C = -Q_v,  K = (M w - Q - B^T L)_q,  and B x = 0
+    where there are constraints. Each solution exp(lambda t) becomes powers of an eigenvalue mu of the stepper's
+    oscillator, and counts as resolved where |log(mu)/(lambda h) - 1| <= tolerance: the errors of period and of
+    damping ratio together. (A real lambda is put into xddot = lambda xdot.) The step is the largest that resolves
+
+        highest = None    every mode that oscillates or grows, or where none does, the slowest decay;
+        highest           every mode of |lambda| <= highest, in rad/s,
+
+    and for which no mode that decays grows in the steps, resolved or not.
+
+    Args:
+        system, stepper, q0, v0, params, t0: as in `simulate`; no `FirstOrderSystem`. Modes change along the way, so
+            take the stiffest state of the motion. They are those of the frozen state: where it moves fast, they also
+            depend on the choice of coordinates.
+        tolerance: in (0, 1).
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value; a system without a time scale of its own; a
+            tolerance out of reach; JAX in single precision.
+        NotImplementedError: constraints or rotations that the stepper does not know.
+
+    Example: masses on a soft and on a stiff spring. The stiff one dictates, unless it is given up.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> system = hhtjax.LinearSystem(M=jnp.ones(2), C=jnp.array([0.1, 0.0]), K=jnp.array([1.0, 1e4]))
+    >>> found = suggest_step_size(system, hhtjax.hht(alpha=-0.05), jnp.zeros(2), jnp.zeros(2), highest=10.0)
+    >>> print(found)
+    dt = 0.316 s: resolves the mode at 1 rad/s to 0.01
+    rad/s  damping ratio  largest dt    w h  its damping ratio  its period
+        1           0.05     0.316 s  0.316             0.0492    +0.934 %      resolved
+      100              0   0.00316 s   31.6             0.0329      +949 %  not resolved
+    """
+    caller = "suggest_step_size"
+    require_stepper(caller, stepper)
+    if not isinstance(system, (System, LinearSystem)):
+        raise TypeError(f"{caller}: `system` must be a System or LinearSystem; received {system!r}.")
+    require_number(caller, "tolerance", tolerance, lambda x: 0 < x < 1, "lie in (0, 1)")
+    if highest is not None:
+        require_number(caller, "highest", highest, lambda x: x > 0, "be positive")
+    if jnp.result_type(float) != jnp.float64:
+        raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
+    q0, v0 = initial_values(caller, system, q0, v0)
+    require_capable(caller, system, stepper, q0, v0)
+    rates = _rates(*map(np.asarray, _linearize(system, q0, v0, params, t0)))
+    if not len(rates):
+        raise ValueError(f"{caller}: the `system` has no time scale of its own at q0, v0: take another state.")
+    size, moves = np.abs(rates), (rates.imag > 0) | (rates.real > 0)
+    chosen = size <= highest if highest is not None else moves if moves.any() else size == size[0]
+    if not chosen.any():
+        raise ValueError(f"{caller}: `highest` must reach the slowest mode, {size[0]:.4g} rad/s; received {highest}.")
+
+    reach = []
+    for rate in rates:
+        error, radius = _errors(stepper, rate / abs(rate))
+        reach.append((_reach(error > tolerance), _reach(radius > STABLE_RADIUS) if rate.real <= 0 else np.inf))
+    resolved, stable = np.transpose(reach) / size
+    limits = np.concatenate([np.where(chosen, resolved, np.inf), stable])
+    which = int(np.argmin(limits))
+    dt, mode = float(limits[which]), f"the mode at {size[which % len(size)]:.4g} rad/s"
+    if not dt:
+        raise ValueError(f"{caller}: no step keeps {mode} within tolerance={tolerance:g}, or stable.")
+    reason = f"resolves {mode} to {tolerance:g}" if which < len(size) else f"with more, {mode} grows"
+
+    modes = []
+    for rate, largest in zip(rates, resolved, strict=True):
+        W, zeta = abs(rate), -rate.real / abs(rate) + 0.0
+        fake, late = (
+            float(f(stepper, W * dt, zeta)) if rate.imag else np.nan for f in (damping_ratio, period_elongation)
+        )
+        modes.append(Mode(float(W), float(zeta), float(largest), fake, late, bool(dt <= largest)))
+    return StepSize(dt, reason, tuple(modes))
+
+
+@jax.jit
+def _linearize(system, q0, v0, params, t0):
+    """Derivatives of w in displacement and velocity, (n, n), and B, (m, n)."""
+    flat, q, v = flatten("suggest_step_size", system, q0, v0, t0, params)
+    t = jnp.asarray(t0).astype(q.dtype)
+
+    def acceleration(x, v):
+        at = flat.move(q, x), v, t, params
+        return acceleration_and_multipliers(flat, *at)[0] if flat.num_constraints else flat.acceleration(*at)
+
+    B = jacobian(flat, q, t, params) if flat.num_constraints else jnp.zeros((0, v.size), v.dtype)
+    return *jax.jacfwd(acceleration, argnums=(0, 1))(jnp.zeros_like(v), v), B
+
+
+def _rates(w_x, w_v, B):
+    """lambda of the motions that satisfy B x = 0, one of each conjugate pair, slowest first; without rigid motions."""
+    N = np.linalg.svd(B)[2][len(B) :].T if len(B) else np.eye(len(w_x))
+    zero = np.zeros((N.shape[1], N.shape[1]))
+    A = np.block([[zero, np.eye(len(zero))], [N.T @ w_x @ N, N.T @ w_v @ N]])
+    rates = np.linalg.eigvals(A)
+    swings = abs(np.imag(rates)) > 1e-6 * abs(rates)
+    rates = np.where(swings, rates, np.real(rates))
+    rates = rates[(np.imag(rates) >= 0) & (abs(rates) > RIGID * abs(rates).max(initial=0))]
+    return rates[np.argsort(abs(rates))]
+
+
+def _errors(stepper, direction):
+    """|log(mu)/(lambda h) - 1| and the spectral radius for lambda of unit modulus on GRID: (grid,) each."""
+    lambda_h, followed = direction * GRID, GRID <= NYQUIST
+    c, k = (-2 * lambda_h.real, GRID**2) if direction.imag else (-lambda_h.real, 0 * GRID)
+    roots = np.asarray(eigenvalues(stepper, c, k))
+    nearest = np.argmin(abs(roots - np.exp(np.where(followed, lambda_h, 0))[:, None]), axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = abs(np.log(roots[np.arange(len(GRID)), nearest]) / lambda_h - 1)
+    return np.where(followed, error, np.inf), abs(roots).max(axis=-1)
+
+
+def _reach(bad):
+    """The last of GRID before the first bad one; 0 if that is the first, inf if none is."""
+    first = bad.argmax()
+    return np.inf if not bad.any() else GRID[first - 1] if first else 0.0
