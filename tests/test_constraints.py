@@ -181,7 +181,7 @@ def test_redundant_constraints_by_least_squares():
 
 
 def test_a_singular_position_on_the_way_is_named():
-    """Rows that become parallel at t = 1: the run says at which step, and which row; least squares goes on."""
+    """Rows that are parallel at t = 1: the run names the step from there, and the row; least squares goes on."""
 
     def crossing(q, t, params):
         return jnp.array([q[0] - t, q[1] * (q[0] - 1) + q[0] - t])
@@ -194,7 +194,7 @@ def test_a_singular_position_on_the_way_is_named():
             run.check()
             np.testing.assert_allclose(run.q[-1], [1.5, 0, -9.81 * 1.5**2 / 2], atol=1e-9)
         else:
-            with pytest.raises(hhtjax.SimulationError, match=r"step 8 .*failed: row 1 of the constraint depends on"):
+            with pytest.raises(hhtjax.SimulationError, match=r"step 9 .*failed: row 1 of the constraint depends on"):
                 run.check()
 
 

@@ -111,7 +111,7 @@ def motion_figure(times, path, true):
     space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="Fig. 9: path of the disk")
     space.legend(fontsize=7, loc="upper left")
     panels = [drawn.add_subplot(2, 2, i) for i in (2, 3, 4)]
-    psi = np.asarray(jax.vmap(log)(jnp.asarray(R)))
+    psi = np.array(jax.vmap(log)(jnp.asarray(R)))
     jumps = np.abs(np.diff(psi, axis=0)).max(axis=1) > 1
     psi[1:][jumps] = np.nan  # at pi, where psi and -psi are the same rotation
     spatial = np.einsum("tij,tj->ti", R, Om)

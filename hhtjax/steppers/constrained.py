@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
-from hhtjax.linear_solve import solve
+from hhtjax.linear_solve import matvec, solve
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import Info, State
 
@@ -40,13 +40,18 @@ def begin_constrained(method, system, q, v, t, params, dt):
     return State(t, q, v, w, method.corrected(system, v, w, wdot, dt), L)
 
 
-def report(method, system, params, s, info):
-    """What the step tells, by how much it violates the constraints, and whether these still are independent."""
+def report(system, params, s, info, row):
+    """What the step tells, by how much it violates the constraints, and which row was dependent at its start."""
     position, rate = violation(system, s.q, s.v, s.t, params)
-    info = info._replace(constraint=jnp.max(jnp.abs(position)), constraint_rate=jnp.max(jnp.abs(rate)))
-    if method.redundant is not None:
-        return info
-    return info._replace(dependent_row=dependent_row(jacobian(system, s.q, s.t, params)))
+    constraint, constraint_rate = (jnp.max(jnp.abs(x)) for x in (position, rate))
+    return info._replace(constraint=constraint, constraint_rate=constraint_rate, dependent_row=row)
+
+
+def directions(M, B, factorize):
+    """D = M^-1 B^T: (n, m)."""
+    if M.ndim == 1:
+        return B.T / M[:, None]
+    return jax.vmap(partial(solve, M, factorize=factorize), in_axes=1, out_axes=1)(B.T)
 
 
 def bind_constrained(method, system, params, dt):
@@ -62,12 +67,12 @@ def bind_constrained(method, system, params, dt):
         return jnp.concatenate(rows + [rate / (c.gamma * dt)] * ggl)
 
     def step(s):
-        M = system.mass(s.q, params)
-        inverse = (lambda b: b / M) if M.ndim == 1 else partial(solve, M, factorize=method.factorize)
+        B = jacobian(system, s.q, s.t, params)
+        D = directions(system.mass(s.q, params), B, method.factorize) if ggl else None
 
         def path(z):
             w, L, eta = z[:n], z[n : n + m], z[n + m :]
-            shift = c.beta * dt**2 * inverse(reaction(system, s.q, s.t, params, eta)) if ggl else None
+            shift = None if D is None else c.beta * dt**2 * matvec(D, eta)
             return method.arrive(system, s, dt, w, shift)._replace(L=L)
 
         z = jnp.concatenate([s.w, s.L] + [jnp.zeros(m, s.q.dtype)] * ggl)
@@ -78,6 +83,7 @@ def bind_constrained(method, system, params, dt):
                 z = linearized_solve(r, path, z, factorize)
             info = Info()
         s1 = system.tidy(path(z))
-        return s1, report(method, system, params, s1, info)
+        row = dependent_row(B) if method.redundant is None else None
+        return s1, report(system, params, s1, info, row)
 
     return step

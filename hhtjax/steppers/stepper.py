@@ -37,7 +37,8 @@ class Info(NamedTuple):
     iterations: number of Newton iterations.
     converged: whether they met the tolerance.
     constraint: max-norm of Phi at the end of the step; constraint_rate: of dPhi/dt.
-    dependent_row: number, from 1, of the first constraint that depends on those before it; 0 while B has full rank.
+    dependent_row: number, from 1, of the first constraint that depends on those before it at the start of the step;
+        0 while B has full rank.
     """
 
     residual: Any = None
