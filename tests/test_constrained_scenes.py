@@ -147,7 +147,8 @@ def test_start_is_consistent(name):
 @pytest.mark.parametrize("name", SCENES)
 def test_mass_is_symmetric_and_positive_definite(name):
     scene = SCENES[name]
-    M = np.asarray(jax.jit(jax.vmap(flat(scene)[0], (0, None)))(states(scene)[0], scene.params))
+    # uncompiled: a compiler may round M[i, j] otherwise than M[j, i]
+    M = np.asarray(jax.vmap(flat(scene)[0], (0, None))(states(scene)[0], scene.params))
     np.testing.assert_array_equal(M, np.swapaxes(M, 1, 2))
     assert np.min(np.linalg.eigvalsh(M)) > 1e-3 * np.min(np.diagonal(M, axis1=1, axis2=2))
 

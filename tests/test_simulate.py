@@ -1,5 +1,7 @@
 """The run: what it saves, dense output, the progress bar, Lagrangian systems."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,16 +105,17 @@ def test_dense_output_is_differentiable():
     """In the times, where the derivative of q is close to v, and in a parameter."""
     path = run(DUFFING, hhtjax.hht(), 2000)
     times = jnp.array([0.123, 0.777])
-    slopes = jax.jacfwd(lambda t: hhtjax.interpolate(path, t).q[:, 0])(times)
+    slopes = jax.jit(jax.jacfwd(lambda t: hhtjax.interpolate(path, t).q[:, 0]))(times)
     np.testing.assert_allclose(np.diag(slopes), hhtjax.interpolate(path, times).v[:, 0], atol=1e-6)
 
+    @jax.jit
     def late(k):
         problem = DUFFING._replace(params={**DUFFING.params, "k": k})
         return hhtjax.interpolate(run(problem, hhtjax.hht(), 200), 0.777).q[0]
 
     central = (late(1.0 + 1e-5) - late(1.0 - 1e-5)) / 2e-5
-    assert float(jax.grad(late)(1.0)) == pytest.approx(float(central), rel=1e-7)
-    assert float(jax.jacfwd(late)(1.0)) == pytest.approx(float(central), rel=1e-7)
+    for derivative in (jax.grad, jax.jacfwd):
+        assert float(jax.jit(derivative(late))(1.0)) == pytest.approx(float(central), rel=1e-7)
 
 
 def test_dense_output_outside_a_traced_run_is_nan():
@@ -122,18 +125,19 @@ def test_dense_output_outside_a_traced_run_is_nan():
 
 
 def test_progress_changes_neither_result_nor_gradient(capfd):
+    @partial(jax.jit, static_argnums=1)
     def loss(k, progress):
         problem = DUFFING._replace(params={**DUFFING.params, "k": k})
         return jnp.sum(run(problem, hhtjax.hht(), 300, progress=progress).q ** 2)
 
-    assert float(jax.jit(loss, static_argnums=1)(1.0, True)) == float(jax.jit(loss, static_argnums=1)(1.0, False))
+    assert float(loss(1.0, True)) == float(loss(1.0, False))
     jax.effects_barrier()
     shown = capfd.readouterr().err
     assert "step 300 of 300" in shown
     assert "step 3 of 300" in shown
     assert len(shown.split("\r")) == 101  # a hundred times, no oftener
-    for derivative in (jax.grad, jax.jacfwd):
-        assert float(derivative(loss)(1.0, True)) == float(derivative(loss)(1.0, False))
+    for derivative in (jax.grad(loss), jax.jacfwd(loss)):
+        assert float(derivative(1.0, True)) == float(derivative(1.0, False))
     batch = jax.vmap(loss, in_axes=(0, None))(jnp.array([1.0, 2.0]), True)
     np.testing.assert_array_equal(batch, jax.vmap(loss, in_axes=(0, None))(jnp.array([1.0, 2.0]), False))
 
@@ -159,10 +163,16 @@ def test_lagrangian_system_equals_the_one_by_hand():
     derived = hhtjax.System.from_lagrangian(pendulum_lagrangian, dampers)
     by_hand = hhtjax.System(double_pendulum.mass, double_pendulum.force)
     q, v = jnp.array([0.4, -0.7]), jnp.array([1.2, -0.5])
-    np.testing.assert_allclose(derived.mass(q, problem.params), by_hand.mass(q, problem.params), rtol=1e-14)
+
+    @jax.jit
+    def both(t):
+        systems = derived, by_hand
+        return [x.mass(q, problem.params) for x in systems], [x.force(q, v, t, problem.params) for x in systems]
+
     for t in (0.0, 2.0):
-        expected = by_hand.force(q, v, t, problem.params)
-        np.testing.assert_allclose(derived.force(q, v, t, problem.params), expected, rtol=1e-13)
+        masses, forces = both(t)
+        np.testing.assert_allclose(*masses, rtol=1e-14)
+        np.testing.assert_allclose(*forces, rtol=1e-13)
     ends = [run(problem._replace(system=system), hhtjax.hht(), 50).q[-1] for system in (derived, by_hand)]
     np.testing.assert_allclose(*ends, rtol=1e-11)
 
