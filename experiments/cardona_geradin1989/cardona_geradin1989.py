@@ -7,12 +7,13 @@ from experiments.cardona_geradin1989 import (
     mechanisms,
     pendulum,
     squeezer,
+    top,
     work_precision,
 )
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = [infinity, pendulum, formulations, drift, mechanisms], [squeezer, work_precision]  # two processes if fast
+GROUPS = [infinity, pendulum, formulations, drift, mechanisms], [squeezer, work_precision, top]  # two processes if fast
 
 
 def run(report: Report, fast: bool):

@@ -66,6 +66,18 @@ def mechanisms_table(entries):
     return table(header, rows)
 
 
+def peaks_table(peaks):
+    """n_max and the largest |D23| by alpha."""
+    rows = [[alpha, *("-" if x is None else f"{x:.4g}" for x in row.values())] for alpha, row in peaks.items()]
+    return table(["alpha", "n_max", "closed form", "largest D23", "relative deviation"], rows)
+
+
+def top_table(entries):
+    """Errors of place and acceleration."""
+    rows = [[e["method"], f"{e['x_error_m']:.2e}", f"{e['ax_error_last_fifth_m_s2']:.2g}"] for e in entries]
+    return table(["method", "x (m)", "acceleration in x, last 0.1 s (m/s2)"], rows)
+
+
 def squeezer_table(entries):
     """Errors at both times."""
     rows = [[x if isinstance(x, str) else f"{x:.2g}" for x in e.values()] for e in entries]
@@ -128,12 +140,21 @@ def page(numbers):
     calls += [find(work["entries"], method="index 1, RK4", h_s=5e-5)]
     by_python, compiled = (1e6 * e["cpu_time_s"] / e["solves"] for e in calls)
     loose = [e["time_over_non_iterative"] for e in stops if e["newton_tolerance_N_m"] == 1e-3]
+    top = {e["method"].split(",")[0]: e for e in reversed(numbers["top"]["entries"])}
     orders = ([name, *(f"{order:.2f}" for order in by.values())] for name, by in work["orders"].items())
     return (
         (HERE / "page.md")
         .read_text()
         .format(
             machine=numbers["machine"],
+            peaks=peaks_table(numbers["infinity"]["fig1"]),
+            root_deviation=max(e["deviation_of_the_constraints_root"] for e in numbers["infinity"]["spectra"]),
+            top_h=numbers["top"]["h_s"],
+            top=top_table(numbers["top"]["entries"]),
+            top_shaken=top["trapezoidal rule"]["ax_error_last_fifth_m_s2"],
+            top_hht=top["HHT"]["x_error_m"],
+            top_trapezoidal=top["trapezoidal rule"]["x_error_m"],
+            top_newmark=top["Newmark + damping"]["x_error_m"],
             speed=pendulum["v0_m_s"],
             h=pendulum["h_s"],
             rise=reading["rise_m"],

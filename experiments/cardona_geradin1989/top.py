@@ -109,6 +109,7 @@ def motion_figure(times, path, true):
     space.plot(*path[0].T, MARKERS[0], color=COLOURS[1], ms=2.5, label="non-iterative, 100 steps")
     space.plot(*zip((0, 0, 0), x[0], strict=True), color="black", lw=1)
     space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="Fig. 9: path of the disk")
+    space.set(xticks=(-0.5, 0, 0.5), yticks=(0, 0.5, 1), zticks=(-1, -0.5, 0))
     space.legend(fontsize=7, loc="upper left")
     panels = [drawn.add_subplot(2, 2, i) for i in (2, 3, 4)]
     psi = np.array(jax.vmap(log)(jnp.asarray(R)))
@@ -146,10 +147,9 @@ def methods_figure(times, paths, true):
         panel.plot(times, true[1][:, 0], color="black", ls=":", lw=1, label="exact")
         panel.set(title=f"{title}: acceleration of the disk", xlabel="time (s)", ylabel="$\\ddot x$ (m/s$^2$)")
     for i, name in enumerate(FIGURED):
-        x, _ = paths[name]
-        panels[2].plot(x[70:, 0], x[70:, 2], MARKERS[i] + "-", color=COLOURS[i], ms=2.5, lw=0.8, label=name)
-    panels[2].plot(true[0][70:, 0], true[0][70:, 2], color="black", ls=":", lw=1.2, label="exact")
-    panels[2].set(title="Fig. 15: path of the disk, last 0.15 s", xlabel="x (m)", ylabel="z (m)")
+        distance = np.linalg.norm(paths[name][0] - true[0], axis=1)
+        panels[2].semilogy(times[2:], distance[2:], color=COLOURS[i], lw=1.2, label=name.replace("alpha", "$\\alpha$"))
+    panels[2].set(title="Fig. 15: distance from the exact path", xlabel="time (s)", ylabel="distance (m)")
     for panel in panels:
         panel.legend(fontsize=6.5)
         panel.title.set_fontsize(9)
