@@ -101,7 +101,7 @@ def run(report, fast):
 
 def motion_figure(times, path, true):
     """Figs. 9-12: the path of the disk, and the exact rotation it belongs to."""
-    drawn = plt.figure(figsize=(8.6, 6.2))
+    drawn = plt.figure(figsize=(7.6, 5.2))
     fine = np.linspace(0, DURATION, 2001)
     x, _, R, Om = exact(fine)
     space = drawn.add_subplot(2, 2, 1, projection="3d")
