@@ -93,9 +93,9 @@ def initial_values(caller, system, q0, v0):
         if kinematics.is_rotation(jnp.shape(q), jnp.shape(v)):
             _require_rotations(f"{caller}: `q0{jax.tree_util.keystr(path)}`", q)
         elif jnp.shape(q) != jnp.shape(v):
+            rotation = ", but (3,) for a rotation (3, 3)" if jnp.shape(q)[-2:] == (3, 3) else ""
             raise ValueError(
-                f"{caller}: `v0` must have the shapes of q0, {describe(q0)}, but (3,) for a rotation (3, 3); "
-                f"received {describe(v0)}."
+                f"{caller}: `v0` must have the shapes of q0, {describe(q0)}{rotation}; received {describe(v0)}."
             )
     if len(dtypes) > 1:
         raise TypeError(f"{caller}: `q0` and `v0` must share one dtype; received {describe(q0)} and {describe(v0)}.")
