@@ -242,8 +242,8 @@ def test_body_chain():
             scene.system, hhtjax.hht(-0.05), *scene[2:4], scene.params, dt=dt, num_steps=num_steps, save_every=10
         )
         run.check()
-        inertia, m, g = body_chain.inertia(scene.params), scene.params["m"], scene.params["g"]
-        R, x, Om, v = run.q["R"], run.q["x"], run.v["R"], run.v["x"]
+        inertia, m, g = np.array(body_chain.inertia(scene.params)), 1.0, 9.81
+        R, x, Om, v = (np.array(y) for y in (run.q["R"], run.q["x"], run.v["R"], run.v["x"]))
         energy = np.sum(inertia * Om**2, (1, 2)) / 2 + m * np.sum(v**2, (1, 2)) / 2 + m * g * np.sum(x[..., 2], 1)
         spin = np.sum(np.einsum("tnij,tnj->tni", R, inertia * Om) + m * np.cross(x, v), 1)[:, 2]
         errors.append([np.max(np.abs(y - y[0])) for y in (energy, spin)])
