@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from test_gradients import check_gradients
 
 import hhtjax
-from hhtjax.rotation import cross, hat
+from hhtjax import kinematics
+from hhtjax.rotation import cross, exp, hat, vee
 from hhtjax.scenes import body_chain, top
 
 E1, E3 = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
@@ -161,6 +162,26 @@ def test_literal_step_is_of_first_order():
     check_order(literal, False, jnp.asarray(0.0), 2)
     check_order(literal, False, jnp.asarray(-0.3), 1)
     check_order(literal, True, jnp.asarray(-0.3), 1)
+
+
+def test_end_of_chart_is_the_motion_of_the_rotation():
+    """Om = vee(R^T dR/dt) and A = dOm/dt of R(t) = R0 exp(x + v t + w t^2/2), beside plain coordinates."""
+    x, v, w, a = np.random.default_rng(0).normal(size=(4, 4))  # three of a rotation, and one more
+    q0 = {"R": jnp.asarray(R0), "s": jnp.zeros(1)}
+    blocks = kinematics.layout(q0, {"R": jnp.zeros(3), "s": jnp.zeros(1)})
+
+    def Om(t, w):
+        def R(t):
+            return jnp.asarray(R0) @ exp(x[:3] + v[:3] * t + w[:3] * t**2 / 2)
+
+        return vee(R(t).T @ jax.jvp(R, (t,), (1.0,))[1])
+
+    def accelerate(w):
+        return jnp.append(jax.jvp(partial(Om, w=w), (0.0,), (1.0,))[1], w[3])
+
+    expected = jax.jit(lambda: (jnp.append(Om(0.0, w), v[3]), accelerate(w), accelerate(a)))()
+    for found, exact in zip(jax.jit(partial(kinematics.end_of_chart, blocks))(x, v, w, a), expected, strict=True):
+        np.testing.assert_allclose(found, exact, rtol=1e-13)
 
 
 def read_top():
