@@ -45,8 +45,6 @@ def reaction(system, q, t, params, L):
 
 def pull_back(system, q, gradient):
     """The force (n,) of a gradient with respect to q: the same, and the material moment for rotations."""
-    if not system.blocks:
-        return gradient
     zero = jnp.zeros(system.size, q.dtype)
     return jax.linear_transpose(lambda v: system.rate(q, v), zero)(gradient)[0]
 
@@ -215,7 +213,7 @@ def dependent_row(B):
     m, limit = B.shape[0], 1e4 * float(jnp.finfo(B.dtype).eps)
     size = jnp.sqrt(jnp.sum(B**2, axis=1, keepdims=True))
     B = B / jnp.where(size == 0, 1, size)
-    G = jax.vmap(lambda row: matvec(B, row))(B) if max(B.shape) <= UNROLLED else B @ B.T
+    G = jax.vmap(partial(matvec, B))(B)
 
     def eliminate(k, G):
         return G - jnp.where(jnp.arange(m) > k, G[:, k] / jnp.maximum(G[k, k], limit), 0)[:, None] * G[k][None, :]

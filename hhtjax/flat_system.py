@@ -47,15 +47,15 @@ class FlatSystem(NamedTuple):
 
     def move(self, q, x):
         """q displaced by x (n,): q + x, and R exp(x) for rotations."""
-        return kinematics.move(self.blocks, q, x) if self.blocks else q + x
+        return kinematics.move(self.blocks, q, x)
 
     def rate(self, q, v):
         """qdot: v, and R hat(v) for rotations."""
-        return kinematics.rate(self.blocks, q, v) if self.blocks else v
+        return kinematics.rate(self.blocks, q, v)
 
     def tidy(self, state):
         """The state at the end of a step, its rotations orthogonal to rounding."""
-        return state._replace(q=kinematics.orthonormalize(self.blocks, state.q)) if self.blocks else state
+        return state._replace(q=kinematics.orthonormalize(self.blocks, state.q))
 
 
 class PrecisionWarning(UserWarning):

@@ -72,6 +72,8 @@ def chart_jerk(blocks, v, w, wdot):
 
 def end_of_chart(blocks, x, v, w, a):
     """Velocity, acceleration and algorithmic acceleration, from first and second rates of the displacement x."""
+    if not blocks:
+        return v, w, a
 
     def turn(psi, psidot, w, a):
         T, convective = rotation.tangent(psi), rotation.tangent_rate(psi, psidot)
@@ -105,6 +107,8 @@ def interpolate_rotation(R0, R1, d0, d1, s):
 
 def _each(blocks, plain, turn, *vectors):
     """`plain` on the plain blocks of vectors like q or like v, `turn` on each rotation, joined again."""
+    if not blocks:
+        return plain(*vectors)
     length = blocks[-1].q.stop  # of q, longer than v
     parts = []
     for block in blocks:

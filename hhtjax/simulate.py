@@ -15,8 +15,7 @@ from hhtjax.checkpointing import checkpointed_scan
 from hhtjax.constraints import require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.flat_system import flatten, initial_values
-from hhtjax.steppers.stepper import Info, Stepper, public, require_capable
-from hhtjax.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.steppers.stepper import Info, public, require_capable, require_stepper, require_system
 
 
 class SimulationError(RuntimeError):
@@ -118,10 +117,8 @@ def simulate(
     >>> [round(float(q), 4) for q in solution.q[:, 0]]                       # cos(2 t)
     [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
     """
-    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
-        raise TypeError(f"simulate: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
-    if not isinstance(stepper, Stepper):
-        raise TypeError(f"simulate: `stepper` must be a stepper such as hht(); received {stepper!r}.")
+    require_system("simulate", system)
+    require_stepper("simulate", stepper)
     for name, value in (("num_steps", num_steps), ("save_every", save_every)):
         if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1:
             raise ValueError(f"simulate: `{name}` must be a positive integer; received {value!r}.")

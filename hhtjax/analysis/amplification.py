@@ -25,10 +25,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax import kinematics
-from hhtjax.analysis.checks import require_real, require_stepper
+from hhtjax.analysis.checks import require_real
 from hhtjax.boundary import require_number
-from hhtjax.steppers.stepper import State
-from hhtjax.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.steppers.stepper import State, require_stepper, require_system
+from hhtjax.system import FirstOrderSystem, System
 
 INFINITE = 1e17  # a frequency whose inverse is lost in rounding, and whose square fits into float32
 
@@ -83,10 +83,7 @@ def amplification_matrix(stepper, system, state, params=None, *, dt):
      [-0.5  0.5]]
     """
     require_stepper("amplification_matrix", stepper)
-    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
-        raise TypeError(
-            f"amplification_matrix: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}."
-        )
+    require_system("amplification_matrix", system)
     if not isinstance(state, State):
         raise TypeError(f"amplification_matrix: `state` must be a State, as of stepper.init; received {state!r}.")
     require_number("amplification_matrix", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
@@ -105,9 +102,9 @@ def _amplification_matrix(stepper, system, state, params, dt):
     def increments(x):
         s = unravel(x)
         dq, _ = ravel_pytree(s.q)
-        s1 = step(s._replace(t=state.t, q=unravel_q(kinematics.move(blocks, q, dq) if blocks else q + dq)))
+        s1 = step(s._replace(t=state.t, q=unravel_q(kinematics.move(blocks, q, dq))))
         q1, _ = ravel_pytree(s1.q)
-        return ravel_pytree(s1._replace(t=None, q=_tangent_part(blocks, q1, dq) if blocks else q1))[0]
+        return ravel_pytree(s1._replace(t=None, q=_tangent_part(blocks, q1, dq)))[0]
 
     h = jnp.asarray(dt).astype(q.dtype)
     weights = (1, h, h, h, h, 1) if isinstance(system, FirstOrderSystem) else (1, h, h**2, h**2, h**2, 1)
@@ -165,6 +162,7 @@ def oscillator_matrix(stepper, frequency, damping=0.0):
 
 @jax.jit
 def oscillator_tangent(stepper, c, k):
+    """A of the oscillator with damping c and stiffness k, at rest; h = 1."""
     zero = jnp.zeros(1, c.dtype)
     state = stepper.init(OSCILLATOR, zero, zero, (c, k), 1.0)
     return amplification_matrix(stepper, OSCILLATOR, state, (c, k), dt=1.0)
@@ -215,11 +213,14 @@ def _constraint(stepper):
 @jax.jit
 def eigenvalues(stepper, c, k):
     """Eigenvalues for each c and k, broadcast: (..., size)."""
-    return jnp.vectorize(lambda c, k: jnp.linalg.eigvals(oscillator_tangent(stepper, c, k)), signature="(),()->(n)")(
-        c, k
-    )
+
+    def single(c, k):
+        return jnp.linalg.eigvals(oscillator_tangent(stepper, c, k))
+
+    return jnp.vectorize(single, signature="(),()->(n)")(c, k)
 
 
 def oscillator_roots(caller, stepper, frequency, damping):
+    """Eigenvalues of `oscillator_matrix`, after a check of what the user gave."""
     require_stepper(caller, stepper)
     return eigenvalues(stepper, *oscillator_params(caller, frequency, damping))

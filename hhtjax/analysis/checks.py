@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.steppers.stepper import Stepper
 
 
 def require_real(caller, name, value, valid, expectation):
@@ -18,12 +17,8 @@ def require_real(caller, name, value, valid, expectation):
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.result_type(float))
 
 
-def require_stepper(caller, stepper):
-    if not isinstance(stepper, Stepper):
-        raise TypeError(f"{caller}: `stepper` must be a stepper such as hht(); received {stepper!r}.")
-
-
 def require_matrix(caller, matrix):
+    """A square, finite matrix of real numbers, as a NumPy array."""
     A = np.asarray(matrix)
     if not is_real(A):
         raise TypeError(f"{caller}: `matrix` must be real; received {matrix!r}.")

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.analysis.checks import require_stepper
 from hhtjax.boundary import require_number
 from hhtjax.flat_system import initial_values
+from hhtjax.steppers.stepper import require_stepper
 
 
 class ObservedOrder(NamedTuple):

@@ -11,8 +11,8 @@ from hhtjax.analysis.amplification import (
     oscillator_params,
     oscillator_roots,
 )
-from hhtjax.analysis.checks import require_stepper
 from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.steppers.stepper import require_stepper
 
 
 def _principal_rate(caller, stepper, frequency, damping):

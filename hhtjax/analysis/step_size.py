@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.analysis.amplification import eigenvalues
-from hhtjax.analysis.checks import require_stepper
 from hhtjax.analysis.oscillator import damping_ratio, period_elongation
 from hhtjax.boundary import require_number
 from hhtjax.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.flat_system import flatten, initial_values
-from hhtjax.steppers.stepper import require_capable
+from hhtjax.steppers.stepper import require_capable, require_stepper
 from hhtjax.system import LinearSystem, System
 
 # of suggest_step_size

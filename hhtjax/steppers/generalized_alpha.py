@@ -130,7 +130,7 @@ class GeneralizedAlpha(Stepper):
 
     def corrected(self, system, v, w, wdot, dt):
         """a0 of second order: w0 + (alpha_m - alpha_f) h times the rate of psiddot, or of v."""
-        if system.blocks and self.options.kinematics == "chart":
+        if self.options.kinematics == "chart":
             wdot = kinematics.chart_jerk(system.blocks, v, w, wdot)
         return w + (self.coefficients.alpha_m - self.coefficients.alpha_f) * dt * wdot
 
@@ -156,7 +156,7 @@ class GeneralizedAlpha(Stepper):
         """State at t + dt, given its acceleration, the displacement changed by `shift`."""
         x, *rates = self.advance(s, dt, w)
         x = x if shift is None else x - shift
-        if system.blocks and self.options.kinematics == "chart":
+        if self.options.kinematics == "chart":
             rates = kinematics.end_of_chart(system.blocks, x, *rates)
         return State(s.t + dt, system.move(s.q, x), *rates)
 

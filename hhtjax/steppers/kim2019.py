@@ -100,15 +100,13 @@ class ConventionalHHT(Stepper):
                 a = z[:n]
                 x = dt * s.v + dt**2 * ((0.5 - beta) * s.w + beta * a)
                 v = s.v + dt * ((1 - gamma) * s.w + gamma * a)
-                if system.blocks:
-                    v, a, _ = kinematics.end_of_chart(system.blocks, x, v, a, a)
+                v, a, _ = kinematics.end_of_chart(system.blocks, x, v, a, a)
                 return State(s.t + dt, system.move(s.q, x), v, a, L=z[n:] if m else None, memory=x)
 
             def r(s1):
                 now = system.inertia(s1.q, s1.w, params) - (1 + alpha) * force(s1, s.t + late)
-                if system.blocks:  # both terms in components that work on the rate of x; for Q0 that is so already
-                    now = kinematics.pull_back(system.blocks, s1.memory, now)
-                now = now + alpha * Q0
+                # both terms in components that work on the rate of x; for Q0 that is so already
+                now = kinematics.pull_back(system.blocks, s1.memory, now) + alpha * Q0
                 if not m:
                     return now
                 return jnp.concatenate([now, system.constraint(s1.q, s1.t, params) / (beta * dt**2)])

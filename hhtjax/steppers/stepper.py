@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax import kinematics
 from hhtjax.description import Description
 from hhtjax.flat_system import flatten, initial_values
+from hhtjax.system import FirstOrderSystem, LinearSystem, System
 
 
 class State(NamedTuple):
@@ -96,6 +97,18 @@ class Stepper(Description):
         step = self.astype(q.dtype).bind(flat, params, jnp.asarray(dt).astype(q.dtype))
         state, info = step(State(state.t, q, v, w, a, state.L, state.memory))
         return _unravel(flat, state), info
+
+
+def require_stepper(caller, stepper):
+    """An error for what is no stepper."""
+    if not isinstance(stepper, Stepper):
+        raise TypeError(f"{caller}: `stepper` must be a stepper such as hht(); received {stepper!r}.")
+
+
+def require_system(caller, system):
+    """An error for what is no system."""
+    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
+        raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
 
 
 def require_capable(caller, system, stepper, q0, v0):
