@@ -17,7 +17,8 @@ from jax import lax
 
 from hhtjax.description import is_concrete
 from hhtjax.flat_system import flatten, initial_values
-from hhtjax.linear_solve import RANK_TOLERANCE, UNROLLED, factorize, factorize_least_squares, matvec, solve_map
+from hhtjax.linear_solve import RANK_TOLERANCE, UNROLLED, factorize, factorize_least_squares, matrix, matvec, solve_map
+from hhtjax.staging import staged
 
 MAX_ITERATIONS = 50
 CONSISTENT = 1e-6  # relative distance of initial values from consistent ones that passes
@@ -153,8 +154,12 @@ def correction(system, q, t, params, rows, factorize):
 
 def jacobian(system, q, t, params):
     """B: (m, n)."""
-    rows = jnp.eye(system.num_constraints, dtype=q.dtype)
-    return jax.vmap(lambda L: reaction(system, q, t, params, L))(rows)
+
+    def linearize(q):
+        return jax.linearize(lambda q: system.constraint(q, t, params), q)[1]
+
+    tangent = staged(linearize, system.size)(q)
+    return matrix(lambda x: tangent(system.rate(q, x)), jnp.zeros(system.size, q.dtype))
 
 
 def nearest_position(system, q0, t, params, factorize):
@@ -242,11 +247,13 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None):
     """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params)))):
         return
-    B, found = examine(system, q0, v0, t0, params, redundant)
+    with jax.ensure_compile_time_eval():  # under jit too
+        B, found = examine(system, q0, v0, t0, params, redundant)
+        found = jax.tree.map(float, found)
     if redundant is None:
         require_independent(caller, np.asarray(B))
     for name, meaning, x, (violated, distance) in zip(("q0", "v0"), ("Phi", "dPhi/dt"), (q0, v0), found, strict=True):
-        size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(x))
+        size = max(np.max(np.abs(leaf)) for leaf in jax.tree.leaves(x))
         if not distance <= CONSISTENT * (1 + size):
             raise ValueError(
                 f"{caller}: `{name}` violates the constraint: max|{meaning}| = {violated:.3g}, {distance:.3g} away "

@@ -23,8 +23,12 @@ def solve_map(f, b, factorize):
     The matrix of f only serves to find x. Derivatives pass through f itself, f(dx) = db - df(x): one
     direction, where differentiating the matrix would take n.
     """
-    A = jax.vmap(f, out_axes=1)(jnp.eye(b.size, dtype=b.dtype))
-    return _solve(f, b, factorize(A))
+    return _solve(f, b, factorize(matrix(f, b)))
+
+
+def matrix(f, b):
+    """The matrix of a linear map f of vectors like b."""
+    return jax.vmap(f, out_axes=1)(jnp.eye(b.size, dtype=b.dtype))
 
 
 def _solve(f, b, inverse):

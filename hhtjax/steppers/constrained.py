@@ -16,6 +16,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from hhtjax.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
 from hhtjax.linear_solve import matvec, solve
@@ -83,7 +84,15 @@ def bind_constrained(method, system, params, dt):
                 z = linearized_solve(r, path, z, factorize)
             info = Info()
         s1 = system.tidy(path(z))
-        row = dependent_row(B) if method.redundant is None else None
-        return s1, report(system, params, s1, info, row)
+        return s1, report(system, params, s1, info, None if method.redundant else dependent(s, s1, B))
+
+    def dependent(s, s1, B):
+        """The row that depends on others at the start of the step, or, if the step failed, at its predicted end."""
+
+        def at_end():
+            predicted = method.arrive(system, s, dt, s.w)
+            return dependent_row(jacobian(system, predicted.q, predicted.t, params))
+
+        return lax.cond(jnp.all(jnp.isfinite(s1.w)), lambda: dependent_row(B), at_end)
 
     return step

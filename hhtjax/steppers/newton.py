@@ -1,10 +1,13 @@
 """How a step is solved: by one linearisation, or by Newton's iteration."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.linear_solve import solve_map
+from hhtjax.linear_solve import matrix, solve_map
+from hhtjax.staging import staged
 from hhtjax.steppers.stepper import Info
 
 
@@ -13,11 +16,16 @@ def linearized_solve(r, path, w, factorize, at=None):
 
     One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
     """
-    start, along = jax.linearize(path, w)
-    point = start if at is None else at
-    value, tangent = jax.linearize(r, point)
-    if at is not None:
-        value = value + tangent(jax.tree.map(jnp.subtract, start, point))
+
+    def expand(w, at):
+        start, along = jax.linearize(path, w)
+        point = start if at is None else at
+        value, tangent = jax.linearize(r, point)
+        if at is not None:
+            value = value + tangent(jax.tree.map(jnp.subtract, start, point))
+        return value, along, tangent
+
+    value, along, tangent = staged(expand, w.size)(w, at)
     return w - solve_map(lambda dw: tangent(along(dw)), value, factorize)
 
 
@@ -41,7 +49,8 @@ def newton(r, path, w, s, factorize, tolerance, max_iterations):
 
         def improve(carry):
             w0, value, iterations, _ = carry
-            w1 = w0 - factorize(jax.jacfwd(f)(w0))(value, trans=0)
+            _, tangent = staged(partial(jax.linearize, f), w.size)(w0)
+            w1 = w0 - factorize(matrix(tangent, w))(value, trans=0)
             value = f(w1)
             converged = jnp.all(jnp.abs(value) <= tolerance) | lost_in_rounding(path(w0), path(w1))
             return w1, value, iterations + 1, converged
