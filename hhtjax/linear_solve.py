@@ -23,8 +23,13 @@ def solve_map(f, b, factorize):
     The matrix of f only serves to find x. Derivatives pass through f itself, f(dx) = db - df(x): one
     direction, where differentiating the matrix would take n.
     """
-    A = jax.vmap(f, out_axes=1)(jnp.eye(b.size, dtype=b.dtype))
-    return _solve(f, b, factorize(A))
+    return factorize_map(f, b, factorize)(b)
+
+
+def factorize_map(f, like, factorize):
+    """The function b -> x with f(x) = b, for vectors like `like`: `solve_map` for many b, factorised once."""
+    inverse = factorize(jax.vmap(f, out_axes=1)(jnp.eye(like.size, dtype=like.dtype)))
+    return lambda b: _solve(f, b, inverse)
 
 
 def _solve(f, b, inverse):
