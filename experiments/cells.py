@@ -20,8 +20,13 @@ class Reference(NamedTuple):
     reach: float
 
 
-def march(stepper, start, scene, num_steps):
-    """q at the sample times, its largest distance from q0, how often Newton failed, from the state `start`.
+def position(state):
+    """What `march` records by default."""
+    return state.q
+
+
+def march(stepper, start, scene, num_steps, record=position):
+    """`record(state)` at the sample times, the largest distance of q from q0, how often Newton failed.
 
     A loop with a traced num_steps, not `hhtjax.simulate`, so that all step sizes share one compilation.
     """
@@ -31,11 +36,12 @@ def march(stepper, start, scene, num_steps):
     def step(i, carry):
         state, path, farthest, failures = carry
         state, info = stepper.step(scene.system, state, scene.params, dt)
-        path = path.at[i // steps_between].set(state.q)  # the last one to write is the one on time
+        # the last one to write is the one on time
+        path = jax.tree.map(lambda x, new: x.at[i // steps_between].set(new), path, record(state))
         farthest = jnp.maximum(farthest, jnp.max(jnp.abs(state.q - scene.q0)))
         return state, path, farthest, failures + (0 if info.converged is None else ~info.converged)
 
-    path = jnp.zeros((SAMPLES, scene.q0.size))
+    path = jax.tree.map(lambda x: jnp.zeros((SAMPLES, *x.shape)), record(start))
     return jax.lax.fori_loop(0, num_steps, step, (start, path, 0.0, 0))[1:]
 
 

@@ -94,7 +94,7 @@ def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:
 
     Where it fails: its Jacobian is that of the start of the step, so a stiff direction that turns (an elastic pendulum
     on its slow manifold), or a contact that begins within the step, can need a step up to 16 times as short
-    as that of `hht`. Constraints are refused.
+    as that of `hht` (`python -m experiments stability`). Constraints are refused.
 
     Args:
         rho_inf: rho, the spectral radius at infinite frequency, in [0, 1]; a number, or a tracer to differentiate.
