@@ -47,7 +47,7 @@ def page(outcomes, causes):
     """Every cell: scenes down, with a line on why methods fail; methods across; the step shrinks to the right."""
     first = next(iter(outcomes.values()))
     methods, columns = list(first), len(next(iter(first.values())).error)
-    figure, axes = plt.subplots(figsize=(max(7.4, 0.9 + 0.78 * len(methods)), 1.3 + 0.52 * len(outcomes)))
+    figure, axes = plt.subplots(figsize=(max(7.4, 0.9 + 0.72 * len(methods)), 1.3 + 0.52 * len(outcomes)))
     style = {
         "cmap": ListedColormap(list(GRADES.values())),
         "vmin": 0,

@@ -54,7 +54,8 @@ METHODS = {
     "RK4": Method(lambda _: hhtjax.rk4(), damped=False),
 }
 REFERENCE = "HHT\nconverged"
-FAST = ("HHT\nconverged", "HHT\nauto", "Rosenbrock")
+FAST = ("HHT\nconverged", "HHT\nauto", "Rosenbrock")  # methods and scenes of the smoke run
+FAST_SCENES = ("hardening spring", "negative damping")
 
 
 @partial(jax.jit, static_argnames="method")
@@ -159,10 +160,9 @@ CAUSES = {
     "chain of four links": "Stiff joints at rest: followed by all but RK4, which must resolve them.",
     "elastic pendulum, k = 1e4": SLOW,
     "elastic pendulum, k = 1e6": SLOW,
-    "elastic pendulum, k = 1e8": SLOW,
     "hardening spring": "The predictor overshoots to where the cubic force is huge; held and state stay nearer.",
     "cubic damper": "The predictor's velocity jumps past zero, and the cube drives it on; the state's is right.",
-    "quadratic drag": "As above, for held, too, whose q + h v is far off; L-stable methods and state come through.",
+    "quadratic drag": "As above, for held, too. L-stable Rosenbrock, Houbolt, Park and Euler stay bounded.",
     "tanh friction": "Friction saturates and so bounds every method; accuracy needs the onset of sticking resolved.",
     "van der Pol, mu = 1000": "No step resolves the jumps: where a run goes is chance. Houbolt, Park and held last.",
     "Hertz contact": CONTACT,
@@ -180,7 +180,7 @@ def run(report, fast):
     """All scenes, methods, alphas and step sizes."""
     outcomes, sizes, references = {}, {}, {}
     for case in all_cases():
-        if fast and not case.fast:
+        if fast and case.name not in FAST_SCENES:
             continue
         steps = [case.fewest * 2**i for i in range(HALVINGS)][:: 2 if fast else 1]
         reference = solve_reference(case)
