@@ -11,8 +11,9 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from experiments.cells import FARTHEST  # noqa: E402
+from experiments.stability.gallery import METHODS, simulate_all  # noqa: E402
+from experiments.stability.grades import plain  # noqa: E402
 from experiments.stability.scenes import all_cases  # noqa: E402
-from experiments.stability.stability import METHODS, plain, simulate_all  # noqa: E402
 
 # "boundaries" of stability.json, from `python -m experiments stability`: for each scene and method, and for alpha = 0,
 # -0.05 and -0.3, the fewest steps from which on every run stays bounded; null where the finest does not

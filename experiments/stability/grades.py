@@ -43,6 +43,27 @@ def boundary(outcome, sizes):
     return steps
 
 
+def plain(method):
+    """The name of a method in one line."""
+    return method.replace("\n", " ")
+
+
+def cells(outcomes, sizes):
+    """Errors with three digits, and what is bounded."""
+
+    def rounded(x):
+        return [[float(f"{y:.3g}") if np.isfinite(y) else None for y in row] for row in x]
+
+    return {
+        scene: {
+            "num_steps": sizes[scene],
+            "error": {plain(m): rounded(x.error) for m, x in by_method.items()},
+            "bounded": {plain(m): x.bounded.tolist() for m, x in by_method.items()},
+        }
+        for scene, by_method in outcomes.items()
+    }
+
+
 def page(outcomes, causes):
     """Every cell: scenes down, with a line on why methods fail; methods across; the step shrinks to the right."""
     first = next(iter(outcomes.values()))

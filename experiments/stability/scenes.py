@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from experiments.linearization.scenes import Case, cases, spring_and_weight, unit_mass
+from experiments.linearization.scenes import Case, cases, elastic_pendulum, spring_and_weight, unit_mass
 from hhtjax.scenes import Scene
 
 
@@ -62,6 +62,7 @@ def hardening_chain() -> Scene:
 def held_out() -> list[Case]:
     """Scenes on which nothing was tuned."""
     return [
+        Case("elastic pendulum, k = 1e8", elastic_pendulum(1e8), 16, "DOP853"),
         Case("elastic pendulum, ringing", ringing_pendulum(), 16, "DOP853"),
         Case("sudden stiffness", sudden_stiffness(), 8, "DOP853"),
         Case("negative damping", negative_damping(), 8, "DOP853"),
