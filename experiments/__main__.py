@@ -20,6 +20,7 @@ EXPERIMENTS = {
     "kim2019": "kim2019.kim2019",
     "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",
     "linearization": "linearization.linearization",
+    "stability": "stability.stability",
     "gradient_cost": "benchmarks.gradient_cost",
 }
 HERE = Path(__file__).parent

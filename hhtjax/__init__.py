@@ -11,6 +11,8 @@ from hhtjax.sampled import sampled as sampled
 from hhtjax.simulate import SimulationError as SimulationError
 from hhtjax.simulate import interpolate as interpolate
 from hhtjax.simulate import simulate as simulate
+from hhtjax.steppers.collocation import collocation as collocation
+from hhtjax.steppers.collocation import wilson as wilson
 from hhtjax.steppers.explicit import rk4 as rk4
 from hhtjax.steppers.generalized_alpha import bossak as bossak
 from hhtjax.steppers.generalized_alpha import generalized_alpha as generalized_alpha
@@ -20,6 +22,10 @@ from hhtjax.steppers.implicit_euler import implicit_euler as implicit_euler
 from hhtjax.steppers.kim2019 import conventional_hht as conventional_hht
 from hhtjax.steppers.kim2019 import kim_hht as kim_hht
 from hhtjax.steppers.kim2019 import kim_implicit_euler as kim_implicit_euler
+from hhtjax.steppers.multistep import houbolt as houbolt
+from hhtjax.steppers.multistep import park as park
+from hhtjax.steppers.rosenbrock import rosenbrock as rosenbrock
+from hhtjax.steppers.rosenbrock import rowda as rowda
 from hhtjax.steppers.splitting import operator_splitting as operator_splitting
 from hhtjax.system import FirstOrderSystem as FirstOrderSystem
 from hhtjax.system import LinearSystem as LinearSystem

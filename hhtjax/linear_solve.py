@@ -23,12 +23,18 @@ def solve_map(f, b, factorize):
     The matrix of f only serves to find x. Derivatives pass through f itself, f(dx) = db - df(x): one
     direction, where differentiating the matrix would take n.
     """
-    return _solve(f, b, factorize(matrix(f, b)))
+    return factorize_map(f, b, factorize)(b)
 
 
-def matrix(f, b):
-    """The matrix of a linear map f of vectors like b."""
-    return jax.vmap(f, out_axes=1)(jnp.eye(b.size, dtype=b.dtype))
+def factorize_map(f, like, factorize):
+    """The function b -> x with f(x) = b, for vectors like `like`: `solve_map` for many b, factorised once."""
+    inverse = factorize(matrix(f, like))
+    return lambda b: _solve(f, b, inverse)
+
+
+def matrix(f, like):
+    """The matrix of a linear map f of vectors like `like`."""
+    return jax.vmap(f, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
 
 
 def _solve(f, b, inverse):

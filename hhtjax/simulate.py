@@ -24,12 +24,17 @@ class SimulationError(RuntimeError):
 
 class Failure(NamedTuple):
     """The first step that failed. step: its number, from 1, or 0 if none did; newton: True if Newton's
-    iteration failed while the state was still finite; row: number, from 1, of the constraint that came to depend
-    on those before it, 0 if none did, None without constraints."""
+    iteration failed while the state was still finite; quantity: index into QUANTITIES of the first that is not finite;
+    row: number, from 1, of the constraint that came to depend on those before it, 0 if none did, None without
+    constraints."""
 
     step: Any
     newton: Any
+    quantity: Any
     row: Any = None
+
+
+QUANTITIES = "the position q", "the velocity v", "the acceleration", "the vector of multipliers"
 
 
 class Solution(NamedTuple):
@@ -52,31 +57,61 @@ class Solution(NamedTuple):
     info: Info
     failure: Failure
 
-    def check(self):
-        """Raises `SimulationError` naming the first bad step and why; silent when all is well.
+    def check(self, reach=None):
+        """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
+
+        reach: how far q may get from its start, in any coordinate and its unit. A run that gets farther has blown up,
+        although it is finite still, and is named by the first saved time. By default q may go anywhere.
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
         if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t)))):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         steps = np.asarray(self.failure.step)
-        if not steps.any():
+        strays = np.zeros_like(steps)
+        if reach is not None:
+            require_number("check", "reach", reach, lambda x: x > 0, "be positive")
+            strays = self._first_beyond(reach)
+            strays = np.where((steps > 0) & (steps <= strays), 0, strays)
+        bad = np.where(strays > 0, strays, steps)
+        if not bad.any():
             return
-        member = tuple(int(i) for i in np.argwhere(steps)[0])
-        row = 0 if self.failure.row is None else np.asarray(self.failure.row)[member]
-        step, newton, dt, start = (np.asarray(x)[member] for x in (*self.failure[:2], self.dt, self.t[..., 0]))
-        failed = f"({np.count_nonzero(steps)} of {steps.size} failed)"
+        member = tuple(int(i) for i in np.argwhere(bad)[0])
+        step, dt, start = (np.asarray(x)[member] for x in (bad, self.dt, self.t[..., 0]))
+        failed = f"({np.count_nonzero(bad)} of {bad.size} failed)"
         which = f"member {', '.join(map(str, member))} {failed}, " if member else ""
         why = (
-            "Newton's iteration did not converge; the state is still finite. Take a smaller dt, "
-            "or more max_iterations, or a larger tolerance"
-            if newton
-            else f"row {row - 1} of the constraint depends on the rows before it: the position is singular. Give the "
-            'stepper redundant="least_squares", or formulate the constraint anew'
-            if row
-            else "the state is not finite. Take a smaller dt, or another linearize=, or a method that damps"
+            f"the position q is farther than {reach:g} from its start. Take a smaller dt, or a method that damps"
+            if strays[member]
+            else self._why(member)
         )
         raise SimulationError(f"simulate: {which}step {step} (to t = {start + step * dt:.6g}) failed: {why}.")
+
+    def _why(self, member):
+        """What `failure` says of one member of a batch."""
+        _, newton, quantity, row = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        if newton:
+            return (
+                "Newton's iteration did not converge; the state is still finite. Take a smaller dt, or more "
+                "max_iterations, or a larger tolerance"
+            )
+        if row:
+            return (
+                f"row {row - 1} of the constraint depends on the rows before it: the position is singular. Give the "
+                'stepper redundant="least_squares", or formulate the constraint anew'
+            )
+        names = ("the position", "y", "y'") if self.acceleration is None else QUANTITIES
+        return f"{names[quantity]} is not finite. Take a smaller dt, or another linearize=, or a method that damps"
+
+    def _first_beyond(self, reach):
+        """Step of the first saved time at which q is farther than `reach` from its start; 0 if none is."""
+        t, axis = np.asarray(self.t), self.t.ndim - 1
+        far: Any = np.zeros(t.shape, bool)
+        for q in map(np.asarray, jax.tree.leaves(self.q)):
+            with np.errstate(invalid="ignore"):
+                far |= (abs(q - np.take(q, [0], axis)) > reach).any(axis=tuple(range(axis + 1, q.ndim)))
+        elapsed = np.take_along_axis(t, far.argmax(axis)[..., None], axis)[..., 0] - t[..., 0]
+        return np.rint(elapsed / np.asarray(self.dt)).astype(int)
 
 
 def simulate(
@@ -172,7 +207,8 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
 
     start = stepper.begin(flat, q, v, t0, params, dt)
     no_info = _no_info(jax.eval_shape(take_step, start)[1])
-    failure = Failure(jnp.zeros((), jnp.int32), jnp.array(False), no_info.dependent_row)
+    none = jnp.zeros((), jnp.int32)
+    failure = Failure(none, jnp.array(False), none, no_info.dependent_row)
     (_, _, failure), (path, info) = checkpointed_scan(
         interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every
     )
@@ -184,10 +220,11 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
 
 def _first_failure(failure, count, state, info):
     """The failure so far, or this step's."""
-    finite = jnp.all(jnp.isfinite(state.v) & jnp.isfinite(state.w))
-    for x in (state.q, state.L):
-        if x is not None:
-            finite = finite & jnp.all(jnp.isfinite(x))
+    known = [(i, x) for i, x in enumerate((state.q, state.v, state.w, state.L)) if x is not None]
+    quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
+    for i, x in reversed(known):
+        fine = jnp.all(jnp.isfinite(x))
+        quantity, finite = jnp.where(fine, quantity, i), finite & fine
     failed, newton, row = ~finite, finite, failure.row
     if info.converged is not None:
         failed = failed | ~info.converged
@@ -196,7 +233,8 @@ def _first_failure(failure, count, state, info):
     first = failed & (failure.step == 0)
     if info.dependent_row is not None:
         row = jnp.where(first, info.dependent_row, failure.row)
-    return Failure(jnp.where(first, count, failure.step), jnp.where(first, newton, failure.newton), row)
+    step, quantity = (jnp.where(first, new, old) for new, old in ((count, failure.step), (quantity, failure.quantity)))
+    return Failure(step, jnp.where(first, newton, failure.newton), quantity, row)
 
 
 def _no_info(shapes):

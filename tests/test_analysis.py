@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 import hhtjax
 from hhtjax import analysis
-from hhtjax.scenes import pendulum, squeezer, top
+from hhtjax.scenes import duffing, pendulum, squeezer, top
 
 FREQUENCIES = np.geomspace(1e-3, 1e6, 46)
 
@@ -336,6 +336,27 @@ def test_suggested_step_of_an_explicit_method_is_a_stable_one():
     assert stable <= 1 < unstable
 
 
+def test_a_duration_asks_for_the_error_of_the_motion():
+    """The step at which the motion of a hardening spring is off by 2 %, whatever its mode at the start."""
+    scene = duffing.hardening_spring()
+    stepper = as_data(hhtjax.hht(-0.05))
+    found = analysis.suggest_step_size(
+        scene.system, stepper, scene.q0, scene.v0, scene.params, tolerance=0.02, duration=scene.duration
+    )
+    reference = hhtjax.simulate(
+        scene.system, hhtjax.rk4(), scene.q0, scene.v0, scene.params, dt=scene.duration / 2**14, num_steps=2**14
+    ).q
+    steps = round(scene.duration / found.dt)
+    path = hhtjax.simulate(
+        scene.system, hhtjax.hht(-0.05), scene.q0, scene.v0, scene.params, dt=scene.duration / steps, num_steps=steps
+    )
+    exact = np.interp(np.asarray(path.t), np.linspace(0, scene.duration, 2**14 + 1), np.asarray(reference)[:, 0])
+    error = np.std(np.asarray(path.q)[1:, 0] - exact[1:]) / np.std(exact)
+    assert error == pytest.approx(0.02, rel=0.2)
+    assert "0.02 of its motion over 2 s" in found.reason
+    assert len(found.modes) == 1
+
+
 def test_modes_of_a_constrained_system_satisfy_its_constraints():
     """Of the pendulum at its lowest point, the tension held: one, of m l w^2 = m g + m v^2/l."""
     scene = pendulum.cartesian(speed=2.5)
@@ -397,6 +418,8 @@ SUGGEST = partial(analysis.suggest_step_size, SPRING, hhtjax.hht(), jnp.ones(1),
         (lambda: ORDER(duration=1.0, num_steps=(2, 4, 5)), ValueError, "`num_steps` must be a geometric sequence"),
         (lambda: SUGGEST(tolerance=0.0), ValueError, r"`tolerance` must lie in \(0, 1\)"),
         (lambda: SUGGEST(tolerance=1e-15), ValueError, "no step keeps the mode at 1 rad/s"),
+        (lambda: SUGGEST(duration=0.0), ValueError, "`duration` must be positive"),
+        (lambda: SUGGEST(duration=1.0, highest=2.0), ValueError, "`highest` must be left out"),
         (lambda: SUGGEST(highest=0.5), ValueError, "`highest` must reach the slowest mode, 1 rad/s"),
         (
             lambda: analysis.suggest_step_size(FREE, hhtjax.hht(), jnp.ones(1), jnp.zeros(1)),

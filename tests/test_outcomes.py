@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -35,18 +36,25 @@ def first_not_finite(path):
     return 0 if finite.all() else int(np.argmin(finite))
 
 
+def what_failed(path, step):
+    """What a message says of that step: the first quantity that is not finite there."""
+    names = {"position q": path.q, "velocity v": path.v, "acceleration": path.acceleration}
+    return f"the {next(name for name, x in names.items() if not np.isfinite(x[step]).all())} is not finite."
+
+
 BREAKING = [(push, "rk4")] + [(bounded, name) for name in ("rk4", "hht state", "kim_implicit_euler")]
 
 
 @pytest.mark.parametrize(("force", "name"), BREAKING)
 def test_check_names_the_first_step_that_is_not_finite(force, name):
     arguments = System(ONE, force), STEPPERS[name], 0.2 * ONE, ONE, 4000.0
-    step = first_not_finite(run(*arguments, num_steps=20))
+    path = run(*arguments, num_steps=20)
+    step = first_not_finite(path)
     assert 1 < step < 20
     assert step % 5 != 0
     for save_every in (1, 5):
         solution = run(*arguments, t0=3.0, num_steps=20, save_every=save_every)
-        message = f"simulate: step {step} (to t = {3 + 0.1 * step:.6g}) failed: the state is not finite."
+        message = f"simulate: step {step} (to t = {3 + 0.1 * step:.6g}) failed: {what_failed(path, step)}"
         check_message(SimulationError, message, solution.check)
 
 
@@ -65,8 +73,8 @@ def test_check_names_the_bad_member_of_a_batch():
     steps = [first_not_finite(member(*x)) for x in zip(k, dt, t0, strict=True)]
     assert steps[0] == steps[2] == 0
     assert 1 < steps[1] < 20
-    time = f"{2 + 0.04 * steps[1]:.6g}"
-    message = f"member 1 (1 of 3 failed), step {steps[1]} (to t = {time}) failed: the state is not finite."
+    why = what_failed(member(*(x[1] for x in (k, dt, t0))), steps[1])
+    message = f"member 1 (1 of 3 failed), step {steps[1]} (to t = {2 + 0.04 * steps[1]:.6g}) failed: {why}"
     for save_every in (1, 5):
         batch = jax.vmap(lambda *x, save_every=save_every: member(*x, save_every))(k, dt, t0)
         check_message(SimulationError, message, batch.check)
@@ -77,6 +85,38 @@ def test_check_names_the_first_of_several_bad_members_in_two_axes():
     batch = jax.vmap(jax.vmap(lambda k: run(BLOW_UP, params=k, num_steps=20)))(k)
     step = first_not_finite(run(BLOW_UP, params=1e3, num_steps=20))
     check_message(SimulationError, f"simulate: member 0, 2 (2 of 6 failed), step {step} (to t = ", batch.check)
+
+
+def test_check_names_where_a_run_that_stays_finite_gets_too_far():
+    """exp(t) of w = q, from 1: beyond 1 + reach at the saved time after log(1 + reach). Of a batch, the first."""
+
+    def grow(q, v, t, params):
+        return jax.tree.map(lambda x: params * x, q)
+
+    start = {"a": ONE, "b": jnp.zeros((2, 2))}
+
+    def member(k, save_every=1):
+        return run(System(jnp.ones(5), grow), hhtjax.rk4(), start, start, params=k, num_steps=20, save_every=save_every)
+
+    for save_every, step in ((1, 11), (4, 12)):  # exp(1.1) = 3.004
+        solution = member(1.0, save_every)
+        solution.check(reach=6.5)  # exp(2) = 7.39
+        message = f"simulate: step {step} (to t = {step / 10}) failed: the position q is farther than 2 from its start."
+        check_message(SimulationError, message, partial(solution.check, reach=2.0))
+    batch = jax.vmap(member)(jnp.array([-1.0, 1.0]))
+    check_message(SimulationError, "member 1 (1 of 2 failed), step 11", partial(batch.check, reach=2))
+    with pytest.raises(ValueError, match="check: `reach` must be positive; received 0"):
+        batch.check(reach=0)
+
+
+def test_what_comes_first_is_named():
+    """A run that is too far before it stops being finite, and one that never is."""
+    path = run(BLOW_UP, STEPPERS["rk4"], 0.2 * ONE, ONE, 4000.0, num_steps=20)
+    step = first_not_finite(path)
+    far = int(np.argmax(np.abs(path.q[:, 0] - 0.2) > 1e3))
+    assert 0 < far < step
+    check_message(SimulationError, f"step {far} (to t = {far / 10:.6g}) failed: the position", lambda: path.check(1e3))
+    check_message(SimulationError, f"step {step} (", lambda: path.check(1e306))
 
 
 def kick(q, v, t, params):

@@ -65,6 +65,9 @@ STEPPERS = {
     "kim_implicit_euler": hhtjax.kim_implicit_euler(),
     "implicit_euler": hhtjax.implicit_euler(),
     "operator_splitting": hhtjax.operator_splitting(alpha=-0.1),
+    "houbolt": hhtjax.houbolt(),
+    "wilson": hhtjax.wilson(),
+    "rowda": hhtjax.rowda(),
     "rk4": hhtjax.rk4(),
 }
 

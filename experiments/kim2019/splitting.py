@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.linearization.linearization import FARTHEST, SAMPLES, relative_error, solve_reference
+from experiments.cells import FARTHEST, SAMPLES, relative_error, solve_reference
 from experiments.linearization.scenes import Case
 from experiments.report import COLOURS, MARKERS
 from hhtjax import System, hht, operator_splitting, simulate

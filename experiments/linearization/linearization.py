@@ -11,7 +11,7 @@ acceleration, and with a step far longer than the fastest decay that alone can t
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.patches import Patch
-from scipy.integrate import solve_ivp
 
+from experiments.cells import (
+    ACCURATE,
+    FARTHEST,
+    geometric_mean,
+    march,
+    relative_error,
+    solve_reference,
+)
 from experiments.linearization.scenes import cases
 from hhtjax import hht
 
@@ -34,17 +41,6 @@ METHODS = {
     "auto": {"linearize": "auto"},
 }
 HALVINGS = 10  # step sizes: so many, each half the one before
-SAMPLES = 64  # times at which q is compared; the coarsest runs hit a part of them
-ACCURATE = 0.05
-FARTHEST = 10.0
-
-
-class Reference(NamedTuple):
-    """q: at the sample times, (SAMPLES, n); motion: its RMS about its mean; reach: its largest distance from q0."""
-
-    q: np.ndarray
-    motion: float
-    reach: float
 
 
 class Outcome(NamedTuple):
@@ -62,71 +58,15 @@ class Outcome(NamedTuple):
 
 @partial(jax.jit, static_argnames="method")
 def simulate_all(scene, num_steps, method):
-    """For each start and alpha: q at the sample times, its largest distance from q0, how often Newton failed.
-
-    A loop with a traced num_steps, not `hhtjax.simulate`, so that all step sizes share one compilation.
-    """
-    dt = scene.duration / num_steps
-    steps_between = jnp.maximum(1, num_steps // SAMPLES)
+    """`march` for each start and alpha."""
 
     def simulate_one(corrected, alpha):
         stepper = hht(alpha, start="corrected", **METHODS[method])
-
-        def step(i, carry):
-            state, path, farthest, failures = carry
-            state, info = stepper.step(scene.system, state, scene.params, dt)
-            path = path.at[i // steps_between].set(state.q)  # the last one to write is the one on time
-            farthest = jnp.maximum(farthest, jnp.max(jnp.abs(state.q - scene.q0)))
-            return state, path, farthest, failures + (0 if info.converged is None else ~info.converged)
-
-        start = stepper.init(scene.system, scene.q0, scene.v0, scene.params, dt)
-        start = start._replace(a=jnp.where(corrected, start.a, start.w))
-        path = jnp.zeros((SAMPLES, scene.q0.size))
-        return jax.lax.fori_loop(0, num_steps, step, (start, path, 0.0, 0))[1:]
+        start = stepper.init(scene.system, scene.q0, scene.v0, scene.params, scene.duration / num_steps)
+        return march(stepper, start._replace(a=jnp.where(corrected, start.a, start.w)), scene, num_steps)
 
     corrected = jnp.array([start == "corrected" for start in STARTS])
     return jax.vmap(jax.vmap(simulate_one, (None, 0)), (0, None))(corrected, jnp.array(ALPHAS))
-
-
-def solve_reference(case) -> Reference:
-    """The motion by scipy with tight tolerances."""
-    system, params, q0, v0, duration = case.scene
-    n = q0.size
-
-    @jax.jit
-    def rate(t, y):
-        q, v = y[:n], y[n:]
-        M = jnp.asarray(system.mass(q, params) if callable(system.mass) else system.mass)
-        Q = system.force(q, v, t, params)
-        return jnp.concatenate([v, Q / M if M.ndim == 1 else jnp.linalg.solve(M, Q)])
-
-    jacobian: dict[str, Any] = {"jac": jax.jit(jax.jacfwd(rate, 1))} if case.solver == "Radau" else {}
-    times = np.linspace(0, duration, SAMPLES + 1)
-    run = solve_ivp(
-        lambda t, y: np.asarray(rate(t, y)),
-        (0, duration),
-        np.concatenate([q0, v0]),
-        case.solver,
-        times,
-        rtol=1e-10,
-        atol=1e-12,
-        **jacobian,
-    )
-    q = run.y[:n].T
-    return Reference(q[1:], rms(q - q.mean(axis=0), (0, 1)), np.abs(q - q0).max())
-
-
-def rms(x, axis):
-    """Root mean square; inf where x is too large to be squared."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.sqrt(np.mean(x**2, axis=axis))
-
-
-def relative_error(path, num_steps, reference):
-    """RMS error of q at the sample times that the run hits, over the RMS of the motion."""
-    hit = min(num_steps, SAMPLES)
-    every = SAMPLES // hit
-    return rms(path[..., :hit, :] - reference.q[every - 1 :: every], (-2, -1)) / reference.motion
 
 
 def assess(case, method, sizes, reference) -> Outcome:
@@ -151,11 +91,6 @@ def error_ratios(outcome, converged):
     """Error over that of the converged method, where that one is accurate; an error beyond 100 % counts as 100 %."""
     error = np.nan_to_num(outcome.error, nan=1.0).clip(max=1.0)
     return (error / converged.error)[converged.accurate]
-
-
-def geometric_mean(x):
-    """NaN for nothing."""
-    return float(np.exp(np.mean(np.log(x)))) if len(x) else float("nan")
 
 
 def select(outcomes, *index):

@@ -101,14 +101,14 @@ def chain() -> Scene:
     q: angles of the links from the horizontal. Joints between links: 10^4 N m/rad, 10 N m s/rad.
     """
     outboard = jnp.array([4.0, 3.0, 2.0, 1.0])  # mass that each joint carries
-    common = jnp.minimum(outboard[:, None], outboard)
+    common = jnp.minimum(outboard[:, None], outboard[None, :])
 
     def mass(q, params):
-        return common * jnp.cos(q[:, None] - q)
+        return common * jnp.cos(q[:, None] - q[None, :])
 
     def force(q, v, t, params):
         joints = jnp.append(params["k"] * jnp.diff(q, prepend=0.0) + params["c"] * jnp.diff(v, prepend=0.0), 0.0)
-        centrifugal = jnp.sum(common * jnp.sin(q[:, None] - q) * v**2, axis=1)
+        centrifugal = jnp.sum(common * jnp.sin(q[:, None] - q[None, :]) * v[None, :] ** 2, axis=1)
         return jnp.diff(joints) - centrifugal - 9.81 * outboard * jnp.cos(q)
 
     params = {"k": jnp.array([0.0, 1e4, 1e4, 1e4]), "c": jnp.array([0.0, 10.0, 10.0, 10.0])}

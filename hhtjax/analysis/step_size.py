@@ -8,6 +8,7 @@ import numpy as np
 
 from hhtjax.analysis.amplification import eigenvalues
 from hhtjax.analysis.oscillator import damping_ratio, period_elongation
+from hhtjax.analysis.resolution import step_size_by_runs
 from hhtjax.boundary import require_number
 from hhtjax.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.flat_system import flatten, initial_values
@@ -66,8 +67,12 @@ class StepSize(NamedTuple):
         return "\n".join([f"dt = {self.dt:.3g} s: {self.reason}", *lines])
 
 
-def suggest_step_size(system, stepper, q0, v0, params=None, *, tolerance=1e-2, highest=None, t0=0.0) -> StepSize:
+def suggest_step_size(
+    system, stepper, q0, v0, params=None, *, tolerance=1e-2, highest=None, duration=None, t0=0.0
+) -> StepSize:
     """A step size that resolves the modes of the system linearised at a state, with what each mode then suffers.
+
+    With a duration, one that brings the motion itself within the tolerance.
 
     Small motions x about the state obey  M xddot + C xdot + K x = 0,  C = -Q_v,  K = (M w - Q - B^T L)_q,  and B x = 0
     where there are constraints. Each solution exp(lambda t) becomes powers of an eigenvalue mu of the stepper's
@@ -77,17 +82,23 @@ def suggest_step_size(system, stepper, q0, v0, params=None, *, tolerance=1e-2, h
         highest = None    every mode that oscillates or grows, or where none does, the slowest decay;
         highest           every mode of |lambda| <= highest, in rad/s,
 
-    and for which no mode that decays grows in the steps, resolved or not.
+    and for which no mode that decays grows in the steps, resolved or not. That is quick, and no more than a guide: it
+    knows neither how long the motion lasts, nor how large each mode is, nor what comes later.
+
+    With `duration`, runs with 8, 16, 32, ... steps are made until the RMS error of q, relative to its motion about its
+    mean, stays within the tolerance over [t0, t0 + duration], and the step is the largest that does. It costs about
+    eight times the run that it recommends. Only chance misleads it: runs that agree with each other on what is wrong.
 
     Args:
         system, stepper, q0, v0, params, t0: as in `simulate`; no `FirstOrderSystem`. Modes change along the way, so
             take the stiffest state of the motion. They are those of the frozen state: where it moves fast, they also
             depend on the choice of coordinates.
         tolerance: in (0, 1).
+        duration: s; without `highest`.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; a system without a time scale of its own; a
-            tolerance out of reach; JAX in single precision.
+        TypeError, ValueError: an argument of a wrong kind or value; a system without a time scale of its own (unless
+            there is a duration); a tolerance out of reach; JAX in single precision.
         NotImplementedError: constraints or rotations that the stepper does not know.
 
     Example: masses on a soft and on a stiff spring. The stiff one dictates, unless it is given up.
@@ -108,29 +119,25 @@ def suggest_step_size(system, stepper, q0, v0, params=None, *, tolerance=1e-2, h
     require_number(caller, "tolerance", tolerance, lambda x: 0 < x < 1, "lie in (0, 1)")
     if highest is not None:
         require_number(caller, "highest", highest, lambda x: x > 0, "be positive")
+    if duration is not None:
+        require_number(caller, "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+        if highest is not None:
+            raise ValueError(f"{caller}: `highest` must be left out where there is a `duration`; received {highest}.")
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
     q0, v0 = initial_values(caller, system, q0, v0)
     require_capable(caller, system, stepper, q0, v0)
     rates = _rates(*map(np.asarray, _linearize(system, q0, v0, params, t0)))
-    if not len(rates):
-        raise ValueError(f"{caller}: the `system` has no time scale of its own at q0, v0: take another state.")
-    size, moves = np.abs(rates), (rates.imag > 0) | (rates.real > 0)
-    chosen = size <= highest if highest is not None else moves if moves.any() else size == size[0]
-    if not chosen.any():
-        raise ValueError(f"{caller}: `highest` must reach the slowest mode, {size[0]:.4g} rad/s; received {highest}.")
-
     reach = []
     for rate in rates:
         error, radius = _errors(stepper, rate / abs(rate))
         reach.append((_reach(error > tolerance), _reach(radius > STABLE_RADIUS) if rate.real <= 0 else np.inf))
-    resolved, stable = np.transpose(reach) / size
-    limits = np.concatenate([np.where(chosen, resolved, np.inf), stable])
-    which = int(np.argmin(limits))
-    dt, mode = float(limits[which]), f"the mode at {size[which % len(size)]:.4g} rad/s"
-    if not dt:
-        raise ValueError(f"{caller}: no step keeps {mode} within tolerance={tolerance:g}, or stable.")
-    reason = f"resolves {mode} to {tolerance:g}" if which < len(size) else f"with more, {mode} grows"
+    resolved, stable = np.reshape(reach, (-1, 2)).T / abs(rates)
+    if duration is None:
+        dt, reason = _modal_step(rates, resolved, stable, tolerance, highest)
+    else:
+        dt, most = step_size_by_runs(system, stepper, q0, v0, params, float(t0), float(duration), tolerance)
+        reason = f"keeps q within {tolerance:g} of its motion over {duration:g} s, by runs of up to {most} steps"
 
     modes = []
     for rate, largest in zip(rates, resolved, strict=True):
@@ -140,6 +147,23 @@ def suggest_step_size(system, stepper, q0, v0, params=None, *, tolerance=1e-2, h
         )
         modes.append(Mode(float(W), float(zeta), float(largest), fake, late, bool(dt <= largest)))
     return StepSize(dt, reason, tuple(modes))
+
+
+def _modal_step(rates, resolved, stable, tolerance, highest):
+    """The largest step that resolves the chosen modes and keeps all from growing, and why it is no larger."""
+    caller, size = "suggest_step_size", abs(rates)
+    if not len(rates):
+        raise ValueError(f"{caller}: the `system` has no time scale of its own at q0, v0: take another state.")
+    moves = (rates.imag > 0) | (rates.real > 0)
+    chosen = size <= highest if highest is not None else moves if moves.any() else size == size[0]
+    if not chosen.any():
+        raise ValueError(f"{caller}: `highest` must reach the slowest mode, {size[0]:.4g} rad/s; received {highest}.")
+    limits = np.concatenate([np.where(chosen, resolved, np.inf), stable])
+    which = int(np.argmin(limits))
+    dt, mode = float(limits[which]), f"the mode at {size[which % len(size)]:.4g} rad/s"
+    if not dt:
+        raise ValueError(f"{caller}: no step keeps {mode} within tolerance={tolerance:g}, or stable.")
+    return dt, f"resolves {mode} to {tolerance:g}" if which < len(size) else f"with more, {mode} grows"
 
 
 @jax.jit

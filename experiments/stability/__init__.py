@@ -1,0 +1,1 @@
+"""Where every method fails: methods x scenes x step sizes x numerical damping."""

@@ -1,0 +1,127 @@
+"""README.md beside this file, made from page.md and stability.json.
+
+`python -m experiments.stability.page`
+"""
+
+import json
+from pathlib import Path
+
+from experiments.page import table
+from experiments.stability.peers import MAX_STEPS
+
+HERE = Path(__file__).parent
+
+
+def summary_table(rows):
+    """Shares of cells."""
+    cells = [[*list(row.values())[:-1], "-" if row["ratio"] is None else f"{row['ratio']:.2f}"] for row in rows]
+    return table(list(rows[0]), cells)
+
+
+def advice_table(summary):
+    """How close the advised steps are."""
+    rows = [
+        [f"{100 * float(limit):g} %", e["cases"], e["within_1.5"], f"{e['least']:.2f} ... {e['largest']:.2f}"]
+        for limit, e in summary.items()
+    ]
+    return table(["error", "cases", "within a factor 1.5", "advised over measured"], rows)
+
+
+def misses(entries):
+    """The cases beyond a factor of 1.5, in words."""
+    found = []
+    for e in entries:
+        for limit, measured in e["measured_s"].items():
+            advised = e["advised_s"][limit]
+            if not e["contact"] and measured and (not advised or not 1 / 1.5 < advised / measured < 1.5):
+                ratio = "none advised" if not advised else f"{advised / measured:.2f}"
+                alpha = "" if e["alpha"] is None else f", alpha = {e['alpha']:g}"
+                found.append(f"* {e['scene']}, {e['method']}{alpha}, {100 * float(limit):g} %: {ratio}")
+    return "\n".join(["Beyond that factor:\n", *found]) if found else "None is beyond that factor."
+
+
+def drift_table(entries):
+    """One row per scene and method."""
+    names = list(dict.fromkeys(key for e in entries for key in e["last"]))
+    rows = []
+    for e in entries:
+        cells = (
+            "" if x not in e["last"] else "not finite" if e["last"][x] is None else f"{e['last'][x]:.1e}" for x in names
+        )
+        rows.append([e["scene"], e["method"], f"{1e3 * e['h_s']:g} ms", *cells])
+    return table(["scene", "method", "h", *names], rows)
+
+
+def dampers_table(rows):
+    """Steps and differences."""
+    header = ["c (N m s/rad)", "steps of hht", "its difference (rad)", "steps of Tsit5", "its difference (rad)"]
+    cells = []
+    for row in rows:
+        peer = ["-", "-"]
+        if "tsit5_steps" in row:
+            steps, difference = row["tsit5_steps"], row["tsit5_minus_rowda_rad"]
+            peer = ["stopped", "-"] if steps is None else [steps, f"{difference:.1e}"]
+        cells.append([f"{row['c_N_m_s']:g}", row["hht_steps"], f"{row['hht_minus_rowda_rad']:.1e}", *peer])
+    return table(header, cells)
+
+
+def page(numbers):
+    """The text of README.md."""
+    gallery, reported, advice, peers = (numbers[part] for part in ("gallery", "reported", "advice", "peers"))
+    drift, spin = numbers["drift"], numbers["rotating"]["spin_error"]
+    scenes = gallery["scenes"]
+    first = next(iter(scenes.values()))
+    held = len(scenes) - gallery["tuned_scenes"]
+    missing = peers["not_installed"]
+    return (
+        (HERE / "page.md")
+        .read_text()
+        .format(
+            scenes=len(scenes),
+            methods=len(first["error"]),
+            halvings=len(first["num_steps"]),
+            cells=sum(len(row) for scene in scenes.values() for x in scene["bounded"].values() for row in x),
+            tuned_scenes=gallery["tuned_scenes"],
+            held_scenes=held,
+            tuned=summary_table(gallery["summary_tuned_on"]),
+            held=summary_table(gallery["summary_held_out"]),
+            blown_up=reported["cells"]["all"],
+            named=reported["cells"]["named_by_check"],
+            named_given_reach=reported["cells"]["named_by_check_given_reach"],
+            quantities=table(["what is named", "cells"], reported["named"].items()),
+            wrong=advice["totals"]["silently_wrong"],
+            flagged=advice["totals"]["flagged"],
+            flagged_by_modes=advice["totals"]["flagged_by_modes"],
+            advised_methods=", ".join(dict.fromkeys(e["method"] for e in advice["entries"])),
+            advice=advice_table(advice["summary"]),
+            misses=misses(advice["entries"]),
+            spin_duration=spin["duration_s"],
+            spin=table(
+                ["method", *(f"{n} steps" for n in spin["num_steps"])],
+                [
+                    [name, *("not finite" if x is None else f"{x:.1e}" for x in row)]
+                    for name, row in spin["relative"].items()
+                ],
+            ),
+            drift_steps=drift["num_steps"],
+            drift_alpha=drift["alpha"],
+            drift=drift_table(drift["entries"]),
+            not_installed=f"Not installed where this was made: {', '.join(missing)}. " if missing else "",
+            omega_max=peers["omega_h"][-1],
+            springs=table(
+                ["method", "largest omega h"],
+                [[name, "all" if x is None else f"{x:.3g}"] for name, x in peers["largest_stable_omega_h"].items()],
+            ),
+            max_steps=MAX_STEPS,
+            dampers=dampers_table(peers["dampers"]),
+            rod_duration=peers["rod"]["duration_s"],
+            rods=table(
+                ["method", "relative error of the length"],
+                [[name, f"{x:.1e}"] for name, x in peers["rod"]["error_at_end"].items()],
+            ),
+        )
+    )
+
+
+if __name__ == "__main__":
+    (HERE / "README.md").write_text(page(json.loads((HERE / "stability.json").read_text())))

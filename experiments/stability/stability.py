@@ -1,0 +1,12 @@
+"""Where every method fails, by scene, step size and numerical damping; who notices; long runs; peers."""
+
+from experiments.parts import run_experiment
+from experiments.report import Report
+from experiments.stability import advice, constrained, drift, gallery, peers, reported, rotating
+
+GROUPS = [gallery, reported, advice], [constrained, rotating, drift, peers]  # two processes if fast
+
+
+def run(report: Report, fast: bool):
+    """All parts."""
+    run_experiment(report, GROUPS, fast)

@@ -1,0 +1,109 @@
+"""Collocation methods: the equation of motion holds at t + theta h, beyond the end of the step. Baselines.
+
+    w_c = (1 - theta) w + theta w1                                              at t_c = t + theta h
+    q_c = q + theta h v + (theta h)^2 [(1/2 - beta) w + beta w_c],   v_c = v + theta h [(1 - gamma) w + gamma w_c]
+    M(q_c) w_c = Q(q_c, v_c, t_c)
+
+and q1, v1 are the same with theta = 1 and w1 for w_c. theta = 1 is Newmark's method.
+
+E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1, 1973, 241-252; H. Hilber, T. Hughes, Earthquake Eng.
+Struct. Dyn. 6, 1978, 99-117.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from hhtjax.boundary import require_number
+from hhtjax.linear_solve import factorize
+from hhtjax.steppers.generalized_alpha import Options, check_options, residual
+from hhtjax.steppers.newton import newton
+from hhtjax.steppers.stepper import State, Stepper
+
+
+def newmark_step(s, h, w, beta):
+    """State at t + h by Newmark's formulas with gamma = 1/2, given the acceleration there."""
+    return State(s.t + h, s.q + h * s.v + h**2 * ((0.5 - beta) * s.w + beta * w), s.v + h / 2 * (s.w + w), w)
+
+
+@dataclass(frozen=True, eq=False)
+class Collocation(Stepper):
+    """A collocation method; made by `collocation` and `wilson`."""
+
+    beta: Any
+    theta: Any
+    options: Options
+    order: int = 2
+
+    def begin(self, system, q, v, t, params, dt):
+        """w0 = M^-1 Q."""
+        return State(t, q, v, system.acceleration(q, v, t, params))
+
+    def bind(self, system, params, dt):
+        """Newton for w_c; the state carries w1, which obeys the equation of motion only within O(h^2)."""
+        beta, theta, options = self.beta, self.theta, self.options
+        r = partial(residual, system, params)
+
+        def step(s):
+            def path(w):
+                return newmark_step(s, theta * dt, w, beta)
+
+            w, info = newton(r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
+            return newmark_step(s, dt, s.w + (w - s.w) / theta, beta), info
+
+        return step
+
+
+def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Collocation:
+    """The collocation method of Hilber and Hughes, with gamma = 1/2; formulas at the top of this file.
+
+    Order 2. Unconditionally stable for theta >= 1 and
+
+        theta/(2 (theta + 1)) >= beta >= (2 theta^2 - 1)/(4 (2 theta^3 - 1))
+
+    Started away from rest with a step far beyond a period, the first q1 overshoots by the square of h.
+
+    Args:
+        beta: in (0, 1/4]; theta: 1 or more; numbers, or tracers to differentiate.
+        tolerance, max_iterations: of Newton's iteration, as in `hht`.
+
+    Raises:
+        ValueError, TypeError: an argument out of its range or of the wrong kind.
+
+    References:
+        Hilber, Hughes (1978).
+
+    >>> import hhtjax
+    >>> hhtjax.collocation(beta=0.18, theta=1.287301).order
+    2
+    """
+    return _collocation("collocation", beta, theta, tolerance, max_iterations)
+
+
+def wilson(theta: Any = 1.4, tolerance=1e-10, max_iterations=20) -> Collocation:
+    """Wilson's theta method: acceleration linear in time up to t + theta h, where the equation of motion holds.
+
+    `collocation` with beta = 1/6. Order 2. Unconditionally stable for theta >= 1.366, where 2 theta^2 - 2 theta >= 1.
+    Started away from rest with a step far beyond a period 2 pi/omega, q1 = q [1 - (omega h)^2 (1 - 1/theta)/2].
+
+    Args:
+        theta: 1 or more.
+        tolerance, max_iterations: of Newton's iteration, as in `hht`.
+
+    Raises:
+        ValueError, TypeError: an argument out of its range or of the wrong kind.
+
+    References:
+        Wilson, Farhoomand, Bathe (1973); Cardona, Geradin (1989), Sec. 2.
+
+    >>> import hhtjax
+    >>> hhtjax.wilson().theta
+    1.4
+    """
+    return _collocation("wilson", 1 / 6, theta, tolerance, max_iterations)
+
+
+def _collocation(caller, beta, theta, tolerance, max_iterations):
+    beta = require_number(caller, "beta", beta, lambda x: 0 < x <= 0.25, "lie in (0, 1/4]")
+    theta = require_number(caller, "theta", theta, lambda x: x >= 1, "be 1 or more")
+    return Collocation(beta, theta, check_options(caller, Options(None, None, tolerance, max_iterations)))

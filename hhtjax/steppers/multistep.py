@@ -1,0 +1,145 @@
+"""Houbolt's and Park's methods: backward differences through four times, solved by Newton. Baselines.
+
+J. Houbolt, J. Aeronautical Sciences 17, 1950, 540-550; K. Park, J. Applied Mechanics 42, 1975, 464-470.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.linear_solve import factorize
+from hhtjax.steppers.generalized_alpha import Options, check_options, residual
+from hhtjax.steppers.newton import newton
+from hhtjax.steppers.rosenbrock import rosenbrock
+from hhtjax.steppers.stepper import Info, State, Stepper
+
+STARTER = rosenbrock(rho_inf=0.0)  # of the first two steps: order 2 and damped at infinity, as what follows
+
+
+class Memory(NamedTuple):
+    """q, v: (2, n), by how much they changed in the last step and in the one before; count: of the steps taken."""
+
+    q: Any
+    v: Any
+    count: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Multistep(Stepper):
+    """Base of both: `advance` is all that they do not share."""
+
+    order: int
+    options: Options
+
+    def advance(self, system, s, past, dt, w):
+        """q and v at t + dt, given the acceleration there."""
+        raise NotImplementedError
+
+    def begin(self, system, q, v, t, params, dt):
+        """w0 = M^-1 Q, and no past."""
+        unknown = jnp.zeros((2, q.size), q.dtype)
+        memory = Memory(unknown, unknown, jnp.zeros((), jnp.int32))
+        return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
+
+    def bind(self, system, params, dt):
+        """Newton on M(q1) w1 = Q(q1, v1, t1); the first two steps are the starter's."""
+        r = partial(residual, system, params)
+        start = STARTER.bind(system, params, dt)
+
+        def first(s):
+            s1, _ = start(s)
+            return s1, Info(jnp.max(jnp.abs(r(s1))), jnp.zeros((), jnp.int32), jnp.array(True))
+
+        def later(s, past):
+            def path(w):
+                q, v = self.advance(system, s, past, dt, w)
+                return State(s.t + dt, q, v, w)
+
+            w, info = newton(r, path, s.w, s, factorize, self.options.tolerance, self.options.max_iterations)
+            return path(w), info
+
+        def step(s):
+            past, now = s.memory, s._replace(memory=None)
+            s1, info = lax.cond(past.count < 2, lambda: first(now), lambda: later(now, past))
+            q, v = jnp.stack([s1.q - s.q, past.q[0]]), jnp.stack([s1.v - s.v, past.v[0]])
+            return s1._replace(memory=Memory(q, v, past.count + 1)), info
+
+        return step
+
+
+class Houbolt(Multistep):
+    """Houbolt's method; made by `houbolt`."""
+
+    def advance(self, system, s, past, dt, w):
+        """By differences, which lose less to rounding than the q themselves."""
+        if system.first_order:
+            return s.q, s.v + (6 * dt * w + 7 * past.v[0] - 2 * past.v[1]) / 11
+        dq = (dt**2 * w + 3 * past.q[0] - past.q[1]) / 2
+        return s.q + dq, (11 * dq - 7 * past.q[0] + 2 * past.q[1]) / (6 * dt)
+
+
+class Park(Multistep):
+    """Park's method; made by `park`."""
+
+    def advance(self, system, s, past, dt, w):
+        """One formula, for v from w and for q from v."""
+        v = s.v + (6 * dt * w + 5 * past.v[0] - past.v[1]) / 10
+        return s.q + (6 * dt * v + 5 * past.q[0] - past.q[1]) / 10, v
+
+
+def houbolt(tolerance=1e-10, max_iterations=20) -> Houbolt:
+    """Houbolt's method: velocity and acceleration at t1 are those of the cubic through q1, q, q_-1, q_-2.
+
+        w1 = (2 q1 - 5 q + 4 q_-1 - q_-2)/h^2,   v1 = (11 q1 - 18 q + 9 q_-1 - 2 q_-2)/(6 h)
+        M(q1) w1 = Q(q1, v1, t1)
+
+    Order 2, unconditionally stable, spectral radius 0 at infinite frequency. Of all methods of order 2 here it damps
+    low frequencies the most: a damping ratio of 5e-4 for omega h = 0.1. v is a quotient of differences of q, so it
+    holds a rounding error of 1e-16 |q|/h. A first-order system gets BDF3, y1' = (11 y1 - 18 y + 9 y_-1 - 2 y_-2)/(6 h),
+    of order 3.
+
+    The first two steps are those of `rosenbrock(rho_inf=0)`. Steps must be of one size.
+
+    Args:
+        tolerance, max_iterations: of Newton's iteration, as in `hht`.
+
+    Raises:
+        ValueError, TypeError: an argument out of its range or of the wrong kind.
+
+    References:
+        Houbolt (1950); Cardona, Geradin (1989), Sec. 2.
+
+    >>> import hhtjax
+    >>> hhtjax.houbolt().order
+    2
+    """
+    return Houbolt(2, check_options("houbolt", Options(None, None, tolerance, max_iterations)))
+
+
+def park(tolerance=1e-10, max_iterations=20) -> Park:
+    """Park's method: the mean of the backward differentiation formulas of two and of three steps.
+
+        v1 = (10 q1 - 15 q + 6 q_-1 - q_-2)/(6 h),   w1 = (10 v1 - 15 v + 6 v_-1 - v_-2)/(6 h)
+        M(q1) w1 = Q(q1, v1, t1)
+
+    Order 2, unconditionally stable, spectral radius 0 at infinite frequency, with little damping at low ones: a damping
+    ratio of 8e-7 for omega h = 0.1. The first two steps are those of `rosenbrock(rho_inf=0)`. Steps must be of one
+    size.
+
+    Args:
+        tolerance, max_iterations: of Newton's iteration, as in `hht`.
+
+    Raises:
+        ValueError, TypeError: an argument out of its range or of the wrong kind.
+
+    References:
+        Park (1975); Cardona, Geradin (1989), Sec. 2.
+
+    >>> import hhtjax
+    >>> hhtjax.park().order
+    2
+    """
+    return Park(2, check_options("park", Options(None, None, tolerance, max_iterations)))

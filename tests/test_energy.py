@@ -1,0 +1,113 @@
+"""Energy balance along a run: what is conserved, damped, put in by forces, by moved constraints, and by the method."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import simpson
+from zoo import PROBLEMS, run
+
+import hhtjax
+from hhtjax.analysis import energy_balance
+from hhtjax.scenes import pendulum, top
+
+
+def springs_and_weight(q, t, params):
+    """V of the double pendulum, angles from the horizontal."""
+    (m1, m2), (l1, l2), (k1, k2), g = params["m"], params["l"], params["k"], params["g"]
+    weight = g * ((m1 + m2) * l1 * jnp.sin(q[0]) + m2 * l2 * jnp.sin(q[1]))
+    return weight + k1 * q[0] ** 2 / 2 + k2 * (q[1] - q[0]) ** 2 / 2
+
+
+def test_the_balance_of_a_driven_and_damped_double_pendulum_closes_with_the_order_of_the_method():
+    """With V and without; what is work without V is work or potential energy with it."""
+    problem = PROBLEMS["forced double pendulum"]
+    params = problem.params
+
+    def torques(q, v, t):
+        c1, c2 = params["c"]
+        second = c2 * (v[:, 1] - v[:, 0])
+        return np.stack([3 * np.sin(5 * t) - c1 * v[:, 0] + second, 2 * np.cos(3 * t) - second], axis=1)
+
+    largest = []
+    for num_steps in (200, 400):
+        path = run(problem, hhtjax.hht(-0.05), num_steps)
+        found = energy_balance(problem.system, path, params, springs_and_weight)
+        bare = energy_balance(problem.system, path, params)
+        between = bare.work - (found.work - found.potential + found.potential[0])  # q is not quite the integral of v
+        largest.append([float(jnp.max(jnp.abs(x))) for x in (found.error, bare.error, between)])
+        assert np.all(bare.potential == 0)
+    np.testing.assert_allclose(np.log2(np.divide(*largest)), 2, atol=0.2)
+    assert max(largest[1]) < 1e-3
+    power = np.sum(np.asarray(path.v) * torques(path.q, np.asarray(path.v), np.asarray(path.t)), axis=1)
+    assert found.work[-1] == pytest.approx(simpson(power, x=path.t), rel=1e-6)
+    M = jax.vmap(lambda q: problem.system.mass(q, params))(path.q)
+    np.testing.assert_allclose(found.kinetic, np.einsum("ni,nij,nj->n", path.v, M, path.v) / 2, rtol=1e-12)
+
+
+def test_the_error_is_what_a_method_loses():
+    """An undamped spring: all that HHT damps; with V that moves in time, the work of whoever moves it."""
+    spring = hhtjax.LinearSystem(M=jnp.array([2.0]), K=jnp.array([50.0]))
+    path = hhtjax.simulate(spring, hhtjax.hht(-0.3), jnp.ones(1), jnp.zeros(1), dt=0.02, num_steps=200)
+    found = energy_balance(spring, path, potential=lambda q, t, params: 25 * jnp.sum(q**2))
+    np.testing.assert_allclose(found.error, (path.v**2 + 25 * path.q**2)[:, 0] - 25, atol=1e-12)
+    assert found.error[-1] < -0.02
+    np.testing.assert_allclose(found.work, 0, atol=1e-12)
+
+    moved = hhtjax.System(jnp.ones(1), lambda q, v, t, params: 9 * (jnp.sin(t) - q))
+    path = hhtjax.simulate(moved, hhtjax.rk4(), jnp.zeros(1), jnp.zeros(1), dt=0.02, num_steps=100)
+    found = energy_balance(moved, path, potential=lambda q, t, params: 4.5 * jnp.sum((q - jnp.sin(t)) ** 2))
+    assert found.work[-1] > 0.1
+    assert np.max(np.abs(found.error)) < 1e-6
+
+
+@pytest.mark.slow
+def test_a_rod_that_is_pulled_in_works():
+    fixed = pendulum.cartesian()
+    pulled = hhtjax.System(
+        fixed.system.mass,
+        fixed.system.force,
+        lambda q, t, params: jnp.array([jnp.sqrt(jnp.sum(q**2)) - params["l"] * (1 - 0.3 * t)]),
+    )
+
+    def height(q, t, params):
+        return params["m"] * params["g"] * q[1]
+
+    v0 = fixed.v0 + jnp.array([0.0, 0.3 * 0.5])
+    path = hhtjax.simulate(pulled, hhtjax.hht(0.0), fixed.q0, v0, fixed.params, dt=5e-3, num_steps=200)
+    found = energy_balance(pulled, path, fixed.params, height)
+    tension = -path.multipliers[:, 0]
+    assert found.work[-1] == pytest.approx(simpson(tension * 0.3 * 0.5, x=path.t), rel=1e-4)
+    assert found.work[-1] > 1
+    assert np.max(np.abs(found.error)) < 5e-3
+
+
+@pytest.mark.slow
+def test_a_top_keeps_its_energy():
+    scene = top.minimal(spin=20.0)
+
+    def height(R, t, params):
+        return params["m"] * params["g"] * params["l"] * R[2, 1]
+
+    path = hhtjax.simulate(scene.system, hhtjax.hht(0.0), scene.q0, scene.v0, scene.params, dt=1e-3, num_steps=200)
+    found = energy_balance(scene.system, path, scene.params, height)
+    assert np.ptp(found.potential) > 1
+    np.testing.assert_allclose(found.work, 0, atol=1e-6)
+    assert np.max(np.abs(found.error)) < 1e-3 * found.kinetic[0]
+
+
+SPRING = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda path: energy_balance(hhtjax.FirstOrderSystem(lambda y, t, p: -y), path), TypeError, "`system` must be"),
+        (lambda path: energy_balance(SPRING, path.q), ValueError, "`solution` must be of one run"),
+        (lambda path: energy_balance(SPRING, path, potential=1.0), TypeError, "`potential` must be a function"),
+    ],
+)
+def test_bad_input(call, error, message):
+    path = hhtjax.simulate(SPRING, hhtjax.rk4(), jnp.ones(1), jnp.ones(1), dt=0.1, num_steps=2)
+    with pytest.raises(error, match=f"energy_balance: {message}"):
+        call(path)
