@@ -5,7 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hhtjax.linear_solve import UNROLLED, factorize, factorize_with, matvec, solve, solve_map
+from hhtjax.linear_solve import (
+    UNROLLED,
+    factorize,
+    factorize_least_squares,
+    factorize_with,
+    matvec,
+    solve,
+    solve_map,
+)
 
 SIZES = range(1, 13)
 
@@ -312,3 +320,13 @@ def test_products(n, dtype):
         assert y.dtype == dtype
         assert y.shape == z.shape
         assert np.max(np.abs(y - z)) < 100 * np.finfo(dtype).eps
+
+
+@pytest.mark.parametrize("trans", [0, 1])
+def test_least_squares_solves_what_lost_rank(trans):
+    """A row of B twice: A x = b and A^T x = b for b in range, and the two multipliers alike."""
+    M, B = np.array([[4.0, 1.0], [1.0, 3.0]]), np.array([[1.0, 2.0], [1.0, 2.0]])
+    A = np.block([[M, -B.T], [B, np.zeros((2, 2))]])
+    b = (A.T if trans else A) @ np.array([1.0, -2.0, 3.0, 5.0])
+    x = factorize_least_squares(2)(jnp.asarray(A))(jnp.asarray(b), trans=trans)
+    np.testing.assert_allclose(x, [1.0, -2.0, 4.0, 4.0], rtol=1e-12)
