@@ -117,6 +117,8 @@ def test_what_comes_first_is_named():
     assert 0 < far < step
     check_message(SimulationError, f"step {far} (to t = {far / 10:.6g}) failed: the position", lambda: path.check(1e3))
     check_message(SimulationError, f"step {step} (", lambda: path.check(1e306))
+    later = path._replace(q=path.q.at[step + 1 :].set(jnp.inf))  # beyond any reach, but that is not what came first
+    check_message(SimulationError, f"step {step} (", lambda: later.check(1e306))
 
 
 def kick(q, v, t, params):

@@ -43,5 +43,5 @@ def position_and_multipliers(state):
 
 def run(report, fast):
     """Grades every cell."""
-    study = Study(cases(), METHODS, "GGL\nNewton", 7, position_and_multipliers, causes=CAUSES)
+    study = Study(cases(), METHODS, "GGL\nNewton", "GGL\none solve", 7, position_and_multipliers, causes=CAUSES)
     return run_study(report, study, "stability_constrained", fast)

@@ -109,7 +109,7 @@ def run(report, fast):
     """All of them."""
     num_steps = FAST_STEPS if fast else NUM_STEPS
     entries = []
-    for name, (scene, values, methods) in studies().items():
+    for name, (scene, values, methods) in list(studies().items())[: 1 if fast else None]:
         for method in list(methods)[:1] if fast else methods:
             system, params, q0, v0, h = scene
             path = hhtjax.simulate(
@@ -131,7 +131,7 @@ def run(report, fast):
 def figure(entries, num_steps):
     """Energy of each scene, and what else each keeps or loses."""
     panels = ("dumbbell", "energy"), ("dumbbell", "angular momentum"), ("free body", "energy"), ("pendulum", "energy")
-    drawn, grid = plt.subplots(2, 2, figsize=(9.4, 7.4), sharex=True)
+    drawn, grid = plt.subplots(2, 2, figsize=(9.4, 7.2), sharex=True, dpi=100)
     steps = num_steps / WINDOWS * np.arange(1, WINDOWS + 1)
     for axes, (scene, quantity) in zip(grid.ravel(), panels, strict=True):
         for i, e in enumerate(e for e in entries if e["scene"] == scene):

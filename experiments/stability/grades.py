@@ -17,6 +17,7 @@ GRADES = {
     "bounded: error 5 to 100 %": "#F5DFB0",
     "accurate: error below 5 %": "#0072B2",
 }
+LETTERS = "XwbA"  # the same in one letter each
 
 
 class Outcome(NamedTuple):
@@ -49,7 +50,7 @@ def plain(method):
 
 
 def cells(outcomes, sizes):
-    """Errors with three digits, and what is bounded."""
+    """Errors with three digits, and for each alpha a letter of LETTERS for each step size, the coarsest first."""
 
     def rounded(x):
         return [[float(f"{y:.3g}") if np.isfinite(y) else None for y in row] for row in x]
@@ -58,7 +59,7 @@ def cells(outcomes, sizes):
         scene: {
             "num_steps": sizes[scene],
             "error": {plain(m): rounded(x.error) for m, x in by_method.items()},
-            "bounded": {plain(m): x.bounded.tolist() for m, x in by_method.items()},
+            "grades": {plain(m): ["".join(LETTERS[i] for i in row) for row in x.grade.T] for m, x in by_method.items()},
         }
         for scene, by_method in outcomes.items()
     }
@@ -68,7 +69,8 @@ def page(outcomes, causes):
     """Every cell: scenes down, with a line on why methods fail; methods across; the step shrinks to the right."""
     first = next(iter(outcomes.values()))
     methods, columns = list(first), len(next(iter(first.values())).error)
-    figure, axes = plt.subplots(figsize=(max(7.4, 0.9 + 0.72 * len(methods)), 1.3 + 0.52 * len(outcomes)))
+    size = max(7.4, 0.9 + 0.72 * len(methods)), 1.3 + 0.52 * len(outcomes)
+    figure, axes = plt.subplots(figsize=size, dpi=115)
     style = {
         "cmap": ListedColormap(list(GRADES.values())),
         "vmin": 0,
@@ -91,8 +93,8 @@ def page(outcomes, causes):
     axes.grid(False)
     axes.spines[:].set_visible(False)
     axes.set_xlabel(
-        f"In each block: step size halved from column to column; rows: alpha = {', '.join(map(str, ALPHAS))}, "
-        "or without alpha",
+        f"In each block: step size halved from column to column\n"
+        f"rows: alpha = {', '.join(map(str, ALPHAS))}, or one without alpha",
         fontsize=8,
     )
     handles = [Patch(color=colour, label=label) for label, colour in GRADES.items()]

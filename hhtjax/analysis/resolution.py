@@ -8,14 +8,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 SAMPLES = 64  # times at which runs are compared; a power of two, so that the coarsest hit a part of them
-FEWEST, MOST = 8, 2**20  # steps
+FEWEST, ENOUGH, MOST = 8, 1024, 2**20  # steps of the first run, and at least and at most of the last
 
 
 def step_size_by_runs(system, stepper, q0, v0, params, t0, duration, tolerance):
     """The largest step from which on the error of q stays within the tolerance, and the steps of the finest run.
 
     The error is the RMS of q less that of the finest run, relative to the motion about its mean. Halving ends when two
-    steps in a row keep to the tolerance, one of them with an agreement that could be chance.
+    runs in a row keep to the tolerance, since one could agree by chance, and not before a run of ENOUGH steps: a few
+    coarse ones agree where the method damps the same vibration out of all of them.
 
     Raises:
         ValueError: more than MOST steps would be needed.
@@ -28,7 +29,7 @@ def step_size_by_runs(system, stepper, q0, v0, params, t0, duration, tolerance):
         errors = _errors(counts, paths, stepper.order)
         good = np.append(errors <= tolerance, True)
         first = len(good) - int(np.argmin(good[::-1])) if not good.all() else 0
-        if len(errors) - first >= 2:
+        if len(errors) - first >= 2 and counts[-1] >= ENOUGH:
             break
     else:
         raise ValueError(

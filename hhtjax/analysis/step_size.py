@@ -87,7 +87,8 @@ def suggest_step_size(
 
     With `duration`, runs with 8, 16, 32, ... steps are made until the RMS error of q, relative to its motion about its
     mean, stays within the tolerance over [t0, t0 + duration], and the step is the largest that does. It costs about
-    eight times the run that it recommends. Only chance misleads it: runs that agree with each other on what is wrong.
+    eight times the run that it recommends, and at least 2000 steps. Runs that agree on what is wrong mislead it: a
+    method may damp a fast vibration out of all of them.
 
     Args:
         system, stepper, q0, v0, params, t0: as in `simulate`; no `FirstOrderSystem`. Modes change along the way, so

@@ -93,7 +93,7 @@ def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:
     error is half (rho = 0) to a quarter (rho = 1) of the trapezoidal rule's.
 
     Where it fails: its Jacobian is that of the start of the step, so a stiff direction that turns (an elastic pendulum
-    on its slow manifold), or a contact that begins within the step, can need a step up to 16 times as short
+    on its slow manifold), or a contact that begins within the step, can need a step up to 18 times as short
     as that of `hht` (`python -m experiments stability`). Constraints are refused.
 
     Args:

@@ -1,0 +1,45 @@
+"""The stability experiment: what its committed numbers must show, and its page."""
+
+import json
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from experiments.page import find  # noqa: E402
+from experiments.stability import page  # noqa: E402
+
+HERE = ROOT / "experiments" / "stability"
+COMMITTED = json.loads((HERE / "stability.json").read_text())
+PINNED = json.loads((ROOT / "tests" / "data" / "stability.json").read_text())
+
+
+def test_the_committed_numbers_hold_what_is_claimed():
+    tuned, held = (COMMITTED["gallery"][key] for key in ("summary_tuned_on", "summary_held_out"))
+
+    def bounded(rows, **which):
+        return 100 - find(rows, **which)["blown up %"]
+
+    default = {"method": "HHT auto", "alpha": -0.05}
+    assert bounded(tuned, **default) >= 89
+    assert bounded(tuned, **default) > bounded(tuned, method="HHT predictor", alpha=-0.05) + 4
+    assert find(tuned, **default)["ratio"] <= 1.5
+    assert bounded(held, **default) >= bounded(tuned, **default) - 5
+    assert find(tuned, method="ROWDA")["ratio"] <= 0.35
+
+    cells = COMMITTED["reported"]["cells"]
+    assert cells["named_by_check_given_reach"] == cells["again"] > 400
+    assert COMMITTED["reported"]["silent"] == []
+
+
+def test_the_boundaries_are_those_pinned():
+    assert COMMITTED["gallery"]["boundaries"] == PINNED
+
+
+def test_the_page_is_made_from_the_committed_numbers():
+    text = (HERE / "README.md").read_text()
+    assert text == page.page(COMMITTED)
+    for figure in HERE.glob("*.png"):
+        assert f"({figure.name})" in text
+        assert figure.stat().st_size < 200_000
