@@ -32,6 +32,11 @@ def test_the_committed_numbers_hold_what_is_claimed():
     assert cells["named_by_check_given_reach"] == cells["again"] > 400
     assert COMMITTED["reported"]["silent"] == []
 
+    for advice in COMMITTED["advice"]["summary"].values():
+        assert advice["within_1.5"] == advice["cases"] > 200
+    totals = COMMITTED["advice"]["totals"]
+    assert totals["flagged"] == totals["silently_wrong"] > 500
+
 
 def test_the_boundaries_are_those_pinned():
     assert COMMITTED["gallery"]["boundaries"] == PINNED

@@ -15,7 +15,15 @@ from hhtjax.analysis import suggest_step_size
 
 LIMITS = 0.05, 0.01
 CONTACT = "Hertz contact", "hard stop", "dissipative contact"
-ADVISED = "HHT\nauto", "Rosenbrock\nL-stable", "ROWDA"
+ADVISED = (
+    "HHT\nauto",
+    "HHT\nconverged",
+    "HHT\npredictor",
+    "HHT\nheld",
+    "HHT\nstate",
+    "Rosenbrock\nL-stable",
+    "ROWDA",
+)
 
 
 def measured_step(error, steps_s, limit):

@@ -93,7 +93,7 @@ def page(numbers):
             wrong=advice["totals"]["silently_wrong"],
             flagged=advice["totals"]["flagged"],
             flagged_by_modes=advice["totals"]["flagged_by_modes"],
-            advised_methods=", ".join(dict.fromkeys(e["method"] for e in advice["entries"])),
+            advised_methods=len({e["method"] for e in advice["entries"]}),
             advice=advice_table(advice["summary"]),
             misses=misses(advice["entries"]),
             spin_duration=spin["duration_s"],
