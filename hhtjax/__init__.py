@@ -4,9 +4,11 @@ from hhtjax import analysis as analysis
 from hhtjax import rotation as rotation
 from hhtjax import scenes as scenes
 from hhtjax.constraints import consistent_initial as consistent_initial
+from hhtjax.fit_arguments import Gaussian as Gaussian
 from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
-from hhtjax.identify import IdentifiabilityWarning as IdentifiabilityWarning
+from hhtjax.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
 from hhtjax.identify import fit as fit
+from hhtjax.identify import multistart as multistart
 from hhtjax.sampled import sampled as sampled
 from hhtjax.simulate import SimulationError as SimulationError
 from hhtjax.simulate import interpolate as interpolate
@@ -24,5 +26,8 @@ from hhtjax.steppers.splitting import operator_splitting as operator_splitting
 from hhtjax.system import FirstOrderSystem as FirstOrderSystem
 from hhtjax.system import LinearSystem as LinearSystem
 from hhtjax.system import System as System
+from hhtjax.transforms import bounded as bounded
+from hhtjax.transforms import fixed as fixed
+from hhtjax.transforms import positive as positive
 
 __version__ = "0.1.0"

@@ -1,9 +1,10 @@
-"""Minimisers of 1/2 sum f(x)^2 on vectors: Levenberg-Marquardt, and any optax optimiser.
+"""Minimisers of 1/2 sum rho((w f(x))^2) on vectors: Levenberg-Marquardt, and any optax optimiser.
 
 All loops are `lax.while_loop`s, so that a fit runs under jit and vmap; what stopped it travels as a code.
 """
 
 import sys
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,11 +25,68 @@ REASONS = {
 }
 
 
+def huber(z):
+    """z up to 1, then 2 sqrt(z) - 1: the square of a small residual, the size of a large one."""
+    return jnp.where(z <= 1, z, 2 * jnp.sqrt(jnp.maximum(z, 1)) - 1)
+
+
+def soft_l1(z):
+    """2 (sqrt(1 + z) - 1): Huber's loss made smooth."""
+    return 2 * z / (jnp.sqrt(1 + z) + 1)
+
+
+LOSSES = {"huber": huber, "soft_l1": soft_l1, "cauchy": jnp.log1p}
+
+
 class History(NamedTuple):
-    """Per iteration, the start first: cost, and the damping of Levenberg-Marquardt (None for optax)."""
+    """Per iteration, the start first: cost; largest entry of the step in the scaled coordinates, 0 where it was
+    taken back; and the damping of Levenberg-Marquardt (None for optax)."""
 
     cost: Any
+    step: Any
     damping: Any
+
+
+class Objective(NamedTuple):
+    """1/2 sum rho(z) with z = (w r)^2 for the first `data` residuals, and rho(z) = z for the others, the priors."""
+
+    weights: Any  # (m,); 0: missing, whatever the residual
+    loss: Callable | None
+    data: int
+
+    def scaled(self, r):
+        """w r, with 0 in the place of what is missing; r may be a Jacobian."""
+        w = self.weights.reshape(-1, *(1,) * (r.ndim - 1))
+        return jnp.where(w == 0, 0, w * r)
+
+    def losses(self, r):
+        """rho of each residual, and its first two derivatives."""
+        z = self.scaled(r) ** 2
+        ones = jnp.ones_like(z)
+        loss = self.loss
+        if loss is None:
+            return z, ones, 0 * z
+
+        def rho(z):
+            return jnp.concatenate([loss(z[: self.data]), z[self.data :]])
+
+        (value, slope), (_, curvature) = jax.jvp(lambda z: jax.jvp(rho, (z,), (ones,)), (z,), (ones,))
+        return value, slope, curvature
+
+    def cost(self, r):
+        """1/2 sum rho."""
+        return jnp.sum(self.losses(r)[0]) / 2
+
+    def least_squares(self, r, J):
+        """(r, J) of the ordinary least-squares problem with the same gradient J^T r and Gauss-Newton matrix J^T J.
+
+        Triggs et al. (2000), Sec. 4.3: the rows of J are scaled by sqrt(rho' + 2 rho'' z), kept positive.
+        """
+        r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
+        if self.loss is None:
+            return r, J
+        row = jnp.sqrt(jnp.maximum(slope + 2 * curvature * r**2, float(jnp.finfo(r.dtype).eps)))
+        return r * slope / row, J * row[:, None]
 
 
 def with_jacobian(f, x):
@@ -49,13 +107,14 @@ class _Trial(NamedTuple):
     r: Any
     J: Any
     cost: Any
+    length: Any  # of the residual of the least-squares problem
     column: Any  # norms of the columns of J
     s: Any  # singular values of J/column
     V: Any
     z: Any  # residual in the basis of the left singular vectors
 
 
-def levenberg_marquardt(f, x, tolerance, max_iterations, progress):
+def levenberg_marquardt(f, x, objective, tolerance, max_iterations, progress):
     """Damped Gauss-Newton, dx = -(J^T J + lam D)^-1 J^T r with D the diagonal of J^T J.
 
     lam shrinks by 8 when a step lowers the cost and grows by 6 when it does not.
@@ -65,113 +124,113 @@ def levenberg_marquardt(f, x, tolerance, max_iterations, progress):
 
     def look(x):
         r, J = with_jacobian(f, x)
-        finite = jnp.all(jnp.isfinite(r)) & jnp.all(jnp.isfinite(J))
-        J_safe = jnp.where(finite, J, 0)
-        norms = jnp.linalg.norm(J_safe, axis=0)
+        r_hat, J_hat = objective.least_squares(r, J)
+        finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
+        r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
+        norms = jnp.linalg.norm(J_hat, axis=0)
         column = jnp.where(norms == 0, 1, norms)
-        Q, R = jnp.linalg.qr(J_safe / column[None, :])
+        Q, R = jnp.linalg.qr(J_hat / column[None, :])
         U, s, Vt = jnp.linalg.svd(R)
-        cost = jnp.where(finite, jnp.sum(r**2) / 2, jnp.inf)
-        return _Trial(x, r, J, cost, column, s, Vt.T, U.T @ (Q.T @ r))
+        cost = jnp.where(finite, objective.cost(r), jnp.inf)
+        return _Trial(x, r, J, cost, jnp.linalg.norm(r_hat), column, s, Vt.T, U.T @ (Q.T @ r_hat))
 
     def unfinished(carry):
         return carry[-1] == RUNNING
 
     def improve(carry):
         now, lam, iteration, history, _ = carry
+        first = iteration < 0
         weight = now.s / (now.s**2 + lam)
         step = -(now.V @ (weight * now.z)) / now.column
         predicted = jnp.sum(now.z**2 * (1 - (1 - now.s * weight) ** 2)) / 2
         new = look(now.x + step)
         lower = new.cost < now.cost
-        lam = jnp.where(lower, lam / 8, lam * 6)
+        lam = jnp.where(first, lam, jnp.where(lower, lam / 8, lam * 6))
         iteration = iteration + 1
         honest = lower | (lam <= 1)  # a step is also small, and changes little, because lam is large
         flat = (predicted <= tolerance * now.cost) & (jnp.abs(now.cost - new.cost) <= tolerance * now.cost)
         short = jnp.all(jnp.abs(step) <= tolerance * (jnp.abs(now.x) + tolerance))
-        best = jax.tree.map(partial(jnp.where, lower), new, now)
+        best = jax.tree.map(partial(jnp.where, lower | first), new, now)
         code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(~lower & (lam > 1 / eps), STUCK, code)
         code = jnp.where(honest & short, STEP, code)
         code = jnp.where(honest & flat, COST, code)
-        code = jnp.where(_gradient_cosine(best) <= tolerance, GRADIENT, code)
-        history = History(history.cost.at[iteration].set(best.cost), history.damping.at[iteration].set(lam))
+        code = jnp.where(first, jnp.where(jnp.isfinite(new.cost), running, BAD_START), code)
+        code = jnp.where((code != BAD_START) & (_gradient_cosine(best) <= tolerance), GRADIENT, code)
+        taken = jnp.where(lower, jnp.max(jnp.abs(step)), 0)
+        history = _record(history, iteration, best.cost, taken, lam)
         if progress:
-            _show(iteration, best.cost)
+            _show(iteration, best.cost, taken)
         return best, lam, iteration, history, code
 
-    start = look(x)
-    lam = jnp.asarray(1e-3, x.dtype)
+    # nothing is known before the first evaluation, which is that of the loop: f is compiled once
+    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(look, x))
+    nothing = nothing._replace(x=x, cost=jnp.asarray(jnp.inf, x.dtype), s=jnp.ones_like(x), column=jnp.ones_like(x))
     empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
-    history = History(empty.at[0].set(start.cost), empty.at[0].set(lam))
-    code = jnp.where(_gradient_cosine(start) <= tolerance, GRADIENT, running)
-    code = jnp.where(jnp.isfinite(start.cost), code, BAD_START)
-    carry = start, lam, jnp.zeros((), jnp.int32), history, code
+    carry = nothing, jnp.asarray(1e-3, x.dtype), jnp.asarray(-1, jnp.int32), History(empty, empty, empty), running
     best, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
     return best.x, best.r, best.J, history, iterations, code
 
 
 def _gradient_cosine(trial):
     """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
-    length = jnp.sqrt(2 * trial.cost)
-    return jnp.max(jnp.abs(trial.V @ (trial.s * trial.z))) / jnp.where(length == 0, 1, length)
+    return jnp.max(jnp.abs(trial.V @ (trial.s * trial.z))) / jnp.where(trial.length == 0, 1, trial.length)
 
 
-def descend(f, x, optimizer, tolerance, max_iterations, progress, patience=5):
-    """An optax optimiser on 1/2 sum f(x)^2; returns the best point it saw."""
+def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, patience=5):
+    """An optax optimiser on the cost; returns the best point it saw."""
     optimizer = optax.with_extra_args_support(optimizer)
     running = jnp.asarray(RUNNING, jnp.int32)
 
     def cost(x):
-        return jnp.sum(f(x) ** 2) / 2
+        return objective.cost(f(x))
 
     def unfinished(carry):
         return carry[-1] == RUNNING
 
     def improve(carry):
-        x, state, best, before, quiet, iteration, history, _ = carry
+        x, state, best, before, step, quiet, iteration, history, _ = carry
         value, gradient = jax.value_and_grad(cost)(x)
         best = jax.tree.map(partial(jnp.where, value < best[1]), (x, value), best)
-        history = History(history.cost.at[iteration].set(value), None)
+        history = _record(history, iteration, value, step, None)
         quiet = jnp.where(jnp.abs(before - value) <= tolerance * value, quiet + 1, 0)
         code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(quiet >= patience, COST, code)
         code = jnp.where(jnp.all(gradient == 0), GRADIENT, code)
         code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
         if progress:
-            _show(iteration, value)
+            _show(iteration, value, step)
         updates, state = optimizer.update(gradient, state, x, value=value, grad=gradient, value_fn=cost)
-        x = jnp.where(code == RUNNING, x + jnp.asarray(updates), x)
+        updates = jnp.where(code == RUNNING, jnp.asarray(updates), 0)
         iteration = jnp.where(code == RUNNING, iteration + 1, iteration)
-        return x, state, best, value, quiet, iteration, history, code
+        return x + updates, state, best, value, jnp.max(jnp.abs(updates)), quiet, iteration, history, code
 
     infinity = jnp.asarray(jnp.inf, x.dtype)
-    history = History(jnp.full(max_iterations + 1, jnp.nan, x.dtype), None)
+    empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
     zero = jnp.zeros((), jnp.int32)
-    carry = x, optimizer.init(x), (x, infinity), infinity, zero, zero, history, running
-    _, _, (x, _), _, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
+    start = x, infinity
+    carry = (
+        x,
+        optimizer.init(x),
+        start,
+        infinity,
+        jnp.zeros((), x.dtype),
+        zero,
+        zero,
+        History(empty, empty, None),
+        running,
+    )
+    _, _, (x, _), _, _, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
     return x, history, iterations, code
 
 
-def covariance(J, r):
-    """s^2 (J^T J)^-1, and which parameters the residuals leave undetermined: infinite there."""
-    m, p = J.shape
-    norms = jnp.linalg.norm(J, axis=0)
-    column = jnp.where(norms == 0, 1, norms)
-    _, s, Vt = jnp.linalg.svd(jnp.linalg.qr(J / column[None, :], mode="r"))
-    seen = s > 10 * m * float(jnp.finfo(J.dtype).eps) * s[0]
-    undetermined = jnp.any(~seen[:, None] & (jnp.abs(Vt) > 1e-6), axis=0)
-    if m == p:  # nothing left to estimate the variance from
-        undetermined = jnp.ones(p, bool)
-    inverse = jnp.where(seen, 1 / jnp.where(seen, s, 1) ** 2, 0)
-    C = jnp.sum(r**2) / max(m - p, 1) * (Vt.T * inverse[None, :]) @ Vt / jnp.outer(column, column)
-    both = undetermined[:, None] & undetermined[None, :]
-    C = jnp.where(undetermined[:, None] | undetermined[None, :], 0, C)
-    return jnp.where(both & jnp.eye(p, dtype=bool), jnp.inf, C), undetermined
+def _record(history, i, *values):
+    return History(*(None if x is None else x.at[i].set(value) for x, value in zip(history, values, strict=True)))
 
 
-def _show(iteration, cost):
-    def show(iteration, cost):
-        print(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}", file=sys.stderr, flush=True)
+def _show(iteration, cost, step):
+    def show(iteration, cost, step):
+        what = f"step {float(step):.3g}" if step else "no step" if iteration else "start"
+        print(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", file=sys.stderr, flush=True)
 
-    jax.debug.callback(show, iteration, cost)
+    jax.debug.callback(show, iteration, cost, step)
