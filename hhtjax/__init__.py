@@ -3,6 +3,11 @@
 from hhtjax import analysis as analysis
 from hhtjax import rotation as rotation
 from hhtjax import scenes as scenes
+from hhtjax.band_limited import band_limited as band_limited
+from hhtjax.band_limited import spline_gain_error as spline_gain_error
+from hhtjax.bias import StepSizeWarning as StepSizeWarning
+from hhtjax.bias import refine as refine
+from hhtjax.bias import step_size_bias as step_size_bias
 from hhtjax.constraints import consistent_initial as consistent_initial
 from hhtjax.fit_arguments import Gaussian as Gaussian
 from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
