@@ -34,5 +34,7 @@ from hhtjax.system import System as System
 from hhtjax.transforms import bounded as bounded
 from hhtjax.transforms import fixed as fixed
 from hhtjax.transforms import positive as positive
+from hhtjax.windows import windows as windows
+from hhtjax.windows import wrap_angle as wrap_angle
 
 __version__ = "0.1.0"

@@ -136,7 +136,7 @@ class Refined(NamedTuple):
     shift: Any
 
 
-def refine(residuals_at, params0, stepper, dt, **options) -> Refined:
+def refine(residuals_at, params0, stepper, dt, **options: Any) -> Refined:
     """Fits with dt and with dt/2, and extrapolates the parameters to dt = 0.
 
         params = fine + (fine - coarse)/(2^p - 1),    p the order of the stepper

@@ -124,6 +124,19 @@ def check_prior(caller, prior, params0):
     return jax.tree.map(fill, prior, params0, is_leaf=is_prior)
 
 
+def check_records(caller, records, starts, prior, optimizer):
+    """The starts as float arrays; they and the records have one leading axis."""
+    if records is None or starts is None:
+        raise ValueError(f"{caller}: `records` and `starts` must be given together; received one of them.")
+    starts = check_parameters(caller, starts, "starts")
+    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves((records, starts))}
+    if len(counts) != 1 or counts == {()}:
+        raise ValueError(f"{caller}: `records` and `starts` must have one leading axis; received {sorted(counts)}.")
+    if optimizer != LEVENBERG_MARQUARDT or prior is not None:
+        raise ValueError(f"{caller}: `records` must go with Levenberg-Marquardt and without a prior.")
+    return starts
+
+
 def check_residuals(caller, shapes, p):
     """shapes: the residuals as shapes and dtypes; p: number of parameters."""
     leaves = jax.tree.leaves(shapes)

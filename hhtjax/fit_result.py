@@ -22,9 +22,10 @@ class FitResult(NamedTuple):
     inside jit. iterations: how many. code: why it stopped, a key of `REASONS`. transforms: of each leaf.
     uncertainty: `Uncertainty` of the free entries; None if not asked for. segments: how many the cluster
     covariance rests on.
+    starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
     covariance: (p, p); rows follow ravel_pytree(params). standard_errors: root of its diagonal, structured like params.
-    Both from the cluster sandwich over segments, or naive where parameters outnumber segments. A fixed parameter has
-    variance 0; one that the residuals do not determine has inf, and covariances 0.
+    Both from the cluster sandwich over segments, or autocorrelated where parameters outnumber segments. A fixed
+    parameter has variance 0; one that the residuals do not determine has inf, and covariances 0.
     """
 
     params: Any
@@ -36,6 +37,7 @@ class FitResult(NamedTuple):
     transforms: tuple
     uncertainty: Uncertainty | None
     segments: int
+    starts: Any = None
 
     @property
     def converged(self):

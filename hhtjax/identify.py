@@ -6,36 +6,29 @@ with exact derivatives: Levenberg-Marquardt on forward-mode Jacobians for few pa
 optimiser on reverse-mode gradients for many.
 """
 
-import math
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
-from hhtjax import least_squares
-from hhtjax import transforms as tf
 from hhtjax.boundary import require_number
 from hhtjax.description import is_concrete
 from hhtjax.fit_arguments import (
-    LEVENBERG_MARQUARDT,
-    Options,
     check_options,
     check_parameters,
     check_prior,
-    check_residuals,
+    check_records,
     check_scale,
     check_transforms,
     check_weights,
     first_bad,
-    spread_weights,
 )
+from hhtjax.fit_problem import Data, solve
 from hhtjax.fit_result import FitResult
 from hhtjax.identifiability import warn_undetermined
 from hhtjax.least_squares import BAD_START
-from hhtjax.uncertainty import SEGMENTS, count_segments, uncertainty, variance_inflation
+from hhtjax.uncertainty import SEGMENTS
 
 
 def fit(
@@ -43,6 +36,8 @@ def fit(
     params0,
     optimizer=None,
     *,
+    records=None,
+    starts=None,
     transforms=None,
     scale=None,
     weights=True,
@@ -62,6 +57,11 @@ def fit(
         optimizer: "levenberg_marquardt" with forward-mode Jacobians, a column for each parameter; or any optax
             optimiser, driven by reverse-mode gradients of the cost. None: the first for up to 64 free
             parameters, optax.lbfgs() for more.
+        records: several experiments, or windows of one: any pytree whose leaves have a leading axis, one entry for
+            each. Then `residuals(params, start, record)` is of one record.
+        starts: guesses of what belongs to one record alone, such as its initial state: a pytree with the same leading
+            axis. It is fitted too, and eliminated from each step (a Schur complement), so that the Jacobian has
+            columns for one start only, however many records there are. Levenberg-Marquardt, without a prior.
         transforms: for each leaf of params0, or for whole branches: `positive`, `bounded(lower, upper)`, `fixed`,
             or None for neither.
         scale: typical size of each parameter: a pytree like params0, whose leaves are numbers or arrays of
@@ -108,7 +108,9 @@ def fit(
         "fit", residuals, params0, optimizer, transforms, loss, max_iterations, covariance, segments, progress
     )
     data = _check_data("fit", params0, scale, weights, prior, tolerance)
-    result = _fit(residuals, options, params0, *data)
+    if records is not None or starts is not None:
+        data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
+    result = solve(residuals, options, params0, data)
     return _finished("fit", result, weights) if is_concrete(result.code) else result
 
 
@@ -162,7 +164,7 @@ def multistart(
     )
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
-    every = jax.vmap(lambda start: _fit(residuals, options, start, *data))(starts)
+    every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
     cost = jnp.where((every.code == BAD_START) | jnp.isnan(every.cost), jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)
     return Multistart(_finished("multistart", best, weights) if is_concrete(best.code) else best, every)
@@ -172,67 +174,7 @@ def _check_data(caller, params0, scale, weights, prior, tolerance):
     require_number(caller, "tolerance", tolerance, lambda x: x > 0, "be positive")
     check_weights(caller, weights)
     prior = None if prior is None else check_prior(caller, prior, params0)
-    return check_scale(caller, scale, params0), weights, prior, tolerance
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _fit(residuals, options: Options, params0, scale, weights, prior, tolerance):
-    leaves, structure = jax.tree.flatten(params0)
-    scales = jax.tree.leaves(scale)
-    free = [i for i, T in enumerate(options.transforms) if T is not tf.fixed]
-    x0, unravel = ravel_pytree([options.transforms[i].coordinate(leaves[i], scales[i]) for i in free])
-    tolerance = jnp.maximum(jnp.asarray(tolerance, x0.dtype), 10 * float(jnp.finfo(x0.dtype).eps))
-
-    def parameters(x):
-        """Leaves of the free parameters."""
-        return [options.transforms[i].parameter(y, scales[i]) for i, y in zip(free, unravel(x), strict=True)]
-
-    def params(x):
-        changed = dict(zip(free, parameters(x), strict=True))
-        return structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(leaves)])
-
-    shapes = jax.eval_shape(residuals, params0)
-    check_residuals("fit", shapes, x0.size)
-    _, unravel_residual = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
-    weights = spread_weights("fit", weights, shapes)
-    w = jnp.concatenate([x.ravel() for x in weights]).astype(x0.dtype)
-    data = w.size
-    if prior is not None:
-        means, deviations = ([jax.tree.leaves(x)[i] for i in free] for x in _split(prior, structure))
-        w = jnp.concatenate([w, 1 / ravel_pytree(deviations)[0]])
-
-    def f(x):
-        r, _ = ravel_pytree(residuals(params(x)))
-        if prior is None:
-            return r
-        away = [p - mean for p, mean in zip(parameters(x), means, strict=True)]
-        return jnp.concatenate([r, ravel_pytree(away)[0]])
-
-    objective = least_squares.Objective(w, options.loss, data)
-    limits = tolerance, options.max_iterations, options.progress
-    if options.optimizer == LEVENBERG_MARQUARDT:
-        x, r, J, history, iterations, code = least_squares.levenberg_marquardt(f, x0, objective, *limits)
-    else:
-        x, history, iterations, code = least_squares.descend(f, x0, objective, options.optimizer, *limits)
-        r, J = least_squares.with_jacobian(f, x) if options.covariance else (f(x), None)
-    believed, segments = None, 0
-    if options.covariance:
-        r_hat, J_hat = objective.least_squares(r, J)
-        _, slope = jax.jvp(lambda x: ravel_pytree(parameters(x))[0], (x,), (jnp.ones_like(x),))
-        sizes = [math.prod(leaf.shape) for leaf in jax.tree.leaves(shapes)]
-        segments = count_segments(sizes, options.segments)
-        tau = variance_inflation(jax.tree.leaves(unravel_residual(r_hat[:data])))
-        believed = uncertainty(J_hat / slope[None, :], r_hat, jnp.sum(w != 0), sizes, segments, tau)
-    return FitResult(
-        params(x), unravel_residual(r[:data]), objective.cost(r), history, iterations, code, options.transforms,
-        believed, segments,
-    )  # fmt: skip
-
-
-def _split(prior, structure):
-    """Means and deviations, as two pytrees."""
-    pairs = structure.flatten_up_to(prior)
-    return structure.unflatten([pair.mean for pair in pairs]), structure.unflatten([pair.deviation for pair in pairs])
+    return Data(check_scale(caller, scale, params0), weights, prior, tolerance, None, None)
 
 
 def _finished(caller, result, weights):

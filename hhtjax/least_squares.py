@@ -89,50 +89,14 @@ class Objective(NamedTuple):
         return r * slope / row, J * row[:, None]
 
 
-def with_jacobian(f, x):
-    """f(x) and its forward-mode Jacobian."""
+def levenberg_marquardt(problem, x, tolerance, max_iterations, progress):
+    """Damped Gauss-Newton on a `Dense` or an `Arrow` problem; returns the best trial, the history, and why it ended.
 
-    def twice(x):
-        r = f(x)
-        return r, r
-
-    J, r = jax.jacfwd(twice, has_aux=True)(x)
-    return r, J
-
-
-class _Trial(NamedTuple):
-    """A point, and the least-squares problem there, its columns scaled to one and reduced to p rows."""
-
-    x: Any
-    r: Any
-    J: Any
-    cost: Any
-    length: Any  # of the residual of the least-squares problem
-    column: Any  # norms of the columns of J
-    s: Any  # singular values of J/column
-    V: Any
-    z: Any  # residual in the basis of the left singular vectors
-
-
-def levenberg_marquardt(f, x, objective, tolerance, max_iterations, progress):
-    """Damped Gauss-Newton, dx = -(J^T J + lam D)^-1 J^T r with D the diagonal of J^T J.
-
-    lam shrinks by 8 when a step lowers the cost and grows by 6 when it does not.
+    dx = -(J^T J + lam D)^-1 J^T r with D the diagonal of J^T J; lam shrinks by 8 when a step lowers the cost and grows
+    by 6 when it does not.
     """
     eps = float(jnp.finfo(x.dtype).eps)
     running = jnp.asarray(RUNNING, jnp.int32)
-
-    def look(x):
-        r, J = with_jacobian(f, x)
-        r_hat, J_hat = objective.least_squares(r, J)
-        finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
-        r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
-        norms = jnp.linalg.norm(J_hat, axis=0)
-        column = jnp.where(norms == 0, 1, norms)
-        Q, R = jnp.linalg.qr(J_hat / column[None, :])
-        U, s, Vt = jnp.linalg.svd(R)
-        cost = jnp.where(finite, objective.cost(r), jnp.inf)
-        return _Trial(x, r, J, cost, jnp.linalg.norm(r_hat), column, s, Vt.T, U.T @ (Q.T @ r_hat))
 
     def unfinished(carry):
         return carry[-1] == RUNNING
@@ -140,10 +104,8 @@ def levenberg_marquardt(f, x, objective, tolerance, max_iterations, progress):
     def improve(carry):
         now, lam, iteration, history, _ = carry
         first = iteration < 0
-        weight = now.s / (now.s**2 + lam)
-        step = -(now.V @ (weight * now.z)) / now.column
-        predicted = jnp.sum(now.z**2 * (1 - (1 - now.s * weight) ** 2)) / 2
-        new = look(now.x + step)
+        step, predicted = problem.step(now, lam)
+        new = problem.look(now.x + jnp.where(first, 0, step))
         lower = new.cost < now.cost
         lam = jnp.where(first, lam, jnp.where(lower, lam / 8, lam * 6))
         iteration = iteration + 1
@@ -156,25 +118,20 @@ def levenberg_marquardt(f, x, objective, tolerance, max_iterations, progress):
         code = jnp.where(honest & short, STEP, code)
         code = jnp.where(honest & flat, COST, code)
         code = jnp.where(first, jnp.where(jnp.isfinite(new.cost), running, BAD_START), code)
-        code = jnp.where((code != BAD_START) & (_gradient_cosine(best) <= tolerance), GRADIENT, code)
-        taken = jnp.where(lower, jnp.max(jnp.abs(step)), 0)
+        code = jnp.where((code != BAD_START) & (problem.cosine(best) <= tolerance), GRADIENT, code)
+        taken = jnp.where(lower & ~first, jnp.max(jnp.abs(step)), 0)
         history = _record(history, iteration, best.cost, taken, lam)
         if progress:
             _show(iteration, best.cost, taken)
         return best, lam, iteration, history, code
 
     # nothing is known before the first evaluation, which is that of the loop: f is compiled once
-    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(look, x))
-    nothing = nothing._replace(x=x, cost=jnp.asarray(jnp.inf, x.dtype), s=jnp.ones_like(x), column=jnp.ones_like(x))
+    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(problem.look, x))
+    nothing = nothing._replace(x=x, cost=jnp.asarray(jnp.inf, x.dtype))
     empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
     carry = nothing, jnp.asarray(1e-3, x.dtype), jnp.asarray(-1, jnp.int32), History(empty, empty, empty), running
     best, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
-    return best.x, best.r, best.J, history, iterations, code
-
-
-def _gradient_cosine(trial):
-    """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
-    return jnp.max(jnp.abs(trial.V @ (trial.s * trial.z))) / jnp.where(trial.length == 0, 1, trial.length)
+    return best, history, iterations, code
 
 
 def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, patience=5):
