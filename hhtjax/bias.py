@@ -55,7 +55,7 @@ def amplification_matrix(system, stepper, params, dt):
     True
     """
     M = system.M(params) if callable(system.M) else system.M
-    rest = jnp.zeros(jnp.shape(M)[0], jnp.result_type(float))
+    rest = jnp.zeros(jnp.asarray(M).shape[0], jnp.result_type(float))
     state = stepper.init(system, rest, rest, params, dt)
     moving, unravel = ravel_pytree(state._replace(t=None))
 

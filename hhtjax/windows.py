@@ -27,7 +27,8 @@ def windows(t, y, duration, present=None) -> Windows:
     Args:
         t: (samples,), s, increasing; not necessarily uniform: windows follow the clock, and may hold gaps.
         y: (samples, ...), measured. present: Booleans like y; False where a sample is missing, and may be NaN.
-        duration: of a window, s. A window ends with the first sample of the next one, so that they overlap by it.
+        duration: of a window, s. The next window begins with the first sample at its end or after it; without a gap
+            there, the two share that sample.
 
     Raises:
         TypeError, ValueError: unequal lengths; times that do not increase; NaN not declared missing; a record shorter
@@ -37,7 +38,7 @@ def windows(t, y, duration, present=None) -> Windows:
     >>> t = np.array([0.0, 0.1, 0.2, 0.45, 0.5, 0.6, 0.8])
     >>> cut = hhtjax.windows(t, np.sin(t), duration=0.3)
     >>> cut.begin, cut.present.sum(axis=1)
-    (array([0.  , 0.45]), array([4, 4]))
+    (array([0.  , 0.45]), array([3, 3]))
     """
     t, y = np.asarray(t, float), np.asarray(y, float)
     present = np.full(y.shape, True) if present is None else np.asarray(present, bool)
@@ -52,19 +53,18 @@ def windows(t, y, duration, present=None) -> Windows:
     if not np.all(np.isfinite(y[present])):
         raise ValueError("windows: `y` must be finite, or declared missing by `present`; received NaN or inf.")
     require_number("windows", "duration", duration, lambda x: x > 0, "be positive")
-    ends = [0]
-    while (following := int(np.searchsorted(t, t[ends[-1]] + duration * (1 - 1e-9)))) < len(t):
-        ends.append(following)
-    if len(ends) == 1:
-        raise ValueError(
-            f"windows: `duration` must be less than that of the record, {t[-1] - t[0]}; received {duration}."
-        )
-    samples = max(np.diff(ends)) + 1
-    index = np.minimum(np.array(ends[:-1])[:, None] + np.arange(samples), np.array(ends[1:])[:, None])
-    real = np.arange(samples) <= np.diff(ends)[:, None]
-    real = real.reshape(*real.shape, *(1,) * (y.ndim - 1))
+    first = [0]
+    while (following := int(np.searchsorted(t, t[first[-1]] + duration * (1 - 1e-9)))) < len(t):
+        first.append(following)
+    if len(first) == 1:
+        raise ValueError(f"windows: `duration` must be less than the record's, {t[-1] - t[0]}; received {duration}.")
+    begin = t[first[:-1]]
+    last = np.searchsorted(t, begin + duration * (1 + 1e-9), side="right") - 1
+    steps = np.arange(np.max(last - first[:-1]) + 1)
+    index = np.minimum(np.array(first[:-1])[:, None] + steps, last[:, None])
+    real = (steps <= (last - first[:-1])[:, None]).reshape(*index.shape, *(1,) * (y.ndim - 1))
     y = np.where(present, y, 0)
-    return Windows(t[index] - t[ends[:-1]][:, None], y[index], present[index] & real, t[ends[:-1]])
+    return Windows(t[index] - begin[:, None], y[index], present[index] & real, begin)
 
 
 def wrap_angle(angle):

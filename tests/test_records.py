@@ -54,10 +54,10 @@ def test_eliminated_starts_are_those_of_the_dense_fit():
 def test_windows_follow_the_clock():
     clock = np.array([0.0, 0.1, 0.2, 0.45, 0.5, 0.6, 0.8, 0.9])
     y = np.stack([clock, np.where(clock == 0.2, np.nan, 10 * clock)], axis=1)
-    cut = hhtjax.windows(clock, y, duration=0.3, present=np.isfinite(y))
+    cut = hhtjax.windows(clock, y, duration=0.35, present=np.isfinite(y))
     np.testing.assert_allclose(cut.begin, [0.0, 0.45])
-    np.testing.assert_allclose(cut.t + cut.begin[:, None], [[0.0, 0.1, 0.2, 0.45], [0.45, 0.5, 0.6, 0.8]])
-    np.testing.assert_array_equal(cut.present[0], [[1, 1], [1, 1], [1, 0], [1, 1]])
+    np.testing.assert_allclose(cut.t + cut.begin[:, None], [[0.0, 0.1, 0.2, 0.2], [0.45, 0.5, 0.6, 0.8]])
+    np.testing.assert_array_equal(cut.present[0], [[1, 1], [1, 1], [1, 0], [0, 0]])
     np.testing.assert_allclose(cut.y[1, :, 1], [4.5, 5.0, 6.0, 8.0])
     with pytest.raises(ValueError, match="windows: `y` must be finite, or declared missing"):
         hhtjax.windows(clock, y, duration=0.3)
@@ -65,7 +65,7 @@ def test_windows_follow_the_clock():
         hhtjax.windows([0.0, 0.1, 0.05], np.zeros(3), duration=0.05)
     with pytest.raises(ValueError, match="windows: `t`, `y` and `present` must have equal lengths"):
         hhtjax.windows(clock, y[:-1], duration=0.3)
-    with pytest.raises(ValueError, match=r"windows: `duration` must be less than that of the record, 0.9; received 2"):
+    with pytest.raises(ValueError, match=r"windows: `duration` must be less than the record's, 0.9; received 2"):
         hhtjax.windows(clock, clock, duration=2)
 
 

@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
@@ -83,23 +84,43 @@ def generate():
     amplitude = np.full(size, 0.055)
     amplitude[:40650] = np.linspace(0.0, 0.09, 40650)
     u = amplitude * u / u.std()
-    y = np.asarray(simulate(GENERATED, {"y": 0.0, "v": 0.0}, u, substeps=32, alpha=0.0))
+    y = np.asarray(simulate(GENERATED, {"y": 0.0, "v": 0.0}, reconstruct(u), size, substeps=32, alpha=0.0))
     return u, y + NOISE * rng.normal(size=size)
 
 
-def simulate(params, start, u, substeps, alpha):
-    """Output at the samples of the input u, in V, by the non-iterative step."""
-    dt = 1 / SAMPLING_RATE
-    scene = duffing.measured(params, hhtjax.sampled(u, dt), start["y"], start["v"], dt * (len(u) - 1))
-    # the predictor form is smooth in the parameters
+def force(q, v, t, params):
+    """Duffing's oscillator under a sampled input, with those of the further terms that params names."""
+    own, u = params
+    if "delay" in own:
+        t = t - own["delay"]
+    damping = 0.0
+    if "c2" in own:
+        damping = damping + own["c2"] * q**2
+    if "d" in own:
+        damping = damping + own["d"] * jnp.abs(v)
+    if "e" in own:
+        damping = damping + own["e"] * q * v
+    return duffing.restoring(q, v, own) - damping * v + u(t) + own["offset"]
+
+
+SYSTEM = hhtjax.System(duffing.sampled_mass, force)
+
+
+def reconstruct(u):
+    """The input between its samples, band-limited."""
+    return hhtjax.band_limited(jnp.asarray(u), 1 / SAMPLING_RATE)
+
+
+def simulate(params, start, u, samples, substeps, alpha):
+    """Output at `samples` samples of the reconstructed input u, in V, by the non-iterative step."""
     solution = hhtjax.simulate(
-        scene.system,
-        hhtjax.hht(alpha, linearize="predictor"),
-        scene.q0,
-        scene.v0,
-        scene.params,
-        dt=dt / substeps,
-        num_steps=(len(u) - 1) * substeps,
+        SYSTEM,
+        hhtjax.hht(alpha, linearize="predictor"),  # smooth in the parameters
+        jnp.reshape(start["y"], (1,)),
+        jnp.reshape(start["v"], (1,)),
+        (params, u),
+        dt=1 / SAMPLING_RATE / substeps,
+        num_steps=(samples - 1) * substeps,
         save_every=substeps,
     )
     return solution.q[:, 0]
