@@ -14,6 +14,9 @@ from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
 from hhtjax.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
 from hhtjax.identify import fit as fit
 from hhtjax.identify import multistart as multistart
+from hhtjax.inference import prediction_errors as prediction_errors
+from hhtjax.inference import profile as profile
+from hhtjax.inference import score_test as score_test
 from hhtjax.sampled import sampled as sampled
 from hhtjax.simulate import SimulationError as SimulationError
 from hhtjax.simulate import interpolate as interpolate

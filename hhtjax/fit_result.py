@@ -1,5 +1,6 @@
 """What `fit` returns."""
 
+import json
 import statistics
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from hhtjax import fit_report
 from hhtjax import transforms as tf
 from hhtjax.boundary import require_number
 from hhtjax.least_squares import COST, GRADIENT, REASONS, STEP, History
@@ -98,6 +100,32 @@ class FitResult(NamedTuple):
         errors = jax.tree.leaves(self.standard_errors)
         ends = [_ends(T, p, t * e) for T, p, e in zip(self.transforms, leaves, errors, strict=True)]
         return structure.unflatten([lower for lower, _ in ends]), structure.unflatten([upper for _, upper in ends])
+
+    def summary(self) -> str:
+        """A table of estimates, standard errors and intervals, and what limits them.
+
+        >>> import jax.numpy as jnp, hhtjax
+        >>> wave = jnp.sin(jnp.arange(400.0))
+        >>> print(hhtjax.fit(lambda p: p["a"] * wave + p["b"] - 2 * wave - 0.1, {"a": 1.0, "b": 0.0}).summary())
+        ... # doctest: +ELLIPSIS
+        converged: ...
+        parameter  estimate  standard error  95 % interval  error / naive
+        a          2  ...
+        """
+        return fit_report.summary(self)
+
+    def plot(self, sampling_rate=1.0):
+        """A figure: residual and its spectrum (of the first channel), intervals, correlations. Needs matplotlib."""
+        return fit_report.plot(self, sampling_rate)
+
+    def to_json(self) -> str:
+        """The whole result as JSON, for `FitResult.from_json`; inf and NaN as Python writes them."""
+        return json.dumps(fit_report.encode(self))
+
+    @staticmethod
+    def from_json(text) -> "FitResult":
+        """What `to_json` wrote. params of dicts, lists and tuples."""
+        return fit_report.decode(json.loads(text), {c.__name__: c for c in (FitResult, History, Uncertainty)})
 
 
 def _ends(T, p, reach):

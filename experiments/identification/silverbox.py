@@ -1,9 +1,9 @@
 """Stiffness and damping of a measured oscillator (Silverbox), fitted by gradient through the step.
 
-Model: m y'' + (c + c2 y^2 + d |y'| + e y y') y' + k y + k2 y^2 + k3 y^3 = u(t - delay) + offset, with u and y in V: with
-6 parameters without c2, d, e and the delay, with 8 without e and the delay. Only the ratio of the mechanical
-parameters to the gain of the input can be found from u and y: the gain is fixed to 1, so that m, c, k, k2 and k3 carry
-the unit of u over that of their power of y and t.
+Model: m y'' + (c + c2 y^2 + d |y'| + e y y') y' + k y + k2 y^2 + k3 y^3 = u(t - delay) + offset, with u and y in V;
+c2 and d belong to the models with 8 and 10 parameters, e and the delay to the one with 10. Only the ratio of the
+mechanical parameters to the gain of the input can be found from u and y: the gain is fixed to 1, so that m, c, k, k2
+and k3 carry the unit of u over that of their power of y and t.
 """
 
 import time
