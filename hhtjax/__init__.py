@@ -5,18 +5,23 @@ from hhtjax import rotation as rotation
 from hhtjax import scenes as scenes
 from hhtjax.band_limited import band_limited as band_limited
 from hhtjax.band_limited import spline_gain_error as spline_gain_error
-from hhtjax.bias import StepSizeWarning as StepSizeWarning
-from hhtjax.bias import refine as refine
-from hhtjax.bias import step_size_bias as step_size_bias
 from hhtjax.constraints import consistent_initial as consistent_initial
-from hhtjax.fit_arguments import Gaussian as Gaussian
 from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
-from hhtjax.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
-from hhtjax.identify import fit as fit
-from hhtjax.identify import multistart as multistart
-from hhtjax.inference import prediction_errors as prediction_errors
-from hhtjax.inference import profile as profile
-from hhtjax.inference import score_test as score_test
+from hhtjax.identification.arguments import Gaussian as Gaussian
+from hhtjax.identification.bias import StepSizeWarning as StepSizeWarning
+from hhtjax.identification.bias import refine as refine
+from hhtjax.identification.bias import step_size_bias as step_size_bias
+from hhtjax.identification.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
+from hhtjax.identification.identify import fit as fit
+from hhtjax.identification.identify import multistart as multistart
+from hhtjax.identification.inference import prediction_errors as prediction_errors
+from hhtjax.identification.inference import profile as profile
+from hhtjax.identification.inference import score_test as score_test
+from hhtjax.identification.transforms import bounded as bounded
+from hhtjax.identification.transforms import fixed as fixed
+from hhtjax.identification.transforms import positive as positive
+from hhtjax.identification.windows import windows as windows
+from hhtjax.identification.windows import wrap_angle as wrap_angle
 from hhtjax.sampled import sampled as sampled
 from hhtjax.simulate import SimulationError as SimulationError
 from hhtjax.simulate import interpolate as interpolate
@@ -34,10 +39,5 @@ from hhtjax.steppers.splitting import operator_splitting as operator_splitting
 from hhtjax.system import FirstOrderSystem as FirstOrderSystem
 from hhtjax.system import LinearSystem as LinearSystem
 from hhtjax.system import System as System
-from hhtjax.transforms import bounded as bounded
-from hhtjax.transforms import fixed as fixed
-from hhtjax.transforms import positive as positive
-from hhtjax.windows import windows as windows
-from hhtjax.windows import wrap_angle as wrap_angle
 
 __version__ = "0.1.0"

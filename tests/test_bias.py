@@ -63,7 +63,7 @@ def test_the_bias_of_the_trapezoidal_rule_in_every_mode(wh):
         (
             lambda: hhtjax.step_size_bias(spring, "hht", None, 0.1, q=jnp.zeros(1)),
             TypeError,
-            "step_size_bias: `stepper` must be a stepper; received 'hht'",
+            "step_size_bias: `stepper` must be a stepper such as .* received 'hht'",
         ),
         (
             lambda: hhtjax.step_size_bias(hhtjax.scenes.pendulum.cartesian().system, hhtjax.hht(), None, 0.1, q=t),

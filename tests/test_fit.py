@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import hhtjax
-from hhtjax.least_squares import BAD_START, REASONS
+from hhtjax.identification.least_squares import BAD_START, REASONS
 
 t = jnp.linspace(0.0, 2.0, 60)
 TRUE = {"a": 3.0, "decay": jnp.array([0.5, 2.0])}

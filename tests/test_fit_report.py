@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.fit_result import FitResult
+from hhtjax.identification.result import FitResult
 
 x = jnp.linspace(0.0, 1.0, 200)
 Y = 2.0 * jnp.exp(-3.0 * x) + 0.3 + 0.05 * np.random.default_rng(0).normal(size=200)

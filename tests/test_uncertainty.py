@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.identifiability import undetermined_combinations
+from hhtjax.identification.identifiability import undetermined_combinations
 
 k = jnp.arange(1600.0)
 X = jnp.stack([jnp.ones(1600), jnp.sin(0.02 * k), jnp.cos(0.9 * k)], axis=1)

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hhtjax import transforms as tf
-from hhtjax.fit_arguments import LEVENBERG_MARQUARDT, Options, check_residuals, spread_weights
-from hhtjax.fit_result import FitResult
-from hhtjax.gauss_newton import Arrow, Dense, with_jacobian
-from hhtjax.least_squares import Objective, descend, levenberg_marquardt
-from hhtjax.uncertainty import count_segments, uncertainty, variance_inflation
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options, check_residuals, spread_weights
+from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
+from hhtjax.identification.least_squares import Objective, descend, levenberg_marquardt
+from hhtjax.identification.result import FitResult
+from hhtjax.identification.uncertainty import count_segments, uncertainty, variance_inflation
 
 
 class Data(NamedTuple):

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax import transforms as tf
 from hhtjax.boundary import require_function
-from hhtjax.gauss_newton import with_jacobian
-from hhtjax.identifiability import parameter_names
-from hhtjax.identify import fit
-from hhtjax.uncertainty import SEGMENTS
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.gauss_newton import with_jacobian
+from hhtjax.identification.identifiability import parameter_names
+from hhtjax.identification.identify import fit
+from hhtjax.identification.uncertainty import SEGMENTS
 
 
 class Score(NamedTuple):

@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from hhtjax.analysis import amplification_matrix
 from hhtjax.boundary import require_function, require_number
-from hhtjax.fit_result import FitResult
-from hhtjax.identifiability import parameter_names
-from hhtjax.identify import fit
-from hhtjax.steppers.stepper import State, Stepper
+from hhtjax.identification.identifiability import parameter_names
+from hhtjax.identification.identify import fit
+from hhtjax.identification.result import FitResult
+from hhtjax.steppers.stepper import require_stepper
 from hhtjax.system import LinearSystem
 
 
@@ -41,29 +42,6 @@ class ModeBias(NamedTuple):
     wh: Any
     stiffness_bias: Any
     damping_bias: Any
-
-
-def amplification_matrix(system, stepper, params, dt):
-    """The matrix of one step, by differentiation of the step itself, for a linear system without load.
-
-    Rows and columns are those of the state (q, v, w, a), as far as the stepper carries them, and its memory.
-
-    >>> import jax.numpy as jnp, hhtjax
-    >>> oscillator = hhtjax.LinearSystem(M=jnp.array([1.0]), K=jnp.array([4.0]))
-    >>> A = amplification_matrix(oscillator, hhtjax.hht(alpha=0.0), None, 0.1)
-    >>> bool(abs(jnp.max(jnp.abs(jnp.linalg.eigvals(A))) - 1) < 1e-12)            # the trapezoidal rule does not damp
-    True
-    """
-    M = system.M(params) if callable(system.M) else system.M
-    rest = jnp.zeros(jnp.asarray(M).shape[0], jnp.result_type(float))
-    state = stepper.init(system, rest, rest, params, dt)
-    moving, unravel = ravel_pytree(state._replace(t=None))
-
-    def step(x):
-        after, _ = stepper.step(system, State(state.t, *unravel(x)[1:]), params, dt)
-        return ravel_pytree(after._replace(t=None))[0]
-
-    return jax.jacfwd(step)(moving)
 
 
 def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0) -> ModeBias:
@@ -92,8 +70,7 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0) -> ModeBias:
     '0.1993 0.00666'
     """
     require_number("step_size_bias", "dt", dt, lambda x: x > 0, "be positive")
-    if not isinstance(stepper, Stepper):
-        raise TypeError(f"step_size_bias: `stepper` must be a stepper; received {stepper!r}.")
+    require_stepper("step_size_bias", stepper)
     if system.constraint is not None:
         raise NotImplementedError("step_size_bias: `system` has a constraint; give a minimal form of it.")
     q, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
@@ -105,8 +82,8 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0) -> ModeBias:
     M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
     M = jnp.diag(M) if M.ndim == 1 else M
     K, C = (-D for D in jax.jacfwd(force, argnums=(0, 1))(q, v))
-    A = np.asarray(amplification_matrix(LinearSystem(M, C, K), stepper, None, dt))
-    n = len(q)
+    linear, rest, n = LinearSystem(M, C, K), jnp.zeros_like(q), len(q)
+    A = np.asarray(amplification_matrix(stepper, linear, stepper.init(linear, rest, rest, None, dt), dt=dt))
     first_order = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
     fitted = np.linalg.eigvals(first_order)
     fitted = fitted[fitted.imag > 1e-9 * np.abs(fitted)]

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax import fit_report
-from hhtjax import transforms as tf
 from hhtjax.boundary import require_number
-from hhtjax.least_squares import COST, GRADIENT, REASONS, STEP, History
-from hhtjax.uncertainty import Uncertainty, correlation
+from hhtjax.identification import report
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.least_squares import COST, GRADIENT, REASONS, STEP, History
+from hhtjax.identification.uncertainty import Uncertainty, correlation
 
 
 class FitResult(NamedTuple):
@@ -112,20 +112,20 @@ class FitResult(NamedTuple):
         parameter  estimate  standard error  95 % interval  error / naive
         a          2  ...
         """
-        return fit_report.summary(self)
+        return report.summary(self)
 
     def plot(self, sampling_rate=1.0):
         """A figure: residual and its spectrum (of the first channel), intervals, correlations. Needs matplotlib."""
-        return fit_report.plot(self, sampling_rate)
+        return report.plot(self, sampling_rate)
 
     def to_json(self) -> str:
         """The whole result as JSON, for `FitResult.from_json`; inf and NaN as Python writes them."""
-        return json.dumps(fit_report.encode(self))
+        return json.dumps(report.encode(self))
 
     @staticmethod
     def from_json(text) -> "FitResult":
         """What `to_json` wrote. params of dicts, lists and tuples."""
-        return fit_report.decode(json.loads(text), {c.__name__: c for c in (FitResult, History, Uncertainty)})
+        return report.decode(json.loads(text), {c.__name__: c for c in (FitResult, History, Uncertainty)})
 
 
 def _ends(T, p, reach):

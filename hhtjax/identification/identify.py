@@ -14,7 +14,7 @@ import numpy as np
 
 from hhtjax.boundary import require_number
 from hhtjax.description import is_concrete
-from hhtjax.fit_arguments import (
+from hhtjax.identification.arguments import (
     check_options,
     check_parameters,
     check_prior,
@@ -24,11 +24,11 @@ from hhtjax.fit_arguments import (
     check_weights,
     first_bad,
 )
-from hhtjax.fit_problem import Data, solve
-from hhtjax.fit_result import FitResult
-from hhtjax.identifiability import warn_undetermined
-from hhtjax.least_squares import BAD_START
-from hhtjax.uncertainty import SEGMENTS
+from hhtjax.identification.identifiability import warn_undetermined
+from hhtjax.identification.least_squares import BAD_START
+from hhtjax.identification.problem import Data, solve
+from hhtjax.identification.result import FitResult
+from hhtjax.identification.uncertainty import SEGMENTS
 
 
 def fit(
@@ -78,7 +78,7 @@ def fit(
             residual and Jacobian columns. With optax: the relative change of the cost, five times running.
         covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
         segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
-            residuals are cut for the cluster covariance (`hhtjax.uncertainty`).
+            residuals are cut for the cluster covariance (`hhtjax.identification.uncertainty`).
         progress: print cost and step after every iteration, to stderr.
 
     Returns:

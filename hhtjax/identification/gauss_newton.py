@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.least_squares import Objective
+from hhtjax.identification.least_squares import Objective
 
 
 def with_jacobian(f, x):

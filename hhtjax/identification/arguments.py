@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from hhtjax import transforms as tf
 from hhtjax.boundary import require_function
 from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.least_squares import LOSSES
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.least_squares import LOSSES
 
 FEW = 64  # parameters up to which a forward-mode Jacobian is the cheaper derivative
 LEVENBERG_MARQUARDT = "levenberg_marquardt"

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax import transforms as tf
-from hhtjax.identifiability import parameter_names
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.identifiability import parameter_names
 
 
 def summary(result) -> str:
