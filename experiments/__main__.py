@@ -18,6 +18,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_small_wh
 EXPERIMENTS = {
     "silverbox": "identification.silverbox",
     "double_pendulum_measured": "identification.double_pendulum_measured",
+    "stiff_joint": "identification.stiff_joint",
     "kim2019": "kim2019.kim2019",
     "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",
     "linearization": "linearization.linearization",

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import hhtjax
+from hhtjax.identification.refine import Refined
 
 t = jnp.arange(0.0, 60.0, 0.35)
 K, C = 1.0, 0.04
@@ -26,20 +27,44 @@ def through(stepper, dt):
     return residuals
 
 
-def test_predicted_bias_is_measured_and_richardson_takes_it_back():
-    """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, k to 1e-4."""
+def test_predicted_bias_is_measured_and_taken_back():
+    """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then none in k and c."""
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
     with pytest.warns(hhtjax.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
-        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35)
+        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35, levels=3)
     assert (refined.stepper, refined.dt) == (stepper, 0.35)
-    for fit, dt in ((refined.coarse, 0.35), (refined.fine, 0.175)):
-        bias = hhtjax.step_size_bias(spring, stepper, fit.params, dt, q=jnp.zeros(1))
+    for fit, dt in zip(refined.fits, (0.35, 0.175), strict=False):
+        bias = hhtjax.step_size_bias(spring, stepper, fit.params, dt, q=jnp.zeros(1), correct=True)
         assert bias.stiffness_bias[0] == pytest.approx(float(fit.params["k"]) / K - 1, rel=0.03)
         assert bias.damping_bias[0] == pytest.approx(float(fit.params["c"]) / C - 1, rel=0.03)
+        assert bias.params["k"] == pytest.approx(K, abs=0.03 * float(fit.params["k"] - K))
+        assert bias.params["c"] == pytest.approx(C, abs=0.03 * float(fit.params["c"] - C))
         assert bias.frequency[0] ** 2 == pytest.approx(K, rel=1e-3)  # free of the bias
-    assert abs(refined.coarse.params["k"] - K) > 0.02
-    assert float(refined.params["k"]) == pytest.approx(K, abs=2e-4)
-    assert float(refined.params["c"]) == pytest.approx(C, rel=3e-3)
+    assert refined.fits[0].params["k"] - K > 0.02
+    assert float(refined.params["k"]) == pytest.approx(K, rel=3e-5)
+    assert float(refined.params["c"]) == pytest.approx(C, rel=1e-3)
+    again = Refined.from_json(refined.to_json())
+    assert again.stepper == stepper
+    assert again.params == refined.params
+    assert again.interval()[0]["k"] == refined.interval()[0]["k"]
+
+
+def test_the_response_to_forces_is_corrected_too():
+    """m, c, k of a driven oscillator at w h = 0.35: the closed forms, of k and c relative to m, and of the gain 1/m."""
+    driven = hhtjax.System(lambda q, p: p["m"] * jnp.ones(1), lambda q, v, t, p: -p["k"] * q - p["c"] * v - p["cubic"] * q**3)
+    fitted = {"m": 2.0, "c": 0.01, "k": 3.0, "cubic": 5.0}
+    bias = hhtjax.step_size_bias(driven, hhtjax.hht(alpha=0.0), fitted, 0.3, q=jnp.zeros(1), correct=True)
+    x = float(bias.wh[0]) / 2
+    gain = np.tan(x) / x / np.cos(x) ** 2
+    assert float(bias.params["m"]) == pytest.approx(2.0 * gain, rel=1e-4)
+    assert float(bias.params["k"] / bias.params["m"]) == pytest.approx(1.5 * (x / np.tan(x)) ** 2, rel=1e-5)
+    assert float(bias.params["c"] / bias.params["m"]) == pytest.approx(0.005 * np.cos(x) ** 2, rel=1e-4)
+    assert bias.params["cubic"] == 5.0
+    held = hhtjax.step_size_bias(
+        driven, hhtjax.hht(alpha=0.0), fitted, 0.3, jnp.zeros(1), correct=dict.fromkeys(fitted, True) | {"m": False}
+    )
+    assert held.params["m"] == 2.0
+    assert float(held.params["k"]) == pytest.approx(3.0 * (x / np.tan(x)) ** 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("wh", [0.1, 0.7])
@@ -59,7 +84,11 @@ def test_the_bias_of_the_trapezoidal_rule_in_every_mode(wh):
     ("call", "error", "message"),
     [
         (lambda: hhtjax.refine(3, 1.0, None, 0.1), TypeError, r"refine: `residuals_at` must be a function"),
-        (lambda: hhtjax.refine(through, 1.0, None, -0.1), ValueError, "refine: `dt` must be positive; received -0.1"),
+        (
+            lambda: hhtjax.refine(through, 1.0, hhtjax.hht(), -0.1),
+            ValueError,
+            "refine: `dt` must be positive; received -0.1",
+        ),
         (
             lambda: hhtjax.step_size_bias(spring, "hht", None, 0.1, q=jnp.zeros(1)),
             TypeError,

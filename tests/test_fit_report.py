@@ -18,31 +18,35 @@ def residuals(params):
 
 START = {"a": 1.0, "rate": 1.0, "rest": (0.3,)}
 TRANSFORMS = {"a": hhtjax.positive, "rate": hhtjax.bounded(0, 10), "rest": hhtjax.fixed}
-RESULT = hhtjax.fit(residuals, START, transforms=TRANSFORMS)
 
 
-def test_summary_and_json():
-    lines = RESULT.summary().splitlines()
+@pytest.fixture(scope="module")
+def result():
+    return hhtjax.fit(residuals, START, transforms=TRANSFORMS)
+
+
+def test_summary_and_json(result):
+    lines = result.summary().splitlines()
     assert lines[0].startswith("converged: ")
     row = next(line for line in lines if line.startswith("rate")).split()
-    assert float(row[1]) == pytest.approx(float(RESULT.params["rate"]), rel=1e-5)
-    assert float(row[2]) == pytest.approx(float(RESULT.standard_errors["rate"]), rel=1e-2)
+    assert float(row[1]) == pytest.approx(float(result.params["rate"]), rel=1e-5)
+    assert float(row[2]) == pytest.approx(float(result.standard_errors["rate"]), rel=1e-2)
     assert next(line for line in lines if line.startswith("rest.0")).split()[2] == "fixed"
     assert any(line.startswith("largest correlation: +") and line.endswith("a and rate") for line in lines)
-    again = FitResult.from_json(RESULT.to_json())
-    assert jax.tree.structure(again) == jax.tree.structure(RESULT)
-    jax.tree.map(np.testing.assert_array_equal, again, RESULT)
-    assert again.summary() == RESULT.summary()
+    again = FitResult.from_json(result.to_json())
+    assert jax.tree.structure(again) == jax.tree.structure(result)
+    jax.tree.map(np.testing.assert_array_equal, again, result)
+    assert again.summary() == result.summary()
 
 
-def test_profile_is_the_parabola_of_the_standard_error():
+def test_profile_is_the_parabola_of_the_standard_error(result):
     """Naive errors, for which the white likelihood is right."""
-    sigma = float(RESULT.standard_errors["rate"])
-    values = float(RESULT.params["rate"]) + sigma * np.array([-1.0, 0.0, 1.0])
-    found = hhtjax.profile(residuals, RESULT, "rate", values)
+    sigma = float(result.standard_errors["rate"])
+    values = float(result.params["rate"]) + sigma * np.array([-1.0, 0.0, 1.0])
+    found = hhtjax.profile(residuals, result, "rate", values)
     np.testing.assert_allclose(found.deviance, [1, 0, 1], atol=0.06)
     with pytest.raises(ValueError, match=r"profile: `name` must be one of a, rate; received 'k'"):
-        hhtjax.profile(residuals, RESULT, "k", values)
+        hhtjax.profile(residuals, result, "k", values)
 
 
 def test_the_score_test_predicts_the_refit():

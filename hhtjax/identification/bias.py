@@ -1,4 +1,4 @@
-"""What a step size does to fitted parameters, and how to take it back.
+"""What a step size does to fitted parameters, predicted from the step itself.
 
 A simulation with steps h has its own frequencies: its amplification matrix A(h) has eigenvalues mu = exp(s h) with
 s not quite the eigenvalue of the equations. Parameters fitted through it make mu right, so the equations with these
@@ -6,9 +6,10 @@ parameters have eigenvalues s' that are wrong by as much. For HHT with alpha = 0
 
     |s'|^2/|s|^2 = (tan x/x)^2 = 1 + (w h)^2/6 + ...        stiffness over mass
     Re s'/Re s   = 1/cos(x)^2  = 1 + (w h)^2/4 + ...        damping over mass
+
+and the response to a force is wrong too, by 1 + (w h)^2/3 + ...: where the force is known, so is the mass.
 """
 
-import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -17,16 +18,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis import amplification_matrix
-from hhtjax.boundary import require_function, require_number
-from hhtjax.identification.identifiability import parameter_names
-from hhtjax.identification.identify import fit
-from hhtjax.identification.result import FitResult
+from hhtjax.boundary import require_number
 from hhtjax.steppers.stepper import require_stepper
 from hhtjax.system import LinearSystem
 
-
-class StepSizeWarning(UserWarning):
-    """The step size shifts an estimate by more than its standard error."""
+OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
+GAIN_WEIGHT = 1e-3  # frequency and damping first; the response to forces with the freedom that they leave
+PROBE = 1e-4  # relative change of the stiffness that shows the response to forces
 
 
 class ModeBias(NamedTuple):
@@ -35,6 +33,7 @@ class ModeBias(NamedTuple):
     frequency: w = |s|, rad/s, and damping: -Re s/w, of the motion itself; both free of the bias. wh: w h.
     stiffness_bias: |s'|^2/|s|^2 - 1. damping_bias: Re s'/Re s - 1, 0 for an undamped mode. s' belongs to the
     parameters as fitted with steps h.
+    params: the fitted ones without the bias; None if not asked for.
     """
 
     frequency: Any
@@ -42,9 +41,10 @@ class ModeBias(NamedTuple):
     wh: Any
     stiffness_bias: Any
     damping_bias: Any
+    params: Any = None
 
 
-def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0) -> ModeBias:
+def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct=False) -> ModeBias:
     """By how much stiffness and damping are off that were fitted through steps of dt.
 
     The system is linearised about (q, v, t): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
@@ -55,6 +55,10 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0) -> ModeBias:
         system, stepper, dt: what the parameters were fitted through.
         params: the fitted ones.
         q: an equilibrium, or another point about which the motion is small. v: 0 by default.
+        correct: True returns `params` with the smallest relative changes that give the equations the eigenvalues s
+            and, as far as parameters can, the steps' response to forces ("pre-warped"). Parameters that the linear
+            part does not depend on stay as they are. Or Booleans for the leaves of params, or for whole branches:
+            False for what was not fitted, such as a known mass.
 
     Raises:
         TypeError, ValueError: dt is no positive number.
@@ -65,14 +69,30 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0) -> ModeBias:
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.array([1.0]), lambda q, v, t, params: -params * q)
-    >>> bias = hhtjax.step_size_bias(spring, hhtjax.hht(alpha=0.0), 400.0, 0.01, q=jnp.zeros(1))
+    >>> bias = hhtjax.step_size_bias(spring, hhtjax.hht(alpha=0.0), 400.0, 0.01, q=jnp.zeros(1), correct=True)
     >>> f"{float(bias.wh[0]):.4f} {float(bias.stiffness_bias[0]):.5f}"             # w h, and about (w h)^2/6
     '0.1993 0.00666'
+    >>> f"{float(bias.params):.3f} {float(bias.frequency[0]) ** 2:.3f}"
+    '397.354 397.354'
     """
     require_number("step_size_bias", "dt", dt, lambda x: x > 0, "be positive")
     require_stepper("step_size_bias", stepper)
     if system.constraint is not None:
         raise NotImplementedError("step_size_bias: `system` has a constraint; give a minimal form of it.")
+    matrices = _linear_part(system, params, q, v, t)
+    fitted = _rates_of_equations(*matrices)
+    s = _rates_of_steps(stepper, dt, *matrices)
+    w = np.abs(s)
+    damped = np.abs(fitted.real) > OSCILLATES * np.abs(fitted)
+    damping_bias = np.where(damped, fitted.real / np.where(damped, s.real, 1) - 1, 0)
+    bias = ModeBias(w, -s.real / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
+    if correct is False:
+        return bias
+    return bias._replace(params=_corrected(system, stepper, params, dt, (q, v, t), matrices, correct))
+
+
+def _linear_part(system, params, q, v, t):
+    """M, C, K about a state, (n, n) each."""
     q, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
     v = jnp.zeros_like(q) if v is None else ravel_pytree(v)[0]
 
@@ -80,76 +100,55 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0) -> ModeBias:
         return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0]
 
     M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
-    M = jnp.diag(M) if M.ndim == 1 else M
     K, C = (-D for D in jax.jacfwd(force, argnums=(0, 1))(q, v))
-    linear, rest, n = LinearSystem(M, C, K), jnp.zeros_like(q), len(q)
-    A = np.asarray(amplification_matrix(stepper, linear, stepper.init(linear, rest, rest, None, dt), dt=dt))
+    return jnp.diag(M) if M.ndim == 1 else M, C, K
+
+
+def _rates_of_equations(M, C, K):
+    """Eigenvalues s with an oscillation, one of each pair, slowest first."""
+    n = len(M)
     first_order = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
-    fitted = np.linalg.eigvals(first_order)
-    fitted = fitted[fitted.imag > 1e-9 * np.abs(fitted)]
-    fitted = fitted[np.argsort(np.abs(fitted))]
-    mu = np.linalg.eigvals(A)
+    s = np.linalg.eigvals(first_order)
+    s = s[s.imag > OSCILLATES * np.abs(s)]
+    return s[np.argsort(np.abs(s))]
+
+
+def _rates_of_steps(stepper, dt, M, C, K):
+    """log(mu)/dt of the steps, in the order of the equations' eigenvalues."""
+    linear, rest = LinearSystem(M, C, K), jnp.zeros(len(M))
+    state = stepper.init(linear, rest, rest, None, dt)
+    mu = np.linalg.eigvals(np.asarray(amplification_matrix(stepper, linear, state, dt=dt)))
     mu = mu[mu.imag > 0]
-    nearest = np.array([mu[np.argmin(np.abs(mu - np.exp(s * dt)))] for s in fitted])
-    s = np.log(nearest) / dt
-    w = np.abs(s)
-    damped = np.abs(fitted.real) > 1e-9 * np.abs(fitted)
-    damping_bias = np.where(damped, fitted.real / np.where(damped, s.real, 1) - 1, 0)
-    return ModeBias(w, -s.real / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
+    return np.array([np.log(mu[np.argmin(np.abs(mu - np.exp(s * dt)))]) / dt for s in _rates_of_equations(M, C, K)])
 
 
-class Refined(NamedTuple):
-    """What `refine` returns: an estimate together with the scheme and the step that it belongs to.
+def _corrected(system, stepper, params, dt, state, matrices, correct):
+    """Gauss-Newton steps of least relative change towards the rates of the steps, and their change with stiffness.
 
-    stepper, dt: of `coarse`. coarse, fine: `FitResult` with steps of dt and dt/2. params: Richardson's extrapolation
-    to dt = 0. shift: coarse - params in standard errors of `coarse`, a pytree like params.
+    A force -eps K q changes s by as much as the system responds to forces: so no force needs to be applied.
     """
+    _, _, K0 = matrices
 
-    stepper: Any
-    dt: float
-    coarse: FitResult
-    fine: FitResult
-    params: Any
-    shift: Any
+    def with_response(rates, M, C, K):
+        plus, minus = (rates(M, C, K + sign * PROBE * K0) for sign in (1, -1))
+        return np.concatenate([rates(M, C, K), (plus - minus) / (2 * PROBE)])
 
-
-def refine(residuals_at, params0, stepper, dt, **options: Any) -> Refined:
-    """Fits with dt and with dt/2, and extrapolates the parameters to dt = 0.
-
-        params = fine + (fine - coarse)/(2^p - 1),    p the order of the stepper
-
-    Parameters belong to the step size they were fitted with: for simulations with dt take `coarse.params`, for what
-    they mean physically `params`.
-
-    Args:
-        residuals_at: (stepper, dt) -> the function residuals(params) of `fit`.
-        params0, options: as in `fit`. The second fit starts where the first one ended.
-
-    Warns:
-        StepSizeWarning: some parameter is shifted by more than one standard error: names it.
-
-    Raises:
-        TypeError, ValueError: dt is no positive number, and whatever `fit` raises.
-    """
-    require_function("refine", "residuals_at", residuals_at, "residuals_at(stepper, dt)")
-    require_number("refine", "dt", dt, lambda x: x > 0, "be positive")
-    coarse = fit(residuals_at(stepper, dt), params0, **options)
-    fine = fit(residuals_at(stepper, dt / 2), coarse.params, **options)
-    gain = 1 / (2**stepper.order - 1)
-    params = jax.tree.map(lambda a, b: b + gain * (b - a), coarse.params, fine.params)
-    shift = jax.tree.map(
-        lambda a, b, e: (a - b) / jnp.where(e > 0, e, jnp.inf), coarse.params, params, coarse.standard_errors
+    target = with_response(lambda *matrices: _rates_of_steps(stepper, dt, *matrices), *matrices)
+    weight = np.repeat([1.0, GAIN_WEIGHT], len(target) // 2)
+    params = jax.tree.map(lambda p: jnp.asarray(p, jnp.result_type(float)), params)
+    fitted, unravel = ravel_pytree(params)
+    repeated = jax.tree.map(
+        lambda flag, branch: jax.tree.map(lambda p: jnp.full(p.shape, flag), branch), correct, params
     )
-    _warn_if_shifted(coarse, shift, dt)
-    return Refined(stepper, dt, coarse, fine, params, shift)
+    at = np.flatnonzero(ravel_pytree(repeated)[0])
 
+    def apart(x):
+        moved = unravel(fitted.at[at].multiply(1 + x))
+        off = weight * (with_response(_rates_of_equations, *_linear_part(system, moved, *state)) / target - 1)
+        return np.concatenate([off.real, off.imag])
 
-def _warn_if_shifted(coarse, shift, dt):
-    sizes = np.concatenate([np.ravel(x) for x in jax.tree.leaves(shift)])
-    named = [f"{n} ({s:+.1f})" for n, s in zip(parameter_names(coarse.params), sizes, strict=True) if abs(s) > 1]
-    if named:
-        warnings.warn(
-            f"refine: steps of {dt:.6g} shift {', '.join(named)} by that many standard errors.",
-            StepSizeWarning,
-            stacklevel=3,
-        )
+    x = np.zeros(len(at))
+    for _ in range(4):
+        J = np.stack([(apart(x + e) - apart(x - e)) / 2e-5 for e in 1e-5 * np.eye(len(x))], axis=1)
+        x = x - np.linalg.lstsq(J, apart(x), rcond=1e-5)[0]
+    return unravel(fitted.at[at].multiply(1 + x))

@@ -1,5 +1,6 @@
 """A fit for readers: a text table, charts, and JSON."""
 
+from dataclasses import fields
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.identifiability import parameter_names
+from hhtjax.steppers.stepper import Stepper
 
 
 def summary(result) -> str:
@@ -84,7 +86,7 @@ TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}
 
 
 def encode(x):
-    """A pytree of named tuples, dicts, lists, tuples, arrays and transforms, as what JSON can hold."""
+    """A pytree of named tuples, dicts, lists, tuples, arrays, transforms and steppers, as what JSON can hold."""
     if x is None or isinstance(x, (int, float, str)):
         return x
     if isinstance(x, tf.Bounded):
@@ -93,15 +95,17 @@ def encode(x):
         return {"transform": next(name for name, T in TRANSFORMS.items() if T is x)}
     if isinstance(x, dict):
         return {"dict": {name: encode(y) for name, y in x.items()}}
-    if fields := getattr(x, "_fields", None):
-        return {type(x).__name__: {name: encode(y) for name, y in zip(fields, x, strict=True)}}
+    if isinstance(x, Stepper):
+        return {type(x).__name__: {field.name: encode(getattr(x, field.name)) for field in fields(x)}}
+    if names := getattr(x, "_fields", None):
+        return {type(x).__name__: {name: encode(y) for name, y in zip(names, x, strict=True)}}
     if isinstance(x, (list, tuple)):
         return {type(x).__name__: [encode(y) for y in x]}
     return {"array": np.asarray(x).tolist(), "dtype": str(np.asarray(x).dtype)}
 
 
 def decode(x, named) -> Any:
-    """The inverse of `encode`; named: the classes of named tuples, by name."""
+    """The inverse of `encode`; named: the classes of named tuples and steppers, by name."""
     if not isinstance(x, dict):
         return x
     kind, content = next(iter(x.items()))

@@ -125,7 +125,10 @@ class FitResult(NamedTuple):
     @staticmethod
     def from_json(text) -> "FitResult":
         """What `to_json` wrote. params of dicts, lists and tuples."""
-        return report.decode(json.loads(text), {c.__name__: c for c in (FitResult, History, Uncertainty)})
+        return report.decode(json.loads(text), NAMED)
+
+
+NAMED: dict[str, Any] = {c.__name__: c for c in (FitResult, History, Uncertainty)}
 
 
 def _ends(T, p, reach):

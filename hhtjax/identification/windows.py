@@ -1,11 +1,13 @@
-"""Measured records cut into windows of one shape, for `fit(..., records=...)`."""
+"""Measurements: records cut into windows of one shape for `fit(..., records=...)`, and what sensors make of motion."""
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.boundary import require_number
+from hhtjax.simulate import interpolate
 
 
 class Windows(NamedTuple):
@@ -74,3 +76,30 @@ def wrap_angle(angle):
     -0.2832
     """
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+
+
+def measure(solution, times, gain=1.0, offset=0.0, delay=0.0):
+    """What sensors of position show at `times`: gain q(t - delay) + offset, at the start of the run for earlier times.
+
+    gain, offset and delay (s, a number) are ordinary parameters of a fit: of a signal's gain and a model's stiffness
+    and mass only ratios can be found.
+
+    Args:
+        solution: of one run. times: (samples,), s, not after its end.
+        gain, offset: numbers, or pytrees like q.
+
+    Returns:
+        A pytree like q, with a leading axis of samples.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q)
+    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.zeros(1), jnp.ones(1), dt=0.1, num_steps=10)    # q = t
+    >>> float(measure(run, jnp.array([0.8]), gain=2.0, offset=0.5, delay=0.3)[0, 0].round(6))
+    1.5
+    """
+    q = interpolate(solution, jnp.maximum(times - delay, solution.t[0])).q
+
+    def like_q(x):
+        return jax.tree.map(lambda _: x, q) if jax.tree.structure(x) != jax.tree.structure(q) else x
+
+    return jax.tree.map(lambda y, g, b: g * y + b, q, like_q(gain), like_q(offset))
