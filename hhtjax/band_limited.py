@@ -64,9 +64,14 @@ def band_limited_motion(values, dt, cutoff):
     """
     sampled(values, dt)
     require_number("band_limited_motion", "cutoff", cutoff, lambda f: 0 < f * dt <= 0.5, "lie in (0, 1/(2 dt)]")
+    return _motion(jnp.asarray(values), dt, cutoff)
+
+
+@jax.jit
+def _motion(values, dt, cutoff):
     line, spectrum = _odd_series(values)
     n = spectrum.shape[0] - 1
-    frequency = jnp.linspace(0, 0.5 / dt, n + 1, dtype=line(n).dtype).reshape(-1, *(1,) * (spectrum.ndim - 1))
+    frequency = (jnp.linspace(0, 0.5, n + 1) / dt).astype(line(n).dtype).reshape(-1, *(1,) * (spectrum.ndim - 1))
     kept = jnp.where(frequency <= cutoff, spectrum, 0)
 
     def derivative(order):

@@ -7,7 +7,7 @@ import pytest
 import hhtjax
 from hhtjax.identification.refine import Refined
 
-t = jnp.arange(0.0, 60.0, 0.35)
+t = jnp.arange(0.0, 30.0, 0.35)
 K, C = 1.0, 0.04
 DECAY, FREQUENCY = C / 2, np.sqrt(K - C**2 / 4)
 EXACT = jnp.exp(-DECAY * t) * (jnp.cos(FREQUENCY * t) + DECAY / FREQUENCY * jnp.sin(FREQUENCY * t))
@@ -28,21 +28,22 @@ def through(stepper, dt):
 
 
 def test_predicted_bias_is_measured_and_taken_back():
-    """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then none in k and c."""
+    """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then next to none."""
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
     with pytest.warns(hhtjax.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
-        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35, levels=3)
+        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35, levels=2)
     assert (refined.stepper, refined.dt) == (stepper, 0.35)
-    for fit, dt in zip(refined.fits, (0.35, 0.175), strict=False):
-        bias = hhtjax.step_size_bias(spring, stepper, fit.params, dt, q=jnp.zeros(1), correct=True)
-        assert bias.stiffness_bias[0] == pytest.approx(float(fit.params["k"]) / K - 1, rel=0.03)
-        assert bias.damping_bias[0] == pytest.approx(float(fit.params["c"]) / C - 1, rel=0.03)
-        assert bias.params["k"] == pytest.approx(K, abs=0.03 * float(fit.params["k"] - K))
-        assert bias.params["c"] == pytest.approx(C, abs=0.03 * float(fit.params["c"] - C))
-        assert bias.frequency[0] ** 2 == pytest.approx(K, rel=1e-3)  # free of the bias
+    found, fine = refined.fits
+    bias = hhtjax.step_size_bias(spring, stepper, found.params, 0.35, q=jnp.zeros(1), correct=True)
+    assert bias.stiffness_bias[0] == pytest.approx(float(found.params["k"]) / K - 1, rel=0.03)
+    assert bias.damping_bias[0] == pytest.approx(float(found.params["c"]) / C - 1, rel=0.03)
+    assert bias.params["k"] == pytest.approx(K, abs=0.03 * float(found.params["k"] - K))
+    assert bias.params["c"] == pytest.approx(C, abs=0.03 * float(found.params["c"] - C))
+    assert bias.frequency[0] ** 2 == pytest.approx(K, rel=1e-3)  # free of the bias
+    assert float(fine.params["k"] - K) == pytest.approx(float(found.params["k"] - K) / 4, rel=0.05)
     assert refined.fits[0].params["k"] - K > 0.02
-    assert float(refined.params["k"]) == pytest.approx(K, rel=3e-5)
-    assert float(refined.params["c"]) == pytest.approx(C, rel=1e-3)
+    assert float(refined.params["k"]) == pytest.approx(K, abs=2e-4)
+    assert float(refined.params["c"]) == pytest.approx(C, rel=3e-3)  # the numerical damping's h^3
     again = Refined.from_json(refined.to_json())
     assert again.stepper == stepper
     assert again.params == refined.params
@@ -51,7 +52,9 @@ def test_predicted_bias_is_measured_and_taken_back():
 
 def test_the_response_to_forces_is_corrected_too():
     """m, c, k of a driven oscillator at w h = 0.35: the closed forms, of k and c relative to m, and of the gain 1/m."""
-    driven = hhtjax.System(lambda q, p: p["m"] * jnp.ones(1), lambda q, v, t, p: -p["k"] * q - p["c"] * v - p["cubic"] * q**3)
+    driven = hhtjax.System(
+        lambda q, p: p["m"] * jnp.ones(1), lambda q, v, t, p: -p["k"] * q - p["c"] * v - p["cubic"] * q**3
+    )
     fitted = {"m": 2.0, "c": 0.01, "k": 3.0, "cubic": 5.0}
     bias = hhtjax.step_size_bias(driven, hhtjax.hht(alpha=0.0), fitted, 0.3, q=jnp.zeros(1), correct=True)
     x = float(bias.wh[0]) / 2
@@ -67,12 +70,11 @@ def test_the_response_to_forces_is_corrected_too():
     assert float(held.params["k"]) == pytest.approx(3.0 * (x / np.tan(x)) ** 2, rel=1e-4)
 
 
-@pytest.mark.parametrize("wh", [0.1, 0.7])
-def test_the_bias_of_the_trapezoidal_rule_in_every_mode(wh):
+def test_the_bias_of_the_trapezoidal_rule_in_every_mode():
     """Two masses, w = 1 and w = sqrt(3): (tan x/x)^2 and, for damping proportional to K, 1/cos(x)^2."""
     K = jnp.array([[2.0, -1.0], [-1.0, 2.0]])
     pair = hhtjax.System(jnp.ones(2), lambda q, v, t, params: -K @ q - 1e-3 * K @ v)
-    bias = hhtjax.step_size_bias(pair, hhtjax.hht(alpha=0.0), None, wh, q=jnp.zeros(2))
+    bias = hhtjax.step_size_bias(pair, hhtjax.hht(alpha=0.0), None, 0.5, q=jnp.zeros(2))
     x = bias.wh / 2
     np.testing.assert_allclose(bias.stiffness_bias, (np.tan(x) / x) ** 2 - 1, rtol=1e-3)
     np.testing.assert_allclose(bias.damping_bias, 1 / np.cos(x) ** 2 - 1, rtol=1e-3)

@@ -17,19 +17,14 @@ def model(params):
     return params["a"] * jnp.exp(-params["decay"][0] * t) + jnp.exp(-params["decay"][1] * t)
 
 
+NOISE = 0.01 * np.random.default_rng(0).normal(size=60)
+
+
 def decay_residuals(params):
-    return {"signal": model(params) - model(TRUE), "nothing": jnp.zeros((2, 3))}
+    return {"signal": model(params) - model(TRUE) - NOISE, "nothing": jnp.zeros((2, 3))}
 
 
 START = {"a": 1.0, "decay": jnp.array([0.2, 4.0])}
-
-
-def oscillator(params, num_steps=100):
-    """Position of a damped oscillator, by the non-iterative step."""
-    system = hhtjax.System(jnp.array([1.0]), lambda q, v, t, params: -params["c"] * v - params["k"] * q)
-    stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
-    run = hhtjax.simulate(system, stepper, jnp.array([1.0]), jnp.array([0.0]), params, dt=0.05, num_steps=num_steps)
-    return run.q[:, 0]
 
 
 @pytest.fixture
@@ -39,7 +34,7 @@ def _promotion():
         yield
 
 
-def test_known_parameters_are_found(capfd):
+def test_estimate_and_naive_covariance_are_scipys(capfd):
     """With progress on stderr; a second start costs no tracing."""
     calls = []
 
@@ -50,8 +45,11 @@ def test_known_parameters_are_found(capfd):
     result = hhtjax.fit(residuals, START, progress=True)
     jax.effects_barrier()
     assert jax.tree.structure(result.params) == jax.tree.structure(START)
-    assert float(result.params["a"]) == pytest.approx(3.0, rel=1e-6)
-    np.testing.assert_allclose(result.params["decay"], TRUE["decay"], rtol=1e-6)
+    compiled = jax.jit(lambda x: decay_residuals({"a": x[0], "decay": x[1:]})["signal"])
+    scipys = least_squares(lambda x: np.asarray(compiled(x)), [1.0, 0.2, 4.0], xtol=1e-14, ftol=1e-14)
+    np.testing.assert_allclose([result.params["a"], *result.params["decay"]], scipys.x, rtol=1e-5)
+    covariance = 2 * scipys.cost / (t.size + 6 - 3) * np.linalg.inv(scipys.jac.T @ scipys.jac)
+    np.testing.assert_allclose(result.uncertainty.naive, covariance, rtol=1e-3)
     assert result.residual["nothing"].shape == (2, 3)
     assert np.all(np.isfinite(result.history.cost))
     assert result.history.cost.shape == (int(result.iterations) + 1,)
@@ -63,38 +61,6 @@ def test_known_parameters_are_found(capfd):
     count = len(calls)
     hhtjax.fit(residuals, {"a": 2.0, "decay": jnp.array([0.3, 3.0])}, progress=True)
     assert len(calls) == count
-
-
-def test_stiffness_and_damping_through_the_non_iterative_step():
-    measured = oscillator({"k": 4.0, "c": 0.3})
-    result = hhtjax.fit(lambda p: oscillator(p) - measured, {"k": 5.0, "c": 0.6}, covariance=False)
-    assert result.converged
-    assert float(result.params["k"]) == pytest.approx(4.0, rel=1e-5)
-    assert float(result.params["c"]) == pytest.approx(0.3, rel=1e-4)
-
-
-def test_standard_error_is_the_scatter_of_the_estimates_and_scipys():
-    """Over 300 noise records at once: fit works under vmap. The first of them is compared with SciPy."""
-    noise = 0.002 * jax.random.normal(jax.random.key(0), (300, t.size))
-
-    def residuals(params, noise):
-        return model(params) - model(TRUE) - noise
-
-    def estimate(noise):
-        result = hhtjax.fit(lambda p: residuals(p, noise), START)
-        return result.params, result.standard_errors, result.uncertainty.naive, result.converged
-
-    params, errors, naive, converged = jax.jit(jax.vmap(estimate))(noise)
-    assert converged.all()
-    errors = jax.tree.map(lambda e: np.sqrt(np.mean(e**2, axis=0)), errors)  # it is the variance that has no bias
-    assert float(params["a"].std() / errors["a"]) == pytest.approx(1, abs=0.12)
-    np.testing.assert_allclose(params["decay"].std(axis=0) / errors["decay"], 1, atol=0.15)
-
-    first = jax.jit(lambda x: residuals({"a": x[0], "decay": x[1:]}, noise[0]))
-    scipys = least_squares(lambda x: np.asarray(first(x)), [1.0, 0.2, 4.0], xtol=1e-14, ftol=1e-14)
-    np.testing.assert_allclose([params["a"][0], *params["decay"][0]], scipys.x, rtol=1e-5)
-    covariance = 2 * scipys.cost / (t.size - 3) * np.linalg.inv(scipys.jac.T @ scipys.jac)
-    np.testing.assert_allclose(naive[0], covariance, rtol=1e-3)
 
 
 @pytest.mark.usefixtures("_promotion")
@@ -209,7 +175,8 @@ def rooted(p):
         (
             lambda: hhtjax.fit(rooted, -1.0, covariance=False),
             ValueError,
-            r"`residuals` must be finite at params0; received nan at residuals\['b'\]\[0\] \(3 of 7 entries\)",
+            r"`residuals` must be finite at params0; received nan at residuals\['b'\]\[0\] \(3 of 7 entries\); give "
+            "missing samples the weight False",
         ),
         (
             lambda: hhtjax.fit(rooted, 0.0, covariance=False),

@@ -27,7 +27,7 @@ def test_cluster_errors_are_the_scatter_where_residuals_are_correlated():
         u = result.uncertainty
         return result.params, *(jnp.diagonal(C) for C in (u.cluster, u.naive, u.autocorrelated))
 
-    params, *variances = jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(0), 400))
+    params, *variances = jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(0), 200))
     cluster, naive, autocorrelated = (np.sqrt(v.mean(axis=0)) / params.std(axis=0) for v in variances)
     np.testing.assert_allclose(cluster, 1, atol=0.12)
     assert naive[0] < 0.4

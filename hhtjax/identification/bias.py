@@ -142,13 +142,17 @@ def _corrected(system, stepper, params, dt, state, matrices, correct):
     )
     at = np.flatnonzero(ravel_pytree(repeated)[0])
 
+    @jax.jit
+    def moved(x):
+        params = unravel(fitted.at[at].multiply(1 + x))
+        return params, _linear_part(system, params, *state)
+
     def apart(x):
-        moved = unravel(fitted.at[at].multiply(1 + x))
-        off = weight * (with_response(_rates_of_equations, *_linear_part(system, moved, *state)) / target - 1)
+        off = weight * (with_response(_rates_of_equations, *map(np.asarray, moved(x)[1])) / target - 1)
         return np.concatenate([off.real, off.imag])
 
     x = np.zeros(len(at))
     for _ in range(4):
         J = np.stack([(apart(x + e) - apart(x - e)) / 2e-5 for e in 1e-5 * np.eye(len(x))], axis=1)
         x = x - np.linalg.lstsq(J, apart(x), rcond=1e-5)[0]
-    return unravel(fitted.at[at].multiply(1 + x))
+    return moved(x)[0]
