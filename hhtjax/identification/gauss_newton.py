@@ -13,6 +13,8 @@ import jax.numpy as jnp
 
 from hhtjax.identification.least_squares import Objective
 
+PART = 512  # rows
+
 
 def with_jacobian(f, x):
     """f(x) and its forward-mode Jacobian."""
@@ -23,6 +25,25 @@ def with_jacobian(f, x):
 
     J, r = jax.jacfwd(twice, has_aux=True)(x)
     return r, J
+
+
+def triangle(A):
+    """R of A = Q R. Of a tall matrix by QR of parts of its rows, then of what is left of them, and so on: LAPACK's goes
+    through the whole of it for every column.
+
+    >>> A = jnp.sin(jnp.arange(9000.0)).reshape(3000, 3)
+    >>> R = triangle(A)
+    >>> R.shape, bool(jnp.allclose(R.T @ R, A.T @ A))
+    ((3, 3), True)
+    """
+    m, k = A.shape
+    rows = max(PART, 4 * k)
+    while m > 2 * rows:
+        parts = -(-m // rows)
+        A = jnp.pad(A, ((0, parts * rows - m), (0, 0))).reshape(parts, rows, k)
+        A = jnp.linalg.qr(A, mode="r").reshape(-1, k)
+        m = A.shape[0]
+    return jnp.linalg.qr(A, mode="r")
 
 
 class DenseTrial(NamedTuple):
@@ -52,10 +73,11 @@ class Dense(NamedTuple):
         finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
         r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
         column = _norms(J_hat)
-        Q, R = jnp.linalg.qr(J_hat / column[None, :])
-        U, s, Vt = jnp.linalg.svd(R)
+        p = x.size
+        R = triangle(jnp.concatenate([J_hat / column[None, :], r_hat[:, None]], axis=1))
+        U, s, Vt = jnp.linalg.svd(R[:p, :p])
         cost = jnp.where(finite, self.objective.cost(r), jnp.inf)
-        return DenseTrial(x, r, J, cost, jnp.linalg.norm(r_hat), column, s, Vt.T, U.T @ (Q.T @ r_hat))
+        return DenseTrial(x, r, J, cost, jnp.linalg.norm(R[:, p]), column, s, Vt.T, U.T @ R[:p, p])
 
     def step(self, trial, lam):
         """The damped step, and the decrease of the cost that the linear problem predicts."""

@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+
+from hhtjax.identification.gauss_newton import triangle
 
 SEGMENTS = 32
 ALONE = 0.75  # share of the information on a combination of parameters, above which its segment has taken it all
@@ -74,7 +75,7 @@ def uncertainty(J, r, present, sizes, segments, tau) -> Uncertainty:
     eps = float(jnp.finfo(J.dtype).eps)
     norms = jnp.linalg.norm(J, axis=0)
     column = jnp.where(norms == 0, 1, norms)
-    _, s, Vt = jnp.linalg.svd(jnp.linalg.qr(J / column[None, :], mode="r"))
+    _, s, Vt = jnp.linalg.svd(triangle(J / column[None, :]))
     seen = s > 10 * J.shape[0] * eps * s[0]
     undetermined = jnp.any(~seen[:, None] & (jnp.abs(Vt) > 1e-6), axis=0) | (present == p)
     T = Vt.T * jnp.where(seen, 1 / jnp.where(seen, s, 1), 0)[None, :]  # coordinates in which J^T J = 1
@@ -127,9 +128,7 @@ def variance_inflation(leaves):
             axis = int(np.argmax(r.shape)) if r.ndim else 0
             r = jnp.moveaxis(jnp.atleast_1d(r), axis, 0)
             L = math.isqrt(r.shape[0])
-            rest = (1,) * (r.ndim - 1)
-            padding = ((L - 1, L - 1), *((0, 0),) * len(rest))
-            zero = jnp.zeros((), r.dtype)
-            window = lax.reduce_window(r, zero, lax.add, (L, *rest), (1, *rest), padding)
+            sums_to = jnp.cumsum(jnp.pad(r, ((L, L - 1), *((0, 0),) * (r.ndim - 1))), axis=0)
+            window = sums_to[L:] - sums_to[:-L]
             energy, sums = energy + jnp.sum(r**2), sums + jnp.sum(window**2) / L
     return jnp.maximum(sums / jnp.where(energy > 0, energy, 1), 1)  # a fit takes the slow part of white residuals away
