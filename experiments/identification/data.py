@@ -25,6 +25,14 @@ HOW_TO_GET_IT = (
 GENERATED = {"m": 5.4e-6, "c": 2.2e-4, "k": 1.0, "k2": -0.03, "k3": 4.0, "offset": -5e-3}
 NOISE = 3e-4  # V, standard deviation
 
+LINEAR = ("m", "c", "k", "k2", "k3", "offset")
+# a linear oscillator with the resonance at 68 Hz and 2 % of damping, seen in the spectrum
+RESONANCE = 68.0  # Hz
+START = {"m": (2 * np.pi * RESONANCE) ** -2.0, "c": 0.04 / (2 * np.pi * RESONANCE), "k": 1.0}
+SCALE = {"m": 5e-6, "c": 1e-4, "k": 1.0, "k2": 1.0, "k3": 1.0, "offset": 0.01}
+SCALE |= {"c2": 1e-3, "d": 1e-5, "e": 1e-5, "delay": 1e-4}
+STATE_SCALE = {"y": 0.01, "v": 5.0}
+
 
 class Record(NamedTuple):
     """Uniform samples of input u and output y, in V."""
@@ -129,3 +137,14 @@ def simulate(params, start, u, samples, substeps, alpha):
 def first_state(record: Record):
     """Position and velocity of the first sample, by differences: a start for the fit of the initial state."""
     return {"y": float(record.y[0]), "v": float(record.y[1] - record.y[0]) * SAMPLING_RATE}
+
+
+def training_residuals(record: Record, substeps: int, alpha: float):
+    """The residual of (parameters, initial state) over a record, in V."""
+    u, y = reconstruct(record.u), jnp.asarray(record.y)
+
+    def residuals(unknown):
+        params, start = unknown
+        return simulate(params, start, u, len(y), substeps, alpha) - y
+
+    return residuals

@@ -14,16 +14,25 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from scipy.optimize import least_squares
 
 import hhtjax
-from experiments.identification import data
-from experiments.identification.data import SAMPLING_RATE, WASHOUT, Record
+from experiments.identification import comparison, data
+from experiments.identification.data import (
+    LINEAR,
+    RESONANCE,
+    SAMPLING_RATE,
+    SCALE,
+    START,
+    STATE_SCALE,
+    WASHOUT,
+    Record,
+    training_residuals,
+)
+from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
+from hhtjax.identification.refine import extrapolate
 
 SUBSTEPS = 8
-LINEAR = ("m", "c", "k", "k2", "k3", "offset")
 MODELS = {
     "6 parameters": LINEAR,
     "8 parameters": (*LINEAR, "c2", "d"),
@@ -32,23 +41,6 @@ MODELS = {
 BEST = "10 parameters"
 UNITS = {"m": "s^2", "c": "s", "k": "1", "k2": "1/V", "k3": "1/V^2", "offset": "V"}
 UNITS |= {"c2": "s/V^2", "d": "s^2/V", "e": "s^2/V", "delay": "s"}
-# a linear oscillator with the resonance at 68 Hz and 2 % of damping, seen in the spectrum
-RESONANCE = 68.0  # Hz
-START = {"m": (2 * np.pi * RESONANCE) ** -2.0, "c": 0.04 / (2 * np.pi * RESONANCE), "k": 1.0}
-SCALE = {"m": 5e-6, "c": 1e-4, "k": 1.0, "k2": 1.0, "k3": 1.0, "offset": 0.01}
-SCALE |= {"c2": 1e-3, "d": 1e-5, "e": 1e-5, "delay": 1e-4}
-STATE_SCALE = {"y": 0.01, "v": 5.0}
-
-
-def training_residuals(record: Record, substeps: int, alpha: float):
-    """The residual of (parameters, initial state) over a record, in V."""
-    u, y = data.reconstruct(record.u), jnp.asarray(record.y)
-
-    def residuals(unknown):
-        params, start = unknown
-        return data.simulate(params, start, u, len(y), substeps, alpha) - y
-
-    return residuals
 
 
 def fit_training(record: Record, substeps: int, alpha: float, terms=LINEAR, progress=False):
@@ -117,8 +109,9 @@ def run(report: Report, fast: bool):
     numbers = {f"{part}_mV": models[best][f"{part}_mV"] for part in sizes}
     numbers |= {"data": "measured" if sets.measured else "generated", "fast": fast, "models": models}
     if not fast:
-        numbers["scipy"] = compare_with_scipy(report, sets.train, models["6 parameters"])
-    report.numbers({**numbers, "by_step_size": step_size_study(report, sets, fast)})
+        linear = {name: models["6 parameters"][f"{name}_in_{UNITS[name]}"] for name in LINEAR}
+        numbers["comparison"] = comparison.run(report, sets.train, linear)
+    report.numbers(rounded({**numbers, "by_step_size": step_size_study(report, sets, fast)}))
 
 
 def fit_and_score(report: Report, sets, terms):
@@ -153,34 +146,21 @@ def fit_and_score(report: Report, sets, terms):
     return result, scores, numbers
 
 
-def compare_with_scipy(report: Report, record: Record, model):
-    """SciPy's least_squares with its 2-point Jacobian on the same residual, from the same start, in the same scales."""
-    residuals = training_residuals(record, SUBSTEPS, 0.0)
-    guess = {name: START.get(name, 0.0) for name in LINEAR}, data.first_state(record)
-    x0, unravel = ravel_pytree(guess)
-    scale, _ = ravel_pytree(({name: SCALE[name] for name in LINEAR}, STATE_SCALE))
-    compiled = jax.jit(lambda x: residuals(unravel(x)))
-    compiled(x0).block_until_ready()
-    start = time.perf_counter()
-    found = least_squares(lambda x: np.asarray(compiled(x)), np.asarray(x0), x_scale=np.asarray(scale), max_nfev=50)
-    seconds = time.perf_counter() - start
-    print(f"SciPy least_squares, 2-point Jacobian, 6 parameters: cost {found.cost:.6g} V^2 in {seconds:.2f} s;")
-    print(f"hhtjax.fit: cost {model['cost_in_V^2']:.6g} V^2 in {model['fit_time_s']:.2f} s (both without compiling).\n")
-    return {"cost_in_V^2": float(found.cost), "fit_time_s": seconds, "evaluations": int(found.nfev)}
-
-
 def step_size_study(report: Report, sets, fast: bool):
     """RMSE, fit time, and the bias of stiffness and damping, for other steps per sample and other alphas.
 
-    The bias predicted is that of the linear part's amplification matrix; the one measured is against the estimate
-    with twice as many steps, extrapolated.
+    The bias predicted is that of the linear part's amplification matrix; the one measured is against Richardson's
+    value of the three finest steps. Agreement: the relative change of his value from those steps to steps half as long.
     """
-    rows = []
+    rows, agreement = [], {}
     for alpha in (0.0,) if fast else (0.0, -0.05, -0.3):
         counts = (1, 2) if fast else (1, 2, 4, 8, 16)
         fits = [fit_training(sets.train, substeps, alpha) for substeps in counts]
         ratios = np.array([[float(fit[0].params[0][name] / fit[0].params[0]["m"]) for name in "kc"] for fit in fits])
-        exact = ratios[-1] + (ratios[-1] - ratios[-2]) / 3
+        exact = extrapolate(list(ratios[-3:]), 2)
+        for levels in () if fast else (2, 3):
+            before, after = (extrapolate(list(x[-levels:]), 2) for x in (ratios[:-1], ratios))
+            agreement[f"alpha {alpha}, {levels} levels"] = dict(zip(("k/m", "c/m"), before / after - 1, strict=True))
         for substeps, (result, seconds, _), ratio in zip(counts, fits, ratios, strict=True):
             params = result.params[0]
             test = score(params, sets.tests["multisine"], substeps, alpha)[1]
@@ -203,8 +183,10 @@ def step_size_study(report: Report, sets, fast: bool):
             )
             report.progress(f"alpha {alpha}, {substeps} steps per sample: test {test:.4f} mV, fit {seconds:.2f} s")
     report.table(list(rows[0]), [list(row.values()) for row in rows])
+    if agreement:
+        report.table(["Richardson pairs", "k/m", "c/m"], [[name, *by.values()] for name, by in agreement.items()])
     plot_step_sizes(report, rows)
-    return rows
+    return {"rows": rows, "richardson_agreement": agreement}
 
 
 def plot_fit(report: Report, sets, scores):

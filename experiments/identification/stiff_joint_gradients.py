@@ -84,7 +84,7 @@ def timed(function, repeats):
 def run(report, fast):
     """Errors and times by method and step; None where diffrax is not installed."""
     try:
-        import diffrax
+        import diffrax  # pyright: ignore[reportMissingImports]  # of an extra of its own
     except ImportError:
         diffrax = None
     counts, repeats = (STEPS_PER_SAMPLE[:2], 1) if fast else (STEPS_PER_SAMPLE, 5)

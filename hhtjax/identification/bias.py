@@ -83,9 +83,9 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct=False)
     fitted = _rates_of_equations(*matrices)
     s = _rates_of_steps(stepper, dt, *matrices)
     w = np.abs(s)
-    damped = np.abs(fitted.real) > OSCILLATES * np.abs(fitted)
-    damping_bias = np.where(damped, fitted.real / np.where(damped, s.real, 1) - 1, 0)
-    bias = ModeBias(w, -s.real / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
+    damped = np.abs(np.real(fitted)) > OSCILLATES * np.abs(fitted)
+    damping_bias = np.where(damped, np.real(fitted) / np.where(damped, np.real(s), 1) - 1, 0)
+    bias = ModeBias(w, -np.real(s) / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
     if correct is False:
         return bias
     return bias._replace(params=_corrected(system, stepper, params, dt, (q, v, t), matrices, correct))

@@ -1,7 +1,7 @@
 """A fit for readers: a text table, charts, and JSON."""
 
 from dataclasses import fields
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -96,7 +96,8 @@ def encode(x):
     if isinstance(x, dict):
         return {"dict": {name: encode(y) for name, y in x.items()}}
     if isinstance(x, Stepper):
-        return {type(x).__name__: {field.name: encode(getattr(x, field.name)) for field in fields(x)}}
+        names = [field.name for field in fields(cast(Any, x))]  # each is a dataclass
+        return {type(x).__name__: {name: encode(getattr(x, name)) for name in names}}
     if names := getattr(x, "_fields", None):
         return {type(x).__name__: {name: encode(y) for name, y in zip(names, x, strict=True)}}
     if isinstance(x, (list, tuple)):
