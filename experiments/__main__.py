@@ -19,6 +19,8 @@ EXPERIMENTS = {
     "silverbox": "identification.silverbox",
     "double_pendulum_measured": "identification.double_pendulum_measured",
     "stiff_joint": "identification.stiff_joint",
+    "vehicle": "identification.vehicle",
+    "squeezer": "identification.squeezer",
     "kim2019": "kim2019.kim2019",
     "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",
     "linearization": "linearization.linearization",

@@ -243,6 +243,8 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None):
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params)))):
         return
     B, found = examine(system, q0, v0, t0, params, redundant)
+    if not is_concrete(B):  # known values, but inside of jit
+        return
     if redundant is None:
         require_independent(caller, np.asarray(B))
     for name, meaning, x, (violated, distance) in zip(("q0", "v0"), ("Phi", "dPhi/dt"), (q0, v0), found, strict=True):

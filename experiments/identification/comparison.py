@@ -29,7 +29,7 @@ def problem(record: Record):
     """residuals(unknown), a function of a vector x = unknown/scale, and its start."""
     residuals = data.training_residuals(record, SUBSTEPS, 0.0)
     guess = {name: data.START.get(name, 0.0) for name in data.LINEAR}, data.first_state(record)
-    scale, unravel = ravel_pytree(({name: data.SCALE[name] for name in data.LINEAR}, data.STATE_SCALE))
+    scale, unravel = ravel_pytree((data.SCALE_OF_LINEAR, data.STATE_SCALE))
     return jax.jit(lambda x: residuals(unravel(scale * x))), ravel_pytree(guess)[0] / scale, unravel(scale)
 
 
@@ -134,27 +134,34 @@ def others(report, train):
 
 def far_starts(report, train, estimate):
     """Five starts, each parameter of the estimate times 3 or 1/3: how many reach the least cost, and how fast."""
-    piece = Record(train.u[:PIECE], train.y[:PIECE])
-    residuals, _, scales = problem(piece)
-    flat, _ = ravel_pytree(scales)
-    best = ravel_pytree((estimate, data.first_state(piece)))[0] / flat
-    parts = {n: problem(Record(piece.u[:n], piece.y[:n]))[0] for n in (2 * PERIOD, 10 * PERIOD, 100 * PERIOD)}
-    least = float(hhtjax.fit(residuals, best, covariance=False).cost)
+    parts = {
+        n: data.training_residuals(Record(train.u[:n], train.y[:n]), SUBSTEPS, 0.0)
+        for n in (PERIOD, 5 * PERIOD, 50 * PERIOD, PIECE)
+    }
+    residuals, initial = parts[PIECE], data.first_state(train)
+    positive = {name: hhtjax.positive if name in ("m", "c", "k") else None for name in estimate}
+    options = {"transforms": (positive, None), "scale": (data.SCALE_OF_LINEAR, data.STATE_SCALE), "covariance": False}
+    least = float(hhtjax.fit(residuals, (estimate, initial), **options).cost)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (5, len(estimate)))
-    starts = [best.at[: len(estimate)].multiply(OFF**sign) for sign in signs]
-    parts[PIECE] = residuals
+    factors = [dict(zip(estimate, OFF**sign, strict=True)) for sign in signs]
+    starts = [({name: value * f[name] for name, value in estimate.items()}, initial) for f in factors]
 
     def progressive(start):
-        return hhtjax.fit_progressively(lambda n: {"residuals": parts[n]}, start, list(parts), covariance=False)
+        return hhtjax.fit_progressively(lambda n: {"residuals": parts[n]}, start, list(parts), **options)
 
+    def alone(start):
+        return hhtjax.fit(residuals, start, **options)
+
+    flat, unravel = ravel_pytree((data.SCALE_OF_LINEAR, data.STATE_SCALE))
+    scaled = jax.jit(lambda x: residuals(unravel(flat * x)))
     counts = {}
     for name, solve in {
-        "hhtjax.fit at once": partial(hhtjax.fit, residuals, covariance=False),
+        "hhtjax.fit at once": alone,
         "hhtjax.fit_progressively": progressive,
     }.items():
         found = [warm(partial(solve, start)) for start in starts]
         counts[name] = [float(r.cost) <= SAME * least for r, _ in found], max(seconds for _, seconds in found)
-    found = [by_scipy(residuals, start) for start in starts]
+    found = [by_scipy(scaled, ravel_pytree(start)[0] / flat) for start in starts]
     counts["SciPy least_squares, 2-point"] = [cost <= SAME * least for cost, *_ in found], max(s for _, s, _ in found)
     report.table(
         [f"{OFF:g} times off, {PIECE} samples", "reach the least cost", "slowest, s"],

@@ -31,6 +31,7 @@ RESONANCE = 68.0  # Hz
 START = {"m": (2 * np.pi * RESONANCE) ** -2.0, "c": 0.04 / (2 * np.pi * RESONANCE), "k": 1.0}
 SCALE = {"m": 5e-6, "c": 1e-4, "k": 1.0, "k2": 1.0, "k3": 1.0, "offset": 0.01}
 SCALE |= {"c2": 1e-3, "d": 1e-5, "e": 1e-5, "delay": 1e-4}
+SCALE_OF_LINEAR = {name: SCALE[name] for name in LINEAR}
 STATE_SCALE = {"y": 0.01, "v": 5.0}
 
 

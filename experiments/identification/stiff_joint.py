@@ -18,6 +18,7 @@ import numpy as np
 
 import hhtjax
 from experiments.identification import stiff_joint_gradients
+from experiments.identification.coverage import fit_logarithms, judge, tell
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
 from hhtjax.scenes import double_pendulum
@@ -64,18 +65,10 @@ def fit_part(x, guess, duration, measured, deviation, horizon, steps_per_sample)
     """The fit to the first part of each record, from x, the logarithms of parameters over their guess."""
     present = jnp.arange(1, SAMPLES + 1) <= horizon * SAMPLES
 
-    def residuals(x):
-        params = {name: value * jnp.exp(x[name]) for name, value in guess.items()}
+    def residuals(params):
         return angles(params, duration, STEPPER, steps_per_sample) - measured
 
-    ones = dict.fromkeys(x, 1.0)
-    return hhtjax.fit(residuals, x, weights=present[:, None] / deviation, prior=PRIOR, scale=ones)
-
-
-@jax.vmap
-def interval(result, x):
-    """The result's 95 % interval about x, in logarithms."""
-    return result._replace(params=x).interval()
+    return fit_logarithms(residuals, x, guess, weights=present[:, None] / deviation, prior=PRIOR)
 
 
 def recover(report, seeds):
@@ -94,37 +87,25 @@ def recover(report, seeds):
             seconds.append(time.perf_counter() - begin)
         fits.append(result)
         report.progress(f"{seeds} fits, {steps_per_sample} steps per sample: {seconds[-1]:.2f} s, warm")
-    coarse, fine = fits
-    estimates = {
-        "h": (coarse, coarse.params),
-        "h/2": (fine, fine.params),
-        "Richardson": (fine, jax.tree.map(lambda a, b: b + (b - a) / 3, coarse.params, fine.params)),
+    deviation = jax.vmap(lambda r: r.standard_errors)(fits[1])
+    return judge(*fits, off) | {
+        "fit_time_s": sum(seconds[1::2]),
+        "fit_with_compilation_s": sum(seconds[::2]),
+        "k1_true_N_m_rad": np.asarray(truth["k1"]).tolist(),
+        "determined": {n: int(np.sum(np.asarray(deviation[n]) < PRIOR.deviation / 2)) for n in KIM},
+        "largest_cost_per_residual": float(jnp.max(fits[1].cost)) / SAMPLES,
     }
-    numbers = {"fit_time_s": sum(seconds[1::2]), "fit_with_compilation_s": sum(seconds[::2]), "seeds": seeds}
-    numbers["covered"], entries = {}, {}
-    for kind, (result, x) in estimates.items():
-        lower, upper = ({name: np.asarray(end[name] + off[name]) for name in KIM} for end in interval(result, x))
-        numbers["covered"][kind] = {n: int(np.sum((lower[n] <= 0) & (upper[n] >= 0))) for n in KIM}
-        entries = {n: [np.exp(np.asarray(y)).tolist() for y in (x[n] + off[n], lower[n], upper[n])] for n in KIM}
-    numbers["k1_true_N_m_rad"] = np.asarray(truth["k1"]).tolist()
-    numbers["over_truth_with_interval"] = entries
-    deviation = jax.vmap(lambda r: r.standard_errors)(fine)
-    numbers["determined"] = {n: int(np.sum(np.asarray(deviation[n]) < PRIOR.deviation / 2)) for n in KIM}
-    numbers["converged"] = int(np.sum(fine.converged))
-    numbers["largest_cost_per_residual"] = float(jnp.max(fine.cost)) / SAMPLES
-    return numbers
 
 
 def run(report: Report, fast: bool):
     """Recovery over many seeds, and the quality of gradients."""
     numbers: dict[str, Any] = {"recovery": recover(report, 8 if fast else 100)}
     found = numbers["recovery"]
-    seeds = found["seeds"]
-    rows = [[f"truth inside, of {seeds}, {kind}", *map(str, by.values())] for kind, by in found["covered"].items()]
-    rows.append(["interval less than half the prior's", *map(str, found["determined"].values())])
-    report.table(["95 % intervals", *KIM], rows)
-    cost = found["largest_cost_per_residual"]
-    print(f"{found['converged']} of {seeds} converged; largest cost per residual {cost:.3f}.\n")
+    tell(report, found)
+    print(
+        "Intervals less than half the prior's:", ", ".join(f"{n} {count}" for n, count in found["determined"].items())
+    )
+    print(f"Largest cost per residual: {found['largest_cost_per_residual']:.3f}.\n")
     plot_recovery(report, found)
     numbers["gradients"] = stiff_joint_gradients.run(report, fast)
     plot_gradients(report, numbers["gradients"]["rows"])
@@ -150,7 +131,7 @@ def plot_recovery(report, found):
     for axis in (left, middle):
         axis.set_xlabel("true k1 (N m/rad)")
     for i, (kind, by) in enumerate(found["covered"].items()):
-        share = 100 * np.array(list(by.values())) / found["seeds"]
+        share = 100 * np.array(list(by.values())) / found["records"]
         right.bar(np.arange(len(by)) + 0.27 * (i - 1), share, 0.25, color=COLOURS[i + 4], label=f"steps: {kind}")
     right.axhline(93, color="black", lw=0.8)
     right.set_xticks(range(len(KIM)), list(KIM))
