@@ -26,7 +26,7 @@ def experiments(*arguments, **environment):
 def test_without_a_name_they_are_listed():
     result = experiments()
     assert result.returncode == 0
-    for name in ("silverbox", "double_pendulum_measured", "kim2019", "linearization", "gradient_cost", "all"):
+    for name in ("silverbox", "double_pendulum_measured", "stiff_joint", "vehicle", "squeezer", "kim2019", "all"):
         assert any(line.split()[:1] == [name] and len(line) > 30 for line in result.stdout.splitlines())
 
 

@@ -53,4 +53,4 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match=r"band_limited_motion: `cutoff` must lie in \(0, 1/\(2 dt\)\]; received 6.0"):
         hhtjax.equation_error(spring, np.ones((9, 1)), 0.1, cutoff=6.0)
     with pytest.raises(ValueError, match=r"fit_progressively: `horizons` must hold at least one; received \(\)"):
-        hhtjax.fit_progressively(lambda n: {}, 1.0, ())
+        hhtjax.fit_progressively(lambda n, before: {}, 1.0, ())

@@ -147,7 +147,7 @@ def far_starts(report, train, estimate):
     starts = [({name: value * f[name] for name, value in estimate.items()}, initial) for f in factors]
 
     def progressive(start):
-        return hhtjax.fit_progressively(lambda n: {"residuals": parts[n]}, start, list(parts), **options)
+        return hhtjax.fit_progressively(lambda n, _: {"residuals": parts[n]}, start, list(parts), **options)
 
     def alone(start):
         return hhtjax.fit(residuals, start, **options)

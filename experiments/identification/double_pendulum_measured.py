@@ -41,21 +41,45 @@ def errors(params, start, record, num_steps):
     return hhtjax.wrap_angle(hhtjax.interpolate(run, record.t).q - params["offset"] - record.y)
 
 
-def fit_windows(params0, trial, duration, **options):
-    """Parameters and a start for each window."""
+def problem_at(trial, duration, before):
+    """The fit to windows of a duration, whose starts are those of the fit to shorter ones before, if there was one."""
     records, starts = cut(trial, duration)
-    residuals = partial(errors, num_steps=int(np.ceil(float(jnp.max(records.t)) / DT)))
-    transforms = POSITIVE | {name: None for name in params0 if name not in POSITIVE}
-    return hhtjax.fit(
-        residuals, params0, records=records, starts=starts, weights=records.present, transforms=transforms, **options
-    ), records
+    if before is not None:
+        starts = states_at(records.begin, *before)
+    residuals = partial(errors, num_steps=steps_of(records))
+    return records, {"residuals": residuals, "records": records, "starts": starts, "weights": records.present}
+
+
+def steps_of(records):
+    """Steps of a window."""
+    return int(np.ceil(float(jnp.max(records.t)) / DT))
+
+
+def states_at(times, records, result):
+    """q and v at times of the record, on the trajectories of fitted windows."""
+    window = jnp.searchsorted(records.begin, times, side="right") - 1
+
+    @jax.jit
+    @jax.vmap
+    def state(time, begin, start):
+        run = pendulum_data.simulate(result.params, start["q"], start["v"], DT, steps_of(records))
+        return hhtjax.interpolate(run, jnp.minimum(time - begin, run.t[-1]))
+
+    found = state(times, records.begin[window], jax.tree.map(lambda x: x[window], result.starts))
+    return {"q": found.q, "v": found.v}
 
 
 def fit_progressively(params0, trial, horizons):
-    """One fit after the other, each with longer windows from where the last one ended."""
-    for duration in horizons[:-1]:
-        params0 = fit_windows(params0, trial, duration, covariance=False)[0].params
-    return fit_windows(params0, trial, horizons[-1])
+    """One fit after the other, each with longer windows from where the last one ended; and its windows."""
+    transforms = POSITIVE | {name: None for name in params0 if name not in POSITIVE}
+    used = []
+
+    def problem(duration, result):
+        records, arguments = problem_at(trial, duration, None if result is None else (used[-1], result))
+        used.append(records)
+        return arguments
+
+    return hhtjax.fit_progressively(problem, params0, horizons, transforms=transforms), used[-1]
 
 
 def score(params, trial, duration):
@@ -64,7 +88,7 @@ def score(params, trial, duration):
     First to the windows' beginnings: over a second, a start by differences ends in a local minimum.
     """
     records, starts = cut(trial, duration)
-    residuals = partial(errors, params, num_steps=int(np.ceil(float(jnp.max(records.t)) / DT)))
+    residuals = partial(errors, params, num_steps=steps_of(records))
 
     @jax.jit
     @partial(jax.vmap, in_axes=(0, 0, None))
@@ -140,7 +164,7 @@ def table_of(report: Report, result):
 
 def long_windows(report: Report, train):
     """Windows of LONG from the start values: at once, and by a progressive horizon."""
-    single, records = fit_windows(START, train, LONG, covariance=False)
+    single, records = fit_progressively(START, train, (LONG,))
     progressive, records = fit_progressively(START, train, (*HORIZONS, 1.0, LONG))
     found = {"at once": rmse(single.residual, records), "progressive horizon": rmse(progressive.residual, records)}
     report.table([f"windows of {LONG} s from a poor start", "RMSE mrad"], [[k, v] for k, v in found.items()])

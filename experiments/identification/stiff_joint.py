@@ -88,7 +88,7 @@ def recover(report, seeds):
         fits.append(result)
         report.progress(f"{seeds} fits, {steps_per_sample} steps per sample: {seconds[-1]:.2f} s, warm")
     deviation = jax.vmap(lambda r: r.standard_errors)(fits[1])
-    return judge(*fits, off) | {
+    return judge(fits[0], fits[1], off) | {
         "fit_time_s": sum(seconds[1::2]),
         "fit_with_compilation_s": sum(seconds[::2]),
         "k1_true_N_m_rad": np.asarray(truth["k1"]).tolist(),

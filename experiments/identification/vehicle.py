@@ -26,10 +26,11 @@ UNITS = {"k_tyre front": "N/m", "k_tyre rear": "N/m", "c front": "N s/m", "c rea
 GUESS = {name: value * factor for (name, value), factor in zip(TRUTH.items(), (2, 0.5, 2, 0.5, 2, 0.5), strict=True)}
 SAMPLING_PERIOD = 5e-3  # s
 NOISE = 0.05  # of the RMS of each channel
+STEPPER: Any = hhtjax.hht(alpha=-0.05, linearize="predictor")
 CHANNELS = ("heave", "pitch", "roll", "wheel, front left", "front right", "rear left", "rear right")
 
 
-def accelerations(params, steps_per_sample, scene=SCENE, stepper=hhtjax.hht(alpha=-0.05, linearize="predictor")):  # noqa: B008
+def accelerations(params, steps_per_sample, scene=SCENE, stepper=STEPPER):
     """(samples, 7): of the body in heave, pitch and roll, and of the wheels."""
     ends = {name: jnp.stack([params[f"{name} front"]] * 2 + [params[f"{name} rear"]] * 2) for name in ("k_tyre", "c")}
     steps = round(scene.duration / SAMPLING_PERIOD) * steps_per_sample
@@ -70,7 +71,7 @@ def run(report: Report, fast: bool):
     estimate = {name: value * float(jnp.exp(fits[-1].params[name][0])) for name, value in GUESS.items()}
     found = {}
     for kind, params in {"estimate": estimate, "guess": GUESS, "truth": TRUTH}.items():
-        stepper = hhtjax.rk4() if kind == "truth" else hhtjax.hht(alpha=-0.05, linearize="predictor")
+        stepper = hhtjax.rk4() if kind == "truth" else STEPPER
         n = 40 if kind == "truth" else steps[-1]
         found[kind] = np.asarray(jax.jit(partial(accelerations, params, n, OTHER_ROAD, stepper))())
     size = np.sqrt(np.mean(found["truth"] ** 2, axis=0))

@@ -68,8 +68,9 @@ def fit_progressively(problem_at, params0, horizons, **options: Any) -> FitResul
     minima, and only the lowest is right. The early fits are cheap too.
 
     Args:
-        problem_at: horizon -> the arguments of `fit` for it, a dict with "residuals" and perhaps "records", "starts",
-            "weights". With `windows` of that duration it is multiple shooting.
+        problem_at: (horizon, before) -> the arguments of `fit` for it, a dict with "residuals" and perhaps "records",
+            "starts", "weights". before: the `FitResult` of the last horizon, None for the first. With `windows` of that
+            duration it is multiple shooting.
         params0: as in `fit`. horizons: whatever problem_at takes, the shortest first.
         options: of every fit. Only the last one computes a covariance.
 
@@ -82,16 +83,18 @@ def fit_progressively(problem_at, params0, horizons, **options: Any) -> FitResul
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.linspace(0.0, 30.0, 600)
     >>> measured = jnp.sin(3.0 * t)
-    >>> def problem_at(n):
+    >>> def problem_at(n, before):
     ...     return {"residuals": lambda w: jnp.sin(w * t[:n]) - measured[:n]}
     >>> [round(float(hhtjax.fit_progressively(problem_at, 1.5, h).params), 3) == 3.0 for h in ([600], [20, 600])]
     [False, True]
     """
-    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon)")
+    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)")
     if not len(horizons):
         raise ValueError(f"fit_progressively: `horizons` must hold at least one; received {horizons!r}.")
-    *early, last = horizons
-    params = params0
-    for horizon in early:
-        params = fit(params0=params, **problem_at(horizon), **options | {"covariance": False}).params
-    return fit(params0=params, **problem_at(last), **options)
+    params, result = params0, None
+    for i, horizon in enumerate(horizons):
+        last = i == len(horizons) - 1
+        result = fit(params0=params, **problem_at(horizon, result), **options | ({} if last else {"covariance": False}))
+        params = result.params
+    assert result is not None
+    return result
