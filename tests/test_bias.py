@@ -27,6 +27,7 @@ def through(stepper, dt):
     return residuals
 
 
+@pytest.mark.slow
 def test_predicted_bias_is_measured_and_taken_back():
     """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then next to none."""
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")

@@ -323,6 +323,12 @@ def test_bad_input(message, call):
         call()
 
 
+def test_a_run_that_is_a_constant_of_a_program_is_traced():
+    """All its values are known, but what the check makes of them is not."""
+    traced = jax.eval_shape(lambda: simulate(constrained(level), HHT, jnp.ones(2), jnp.zeros(2)).q)
+    assert traced.shape[1:] == (2,)
+
+
 @pytest.mark.parametrize("where", ["held", "state"])
 def test_other_points_of_linearisation_are_refused(where):
     with pytest.raises(ValueError, match=f"hht: with constraints, leave `linearize` out.*; received {where!r}"):

@@ -18,6 +18,7 @@ def coloured(key, size):
     return jax.lax.scan(lambda x, e: ((0.9 * x + e),) * 2, 0.0, white)[1]
 
 
+@pytest.mark.slow
 def test_cluster_errors_are_the_scatter_where_residuals_are_correlated():
     """Of a slow and a fast regressor: naive errors are too small for the one and too large for the other."""
 

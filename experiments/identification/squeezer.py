@@ -52,8 +52,9 @@ def fit_all(x, measured, horizon, steps_per_sample):
 
 def run(report: Report, fast: bool):
     """Fits and coverage; fast: one fit to one record."""
-    records = 1 if fast else 40
-    exact = crank_angle(TRUTH, 1 if fast else 16, STEPPER if fast else hhtjax.hht(alpha=0.0))
+    records = 1 if fast else 20
+    finely = {"steps_per_sample": 1 if fast else 16, "stepper": STEPPER if fast else hhtjax.hht(alpha=0.0)}
+    exact, guessed = (np.asarray(crank_angle(params, **finely)) for params in (TRUTH, GUESS))
     measured = exact + NOISE * jax.random.normal(jax.random.key(0), (records, SAMPLES))
     fits = []
     for n in (1,) if fast else (1, 2):
@@ -70,7 +71,7 @@ def run(report: Report, fast: bool):
         report,
         numbers,
         np.asarray(measured[0]),
-        np.asarray(crank_angle(GUESS, 1)),
+        guessed,
         np.asarray(exact),
     )
     report.numbers(rounded(numbers))
