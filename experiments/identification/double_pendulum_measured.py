@@ -57,12 +57,12 @@ def steps_of(records):
 
 def states_at(times, records, result):
     """q and v at times of the record, on the trajectories of fitted windows."""
-    window = jnp.searchsorted(records.begin, times, side="right") - 1
+    window, num_steps = jnp.searchsorted(records.begin, times, side="right") - 1, steps_of(records)
 
     @jax.jit
     @jax.vmap
     def state(time, begin, start):
-        run = pendulum_data.simulate(result.params, start["q"], start["v"], DT, steps_of(records))
+        run = pendulum_data.simulate(result.params, start["q"], start["v"], DT, num_steps)
         return hhtjax.interpolate(run, jnp.minimum(time - begin, run.t[-1]))
 
     found = state(times, records.begin[window], jax.tree.map(lambda x: x[window], result.starts))

@@ -56,10 +56,9 @@ def run(report: Report, fast: bool):
     finely = {"steps_per_sample": 1 if fast else 16, "stepper": STEPPER if fast else hhtjax.hht(alpha=0.0)}
     exact, guessed = (np.asarray(crank_angle(params, **finely)) for params in (TRUTH, GUESS))
     measured = exact + NOISE * jax.random.normal(jax.random.key(0), (records, SAMPLES))
-    fits = []
+    fits, x = [], {name: jnp.zeros(records) for name in TRUTH}
     for n in (1,) if fast else (1, 2):
-        x = {name: jnp.zeros(records) for name in TRUTH}
-        for horizon in HORIZONS[-1:] if fast else HORIZONS:
+        for horizon in HORIZONS if not fast and n == 1 else HORIZONS[-1:]:
             result = jax.block_until_ready(fit_all(x, measured, horizon, n))
             x = result.params
         fits.append(result)
