@@ -17,6 +17,10 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_small_wh
 
 EXPERIMENTS = {
     "silverbox": "identification.silverbox",
+    "double_pendulum_measured": "identification.double_pendulum_measured",
+    "stiff_joint": "identification.stiff_joint",
+    "vehicle": "identification.vehicle",
+    "squeezer": "identification.squeezer",
     "kim2019": "kim2019.kim2019",
     "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",
     "linearization": "linearization.linearization",
@@ -34,8 +38,8 @@ def summary(module: str) -> str:
 
 def listing() -> str:
     """The experiments, a line each."""
-    lines = [f"  {name:<21}{summary(module)}" for name, module in EXPERIMENTS.items()]
-    return "\n".join(["Experiments:", *lines, f"  {'all':<21}Every one of them.", "", USAGE])
+    lines = [f"  {name:<26}{summary(module)}" for name, module in EXPERIMENTS.items()]
+    return "\n".join(["Experiments:", *lines, f"  {'all':<26}Every one of them.", "", USAGE])
 
 
 def run_side_by_side(options: list[str]) -> int:

@@ -10,11 +10,12 @@ import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stdout
+from typing import Any
 
 import jax
 
 
-def rounded(x):
+def rounded(x) -> Any:
     """Floats to seven digits, which keeps the committed JSON small; None for those that are not finite."""
     if isinstance(x, dict):
         return {key: rounded(value) for key, value in x.items()}

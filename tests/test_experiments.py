@@ -26,7 +26,7 @@ def experiments(*arguments, **environment):
 def test_without_a_name_they_are_listed():
     result = experiments()
     assert result.returncode == 0
-    for name in ("silverbox", "kim2019", "linearization", "gradient_cost", "all"):
+    for name in ("silverbox", "double_pendulum_measured", "stiff_joint", "vehicle", "squeezer", "kim2019", "all"):
         assert any(line.split()[:1] == [name] and len(line) > 30 for line in result.stdout.splitlines())
 
 
@@ -54,7 +54,7 @@ def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path):
 
 @pytest.mark.slow
 def test_silverbox_on_the_measured_record():
-    """Full training record, 8 steps per sample, cubic input: the errors that this model reaches."""
+    """Full training record, 8 steps per sample, 6 parameters: the errors that this model reaches."""
     if not (DATA / "silverbox").is_dir():
         pytest.skip("the measured Silverbox record is not here: set HHTJAX_DATA to the folder that holds silverbox/")
     sys.path.insert(0, str(ROOT))
@@ -62,10 +62,10 @@ def test_silverbox_on_the_measured_record():
 
     sets = data.load(fast=False)
     assert sets.measured
-    result, _ = silverbox.fit_training(sets.train, silverbox.SUBSTEPS, 0.0)
+    result, *_ = silverbox.fit_training(sets.train, silverbox.SUBSTEPS, 0.0)
     assert result.converged
-    assert silverbox.rmse(result.residual) == pytest.approx(0.3064, abs=5e-4)
-    expected = {"arrow_full": 0.3947, "arrow_no_extrapolation": 0.3200, "multisine": 0.3121}
+    assert silverbox.rmse(result.residual) == pytest.approx(0.2987, abs=5e-4)
+    expected = {"arrow_full": 0.3894, "arrow_no_extrapolation": 0.3156, "multisine": 0.3043}
     for name, value in expected.items():
         _, error, _ = silverbox.score(result.params[0], sets.tests[name], silverbox.SUBSTEPS, 0.0)
         assert error == pytest.approx(value, abs=5e-4)

@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
@@ -23,6 +24,15 @@ HOW_TO_GET_IT = (
 )
 GENERATED = {"m": 5.4e-6, "c": 2.2e-4, "k": 1.0, "k2": -0.03, "k3": 4.0, "offset": -5e-3}
 NOISE = 3e-4  # V, standard deviation
+
+LINEAR = ("m", "c", "k", "k2", "k3", "offset")
+# a linear oscillator with the resonance at 68 Hz and 2 % of damping, seen in the spectrum
+RESONANCE = 68.0  # Hz
+START = {"m": (2 * np.pi * RESONANCE) ** -2.0, "c": 0.04 / (2 * np.pi * RESONANCE), "k": 1.0}
+SCALE = {"m": 5e-6, "c": 1e-4, "k": 1.0, "k2": 1.0, "k3": 1.0, "offset": 0.01}
+SCALE |= {"c2": 1e-3, "d": 1e-5, "e": 1e-5, "delay": 1e-4}
+SCALE_OF_LINEAR = {name: SCALE[name] for name in LINEAR}
+STATE_SCALE = {"y": 0.01, "v": 5.0}
 
 
 class Record(NamedTuple):
@@ -83,23 +93,43 @@ def generate():
     amplitude = np.full(size, 0.055)
     amplitude[:40650] = np.linspace(0.0, 0.09, 40650)
     u = amplitude * u / u.std()
-    y = np.asarray(simulate(GENERATED, {"y": 0.0, "v": 0.0}, u, substeps=32, alpha=0.0))
+    y = np.asarray(simulate(GENERATED, {"y": 0.0, "v": 0.0}, reconstruct(u), size, substeps=32, alpha=0.0))
     return u, y + NOISE * rng.normal(size=size)
 
 
-def simulate(params, start, u, substeps, alpha):
-    """Output at the samples of the input u, in V, by the non-iterative step."""
-    dt = 1 / SAMPLING_RATE
-    scene = duffing.measured(params, hhtjax.sampled(u, dt), start["y"], start["v"], dt * (len(u) - 1))
-    # the predictor form is smooth in the parameters
+def force(q, v, t, params):
+    """Duffing's oscillator under a sampled input, with those of the further terms that params names."""
+    own, u = params
+    if "delay" in own:
+        t = t - own["delay"]
+    damping = 0.0
+    if "c2" in own:
+        damping = damping + own["c2"] * q**2
+    if "d" in own:
+        damping = damping + own["d"] * jnp.abs(v)
+    if "e" in own:
+        damping = damping + own["e"] * q * v
+    return duffing.restoring(q, v, own) - damping * v + u(t) + own["offset"]
+
+
+SYSTEM = hhtjax.System(duffing.sampled_mass, force)
+
+
+def reconstruct(u):
+    """The input between its samples, band-limited."""
+    return hhtjax.band_limited(jnp.asarray(u), 1 / SAMPLING_RATE)
+
+
+def simulate(params, start, u, samples, substeps, alpha):
+    """Output at `samples` samples of the reconstructed input u, in V, by the non-iterative step."""
     solution = hhtjax.simulate(
-        scene.system,
-        hhtjax.hht(alpha, linearize="predictor"),
-        scene.q0,
-        scene.v0,
-        scene.params,
-        dt=dt / substeps,
-        num_steps=(len(u) - 1) * substeps,
+        SYSTEM,
+        hhtjax.hht(alpha, linearize="predictor"),  # smooth in the parameters
+        jnp.reshape(start["y"], (1,)),
+        jnp.reshape(start["v"], (1,)),
+        (params, u),
+        dt=1 / SAMPLING_RATE / substeps,
+        num_steps=(samples - 1) * substeps,
         save_every=substeps,
     )
     return solution.q[:, 0]
@@ -108,3 +138,14 @@ def simulate(params, start, u, substeps, alpha):
 def first_state(record: Record):
     """Position and velocity of the first sample, by differences: a start for the fit of the initial state."""
     return {"y": float(record.y[0]), "v": float(record.y[1] - record.y[0]) * SAMPLING_RATE}
+
+
+def training_residuals(record: Record, substeps: int, alpha: float):
+    """The residual of (parameters, initial state) over a record, in V."""
+    u, y = reconstruct(record.u), jnp.asarray(record.y)
+
+    def residuals(unknown):
+        params, start = unknown
+        return simulate(params, start, u, len(y), substeps, alpha) - y
+
+    return residuals

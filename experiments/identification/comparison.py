@@ -1,0 +1,199 @@
+"""Silverbox, 6 parameters: the same fit by others, and from starts that are 3 times off in every parameter.
+
+All minimise the same sum of squares, with 8 steps per sample; diffrax solves the same equation with 8 fixed steps of
+its own per sample. Times are warm, of one run after the other.
+"""
+
+import time
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from scipy.optimize import least_squares
+
+import hhtjax
+from experiments.identification import data
+from experiments.identification.data import SAMPLING_RATE, Record
+
+SUBSTEPS = 8
+PIECE = 16384  # samples, of the comparison with the others
+PERIOD = 9  # samples
+OFF = 3.0
+SAME = 1.001  # cost over the least one found, below which it counts as the same
+
+
+def problem(record: Record):
+    """residuals(unknown), a function of a vector x = unknown/scale, and its start."""
+    residuals = data.training_residuals(record, SUBSTEPS, 0.0)
+    guess = {name: data.START.get(name, 0.0) for name in data.LINEAR}, data.first_state(record)
+    scale, unravel = ravel_pytree((data.SCALE_OF_LINEAR, data.STATE_SCALE))
+    return jax.jit(lambda x: residuals(unravel(scale * x))), ravel_pytree(guess)[0] / scale, unravel(scale)
+
+
+def warm(function):
+    """Result and seconds of the second call."""
+    jax.block_until_ready(function())
+    begin = time.perf_counter()
+    result = jax.block_until_ready(function())
+    return result, time.perf_counter() - begin
+
+
+def by_scipy(residuals, x0):
+    """SciPy with its 2-point Jacobian: cost, seconds, simulations."""
+    calls = []
+
+    def f(x):
+        calls.append(None)
+        return np.asarray(residuals(x))
+
+    f(np.asarray(x0))
+    begin = time.perf_counter()
+    found = least_squares(f, np.asarray(x0), max_nfev=50)
+    return float(found.cost), time.perf_counter() - begin, len(calls)
+
+
+def by_optax(residuals, x0, optimizer, iterations):
+    """Reverse-mode gradients: cost and seconds."""
+    result, seconds = warm(
+        lambda: hhtjax.fit(residuals, x0, optimizer, max_iterations=iterations, tolerance=1e-10, covariance=False)
+    )
+    return float(result.cost), seconds
+
+
+def by_optimistix(optimistix, residuals, x0):
+    """Levenberg-Marquardt of optimistix: cost and seconds."""
+
+    @jax.jit
+    def solve(x0):
+        solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+        found = optimistix.least_squares(lambda x, _: residuals(x), solver, x0, max_steps=100, throw=False)
+        return jnp.sum(residuals(found.value) ** 2) / 2
+
+    cost, seconds = warm(lambda: solve(x0))
+    return float(cost), seconds
+
+
+def diffrax_residuals(diffrax, record: Record, scales):
+    """The residual through diffrax's Tsit5 instead, differentiable by its default adjoint."""
+    u, y = data.reconstruct(record.u), jnp.asarray(record.y)
+    _, unravel = ravel_pytree(scales)
+    flat = ravel_pytree(scales)[0]
+    times = jnp.arange(len(y)) / SAMPLING_RATE
+
+    def rate(t, state, args):
+        q, v = state
+        return v, data.force(q, v, t, args) / args[0]["m"]
+
+    @jax.jit
+    def residuals(x):
+        params, start = unravel(flat * x)
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(rate), diffrax.Tsit5(), 0.0, times[-1], 1 / SAMPLING_RATE / SUBSTEPS,
+            (start["y"], start["v"]), (params, u), saveat=diffrax.SaveAt(ts=times),
+            stepsize_controller=diffrax.ConstantStepSize(), max_steps=SUBSTEPS * len(y) + 8,
+        )  # fmt: skip
+        return found.ys[0] - y
+
+    return residuals
+
+
+def others(report, train):
+    """Cost and time of each on a piece of the record."""
+    piece = Record(train.u[:PIECE], train.y[:PIECE])
+    residuals, x0, scales = problem(piece)
+    result, seconds = warm(lambda: hhtjax.fit(residuals, x0, covariance=False))
+    rows = [["hhtjax.fit, Levenberg-Marquardt", float(result.cost), seconds]]
+    cost, seconds, _ = by_scipy(residuals, x0)
+    rows.append(["SciPy least_squares, 2-point", cost, seconds])
+    for name, optimizer, iterations in (("lbfgs", optax.lbfgs(), 200), ("adam", optax.adam(0.02), 300)):
+        report.progress(f"the step of hhtjax with optax.{name}")
+        rows.append(
+            [f"hhtjax.fit, optax.{name}, {iterations} iterations", *by_optax(residuals, x0, optimizer, iterations)]
+        )
+    try:
+        import optimistix  # pyright: ignore[reportMissingImports]  # of an extra of its own
+
+        report.progress("optimistix")
+        rows.append(["optimistix LevenbergMarquardt", *by_optimistix(optimistix, residuals, x0)])
+    except ImportError:
+        print("optimistix is not installed.")
+    try:
+        import diffrax  # pyright: ignore[reportMissingImports]  # of an extra of its own
+
+        report.progress("diffrax")
+        theirs = diffrax_residuals(diffrax, piece, scales)
+        rows.append(["diffrax Tsit5 with optax.adam, 10 iterations", *by_optax(theirs, x0, optax.adam(0.02), 10)])
+    except ImportError:
+        print("diffrax is not installed.")
+    report.table([f"{PIECE} samples", "cost V^2", "s"], rows)
+    return [{"method": name, "cost_in_V^2": cost, "seconds": seconds} for name, cost, seconds in rows]
+
+
+def far_starts(report, train, estimate):
+    """Five starts, each parameter of the estimate times 3 or 1/3: how many reach the least cost, and how fast."""
+    parts = {
+        n: data.training_residuals(Record(train.u[:n], train.y[:n]), SUBSTEPS, 0.0)
+        for n in (PERIOD, 5 * PERIOD, 50 * PERIOD, PIECE)
+    }
+    residuals, initial = parts[PIECE], data.first_state(train)
+    positive = {name: hhtjax.positive if name in ("m", "c", "k") else None for name in estimate}
+    options = {"transforms": (positive, None), "scale": (data.SCALE_OF_LINEAR, data.STATE_SCALE), "covariance": False}
+    least = float(hhtjax.fit(residuals, (estimate, initial), **options).cost)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (5, len(estimate)))
+    factors = [dict(zip(estimate, OFF**sign, strict=True)) for sign in signs]
+    starts = [({name: value * f[name] for name, value in estimate.items()}, initial) for f in factors]
+
+    def progressive(start):
+        return hhtjax.fit_progressively(lambda n, _: {"residuals": parts[n]}, start, list(parts), **options)
+
+    def alone(start):
+        return hhtjax.fit(residuals, start, **options)
+
+    flat, unravel = ravel_pytree((data.SCALE_OF_LINEAR, data.STATE_SCALE))
+    scaled = jax.jit(lambda x: residuals(unravel(flat * x)))
+    counts = {}
+    for name, solve in {
+        "hhtjax.fit at once": alone,
+        "hhtjax.fit_progressively": progressive,
+    }.items():
+        found = [warm(partial(solve, start)) for start in starts]
+        counts[name] = [float(r.cost) <= SAME * least for r, _ in found], max(seconds for _, seconds in found)
+    found = [by_scipy(scaled, ravel_pytree(start)[0] / flat) for start in starts]
+    counts["SciPy least_squares, 2-point"] = [cost <= SAME * least for cost, *_ in found], max(s for _, s, _ in found)
+    report.table(
+        [f"{OFF:g} times off, {PIECE} samples", "reach the least cost", "slowest, s"],
+        [[name, f"{sum(right)} of {len(right)}", seconds] for name, (right, seconds) in counts.items()],
+    )
+    return {name: {"right": sum(right), "of": len(right), "slowest_s": s} for name, (right, s) in counts.items()}
+
+
+def whole_record(report, train):
+    """SciPy and hhtjax on the whole training record: costs and seconds, three times in turns, the least."""
+    residuals, x0, _ = problem(train)
+    times, ours_times = [], []
+    for _ in range(2):
+        result, seconds = warm(lambda: hhtjax.fit(residuals, x0, covariance=False))
+        ours_times.append(seconds)
+        cost, seconds, simulations = by_scipy(residuals, x0)
+        times.append(seconds)
+    numbers = {
+        "fit_time_s": min(ours_times), "cost_in_V^2": float(result.cost), "iterations": int(result.iterations),
+        "scipy_s": min(times), "scipy_cost_in_V^2": cost, "scipy_simulations": simulations,
+    }  # fmt: skip
+    print(
+        f"SciPy least_squares, 2-point Jacobian: cost {cost:.6g} V^2 in {min(times):.2f} s, {simulations} simulations;"
+    )
+    print(f"hhtjax.fit: cost {float(result.cost):.6g} V^2 in {min(ours_times):.2f} s (both without compiling).\n")
+    return numbers
+
+
+def run(report, train, estimate):
+    """All three."""
+    return {
+        "whole_record": whole_record(report, train),
+        "others": others(report, train),
+        "far_starts": far_starts(report, train, estimate),
+    }

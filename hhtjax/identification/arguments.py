@@ -1,0 +1,218 @@
+"""What `fit` is given, checked and brought into one form."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from hhtjax.boundary import require_function
+from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.least_squares import LOSSES
+
+FEW = 64  # parameters up to which a forward-mode Jacobian is the cheaper derivative
+LEVENBERG_MARQUARDT = "levenberg_marquardt"
+FOR_MANY = optax.lbfgs()  # one object, so that a second fit finds the first one's program
+
+
+class Gaussian(NamedTuple):
+    """A prior: mean and standard deviation, numbers or arrays like the parameter."""
+
+    mean: Any
+    deviation: Any
+
+
+class Options(NamedTuple):
+    """The static arguments of a fit, hashable."""
+
+    optimizer: Any
+    transforms: tuple
+    loss: Any
+    max_iterations: int
+    covariance: bool
+    segments: int
+    progress: bool
+
+
+def check_options(
+    caller, residuals, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress
+):
+    """`Options` with the defaults filled in, or an error that names what is wrong."""
+    require_function(caller, "residuals", residuals, "residuals(params)")
+    if not (
+        optimizer is None or optimizer == LEVENBERG_MARQUARDT or isinstance(optimizer, optax.GradientTransformation)
+    ):
+        raise TypeError(
+            f'{caller}: `optimizer` must be an optax optimiser, "{LEVENBERG_MARQUARDT}" or None; '
+            f"received {optimizer!r}."
+        )
+    transforms = check_transforms(caller, transforms, params)
+    free = sum(np.size(p) for T, p in zip(transforms, jax.tree.leaves(params), strict=True) if T is not tf.fixed)
+    if not free:
+        raise ValueError(f"{caller}: `transforms` must leave a parameter free; received {tf.fixed} for all.")
+    if optimizer is None:
+        optimizer = LEVENBERG_MARQUARDT if free <= FEW else FOR_MANY
+    if loss is not None and not callable(loss) and loss not in LOSSES:
+        raise ValueError(f"{caller}: `loss` must be one of {', '.join(LOSSES)}, a function or None; received {loss!r}.")
+    if max_iterations is None:
+        max_iterations = 50 if optimizer == LEVENBERG_MARQUARDT else 1000
+    for name, value, least in (("max_iterations", max_iterations, 1), ("segments", segments, 2)):
+        if not isinstance(value, int) or value < least:
+            words = "a positive integer" if least == 1 else f"an integer of at least {least}"
+            raise ValueError(f"{caller}: `{name}` must be {words}; received {value!r}.")
+    rho = LOSSES.get(loss) if isinstance(loss, str) else loss
+    return Options(optimizer, transforms, rho, max_iterations, covariance, segments, progress)
+
+
+def check_parameters(caller, params0, name="params0"):
+    """params0 as a pytree of float arrays."""
+    leaves = jax.tree_util.tree_leaves_with_path(params0)
+    if not leaves:
+        raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
+    for path, leaf in leaves:
+        check_real(f"{caller}: `{name}{jax.tree_util.keystr(path)}`", leaf)
+
+    def as_float(x):
+        x = jnp.asarray(x)
+        return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
+
+    return jax.tree.map(as_float, params0)
+
+
+def check_scale(caller, scale, params0):
+    """The scale of each entry of params0, by default its size, or 1 where that is 0."""
+    if scale is None:
+        return jax.tree.map(lambda x: jnp.where(x == 0, 1, jnp.abs(x)), params0)
+    if jax.tree.structure(scale) != jax.tree.structure(params0):
+        raise ValueError(
+            f"{caller}: `scale` must be a pytree structured like params0, {jax.tree.structure(params0)}; "
+            f"received {jax.tree.structure(scale)}."
+        )
+    for (path, leaf), parameter in zip(
+        jax.tree_util.tree_leaves_with_path(scale), jax.tree.leaves(params0), strict=True
+    ):
+        where = f"{caller}: `scale{jax.tree_util.keystr(path)}`"
+        check_real(where, leaf)
+        if is_concrete(leaf) and np.any(np.asarray(leaf) <= 0):
+            raise ValueError(f"{where} must be positive; received {leaf}.")
+        if jnp.shape(leaf) not in ((), parameter.shape):
+            raise ValueError(
+                f"{where} must have the shape of its parameter, {parameter.shape}; received {jnp.shape(leaf)}."
+            )
+    return jax.tree.map(lambda s, x: jnp.broadcast_to(jnp.asarray(s, x.dtype), x.shape), scale, params0)
+
+
+def check_prior(caller, prior, params0):
+    """Mean and standard deviation of each leaf, pytrees like params0; inf where there is no prior."""
+
+    def is_prior(x):
+        return x is None or isinstance(x, Gaussian)
+
+    def fill(entry, branch):
+        entry = Gaussian(0.0, np.inf) if entry is None else entry
+        if not isinstance(entry, Gaussian):
+            raise TypeError(f"{caller}: `prior` must hold Gaussian(mean, deviation) or None; received {entry!r}.")
+        if is_concrete(entry.deviation) and not np.all(np.asarray(entry.deviation) > 0):
+            raise ValueError(f"{caller}: `prior` must have a positive deviation; received {entry.deviation}.")
+        return jax.tree.map(
+            lambda x: Gaussian(*(jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape) for y in entry)), branch
+        )
+
+    return jax.tree.map(fill, prior, params0, is_leaf=is_prior)
+
+
+def check_records(caller, records, starts, prior, optimizer):
+    """The starts as float arrays; they and the records have one leading axis."""
+    if records is None or starts is None:
+        raise ValueError(f"{caller}: `records` and `starts` must be given together; received one of them.")
+    starts = check_parameters(caller, starts, "starts")
+    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves((records, starts))}
+    if len(counts) != 1 or counts == {()}:
+        raise ValueError(f"{caller}: `records` and `starts` must have one leading axis; received {sorted(counts)}.")
+    if optimizer != LEVENBERG_MARQUARDT or prior is not None:
+        raise ValueError(f"{caller}: `records` must go with Levenberg-Marquardt and without a prior.")
+    return starts
+
+
+def check_residuals(caller, shapes, p):
+    """shapes: the residuals as shapes and dtypes; p: number of parameters."""
+    leaves = jax.tree.leaves(shapes)
+    for leaf in leaves:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise TypeError(f"{caller}: `residuals` must return real floats; received {leaf.dtype}.")
+    m = sum(math.prod(x.shape) for x in leaves)
+    if m < p:
+        raise ValueError(
+            f"{caller}: `residuals` must return at least as many numbers as there are parameters, {p}; received {m}."
+        )
+
+
+def spread_weights(caller, weights, shapes):
+    """The weight of every entry of the raveled residuals."""
+
+    def spread(weight, branch):
+        weight = jnp.asarray(weight)
+
+        def one(leaf):
+            if weight.shape != leaf.shape[: weight.ndim]:
+                raise ValueError(
+                    f"{caller}: `weights` must have the leading axes of their residuals, {leaf.shape}; "
+                    f"received {weight.shape}."
+                )
+            return jnp.broadcast_to(weight.reshape(weight.shape + (1,) * (leaf.ndim - weight.ndim)), leaf.shape)
+
+        return jax.tree.map(lambda leaf: one(leaf).astype(leaf.dtype), branch)
+
+    return jax.tree.leaves(jax.tree.map(spread, weights, shapes))
+
+
+def check_weights(caller, weights):
+    """Finite numbers, or Booleans: True to keep, False for a missing sample."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(weights):
+        where = f"{caller}: `weights{jax.tree_util.keystr(path)}`"
+        if jnp.asarray(leaf).dtype != bool:
+            check_real(where, leaf)
+            if is_concrete(leaf) and np.any(np.asarray(leaf) < 0):
+                raise ValueError(f"{where} must not be negative; received {np.min(leaf)}.")
+
+
+def check_real(where, leaf):
+    """An error unless `leaf` is a finite real number or array."""
+    if not (is_array(leaf) or isinstance(leaf, (int, float))) or isinstance(leaf, bool):
+        raise TypeError(f"{where} must be a real number or array; received {leaf!r}.")
+    if not is_real(leaf):
+        raise TypeError(f"{where} must be real; received {jnp.result_type(leaf)}.")
+    if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
+        raise ValueError(f"{where} must be finite; received {leaf}.")
+
+
+def first_bad(residual):
+    """Words for the entries of a residual that are not finite."""
+    values = [(path, np.asarray(leaf)) for path, leaf in jax.tree_util.tree_leaves_with_path(residual)]
+    total = sum(x.size for _, x in values)
+    bad = sum(int(np.sum(~np.isfinite(x))) for _, x in values)
+    for path, x in values:
+        if not np.all(np.isfinite(x)):
+            index = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
+            return f"{x[index]} at residuals{jax.tree_util.keystr(path)}{list(index)} ({bad} of {total} entries)"
+    return "a finite residual with a derivative that is not finite"
+
+
+def check_transforms(caller, transforms, params, name="params0"):
+    """The transform of each leaf of params, which have to be reachable by it."""
+    try:
+        transforms = tf.per_leaf(transforms, params)
+    except ValueError as error:
+        raise ValueError(f"{caller}: `transforms` must be a prefix of {name}: {error}") from None
+    for (path, leaf), T in zip(jax.tree_util.tree_leaves_with_path(params), transforms, strict=True):
+        where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
+        if not isinstance(T, tf.Transform):
+            raise TypeError(
+                f"{caller}: `transforms` must hold hhtjax.positive, bounded(), fixed or None; received {T!r}."
+            )
+        if is_concrete(leaf) and not np.all(T.contains(leaf)):
+            raise ValueError(f"{where} must {T.expectation}; received {leaf}.")
+    return transforms

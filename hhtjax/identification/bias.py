@@ -1,0 +1,158 @@
+"""What a step size does to fitted parameters, predicted from the step itself.
+
+A simulation with steps h has its own frequencies: its amplification matrix A(h) has eigenvalues mu = exp(s h) with
+s not quite the eigenvalue of the equations. Parameters fitted through it make mu right, so the equations with these
+parameters have eigenvalues s' that are wrong by as much. For HHT with alpha = 0 and x = w h/2
+
+    |s'|^2/|s|^2 = (tan x/x)^2 = 1 + (w h)^2/6 + ...        stiffness over mass
+    Re s'/Re s   = 1/cos(x)^2  = 1 + (w h)^2/4 + ...        damping over mass
+
+and the response to a force is wrong too, by 1 + (w h)^2/3 + ...: where the force is known, so is the mass.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.analysis import amplification_matrix
+from hhtjax.boundary import require_number
+from hhtjax.steppers.stepper import require_stepper
+from hhtjax.system import LinearSystem
+
+OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
+GAIN_WEIGHT = 1e-3  # frequency and damping first; the response to forces with the freedom that they leave
+PROBE = 1e-4  # relative change of the stiffness that shows the response to forces
+
+
+class ModeBias(NamedTuple):
+    """Per mode with an oscillation, slowest first, arrays (modes,).
+
+    frequency: w = |s|, rad/s, and damping: -Re s/w, of the motion itself; both free of the bias. wh: w h.
+    stiffness_bias: |s'|^2/|s|^2 - 1. damping_bias: Re s'/Re s - 1, 0 for an undamped mode. s' belongs to the
+    parameters as fitted with steps h.
+    params: the fitted ones without the bias; None if not asked for.
+    """
+
+    frequency: Any
+    damping: Any
+    wh: Any
+    stiffness_bias: Any
+    damping_bias: Any
+    params: Any = None
+
+
+def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct=False) -> ModeBias:
+    """By how much stiffness and damping are off that were fitted through steps of dt.
+
+    The system is linearised about (q, v, t): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
+    eigenvalues s' is compared with the s = log(mu)/dt of the nearest eigenvalue mu of the real step's amplification
+    matrix: s is what the data have.
+
+    Args:
+        system, stepper, dt: what the parameters were fitted through.
+        params: the fitted ones.
+        q: an equilibrium, or another point about which the motion is small. v: 0 by default.
+        correct: True returns `params` with the smallest relative changes that give the equations the eigenvalues s
+            and, as far as parameters can, the steps' response to forces ("pre-warped"). Parameters that the linear
+            part does not depend on stay as they are. Or Booleans for the leaves of params, or for whole branches:
+            False for what was not fitted, such as a known mass.
+
+    Raises:
+        TypeError, ValueError: dt is no positive number.
+        NotImplementedError: a system with constraints.
+
+    References:
+        Cook, Malkus, Plesha, Witt (2002), Sec. 11.13, for the period error of Newmark's method.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.array([1.0]), lambda q, v, t, params: -params * q)
+    >>> bias = hhtjax.step_size_bias(spring, hhtjax.hht(alpha=0.0), 400.0, 0.01, q=jnp.zeros(1), correct=True)
+    >>> f"{float(bias.wh[0]):.4f} {float(bias.stiffness_bias[0]):.5f}"             # w h, and about (w h)^2/6
+    '0.1993 0.00666'
+    >>> f"{float(bias.params):.3f} {float(bias.frequency[0]) ** 2:.3f}"
+    '397.354 397.354'
+    """
+    require_number("step_size_bias", "dt", dt, lambda x: x > 0, "be positive")
+    require_stepper("step_size_bias", stepper)
+    if system.constraint is not None:
+        raise NotImplementedError("step_size_bias: `system` has a constraint; give a minimal form of it.")
+    matrices = _linear_part(system, params, q, v, t)
+    fitted = _rates_of_equations(*matrices)
+    s = _rates_of_steps(stepper, dt, *matrices)
+    w = np.abs(s)
+    damped = np.abs(np.real(fitted)) > OSCILLATES * np.abs(fitted)
+    damping_bias = np.where(damped, np.real(fitted) / np.where(damped, np.real(s), 1) - 1, 0)
+    bias = ModeBias(w, -np.real(s) / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
+    if correct is False:
+        return bias
+    return bias._replace(params=_corrected(system, stepper, params, dt, (q, v, t), matrices, correct))
+
+
+def _linear_part(system, params, q, v, t):
+    """M, C, K about a state, (n, n) each."""
+    q, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
+    v = jnp.zeros_like(q) if v is None else ravel_pytree(v)[0]
+
+    def force(q, v):
+        return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0]
+
+    M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
+    K, C = (-D for D in jax.jacfwd(force, argnums=(0, 1))(q, v))
+    return jnp.diag(M) if M.ndim == 1 else M, C, K
+
+
+def _rates_of_equations(M, C, K):
+    """Eigenvalues s with an oscillation, one of each pair, slowest first."""
+    n = len(M)
+    first_order = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
+    s = np.linalg.eigvals(first_order)
+    s = s[s.imag > OSCILLATES * np.abs(s)]
+    return s[np.argsort(np.abs(s))]
+
+
+def _rates_of_steps(stepper, dt, M, C, K):
+    """log(mu)/dt of the steps, in the order of the equations' eigenvalues."""
+    linear, rest = LinearSystem(M, C, K), jnp.zeros(len(M))
+    state = stepper.init(linear, rest, rest, None, dt)
+    mu = np.linalg.eigvals(np.asarray(amplification_matrix(stepper, linear, state, dt=dt)))
+    mu = mu[mu.imag > 0]
+    return np.array([np.log(mu[np.argmin(np.abs(mu - np.exp(s * dt)))]) / dt for s in _rates_of_equations(M, C, K)])
+
+
+def _corrected(system, stepper, params, dt, state, matrices, correct):
+    """Gauss-Newton steps of least relative change towards the rates of the steps, and their change with stiffness.
+
+    A force -eps K q changes s by as much as the system responds to forces: so no force needs to be applied.
+    """
+    _, _, K0 = matrices
+
+    def with_response(rates, M, C, K):
+        plus, minus = (rates(M, C, K + sign * PROBE * K0) for sign in (1, -1))
+        return np.concatenate([rates(M, C, K), (plus - minus) / (2 * PROBE)])
+
+    target = with_response(lambda *matrices: _rates_of_steps(stepper, dt, *matrices), *matrices)
+    weight = np.repeat([1.0, GAIN_WEIGHT], len(target) // 2)
+    params = jax.tree.map(lambda p: jnp.asarray(p, jnp.result_type(float)), params)
+    fitted, unravel = ravel_pytree(params)
+    repeated = jax.tree.map(
+        lambda flag, branch: jax.tree.map(lambda p: jnp.full(p.shape, flag), branch), correct, params
+    )
+    at = np.flatnonzero(ravel_pytree(repeated)[0])
+
+    @jax.jit
+    def moved(x):
+        params = unravel(fitted.at[at].multiply(1 + x))
+        return params, _linear_part(system, params, *state)
+
+    def apart(x):
+        off = weight * (with_response(_rates_of_equations, *map(np.asarray, moved(x)[1])) / target - 1)
+        return np.concatenate([off.real, off.imag])
+
+    x = np.zeros(len(at))
+    for _ in range(4):
+        J = np.stack([(apart(x + e) - apart(x - e)) / 2e-5 for e in 1e-5 * np.eye(len(x))], axis=1)
+        x = x - np.linalg.lstsq(J, apart(x), rcond=1e-5)[0]
+    return moved(x)[0]

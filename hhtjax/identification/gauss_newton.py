@@ -1,0 +1,194 @@
+"""The linear least-squares problems inside Levenberg-Marquardt: dense, and with unknowns that belong to one record.
+
+A problem evaluates a point x into a trial with its cost, and finds from it the damped step
+
+    min_dx |r + J dx|^2 + lam |D dx|^2,      D: the norms of the columns of J
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.identification.least_squares import Objective
+
+PART = 512  # rows
+
+
+def with_jacobian(f, x):
+    """f(x) and its forward-mode Jacobian."""
+
+    def twice(x):
+        r = f(x)
+        return r, r
+
+    J, r = jax.jacfwd(twice, has_aux=True)(x)
+    return r, J
+
+
+def triangle(A):
+    """R of A = Q R. Of a tall matrix by QR of parts of its rows, then of what is left of them, and so on: LAPACK's goes
+    through the whole of it for every column.
+
+    >>> A = jnp.sin(jnp.arange(9000.0)).reshape(3000, 3)
+    >>> R = triangle(A)
+    >>> R.shape, bool(jnp.allclose(R.T @ R, A.T @ A))
+    ((3, 3), True)
+    """
+    m, k = A.shape
+    rows = max(PART, 4 * k)
+    while m > 2 * rows:
+        parts = -(-m // rows)
+        A = jnp.pad(A, ((0, parts * rows - m), (0, 0))).reshape(parts, rows, k)
+        A = jnp.linalg.qr(A, mode="r").reshape(-1, k)
+        m = A.shape[0]
+    return jnp.linalg.qr(A, mode="r")
+
+
+class DenseTrial(NamedTuple):
+    """A point, and the least-squares problem there, its columns scaled to one and reduced to p rows."""
+
+    x: Any
+    r: Any
+    J: Any
+    cost: Any
+    length: Any  # of the residual of the least-squares problem
+    column: Any  # norms of the columns of J
+    s: Any  # singular values of J/column
+    V: Any
+    z: Any  # residual in the basis of the left singular vectors
+
+
+class Dense(NamedTuple):
+    """Residuals f(x) (m,) of which each may depend on every unknown."""
+
+    f: Callable
+    objective: Objective
+
+    def look(self, x) -> DenseTrial:
+        """The trial at x; its cost is inf where something is not finite."""
+        r, J = with_jacobian(self.f, x)
+        r_hat, J_hat = self.objective.least_squares(r, J)
+        finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
+        r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
+        column = _norms(J_hat)
+        p = x.size
+        R = triangle(jnp.concatenate([J_hat / column[None, :], r_hat[:, None]], axis=1))
+        U, s, Vt = jnp.linalg.svd(R[:p, :p])
+        cost = jnp.where(finite, self.objective.cost(r), jnp.inf)
+        return DenseTrial(x, r, J, cost, jnp.linalg.norm(R[:, p]), column, s, Vt.T, U.T @ R[:p, p])
+
+    def step(self, trial, lam):
+        """The damped step, and the decrease of the cost that the linear problem predicts."""
+        weight = trial.s / jnp.maximum(trial.s**2 + lam, float(jnp.finfo(lam.dtype).tiny))
+        dx = -(trial.V @ (weight * trial.z)) / trial.column
+        return dx, jnp.sum(trial.z**2 * (1 - (1 - trial.s * weight) ** 2)) / 2
+
+    def cosine(self, trial):
+        """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
+        return _cosine(trial.V @ (trial.s * trial.z), trial.length)
+
+
+class ArrowTrial(NamedTuple):
+    """A point, and each record's problem, columns scaled to one and reduced to k + p + 1 rows."""
+
+    x: Any
+    r: Any  # (records, m)
+    J: Any  # of the shared unknowns, (records, m, p)
+    J_own: Any  # (records, m, k)
+    cost: Any
+    length: Any
+    column: Any  # (p,)
+    column_own: Any  # (records, k)
+    R: Any  # (records, k + p + 1, p)
+    R_own: Any
+    z: Any  # (records, k + p + 1)
+
+
+class Arrow(NamedTuple):
+    """Residuals f(shared, own, record) (m,) of each record, with k unknowns of its own, which are eliminated.
+
+    x holds the p shared unknowns, then those of the records. For given shared ones the own unknowns are a small
+    problem in each record; what is left of J is orthogonal to it (a Schur complement, taken by QR). The Jacobian has
+    p + k columns, whatever the number of records.
+    """
+
+    f: Callable
+    objective: Objective
+    records: Any
+    p: int
+
+    def split(self, x):
+        """Shared unknowns (p,) and own ones (records, k)."""
+        count = jax.tree.leaves(self.records)[0].shape[0]
+        return x[: self.p], x[self.p :].reshape(count, -1)
+
+    def look(self, x) -> ArrowTrial:
+        """The trial at x; its cost is inf where something is not finite."""
+        shared, own = self.split(x)
+
+        def one(own, record):
+            r, J = with_jacobian(lambda y: self.f(y[: self.p], y[self.p :], record), jnp.concatenate([shared, own]))
+            return r, J[:, : self.p], J[:, self.p :]
+
+        r, J, J_own = jax.vmap(one)(own, self.records)
+        count, m, k = J_own.shape
+        both = jnp.concatenate([J_own, J], axis=2).reshape(count * m, -1)
+        r_hat, both = self.objective.least_squares(r.ravel(), both)
+        finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(both))
+        r_hat, both = (jnp.where(finite, y, 0) for y in (r_hat, both))
+        both = both.reshape(count, m, -1)
+        column, column_own = _norms(both[:, :, k:].reshape(count * m, -1)), jax.vmap(_norms)(both[:, :, :k])
+        columns = jnp.concatenate([column_own, jnp.broadcast_to(column, (count, self.p))], axis=1)
+        R = jnp.linalg.qr(jnp.concatenate([both / columns[:, None, :], r_hat.reshape(count, m, 1)], axis=2), mode="r")
+        cost = jnp.where(finite, self.objective.cost(r.ravel()), jnp.inf)
+        length = jnp.linalg.norm(r_hat)
+        return ArrowTrial(x, r, J, J_own, cost, length, column, column_own, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
+
+    def step(self, trial, lam):
+        """The damped step, and the decrease of the cost that the linear problem predicts."""
+        k, p = trial.R_own.shape[-1], self.p
+        root = jnp.sqrt(jnp.maximum(lam, float(jnp.finfo(lam.dtype).eps) ** 2))
+
+        def eliminate(R_own, R, z):
+            Q, T = jnp.linalg.qr(jnp.concatenate([R_own, root * jnp.eye(k, dtype=z.dtype)]))
+            b = jnp.pad(jnp.concatenate([R, z[:, None]], axis=1), ((0, k), (0, 0)))
+            part = Q.T @ b
+            return T, part, b - Q @ part
+
+        T, part, rest = jax.vmap(eliminate)(trial.R_own, trial.R, trial.z)
+        rest = rest.reshape(-1, p + 1)
+        damped = jnp.concatenate([rest, root * jnp.eye(p, p + 1, dtype=root.dtype)])
+        Q, S = jnp.linalg.qr(damped[:, :p])
+        shared = -jax.scipy.linalg.solve_triangular(S, Q.T @ damped[:, p])
+        unmet = part[:, :, p] + jnp.einsum("bkp,p->bk", part[:, :, :p], shared)
+        own = -jax.vmap(jax.scipy.linalg.solve_triangular)(T, unmet)
+        left = trial.z + jnp.einsum("bip,p->bi", trial.R, shared) + jnp.einsum("bik,bk->bi", trial.R_own, own)
+        predicted = (jnp.sum(trial.z**2) - jnp.sum(left**2)) / 2
+        return jnp.concatenate([shared / trial.column, (own / trial.column_own).ravel()]), predicted
+
+    def cosine(self, trial):
+        """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
+        shared = jnp.einsum("bip,bi->p", trial.R, trial.z)
+        own = jnp.einsum("bik,bi->bk", trial.R_own, trial.z)
+        return _cosine(jnp.concatenate([shared, own.ravel()]), trial.length)
+
+    def free_of_own(self, trial):
+        """Residuals (records m,) and the part of their shared Jacobian that no own unknown can make up for."""
+        count, m, k = trial.J_own.shape
+        both = jnp.concatenate([trial.J_own, trial.J], axis=2).reshape(count * m, -1)
+        r, both = self.objective.least_squares(trial.r.ravel(), both)
+        both = both.reshape(count, m, -1)
+        Q, _ = jnp.linalg.qr(both[:, :, :k])
+        rest = both[:, :, k:] - Q @ (jnp.swapaxes(Q, 1, 2) @ both[:, :, k:])
+        return r, rest.reshape(count * m, -1)
+
+
+def _norms(J):
+    norms = jnp.linalg.norm(J, axis=0)
+    return jnp.where(norms == 0, 1, norms)
+
+
+def _cosine(slopes, length):
+    return jnp.max(jnp.abs(slopes)) / jnp.where(length == 0, 1, length)

@@ -1,0 +1,84 @@
+"""Words for what residuals do not determine: the combination of parameters, by name."""
+
+import warnings
+
+import jax
+import numpy as np
+
+
+class IdentifiabilityWarning(UserWarning):
+    """The residuals do not determine every parameter."""
+
+
+def parameter_names(params):
+    """A name for each entry, in the order of `ravel_pytree(params)`: a, decay[0], decay[1]."""
+    names = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        name = jax.tree_util.keystr(path, simple=True, separator=".") or "params"
+        names += [f"{name}{list(map(int, i)) or ''}" for i in np.ndindex(np.shape(leaf))]
+    return names
+
+
+def undetermined_combinations(names, values, singular_values, directions, num_residuals):
+    """A phrase for each combination of parameters that does not matter to the residuals.
+
+    Args:
+        names, values: of the p parameters. singular_values, directions: those of `Uncertainty`.
+        num_residuals: number of rows of the Jacobian.
+
+    >>> import numpy as np
+    >>> undetermined_combinations(["k1", "k2"], [2.0, 3.0], [1.4, 0.0], np.array([[2, -3], [2, 3]]), 9)
+    ['k1, k2 only through their ratio']
+    """
+    s, values = np.asarray(singular_values), np.asarray(values)
+    null = np.asarray(directions)[s <= 10 * num_residuals * np.finfo(s.dtype).eps * s[0]]
+    relative = null / np.where(values == 0, 1, values)[None, :]
+    basis = sorted(_sparse_basis(relative), key=lambda row: tuple(np.abs(row) < 1e-4))
+    return [_phrase(names, row, values) for row in basis]
+
+
+def _sparse_basis(rows):
+    """The same row space with as many zeros as elimination with pivoting gives; largest entries one."""
+    rows = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True, initial=0), 1e-300)
+    free = list(range(len(rows)))
+    for _ in range(len(rows)):
+        i, j = max(((i, j) for i in free for j in range(rows.shape[1])), key=lambda ij: abs(rows[ij]))
+        rows[i] /= rows[i, j]
+        free.remove(i)
+        for other in range(len(rows)):
+            if other != i:
+                rows[other] -= rows[other, j] * rows[i]
+    return rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True, initial=0), 1e-300)
+
+
+def _phrase(names, direction, values):
+    """Direction: relative changes that cancel."""
+    at = np.flatnonzero(np.abs(direction) > 1e-4)
+    names, direction = [names[i] for i in at], direction[at] / direction[at[0]]
+    if len(names) == 1:
+        return f"{names[0]} not at all"
+    joined = ", ".join(names)
+    if np.all(values[at] != 0) and np.allclose(direction, 1, atol=1e-3):
+        return f"{joined} only through their ratio{'s' * (len(names) > 2)}"
+    if np.all(values[at] != 0) and len(names) == 2 and np.allclose(direction, [1, -1], atol=1e-3):
+        return f"{joined} only through their product"
+    unit = ["d{0}/{0}" if value != 0 else "d{0}" for value in values[at]]
+    terms = " ".join(f"{x:+.3g} {u.format(n)}" for x, u, n in zip(direction, unit, names, strict=True))
+    return f"{joined} not along {terms}"
+
+
+def warn_undetermined(caller, params, free, uncertainty, num_residuals, stacklevel):
+    """An `IdentifiabilityWarning` that names parameters and combinations; silent where all are determined."""
+    flags = np.asarray(uncertainty.undetermined)
+    if not flags.any():
+        return
+    names = np.asarray(parameter_names(params))[free]
+    if num_residuals == len(names):
+        why = "there are as many residuals as parameters, so their variance cannot be estimated"
+    else:
+        values = np.concatenate([np.ravel(x) for x in jax.tree.leaves(params)])[free]
+        s, directions = uncertainty.singular_values, uncertainty.directions
+        combinations = undetermined_combinations(names, values, s, directions, num_residuals)
+        why = f"the residuals determine {'; '.join(combinations)}"
+    message = f"{caller}: no standard error for {', '.join(names[flags])}: {why}."
+    warnings.warn(message, IdentifiabilityWarning, stacklevel=stacklevel)

@@ -1,0 +1,191 @@
+"""Parameters from measurements: nonlinear least squares through the simulation.
+
+    minimise  1/2 sum_i rho((w_i r_i(params))^2)  +  priors
+
+with exact derivatives: Levenberg-Marquardt on forward-mode Jacobians for few parameters, any optax
+optimiser on reverse-mode gradients for many.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.boundary import require_number
+from hhtjax.description import is_concrete
+from hhtjax.identification.arguments import (
+    check_options,
+    check_parameters,
+    check_prior,
+    check_records,
+    check_scale,
+    check_transforms,
+    check_weights,
+    first_bad,
+)
+from hhtjax.identification.identifiability import warn_undetermined
+from hhtjax.identification.least_squares import BAD_START
+from hhtjax.identification.problem import Data, solve
+from hhtjax.identification.result import FitResult
+from hhtjax.identification.uncertainty import SEGMENTS
+
+
+def fit(
+    residuals,
+    params0,
+    optimizer=None,
+    *,
+    records=None,
+    starts=None,
+    transforms=None,
+    scale=None,
+    weights=True,
+    loss=None,
+    prior=None,
+    max_iterations=None,
+    tolerance=1e-8,
+    covariance=True,
+    segments=SEGMENTS,
+    progress=False,
+) -> FitResult:
+    """The parameters that minimise the sum of squares of `residuals(params)`.
+
+    Args:
+        residuals: params -> any pytree of real arrays; traceable by JAX, so that its derivatives are exact.
+        params0: where to start, any pytree of real numbers and arrays.
+        optimizer: "levenberg_marquardt" with forward-mode Jacobians, a column for each parameter; or any optax
+            optimiser, driven by reverse-mode gradients of the cost. None: the first for up to 64 free
+            parameters, optax.lbfgs() for more.
+        records: several experiments, or windows of one: any pytree whose leaves have a leading axis, one entry for
+            each. Then `residuals(params, start, record)` is of one record.
+        starts: guesses of what belongs to one record alone, such as its initial state: a pytree with the same leading
+            axis. It is fitted too, and eliminated from each step (a Schur complement), so that the Jacobian has
+            columns for one start only, however many records there are. Levenberg-Marquardt, without a prior.
+        transforms: for each leaf of params0, or for whole branches: `positive`, `bounded(lower, upper)`, `fixed`,
+            or None for neither.
+        scale: typical size of each parameter: a pytree like params0, whose leaves are numbers or arrays of
+            the shape of theirs. The optimiser works on params/scale, if no transform is given. Default: |params0|,
+            or 1 where that is 0. Levenberg-Marquardt scales itself, and uses it for its step tolerance only.
+        weights: w, for each leaf of the residuals, or for whole branches: numbers, or arrays over their leading
+            axes; one over the standard deviation of the noise. 0 or False: a missing sample, whose residual may be NaN.
+        loss: rho, robust against outliers: "huber", "soft_l1", "cauchy", or an elementwise function with
+            rho(z) = z for small z. It bends where w r is about 1, so that weights matter. None: rho(z) = z.
+        prior: for each leaf of params0, or for whole branches: `Gaussian(mean, deviation)`, or None. It adds
+            1/2 ((p - mean)/deviation)^2, so that w r should have unit variance.
+        max_iterations: default 50, or 1000 with an optax optimiser.
+        tolerance: relative, on the change of the cost, on the scaled step and on the cosine between
+            residual and Jacobian columns. With optax: the relative change of the cost, five times running.
+        covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
+        segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
+            residuals are cut for the cluster covariance (`hhtjax.identification.uncertainty`).
+        progress: print cost and step after every iteration, to stderr.
+
+    Returns:
+        A `FitResult`. Inside jit or vmap, look at `result.code`; outside, trouble is raised or warned about.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind; a start that a transform excludes; no free parameter;
+            residuals that are not finite at params0, and not declared missing; more parameters than residuals.
+
+    Warns:
+        IdentifiabilityWarning: the Jacobian at the solution lacks rank: names the parameters concerned, and the
+            combination of them that does not matter.
+
+    References:
+        Levenberg (1944); Marquardt (1963), with his scaling of the damping; Nocedal, Wright (2006), Ch. 10. Robust
+        losses: Triggs, McLauchlan, Hartley, Fitzgibbon (2000), as in SciPy's `least_squares`.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> t = jnp.linspace(0.0, 1.0, 20)
+    >>> measured = 3.0 * jnp.exp(-2.0 * t)
+    >>> result = hhtjax.fit(lambda p: p["a"] * jnp.exp(-p["rate"] * t) - measured, {"a": 1.0, "rate": 1.0})
+    >>> round(float(result.params["a"]), 3), round(float(result.params["rate"]), 3)
+    (3.0, 2.0)
+    """
+    params0 = check_parameters("fit", params0)
+    options = check_options(
+        "fit", residuals, params0, optimizer, transforms, loss, max_iterations, covariance, segments, progress
+    )
+    data = _check_data("fit", params0, scale, weights, prior, tolerance)
+    if records is not None or starts is not None:
+        data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
+    result = solve(residuals, options, params0, data)
+    return _finished("fit", result, weights) if is_concrete(result.code) else result
+
+
+class Multistart(NamedTuple):
+    """best: the `FitResult` of the lowest cost. all: a `FitResult` with a leading axis, one for each start."""
+
+    best: FitResult
+    all: FitResult
+
+
+def multistart(
+    residuals,
+    starts,
+    optimizer=None,
+    *,
+    transforms=None,
+    scale=None,
+    weights=True,
+    loss=None,
+    prior=None,
+    max_iterations=None,
+    tolerance=1e-8,
+    covariance=True,
+    segments=SEGMENTS,
+) -> Multistart:
+    """`fit` from several starts at once, vectorised.
+
+    Args:
+        starts: a pytree like params0, each leaf with a leading axis, one entry for each start.
+        scale: a pytree like params0; by default that of the first start.
+        Everything else as in `fit`.
+
+    Raises:
+        TypeError, ValueError: as `fit`; starts of unequal numbers; residuals that are finite at none of them.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> t = jnp.linspace(0.0, 6.0, 50)
+    >>> found = hhtjax.multistart(lambda w: jnp.sin(w * t) - jnp.sin(3.0 * t), jnp.array([0.5, 2.8, 6.0]))
+    >>> round(float(found.best.params), 6), int(jnp.sum(found.all.cost < 1e-9))
+    (3.0, 1)
+    """
+    starts = check_parameters("multistart", starts, "starts")
+    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves(starts)}
+    if len(counts) != 1 or counts == {()}:
+        raise ValueError(
+            f"multistart: `starts` must have one leading axis in all its leaves; received {sorted(counts)}."
+        )
+    first = jax.tree.map(lambda x: x[0], starts)
+    options = check_options(
+        "multistart", residuals, first, optimizer, transforms, loss, max_iterations, covariance, segments, False
+    )
+    check_transforms("multistart", transforms, starts, "starts")
+    data = _check_data("multistart", first, scale, weights, prior, tolerance)
+    every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
+    cost = jnp.where((every.code == BAD_START) | jnp.isnan(every.cost), jnp.inf, every.cost)
+    best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)
+    return Multistart(_finished("multistart", best, weights) if is_concrete(best.code) else best, every)
+
+
+def _check_data(caller, params0, scale, weights, prior, tolerance):
+    require_number(caller, "tolerance", tolerance, lambda x: x > 0, "be positive")
+    check_weights(caller, weights)
+    prior = None if prior is None else check_prior(caller, prior, params0)
+    return Data(check_scale(caller, scale, params0), weights, prior, tolerance, None, None)
+
+
+def _finished(caller, result, weights):
+    """The result of a fit outside of jit: trouble told, and the history cut to what happened."""
+    if result.code == BAD_START:
+        missing = "" if weights is not True else "; give missing samples the weight False"
+        raise ValueError(
+            f"{caller}: `residuals` must be finite at params0; received {first_bad(result.residual)}{missing}."
+        )
+    if result.uncertainty is not None:
+        size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
+        warn_undetermined(caller, result.params, result.free, result.uncertainty, size, stacklevel=3)
+    done = int(result.iterations) + 1
+    return result._replace(history=jax.tree.map(lambda x: x[:done], result.history), segments=int(result.segments))

@@ -1,0 +1,193 @@
+"""Minimisers of 1/2 sum rho((w f(x))^2) on vectors: Levenberg-Marquardt, and any optax optimiser.
+
+All loops are `lax.while_loop`s, so that a fit runs under jit and vmap; what stopped it travels as a code.
+"""
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+
+RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START = range(7)
+REASONS = {
+    RUNNING: "still running",
+    COST: "converged: the cost changes by less than tolerance",
+    STEP: "converged: the step is smaller than tolerance",
+    GRADIENT: "converged: the gradient vanishes to within tolerance",
+    LIMIT: "stopped: max_iterations reached",
+    STUCK: "stopped: no step lowers the cost",
+    BAD_START: "failed: the residual is not finite at params0",
+}
+
+
+def huber(z):
+    """z up to 1, then 2 sqrt(z) - 1: the square of a small residual, the size of a large one."""
+    return jnp.where(z <= 1, z, 2 * jnp.sqrt(jnp.maximum(z, 1)) - 1)
+
+
+def soft_l1(z):
+    """2 (sqrt(1 + z) - 1): Huber's loss made smooth."""
+    return 2 * z / (jnp.sqrt(1 + z) + 1)
+
+
+LOSSES = {"huber": huber, "soft_l1": soft_l1, "cauchy": jnp.log1p}
+
+
+class History(NamedTuple):
+    """Per iteration, the start first: cost; largest entry of the step in the scaled coordinates, 0 where it was
+    taken back; and the damping of Levenberg-Marquardt (None for optax)."""
+
+    cost: Any
+    step: Any
+    damping: Any
+
+
+class Objective(NamedTuple):
+    """1/2 sum rho(z) with z = (w r)^2 for the first `data` residuals, and rho(z) = z for the others, the priors."""
+
+    weights: Any  # (m,); 0: missing, whatever the residual
+    loss: Callable | None
+    data: int
+
+    def scaled(self, r):
+        """w r, with 0 in the place of what is missing; r may be a Jacobian."""
+        w = self.weights.reshape(-1, *(1,) * (r.ndim - 1))
+        return jnp.where(w == 0, 0, w * r)
+
+    def losses(self, r):
+        """rho of each residual, and its first two derivatives."""
+        z = self.scaled(r) ** 2
+        ones = jnp.ones_like(z)
+        loss = self.loss
+        if loss is None:
+            return z, ones, 0 * z
+
+        def rho(z):
+            return jnp.concatenate([loss(z[: self.data]), z[self.data :]])
+
+        (value, slope), (_, curvature) = jax.jvp(lambda z: jax.jvp(rho, (z,), (ones,)), (z,), (ones,))
+        return value, slope, curvature
+
+    def cost(self, r):
+        """1/2 sum rho."""
+        return jnp.sum(self.losses(r)[0]) / 2
+
+    def least_squares(self, r, J):
+        """(r, J) of the ordinary least-squares problem with the same gradient J^T r and Gauss-Newton matrix J^T J.
+
+        Triggs et al. (2000), Sec. 4.3: the rows of J are scaled by sqrt(rho' + 2 rho'' z), kept positive.
+        """
+        r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
+        if self.loss is None:
+            return r, J
+        row = jnp.sqrt(jnp.maximum(slope + 2 * curvature * r**2, float(jnp.finfo(r.dtype).eps)))
+        return r * slope / row, J * row[:, None]
+
+
+def levenberg_marquardt(problem, x, tolerance, max_iterations, progress):
+    """Damped Gauss-Newton on a `Dense` or an `Arrow` problem; returns the best trial, the history, and why it ended.
+
+    dx = -(J^T J + lam D)^-1 J^T r with D the diagonal of J^T J; lam shrinks by 8 when a step lowers the cost and grows
+    by 6 when it does not.
+    """
+    eps = float(jnp.finfo(x.dtype).eps)
+    running = jnp.asarray(RUNNING, jnp.int32)
+
+    def unfinished(carry):
+        return carry[-1] == RUNNING
+
+    def improve(carry):
+        now, lam, iteration, history, _ = carry
+        first = iteration < 0
+        step, predicted = problem.step(now, lam)
+        new = problem.look(now.x + jnp.where(first, 0, step))
+        lower = new.cost < now.cost
+        lam = jnp.where(first, lam, jnp.where(lower, lam / 8, lam * 6))
+        iteration = iteration + 1
+        honest = lower | (lam <= 1)  # a step is also small, and changes little, because lam is large
+        flat = (predicted <= tolerance * now.cost) & (jnp.abs(now.cost - new.cost) <= tolerance * now.cost)
+        short = jnp.all(jnp.abs(step) <= tolerance * (jnp.abs(now.x) + tolerance))
+        best = jax.tree.map(partial(jnp.where, lower | first), new, now)
+        code = jnp.where(iteration == max_iterations, LIMIT, running)
+        code = jnp.where(~lower & (lam > 1 / eps), STUCK, code)
+        code = jnp.where(honest & short, STEP, code)
+        code = jnp.where(honest & flat, COST, code)
+        code = jnp.where(first, jnp.where(jnp.isfinite(new.cost), running, BAD_START), code)
+        code = jnp.where((code != BAD_START) & (problem.cosine(best) <= tolerance), GRADIENT, code)
+        taken = jnp.where(lower & ~first, jnp.max(jnp.abs(step)), 0)
+        history = _record(history, iteration, best.cost, taken, lam)
+        if progress:
+            _show(iteration, best.cost, taken)
+        return best, lam, iteration, history, code
+
+    # nothing is known before the first evaluation, which is that of the loop: f is compiled once
+    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(problem.look, x))
+    nothing = nothing._replace(x=x, cost=jnp.asarray(jnp.inf, x.dtype))
+    empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
+    carry = nothing, jnp.asarray(1e-3, x.dtype), jnp.asarray(-1, jnp.int32), History(empty, empty, empty), running
+    best, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
+    return best, history, iterations, code
+
+
+def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, patience=5):
+    """An optax optimiser on the cost; returns the best point it saw."""
+    optimizer = optax.with_extra_args_support(optimizer)
+    running = jnp.asarray(RUNNING, jnp.int32)
+
+    def cost(x):
+        return objective.cost(f(x))
+
+    def unfinished(carry):
+        return carry[-1] == RUNNING
+
+    def improve(carry):
+        x, state, best, before, step, quiet, iteration, history, _ = carry
+        value, gradient = jax.value_and_grad(cost)(x)
+        best = jax.tree.map(partial(jnp.where, value < best[1]), (x, value), best)
+        history = _record(history, iteration, value, step, None)
+        quiet = jnp.where(jnp.abs(before - value) <= tolerance * value, quiet + 1, 0)
+        code = jnp.where(iteration == max_iterations, LIMIT, running)
+        code = jnp.where(quiet >= patience, COST, code)
+        code = jnp.where(jnp.all(gradient == 0), GRADIENT, code)
+        code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
+        if progress:
+            _show(iteration, value, step)
+        updates, state = optimizer.update(gradient, state, x, value=value, grad=gradient, value_fn=cost)
+        updates = jnp.where(code == RUNNING, jnp.asarray(updates), 0)
+        iteration = jnp.where(code == RUNNING, iteration + 1, iteration)
+        return x + updates, state, best, value, jnp.max(jnp.abs(updates)), quiet, iteration, history, code
+
+    infinity = jnp.asarray(jnp.inf, x.dtype)
+    empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
+    zero = jnp.zeros((), jnp.int32)
+    start = x, infinity
+    carry = (
+        x,
+        optimizer.init(x),
+        start,
+        infinity,
+        jnp.zeros((), x.dtype),
+        zero,
+        zero,
+        History(empty, empty, None),
+        running,
+    )
+    _, _, (x, _), _, _, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
+    return x, history, iterations, code
+
+
+def _record(history, i, *values):
+    return History(*(None if x is None else x.at[i].set(value) for x, value in zip(history, values, strict=True)))
+
+
+def _show(iteration, cost, step):
+    def show(iteration, cost, step):
+        what = f"step {float(step):.3g}" if step else "no step" if iteration else "start"
+        print(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", file=sys.stderr, flush=True)
+
+    jax.debug.callback(show, iteration, cost, step)

@@ -1,0 +1,169 @@
+"""A fit as one compiled program: from checked arguments to a `FitResult`."""
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options, check_residuals, spread_weights
+from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
+from hhtjax.identification.least_squares import Objective, descend, levenberg_marquardt
+from hhtjax.identification.result import FitResult
+from hhtjax.identification.uncertainty import count_segments, uncertainty, variance_inflation
+
+
+class Data(NamedTuple):
+    """The traced arguments of a fit besides params0: pytrees, or None where there is nothing."""
+
+    scale: Any
+    weights: Any
+    prior: Any
+    tolerance: Any
+    records: Any
+    starts: Any
+
+
+class _Solved(NamedTuple):
+    """x and what belongs to it. r, J: of the linear problem there, J None if not asked for; r_leaves: r as a pytree's
+    leaves, of the given sizes; present: how many rows are not missing."""
+
+    x: Any
+    cost: Any
+    history: Any
+    iterations: Any
+    code: Any
+    residual: Any
+    starts: Any
+    r: Any
+    J: Any
+    r_leaves: Any
+    sizes: list
+    present: Any
+
+
+class Coordinates:
+    """params as a function of the vector x that the optimiser moves."""
+
+    def __init__(self, transforms, params0, scale):
+        self.leaves, self.structure = jax.tree.flatten(params0)
+        self.scales = jax.tree.leaves(scale)
+        self.transforms = transforms
+        self.free = [i for i, T in enumerate(transforms) if T is not tf.fixed]
+        start = [transforms[i].coordinate(self.leaves[i], self.scales[i]) for i in self.free]
+        self.x0, self.unravel = ravel_pytree(start)
+
+    def free_leaves(self, x):
+        """The fitted leaves."""
+        return [
+            self.transforms[i].parameter(y, self.scales[i]) for i, y in zip(self.free, self.unravel(x), strict=True)
+        ]
+
+    def params(self, x):
+        """All leaves, as params0 has them."""
+        changed = dict(zip(self.free, self.free_leaves(x), strict=True))
+        return self.structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(self.leaves)])
+
+    def slope(self, x):
+        """dp/dx of the fitted entries."""
+        return jax.jvp(lambda x: ravel_pytree(self.free_leaves(x))[0], (x,), (jnp.ones_like(x),))[1]
+
+    def of_prior(self, prior):
+        """Means and standard deviations for the fitted leaves."""
+        pairs = [self.structure.flatten_up_to(prior)[i] for i in self.free]
+        return [pair.mean for pair in pairs], [pair.deviation for pair in pairs]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def solve(residuals, options: Options, params0, data: Data) -> FitResult:
+    """The fit, with what it says about itself as data."""
+    coordinates = Coordinates(options.transforms, params0, data.scale)
+    tolerance = jnp.asarray(data.tolerance, coordinates.x0.dtype)
+    tolerance = jnp.maximum(tolerance, 10 * float(jnp.finfo(tolerance.dtype).eps))
+    limits = tolerance, options.max_iterations, options.progress
+    branch = _solve_dense if data.records is None else _solve_records
+    found = branch(residuals, options, coordinates, data, limits)
+    believed, segments = None, 0
+    if options.covariance:
+        segments = count_segments(found.sizes, options.segments)
+        J = found.J / coordinates.slope(found.x)[None, :]
+        tau = variance_inflation(found.r_leaves)
+        believed = uncertainty(J, found.r, found.present, found.sizes, segments, tau)
+    ended = found.residual, found.cost, found.history, found.iterations, found.code
+    return FitResult(coordinates.params(found.x), *ended, options.transforms, believed, segments, found.starts)
+
+
+def _solve_dense(residuals, options, coordinates, data, limits):
+    """One residual function of all parameters, with priors as further rows."""
+    shapes = jax.eval_shape(residuals, coordinates.params(coordinates.x0))
+    check_residuals("fit", shapes, coordinates.x0.size)
+    leaves = spread_weights("fit", data.weights, shapes)
+    w, unravel = ravel_pytree(jax.tree.unflatten(jax.tree.structure(shapes), leaves))
+    m = w.size
+    if data.prior is not None:
+        means, deviations = coordinates.of_prior(data.prior)
+        w = jnp.concatenate([w, 1 / ravel_pytree(deviations)[0]])
+
+    def f(x):
+        r, _ = ravel_pytree(residuals(coordinates.params(x)))
+        if data.prior is None:
+            return r
+        away = [p - mean for p, mean in zip(coordinates.free_leaves(x), means, strict=True)]
+        return jnp.concatenate([r, ravel_pytree(away)[0]])
+
+    objective = Objective(w, options.loss, m)
+    if options.optimizer == LEVENBERG_MARQUARDT:
+        best, history, iterations, code = levenberg_marquardt(Dense(f, objective), coordinates.x0, *limits)
+        x, r, J = best.x, best.r, best.J
+    else:
+        x, history, iterations, code = descend(f, coordinates.x0, objective, options.optimizer, *limits)
+        r, J = with_jacobian(f, x) if options.covariance else (f(x), None)
+    residual, cost = unravel(r[:m]), objective.cost(r)
+    if J is not None:
+        r, J = objective.least_squares(r, J)
+    sizes = [math.prod(leaf.shape) for leaf in leaves]
+    return _Solved(
+        x,
+        cost,
+        history,
+        iterations,
+        code,
+        residual,
+        None,
+        r,
+        J,
+        jax.tree.leaves(unravel(r[:m])),
+        sizes,
+        jnp.sum(w != 0),
+    )
+
+
+def _solve_records(residuals, options, coordinates, data, limits):
+    """One residual function of each record, with a start of its own."""
+    one = jax.tree.map(lambda x: x[0], data.starts)
+    _, unravel_start = ravel_pytree(one)
+    own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
+    every = jax.vmap(residuals, in_axes=(None, 0, 0))
+    shapes = jax.eval_shape(every, coordinates.params(coordinates.x0), data.starts, data.records)
+    check_residuals("fit", shapes, coordinates.x0.size + own0.size)
+    weights = jax.tree.unflatten(jax.tree.structure(shapes), spread_weights("fit", data.weights, shapes))
+    w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)
+    _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], weights))
+
+    def f(x, own, record):
+        return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
+
+    objective = Objective(w.ravel(), options.loss, w.size)
+    problem = Arrow(f, objective, data.records, coordinates.x0.size)
+    best, history, iterations, code = levenberg_marquardt(
+        problem, jnp.concatenate([coordinates.x0, own0.ravel()]), *limits
+    )
+    x, own = problem.split(best.x)
+    residual, starts, cost = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own), objective.cost(best.r.ravel())
+    r, J = problem.free_of_own(best)
+    r_leaves = jax.tree.leaves(jax.vmap(unravel)(r.reshape(w.shape)))
+    present = jnp.sum(w != 0) - own0.size  # each start has used up as many residuals as it has entries
+    return _Solved(x, cost, history, iterations, code, residual, starts, r, J, r_leaves, [w.size], present)

@@ -1,0 +1,122 @@
+"""A fit for readers: a text table, charts, and JSON."""
+
+from dataclasses import fields
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.identifiability import parameter_names
+from hhtjax.steppers.stepper import Stepper
+
+
+def summary(result) -> str:
+    """The text of `FitResult.summary`."""
+    size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
+    lines = [f"{result.reason}; {int(result.iterations)} iterations, cost {float(result.cost):.6g}, {size} residuals"]
+    names, values = parameter_names(result.params), _flat(result.params)
+    rows = [["parameter", "estimate"]]
+    columns = []
+    if result.uncertainty is not None:
+        rows[0] += ["standard error", "95 % interval", "error / naive"]
+        lower, upper = map(_flat, result.interval())
+        errors, naive = _flat(result.standard_errors), _flat(result.errors(result.uncertainty.naive))
+        columns = [
+            ["fixed", "", ""] if not free else [f"{e:.3g}", f"{low:.6g} .. {high:.6g}", f"{e / n:.2f}" if n else ""]
+            for free, e, low, high, n in zip(result.free, errors, lower, upper, naive, strict=True)
+        ]
+    for i, (name, value) in enumerate(zip(names, values, strict=True)):
+        rows.append([name, f"{value:.6g}", *(columns[i] if columns else [])])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines += ["  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    if result.uncertainty is not None:
+        lines += _remarks(result, np.asarray(names))
+    return "\n".join(lines)
+
+
+def _remarks(result, names):
+    believed = result.uncertainty
+    kind = f"cluster sandwich over {result.segments} segments" if believed.cluster is not None else "autocorrelated"
+    remarks = [f"standard errors: {kind}"]
+    R = np.abs(np.asarray(result.correlation)) * (1 - np.eye(len(names)))
+    if len(names) > 1:
+        i, j = np.unravel_index(np.argmax(R), R.shape)
+        remarks.append(f"largest correlation: {float(result.correlation[i, j]):+.3f} between {names[i]} and {names[j]}")
+    s = np.asarray(believed.singular_values)
+    remarks.append(f"singular values of the scaled Jacobian: {s[0]:.3g} .. {s[-1]:.3g}")
+    return remarks
+
+
+def plot(result, sampling_rate=1.0):
+    """The figure of `FitResult.plot`."""
+    import matplotlib.pyplot as plt
+
+    r = np.asarray(jax.tree.leaves(result.residual)[0])
+    r = r.reshape(r.shape[0], -1)[:, 0] if r.ndim else r.reshape(1)
+    figure, axes = plt.subplots(2, 2, figsize=(9, 6), layout="constrained")
+    time, frequency = np.arange(len(r)) / sampling_rate, np.fft.rfftfreq(len(r), 1 / sampling_rate)
+    axes[0, 0].plot(time, r, lw=0.7)
+    axes[0, 0].set(xlabel="time (samples / sampling rate)", ylabel="residual")
+    power = np.abs(np.fft.rfft(np.where(np.isfinite(r), r, 0))) ** 2 / len(r)
+    axes[0, 1].semilogy(frequency[1:], power[1:], lw=0.7)
+    axes[0, 1].set(xlabel="frequency (of the sampling rate's unit)", ylabel="power of the residual")
+    if result.uncertainty is not None:
+        names = np.asarray(parameter_names(result.params))[result.free]
+        free = np.flatnonzero(result.free)
+        values = _flat(result.params)[free]
+        lower, upper = (_flat(end)[free] for end in result.interval())
+        size = np.where(values == 0, 1, np.abs(values))
+        reach = 100 * np.stack([values - lower, upper - values]) / size
+        axes[1, 0].errorbar(np.zeros(len(free)), np.arange(len(free)), xerr=reach, fmt="o", capsize=3)
+        axes[1, 0].set(xlabel="95 % interval (% of the estimate)", yticks=np.arange(len(free)), yticklabels=names)
+        image = axes[1, 1].imshow(np.asarray(result.correlation)[np.ix_(free, free)], vmin=-1, vmax=1, cmap="RdBu")
+        axes[1, 1].set(xticks=np.arange(len(free)), yticks=np.arange(len(free)), yticklabels=names)
+        axes[1, 1].set_xticklabels(names, rotation=90)
+        figure.colorbar(image, ax=axes[1, 1], label="correlation of the estimates")
+    return figure
+
+
+def _flat(tree):
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+
+
+TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}
+
+
+def encode(x):
+    """A pytree of named tuples, dicts, lists, tuples, arrays, transforms and steppers, as what JSON can hold."""
+    if x is None or isinstance(x, (int, float, str)):
+        return x
+    if isinstance(x, tf.Bounded):
+        return {"bounded": [x.lower, x.upper]}
+    if isinstance(x, tf.Transform):
+        return {"transform": next(name for name, T in TRANSFORMS.items() if T is x)}
+    if isinstance(x, dict):
+        return {"dict": {name: encode(y) for name, y in x.items()}}
+    if isinstance(x, Stepper):
+        names = [field.name for field in fields(cast(Any, x))]  # each is a dataclass
+        return {type(x).__name__: {name: encode(getattr(x, name)) for name in names}}
+    if names := getattr(x, "_fields", None):
+        return {type(x).__name__: {name: encode(y) for name, y in zip(names, x, strict=True)}}
+    if isinstance(x, (list, tuple)):
+        return {type(x).__name__: [encode(y) for y in x]}
+    return {"array": np.asarray(x).tolist(), "dtype": str(np.asarray(x).dtype)}
+
+
+def decode(x, named) -> Any:
+    """The inverse of `encode`; named: the classes of named tuples and steppers, by name."""
+    if not isinstance(x, dict):
+        return x
+    kind, content = next(iter(x.items()))
+    if kind == "array":
+        return jnp.asarray(np.asarray(content, x["dtype"]))
+    if kind == "bounded":
+        return tf.bounded(*content)
+    if kind == "transform":
+        return TRANSFORMS[content]
+    if kind in ("list", "tuple"):
+        return (list if kind == "list" else tuple)(decode(y, named) for y in content)
+    values = {name: decode(y, named) for name, y in content.items()}
+    return values if kind == "dict" else named[kind](**values)

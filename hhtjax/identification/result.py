@@ -1,0 +1,151 @@
+"""What `fit` returns."""
+
+import json
+import statistics
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.boundary import require_number
+from hhtjax.identification import report
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.least_squares import COST, GRADIENT, REASONS, STEP, History
+from hhtjax.identification.uncertainty import Uncertainty, correlation
+
+
+class FitResult(NamedTuple):
+    """An estimate, how it was reached, and how far to trust it.
+
+    params: the estimate, structured like params0. residual: residuals(params), as the user's function gives it.
+    cost: 1/2 sum rho(weighted residual^2), and of priors. history: `History`, NaN after the last iteration when made
+    inside jit. iterations: how many. code: why it stopped, a key of `REASONS`. transforms: of each leaf.
+    uncertainty: `Uncertainty` of the free entries; None if not asked for. segments: how many the cluster
+    covariance rests on.
+    starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
+    covariance: (p, p); rows follow ravel_pytree(params). standard_errors: root of its diagonal, structured like params.
+    Both from the cluster sandwich over segments, or autocorrelated where parameters outnumber segments. A fixed
+    parameter has variance 0; one that the residuals do not determine has inf, and covariances 0.
+    """
+
+    params: Any
+    residual: Any
+    cost: Any
+    history: History
+    iterations: Any
+    code: Any
+    transforms: tuple
+    uncertainty: Uncertainty | None
+    segments: int
+    starts: Any = None
+
+    @property
+    def converged(self):
+        """Whether a tolerance was met."""
+        return (self.code == COST) | (self.code == STEP) | (self.code == GRADIENT)
+
+    @property
+    def reason(self) -> str:
+        """Why it stopped, in words."""
+        return REASONS[int(self.code)]
+
+    @property
+    def free(self):
+        """Whether each entry of ravel_pytree(params) was fitted, (p,)."""
+        leaves = zip(self.transforms, jax.tree.leaves(self.params), strict=True)
+        return np.concatenate([np.full(np.size(x), T is not tf.fixed) for T, x in leaves])
+
+    @property
+    def covariance(self):
+        """(p, p), or None."""
+        return None if self.uncertainty is None else self.embed(self.uncertainty.covariance)
+
+    @property
+    def standard_errors(self):
+        """Structured like params, or None."""
+        return None if self.uncertainty is None else self.errors(self.uncertainty.covariance)
+
+    @property
+    def correlation(self):
+        """Of the estimates, (p, p), or None."""
+        return None if self.uncertainty is None else correlation(self.covariance)
+
+    def embed(self, covariance):
+        """A covariance of the free entries with rows of zeros for the fixed ones, (p, p)."""
+        at = np.flatnonzero(self.free)
+        p = len(self.free)
+        return jnp.zeros((p, p), covariance.dtype).at[np.ix_(at, at)].set(covariance)
+
+    def errors(self, covariance):
+        """Standard errors from a covariance of the free entries, structured like params."""
+        _, unravel = ravel_pytree(self.params)
+        return unravel(jnp.sqrt(jnp.diagonal(self.embed(covariance))))
+
+    def interval(self, level=0.95):
+        """Lower and upper ends of each parameter's confidence interval, two pytrees like params.
+
+        Student's t with segments - 1 degrees of freedom, symmetric in the coordinate that was fitted: for a
+        `positive` parameter p exp(-+ t sigma/p), which stays positive.
+
+        Raises:
+            TypeError, ValueError: level is no number between 0 and 1; a fit without covariance.
+        """
+        require_number("interval", "level", level, lambda x: 0 < x < 1, "lie between 0 and 1")
+        if self.uncertainty is None:
+            raise ValueError("interval: the fit was made with covariance=False.")
+        t = _student(level, self.segments - 1 if self.uncertainty.cluster is not None else None)
+        leaves, structure = jax.tree.flatten(self.params)
+        errors = jax.tree.leaves(self.standard_errors)
+        ends = [_ends(T, p, t * e) for T, p, e in zip(self.transforms, leaves, errors, strict=True)]
+        return structure.unflatten([lower for lower, _ in ends]), structure.unflatten([upper for _, upper in ends])
+
+    def summary(self) -> str:
+        """A table of estimates, standard errors and intervals, and what limits them.
+
+        >>> import jax.numpy as jnp, hhtjax
+        >>> wave = jnp.sin(jnp.arange(400.0))
+        >>> print(hhtjax.fit(lambda p: p["a"] * wave + p["b"] - 2 * wave - 0.1, {"a": 1.0, "b": 0.0}).summary())
+        ... # doctest: +ELLIPSIS
+        converged: ...
+        parameter  estimate  standard error  95 % interval  error / naive
+        a          2  ...
+        """
+        return report.summary(self)
+
+    def plot(self, sampling_rate=1.0):
+        """A figure: residual and its spectrum (of the first channel), intervals, correlations. Needs matplotlib."""
+        return report.plot(self, sampling_rate)
+
+    def to_json(self) -> str:
+        """The whole result as JSON, for `FitResult.from_json`; inf and NaN as Python writes them."""
+        return json.dumps(report.encode(self))
+
+    @staticmethod
+    def from_json(text) -> "FitResult":
+        """What `to_json` wrote. params of dicts, lists and tuples."""
+        return report.decode(json.loads(text), NAMED)
+
+
+NAMED: dict[str, Any] = {c.__name__: c for c in (FitResult, History, Uncertainty)}
+
+
+def _ends(T, p, reach):
+    if T is tf.fixed:
+        return p, p
+    one = jnp.ones_like(p)
+    x = T.coordinate(p, one)
+    _, slope = jax.jvp(lambda x: T.parameter(x, one), (x,), (one,))
+    return T.parameter(x - reach / slope, one), T.parameter(x + reach / slope, one)
+
+
+def _student(level, degrees):
+    """Two-sided quantile of Student's t, by Cornish and Fisher's expansion about the normal one (None: normal)."""
+    z = statistics.NormalDist().inv_cdf((1 + level) / 2)
+    if degrees is None:
+        return z
+    first = (z**3 + z) / 4
+    second = (5 * z**5 + 16 * z**3 + 3 * z) / 96
+    third = (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384
+    return z + first / degrees + second / degrees**2 + third / degrees**3

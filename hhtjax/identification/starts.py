@@ -1,0 +1,100 @@
+"""Where a fit starts: parameters from the equation of motion itself, and longer and longer parts of a record."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.band_limited import band_limited_motion
+from hhtjax.boundary import require_function
+from hhtjax.flat_system import flatten
+from hhtjax.identification.identify import fit
+from hhtjax.identification.result import FitResult
+
+MARGIN = 1.0  # periods of the cutoff left out at both ends
+
+
+def equation_error(system, values, dt, cutoff, t0=0.0) -> Callable:
+    """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
+
+    Nothing is simulated, and most parameters enter linearly: so the fit converges from anywhere, and its estimate is a
+    start for the fit through the simulation. It is no more than that, because noise and filter bias it.
+
+    Args:
+        system: without constraints and rotations, all of whose coordinates are measured.
+        values: positions, a pytree like q with a leading axis of samples. dt: sampling period, s.
+        cutoff: Hz, between the frequencies of the motion and those of the noise.
+        t0: time of the first sample.
+
+    Raises:
+        TypeError, ValueError: as `band_limited_motion`. NotImplementedError: a system with constraints.
+
+    Shape of the result: (samples without both ends, n), in units of force.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
+    >>> t = 0.01 * jnp.arange(1000.0)
+    >>> q = jnp.exp(-0.1 * t) * jnp.cos(3.0 * t)                                        # k = 9.01, c = 0.2
+    >>> found = hhtjax.fit(hhtjax.equation_error(spring, q[:, None], 0.01, cutoff=5.0), {"k": 1.0, "c": 1.0})
+    >>> f"{float(found.params['k']):.1f} {float(found.params['c']):.1f}"
+    '9.0 0.2'
+    """
+    if system.constraint is not None:
+        raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
+    motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)
+    q, v, a = jax.tree.transpose(jax.tree.structure(values), jax.tree.structure((0, 0, 0)), motion)
+    samples = jax.tree.leaves(q)[0].shape[0]
+    left_out = int(jnp.ceil(MARGIN / (cutoff * dt)))
+    t = t0 + jnp.linspace(0, dt * (samples - 1), samples)
+    inside = jax.tree.map(lambda y: y[left_out : samples - left_out], (q, v, a, t))
+
+    def residuals(params):
+        def one(q, v, a, t):
+            flat, x, rate = flatten("equation_error", system, q, v, t, params)
+            acceleration, _ = ravel_pytree(a)
+            return flat.inertia(x, acceleration, params) - flat.force(x, rate, t.astype(x.dtype), params)
+
+        return jax.vmap(one)(*inside)
+
+    return residuals
+
+
+def fit_progressively(problem_at, params0, horizons, **options: Any) -> FitResult:
+    """One `fit` after the other, each to a longer part of the data, and each from where the one before ended.
+
+    Over a short part a motion depends on its parameters almost linearly; over a long or chaotic one the cost has many
+    minima, and only the lowest is right. The early fits are cheap too.
+
+    Args:
+        problem_at: (horizon, before) -> the arguments of `fit` for it, a dict with "residuals" and perhaps "records",
+            "starts", "weights". before: the `FitResult` of the last horizon, None for the first. With `windows` of that
+            duration it is multiple shooting.
+        params0: as in `fit`. horizons: whatever problem_at takes, the shortest first.
+        options: of every fit. Only the last one computes a covariance.
+
+    Returns:
+        The last `FitResult`.
+
+    Raises:
+        TypeError: problem_at is no function. ValueError: no horizon.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> t = jnp.linspace(0.0, 30.0, 600)
+    >>> measured = jnp.sin(3.0 * t)
+    >>> def problem_at(n, before):
+    ...     return {"residuals": lambda w: jnp.sin(w * t[:n]) - measured[:n]}
+    >>> [round(float(hhtjax.fit_progressively(problem_at, 1.5, h).params), 3) == 3.0 for h in ([600], [20, 600])]
+    [False, True]
+    """
+    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)")
+    if not len(horizons):
+        raise ValueError(f"fit_progressively: `horizons` must hold at least one; received {horizons!r}.")
+    params, result = params0, None
+    for i, horizon in enumerate(horizons):
+        last = i == len(horizons) - 1
+        result = fit(params0=params, **problem_at(horizon, result), **options | ({} if last else {"covariance": False}))
+        params = result.params
+    assert result is not None
+    return result

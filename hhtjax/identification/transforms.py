@@ -1,0 +1,138 @@
+"""Coordinates for fitting: what keeps a parameter positive, inside bounds, or fixed.
+
+`fit` moves numbers x without limits, and a transform turns them into parameters p, entry by entry:
+
+    none          p = scale x
+    positive      p = exp(x)
+    bounded       p = lower + (upper - lower)/(1 + exp(-x))
+    fixed         p stays as it is in params0
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.boundary import require_number
+
+
+class Transform:
+    """Base of the transforms; frozen, hashable, and static in a pytree."""
+
+    expectation = "be real"
+
+    def __init_subclass__(cls):
+        jax.tree_util.register_static(cls)
+
+    def contains(self, p):
+        """Whether the values p can be reached."""
+        return np.full(np.shape(p), True)
+
+    def parameter(self, x, scale):
+        """p of x; scale: typical size of p, used by the plain transform only."""
+        raise NotImplementedError
+
+    def coordinate(self, p, scale):
+        """x of p."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Scaled(Transform):
+    """p = scale x, the default."""
+
+    def parameter(self, x, scale):
+        """scale x."""
+        return scale * x
+
+    def coordinate(self, p, scale):
+        """p/scale."""
+        return p / scale
+
+
+@dataclass(frozen=True)
+class Positive(Transform):
+    """p = exp(x)."""
+
+    expectation = "be positive, for its transform"
+
+    def contains(self, p):
+        """p > 0."""
+        return np.asarray(p) > 0
+
+    def parameter(self, x, scale):
+        """exp(x)."""
+        return jnp.exp(x)
+
+    def coordinate(self, p, scale):
+        """log(p)."""
+        return jnp.log(p)
+
+
+@dataclass(frozen=True)
+class Bounded(Transform):
+    """p between lower and upper."""
+
+    lower: float
+    upper: float
+
+    @property
+    def expectation(self):
+        """Words for an error."""
+        return f"lie between {self.lower} and {self.upper}, for its transform"
+
+    def contains(self, p):
+        """lower < p < upper."""
+        return (np.asarray(p) > self.lower) & (np.asarray(p) < self.upper)
+
+    def parameter(self, x, scale):
+        """lower + (upper - lower)/(1 + exp(-x))."""
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(x)
+
+    def coordinate(self, p, scale):
+        """log((p - lower)/(upper - p))."""
+        return jnp.log((p - self.lower) / (self.upper - p))
+
+
+@dataclass(frozen=True)
+class Fixed(Transform):
+    """p as it is; not a coordinate at all."""
+
+
+scaled = Scaled()
+positive = Positive()
+fixed = Fixed()
+
+
+def bounded(lower, upper) -> Bounded:
+    """A transform that keeps a parameter strictly between two numbers.
+
+    Raises:
+        TypeError, ValueError: a bound is no finite number, or lower >= upper.
+
+    >>> import hhtjax
+    >>> result = hhtjax.fit(lambda p: p - jax.numpy.array([2.0, 3.0]), 0.5, transforms=hhtjax.bounded(0, 1))
+    >>> round(float(result.params), 3)                                          # 2.5 without the bound
+    1.0
+    """
+    for name, value in (("lower", lower), ("upper", upper)):
+        require_number("bounded", name, value, np.isfinite, "be finite")
+    if lower >= upper:
+        raise ValueError(f"bounded: `lower` must be less than upper; received {lower} and {upper}.")
+    return Bounded(float(lower), float(upper))
+
+
+def per_leaf(prefix, tree):
+    """The transform of each leaf of `tree`, given for leaves or whole branches; None stands for `scaled`."""
+
+    def is_transform(x):
+        return x is None or isinstance(x, Transform)
+
+    repeated = jax.tree.map(
+        lambda T, branch: [scaled if T is None else T] * len(jax.tree.leaves(branch)),
+        prefix,
+        tree,
+        is_leaf=is_transform,
+    )
+    return tuple(jax.tree.leaves(repeated, is_leaf=is_transform))

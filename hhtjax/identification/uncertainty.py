@@ -1,0 +1,134 @@
+"""Covariance of a least-squares estimate: what to believe when residuals are correlated, as after any model error.
+
+With the Jacobian J and the residual r at the estimate, each covariance is a sandwich
+
+    (J^T J)^-1 S (J^T J)^-1,      S = variance of J^T r:
+
+    naive            S = s^2 J^T J,  s^2 = sum r^2/(m - p):  independent residuals of equal variance
+    autocorrelated   S = tau s^2 J^T J,  tau = 1 + 2 sum_k (1 - k/L) rho_k,  rho_k the autocorrelation of r (Bartlett)
+    cluster          S = sum_g s_g s_g^T,  s_g = J_g^T (1 - H_g)^(-1/2) r_g,  over segments g of the residual that are
+                     long against its correlation time; H_g = J_g (J^T J)^-1 J_g^T is the part of r_g that the fit took
+
+(Liang and Zeger 1986, with the correction "CR2" of Bell and McCaffrey 2002: S has no bias for white residuals.) A
+combination of parameters that a single segment determines, such as its initial state, leaves no residual to estimate
+its variance from: there, that of the autocorrelated S stands in. A prior adds its own precision to S.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.identification.gauss_newton import triangle
+
+SEGMENTS = 32
+ALONE = 0.75  # share of the information on a combination of parameters, above which its segment has taken it all
+
+
+class Uncertainty(NamedTuple):
+    """Covariances (p, p) of the free entries, in the order of `ravel_pytree(params)`, and what the residuals determine.
+
+    cluster: None where there are no more segments than parameters. singular_values: (p,), of the Jacobian with columns
+    scaled to one, largest first: a small one belongs to a combination of parameters that hardly matters. directions:
+    (p, p), a row for each: the change of the parameters, in their units. undetermined: (p,), parameters in a
+    combination that does not matter at all; their variance is inf, and their covariances are 0.
+    """
+
+    cluster: Any
+    naive: Any
+    autocorrelated: Any
+    singular_values: Any
+    directions: Any
+    undetermined: Any
+
+    @property
+    def covariance(self):
+        """The cluster sandwich; the autocorrelated one where there is none."""
+        return self.autocorrelated if self.cluster is None else self.cluster
+
+
+def correlation(covariance):
+    """C_ij/sqrt(C_ii C_jj); 0 beside an undetermined parameter."""
+    sigma = jnp.sqrt(jnp.diagonal(covariance))
+    safe = jnp.where(jnp.isfinite(sigma) & (sigma > 0), sigma, 1)
+    eye = jnp.eye(sigma.size, dtype=sigma.dtype)
+    return jnp.where(eye == 1, eye, covariance / jnp.outer(safe, safe))
+
+
+def count_segments(sizes, segments):
+    """How many segments leaves of these sizes are cut into, at most `segments`."""
+    return max(-(-n // -(-n // segments)) for n in sizes if n)
+
+
+def uncertainty(J, r, present, sizes, segments, tau) -> Uncertainty:
+    """All of the above.
+
+    Args:
+        J, r: (m + k, p), (m + k,), in units of parameters; the last k rows are priors, and missing rows are zero.
+        present: number of rows that are not missing.
+        sizes: of the raveled residual leaves, m together. Each is cut into equal parts, and the k-th parts of all
+            leaves, which belong to the same times, are one segment; `segments` of them, by `count_segments`.
+        tau: of `variance_inflation`.
+    """
+    p, m = J.shape[1], sum(sizes)
+    eps = float(jnp.finfo(J.dtype).eps)
+    norms = jnp.linalg.norm(J, axis=0)
+    column = jnp.where(norms == 0, 1, norms)
+    _, s, Vt = jnp.linalg.svd(triangle(J / column[None, :]))
+    seen = s > 10 * J.shape[0] * eps * s[0]
+    undetermined = jnp.any(~seen[:, None] & (jnp.abs(Vt) > 1e-6), axis=0) | (present == p)
+    T = Vt.T * jnp.where(seen, 1 / jnp.where(seen, s, 1), 0)[None, :]  # coordinates in which J^T J = 1
+    J = J @ (T / column[:, None])
+    prior = J[m:].T @ J[m:]
+    J, r = J[:m], r[:m]
+    s2 = jnp.sum(r**2) / jnp.maximum(present - p, 1).astype(J.dtype)
+
+    def covariance(S):
+        C = T @ (S + prior) @ T.T / jnp.outer(column, column)
+        both = undetermined[:, None] & undetermined[None, :]
+        C = jnp.where(undetermined[:, None] | undetermined[None, :], 0, C)
+        return jnp.where(both & jnp.eye(p, dtype=bool), jnp.inf, C)
+
+    white = s2 * J.T @ J
+    cluster = covariance(_clusters(J, r, sizes, segments, tau * s2)) if segments > p else None
+    directions = Vt / column[None, :]
+    return Uncertainty(cluster, covariance(white), covariance(tau * white), s, directions, undetermined)
+
+
+def _clusters(J, r, sizes, segments, variance):
+    """sum_g s_g s_g^T, for J^T J = 1: then J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T with A = J_g^T J_g."""
+    ends = np.cumsum(sizes)[:-1]
+    pieces = zip(jnp.split(J, ends), jnp.split(r, ends), strict=True)
+    A, score = 0.0, 0.0
+    for J_leaf, r_leaf in pieces:
+        n, p = J_leaf.shape
+        if n:
+            length = -(-n // segments)
+            rows = jnp.pad(J_leaf, ((0, segments * length - n), (0, 0))).reshape(segments, length, p)
+            A = A + jnp.einsum("glp,glq->gpq", rows, rows)
+            r_rows = jnp.pad(r_leaf, (0, segments * length - n)).reshape(segments, length)
+            score = score + jnp.einsum("glp,gl->gp", rows, r_rows)
+    share, U = jnp.linalg.eigh(A)
+    alone = share > ALONE
+    score = jnp.where(alone, 0, jnp.einsum("gpk,gp->gk", U, score) / jnp.sqrt(jnp.where(alone, 1, 1 - share)))
+    stand_in = jnp.where(alone, share, 0) * variance
+    score = jnp.einsum("gpk,gk->gp", U, score)
+    return score.T @ score + jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U)
+
+
+def variance_inflation(leaves):
+    """tau >= 1 of weighted residual leaves, each along its longest axis of N entries, with L = sqrt(N).
+
+    The sum over lags is sum_w (sum of r in w)^2/(L sum r^2) over all windows w of L entries, the ends padded with 0.
+    """
+    energy, sums = 0.0, 0.0
+    for r in leaves:
+        if r.size:
+            axis = int(np.argmax(r.shape)) if r.ndim else 0
+            r = jnp.moveaxis(jnp.atleast_1d(r), axis, 0)
+            L = math.isqrt(r.shape[0])
+            sums_to = jnp.cumsum(jnp.pad(r, ((L, L - 1), *((0, 0),) * (r.ndim - 1))), axis=0)
+            window = sums_to[L:] - sums_to[:-L]
+            energy, sums = energy + jnp.sum(r**2), sums + jnp.sum(window**2) / L
+    return jnp.maximum(sums / jnp.where(energy > 0, energy, 1), 1)  # a fit takes the slow part of white residuals away

@@ -1,0 +1,105 @@
+"""Measurements: records cut into windows of one shape for `fit(..., records=...)`, and what sensors make of motion."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.boundary import require_number
+from hhtjax.simulate import interpolate
+
+
+class Windows(NamedTuple):
+    """Windows of measurements, each with its own clock; the last entries of shorter ones repeat, and are not present.
+
+    t: (windows, samples), s since the first sample of the window. y: (windows, samples, ...). present: Booleans like
+    y, the weights of `fit`. begin: (windows,), time of the first samples on the clock of the record.
+    """
+
+    t: Any
+    y: Any
+    present: Any
+    begin: Any
+
+
+def windows(t, y, duration, present=None) -> Windows:
+    """A record cut into windows of `duration`, one after the other; what is left at the end is dropped.
+
+    Args:
+        t: (samples,), s, increasing; not necessarily uniform: windows follow the clock, and may hold gaps.
+        y: (samples, ...), measured. present: Booleans like y; False where a sample is missing, and may be NaN.
+        duration: of a window, s. The next window begins with the first sample at its end or after it; without a gap
+            there, the two share that sample.
+
+    Raises:
+        TypeError, ValueError: unequal lengths; times that do not increase; NaN not declared missing; a record shorter
+            than one window.
+
+    >>> import numpy as np, hhtjax
+    >>> t = np.array([0.0, 0.1, 0.2, 0.45, 0.5, 0.6, 0.8])
+    >>> cut = hhtjax.windows(t, np.sin(t), duration=0.3)
+    >>> cut.begin, cut.present.sum(axis=1)
+    (array([0.  , 0.45]), array([3, 3]))
+    """
+    t, y = np.asarray(t, float), np.asarray(y, float)
+    present = np.full(y.shape, True) if present is None else np.asarray(present, bool)
+    if t.ndim != 1 or not (len(t) == len(y) == len(present)) or present.shape != y.shape:
+        raise ValueError(
+            f"windows: `t`, `y` and `present` must have equal lengths; received {t.shape}, {y.shape}, {present.shape}."
+        )
+    falls = np.flatnonzero(np.diff(t) <= 0)
+    if not np.all(np.isfinite(t)) or falls.size:
+        at = int(falls[0]) + 1 if falls.size else int(np.argmin(np.isfinite(t)))
+        raise ValueError(f"windows: `t` must increase; received {t[at]} at sample {at}.")
+    if not np.all(np.isfinite(y[present])):
+        raise ValueError("windows: `y` must be finite, or declared missing by `present`; received NaN or inf.")
+    require_number("windows", "duration", duration, lambda x: x > 0, "be positive")
+    first = [0]
+    while (following := int(np.searchsorted(t, t[first[-1]] + duration * (1 - 1e-9)))) < len(t):
+        first.append(following)
+    if len(first) == 1:
+        raise ValueError(f"windows: `duration` must be less than the record's, {t[-1] - t[0]}; received {duration}.")
+    begin = t[first[:-1]]
+    last = np.searchsorted(t, begin + duration * (1 + 1e-9), side="right") - 1
+    steps = np.arange(np.max(last - first[:-1]) + 1)
+    index = np.minimum(np.array(first[:-1])[:, None] + steps, last[:, None])
+    real = (steps <= (last - first[:-1])[:, None]).reshape(*index.shape, *(1,) * (y.ndim - 1))
+    y = np.where(present, y, 0)
+    return Windows(t[index] - begin[:, None], y[index], present[index] & real, begin)
+
+
+def wrap_angle(angle):
+    """The same angle in [-pi, pi): for the difference of two angles of which one has lost its whole turns.
+
+    >>> round(float(wrap_angle(6.0)), 4)                                          # 6 - 2 pi
+    -0.2832
+    """
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+
+
+def measure(solution, times, gain=1.0, offset=0.0, delay=0.0):
+    """What sensors of position show at `times`: gain q(t - delay) + offset, at the start of the run for earlier times.
+
+    gain, offset and delay (s, a number) are ordinary parameters of a fit: of a signal's gain and a model's stiffness
+    and mass only ratios can be found.
+
+    Args:
+        solution: of one run. times: (samples,), s, not after its end.
+        gain, offset: numbers, or pytrees like q.
+
+    Returns:
+        A pytree like q, with a leading axis of samples.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q)
+    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.zeros(1), jnp.ones(1), dt=0.1, num_steps=10)    # q = t
+    >>> float(measure(run, jnp.array([0.8]), gain=2.0, offset=0.5, delay=0.3)[0, 0].round(6))
+    1.5
+    """
+    q = interpolate(solution, jnp.maximum(times - delay, solution.t[0])).q
+
+    def like_q(x):
+        return jax.tree.map(lambda _: x, q) if jax.tree.structure(x) != jax.tree.structure(q) else x
+
+    return jax.tree.map(lambda y, g, b: g * y + b, q, like_q(gain), like_q(offset))

@@ -1,0 +1,109 @@
+"""What the step size does to stiffness and damping: predicted, measured on exact data, and taken back."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from hhtjax.identification.refine import Refined
+
+t = jnp.arange(0.0, 30.0, 0.35)
+K, C = 1.0, 0.04
+DECAY, FREQUENCY = C / 2, np.sqrt(K - C**2 / 4)
+EXACT = jnp.exp(-DECAY * t) * (jnp.cos(FREQUENCY * t) + DECAY / FREQUENCY * jnp.sin(FREQUENCY * t))
+spring = hhtjax.System(jnp.array([1.0]), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
+
+
+def through(stepper, dt):
+    """The residual of a free vibration, sampled every 0.35."""
+    each = round(0.35 / dt)
+
+    def residuals(params):
+        one, zero = jnp.ones(1), jnp.zeros(1)
+        steps = (len(t) - 1) * each
+        run = hhtjax.simulate(spring, stepper, one, zero, params, dt=dt, num_steps=steps, save_every=each)
+        return run.q[:, 0] - EXACT
+
+    return residuals
+
+
+@pytest.mark.slow
+def test_predicted_bias_is_measured_and_taken_back():
+    """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then next to none."""
+    stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
+    with pytest.warns(hhtjax.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
+        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35, levels=2)
+    assert (refined.stepper, refined.dt) == (stepper, 0.35)
+    found, fine = refined.fits
+    bias = hhtjax.step_size_bias(spring, stepper, found.params, 0.35, q=jnp.zeros(1), correct=True)
+    assert bias.stiffness_bias[0] == pytest.approx(float(found.params["k"]) / K - 1, rel=0.03)
+    assert bias.damping_bias[0] == pytest.approx(float(found.params["c"]) / C - 1, rel=0.03)
+    assert bias.params["k"] == pytest.approx(K, abs=0.03 * float(found.params["k"] - K))
+    assert bias.params["c"] == pytest.approx(C, abs=0.03 * float(found.params["c"] - C))
+    assert bias.frequency[0] ** 2 == pytest.approx(K, rel=1e-3)  # free of the bias
+    assert float(fine.params["k"] - K) == pytest.approx(float(found.params["k"] - K) / 4, rel=0.05)
+    assert refined.fits[0].params["k"] - K > 0.02
+    assert float(refined.params["k"]) == pytest.approx(K, abs=2e-4)
+    assert float(refined.params["c"]) == pytest.approx(C, rel=3e-3)  # the numerical damping's h^3
+    again = Refined.from_json(refined.to_json())
+    assert again.stepper == stepper
+    assert again.params == refined.params
+    assert again.interval()[0]["k"] == refined.interval()[0]["k"]
+
+
+def test_the_response_to_forces_is_corrected_too():
+    """m, c, k of a driven oscillator at w h = 0.35: the closed forms, of k and c relative to m, and of the gain 1/m."""
+    driven = hhtjax.System(
+        lambda q, p: p["m"] * jnp.ones(1), lambda q, v, t, p: -p["k"] * q - p["c"] * v - p["cubic"] * q**3
+    )
+    fitted = {"m": 2.0, "c": 0.01, "k": 3.0, "cubic": 5.0}
+    bias = hhtjax.step_size_bias(driven, hhtjax.hht(alpha=0.0), fitted, 0.3, q=jnp.zeros(1), correct=True)
+    x = float(bias.wh[0]) / 2
+    gain = np.tan(x) / x / np.cos(x) ** 2
+    assert float(bias.params["m"]) == pytest.approx(2.0 * gain, rel=1e-4)
+    assert float(bias.params["k"] / bias.params["m"]) == pytest.approx(1.5 * (x / np.tan(x)) ** 2, rel=1e-5)
+    assert float(bias.params["c"] / bias.params["m"]) == pytest.approx(0.005 * np.cos(x) ** 2, rel=1e-4)
+    assert bias.params["cubic"] == 5.0
+    held = hhtjax.step_size_bias(
+        driven, hhtjax.hht(alpha=0.0), fitted, 0.3, jnp.zeros(1), correct=dict.fromkeys(fitted, True) | {"m": False}
+    )
+    assert held.params["m"] == 2.0
+    assert float(held.params["k"]) == pytest.approx(3.0 * (x / np.tan(x)) ** 2, rel=1e-4)
+
+
+def test_the_bias_of_the_trapezoidal_rule_in_every_mode():
+    """Two masses, w = 1 and w = sqrt(3): (tan x/x)^2 and, for damping proportional to K, 1/cos(x)^2."""
+    K = jnp.array([[2.0, -1.0], [-1.0, 2.0]])
+    pair = hhtjax.System(jnp.ones(2), lambda q, v, t, params: -K @ q - 1e-3 * K @ v)
+    bias = hhtjax.step_size_bias(pair, hhtjax.hht(alpha=0.0), None, 0.5, q=jnp.zeros(2))
+    x = bias.wh / 2
+    np.testing.assert_allclose(bias.stiffness_bias, (np.tan(x) / x) ** 2 - 1, rtol=1e-3)
+    np.testing.assert_allclose(bias.damping_bias, 1 / np.cos(x) ** 2 - 1, rtol=1e-3)
+    fitted = bias.frequency * np.sqrt(1 + bias.stiffness_bias)
+    np.testing.assert_allclose(fitted, [1.0, np.sqrt(3.0)], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: hhtjax.refine(3, 1.0, None, 0.1), TypeError, r"refine: `residuals_at` must be a function"),
+        (
+            lambda: hhtjax.refine(through, 1.0, hhtjax.hht(), -0.1),
+            ValueError,
+            "refine: `dt` must be positive; received -0.1",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(spring, "hht", None, 0.1, q=jnp.zeros(1)),
+            TypeError,
+            "step_size_bias: `stepper` must be a stepper such as .* received 'hht'",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(hhtjax.scenes.pendulum.cartesian().system, hhtjax.hht(), None, 0.1, q=t),
+            NotImplementedError,
+            "step_size_bias: `system` has a constraint",
+        ),
+    ],
+)
+def test_bad_input_is_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

@@ -1,0 +1,166 @@
+"""Transforms, weights, robust losses, priors, many starts: each against an independent calculation."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import hhtjax
+from hhtjax.identification.least_squares import BAD_START, LOSSES, Objective
+
+t = jnp.linspace(0.0, 3.0, 40)
+NOISE = 0.02 * np.random.default_rng(1).normal(size=t.size)
+TRUE = {"a": 2.0, "rate": 1.5, "offset": 0.5}
+
+
+def model(params):
+    return params["a"] * jnp.exp(-params["rate"] * t) + params["offset"]
+
+
+MEASURED = model(TRUE) + NOISE
+
+
+def residuals(params):
+    return model(params) - MEASURED
+
+
+def test_transforms_keep_parameters_where_they_belong():
+    """The same minimum in other coordinates, with the same errors; a bound that is felt; a fixed leaf untouched."""
+    start = {"a": 20.0, "rate": 0.1, "offset": 0.0}
+    plain = hhtjax.fit(residuals, TRUE)
+    logs = hhtjax.fit(residuals, start, transforms={"a": hhtjax.positive, "rate": hhtjax.positive, "offset": None})
+    for name in TRUE:
+        assert float(logs.params[name]) == pytest.approx(float(plain.params[name]), rel=1e-5)
+        assert float(logs.standard_errors[name]) == pytest.approx(float(plain.standard_errors[name]), rel=1e-3)
+    lower, upper = logs.interval()
+    ratios = [upper["rate"] / logs.params["rate"], logs.params["rate"] / lower["rate"]]
+    np.testing.assert_allclose(ratios, np.exp(2.04 * logs.standard_errors["rate"] / logs.params["rate"]), rtol=1e-3)
+
+    felt = hhtjax.fit(
+        residuals, start, transforms={"a": hhtjax.bounded(0.0, 30.0), "rate": hhtjax.fixed, "offset": hhtjax.fixed}
+    )
+    assert felt.params["rate"] == 0.1
+    assert felt.standard_errors["rate"] == 0
+    shape = np.exp(-0.1 * t)
+    assert float(felt.params["a"]) == pytest.approx(float(shape @ MEASURED / (shape @ shape)), rel=1e-6)
+    assert felt.interval()[0]["rate"] == 0.1
+
+
+def test_missing_samples_and_weights():
+    """A missing sample, NaN or not, is as good as none; a weight of 2 as good as four samples."""
+    gone = np.arange(t.size) % 3 == 0
+    holes = jnp.where(gone, jnp.nan, MEASURED)
+
+    def with_holes(params):
+        return {"y": jnp.stack([model(params) - holes, params["a"] - 2.1 + 0 * t], axis=1)}
+
+    def without(params):
+        once = (model(params) - MEASURED)[~gone]
+        return jnp.concatenate([*4 * [once], 0.5 * (params["a"] - 2.1 + 0 * t)])
+
+    weights = {"y": jnp.stack([jnp.where(gone, 0.0, 2.0), 0.5 + 0 * t], axis=1)}
+    result, expected = hhtjax.fit(with_holes, TRUE, weights=weights), hhtjax.fit(without, TRUE)
+    for name in TRUE:
+        assert float(result.params[name]) == pytest.approx(float(expected.params[name]), rel=1e-6)
+    assert np.isnan(result.residual["y"][0, 0])
+    assert np.isfinite(result.covariance).all()
+
+
+SPOILT = MEASURED.at[jnp.array([3, 20, 33])].add(jnp.array([5.0, -4.0, 8.0]))
+
+
+def weighted(params):
+    return (model(params) - SPOILT) / 0.02
+
+
+def test_a_robust_fit_is_scipys():
+    result = hhtjax.fit(weighted, TRUE, loss="cauchy", covariance=False, tolerance=1e-12)
+    compiled = jax.jit(lambda x: weighted(dict(zip(TRUE, x, strict=True))))
+    scipys = least_squares(lambda x: np.asarray(compiled(x)), list(TRUE.values()), loss="cauchy", xtol=1e-14)
+    assert float(result.cost) == pytest.approx(scipys.cost, rel=1e-6)
+    np.testing.assert_allclose([result.params[name] for name in TRUE], scipys.x, rtol=1e-4)
+    assert abs(result.params["offset"] - 0.5) < 0.02
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_robust_losses_are_scipys(loss):
+    """As its cost at the start."""
+    x = np.linspace(-4.0, 4.0, 9)
+    with warnings.catch_warnings(action="ignore"):
+        scipys = least_squares(lambda _: x, [0.0], loss=loss, max_nfev=1).cost
+    assert float(Objective(jnp.ones(9), LOSSES[loss], 9).cost(x)) == pytest.approx(scipys, rel=1e-12)
+
+
+def test_a_prior_is_one_more_measurement():
+    """Linear, so that Bayes' rule gives mean and covariance."""
+    X = np.random.default_rng(2).normal(size=(30, 2))
+    y = X @ [1.0, -2.0] + np.random.default_rng(3).normal(size=30)
+    result = hhtjax.fit(
+        lambda p: X @ p - y, jnp.zeros(2), prior=hhtjax.Gaussian(jnp.array([1.1, 0.0]), np.array([0.1, np.inf]))
+    )
+    precision = X.T @ X + np.diag([100.0, 0.0])
+    np.testing.assert_allclose(result.params, np.linalg.solve(precision, X.T @ y + [110.0, 0.0]), rtol=1e-6)
+    assert float(result.standard_errors[0]) < 0.1 < np.sqrt(np.linalg.inv(X.T @ X)[0, 0])
+
+
+def test_many_starts_find_the_lowest_minimum():
+    """One of them is none, which inside vmap is a flag."""
+
+    def wave(frequency):
+        return jnp.sin(frequency * t) - jnp.sin(6.0 * t) + 0 * jnp.log(frequency)
+
+    starts = jnp.linspace(1.0, 12.0, 8).at[4].set(-1.0)
+    found = hhtjax.multistart(wave, starts, covariance=False)
+    alone = [hhtjax.fit(wave, x, covariance=False).cost for x in starts[:2]]
+    np.testing.assert_allclose(found.all.cost[:2], alone, rtol=1e-9)
+    assert float(found.best.params) == pytest.approx(6.0, abs=1e-6)
+    assert float(np.nanmax(found.all.cost[:4])) > 1.0
+    assert found.best.history.cost.shape == (int(found.best.iterations) + 1,)
+    np.testing.assert_array_equal(np.flatnonzero(found.all.code == BAD_START), [4])
+
+
+def test_many_parameters_take_an_optax_optimiser():
+    """The program of 100 parameters is one reverse pass, and no Jacobian of 100 columns."""
+    target = jnp.linspace(1.0, 2.0, 100)
+    with jax.numpy_dtype_promotion("standard"):  # optax does not compute under strict promotion
+        result = hhtjax.fit(lambda p: p - target, jnp.ones(100), covariance=False)
+    assert result.history.damping is None
+    np.testing.assert_allclose(result.params, target, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"transforms": hhtjax.fixed}, ValueError, "`transforms` must leave a parameter free"),
+        ({"transforms": {"a": hhtjax.positive, "b": None}}, ValueError, "`transforms` must be a prefix of params0"),
+        ({"transforms": "log"}, TypeError, "`transforms` must hold hhtjax.positive, .* received 'log'"),
+        (
+            {"transforms": {"a": None, "rate": hhtjax.bounded(2, 3), "offset": None}},
+            ValueError,
+            r"`params0\['rate'\]` must lie between 2.0 and 3.0, for its transform; received 1.5",
+        ),
+        ({"weights": -1.0}, ValueError, "`weights` must not be negative; received -1.0"),
+        ({"weights": np.ones(7)}, ValueError, r"`weights` must have the leading axes .* \(40,\); received \(7,\)"),
+        ({"loss": "hubert"}, ValueError, "`loss` must be one of huber, soft_l1, cauchy, a function .* 'hubert'"),
+        ({"prior": {"a": 1.0, "rate": None, "offset": None}}, TypeError, "`prior` must hold Gaussian.* received 1.0"),
+        ({"prior": hhtjax.Gaussian(0.0, -1.0)}, ValueError, "`prior` must have a positive deviation; received -1.0"),
+        ({"segments": 1}, ValueError, "`segments` must be an integer of at least 2; received 1"),
+    ],
+)
+def test_bad_options_are_named(options, error, message):
+    with pytest.raises(error, match=f"fit: {message}"):
+        hhtjax.fit(residuals, TRUE, **options)
+
+
+def test_bad_starts_and_bounds_are_named():
+    with pytest.raises(ValueError, match="bounded: `lower` must be less than upper; received 2 and 1"):
+        hhtjax.bounded(2, 1)
+    with pytest.raises(ValueError, match="multistart: `starts` must have one leading axis in all its leaves"):
+        hhtjax.multistart(residuals, TRUE)
+    with pytest.raises(
+        ValueError, match=r"multistart: `starts` must be positive, for its transform; received \[ 1. -1.\]"
+    ):
+        hhtjax.multistart(lambda p: p - t, jnp.array([1.0, -1.0]), transforms=hhtjax.positive)

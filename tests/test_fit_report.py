@@ -1,0 +1,64 @@
+"""What a reader gets: the table, JSON and back, and answers to what-if questions, against refits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from hhtjax.identification.result import FitResult
+
+x = jnp.linspace(0.0, 1.0, 200)
+Y = 2.0 * jnp.exp(-3.0 * x) + 0.3 + 0.05 * np.random.default_rng(0).normal(size=200)
+
+
+def residuals(params):
+    return {"y": params["a"] * jnp.exp(-params["rate"] * x) + params["rest"][0] - Y}
+
+
+START = {"a": 1.0, "rate": 1.0, "rest": (0.3,)}
+TRANSFORMS = {"a": hhtjax.positive, "rate": hhtjax.bounded(0, 10), "rest": hhtjax.fixed}
+
+
+@pytest.fixture(scope="module")
+def result():
+    return hhtjax.fit(residuals, START, transforms=TRANSFORMS)
+
+
+def test_summary_and_json(result):
+    lines = result.summary().splitlines()
+    assert lines[0].startswith("converged: ")
+    row = next(line for line in lines if line.startswith("rate")).split()
+    assert float(row[1]) == pytest.approx(float(result.params["rate"]), rel=1e-5)
+    assert float(row[2]) == pytest.approx(float(result.standard_errors["rate"]), rel=1e-2)
+    assert next(line for line in lines if line.startswith("rest.0")).split()[2] == "fixed"
+    assert any(line.startswith("largest correlation: +") and line.endswith("a and rate") for line in lines)
+    again = FitResult.from_json(result.to_json())
+    assert jax.tree.structure(again) == jax.tree.structure(result)
+    jax.tree.map(np.testing.assert_array_equal, again, result)
+    assert again.summary() == result.summary()
+
+
+def test_profile_is_the_parabola_of_the_standard_error(result):
+    """Naive errors, for which the white likelihood is right."""
+    sigma = float(result.standard_errors["rate"])
+    values = float(result.params["rate"]) + sigma * np.array([-1.0, 0.0, 1.0])
+    found = hhtjax.profile(residuals, result, "rate", values)
+    np.testing.assert_allclose(found.deviance, [1, 0, 1], atol=0.06)
+    with pytest.raises(ValueError, match=r"profile: `name` must be one of a, rate; received 'k'"):
+        hhtjax.profile(residuals, result, "k", values)
+
+
+def test_the_score_test_predicts_the_refit():
+    def with_kink(params, candidates):
+        return residuals(params | {"rest": (0.3,)})["y"] + (candidates["kink"] - 0.6) * jnp.maximum(x - 0.5, 0.0)
+
+    absent = {"kink": 0.0}
+    params = {"a": 1.0, "rate": 1.0}
+    without = hhtjax.fit(lambda p: with_kink(p, absent), params, covariance=False)
+    both = hhtjax.fit(lambda u: with_kink(*u), (params, absent), covariance=False)
+    found = hhtjax.score_test(with_kink, without.params, absent)
+    assert found.names == ["kink"]
+    assert found.statistic[0] > 10.8
+    assert found.estimate[0] == pytest.approx(float(both.params[1]["kink"]), rel=0.2)
+    assert found.cost_drop[0] == pytest.approx(1 - float(both.cost / without.cost), rel=0.2)

@@ -1,0 +1,56 @@
+"""Where fits start: from the equation of motion itself, and from shorter parts of a record; and what sensors show."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from hhtjax.scenes import double_pendulum
+
+
+def test_the_equation_of_motion_gives_stiffness_and_damping_without_a_guess():
+    """Of a double pendulum with M(q), as a dict whose keys sort otherwise, with 0.1 mrad of noise; 20 times off."""
+    scene = double_pendulum.free()
+    joints = {"k": jnp.array([40.0, 20.0]), "c": jnp.array([1.0, 0.5])}
+
+    def forces(q, v, t, params):
+        angles, rates = (jnp.stack([x["upper"], x["fore"]]) for x in (q, v))
+        Q = double_pendulum.force(angles, rates, t, scene.params | params)
+        return {"upper": Q[0], "fore": Q[1]}
+
+    def mass(q, params):  # rows in the order of ravel_pytree: fore, upper
+        return double_pendulum.mass(jnp.stack([q["upper"], q["fore"]]), scene.params)[::-1, ::-1]
+
+    arm, rest = hhtjax.System(mass, forces), {"upper": 0.0, "fore": 0.0}
+    run = hhtjax.simulate(arm, hhtjax.rk4(), rest | {"upper": 0.5}, rest, joints, dt=0.005, num_steps=1000)
+    noise = np.random.default_rng(0).normal(size=(2, 1001))
+    measured = {name: run.q[name] + 1e-4 * e for name, e in zip(("upper", "fore"), noise, strict=True)}
+    residuals = hhtjax.equation_error(arm, measured, 0.005, cutoff=5.0)
+    guess = jax.tree.map(lambda x: 0.05 * x, joints)
+    found = hhtjax.fit(residuals, guess, covariance=False)
+    assert residuals(guess).shape == (1001 - 2 * 40, 2)
+    np.testing.assert_allclose(found.params["k"], joints["k"], rtol=0.02)
+    np.testing.assert_allclose(found.params["c"], joints["c"], rtol=0.1)
+
+
+def test_sensors_show_a_delayed_signal():
+    ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: {"x": 0 * q["x"] + 2.0})
+    zero = {"x": 0.0}
+    run = hhtjax.simulate(ball, hhtjax.rk4(), zero, zero, dt=0.1, num_steps=10)  # x = t^2
+    times = jnp.array([0.1, 0.5, 1.0])
+    shown = hhtjax.measure(run, times, gain={"x": 3.0}, offset=0.25, delay=0.2)
+    np.testing.assert_allclose(shown["x"], 3 * np.array([0.0, 0.3, 0.8]) ** 2 + 0.25, rtol=1e-12)
+    slope = jax.grad(lambda delay: hhtjax.measure(run, times[1], delay=delay)["x"])(0.2)
+    assert float(slope) == pytest.approx(-2 * 0.3, rel=1e-9)
+
+
+def test_bad_input_is_named():
+    four_bars = hhtjax.scenes.pendulum.cartesian().system
+    with pytest.raises(NotImplementedError, match="equation_error: `system` has a constraint"):
+        hhtjax.equation_error(four_bars, np.ones((9, 2)), 0.1, cutoff=1.0)
+    spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
+    with pytest.raises(ValueError, match=r"band_limited_motion: `cutoff` must lie in \(0, 1/\(2 dt\)\]; received 6.0"):
+        hhtjax.equation_error(spring, np.ones((9, 1)), 0.1, cutoff=6.0)
+    with pytest.raises(ValueError, match=r"fit_progressively: `horizons` must hold at least one; received \(\)"):
+        hhtjax.fit_progressively(lambda n, before: {}, 1.0, ())
