@@ -80,7 +80,7 @@ def plot(report, numbers, measured, guessed, exact):
     """The crank angle, and the estimates of all records."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
     t = 1e3 * SCENE.duration * np.arange(1, SAMPLES + 1) / SAMPLES
-    left.plot(t, exact, color=COLOURS[0], lw=1, label="fitted (and true, to line width)")
+    left.plot(t, exact, color=COLOURS[0], lw=1, label="truth (and fits, to line width)")
     left.plot(t[::6], measured[::6], ".", color="black", ms=3, label="measured")
     left.plot(t, guessed, color=COLOURS[7], lw=1, ls="--", label="guess")
     left.set(xlabel="time (ms)", ylabel="crank angle (rad)")
