@@ -99,10 +99,11 @@ def _odd_series(values):
 def spline_gain_error(frequency, dt, order=3):
     """Relative error of the amplitude of a harmonic of `frequency` that `sampled(..., order)` reconstructs.
 
-        order 1: 1 - sinc^2(f dt),    order 3: 1 - 3 sinc^4(f dt)/(2 + cos(2 pi f dt)),    sinc x = sin(pi x)/(pi x)
+        order 0: 1 - sinc(f dt), late by dt/2 besides,    order 1: 1 - sinc^2(f dt),
+        order 3: 1 - 3 sinc^4(f dt)/(2 + cos(2 pi f dt)),    sinc x = sin(pi x)/(pi x)
 
     Args:
-        frequency: in Hz, at most half the sampling rate. dt: sampling period in s. order: 1 or 3.
+        frequency: in Hz, at most half the sampling rate. dt: sampling period in s. order: 0, 1 or 3.
 
     Raises:
         TypeError, ValueError: an argument out of its range.
@@ -115,7 +116,7 @@ def spline_gain_error(frequency, dt, order=3):
     """
     require_number("spline_gain_error", "dt", dt, lambda x: x > 0, "be positive")
     require_number("spline_gain_error", "frequency", frequency, lambda f: 0 <= f * dt <= 0.5, "be below 1/(2 dt)")
-    if order not in (1, 3) or not is_real(order):
-        raise ValueError(f"spline_gain_error: `order` must be 1 or 3; received {order!r}.")
+    if order not in (0, 1, 3) or not is_real(order):
+        raise ValueError(f"spline_gain_error: `order` must be 0, 1 or 3; received {order!r}.")
     sinc = float(np.sinc(frequency * dt))
-    return 1 - sinc**2 if order == 1 else 1 - 3 * sinc**4 / (2 + float(np.cos(2 * np.pi * frequency * dt)))
+    return 1 - sinc ** (order + 1) if order < 3 else 1 - 3 * sinc**4 / (2 + float(np.cos(2 * np.pi * frequency * dt)))

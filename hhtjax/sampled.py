@@ -26,6 +26,8 @@ class Sampled:
         """Value at time t, a scalar or an array; outside the samples, the nearest end value."""
         intervals, terms = self.polynomials.shape[:2]
         x = (jnp.asarray(t).astype(self.dt.dtype) - self.t0) / self.dt
+        if terms == 1:  # a jump: at a sample, up to rounding, the new value
+            x = x + 8 * float(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + jnp.abs(self.t0 / self.dt))
         i = jnp.clip(jnp.floor(x), 0, intervals - 1)
         x = x - i
         x = jnp.where(x < 0, 0, jnp.where(x > 1, 1, x))  # at the ends the slope is the one inside
@@ -42,10 +44,10 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
     """The function of time through `values[k]` at t0 + k dt: a pytree to put in params and call with t.
 
     Args:
-        values: (samples,) or (samples, channels...), real. order=1 needs 2 samples, order=3 needs 4.
+        values: (samples,) or (samples, channels...), real; order + 1 samples at least.
         dt: sampling period, positive; t0: time of the first sample.
-        order: 1, linear; 3, cubic spline, twice continuously differentiable ("not-a-knot" ends, as in
-            SciPy's CubicSpline).
+        order: 0, each value held until the next, as a D/A converter does; 1, linear; 3, cubic spline, twice
+            continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
     Outside [t0, t0 + (samples - 1) dt] the nearest end value is held. Differentiable in values and t.
     An input enters a simulation only through its values at the steps: with a step shorter than dt the
@@ -60,8 +62,8 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
     >>> float(u(0.75)), float(u(100.0))
     (2.25, 16.0)
     """
-    if order not in (1, 3):
-        raise ValueError(f"sampled: `order` must be 1 (linear) or 3 (cubic); received {order!r}.")
+    if order not in (0, 1, 3) or isinstance(order, bool):
+        raise ValueError(f"sampled: `order` must be 0 (held), 1 (linear) or 3 (cubic); received {order!r}.")
     values = values if is_array(values) else np.asarray(values)
     if not is_real(values) or values.dtype == jnp.float16:
         raise TypeError(f"sampled: `values` must be real numbers; received an array of {values.dtype}.")
@@ -80,7 +82,9 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
     require_number("sampled", "t0", t0, np.isfinite, "be finite")
 
     rise = values[1:] - values[:-1]
-    if order == 1:
+    if order == 0:
+        polynomials = values[:, None]
+    elif order == 1:
         polynomials = jnp.stack([values[:-1], rise], axis=1)
     else:
         slope = _spline_slopes(rise)

@@ -55,6 +55,15 @@ def test_values_between_the_samples(order, samples):
     assert np.max(np.abs(both[333:] - values)) < 1e-12
 
 
+def test_order_zero_holds_each_value_until_the_next():
+    """At a sample the new value already, although no sampling time is a number of the computer."""
+    values = RNG.standard_normal((2001, 2))
+    steps = 0.1 * np.arange(2001)
+    for shift, expected in ((0.0, values), (0.0999, values), (-1e-4, np.concatenate([values[:1], values[:-1]]))):
+        np.testing.assert_array_equal(evaluate(values, 0.1, 0.7, 0.7 + steps + shift, 0), expected)
+    np.testing.assert_array_equal(evaluate(values[:1], 0.1, 0.0, np.array([-1.0, 0.0, 5.0]), 0), values[[0, 0, 0]])
+
+
 def test_cubic_is_the_default_and_reproduces_cubics():
     def cubic(t):
         return 1 - 2 * t + 3 * t**2 - 4 * t**3
@@ -210,8 +219,8 @@ def test_integer_samples_become_the_default_float_type():
 REAL = "must be a real number; received"
 ERRORS = [
     *(
-        (ValueError, f"`order` must be 1 (linear) or 3 (cubic); received {x!r}.", {"order": x})
-        for x in (0, 2, None, "3")
+        (ValueError, f"`order` must be 0 (held), 1 (linear) or 3 (cubic); received {x!r}.", {"order": x})
+        for x in (True, 2, None, "3")
     ),
     (TypeError, "`values` must be real numbers; received an array of complex128.", {"values": 1j * VALUES}),
     (TypeError, "`values` must be real numbers; received an array of bool.", {"values": VALUES > 0}),
