@@ -13,10 +13,12 @@ DATA = Path(os.environ.get("HHTJAX_DATA") or ROOT.parent / "shared" / "data")
 
 
 def experiments(*arguments, **environment):
+    """As on a user's machine: with the experiments' own flags for XLA."""
+    inherited = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     return subprocess.run(
         [sys.executable, "-m", "experiments", *arguments],
         cwd=ROOT,
-        env={**os.environ, **environment},
+        env={**inherited, **environment},
         capture_output=True,
         text=True,
         check=False,
@@ -65,7 +67,7 @@ def test_silverbox_on_the_measured_record():
     result, *_ = silverbox.fit_training(sets.train, silverbox.SUBSTEPS, 0.0)
     assert result.converged
     assert silverbox.rmse(result.residual) == pytest.approx(0.2987, abs=5e-4)
-    expected = {"arrow_full": 0.3894, "arrow_no_extrapolation": 0.3156, "multisine": 0.3043}
+    expected = {"arrow_full": 0.3894, "multisine": 0.3043}
     for name, value in expected.items():
         _, error, _ = silverbox.score(result.params[0], sets.tests[name], silverbox.SUBSTEPS, 0.0)
         assert error == pytest.approx(value, abs=5e-4)

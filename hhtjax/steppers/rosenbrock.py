@@ -21,6 +21,7 @@ import jax.numpy as jnp
 
 from hhtjax.boundary import require_number
 from hhtjax.linear_solve import factorize, factorize_map
+from hhtjax.staging import staged
 from hhtjax.steppers.generalized_alpha import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 
@@ -65,7 +66,7 @@ class Rosenbrock(Stepper):
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 
         def step(s):
-            value, tangent = jax.linearize(r, s)
+            value, tangent = staged(partial(jax.linearize, r), system.size)(s)
             solve = once if system.linear else factorized(tangent)
             rates = []
             for row, coupling in zip(A, G, strict=True):
