@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax import LinearSystem, PrecisionWarning, System, interpolate, simulate
+from hhtjax import LinearSystem, System, interpolate, simulate
 
 NAN, INF = float("nan"), float("inf")
 ONE, ZERO = np.ones(1), np.zeros(1)
@@ -316,123 +316,6 @@ def test_arrays_without_entries_are_no_initial_values(q0):
 def test_arrays_of_no_numbers_are_no_initial_values(q0):
     with pytest.raises(TypeError, match=r"simulate: `q0` must be .*; received"):
         run(q0=q0, v0=ZERO)
-
-
-# ------------------------------------------------------------------------- what the functions of a system return
-
-MASS_SHAPE = "`mass` must give an array of shape (1, 1), or (1,) for a diagonal; received"
-FORCE_LIKE = "`force` must return a pytree like v0, shape (1,) float64; received"
-RESULTS = [
-    (ValueError, f"{MASS_SHAPE} shape (3,) float64.", System(np.ones(3), pull)),
-    (ValueError, f"{MASS_SHAPE} shape (2, 2) float64.", System(EYE, pull)),
-    (ValueError, f"{MASS_SHAPE} shape (3,) float64.", System(lambda q, params: jnp.ones(3), pull)),
-    (ValueError, f"{MASS_SHAPE} [0]: shape () float64.", System(lambda q, params: [1.0], pull)),
-    (ValueError, f"{MASS_SHAPE} ['m']: shape (1,) float64.", System(lambda q, params: {"m": jnp.ones(1)}, pull)),
-    (ValueError, f"{MASS_SHAPE} nothing.", System(lambda q, params: None, pull)),
-    (ValueError, f"{FORCE_LIKE} shape (2,) float64.", System(ONE, lambda q, v, t, params: jnp.ones(2))),
-    (ValueError, f"{FORCE_LIKE} shape () float64.", System(ONE, lambda q, v, t, params: -q[0])),
-    (ValueError, f"{FORCE_LIKE} ['x']: shape (1,) float64.", System(ONE, lambda q, v, t, params: {"x": q})),
-    (ValueError, f"{FORCE_LIKE} [0]: shape (1,) float64.", System(ONE, lambda q, v, t, params: (q,))),
-    (ValueError, f"{FORCE_LIKE} nothing.", System(ONE, lambda q, v, t, params: None)),
-]
-
-
-@pytest.mark.parametrize(("error", "message", "system"), RESULTS)
-def test_shapes_of_mass_and_force_are_checked(error, message, system):
-    check_message(error, f"simulate: {message}", lambda: run(system))
-    check_message(error, f"init: {message}", lambda: STEPPERS["hht"].init(system, ONE, ZERO, None, dt=0.1))
-
-
-@pytest.mark.parametrize("dtype", ["float32", "complex128", "bool"])
-@pytest.mark.parametrize("name", ["mass", "force"])
-def test_dtypes_of_mass_and_force_are_checked(name, dtype):
-    def mass(q, params):
-        return jnp.ones(1, dtype if name == "mass" else q.dtype)
-
-    def force(q, v, t, params):
-        return jnp.ones(1, dtype if name == "force" else q.dtype)
-
-    message = f"simulate: `{name}` returned {dtype} for a state of float64; give params, and arrays made inside"
-    check_message(TypeError, message, lambda: run(System(mass, force)))
-
-
-def test_a_complex_number_as_mass_is_named():
-    """Python numbers take the dtype of the state, but only real ones."""
-    with pytest.raises(TypeError, match="simulate: `mass` returned complex128 for a state of float64"):
-        run(System(lambda q, params: 1.0 + 1.0j, pull))
-
-
-@pytest.mark.parametrize("name", ["mass", "force"])
-def test_a_double_result_for_a_single_state_is_named(name):
-    def mass(q, params):
-        return jnp.ones(1, params["mass"].dtype)
-
-    def force(q, v, t, params):
-        return -params["force"] * q.astype(params["force"].dtype)
-
-    params = {"mass": SINGLE, "force": SINGLE, name: ONE}
-    message = f"simulate: `{name}` returned float64 for a state of float32; give params"
-    with pytest.warns(PrecisionWarning), pytest.raises(TypeError, match=re.escape(message)):
-        run(System(mass, force), q0=SINGLE, v0=0 * SINGLE, params=params)
-
-
-@pytest.mark.parametrize("name", ["M", "C", "K"])
-@pytest.mark.parametrize("matrix", [np.eye(3), np.ones(3), lambda params: jnp.eye(3), lambda params: {"a": 1.0}])
-def test_matrices_of_a_linear_system_must_fit_its_size(name, matrix):
-    with pytest.raises((TypeError, ValueError), match=rf"`{name}` must .*\(2, 2\), or \(2,\).*; received"):
-        run(LinearSystem(**{"M": EYE, name: matrix}), q0=np.ones(2), v0=np.zeros(2))
-
-
-@pytest.mark.parametrize(
-    ("load", "received"),
-    [
-        (lambda t, params: {"a": jnp.ones(2)}, "['a']: shape (2,) float64"),
-        (lambda t, params: (jnp.ones(1), jnp.ones(1)), "[0]: shape (1,) float64, [1]: shape (1,) float64"),
-        (lambda t, params: jnp.ones(3), "shape (3,) float64"),
-        (lambda t, params: jnp.ones((2, 1)), "shape (2, 1) float64"),
-        (lambda t, params: 1.0, "shape () float64"),
-    ],
-)
-def test_the_load_of_a_linear_system_must_be_like_v0(load, received):
-    message = f"`force` must return a pytree like v0, shape (2,) float64; received {received}"
-    check_message(ValueError, message, lambda: run(LinearSystem(EYE, force=load), q0=np.ones(2), v0=np.zeros(2)))
-
-
-@pytest.mark.parametrize("name", ["mass", "force"])
-def test_an_error_inside_mass_or_force_keeps_its_kind_and_says_where(name):
-    def fail(q, *args):
-        return args[-1]["k"] * q
-
-    system = System(fail, pull) if name == "mass" else System(ONE, fail)
-    with pytest.raises(KeyError, match="k") as caught:
-        run(system, params={"stiffness": 1.0})
-    notes = " ".join(caught.value.__notes__)
-    assert f"simulate: raised while tracing `{name}` with shape (1,) float64" in notes
-    assert "['stiffness']: shape () float64" in notes
-
-
-def test_a_constraint_is_refused_where_it_would_be_ignored():
-    system = System(ONE, pull, constraint=lambda q, t, params: q)
-    message = "RK4 cannot solve the `constraint`; use hht()"
-    check_message(NotImplementedError, f"init: {message}", lambda: STEPPERS["rk4"].init(system, ONE, ZERO, None, 0.1))
-
-
-@pytest.mark.parametrize(("q0", "v0"), [(ONE, np.zeros(2)), ({"a": 1.0}, {"b": 1.0})])
-def test_init_checks_that_v0_is_like_q0(q0, v0):
-    with pytest.raises(ValueError, match=r"init: `v0` must .* q0.*; received"):
-        STEPPERS["hht"].init(SPRING, q0, v0, None, dt=0.1)
-
-
-def test_init_takes_integers_as_simulate_does():
-    state = STEPPERS["hht"].init(SPRING, np.array([1]), np.array([0]), None, dt=0.1)
-    assert state.q.dtype == state.v.dtype == state.w.dtype == jnp.float64
-    assert state.w[0] == -4.0
-
-
-def test_step_names_itself():
-    state = STEPPERS["hht"].init(SPRING, ONE, ZERO, None, dt=0.1)
-    wrong = System(ONE, lambda q, v, t, params: (q,))
-    check_message(ValueError, f"step: {FORCE_LIKE} [0]", lambda: STEPPERS["hht"].step(wrong, state, None, dt=0.1))
 
 
 # ---------------------------------------------------------------------------------------------- interpolate
