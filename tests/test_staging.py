@@ -17,8 +17,11 @@ def links(q, v, t, params):
 
 
 def value_and_gradient(params):
+    def force(*args):
+        return links(*args)  # new for JAX, which would take the program of the other call
+
     def end(params):
-        system = hhtjax.System(jnp.arange(1.0, N + 1), links)
+        system = hhtjax.System(jnp.arange(1.0, N + 1), force)
         q0 = jnp.linspace(0.1, 1.0, N)
         run = hhtjax.simulate(system, hhtjax.hht(), q0, 0 * q0, params, dt=0.05, num_steps=20, save_every=20)
         return jnp.sum(run.q[-1] ** 2)
@@ -29,7 +32,6 @@ def value_and_gradient(params):
 def test_a_staged_run_is_the_plain_run(monkeypatch):
     staged = value_and_gradient(2.0)
     monkeypatch.setattr(staging, "SMALL", N)
-    jax.clear_caches()
     assert np.allclose(staged, value_and_gradient(2.0), rtol=1e-12, atol=0)
 
 
