@@ -17,6 +17,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_small_wh
 
 EXPERIMENTS = {
     "silverbox": "identification.silverbox",
+    "silverbox_comparison": "identification.comparison",
     "double_pendulum_measured": "identification.double_pendulum_measured",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",

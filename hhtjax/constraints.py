@@ -154,11 +154,8 @@ def correction(system, q, t, params, rows, factorize):
 
 def jacobian(system, q, t, params):
     """B: (m, n)."""
-
-    def linearize(q):
-        return jax.linearize(lambda q: system.constraint(q, t, params), q)[1]
-
-    tangent = staged(linearize, system.size)(q)
+    Phi = partial(system.constraint, t=t, params=params)
+    _, tangent = staged(partial(jax.linearize, Phi), system.size)(q)
     return matrix(lambda x: tangent(system.rate(q, x)), jnp.zeros(system.size, q.dtype))
 
 

@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
-from experiments.identification import comparison, data
+from experiments.identification import data
 from experiments.identification.data import (
     LINEAR,
     RESONANCE,
@@ -108,9 +108,6 @@ def run(report: Report, fast: bool):
     )
     numbers = {f"{part}_mV": models[best][f"{part}_mV"] for part in sizes}
     numbers |= {"data": "measured" if sets.measured else "generated", "fast": fast, "models": models}
-    if not fast:
-        linear = {name: models["6 parameters"][f"{name}_in_{UNITS[name]}"] for name in LINEAR}
-        numbers["comparison"] = comparison.run(report, sets.train, linear)
     report.numbers(rounded({**numbers, "by_step_size": step_size_study(report, sets, fast)}))
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from hhtjax import kinematics
 from hhtjax.constraints import acceleration_and_multipliers, reaction
 from hhtjax.description import is_concrete
-from hhtjax.linear_solve import factorize, solve
+from hhtjax.linear_solve import factorize, matrix, solve
 from hhtjax.steppers.generalized_alpha import Options, check_options, require_alpha
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.stepper import Info, State, Stepper
@@ -25,10 +25,10 @@ def linearize_at_state(system, params, s):
     def forces(q, v):
         return system.force(q, v, s.t, params)
 
-    eye = jnp.eye(s.q.size, dtype=s.q.dtype)
+    zero = jnp.zeros_like(s.q)
     Q, tangent = jax.linearize(forces, s.q, s.v)
-    Q_q = jax.vmap(lambda e: tangent(e, jnp.zeros_like(e)), out_axes=1)(eye)
-    Q_v = jax.vmap(lambda e: tangent(jnp.zeros_like(e), e), out_axes=1)(eye)
+    Q_q = matrix(lambda x: tangent(x, zero), zero)
+    Q_v = matrix(lambda x: tangent(zero, x), zero)
     Ma_q = jax.jacfwd(lambda q: system.inertia(q, s.w, params))(s.q)
     M = system.mass(s.q, params)
     return jnp.diag(M) if M.ndim == 1 else M, Q, Q_q, Q_v, Ma_q
