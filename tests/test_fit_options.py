@@ -49,6 +49,17 @@ def test_transforms_keep_parameters_where_they_belong():
     assert felt.interval()[0]["rate"] == 0.1
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_no_coordinate_leaves_the_domain_of_its_transform(dtype):
+    """However far a fit has run, the next one may start there."""
+    for T in (hhtjax.positive, *(hhtjax.bounded(a, a + 1) for a in (-1, 0, 2))):
+        p = T.parameter(jnp.array([-1e4, 0.0, 80.0], dtype), 1.0)
+        assert p.dtype == dtype
+        assert T.contains(p).all()
+        assert np.isfinite(T.coordinate(p, 1.0)).all()
+        assert T.parameter(T.coordinate(p, 1.0), 1.0)[1] == pytest.approx(float(p[1]))
+
+
 def test_missing_samples_and_weights():
     """A missing sample, NaN or not, is as good as none; a weight of 2 as good as four samples."""
     gone = np.arange(t.size) % 3 == 0

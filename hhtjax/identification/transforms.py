@@ -62,8 +62,9 @@ class Positive(Transform):
         return np.asarray(p) > 0
 
     def parameter(self, x, scale):
-        """exp(x)."""
-        return jnp.exp(x)
+        """exp(x), which never underflows to 0."""
+        p = jnp.exp(x)
+        return jnp.maximum(p, jnp.finfo(p.dtype).tiny)
 
     def coordinate(self, p, scale):
         """log(p)."""
@@ -88,7 +89,11 @@ class Bounded(Transform):
 
     def parameter(self, x, scale):
         """lower + (upper - lower)/(1 + exp(-x))."""
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(x)
+        p = self.lower + (self.upper - self.lower) * jax.nn.sigmoid(x)
+        lower, upper = (np.asarray(bound, p.dtype) for bound in (self.lower, self.upper))
+        tiny = jnp.finfo(p.dtype).tiny
+        least, most = np.nextafter(lower, upper), np.nextafter(upper, lower)  # what rounds to a bound stays inside
+        return jnp.clip(p, np.maximum(least, lower + tiny), np.minimum(most, upper - tiny))
 
     def coordinate(self, p, scale):
         """log((p - lower)/(upper - p))."""
