@@ -9,11 +9,8 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-# Lets XLA:CPU compile the loop over the steps into one kernel: two to eight times faster. It checks itself
-# whether it can. Flags have to be there before JAX starts, so they belong to a program, not to a library; and to the
-# processes it starts.
+# Has to be there before JAX starts, and for the processes that experiments start.
 os.environ["JAX_ENABLE_X64"] = "1"
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000")
 
 EXPERIMENTS = {
     "silverbox": "identification.silverbox",

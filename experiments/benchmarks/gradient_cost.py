@@ -1,8 +1,7 @@
 """Time and memory of reverse mode: the gradient of a long run against the run itself.
 
 Double pendulum with stiff joints, loss over stiffness and damping (4 numbers), 1e3 to 1e5 steps. Temporary
-memory is XLA's own count of the compiled program. Times are the best of several calls in one process, with
-the loop as one kernel (see experiments/__main__.py) unless XLA_FLAGS says otherwise.
+memory is XLA's own count of the compiled program. Times are the best of several calls in one process.
 """
 
 import os
@@ -90,7 +89,6 @@ def run(report: Report, fast: bool):
             "jax": jax.__version__,
             "device": str(jax.devices()[0]),
             "cores": os.cpu_count(),
-            "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
         }
     )
 
