@@ -28,6 +28,7 @@ EXPERIMENTS = {
     "stability": "stability.stability",
     "gradient_cost": "benchmarks.gradient_cost",
     "benchmarks": "benchmarks.benchmarks",
+    "work_precision": "work_precision.work_precision",
 }
 HERE = Path(__file__).parent
 
