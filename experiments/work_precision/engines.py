@@ -16,9 +16,9 @@ def links(name):
     """Of a case: masses, lengths, stiffness, damping, gravity along the zero direction and across it, start."""
     params, q0 = cases()[name].scene.params, cases()[name].scene.q0
     n = q0.size
-    per_link = (np.broadcast_to(np.asarray(params[key], float), n) for key in "mlkc")
+    m, length, k, c = (np.broadcast_to(np.asarray(params[key], float), n) for key in "mlkc")
     gravity = (params["g"], 0.0) if name == "stiff chain of 8" else (0.0, -params["g"])
-    return *per_link, gravity, np.asarray(q0)
+    return m, length, k, c, gravity, np.asarray(q0)
 
 
 def mujoco_model(m, length, k, c, gravity, integrator):
@@ -47,9 +47,9 @@ def mujoco_entries(name, sizes=SIZES):
 
     mujoco.set_mju_user_warning(lambda text: None)
     duration, rows = cases()[name].scene.duration, []
-    *parameters, gravity, q0 = links(name)
+    m, length, k, c, gravity, q0 = links(name)
     for integrator in INTEGRATORS:
-        model = mujoco_model(*parameters, gravity, integrator)
+        model = mujoco_model(m, length, k, c, gravity, integrator)
         data = mujoco.MjData(model)
         data.qpos[:] = np.diff(q0, prepend=0.0)
         whole = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -122,8 +122,9 @@ def exudyn_entries(name, sizes=SIZES):
     """Rows of its generalised-alpha method with a spectral radius of 0.9, that of our alpha = -0.05."""
     import exudyn as exu  # pyright: ignore[reportMissingImports]
 
-    duration, q0 = cases()[name].scene.duration, links(name)[-1]
-    system, sensor = exudyn_system(*links(name))
+    duration = cases()[name].scene.duration
+    m, length, k, c, gravity, q0 = links(name)
+    system, sensor = exudyn_system(m, length, k, c, gravity, q0)
 
     def solve(substeps):
         settings = exu.SimulationSettings()

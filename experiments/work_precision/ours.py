@@ -27,8 +27,11 @@ PLAIN = "rosenbrock", "rowda", "rowda, extrapolate=2", "rk4"  # take the system 
 
 def run(system, stepper, levels, q0, v0, duration, params, substeps):
     """As `march`, extrapolated."""
-    found = [march(system, stepper, q0, v0, params, duration, substeps * 2**i) for i in range(levels)]
-    return richardson([path for path, _ in found], stepper.order), sum(solves for _, solves in found)
+    march_by = partial(march, system, stepper, q0, v0, params, duration)
+    if levels == 1:
+        return march_by(substeps)
+    paths, solves = jax.lax.map(march_by, substeps * 2 ** jnp.arange(levels))  # a loop, so that one program serves all
+    return richardson(list(paths), stepper.order), jnp.sum(solves)
 
 
 def entries(name, sizes, only=None):

@@ -1,7 +1,9 @@
 """SciPy's LSODA, Radau, BDF and DOP853, with right-hand sides compiled by JAX, by the C compiler, and in Python."""
 
 import math
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +15,7 @@ from experiments.work_precision.timing import sweep
 
 SOLVERS = "LSODA", "Radau", "BDF", "DOP853"
 TOLERANCES = tuple(10.0**-n for n in range(2, 12))
+Makers = dict[str, Callable[[Any], Callable]]
 
 
 def by_jax(case):
@@ -24,9 +27,9 @@ def by_jax(case):
 
 def by_c(case):
     """The C source's right-hand side, called by ctypes without any checks."""
-    found = native.library()
+    found: Any = native.library()
     p, y, dy = native.numbers_of(case.scene), np.zeros(4), np.zeros(4)
-    call = found["rate"]  # a second function object, without the argument types of the first
+    call: Any = found["rate"]  # a second function object, without the argument types of the first
     addresses = [native.ctypes.c_void_p(x.ctypes.data) for x in (p, y, dy)]
 
     def rate(t, state, _keep=p):
@@ -57,7 +60,7 @@ def by_python(case):
 def entries(name, tolerances=TOLERANCES, only=None):
     """Rows of all solvers on a case; with C's right-hand side where there is one, and LSODA with Python's too."""
     case = cases()[name]
-    kinds = {"jitted": by_jax}
+    kinds: Makers = {"jitted": by_jax}
     if "double pendulum" in name:
         kinds = {"C": by_c} if native.library() else kinds
         kinds["Python"] = by_python
