@@ -16,6 +16,7 @@ from hhtjax.constraints import require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.extrapolation import MOST, extrapolated
 from hhtjax.flat_system import flatten, initial_values
+from hhtjax.kernels import one_kernel
 from hhtjax.steppers.stepper import Info, public, require_capable, require_stepper, require_system
 
 
@@ -218,9 +219,11 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
     no_info = _no_info(jax.eval_shape(take_step, start)[1])
     none = jnp.zeros((), jnp.int32)
     failure = Failure(none, jnp.array(False), none, no_info.dependent_row)
-    (_, _, failure), (path, info) = checkpointed_scan(
-        interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every
-    )
+
+    def run(start, failure):
+        return checkpointed_scan(interval, (start, none, failure), num_steps // save_every)
+
+    (_, _, failure), (path, info) = one_kernel(run, start, failure)
     t, q, *rates, L = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(start), path)
     q = jax.vmap(flat.unravel)(q)
     v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in rates)
