@@ -132,8 +132,10 @@ def simulate(
             start and the end only, and stores no path.
         progress: show a bar on stderr, also under jit.
         extrapolate: number of runs, with steps of dt, dt/2, dt/4, ..., that Richardson's extrapolation joins at the
-            same saved times: 2 takes the leading error out, for three times the work, 3 the next one too, for seven
-            times. `hht` becomes of order 3 and 4. For motions that dt resolves: elsewhere it makes errors larger.
+            same saved times, 1 to 4. For a stepper of order p, 2 takes the error dt^p out, for three times the work, 3
+            dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already). For
+            motions that dt resolves, elsewhere it makes errors larger; and for smooth steps, such as
+            linearize="predictor": where "auto" changes its choice, dt^3 is left.
 
     Returns:
         A `Solution`. Nothing raises while the steps run: call `solution.check()`.

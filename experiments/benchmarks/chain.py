@@ -15,7 +15,7 @@ from hhtjax.system import System
 
 def hanging(N, params):
     """mu_ij l^2."""
-    i = np.arange(N)
+    i = np.arange(float(N))
     return params["m"] * params["l"] ** 2 * (N - np.maximum(i[:, None], i[None, :]))
 
 
@@ -29,7 +29,7 @@ def joint_torques(q, v, params):
 def weight(q, params):
     """-mu_ii g l sin q_i."""
     N = q.size
-    return -params["m"] * params["g"] * params["l"] * (N - np.arange(N)) * jnp.sin(q)
+    return -params["m"] * params["g"] * params["l"] * (N - np.arange(float(N))) * jnp.sin(q)
 
 
 def mass(q, params):

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 import hhtjax
 from experiments.benchmarks.chain import chain
 from experiments.cardona_geradin1989.index_1 import unconstrained
+from hhtjax.kernels import one_kernel
 from hhtjax.linear_solve import solve
 from hhtjax.rotation import hat
 from hhtjax.scenes import Scene, double_pendulum, duffing, squeezer, top
@@ -110,7 +111,8 @@ def rms_error(name, positions):
     """Root mean square over times and coordinates; None where it is not finite, or positions is None."""
     if positions is None or np.shape(positions) != (SAMPLES, cases()[name].size):
         return None
-    error = float(np.sqrt(np.mean((np.asarray(positions) - reference(name)) ** 2)))
+    with np.errstate(over="ignore"):
+        error = float(np.sqrt(np.mean((np.asarray(positions) - reference(name)) ** 2)))
     return error if np.isfinite(error) else None
 
 
@@ -122,19 +124,22 @@ def flat(q):
 def march(system, stepper, q0, v0, params, duration, substeps):
     """Positions at the sample times, and the number of factorised matrices, substeps of them between samples.
 
-    A loop around `stepper.step`, the step that `hhtjax.simulate` takes.
+    A loop around `stepper.step`, the step that `hhtjax.simulate` takes, and as one kernel of XLA like there.
     """
+
+    def loop(start, params, dt, substeps):
+        def step(_, carry):
+            state, solves = carry
+            state, info = stepper.step(system, state, params, dt)
+            return state, solves + (1 if info.iterations is None else info.iterations)
+
+        def interval(carry, _):
+            carry = jax.lax.fori_loop(0, substeps, step, carry)
+            return carry, flat(carry[0].q)
+
+        return jax.lax.scan(interval, (start, 0), None, SAMPLES)
+
     dt = duration / (SAMPLES * substeps)
-
-    def step(_, carry):
-        state, solves = carry
-        state, info = stepper.step(system, state, params, dt)
-        return state, solves + (1 if info.iterations is None else info.iterations)
-
-    def interval(carry, _):
-        carry = jax.lax.fori_loop(0, substeps, step, carry)
-        return carry, flat(carry[0].q)
-
     start = stepper.init(system, q0, v0, params, dt)
-    (_, solves), path = jax.lax.scan(interval, (start, 0), None, SAMPLES)
+    (_, solves), path = one_kernel(loop, start, params, dt, substeps)
     return path, solves

@@ -9,7 +9,7 @@ from experiments.report import Report
 from experiments.work_precision import diffrax_peers, engines, gradients, ours, scipy_peers
 from experiments.work_precision.cases import cases, reference
 from experiments.work_precision.figures import draw
-from experiments.work_precision.timing import LONGEST, time_to
+from experiments.work_precision.timing import LONGEST, lines, time_to
 
 PEERS = "diffrax", "mujoco", "exudyn"
 PRIMARY = "stiff double pendulum"  # every method and every kind of step-size control
@@ -58,6 +58,12 @@ def times(rows):
     return found
 
 
+def show(report, entries):
+    """Times in ms."""
+    rows = [[e["method"], *("-" if t is None else 1e3 * t for t in e["time_s"].values())] for e in entries]
+    report.table(["method", *(f"{level:g}" for level in LEVELS)], rows)
+
+
 def run(report: Report, fast: bool):
     """All cases, then the gradients."""
     installed = [name for name in PEERS if importlib.util.find_spec(name)]
@@ -74,20 +80,16 @@ def run(report: Report, fast: bool):
         summary[name] = times(mine)
         rows += mine
         print(f"{name}: ms to an RMS error ({unit}) of")
-        lines = [[e["method"], *("-" if t is None else 1e3 * t for t in e["time_s"].values())] for e in summary[name]]
-        report.table(["method", *(f"{level:g}" for level in LEVELS)], lines)
+        show(report, summary[name])
     scenes = ["forced Duffing"] if fast else list(gradients.SCENES)
     gradient_rows = gradients.entries(scenes, fast, installed)
     gradient_summary = {name: times([r for r in gradient_rows if r["case"] == name]) for name in scenes}
     for name in scenes:
         print(f"{name}: ms to a relative error of the gradient of")
-        lines = [
-            [e["method"], *("-" if t is None else 1e3 * t for t in e["time_s"].values())]
-            for e in gradient_summary[name]
-        ]
-        report.table(["method", *(f"{level:g}" for level in LEVELS)], lines)
+        show(report, gradient_summary[name])
+    charts, gradient_charts = lines(rows), lines(gradient_rows)
     if not fast:
-        draw(report, rows, names, gradient_rows, scenes)
+        draw(report, charts, names, gradient_charts, scenes)
     numbers = {
         "machine": found,
         "versions": {name: importlib.metadata.version(name) for name in ("scipy", *installed)},
@@ -95,7 +97,7 @@ def run(report: Report, fast: bool):
         "longest_s": LONGEST,
         "times": summary,
         "gradient_times": gradient_summary,
-        "rows": [{k: x for k, x in r.items() if k not in ("package", "unit")} for r in rows],
-        "gradient_rows": [{k: x for k, x in r.items() if k != "package"} for r in gradient_rows],
+        "lines": charts,
+        "gradient_lines": gradient_charts,
     }
     report.numbers(rounded(numbers))
