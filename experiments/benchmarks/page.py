@@ -6,7 +6,7 @@ python -m experiments.benchmarks.page
 import json
 from pathlib import Path
 
-from experiments.page import find, table
+from experiments.page import busy, find, table
 
 HERE = Path(__file__).parent
 PREDICTOR, AUTO, CONVERGED = "non-iterative, predictor", "non-iterative, auto", "converged"
@@ -73,7 +73,7 @@ def page(numbers):
         .format(
             machine=(
                 f"{machine['processor']}, {machine['cores']} cores; jax {machine['jax']}, Python {machine['python']}; "
-                f"{machine['compiler'] or 'no C compiler'}; load at the start {machine['load_at_start']:.1f}; "
+                f"{machine['compiler'] or 'no C compiler'}; load at the start {machine['load_at_start']:.1f}{busy(machine)}; "
                 f"`XLA_FLAGS={machine['XLA_FLAGS']}`."
             ),
             bars=bars(numbers),

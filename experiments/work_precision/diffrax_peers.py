@@ -9,7 +9,7 @@ import numpy as np
 from experiments.work_precision.cases import SAMPLES, cases
 from experiments.work_precision.timing import sweep
 
-TOLERANCES = tuple(10.0**-n for n in range(2, 12))
+TOLERANCES = tuple(10.0**-n for n in range(3, 12))
 SIZES = tuple(2**n for n in range(12))  # steps between sample times
 MOST_STEPS = 200_000
 CONTROLLED = "Tsit5", "Kvaerno3", "Kvaerno5"

@@ -6,8 +6,9 @@ python -m experiments.work_precision.page
 import json
 from pathlib import Path
 
-from experiments.page import table
+from experiments.page import busy, table
 from experiments.work_precision.figures import PACKAGES
+from experiments.work_precision.timing import FINEST
 
 HERE = Path(__file__).parent
 STIFF = "stiff double pendulum"
@@ -52,22 +53,25 @@ def bars(entries):
 
 
 def losses(times):
-    """A sentence for each case and level at which a peer is faster than all of ours, or than the default."""
+    """For each case the errors at which a peer is faster than all of ours, and those at which only `hht()` loses."""
     lines = []
     for name, entries in times.items():
-        for level in next(iter(entries))["time_s"]:
+        lost, default_lost = [], []
+        for level in entries[0]["time_s"]:
             (ours, _), (theirs, peer) = best(entries, level, PACKAGES[:1]), best(entries, level, PACKAGES[1:])
             default = next(e["time_s"][level] for e in entries if e["method"] == "hht")
             if theirs is None:
                 continue
             if ours is None or theirs < ours:
-                ratio = (
-                    "none of ours gets there" if ours is None else f"in {theirs / ours:.2f} of the best of our times"
-                )
-                lines.append(f"* {name}, {level}: {peer}, {ratio}.")
+                times_faster = "none of ours gets there" if ours is None else f"{ours / theirs:.1f} times as fast"
+                lost.append(f"{level} ({peer}: {times_faster})")
             elif default is None or theirs < default:
-                ratio = "it does not get there" if default is None else f"{default / theirs:.1f} times as fast"
-                lines.append(f"* {name}, {level}: only the default `hht()` loses, to {peer} ({ratio}).")
+                times_faster = "hht does not get there" if default is None else f"{default / theirs:.1f} times as fast"
+                default_lost.append(f"{level} ({peer}: {times_faster})")
+        if lost:
+            lines.append(f"* {name}: all of ours lose at {', '.join(lost)}.")
+        if default_lost:
+            lines.append(f"* {name}: the default `hht()` loses, others of ours do not, at {', '.join(default_lost)}.")
     return "\n".join(lines) or "Nowhere, in these runs."
 
 
@@ -88,11 +92,12 @@ def page(numbers):
             machine=(
                 f"{machine['processor']}, {machine['cores']} cores; jax {machine['jax']}, {versions}, Python "
                 f"{machine['python']}; {machine['compiler'] or 'no C compiler'}; load at the start "
-                f"{machine['load_at_start']:.1f}; `XLA_FLAGS={machine['XLA_FLAGS']}`."
+                f"{machine['load_at_start']:.1f}{busy(machine)}; `XLA_FLAGS={machine['XLA_FLAGS']}`."
             ),
             missing=f"Not installed where this was made, and left out: {', '.join(missing)}." if missing else "",
             samples=SAMPLES,
             longest=numbers["longest_s"],
+            finest=FINEST,
             best=best_table(times),
             bars=bars(times[STIFF]),
             losses=losses(times),

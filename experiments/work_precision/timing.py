@@ -8,6 +8,7 @@ import numpy as np
 from experiments.work_precision.cases import rms_error
 
 LONGEST = 0.3  # s, of a run; nothing finer is tried after one that takes longer, or eight times as long if it is wrong
+FINEST = 1e-9  # error, below which nothing finer is tried
 REPEATS = 5
 PATIENCE = 0.08  # s, for the repeats of a run
 
@@ -24,9 +25,11 @@ def seconds(function, compiles):
     return result, min(times)
 
 
-def too_long(time_s, error):
+def enough(time_s, error):
     """Whether to stop refining."""
-    return time_s > (LONGEST if error is not None and error < 1 else 8 * LONGEST)
+    if error is None or error > 0.1:
+        return time_s > 8 * LONGEST
+    return time_s > LONGEST or error < FINEST
 
 
 def sweep(case, method, package, solve, settings, describe):
@@ -41,7 +44,7 @@ def sweep(case, method, package, solve, settings, describe):
         row = {"case": case, "method": method, "package": package, **describe(setting)}
         error = rms_error(case, positions)
         rows.append(row | {"rms_error": error, "time_s": time_s, "solves": None if solves is None else int(solves)})
-        if too_long(time_s, error) or (error is not None and error < 1e-11):
+        if enough(time_s, error):
             break
     return rows
 
