@@ -73,7 +73,8 @@ def page(numbers):
         .format(
             machine=(
                 f"{machine['processor']}, {machine['cores']} cores; jax {machine['jax']}, Python {machine['python']}; "
-                f"{machine['compiler'] or 'no C compiler'}; load at the start {machine['load_at_start']:.1f}{busy(machine)}; "
+                f"{machine['compiler'] or 'no C compiler'}; load at the start "
+                f"{machine['load_at_start']:.1f}{busy(machine)}; "
                 f"`XLA_FLAGS={machine['XLA_FLAGS']}`."
             ),
             bars=bars(numbers),
