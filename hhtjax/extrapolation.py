@@ -43,7 +43,11 @@ def extrapolated(run, levels, order, join):
     run: k -> the `Solution` with steps of dt/k at the same saved times. order: of the stepper. join: two `Info` of an
     interval into one. Rotations are moved along the one that leads from the coarse to the fine.
     """
-    solutions = [run(2**level) for level in range(levels)]
+    return _combine([run(2**level) for level in range(levels)], order=order, join=join)
+
+
+@partial(jax.jit, static_argnames=("order", "join"))
+def _combine(solutions, order, join):
     first = solutions[0]
 
     def value(name, combine=None):

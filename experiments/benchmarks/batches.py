@@ -114,5 +114,5 @@ def figure(rows, columns):
         style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 4, "lw": 1}
         axes.loglog([row["members"] for row in mine], [row[name] for row in mine], **style, label=name)
     axes.set(xlabel="members of the batch", ylabel="time per step and member (ns)")
-    axes.legend(loc="upper right", fontsize=8)
+    drawn.legend(loc="outside lower center", ncols=3, fontsize=8)
     return drawn
