@@ -137,7 +137,7 @@ def _make_kernel(module, call):
             del kernel.attributes["res_attrs"]
         between = func.FuncOp(name, old_type, ip=module.ip)
         with ir.InsertionPoint(between.add_entry_block()):
-            hidden = stablehlo.OptimizationBarrierOp(between.arguments).results
+            hidden = list(stablehlo.OptimizationBarrierOp(between.arguments).results)
             inner = func.CallOp(new_type.results, _insert(module, kernel), hidden)
             func.ReturnOp(list(inner.results)[: len(old_type.results)])
         _attach(inner.operation, inlineable="false", xla_cpu_small_call="true")

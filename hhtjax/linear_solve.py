@@ -30,7 +30,7 @@ def solve_map(f, b, factorize):
 def factorize_map(f, like, factorize):
     """The function b -> x with f(x) = b, for vectors like `like`: `solve_map` for many b, factorised once."""
     inverse = factorize(matrix(f, like))
-    return lambda b: _solve(f, b, inverse)
+    return lambda b: solve_by(f, b, inverse)
 
 
 def matrix(f, like):
@@ -38,7 +38,8 @@ def matrix(f, like):
     return jax.vmap(f, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
 
 
-def _solve(f, b, inverse):
+def solve_by(f, b, inverse):
+    """The same by an inverse of its matrix, which `factorize` made."""
     return lax.custom_linear_solve(
         f, b, solve=lambda _, y: inverse(y, trans=0), transpose_solve=lambda _, y: inverse(y, trans=1)
     )
@@ -107,7 +108,7 @@ def solve(A, b, factorize=factorize):
     >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
     [2.0, 1.0]
     """
-    return _solve(lambda x: matvec(A, x), b, factorize(A))
+    return solve_by(lambda x: matvec(A, x), b, factorize(A))
 
 
 def _lu(A):

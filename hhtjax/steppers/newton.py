@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.kernels import staged
-from hhtjax.linear_solve import matrix, solve_map
+from hhtjax.linear_solve import matrix, solve_by, solve_map
 from hhtjax.steppers.stepper import Info
 
 
@@ -25,8 +25,12 @@ def linearized_solve(r, path, w, factorize, at=None):
             value = value + tangent(jax.tree.map(jnp.subtract, start, point))
         return value, along, tangent
 
+    def columns(along, tangent):
+        return matrix(lambda dw: tangent(along(dw)), w)
+
     value, along, tangent = staged(expand)(w, at)
-    return w - solve_map(lambda dw: tangent(along(dw)), value, factorize)
+    inverse = factorize(staged(columns)(along, tangent))
+    return w - solve_by(lambda dw: tangent(along(dw)), value, inverse)
 
 
 def newton(r, path, w, s, factorize, tolerance, max_iterations):
