@@ -24,6 +24,8 @@ EXPERIMENTS = {
     "linearization": "linearization.linearization",
     "stability": "stability.stability",
     "gradient_cost": "benchmarks.gradient_cost",
+    "benchmarks": "benchmarks.benchmarks",
+    "work_precision": "work_precision.work_precision",
 }
 HERE = Path(__file__).parent
 

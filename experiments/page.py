@@ -11,3 +11,9 @@ def find(entries, **keys):
     """The one entry with these values."""
     (entry,) = (e for e in entries if all(e[key] == value for key, value in keys.items()))
     return entry
+
+
+def busy(machine):
+    """A warning where others kept the machine busy while its times were taken."""
+    load = machine["load_at_start"]
+    return ", so that all times are too long and ratios rough" if load and load > machine["cores"] / 2 else ""

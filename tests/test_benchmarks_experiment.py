@@ -1,0 +1,66 @@
+"""The C that the library is measured against does the same arithmetic, the charts are read rightly, and the pages."""
+
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from hhtjax.scenes import double_pendulum
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from experiments.benchmarks import native  # noqa: E402
+from experiments.benchmarks import page as benchmarks_page  # noqa: E402
+from experiments.benchmarks.chain import FORMULATIONS, chain  # noqa: E402
+from experiments.work_precision import page as work_precision_page  # noqa: E402
+from experiments.work_precision.timing import time_to  # noqa: E402
+
+
+@pytest.mark.parametrize("page", [benchmarks_page, work_precision_page])
+def test_the_page_is_made_of_the_committed_numbers(page):
+    name = page.HERE.name
+    assert (page.HERE / "README.md").read_text() == page.page(json.loads((page.HERE / f"{name}.json").read_text()))
+
+
+@pytest.mark.parametrize("as_printed", [False, True])
+def test_c_steps_like_the_library(as_printed):
+    if not native.libraries():
+        pytest.skip("no C compiler here")
+    scene, q0 = double_pendulum.stiff(as_printed), np.array([0.3, -0.2])
+    options = {"dt": 1e-3, "num_steps": 100}
+    run = hhtjax.simulate(
+        scene.system, hhtjax.hht(-0.1, linearize="predictor"), jnp.asarray(q0), scene.v0, scene.params, **options
+    )
+    ours = np.concatenate([run.q[-1], run.v[-1], run.acceleration[-1]])
+    batch = q0[:, None] + np.array([[0.0, 0.1, 0.2], [0.0, 0.0, 0.3]])
+    libraries = native.libraries().values()
+    assert np.float64(1e-300) * np.float64(1e-10) > 0  # to load them has not made the processor flush small numbers
+    for found in libraries:
+        single = native.Run(found, scene, q0, *options.values(), -0.1, save=True)
+        np.testing.assert_allclose(single()[:6], ours, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(single.path[:, :2], run.q[1:], rtol=1e-9)
+        np.testing.assert_allclose(native.Run(found, scene, batch, *options.values(), -0.1)()[:6, 0], ours, rtol=1e-8)
+
+
+def test_both_formulations_of_the_chain_are_one():
+    scene = chain(5, k=2.0, c=0.1)
+    q, v = jnp.linspace(-1.0, 2.0, 5), jnp.linspace(3.0, -1.0, 5)
+    (mass, force), (mass_2, force_2) = FORMULATIONS.values()
+    M, Q = (jax.jit(f)(*x, scene.params) for f, x in ((mass, (q,)), (force, (q, v, 0.0))))
+    np.testing.assert_allclose(mass_2(q, scene.params), M, atol=1e-14)
+    np.testing.assert_allclose(force_2(q, v, 0.0, scene.params), Q, atol=1e-13)
+
+
+def test_time_to_an_error_is_read_off_the_line_between_runs():
+    points = [(1.0, None), (1.0, 1e-1), (10.0, 1e-3), (12.0, 1e-2), (100.0, 1e-5)]
+    rows = [{"time_s": t, "rms_error": error} for t, error in points]
+    assert time_to(rows, 1e-2) == pytest.approx(10**0.5)
+    assert time_to(rows, 1e-4) == pytest.approx(10**1.5)
+    assert time_to(rows, 0.5) == 1.0
+    assert time_to(rows, 1e-6) is None
