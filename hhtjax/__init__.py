@@ -46,6 +46,7 @@ from hhtjax.steppers.multistep import park as park
 from hhtjax.steppers.rosenbrock import rosenbrock as rosenbrock
 from hhtjax.steppers.rosenbrock import rowda as rowda
 from hhtjax.steppers.splitting import operator_splitting as operator_splitting
+from hhtjax.sweep import sweep as sweep
 from hhtjax.system import FirstOrderSystem as FirstOrderSystem
 from hhtjax.system import LinearSystem as LinearSystem
 from hhtjax.system import System as System
