@@ -56,8 +56,5 @@ def _repeat_in_levels(body, count, carry, constants):
         return run
 
     carry = level(LEVELS)(jnp.zeros((), jnp.int32), carry)
-    return jax.tree.map(lambda x: _require(count <= LONGEST, x), carry)
-
-
-def _require(fine, x):
-    return jnp.where(fine, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
+    known = jnp.where(count <= LONGEST, 1.0, jnp.nan)  # a factor, so that derivatives are NaN too
+    return jax.tree.map(lambda x: x * known.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, carry)

@@ -1,11 +1,13 @@
 """Many runs in one compiled call: step sizes, parameters, initial states and coefficients as data."""
 
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpoint
@@ -25,7 +27,7 @@ from hhtjax.simulate import (
 )
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 
-LANES, BLOCKS = 256, 8
+LANES, BLOCKS = 128, 8  # members in a block at most, and blocks at least where there are enough members
 
 
 def sweep(
@@ -40,27 +42,30 @@ def sweep(
     num_samples,
     t0=0.0,
     in_axes=None,
+    mesh=None,
     progress=False,
 ) -> Solution:
     """Runs `system` once for each of `dts`, all over [t0, t0 + duration], sampled at common times.
 
     Each step size is made smaller, if need be, so that a whole number of steps lands on every sample, at distances
-    H = duration/num_samples: h = H/ceil(H/dt), reported as `sweep.dt`. Members are sorted by their number of steps and run
-    in blocks, vectorised, each block for as many steps as its longest member needs: the work is about the sum over the
-    members. A member that fails is named by `check()` and leaves the others as they are.
+    H = duration/num_samples: h = H/ceil(H/dt), reported as `sweep.dt`. Members are sorted by their number of steps and
+    run in blocks, vectorised, each block for as many steps as its longest member needs: the work is about the sum over
+    the members. A member that fails is named by `check()` and leaves the others as they are.
 
     Args:
         system, stepper, q0, v0, params, t0: as for `simulate`.
         dts: (B,) step sizes, positive, at most H. Their number B is part of the program, their values are data.
         duration: positive. num_samples: K, the number of samples after the start.
-        in_axes: what else differs between members: (stepper, q0, v0, params), each 0 where all its arrays have a leading
-            axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A stepper with an
+        in_axes: what else differs between members: (stepper, q0, v0, params), each 0 where all its arrays have a
+            leading axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A stepper with an
             axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
+        mesh: devices that share the work, `jax.make_mesh((jax.device_count(),), ("members",))`, also of several
+            processes; each then holds all results, bitwise those of one device.
         progress: show a bar on stderr, also under jit.
 
     Returns:
-        A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for all;
-        dt (B,), the step sizes used; failure.step counts each member's own steps.
+        A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for
+        all; dt (B,), the step sizes used; failure.step counts each member's own steps.
 
     Compiled once for each system, stepper, structure, B and num_samples. To be used inside jit and under vmap over
     all but dts; differentiable, forward and reverse, in all that `simulate` is, except that the dts only choose the
@@ -81,30 +86,61 @@ def sweep(
     >>> [round(float(q), 4) for q in runs.q[:, -1, 0]]                        # cos(2) = -0.4161
     [-0.4101, -0.4157, -0.4161]
     """
-    require_system("sweep", system)
-    require_stepper("sweep", stepper)
-    if not isinstance(num_samples, (int, np.integer)) or isinstance(num_samples, bool) or num_samples < 1:
-        raise ValueError(f"sweep: `num_samples` must be a positive integer; received {num_samples!r}.")
-    require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    require_number("sweep", "t0", t0, np.isfinite, "be finite")
-    dts = _require_step_sizes(dts, duration, num_samples)
-    (q0, v0), mapped = _initial_values(system, q0, v0, params, stepper, in_axes, dts.size)
-    data = stepper, q0, v0, params
-    require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
-    if system.constraint is not None:
-        _require_consistent(system, data, mapped, dts.size, t0)
-    duration, t0 = (float(x) if is_concrete(x) else x for x in (duration, t0))
-    return _sweep(
-        system,
-        data,
-        dts,
-        duration,
-        t0,
-        mapped=mapped,
-        num_samples=int(num_samples),
-        lanes=_lanes(dts.size),
-        progress=progress,
+    inputs = Inputs.checked(
+        system, stepper, q0, v0, params, dts=dts, duration=duration, num_samples=num_samples, t0=t0, in_axes=in_axes
     )
+    return inputs.run(mesh=mesh, progress=progress)
+
+
+class Inputs(NamedTuple):
+    """What a sweep is made from, checked: `data` is (stepper, q0, v0, params), `mapped` which of its leaves differ."""
+
+    system: Any
+    data: Any
+    dts: Any
+    duration: Any
+    t0: Any
+    mapped: tuple
+    num_samples: int
+
+    @classmethod
+    def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes):
+        """An error that names what is wrong, or the inputs."""
+        require_system("sweep", system)
+        require_stepper("sweep", stepper)
+        if not isinstance(num_samples, (int, np.integer)) or isinstance(num_samples, bool) or num_samples < 1:
+            raise ValueError(f"sweep: `num_samples` must be a positive integer; received {num_samples!r}.")
+        require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+        require_number("sweep", "t0", t0, np.isfinite, "be finite")
+        dts = _require_step_sizes(dts, duration, num_samples)
+        (q0, v0), mapped = _initial_values(system, q0, v0, params, stepper, in_axes, dts.size)
+        data = stepper, q0, v0, params
+        require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
+        if system.constraint is not None:
+            _require_consistent(system, data, mapped, dts.size, t0)
+        duration, t0 = (float(x) if is_concrete(x) else x for x in (duration, t0))
+        return cls(system, data, dts, duration, t0, mapped, int(num_samples))
+
+    def chunk(self, members):
+        """The same for the members of these numbers."""
+        return self._replace(data=_member(self.data, self.mapped, members), dts=self.dts[members])
+
+    def call(self, mesh=None, progress=False):
+        """The arguments of `run_sweep`."""
+        if mesh is not None and not isinstance(mesh, Mesh):
+            raise TypeError(f"sweep: `mesh` must be a jax.sharding.Mesh; received {mesh!r}.")
+        data, dts = self.data, self.dts
+        if mesh is not None:
+            mesh = Mesh(mesh.devices.ravel(), ("members",))  # whatever its shape and its types of axes
+            # arrays on one device could not be read by another process
+            data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
+        static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": _lanes(dts.size)}
+        return (self.system, data, dts, self.duration, self.t0), {**static, "mesh": mesh, "progress": progress}
+
+    def run(self, **options):
+        """The sweep."""
+        arguments, keywords = self.call(**options)
+        return run_sweep(*arguments, **keywords)
 
 
 def _require_step_sizes(dts, duration, num_samples):
@@ -124,7 +160,9 @@ def _require_step_sizes(dts, duration, num_samples):
                 f"{float(duration):.6g}, num_samples={num_samples}); received dts[{bad}] = {h[bad]:.6g}."
             )
         if duration / h.min() >= 2**31:
-            raise ValueError(f"sweep: `dts` must take fewer than 2^31 steps; received dts[{h.argmin()}] = {h.min():.6g}.")
+            raise ValueError(
+                f"sweep: `dts` must take fewer than 2^31 steps; received dts[{h.argmin()}] = {h.min():.6g}."
+            )
     return dts
 
 
@@ -192,33 +230,46 @@ def _lanes(size):
     return min(LANES, 1 << max(2, (size // BLOCKS).bit_length()))
 
 
-@partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "progress"))
-def _sweep(system, data, dts, duration, t0, *, mapped, num_samples, lanes, progress):
+@partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress"))
+def run_sweep(system, data, dts, duration, t0, *, mapped, num_samples, lanes, mesh, progress):
+    """The sweep of `Inputs`, compiled."""
     dtype = jax.tree.leaves(data[1])[0].dtype
     dts, duration, t0 = (jnp.asarray(x).astype(dtype) for x in (dts, duration, t0))
     H = duration / num_samples
     substeps, dts = _fit_to_samples(dts, H)
     order = jnp.argsort(-substeps)
-    num_blocks = -(-dts.size // lanes)
-    places = np.minimum(np.arange(num_blocks * lanes), dts.size - 1)  # the last one fills the last block
+    hands = 1 if mesh is None else mesh.size
+    rounds = -(-dts.size // (lanes * hands))
+    dealt = np.arange(rounds * hands * lanes).reshape(rounds, hands, lanes).swapaxes(0, 1)  # whole blocks, like cards
+    members = order[np.minimum(dealt, dts.size - 1)]  # the last one fills the last blocks
     leaves, structure = jax.tree.flatten(data)
     axes = [0 if flag else None for flag in mapped]
 
     def member(leaves, dt, substeps, longest):
         return _run(system, jax.tree.unflatten(structure, leaves), dt, substeps, longest, t0, num_samples)
 
-    def block(numbered):
+    def block(leaves, dts, substeps, numbered):
         number, members = numbered
         if progress:
-            show_progress(number + 1, num_blocks, "block")
+            show_progress(number + 1, rounds, "block")
         mine = [x[members] if flag else x for x, flag in zip(leaves, mapped, strict=True)]
         longest = jnp.max(substeps[members])
         return jax.vmap(member, (axes, 0, 0, None))(mine, dts[members], substeps[members], longest)
 
-    numbers = jnp.arange(num_blocks, dtype=jnp.int32)
-    runs = lax.map(block, (numbers, order[places].reshape(num_blocks, lanes)))
-    back = jnp.argsort(order)
+    def hand(members, *data):
+        """The blocks of one device, one after the other."""
+        return lax.map(partial(block, *data), (jnp.arange(rounds, dtype=jnp.int32), members[0]))
+
+    if mesh is not None:
+        spread, shared = PartitionSpec("members"), PartitionSpec()
+        hand = jax.shard_map(
+            hand, mesh=mesh, in_specs=(spread, shared, shared, shared), out_specs=spread, check_vma=False
+        )
+    runs = hand(members, leaves, dts, substeps)
+    back = jnp.asarray(np.argsort(dealt.ravel()))[jnp.argsort(order)]
     runs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[back], runs)
+    if mesh is not None:
+        runs = lax.with_sharding_constraint(runs, NamedSharding(mesh, PartitionSpec()))
     t = jnp.broadcast_to(t0 + H * jnp.arange(num_samples + 1).astype(dtype), (dts.size, num_samples + 1))
     return runs._replace(t=t)
 
