@@ -7,6 +7,7 @@ from hhtjax.band_limited import band_limited as band_limited
 from hhtjax.band_limited import band_limited_motion as band_limited_motion
 from hhtjax.band_limited import spline_gain_error as spline_gain_error
 from hhtjax.constraints import consistent_initial as consistent_initial
+from hhtjax.explain import explain as explain
 from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
 from hhtjax.identification.arguments import Gaussian as Gaussian
 from hhtjax.identification.bias import step_size_bias as step_size_bias

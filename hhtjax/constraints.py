@@ -17,8 +17,8 @@ from jax import lax
 
 from hhtjax.description import is_concrete
 from hhtjax.flat_system import flatten, initial_values
+from hhtjax.kernels import staged
 from hhtjax.linear_solve import RANK_TOLERANCE, UNROLLED, factorize, factorize_least_squares, matrix, matvec, solve_map
-from hhtjax.staging import staged
 
 MAX_ITERATIONS = 50
 CONSISTENT = 1e-6  # relative distance of initial values from consistent ones that passes
@@ -155,7 +155,7 @@ def correction(system, q, t, params, rows, factorize):
 def jacobian(system, q, t, params):
     """B: (m, n)."""
     Phi = partial(system.constraint, t=t, params=params)
-    _, tangent = staged(partial(jax.linearize, Phi), system.size)(q)
+    _, tangent = staged(partial(jax.linearize, Phi))(q)
     return matrix(lambda x: tangent(system.rate(q, x)), jnp.zeros(system.size, q.dtype))
 
 

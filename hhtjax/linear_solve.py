@@ -1,7 +1,7 @@
 """Small dense solves that XLA can fuse; LAPACK above a size.
 
 A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
-up to `UNROLLED` unknowns the elimination is written out as array operations.
+up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones.
 """
 
 from functools import partial
@@ -12,6 +12,7 @@ from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
 UNROLLED = 8
+SCALAR = 4  # beyond, scalar operations are so many that compiling them takes long
 RANK_TOLERANCE = (
     1e-9  # relative size of a singular value below which columns count as dependent; 100 roundings in float32
 )
@@ -55,6 +56,8 @@ def matvec(A, x):
 def factorize(A):
     """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff."""
     A = lax.stop_gradient(A)
+    if A.shape[-1] <= SCALAR:
+        return partial(_substitute_scalars, *_lu_scalars(A))
     if A.shape[-1] <= UNROLLED:
         return partial(_substitute, _lu(A))
     return partial(lu_solve, lu_factor(A))
@@ -144,3 +147,52 @@ def _substitute(factors, b, trans=0):
     for k in reversed(range(1, n)):
         x = x - jnp.where(i < k, LU[k] * x[k], 0)
     return jnp.sum(jnp.where(order[:, None] == i[None, :], x[:, None], 0), axis=0)
+
+
+def _lu_scalars(A):
+    """The entries of L and U in the place of A's, and the exchanges of rows before, as [(k, i, whether)]."""
+    n = A.shape[0]
+    LU = [[A[i, j] for j in range(n)] for i in range(n)]
+    exchanges = []
+    for k in range(n - 1):
+        for i in range(k + 1, n):
+            larger = jnp.abs(LU[i][k]) > jnp.abs(LU[k][k])
+            exchanges.append((k, i, larger))
+            for j in range(n):
+                LU[k][j], LU[i][j] = _exchange(larger, LU[k][j], LU[i][j])
+        for i in range(k + 1, n):
+            LU[i][k] = LU[i][k] / LU[k][k]
+            for j in range(k + 1, n):
+                LU[i][j] = LU[i][j] - LU[i][k] * LU[k][j]
+    return LU, exchanges
+
+
+def _substitute_scalars(LU, exchanges, b, trans=0):
+    """The same as `_substitute`."""
+    n = len(LU)
+    x = [b[i] for i in range(n)]
+    if not trans:
+        for k, i, whether in exchanges:
+            x[k], x[i] = _exchange(whether, x[k], x[i])
+        for k in range(n):
+            for i in range(k + 1, n):
+                x[i] = x[i] - LU[i][k] * x[k]
+        for k in reversed(range(n)):
+            x[k] = x[k] / LU[k][k]
+            for i in range(k):
+                x[i] = x[i] - LU[i][k] * x[k]
+        return jnp.stack(x)
+    for k in range(n):
+        x[k] = x[k] / LU[k][k]
+        for i in range(k + 1, n):
+            x[i] = x[i] - LU[k][i] * x[k]
+    for k in reversed(range(n)):
+        for i in range(k):
+            x[i] = x[i] - LU[k][i] * x[k]
+    for k, i, whether in reversed(exchanges):
+        x[k], x[i] = _exchange(whether, x[k], x[i])
+    return jnp.stack(x)
+
+
+def _exchange(whether, a, b):
+    return jnp.where(whether, b, a), jnp.where(whether, a, b)

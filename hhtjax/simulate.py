@@ -15,6 +15,7 @@ from hhtjax.checkpointing import checkpointed_scan
 from hhtjax.constraints import require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.flat_system import flatten, initial_values
+from hhtjax.kernels import one_kernel
 from hhtjax.steppers.stepper import Info, public, require_capable, require_stepper, require_system
 
 
@@ -199,8 +200,11 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
 
     start = stepper.begin(flat, q, v, t0, params, dt)
     no_info = neutral_info(jax.eval_shape(take_step, start)[1])
-    carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    (_, _, failure), (path, info) = checkpointed_scan(interval, carry, num_steps // save_every)
+
+    def run(start, failure):
+        return checkpointed_scan(interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every)
+
+    (_, _, failure), (path, info) = one_kernel(run, start, no_failure(no_info))
     return as_solution(flat, start, path, dt, info, failure)
 
 

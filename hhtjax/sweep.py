@@ -14,6 +14,7 @@ from hhtjax.checkpointing import checkpoint
 from hhtjax.constraints import require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.flat_system import flatten, initial_values
+from hhtjax.kernels import one_kernel
 from hhtjax.looping import repeat
 from hhtjax.simulate import (
     Solution,
@@ -302,6 +303,8 @@ def _run(system, data, dt, substeps, longest, t0, num_samples):
         run, info = repeat(step, (run, no_info), longest)
         return run, (saved(flat, run[0]), info)
 
-    run = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    (_, _, failure), (path, info) = lax.scan(interval, run, None, num_samples)
+    def samples(start, failure):
+        return lax.scan(interval, (start, jnp.zeros((), jnp.int32), failure), None, num_samples)
+
+    (_, _, failure), (path, info) = one_kernel(samples, start, no_failure(no_info))
     return as_solution(flat, start, path, dt, info, failure)

@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.boundary import require_number
+from hhtjax.kernels import staged
 from hhtjax.linear_solve import factorize, factorize_map
-from hhtjax.staging import staged
 from hhtjax.steppers.generalized_alpha import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 
@@ -66,7 +66,7 @@ class Rosenbrock(Stepper):
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 
         def step(s):
-            value, tangent = staged(partial(jax.linearize, r), system.size)(s)
+            value, tangent = staged(partial(jax.linearize, r))(s)
             solve = once if system.linear else factorized(tangent)
             rates = []
             for row, coupling in zip(A, G, strict=True):

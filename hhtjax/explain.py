@@ -1,0 +1,51 @@
+"""What became of a run in the compiled program."""
+
+import re
+import time
+from typing import Any, NamedTuple
+
+import jax
+
+from hhtjax.kernels import VERDICT
+
+
+class Explanation(NamedTuple):
+    """What `explain` found. paths: for each loop over steps "one kernel", or "plain: " and what stood against it;
+    compile_seconds; temporary_bytes: memory beside arguments and results, None where XLA does not tell."""
+
+    paths: tuple[str, ...]
+    compile_seconds: float
+    temporary_bytes: int | None
+
+    def __str__(self):
+        lines = [f"loop {i}: {path}" for i, path in enumerate(self.paths, 1)] or ["no loop over steps"]
+        memory = "" if self.temporary_bytes is None else f", {self.temporary_bytes / 1e6:.3g} MB of temporaries"
+        return "\n".join([*lines, f"compiled in {self.compile_seconds:.2f} s{memory}"])
+
+
+def explain(f, *args) -> Explanation:
+    """Compiles f(*args), which calls `simulate`, and tells how its loops over steps run.
+
+    On the CPU each becomes one kernel if XLA can compile it so, several times faster on a small system, and a list of
+    kernels if not, as on other platforms: with LAPACK (more than 8 unknowns), sort, indices from an array
+    under reverse mode, large products and sums, or a callback such as progress=True. Values differ by rounding.
+
+    Args:
+        f: any function; a gradient or a vmap has loops of its own.
+        args: pytrees of arrays.
+
+    >>> import jax, jax.numpy as jnp, hhtjax
+    >>> ball = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, c: -9.81 - c * v)
+    >>> def height(c):
+    ...     run = hhtjax.simulate(ball, hhtjax.hht(), jnp.array([9.0]), jnp.array([0.0]), c, dt=0.01, num_steps=50)
+    ...     return run.q[-1, 0]
+    >>> hhtjax.explain(jax.grad(height), 0.1).paths                            # forward, and back
+    ('one kernel', 'one kernel')
+    """
+    start = time.perf_counter()
+    lowered = jax.jit(f).lower(*args)
+    compiled = lowered.compile()
+    seconds = time.perf_counter() - start
+    paths = tuple(re.findall(rf'{VERDICT} = "([^"]*)"', lowered.as_text()))
+    memory: Any = compiled.memory_analysis()
+    return Explanation(paths, seconds, None if memory is None else memory.temp_size_in_bytes)

@@ -1,0 +1,223 @@
+"""How XLA:CPU shall cut a program into kernels: a loop as one, and a barrier that fusion does not cross.
+
+XLA:CPU runs a loop body as a list of kernels. Each costs a call, and so does every buffer between them: on a small
+mechanism several times what the arithmetic costs. And what is fused is evaluated anew in every user: the sines of a
+system once for every column of its Jacobian. Attributes of a call change both. One that is not inlined is computed
+once; one that bears `xla_cpu_small_call` is compiled into one kernel, with all its loops. Such a kernel must hold
+only what its emitter knows: with LAPACK, sort, scatter or a large product, compilation fails.
+
+So it is decided when the program is lowered, with vmap and autodiff done: an identity on the results of the call looks
+the called function through, operation by operation, and attaches the attribute only if it knows them all. Platforms
+other than the CPU never see it. The verdict is attached too, for `explain` to read.
+"""
+
+import inspect
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxlib import version
+from jaxlib.mlir import ir
+from jaxlib.mlir.dialects import func, stablehlo
+
+ATTRIBUTES = "mhlo.frontend_attributes"
+VERDICT = "hhtjax_kernels"
+KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"  # names of functions; autodiff and vmap keep them
+TESTED = 0, 8  # the first jaxlib whose kernels hold all of KNOWN
+
+# operations the emitter knows, whatever their size
+KNOWN = {
+    *("abs", "add", "and", "atan2", "bitcast_convert", "broadcast_in_dim", "case", "cbrt", "ceil", "clamp", "compare"),
+    *("complex", "concatenate", "constant", "convert", "cosine", "count_leading_zeros", "divide", "dynamic_slice"),
+    *("dynamic_update_slice", "exponential", "exponential_minus_one", "floor", "gather", "if", "imag", "iota"),
+    *("is_finite", "log", "log_plus_one", "logistic", "maximum", "minimum", "multiply", "negate", "not", "or", "pad"),
+    *("optimization_barrier", "popcnt", "power", "real", "remainder", "reshape", "return", "reverse"),
+    *("round_nearest_afz", "round_nearest_even", "rsqrt", "select", "shift_left", "shift_right_arithmetic"),
+    *("shift_right_logical", "sign", "sine", "slice", "sqrt", "subtract", "tan", "tanh", "transpose", "while", "xor"),
+}
+LARGEST_SUM = 1024  # elements; XLA hands larger ones to another library, and products of matrices
+LARGEST_PRODUCT = 7  # rows and columns
+LARGEST_MATRIX = 4096  # elements of one that meets a vector
+MOST_OPERATIONS = 20_000  # in one function; LLVM takes long over more
+
+
+def one_kernel(f, *args):
+    """f(*args) of pytrees of arrays, as one kernel where XLA can; the same values otherwise."""
+    f, constants = jax.closure_convert(f, *args)
+    return _watch(_named(KERNEL, f)(*_watch(args), *_watch(constants)))
+
+
+def staged(f):
+    """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have."""
+    return _named(STAGED, f)
+
+
+def _named(name, f):
+    def call(*args):
+        return f(*args)
+
+    call.__name__ = name
+    return jax.jit(call)
+
+
+def _watch(tree):
+    """An identity on either side of a call: whatever autodiff makes of it, one is behind the call or its transpose."""
+    return jax.tree.map(lambda x: watch_p.bind(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x, tree)
+
+
+watch_p = Primitive("hhtjax_watch")
+watch_p.def_impl(lambda x: x)
+watch_p.def_abstract_eval(lambda x: x)
+ad.deflinear2(watch_p, lambda cotangent, _: (watch_p.bind(cotangent),))
+batching.defvectorized(watch_p)
+
+
+def _lower(ctx, x):
+    """Decides on the call that gives x, and on those before it whose results go to derivatives only."""
+    if not isinstance(x.owner, ir.Block) and _is_undecided(x.owner.operation):
+        module = ctx.module_context
+        for call in [op for op in _operations(module.module.operation) if _is_undecided(op)]:
+            objection = _Inspection(module, call).objection
+            _attach(call, **{VERDICT: f"plain: {objection}" if objection else "one kernel"})
+            if objection is None:
+                _make_kernel(module, call)
+    return [x]
+
+
+# a cached lowering would not see the call
+uncached: Any = {"cacheable": False} if "cacheable" in inspect.signature(mlir.register_lowering).parameters else {}
+mlir.register_lowering(watch_p, lambda ctx, x: [x], **uncached)
+mlir.register_lowering(watch_p, _lower, platform="cpu", **uncached)
+
+
+def _operations(op):
+    """All in it, itself included."""
+    yield op
+    for inner in _directly_in(op):
+        yield from _operations(inner)
+
+
+def _directly_in(op):
+    return [x.operation for region in op.regions for block in region for x in block]
+
+
+def _is_undecided(op):
+    return op.name == "func.call" and ATTRIBUTES not in op.attributes and _callee(op).startswith(KERNEL)
+
+
+def _callee(call):
+    return ir.FlatSymbolRefAttr(call.attributes["callee"]).value
+
+
+def _attach(call, **attributes):
+    call.attributes[ATTRIBUTES] = ir.DictAttr.get({key: ir.StringAttr.get(x) for key, x in attributes.items()})
+
+
+def _make_kernel(module, call):
+    """Lets `call` find a function that calls the one it called, as a kernel.
+
+    XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once it is optimised. So the
+    kernel returns an element of each, and the function between drops them.
+    """
+    name = _callee(call)
+    with call.location:
+        kernel = module.symbol_table[name].operation.clone(ip=module.ip)
+        old_type = ir.FunctionType(ir.TypeAttr(kernel.attributes["function_type"]).value)
+        (body,) = kernel.regions[0]
+        end = body.operations[len(body.operations) - 1]
+        with ir.InsertionPoint(end):
+            elements = [stablehlo.slice(x, *_first(x)) if _size(x) else x for x in body.arguments]
+            func.ReturnOp([*end.operands, *elements])
+        end.erase()
+        new_type = ir.FunctionType.get(old_type.inputs, [*old_type.results, *(x.type for x in elements)])
+        kernel.attributes["function_type"] = ir.TypeAttr.get(new_type)
+        if "res_attrs" in kernel.attributes:
+            del kernel.attributes["res_attrs"]
+        between = func.FuncOp(name, old_type, ip=module.ip)
+        with ir.InsertionPoint(between.add_entry_block()):
+            inner = func.CallOp(new_type.results, _insert(module, kernel), between.arguments)
+            func.ReturnOp(list(inner.results)[: len(old_type.results)])
+        _attach(inner.operation, inlineable="false", xla_cpu_small_call="true")
+        between.attributes["sym_visibility"] = ir.StringAttr.get("private")
+        call.attributes["callee"] = _insert(module, between)
+
+
+def _insert(module, function):
+    """Into the module, under a name that is free: the reference to it."""
+    return ir.FlatSymbolRefAttr.get(module.symbol_table.insert(function).value)
+
+
+def _first(x):
+    """Bounds and strides of a slice of one element."""
+    rank = ir.RankedTensorType(x.type).rank
+    return [ir.DenseI64ArrayAttr.get([n] * rank) for n in (0, 1, 1)]
+
+
+class _Inspection:
+    """Looks through a function and all it calls: what in it cannot be part of one kernel, and what is staged."""
+
+    def __init__(self, module, call):
+        self.functions = module.symbol_table
+        self.seen = set()
+        self.operations = 0
+        supported = tuple(map(int, version.__version__.split(".")[:2])) >= TESTED
+        self.objection = None if supported else f"jaxlib {version.__version__}"
+        self.look(call)
+
+    def look(self, op):
+        """`objection` becomes the first there is; staged calls are marked as such."""
+        self.operations += 1
+        dialect, _, name = op.name.partition(".")
+        if self.operations > MOST_OPERATIONS:
+            self.object(f"more than {MOST_OPERATIONS} operations")
+        if op.name == "func.call":
+            callee = _callee(op)
+            if callee.startswith(STAGED):
+                _attach(op, inlineable="false")
+            if callee not in self.seen:
+                self.seen.add(callee)
+                self.look(self.functions[callee].operation)
+        elif name == "custom_call":
+            self.object(ir.StringAttr(op.attributes["call_target_name"]).value)
+        elif dialect == "stablehlo" and name in CHECKS:  # what it holds is scalar
+            if not CHECKS[name](op):
+                self.object(f"{name} of {' and '.join(str(x.type) for x in op.operands)}")
+        elif (dialect == "stablehlo" and name in KNOWN) or dialect in ("chlo", "func"):
+            for inner in _directly_in(op):
+                self.look(inner)
+        else:
+            self.object(op.name)
+
+    def object(self, why):
+        self.objection = self.objection or why
+
+
+def _size(value):
+    size = 1
+    for n in ir.RankedTensorType(value.type).shape:
+        size *= n
+    return size
+
+
+def _small_reduction(op):
+    value = op.operands[0]
+    return _size(value) <= LARGEST_SUM or str(ir.RankedTensorType(value.type).element_type) == "i1"
+
+
+def _small_product(op):
+    """Of a vector, batched or not, or of tiny matrices."""
+    dims = stablehlo.DotDimensionNumbers(op.attributes["dot_dimension_numbers"])
+    left = {*dims.lhs_batching_dimensions, *dims.lhs_contracting_dimensions}
+    right = {*dims.rhs_batching_dimensions, *dims.rhs_contracting_dimensions}
+    shapes = [ir.RankedTensorType(x.type).shape for x in op.operands]
+    free = [
+        [n for i, n in enumerate(shape) if i not in bound] for shape, bound in zip(shapes, (left, right), strict=True)
+    ]
+    if not all(free):
+        return max(map(_size, op.operands)) <= LARGEST_MATRIX
+    return max(n for shape in free for n in shape) <= LARGEST_PRODUCT
+
+
+CHECKS = {"dot_general": _small_product, "reduce": _small_reduction, "reduce_window": _small_reduction}

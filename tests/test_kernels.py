@@ -1,0 +1,120 @@
+"""How a run is cut into kernels changes the compiled program, and nothing else."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from hhtjax import kernels
+
+on_cpu = pytest.mark.skipif(
+    jax.default_backend() != "cpu" or jax.version.__version_info__ < (*kernels.TESTED, 0),
+    reason="kernels are cut on the CPU only, by a jaxlib of 0.8 or newer",
+)
+N = 5
+x = jnp.linspace(0.1, 1.0, 4)
+order = jnp.array([1, 0, 3, 2])
+
+
+def links(q, v, t, params):
+    """Five pendulums, coupled."""
+    return -jnp.sin(q[:, None] - q[None, :]) @ v**2 - params * jnp.sin(q)
+
+
+def end(params, q0=None):
+    """Of a short run of the links; all of it new for JAX, which would take the program of the last call."""
+    system = hhtjax.System(jnp.arange(1.0, N + 1), lambda *args: links(*args))
+    q0 = jnp.linspace(0.1, 1.0, N) if q0 is None else q0
+    return hhtjax.simulate(system, hhtjax.hht(), q0, 0 * q0, params, dt=0.05, num_steps=20, save_every=20).q[-1]
+
+
+def loss(params):
+    return jnp.sum(end(params) ** 2)
+
+
+def paths(f, *args):
+    return hhtjax.explain(f, *args).paths
+
+
+def test_one_kernel_gives_what_the_plain_path_gives(monkeypatch):
+    one = jax.jit(jax.value_and_grad(loss))(2.0)
+    monkeypatch.setattr(kernels, "TESTED", (99, 0))
+    assert "jaxlib" in paths(jax.grad(loss), 2.0)[0]
+    assert np.allclose(one, jax.jit(jax.value_and_grad(loss))(2.0), rtol=1e-12, atol=0)
+
+
+@on_cpu
+def test_derivatives_and_batches_are_one_kernel_too():
+    assert paths(jax.grad(loss), 2.0) == ("one kernel", "one kernel")
+    assert paths(lambda p: jax.jvp(loss, (p,), (p,)), 2.0) == ("one kernel",)
+    assert paths(jax.vmap(end), jnp.ones(3)) == ("one kernel",)
+
+
+SUPPORTED = {
+    "elementwise": lambda c: jnp.tanh(c) + jnp.arctan2(c, 1 + c) + jax.scipy.special.erf(c) + c**0.3,
+    "control flow": lambda c: jax.lax.cond(c[0] > 0.5, lambda c: c / 2, lambda c: c + 1, c),
+    "a loop": lambda c: jax.lax.while_loop(lambda c: c[0] < 3, lambda c: c + 0.5, c) / 10,
+    "indices": lambda c: c[order] + c[(3 * c).astype(int) % 4],
+    "matrices of 7": lambda c: ((jnp.ones((7, 7)) * c[0]) @ (jnp.ones((7, 7)) * c[1]))[:4, :4] @ c / 99,
+    "small products and sums": lambda c: jnp.outer(c, c) @ c / 9 + jnp.sum(c) / 9 + jnp.cumsum(c) / 9,
+    "interpolation": lambda c: jnp.interp(c, jnp.arange(10.0), jnp.arange(10.0) ** 2) / 9,
+    "random numbers": lambda c: c / 2 + jax.random.normal(jax.random.key(3), (4,)),
+    "float32": lambda c: jnp.sin(c.astype(jnp.float32)).astype(c.dtype),
+}
+UNSUPPORTED = {
+    "sort": lambda c: jnp.sort(c) / 2,
+    "scatter": lambda c: c.at[order].add(c) / 3,
+    "lapack": lambda c: jnp.linalg.solve(jnp.eye(4) + jnp.outer(c, c), c),
+    "fft": lambda c: jnp.abs(jnp.fft.fft(c)) / 9,
+    "callback": lambda c: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(c.shape, c.dtype), c),
+    "dot_general": lambda c: jnp.sum(jnp.ones((20, 20)) @ jnp.ones((20, 20)) * c[0], 1)[:4] / 999,
+    "dot_general ": lambda c: jax.vmap(lambda b: jnp.eye(4) @ b)(jnp.outer(jnp.ones(9), c))[3] / 2,
+    "reduce": lambda c: c / 2 + jnp.sum(jnp.ones(5000) * c[0]) / 9999,
+    "gather, in reverse": lambda c: c[(3 * c).astype(int) % 4] / 2,
+}
+
+
+@on_cpu
+@pytest.mark.parametrize("name", [*SUPPORTED, *UNSUPPORTED])
+def test_what_xla_cannot_compile_into_one_kernel_runs_plainly(name):
+    body = (SUPPORTED | UNSUPPORTED)[name]
+
+    def loop(c):
+        return jax.lax.scan(lambda c, _: (body(c), None), c, None, 3)[0]
+
+    def f(c):
+        return kernels.one_kernel(loop, c)
+
+    def run(f, c):
+        return jax.grad(lambda c: jnp.sum(f(c)))(c) if name == "gather, in reverse" else f(c)
+
+    assert np.allclose(jax.jit(run, static_argnums=0)(f, x), jax.jit(run, static_argnums=0)(loop, x), rtol=1e-12)
+    verdict = paths(partial(run, f), x)[-1]
+    assert verdict == "one kernel" if name in SUPPORTED else verdict.startswith("plain")
+    if name.strip() in ("sort", "dot_general", "reduce"):
+        assert name.strip() in verdict
+
+
+@on_cpu
+def test_a_batch_of_thousands_compiles():
+    q0 = jnp.outer(jnp.linspace(-1, 1, 5000), jnp.ones(N))
+    assert jnp.all(jnp.isfinite(jax.vmap(partial(end, 2.0))(q0)))
+
+
+@on_cpu
+def test_shared_values_are_computed_once():
+    def sines(barrier):
+        def body(x, _):
+            y = barrier(jnp.sin)(x)
+            return jnp.cumsum(y * x) + y[::-1] * x, None
+
+        def run(x):
+            return kernels.one_kernel(lambda x: jax.lax.scan(body, x, None, 99)[0], x)
+
+        return jax.jit(run).lower(jnp.ones(N)).compile().as_text().count(" sine(")
+
+    assert sines(kernels.staged) == 1
+    assert sines(lambda f: f) == 2  # fused into both users
