@@ -27,6 +27,7 @@ EXPERIMENTS = {
     "linearization": "linearization.linearization",
     "stability": "stability.stability",
     "gradient_cost": "benchmarks.gradient_cost",
+    "benchmarks": "benchmarks.benchmarks",
 }
 HERE = Path(__file__).parent
 

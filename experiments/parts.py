@@ -43,12 +43,13 @@ def run_group(report, names):
     return numbers, text.getvalue(), report.written
 
 
-def run_experiment(report, groups, fast):
+def run_experiment(report, groups, fast, machine: Any = None):
     """All parts: one after the other, so that times are undisturbed; the smoke run in as many processes as cores.
 
-    groups: lists of parts that share what they compute.
+    groups: lists of parts that share what they compute. machine: what it is run on; by default in a few words.
     """
-    numbers: dict = {"machine": f"{os.cpu_count()} cores ({jax.devices()[0].device_kind}), jax {jax.__version__}"}
+    words = f"{os.cpu_count()} cores ({jax.devices()[0].device_kind}), jax {jax.__version__}"
+    numbers: dict = {"machine": words if machine is None else machine}
     if fast:
         names = [[module.__name__ for module in group] for group in groups]
         with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as pool:

@@ -3,6 +3,7 @@
 from hhtjax import analysis as analysis
 from hhtjax import rotation as rotation
 from hhtjax import scenes as scenes
+from hhtjax import trigonometry as trigonometry
 from hhtjax.band_limited import band_limited as band_limited
 from hhtjax.band_limited import band_limited_motion as band_limited_motion
 from hhtjax.band_limited import spline_gain_error as spline_gain_error

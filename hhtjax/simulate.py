@@ -14,6 +14,7 @@ from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpointed_scan
 from hhtjax.constraints import require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.extrapolation import MOST, extrapolated
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel
 from hhtjax.steppers.stepper import Info, public, require_capable, require_stepper, require_system
@@ -116,7 +117,7 @@ class Solution(NamedTuple):
 
 
 def simulate(
-    system, stepper, q0, v0=None, params=None, *, dt, num_steps, t0=0.0, save_every=1, progress=False
+    system, stepper, q0, v0=None, params=None, *, dt, num_steps, t0=0.0, save_every=1, progress=False, extrapolate=1
 ) -> Solution:
     """Steps `system` from (q0, v0) at t0, num_steps times by dt.
 
@@ -130,6 +131,9 @@ def simulate(
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
         progress: show a bar on stderr, also under jit.
+        extrapolate: number of runs, with steps of dt, dt/2, dt/4, ..., that Richardson's extrapolation joins at the
+            same saved times: 2 takes the leading error out, for three times the work, 3 the next one too, for seven
+            times. `hht` becomes of order 3 and 4. For motions that dt resolves: elsewhere it makes errors larger.
 
     Returns:
         A `Solution`. Nothing raises while the steps run: call `solution.check()`.
@@ -160,6 +164,8 @@ def simulate(
             raise ValueError(f"simulate: `{name}` must be a positive integer; received {value!r}.")
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
+    if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
+        raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
     q0, v0 = initial_values("simulate", system, q0, v0)
@@ -167,9 +173,12 @@ def simulate(
     if system.constraint is not None:
         require_consistent("simulate", system, q0, v0, t0, params, stepper.redundant)
     dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew
-    return _simulate(
-        system, stepper, q0, v0, params, dt, t0, num_steps=int(num_steps), save_every=int(save_every), progress=progress
-    )
+
+    def run(k):
+        sizes = {"num_steps": k * int(num_steps), "save_every": k * int(save_every)}
+        return _simulate(system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress)
+
+    return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, _join)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "save_every", "progress"))

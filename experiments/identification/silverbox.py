@@ -30,7 +30,7 @@ from experiments.identification.data import (
 )
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
-from hhtjax.identification.refine import extrapolate
+from hhtjax.extrapolation import richardson
 
 SUBSTEPS = 8
 MODELS = {
@@ -154,9 +154,9 @@ def step_size_study(report: Report, sets, fast: bool):
         counts = (1, 2) if fast else (1, 2, 4, 8, 16)
         fits = [fit_training(sets.train, substeps, alpha) for substeps in counts]
         ratios = np.array([[float(fit[0].params[0][name] / fit[0].params[0]["m"]) for name in "kc"] for fit in fits])
-        exact = extrapolate(list(ratios[-3:]), 2)
+        exact = richardson(list(ratios[-3:]), 2)
         for levels in () if fast else (2, 3):
-            before, after = (extrapolate(list(x[-levels:]), 2) for x in (ratios[:-1], ratios))
+            before, after = (richardson(list(x[-levels:]), 2) for x in (ratios[:-1], ratios))
             agreement[f"alpha {alpha}, {levels} levels"] = dict(zip(("k/m", "c/m"), before / after - 1, strict=True))
         for substeps, (result, seconds, _), ratio in zip(counts, fits, ratios, strict=True):
             params = result.params[0]

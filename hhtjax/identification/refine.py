@@ -2,8 +2,6 @@
 
 import json
 import warnings
-from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.boundary import require_function, require_number
+from hhtjax.extrapolation import richardson
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
@@ -94,29 +93,12 @@ def refine(residuals_at, params0, stepper, dt, levels=2, **options: Any) -> Refi
     fits = []
     for level in range(levels):
         fits.append(fit(residuals_at(stepper, dt / 2**level), fits[-1].params if fits else params0, **options))
-    params = extrapolate([result.params for result in fits], stepper.order)
+    params = richardson([result.params for result in fits], stepper.order)
     shift = jax.tree.map(
         lambda p, q, e: (p - q) / jnp.where(e > 0, e, jnp.inf), fits[0].params, params, fits[0].standard_errors
     )
     _warn_if_shifted(params, shift, dt)
     return Refined(stepper, dt, tuple(fits), params, shift)
-
-
-def extrapolate(values, order):
-    """Richardson's value of pytrees that belong to h, h/2, h/4, ..., with errors h^order, h^(order + 1), ...
-
-    >>> [round(extrapolate([1 + h**2 + h**3 for h in (0.4, 0.2, 0.1)][:levels], 2), 6) + 0.0 for levels in (2, 3)]
-    [0.989333, 1.0]
-    """
-    while len(values) > 1:
-        better = partial(_take_out, 1 / (2**order - 1))
-        values = [jax.tree.map(better, coarse, fine) for coarse, fine in pairwise(values)]
-        order += 1
-    return values[0]
-
-
-def _take_out(gain, coarse, fine):
-    return fine + gain * (fine - coarse)
 
 
 def _warn_if_shifted(params, shift, dt):

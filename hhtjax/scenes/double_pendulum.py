@@ -2,7 +2,10 @@
 
 q = (q1, q2): angles of the two links from the horizontal, rad. Massless links of lengths l (m), point
 masses m (kg) at their ends, joint stiffness k (N m/rad) and damping c (N m s/rad), gravity g (m/s^2).
+trigonometry: a module with `sin` and `cos`, jax.numpy or hhtjax.trigonometry.
 """
+
+from functools import cache, partial
 
 import jax.numpy as jnp
 
@@ -12,21 +15,21 @@ from hhtjax.system import System
 GRAVITY = 9.80665
 
 
-def mass(q, params):
+def mass(q, params, trigonometry=jnp):
     """M = [[l1^2 (m1 + m2), l1 l2 m2 cos(q1 - q2)], [., l2^2 m2]]."""
     (m1, m2), (l1, l2) = params["m"], params["l"]
-    coupling = l1 * l2 * m2 * jnp.cos(q[0] - q[1])
+    coupling = l1 * l2 * m2 * trigonometry.cos(q[0] - q[1])
     return jnp.array([[l1**2 * (m1 + m2), coupling], [coupling, l2**2 * m2]])
 
 
-def weight_and_inertia(q, v, params):
+def weight_and_inertia(q, v, params, trigonometry=jnp):
     """Q without the joint torques."""
     (m1, m2), (l1, l2), g = params["m"], params["l"], params["g"]
-    coupling = l1 * l2 * m2 * jnp.sin(q[0] - q[1])
+    coupling = l1 * l2 * m2 * trigonometry.sin(q[0] - q[1])
     return jnp.array(
         [
-            -l1 * (m1 + m2) * g * jnp.cos(q[0]) - coupling * v[1] ** 2,
-            -l2 * m2 * g * jnp.cos(q[1]) + coupling * v[0] ** 2,
+            -l1 * (m1 + m2) * g * trigonometry.cos(q[0]) - coupling * v[1] ** 2,
+            -l2 * m2 * g * trigonometry.cos(q[1]) + coupling * v[0] ** 2,
         ]
     )
 
@@ -37,25 +40,32 @@ def joint_torques(q, v, params):
     return -k1 * q[0] - c1 * v[0], -k2 * (q[1] - q[0]) - c2 * (v[1] - v[0])
 
 
-def force_as_printed(q, v, t, params):
+def force_as_printed(q, v, t, params, trigonometry=jnp):
     """Q as Kim et al. computed it: joint 2 acts on link 2 without a reaction on link 1."""
-    return weight_and_inertia(q, v, params) + jnp.array(joint_torques(q, v, params))
+    return weight_and_inertia(q, v, params, trigonometry) + jnp.array(joint_torques(q, v, params))
 
 
-def force(q, v, t, params):
+def force(q, v, t, params, trigonometry=jnp):
     """Q with the reaction of joint 2 on link 1."""
     first, second = joint_torques(q, v, params)
-    return weight_and_inertia(q, v, params) + jnp.array([first - second, second])
+    return weight_and_inertia(q, v, params, trigonometry) + jnp.array([first - second, second])
 
 
-def free() -> Scene:
+@cache  # equal functions for equal systems
+def _using(trigonometry, function):
+    return function if trigonometry is jnp else partial(function, trigonometry=trigonometry)
+
+
+def free(trigonometry=jnp) -> Scene:
     """No springs, no dampers: chaotic, conservative."""
     params = {"m": (1.0, 1.0), "l": (1.0, 1.5), "k": (0.0, 0.0), "c": (0.0, 0.0), "g": GRAVITY}
-    return Scene(System(mass, force), params, jnp.zeros(2), jnp.zeros(2), 10.0)
+    system = System(_using(trigonometry, mass), _using(trigonometry, force))
+    return Scene(system, params, jnp.zeros(2), jnp.zeros(2), 10.0)
 
 
-def stiff(as_printed=False) -> Scene:
+def stiff(as_printed=False, trigonometry=jnp) -> Scene:
     """Stiff joints, the second one damped by 10000 N m s/rad; as_printed: the paper's torques."""
     params = {"m": (10.0, 1.0), "l": (1.0, 1.5), "k": (400.0, 300.0), "c": (15.0, 10000.0), "g": GRAVITY}
-    system = System(mass, force_as_printed if as_printed else force)
+    torques = force_as_printed if as_printed else force
+    system = System(_using(trigonometry, mass), _using(trigonometry, torques))
     return Scene(system, params, jnp.zeros(2), jnp.zeros(2), 8.0)

@@ -1,0 +1,153 @@
+"""Makes README.md from the committed benchmarks.json, so that no number is copied by hand.
+
+python -m experiments.benchmarks.page
+"""
+
+import json
+from pathlib import Path
+
+from experiments.page import find, table
+
+HERE = Path(__file__).parent
+PREDICTOR, AUTO, CONVERGED = "non-iterative, predictor", "non-iterative, auto", "converged"
+
+
+def number(x, unit=""):
+    """Three digits, or a dash."""
+    return "-" if x is None else f"{x:.3g}{unit}"
+
+
+def rows_table(rows, columns):
+    """columns: {heading: key}; numbers to three digits."""
+    cells = [[x if isinstance(x := row.get(key), str) else number(x) for key in columns.values()] for row in rows]
+    return table(list(columns), cells)
+
+
+def bars(numbers):
+    """What was aimed at and what was found: (what, bar, found, met)."""
+    c, stiff = numbers["against_c"], numbers["against_c"]["stiff_ns_per_step"]
+    single = {(r["trigonometry"], r["saved"]): r for r in c["single"] if r["method"] == PREDICTOR}
+    gradient = find(numbers["gradients"]["long"], steps=100_000, saved="path")
+    found = []
+    if c["c_ns_per_step"]:
+        found += [
+            ("one trajectory, polynomial sines, end saved, over C", 1.2, single["polynomial", "end"]["over_c"]),
+            ("the same with jnp.sin", 2.0, single["jnp", "end"]["over_c"]),
+            ("batch of 256, polynomial sines, over C", 1.5, find(c["batch"], trigonometry="polynomial")["over_c"]),
+        ]
+    for name in ("polynomial", "jnp"):
+        ratio = single[name, "path"]["ns_per_step"] / single[name, "end"]["ns_per_step"]
+        found.append((f"every step saved over the end only, {name}", 1.3, ratio))
+    found += [
+        ("value and gradient over value, 4 parameters, 1e5 steps, path", 4.0, gradient["gradient_over_forward"]),
+        ("its temporary memory, MB", 5.0, gradient["gradient_temporary_bytes"] / 1e6),
+    ]
+    for r in numbers["compile_time"]["rows"]:
+        if r["method"] == "hht, auto" and r["over_kvaerno3"] is not None:
+            limit = 0.5 if r["compiled"] == "run" else 1.0
+            found.append((f"compile time of a {r['compiled']} over diffrax Kvaerno3", limit, r["over_kvaerno3"]))
+    at_least = [
+        ("converged over non-iterative, predictor, time per step", 2.0, stiff[CONVERGED] / stiff[PREDICTOR]),
+        ("converged over non-iterative, auto, time per step", 2.0, stiff[CONVERGED] / stiff[AUTO]),
+    ]
+    for N, limit in ((8, 8.0), (16, 9.0), (64, 30.0)):
+        mine = [r["faster_than_obvious_N2"] for r in numbers["chains"]["rows"] if r["N"] == N and r["step"] == "ours"]
+        at_least.append((f"obvious step over ours, chain of {N}", limit, max(mine)))
+    lines = [[what, f"<= {limit:g}", f"{x:.2f}", "yes" if x <= limit else "no"] for what, limit, x in found]
+    lines += [[what, f">= {limit:g}", f"{x:.2f}", "yes" if x >= limit else "no"] for what, limit, x in at_least]
+    return table(["what", "bar", "here", "met"], lines)
+
+
+def page(numbers):
+    """The text of README.md."""
+    c, batches, gradients = (numbers[part] for part in ("against_c", "batches", "gradients"))
+    machine = numbers["machine"]
+    differences = [
+        r["q_minus_c_rad"] for r in c["single"] if r["method"] == PREDICTOR and r["q_minus_c_rad"] is not None
+    ]
+    columns = list(dict.fromkeys(key for row in batches["rows"] for key in row if key != "num_steps"))
+    missing = numbers["compile_time"]["not_installed"]
+    return (
+        (HERE / "page.md")
+        .read_text()
+        .format(
+            machine=(
+                f"{machine['processor']}, {machine['cores']} cores; jax {machine['jax']}, Python {machine['python']}; "
+                f"{machine['compiler'] or 'no C compiler'}; load at the start {machine['load_at_start']:.1f}; "
+                f"`XLA_FLAGS={machine['XLA_FLAGS']}`."
+            ),
+            bars=bars(numbers),
+            difference=number(max(differences, default=None)),
+            steps=c["num_steps"],
+            single=rows_table(
+                c["single"],
+                {
+                    "method": "method",
+                    "sines": "trigonometry",
+                    "saved": "saved",
+                    "ns per step": "ns_per_step",
+                    "over the best C": "over_c",
+                    "compile (s)": "compile_s",
+                },
+            ),
+            c=table(["C", "ns per step"], [[name, number(x)] for name, x in c["c_ns_per_step"].items()]),
+            members=c["members"],
+            batch=table(
+                ["", "ns per step and member", "over the best C"],
+                [[r["trigonometry"], number(r["ns_per_step_and_member"]), number(r["over_c"])] for r in c["batch"]]
+                + [[name, number(x), "-"] for name, x in c["c_batch_ns"].items()],
+            ),
+            stiff=", ".join(f"{name} {x:.0f}" for name, x in c["stiff_ns_per_step"].items()),
+            structure=rows_table(
+                numbers["structure"]["rows"],
+                {
+                    "structure": "structure",
+                    "N": "N",
+                    "us per step": "us_per_step",
+                    "without": "without_us_per_step",
+                    "ratio": "time_over_without",
+                },
+            ),
+            block=batches["block"],
+            batches=table(
+                columns, [[f"{x:.4g}" if (x := r.get(k)) else "-" for k in columns] for r in batches["rows"]]
+            ),
+            over=", ".join(f"{name} {x:.0f}" for name, x in batches["over"].items()),
+            long=rows_table(
+                [{**r, "MB": r["gradient_temporary_bytes"] / 1e6, "steps": f"{r['steps']}"} for r in gradients["long"]],
+                {"steps": "steps", "saved": "saved", "time over value's": "gradient_over_forward", "MB": "MB"},
+            ),
+            num_steps=gradients["num_steps"],
+            gradients=rows_table(
+                [{**r, "MB": r["temporary_bytes"] / 1e6} for r in gradients["rows"]],
+                {
+                    "": "derivative",
+                    "us per step": "us_per_step",
+                    "over the primal": "over_primal",
+                    "MB": "MB",
+                    "compile (s)": "compile_s",
+                },
+            ),
+            chains=rows_table(
+                numbers["chains"]["rows"],
+                {
+                    "N": "N",
+                    "step": "step",
+                    "formulation": "formulation",
+                    "us per step": "us_per_step",
+                    "obvious / this, same formulation": "faster_than_obvious_same_functions",
+                    "obvious on N^2 sines / this": "faster_than_obvious_N2",
+                },
+            ),
+            compile_steps=numbers["compile_time"]["num_steps"],
+            not_installed=f"Not installed where this was made: {', '.join(missing)}." if missing else "",
+            compile=rows_table(
+                numbers["compile_time"]["rows"],
+                {"method": "method", "of": "compiled", "s": "compile_s", "over Kvaerno3's": "over_kvaerno3"},
+            ),
+        )
+    )
+
+
+if __name__ == "__main__":
+    (HERE / "README.md").write_text(page(json.loads((HERE / "benchmarks.json").read_text())))

@@ -1,0 +1,86 @@
+"""Richardson's extrapolation over the step size: values, and whole runs."""
+
+from functools import partial, reduce
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax import kinematics, rotation
+
+MOST = 4  # levels; rounding and work grow with each
+
+
+def richardson(values, order, combine=None):
+    """Richardson's value of pytrees that belong to h, h/2, h/4, ..., with errors h^order, h^(order + 1), ...
+
+        fine + (fine - coarse)/(2^p - 1),    p = order, order + 1, ...
+
+    combine: (gain, coarse, fine) -> fine + gain (fine - coarse), in place of that on each leaf.
+
+    >>> [round(richardson([1 + h**2 + h**3 for h in (0.4, 0.2, 0.1)][:levels], 2), 6) + 0.0 for levels in (2, 3)]
+    [0.989333, 1.0]
+    """
+    combine = combine or _on_leaves
+    while len(values) > 1:
+        gain = 1 / (2**order - 1)
+        values = [combine(gain, coarse, fine) for coarse, fine in pairwise(values)]
+        order += 1
+    return values[0]
+
+
+def _on_leaves(gain, coarse, fine):
+    return jax.tree.map(partial(_take_out, gain), coarse, fine)
+
+
+def _take_out(gain, coarse, fine):
+    return fine + gain * (fine - coarse)
+
+
+def extrapolated(run, levels, order, join):
+    """The `Solution` without the leading errors in dt of several runs, at the saved times of the first.
+
+    run: k -> the `Solution` with steps of dt/k at the same saved times. order: of the stepper. join: two `Info` of an
+    interval into one. Rotations are moved along the one that leads from the coarse to the fine.
+    """
+    solutions = [run(2**level) for level in range(levels)]
+    first = solutions[0]
+
+    def value(name, combine=None):
+        return richardson([getattr(solution, name) for solution in solutions], order, combine)
+
+    turns = first.acceleration is not None  # a first-order system has no rotations
+    q = value("q", partial(_positions, first.v) if turns else None)
+    v, acceleration, multipliers = (value(name) for name in ("v", "acceleration", "multipliers"))
+    return first._replace(
+        q=q,
+        v=v,
+        acceleration=acceleration,
+        multipliers=multipliers,
+        info=reduce(join, [solution.info for solution in solutions]),
+        failure=_first([solution.failure for solution in solutions]),
+    )
+
+
+def _positions(v, gain, coarse, fine):
+    """`_take_out` of saved positions."""
+
+    def turn(coarse, fine):
+        shape = fine.shape
+        beyond = jax.vmap(lambda A, B: rotation.product(B, rotation.exp(gain * rotation.log(rotation.product(A.T, B)))))
+        return beyond(*(R.reshape(-1, 3, 3) for R in (coarse, fine))).reshape(shape)
+
+    def leaf(v, coarse, fine):
+        return turn(coarse, fine) if kinematics.is_rotation(fine.shape, v.shape) else _take_out(gain, coarse, fine)
+
+    return jax.tree.map(leaf, v, coarse, fine)
+
+
+def _first(failures):
+    """The one that comes first in time, its step counted in those of the first run."""
+    first = failures[0]
+    for level, failure in enumerate(failures[1:], 1):
+        step = -(-failure.step // 2**level)
+        earlier = (step > 0) & ((first.step == 0) | (step < first.step))
+        first = jax.tree.map(partial(jnp.where, earlier), failure._replace(step=step), first)
+    return first
