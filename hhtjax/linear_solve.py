@@ -29,8 +29,13 @@ def solve_map(f, b, factorize):
 
 def factorize_map(f, like, factorize):
     """The function b -> x with f(x) = b, for vectors like `like`: `solve_map` for many b, factorised once."""
-    inverse = factorize(matrix(f, like))
+    inverse = invert(f, like, factorize)
     return lambda b: _solve(f, b, inverse)
+
+
+def invert(f, like, factorize):
+    """The function (b, trans=0) -> A^-1 b, or A^-T b, of the matrix A of f; it may be constant to autodiff."""
+    return factorize.of_map(f, like) if isinstance(factorize, Structured) else factorize(matrix(f, like))
 
 
 def matrix(f, like):
@@ -63,8 +68,22 @@ def factorize(A):
     return partial(lu_solve, lu_factor(A))
 
 
+class Structured:
+    """A `factorize` that is given the linear map f itself: `of_map(f, like)` is what `invert` promises."""
+
+    def of_map(self, f, like):
+        """(b, trans=0) -> A^-1 b, or A^-T b."""
+        raise NotImplementedError
+
+    def __call__(self, A):
+        """The same for a matrix."""
+        return self.of_map(partial(matvec, A), A[0])
+
+
 def factorize_with(solve):
     """The same from a function solve(A, b), which need not be differentiable."""
+    if isinstance(solve, Structured):
+        return solve
 
     def factorize(A):
         A = lax.stop_gradient(A)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.kernels import staged
-from hhtjax.linear_solve import matrix, solve_map
+from hhtjax.linear_solve import invert, solve_map
 from hhtjax.steppers.stepper import Info
 
 
@@ -50,7 +50,7 @@ def newton(r, path, w, s, factorize, tolerance, max_iterations):
         def improve(carry):
             w0, value, iterations, _ = carry
             _, tangent = staged(partial(jax.linearize, f))(w0)
-            w1 = w0 - factorize(matrix(tangent, w))(value, trans=0)
+            w1 = w0 - invert(tangent, w, factorize)(value, trans=0)
             value = f(w1)
             converged = jnp.all(jnp.abs(value) <= tolerance) | lost_in_rounding(path(w0), path(w1))
             return w1, value, iterations + 1, converged
