@@ -178,7 +178,7 @@ def simulate(
         sizes = {"num_steps": k * int(num_steps), "save_every": k * int(save_every)}
         return _simulate(system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress)
 
-    return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, _join)
+    return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "save_every", "progress"))

@@ -1,8 +1,8 @@
 """One step at a time, at 1 kHz from Python: latency, deadlines, hardware in the loop, a constant amount of work.
 
-The step is compiled ahead of time, with the state as one vector, so that a call hands over two arrays. The same
-program exported, written to bytes and read again. It is one kernel (hhtjax/kernels.py) where XLA can. Latencies of calls back to back, and of calls started at each
-millisecond; a deadline is missed if the answer is not there a millisecond later.
+The step is compiled ahead of time, with the state as one vector, so that a call hands over two arrays; it is one kernel
+(hhtjax/kernels.py) where XLA can. The same program exported, written to bytes and read again. Latencies of calls back
+to back, and of calls started at each millisecond; a deadline is missed if the answer is not there a millisecond later.
 """
 
 import queue

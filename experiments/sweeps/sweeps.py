@@ -2,9 +2,9 @@
 
 from experiments.parts import run_experiment
 from experiments.report import Report
-from experiments.sweeps import real_time
+from experiments.sweeps import large, real_time
 
-GROUPS = ([real_time],)
+GROUPS = [large], [real_time]
 
 
 def run(report: Report, fast: bool):
