@@ -25,7 +25,7 @@ def timed(function):
 def run(report, fast):
     """Double pendulum, polynomial sines, free."""
     system, params, q0, v0, _ = double_pendulum.free(trigonometry)
-    dts = np.logspace(-4, -1, 31) if not fast else np.logspace(-2, -1, 3)
+    dts = np.logspace(-4, -1, 31) if not fast else np.logspace(-2, -1, 2)
 
     def together():
         return hhtjax.sweep(

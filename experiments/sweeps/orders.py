@@ -134,7 +134,7 @@ def run(report, fast):
 
 def figure(rows, coarse, biases):
     """Errors of the steppers, of alpha, and of the stiffness."""
-    drawn, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 4), sharey=False)
+    drawn, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 5), sharey=False)
     shown = [row for row in rows if row["alpha"] in (None, -0.1) and row["method"] != "hht predictor"]
     for i, row in enumerate(shown):
         style = {"color": COLOURS[i % 8], "marker": MARKERS[i % 8], "ms": 3, "ls": ("-", "--")[i // 8], "lw": 1}
@@ -154,5 +154,5 @@ def figure(rows, coarse, biases):
         axes.set_ylabel("error of the angles after 1 s (rad)")
     for axes in (left, middle, right):
         axes.set_xlabel("step size (s)")
-        axes.legend(fontsize=6)
+        axes.legend(fontsize=6.5, ncols=2, handlelength=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
     return drawn

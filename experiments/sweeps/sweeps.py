@@ -1,10 +1,10 @@
-"""Step sizes as data: orders of all steppers, maps of many members, large systems, many devices, real time."""
+"""Step sizes as data: one call for all, orders, maps of many members, devices, large systems, real time."""
 
 from experiments.parts import run_experiment
 from experiments.report import Report
-from experiments.sweeps import large, real_time
+from experiments.sweeps import devices, large, map, one_call, orders, real_time
 
-GROUPS = [large], [real_time]
+GROUPS = [real_time, one_call, map], [devices, orders, large]  # two processes if fast
 
 
 def run(report: Report, fast: bool):
