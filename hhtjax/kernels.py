@@ -40,7 +40,7 @@ KNOWN = {
 LARGEST_SUM = 1024  # elements; XLA hands larger ones to another library, and products of matrices
 LARGEST_PRODUCT = 7  # rows and columns
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
-MOST_OPERATIONS = 20_000  # in one function; LLVM takes long over more
+MOST_OPERATIONS = 5000  # compiling one function takes longer than in proportion: beyond, minutes
 
 
 def one_kernel(f, *args):
@@ -118,8 +118,8 @@ def _attach(call, **attributes):
 def _make_kernel(module, call):
     """Lets `call` find a function that calls the one it called, as a kernel.
 
-    XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once it is optimised. So the
-    kernel returns an element of each, and the function between drops them.
+    XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once a constant is put in its place.
+    So the kernel returns an element of each; the function between drops them, and hides the values.
     """
     name = _callee(call)
     with call.location:
@@ -137,7 +137,8 @@ def _make_kernel(module, call):
             del kernel.attributes["res_attrs"]
         between = func.FuncOp(name, old_type, ip=module.ip)
         with ir.InsertionPoint(between.add_entry_block()):
-            inner = func.CallOp(new_type.results, _insert(module, kernel), between.arguments)
+            hidden = stablehlo.OptimizationBarrierOp(between.arguments).results
+            inner = func.CallOp(new_type.results, _insert(module, kernel), hidden)
             func.ReturnOp(list(inner.results)[: len(old_type.results)])
         _attach(inner.operation, inlineable="false", xla_cpu_small_call="true")
         between.attributes["sym_visibility"] = ir.StringAttr.get("private")
