@@ -29,6 +29,7 @@ EXPERIMENTS = {
     "sweeps": "sweeps.sweeps",
     "gradient_cost": "benchmarks.gradient_cost",
     "benchmarks": "benchmarks.benchmarks",
+    "work_precision": "work_precision.work_precision",
 }
 HERE = Path(__file__).parent
 

@@ -51,7 +51,7 @@ def kvaerno(k):
 
 def run(report, fast):
     """The least of several compilations in turns, all caches empty each time."""
-    losses = {
+    losses: dict = {
         "hht, predictor": partial(ours, hhtjax.hht(linearize="predictor")),
         "hht, auto": partial(ours, hhtjax.hht()),
         "hht, converged": partial(ours, hhtjax.hht(iterations=None)),

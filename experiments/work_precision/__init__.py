@@ -1,0 +1,1 @@
+"""Error against time, against other packages."""

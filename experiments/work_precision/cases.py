@@ -1,0 +1,140 @@
+"""The scenes: as a system for our steppers, as an ODE for everyone else, with a reference to compare with."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from scipy.integrate import solve_ivp
+
+import hhtjax
+from experiments.benchmarks.chain import chain
+from experiments.cardona_geradin1989.index_1 import unconstrained
+from hhtjax.linear_solve import solve
+from hhtjax.rotation import hat
+from hhtjax.scenes import Scene, double_pendulum, duffing, squeezer, top
+
+SAMPLES = 50  # times at which positions are compared
+TRIGONOMETRY = hhtjax.trigonometry
+
+
+class Case(NamedTuple):
+    """scene: for our steppers. rate: dy/dt of y, `rate(t, y, params)`. size: of the position, the first numbers of y.
+    ode: a system that steppers without constraints or rotations can take, and its start. unit: of the position."""
+
+    scene: Scene
+    rate: Any
+    y0: np.ndarray
+    size: int
+    ode: Any
+    unit: str = "rad"
+
+    @property
+    def times(self):
+        """The sample times, without the start."""
+        return np.linspace(0.0, self.scene.duration, SAMPLES + 1)[1:]
+
+
+def second_order(scene, unit="rad", system=None):
+    """The case of a scene in vectors q and v; system: one without constraints, if it has some."""
+    plain = system or scene.system
+    n = scene.q0.size
+
+    def rate(t, y, params):
+        q, v = y[:n], y[n:]
+        M = jnp.asarray(plain.mass(q, params) if callable(plain.mass) else plain.mass)
+        Q = plain.force(q, v, t, params)
+        return jnp.concatenate([v, Q / M if M.ndim == 1 else solve(M, Q)])
+
+    y0 = np.concatenate([scene.q0, scene.v0])
+    return Case(scene, rate, y0, n, (plain, scene.q0, scene.v0), unit)
+
+
+def spinning_top():
+    """The top as a rotation: for the others as 9 numbers and 3 angular velocities."""
+    scene = top.minimal()
+
+    def rate(t, y, params):
+        R, Om = y[:9].reshape(3, 3), y[9:]
+        moment = scene.system.force(R, Om, t, params)
+        return jnp.concatenate([(R @ hat(Om)).ravel(), moment / scene.system.mass(R, params)])
+
+    system = hhtjax.FirstOrderSystem(lambda y, t, params: rate(t, y, params))
+    y0 = np.concatenate([np.ravel(scene.q0), scene.v0])
+    return Case(scene, rate, y0, 9, (system, jnp.asarray(y0), None), "1")
+
+
+def at(scene, duration):
+    """The scene with another duration."""
+    return scene._replace(duration=duration)
+
+
+@cache
+def cases():
+    """{name: Case}."""
+    linkage = squeezer.squeezer()
+    return {
+        "free double pendulum": second_order(at(double_pendulum.free(TRIGONOMETRY), 5.0)),
+        "stiff double pendulum": second_order(at(double_pendulum.stiff(trigonometry=TRIGONOMETRY), 5.0)),
+        "stiff double pendulum, torques as printed": second_order(
+            at(double_pendulum.stiff(True, trigonometry=TRIGONOMETRY), 5.0)
+        ),
+        "stiff chain of 8": second_order(chain(8, k=10.0, c=0.3, duration=2.0)),
+        "forced Duffing": second_order(duffing.driven(), "m"),
+        "hardening spring": second_order(duffing.hardening_spring(), "m"),
+        "squeezer": second_order(linkage, "rad", unconstrained(linkage.system, linkage.q0.size)),
+        "top": spinning_top(),
+    }
+
+
+@cache
+def reference(name):
+    """Positions at the sample times, (SAMPLES, size), by SciPy's DOP853 at a tolerance of 1e-13."""
+    case = cases()[name]
+    rate = jax.jit(case.rate)
+    run = solve_ivp(
+        lambda t, y: np.asarray(rate(t, y, case.scene.params)),
+        (0.0, case.scene.duration),
+        case.y0,
+        "DOP853",
+        case.times,
+        rtol=1e-13,
+        atol=1e-14,
+    )
+    return run.y[: case.size].T
+
+
+def rms_error(name, positions):
+    """Root mean square over times and coordinates; None where it is not finite, or positions is None."""
+    if positions is None or np.shape(positions) != (SAMPLES, cases()[name].size):
+        return None
+    error = float(np.sqrt(np.mean((np.asarray(positions) - reference(name)) ** 2)))
+    return error if np.isfinite(error) else None
+
+
+def flat(q):
+    """A position as a vector."""
+    return ravel_pytree(q)[0]
+
+
+def march(system, stepper, q0, v0, params, duration, substeps):
+    """Positions at the sample times, and the number of factorised matrices, substeps of them between samples.
+
+    A loop around `stepper.step`, the step that `hhtjax.simulate` takes.
+    """
+    dt = duration / (SAMPLES * substeps)
+
+    def step(_, carry):
+        state, solves = carry
+        state, info = stepper.step(system, state, params, dt)
+        return state, solves + (1 if info.iterations is None else info.iterations)
+
+    def interval(carry, _):
+        carry = jax.lax.fori_loop(0, substeps, step, carry)
+        return carry, flat(carry[0].q)
+
+    start = stepper.init(system, q0, v0, params, dt)
+    (_, solves), path = jax.lax.scan(interval, (start, 0), None, SAMPLES)
+    return path, solves

@@ -1,0 +1,57 @@
+"""Our steppers, as compiled loops."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+import hhtjax
+from experiments.work_precision.cases import SAMPLES, cases, march
+from experiments.work_precision.timing import sweep
+from hhtjax.extrapolation import richardson
+
+SMOOTH = hhtjax.hht(linearize="predictor")
+METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a step if it does not count them
+    "hht": (hhtjax.hht(), 1, None),
+    "hht, predictor": (SMOOTH, 1, None),
+    "hht, converged": (hhtjax.hht(iterations=None), 1, None),
+    "hht, extrapolate=2": (SMOOTH, 2, None),
+    "hht, extrapolate=3": (SMOOTH, 3, None),
+    "rosenbrock": (hhtjax.rosenbrock(), 1, 1),
+    "rowda": (hhtjax.rowda(), 1, 1),
+    "rowda, extrapolate=2": (hhtjax.rowda(), 2, 1),
+    "rk4": (hhtjax.rk4(), 1, 4),
+}
+PLAIN = "rosenbrock", "rowda", "rowda, extrapolate=2", "rk4"  # take the system without constraints and rotations
+
+
+def run(system, stepper, levels, q0, v0, duration, params, substeps):
+    """As `march`, extrapolated."""
+    march_by = partial(march, system, stepper, q0, v0, params, duration)
+    if levels == 1:
+        return march_by(substeps)
+    paths, solves = jax.lax.map(march_by, substeps * 2 ** jnp.arange(levels))  # a loop, so that one program serves all
+    return richardson(list(paths), stepper.order), jnp.sum(solves)
+
+
+def entries(name, sizes, only=None):
+    """Rows of all methods on a case."""
+    case = cases()[name]
+    system, params, q0, v0, duration = case.scene
+    params = jax.tree.map(jnp.asarray, params)
+    rows = []
+    for method, (stepper, levels, solves) in METHODS.items():
+        if only is not None and method not in only:
+            continue
+        start = case.ode if method in PLAIN else (system, q0, v0)
+
+        program = jax.jit(
+            partial(run, start[0], stepper, levels, *start[1:], duration)
+        )  # what stays the same is not passed on
+
+        def solve(substeps, program=program, levels=levels, solves=solves):
+            path, count = program(params, substeps)
+            return path[:, : case.size], count if solves is None else solves * SAMPLES * substeps * (2**levels - 1)
+
+        rows += sweep(name, method, "ours", solve, sizes, lambda n: {"h_s": duration / (SAMPLES * n)})
+    return rows

@@ -1,0 +1,106 @@
+"""Makes README.md from the committed work_precision.json, so that no number is copied by hand.
+
+python -m experiments.work_precision.page
+"""
+
+import json
+from pathlib import Path
+
+from experiments.page import table
+from experiments.work_precision.figures import PACKAGES
+
+HERE = Path(__file__).parent
+STIFF = "stiff double pendulum"
+BARS = {"0.001": 30, "0.0001": 18, "1e-06": 5}
+SAMPLES = 50
+
+
+def ms(t):
+    """Milliseconds to three digits, or a dash."""
+    return "-" if t is None else f"{1e3 * t:.3g}"
+
+
+def best(entries, level, packages=PACKAGES):
+    """(time, method) of the fastest, or (None, "-")."""
+    found = [(e["time_s"][level], e["method"]) for e in entries if e["package"] in packages]
+    return min(((t, m) for t, m in found if t is not None), default=(None, "-"))
+
+
+def best_table(times):
+    """Best times of each package: a row for each case and level."""
+    present = [p for p in PACKAGES if any(e["package"] == p for entries in times.values() for e in entries)]
+    rows = []
+    for name, entries in times.items():
+        for level in ("0.001", "0.0001", "1e-06", "1e-08"):
+            cells = []
+            for package in present:
+                t, method = best(entries, level, (package,))
+                cells.append("-" if t is None else f"{ms(t)} ({method.removeprefix(package).strip()})")
+            rows.append([name, level, *cells])
+    return table(["", "error", *present], rows)
+
+
+def bars(entries):
+    """On the stiff double pendulum: peers over ours."""
+    rows = []
+    for level, bar in BARS.items():
+        (ours, method), (theirs, peer) = best(entries, level, PACKAGES[:1]), best(entries, level, PACKAGES[1:])
+        default = next(e["time_s"][level] for e in entries if e["method"] == "hht")
+        ratios = ["-" if t is None or theirs is None else f"{theirs / t:.1f}" for t in (ours, default)]
+        rows.append([level, f"{peer}: {ms(theirs)} ms", f"{method}: {ms(ours)} ms", *ratios, f">= {bar}"])
+    return table(["error", "best peer", "best of ours", "ratio", "over the default `hht()`", "bar"], rows)
+
+
+def losses(times):
+    """A sentence for each case and level at which a peer is faster than all of ours, or than the default."""
+    lines = []
+    for name, entries in times.items():
+        for level in next(iter(entries))["time_s"]:
+            (ours, _), (theirs, peer) = best(entries, level, PACKAGES[:1]), best(entries, level, PACKAGES[1:])
+            default = next(e["time_s"][level] for e in entries if e["method"] == "hht")
+            if theirs is None:
+                continue
+            if ours is None or theirs < ours:
+                ratio = (
+                    "none of ours gets there" if ours is None else f"in {theirs / ours:.2f} of the best of our times"
+                )
+                lines.append(f"* {name}, {level}: {peer}, {ratio}.")
+            elif default is None or theirs < default:
+                ratio = "it does not get there" if default is None else f"{default / theirs:.1f} times as fast"
+                lines.append(f"* {name}, {level}: only the default `hht()` loses, to {peer} ({ratio}).")
+    return "\n".join(lines) or "Nowhere, in these runs."
+
+
+def times_table(entries, heading):
+    """All methods, in ms."""
+    levels = list(entries[0]["time_s"])
+    return table([heading, *levels], [[e["method"], *(ms(e["time_s"][level]) for level in levels)] for e in entries])
+
+
+def page(numbers):
+    """The text of README.md."""
+    machine, times, missing = numbers["machine"], numbers["times"], numbers["not_installed"]
+    versions = ", ".join(f"{name} {version}" for name, version in numbers["versions"].items())
+    return (
+        (HERE / "page.md")
+        .read_text()
+        .format(
+            machine=(
+                f"{machine['processor']}, {machine['cores']} cores; jax {machine['jax']}, {versions}, Python "
+                f"{machine['python']}; {machine['compiler'] or 'no C compiler'}; load at the start "
+                f"{machine['load_at_start']:.1f}; `XLA_FLAGS={machine['XLA_FLAGS']}`."
+            ),
+            missing=f"Not installed where this was made, and left out: {', '.join(missing)}." if missing else "",
+            samples=SAMPLES,
+            longest=numbers["longest_s"],
+            best=best_table(times),
+            bars=bars(times[STIFF]),
+            losses=losses(times),
+            gradients="\n\n".join(times_table(entries, name) for name, entries in numbers["gradient_times"].items()),
+            tables="\n\n".join(times_table(entries, name) for name, entries in times.items()),
+        )
+    )
+
+
+if __name__ == "__main__":
+    (HERE / "README.md").write_text(page(json.loads((HERE / "work_precision.json").read_text())))

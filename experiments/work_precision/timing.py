@@ -1,0 +1,64 @@
+"""One method over all its step sizes or tolerances: errors, times and work."""
+
+import time
+
+import jax
+import numpy as np
+
+from experiments.work_precision.cases import rms_error
+
+LONGEST = 0.15  # s, of a run; nothing finer is tried after one that takes longer, or eight times as long if it is wrong
+REPEATS = 5
+PATIENCE = 0.08  # s, for the repeats of a run
+
+
+def seconds(function, compiles):
+    """What it returns, and the least wall time of up to REPEATS calls; after one more, if the first one compiles."""
+    if compiles:
+        jax.block_until_ready(function())
+    times: list = []
+    while not times or (len(times) < REPEATS and sum(times) < PATIENCE):
+        start = time.perf_counter()
+        result = jax.block_until_ready(function())
+        times.append(time.perf_counter() - start)
+    return result, min(times)
+
+
+def too_long(time_s, error):
+    """Whether to stop refining."""
+    return time_s > (LONGEST if error is not None and error < 1 else 8 * LONGEST)
+
+
+def sweep(case, method, package, solve, settings, describe):
+    """Rows of a method on a case, from coarse to fine.
+
+    solve: setting -> positions at the sample times (None if it failed), and factorised matrices, None if not known.
+    describe: setting -> its entry in the row.
+    """
+    rows = []
+    for i, setting in enumerate(settings):
+        (positions, solves), time_s = seconds(lambda setting=setting: solve(setting), compiles=i == 0)
+        row = {"case": case, "method": method, "package": package, **describe(setting)}
+        error = rms_error(case, positions)
+        rows.append(row | {"rms_error": error, "time_s": time_s, "solves": None if solves is None else int(solves)})
+        if too_long(time_s, error) or (error is not None and error < 1e-11):
+            break
+    return rows
+
+
+def time_to(rows, error):
+    """Time at which a method reaches an error: along the line between its runs in a log-log plot; None if it does not.
+
+    Of the runs with the same or a smaller error than all cheaper ones; the first of them counts as it is.
+    """
+    best: list = []
+    for row in sorted((r for r in rows if r["rms_error"]), key=lambda r: r["time_s"]):
+        if not best or row["rms_error"] < best[-1]["rms_error"]:
+            best.append(row)
+    for before, row in zip([None, *best], best, strict=False):
+        if row["rms_error"] <= error:
+            if before is None:
+                return row["time_s"]
+            x, y = ([np.log(r[key]) for r in (before, row)] for key in ("rms_error", "time_s"))
+            return float(np.exp(np.interp(-np.log(error), -np.array(x), y)))
+    return None

@@ -1,0 +1,90 @@
+"""Richardson's extrapolation of whole runs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from zoo import PROBLEMS, as_data, reference, run
+
+import hhtjax
+from hhtjax import rotation
+from hhtjax.scenes import top
+
+DUFFING = PROBLEMS["forced Duffing"]
+
+
+def smooth(alpha):
+    """The step that is a smooth function of dt, alpha as data."""
+    return as_data(hhtjax.hht(alpha, linearize="predictor"))
+
+
+@pytest.mark.parametrize(("alpha", "levels", "order"), [(-0.3, 2, 3), (-0.3, 3, 4), (0.0, 2, 4)])
+def test_each_level_adds_an_order_and_the_trapezoidal_rule_two(alpha, levels, order):
+    errors = [
+        abs(run(DUFFING, smooth(alpha), n, save_every=n, extrapolate=levels).q[-1] - reference("forced Duffing"))
+        for n in (40, 80)
+    ]
+    assert float(np.log2(errors[0] / errors[1])[0]) == pytest.approx(order, abs=0.2)
+
+
+def test_all_quantities_at_the_saved_times_of_the_first_run():
+    stepper = hhtjax.hht(iterations=None)
+    found = run(DUFFING, stepper, 20, save_every=4, extrapolate=2)
+    coarse, fine = (run(DUFFING, stepper, 20 * k, save_every=4 * k) for k in (1, 2))
+    np.testing.assert_array_equal(found.t, coarse.t)
+    assert float(found.dt) == float(coarse.dt)
+    for field in ("q", "v", "acceleration"):
+        a, b = getattr(coarse, field), getattr(fine, field)
+        np.testing.assert_allclose(getattr(found, field), (4 * b - a) / 3, rtol=1e-13)
+    np.testing.assert_array_equal(found.info.iterations, coarse.info.iterations + fine.info.iterations)
+    np.testing.assert_array_equal(found.info.residual, np.maximum(coarse.info.residual, fine.info.residual))
+    found.check()
+
+
+def test_derivatives_are_those_of_the_extrapolated_value():
+    @jax.jit
+    def end(k):
+        path = run(DUFFING._replace(params={**DUFFING.params, "k": k}), smooth(-0.1), 20, save_every=20, extrapolate=2)
+        return path.q[-1, 0]
+
+    reverse, forward = jax.jit(lambda k: (jax.grad(end)(k), jax.jvp(end, (k,), (1.0,))[1]))(1.0)
+    assert float(reverse) == pytest.approx(float(forward), rel=1e-12)
+    assert float(reverse) == pytest.approx(float(end(1 + 1e-5) - end(1 - 1e-5)) / 2e-5, rel=1e-8)
+
+
+def test_rotations_stay_rotations():
+    system, params, q0, v0, _ = top.minimal()
+
+    def positions(k, **options):
+        return hhtjax.simulate(
+            system, hhtjax.hht(), q0, v0, params, dt=1e-3 / k, num_steps=4 * k, save_every=2 * k, **options
+        ).q
+
+    coarse, fine = positions(1)[-1], positions(2)[-1]
+    found = positions(1, extrapolate=2)
+    assert found.shape == (3, 3, 3)
+    np.testing.assert_allclose(found[-1].T @ found[-1], np.eye(3), atol=1e-14)
+    turned = rotation.log(coarse.T @ fine)
+    assert float(jnp.abs(turned).max()) > 1e-5
+    np.testing.assert_allclose(rotation.log(coarse.T @ found[-1]), 4 / 3 * turned, rtol=1e-8)
+
+
+def test_a_failure_of_the_fine_run_is_named_by_the_step_of_the_coarse_one():
+    def force(q, v, t, params):
+        return jnp.where(jnp.abs(t - 0.25) < 1e-9, jnp.nan, -q)
+
+    system = hhtjax.System(jnp.ones(1), force)
+
+    def path(levels):
+        start = jnp.array([1.0]), jnp.array([0.0])
+        return hhtjax.simulate(system, hhtjax.hht(), *start, dt=0.1, num_steps=4, extrapolate=levels)
+
+    path(1).check()
+    with pytest.raises(hhtjax.SimulationError, match=r"step 3 \(to t = 0\.3\)"):
+        path(2).check()
+
+
+@pytest.mark.parametrize("levels", [0, 5, True, 1.5, None])
+def test_other_numbers_of_levels_are_refused(levels):
+    with pytest.raises(ValueError, match="simulate: `extrapolate` must be an integer from 1 to 4; received"):
+        run(DUFFING, hhtjax.hht(), 4, extrapolate=levels)
