@@ -25,7 +25,7 @@ def test_three_devices_and_two_processes_give_the_bits_of_one():
 
 
 def test_what_is_no_mesh_is_named():
-    with pytest.raises(TypeError, match="sweep: `mesh` must be a jax.sharding.Mesh; received 2"):
+    with pytest.raises(TypeError, match=r"sweep: `mesh` must be a jax\.sharding\.Mesh; received 2"):
         hhtjax.sweep(
             hhtjax.System(np.ones(1), lambda q, v, t, params: -q), hhtjax.rk4(), np.ones(1), np.zeros(1),
             dts=[0.1], duration=1.0, num_samples=1, mesh=2,
