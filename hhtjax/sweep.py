@@ -11,7 +11,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpoint
-from hhtjax.constraints import require_consistent
+from hhtjax.constraints import examine, require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel
@@ -118,7 +118,7 @@ class Inputs(NamedTuple):
         data = stepper, q0, v0, params
         require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
         if system.constraint is not None:
-            _require_consistent(system, data, mapped, dts.size, t0)
+            _require_consistent(system, data, mapped, t0)
         duration, t0 = (float(x) if is_concrete(x) else x for x in (duration, t0))
         return cls(system, data, dts, duration, t0, mapped, int(num_samples))
 
@@ -216,14 +216,25 @@ def _member(data, mapped, i):
     return jax.tree.unflatten(structure, [x[i] if flag else x for x, flag in zip(leaves, mapped, strict=True)])
 
 
-def _require_consistent(system, data, mapped, size, t0):
-    """An error for the first member whose initial values violate the constraint; tracers pass."""
-    leaves = jax.tree.leaves(data)
+def _require_consistent(system, data, mapped, t0):
+    """An error for the members that are farthest from the constraint, and for the first; tracers pass."""
+    leaves, structure = jax.tree.flatten(data)
     if not all(map(is_concrete, leaves)):
         return
-    for i in range(size if any(mapped) else 1):
+    worst = {0}
+    if any(mapped):
+
+        def distances(leaves):
+            stepper, q0, v0, params = jax.tree.unflatten(structure, leaves)
+            _, found = examine(system, q0, v0, t0, params, stepper.redundant)
+            return [distance for _, distance in found]
+
+        with jax.ensure_compile_time_eval():  # under jit too
+            found = jax.vmap(distances, ([0 if flag else None for flag in mapped],))(leaves)
+        worst |= {int(np.argmax(distance)) for distance in found}
+    for i in sorted(worst):
         stepper, q0, v0, params = _member(data, mapped, i)
-        require_consistent("sweep", system, q0, v0, t0, params, stepper.redundant)
+        require_consistent(f"sweep: member {i}", system, q0, v0, t0, params, stepper.redundant)
 
 
 def _lanes(size):

@@ -9,6 +9,7 @@ import pytest
 
 import hhtjax
 from hhtjax.looping import LONGEST, SLOTS, repeat
+from hhtjax.scenes import pendulum
 from hhtjax.sweep import run_sweep
 
 DTS = np.array([0.1, 0.013, 0.0017, 0.02, 0.05])
@@ -131,6 +132,21 @@ def test_under_jit_and_vmap_and_what_a_traced_step_size_may_be():
     assert runs.q.shape == (2, 5, 5, 1)
     np.testing.assert_array_equal(runs.failure.step > 0, [[False] * 3 + [True] * 2] * 2)
     np.testing.assert_allclose(runs.q[1, :3], sweep({"k": 5.0, "c": 0.1}, dts=DTS).q[:3], rtol=1e-12)
+
+
+def test_constrained_members_and_those_that_violate_their_constraint():
+    scene = pendulum.cartesian()
+    starts = np.asarray(scene.q0) * np.array([[1.0], [1.0], [-1.0]])
+    runs = partial(
+        hhtjax.sweep, scene.system, hhtjax.hht(), v0=np.zeros((3, 2)), params=scene.params, dts=[0.1, 0.05, 0.1],
+        duration=0.2, num_samples=1, in_axes=(None, 0, 0, None),
+    )  # fmt: skip
+    found = runs(starts)
+    found.check()
+    assert found.multipliers.shape == (3, 2, 1)
+    starts[1] *= 1.1
+    with pytest.raises(ValueError, match="sweep: member 1: `q0` violates the constraint"):
+        runs(starts)
 
 
 WRONG = {
