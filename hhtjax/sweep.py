@@ -28,7 +28,7 @@ from hhtjax.simulate import (
 )
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 
-LANES, BLOCKS = 128, 8  # members in a block at most, and blocks at least where there are enough members
+LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 
 
 def sweep(
@@ -238,8 +238,11 @@ def _require_consistent(system, data, mapped, t0):
 
 
 def _lanes(size):
-    """Members in a block: a power of two, so that every block runs the same vector instructions."""
-    return min(LANES, 1 << max(2, (size // BLOCKS).bit_length()))
+    """Members in a block: a power of two, so that every block runs the same vector instructions.
+
+    A batch takes half the time of single runs, so blocks have to be short enough for their members to be alike.
+    """
+    return min(LANES, 1 << (size // BLOCKS).bit_length())
 
 
 @partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress"))

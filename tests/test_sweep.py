@@ -60,8 +60,7 @@ def test_the_work_is_about_the_sum_over_the_members():
     runs = hhtjax.sweep(hhtjax.System(ONE, counting), hhtjax.rk4(), ONE, ZERO, dts=dts, duration=1.0, num_samples=2)
     jax.effects_barrier()
     iterations, steps = len(counted) / 4, np.sum(1 / np.asarray(runs.dt))
-    assert iterations < 0.6 * steps  # 4 members at a time: 0.45
-    assert 4 * iterations < 0.1 * 31 * 1000 * 4
+    assert steps <= iterations < 1.05 * steps
 
 
 def test_derivatives_forward_and_reverse_are_those_of_the_runs():
@@ -178,4 +177,4 @@ def test_bad_input_is_named(name):
 def test_progress_is_shown(capfd):
     sweep(PARAMS, progress=True)
     jax.effects_barrier()
-    assert "block 2 of 2" in capfd.readouterr().err
+    assert "block 5 of 5" in capfd.readouterr().err
