@@ -134,7 +134,7 @@ def run(report, fast):
 
 def figure(rows, coarse, biases):
     """Errors of the steppers, of alpha, and of the stiffness."""
-    drawn, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 5), sharey=False)
+    drawn, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 5), dpi=100)
     shown = [row for row in rows if row["alpha"] in (None, -0.1) and row["method"] != "hht predictor"]
     for i, row in enumerate(shown):
         style = {"color": COLOURS[i % 8], "marker": MARKERS[i % 8], "ms": 3, "ls": ("-", "--")[i // 8], "lw": 1}

@@ -77,6 +77,7 @@ def page(numbers):
         .format(
             machine=numbers["machine"],
             load=devices["load"],
+            notes=numbers.get("notes", ""),
             bars=bars_table(numbers),
             members=one["members"],
             steps=one["steps"],
