@@ -87,7 +87,7 @@ def free_port():
 def run(report, fast):
     """One, two devices, two processes; the same members, and twice as many."""
     n = FAST_MEMBERS if fast else MEMBERS
-    cases = {"one": (n, 1)}
+    cases: dict[str, tuple] = {"one": (n, 1)}
     if not fast:
         cases |= {
             "two processes": (n, 2, True),
