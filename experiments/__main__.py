@@ -23,6 +23,7 @@ EXPERIMENTS = {
     "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",
     "linearization": "linearization.linearization",
     "stability": "stability.stability",
+    "sweeps": "sweeps.sweeps",
     "gradient_cost": "benchmarks.gradient_cost",
     "benchmarks": "benchmarks.benchmarks",
     "work_precision": "work_precision.work_precision",

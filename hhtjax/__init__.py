@@ -48,6 +48,11 @@ from hhtjax.steppers.multistep import park as park
 from hhtjax.steppers.rosenbrock import rosenbrock as rosenbrock
 from hhtjax.steppers.rosenbrock import rowda as rowda
 from hhtjax.steppers.splitting import operator_splitting as operator_splitting
+from hhtjax.storage import load_sweep as load_sweep
+from hhtjax.storage import sweep_to_disk as sweep_to_disk
+from hhtjax.structured_solve import banded as banded
+from hhtjax.structured_solve import conjugate_gradients as conjugate_gradients
+from hhtjax.sweep import sweep as sweep
 from hhtjax.system import FirstOrderSystem as FirstOrderSystem
 from hhtjax.system import LinearSystem as LinearSystem
 from hhtjax.system import System as System

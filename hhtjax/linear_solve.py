@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
+from hhtjax.kernels import staged
+
 UNROLLED = 8
 SCALAR = 4  # beyond, scalar operations are so many that compiling them takes long
 RANK_TOLERANCE = (
@@ -29,8 +31,15 @@ def solve_map(f, b, factorize):
 
 def factorize_map(f, like, factorize):
     """The function b -> x with f(x) = b, for vectors like `like`: `solve_map` for many b, factorised once."""
-    inverse = factorize(matrix(f, like))
-    return lambda b: solve_by(f, b, inverse)
+    inverse = invert(f, like, factorize)
+    return lambda b: _solve(f, b, inverse)
+
+
+def invert(f, like, factorize):
+    """The function (b, trans=0) -> A^-1 b, or A^-T b, of the matrix A of f; it may be constant to autodiff."""
+    if isinstance(factorize, Structured):
+        return factorize.of_map(f, like)
+    return factorize(staged(partial(matrix, f))(like))
 
 
 def matrix(f, like):
@@ -38,8 +47,7 @@ def matrix(f, like):
     return jax.vmap(f, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
 
 
-def solve_by(f, b, inverse):
-    """The same by an inverse of its matrix, which `factorize` made."""
+def _solve(f, b, inverse):
     return lax.custom_linear_solve(
         f, b, solve=lambda _, y: inverse(y, trans=0), transpose_solve=lambda _, y: inverse(y, trans=1)
     )
@@ -64,8 +72,22 @@ def factorize(A):
     return partial(lu_solve, lu_factor(A))
 
 
+class Structured:
+    """A `factorize` that is given the linear map f itself: `of_map(f, like)` is what `invert` promises."""
+
+    def of_map(self, f, like):
+        """(b, trans=0) -> A^-1 b, or A^-T b."""
+        raise NotImplementedError
+
+    def __call__(self, A):
+        """The same for a matrix."""
+        return self.of_map(partial(matvec, A), A[0])
+
+
 def factorize_with(solve):
     """The same from a function solve(A, b), which need not be differentiable."""
+    if isinstance(solve, Structured):
+        return solve
 
     def factorize(A):
         A = lax.stop_gradient(A)
@@ -108,7 +130,7 @@ def solve(A, b, factorize=factorize):
     >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
     [2.0, 1.0]
     """
-    return solve_by(lambda x: matvec(A, x), b, factorize(A))
+    return _solve(lambda x: matvec(A, x), b, factorize(A))
 
 
 def _lu(A):

@@ -180,7 +180,7 @@ def simulate(
         sizes = {"num_steps": k * int(num_steps), "save_every": k * int(save_every)}
         return _simulate(system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress)
 
-    return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, _join)
+    return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "save_every", "progress"))
@@ -189,6 +189,38 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
     stepper = stepper.astype(q.dtype)
     take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)  # traced once, wherever it is called
+    advance = counted(take_step, flat, q, t0, dt)
+
+    def step(carry):
+        carry, info = advance(carry)
+        if progress:
+            show_progress(carry[1], num_steps, "step")
+        return carry, info
+
+    def interval(carry, _):
+        if save_every == 1:
+            carry, info = step(carry)
+        else:
+            (carry, info), _ = checkpointed_scan(joined_step, (carry, no_info), save_every)
+        return carry, (saved(flat, carry[0]), info)
+
+    def joined_step(carry, _):
+        carry, info = carry
+        carry, new = step(carry)
+        return (carry, join_info(info, new)), None
+
+    start = stepper.begin(flat, q, v, t0, params, dt)
+    no_info = neutral_info(jax.eval_shape(take_step, start)[1])
+
+    def run(start, failure):
+        return checkpointed_scan(interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every)
+
+    (_, _, failure), (path, info) = one_kernel(run, start, no_failure(no_info))
+    return as_solution(flat, start, path, dt, info, failure)
+
+
+def counted(take_step, flat, q0, t0, dt):
+    """The step of a run, on (state, number of steps, first failure); also its `Info`."""
 
     def step(carry):
         state, count, failure = carry
@@ -196,40 +228,30 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
         count = count + 1
         state = state._replace(t=t0 + count.astype(dt.dtype) * dt)  # no rounding piles up
         if flat.first_order:
-            state = state._replace(q=q)  # stays zero
-        if progress:
-            _show_progress(count, num_steps)
+            state = state._replace(q=q0)  # stays zero
         return (state, count, _first_failure(failure, count, state, info)), info
 
-    def saved(state):
-        state = public(flat, state)
-        return state.t, state.q, state.v, state.w, state.L
+    return step
 
-    def interval(carry, _):
-        if save_every == 1:
-            carry, info = step(carry)
-        else:
-            (carry, info), _ = checkpointed_scan(joined_step, (carry, no_info), save_every)
-        return carry, (saved(carry[0]), info)
 
-    def joined_step(carry, _):
-        carry, info = carry
-        carry, new = step(carry)
-        return (carry, _join(info, new)), None
+def saved(flat, state):
+    """What a run saves of a state."""
+    state = public(flat, state)
+    return state.t, state.q, state.v, state.w, state.L
 
-    start = stepper.begin(flat, q, v, t0, params, dt)
-    no_info = _no_info(jax.eval_shape(take_step, start)[1])
-    none = jnp.zeros((), jnp.int32)
-    failure = Failure(none, jnp.array(False), none, no_info.dependent_row)
 
-    def run(start, failure):
-        return checkpointed_scan(interval, (start, none, failure), num_steps // save_every)
-
-    (_, _, failure), (path, info) = one_kernel(run, start, failure)
-    t, q, *rates, L = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(start), path)
+def as_solution(flat, start, path, dt, info, failure):
+    """The start and the path after it as a `Solution`."""
+    t, q, *rates, L = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
     q = jax.vmap(flat.unravel)(q)
     v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in rates)
     return Solution(t, q, v, w, L, dt, info, failure)
+
+
+def no_failure(info):
+    """What `Solution.failure` says of a run in which all went well."""
+    none = jnp.zeros((), jnp.int32)
+    return Failure(none, jnp.array(False), none, info.dependent_row)
 
 
 def _first_failure(failure, count, state, info):
@@ -251,28 +273,28 @@ def _first_failure(failure, count, state, info):
     return Failure(step, jnp.where(first, newton, failure.newton), quantity, row)
 
 
-def _no_info(shapes):
-    """What `_join` leaves unchanged."""
+def neutral_info(shapes):
+    """What `join_info` leaves unchanged."""
     return Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
 
 
-def _join(info, new):
+def join_info(info, new):
     """Info of several steps as one: largest residuals, number of iterations, all converged."""
     join = {"iterations": jnp.add, "converged": jnp.logical_and}
     pairs = {name: (x, getattr(new, name)) for name, x in info._asdict().items() if x is not None}
     return info._replace(**{name: join.get(name, jnp.maximum)(*pair) for name, pair in pairs.items()})
 
 
-def _show_progress(count, num_steps):
+def show_progress(count, total, what):
     """A bar on stderr, about a hundred times in a run."""
-    every = max(1, num_steps // 100)
+    every = max(1, total // 100)
 
     def show(count):
-        done = int(count) * 40 // num_steps
-        end = "\n" if int(count) == num_steps else ""
-        print(f"\r[{'#' * done:<40}] step {int(count)} of {num_steps}", end=end, file=sys.stderr, flush=True)
+        done = int(count) * 40 // total
+        end = "\n" if int(count) == total else ""
+        print(f"\r[{'#' * done:<40}] {what} {int(count)} of {total}", end=end, file=sys.stderr, flush=True)
 
-    due = (count % every == 0) | (count == num_steps)
+    due = (count % every == 0) | (count == total)
     lax.cond(due, lambda: jax.debug.callback(show, count), lambda: None)
 
 

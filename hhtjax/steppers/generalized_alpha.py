@@ -25,7 +25,7 @@ from hhtjax import kinematics
 from hhtjax.boundary import require_function, require_number
 from hhtjax.constraints import check_redundant, factorize_constrained
 from hhtjax.description import is_concrete
-from hhtjax.linear_solve import factorize, factorize_with
+from hhtjax.linear_solve import Structured, factorize, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import Info, State, Stepper
@@ -146,6 +146,8 @@ class GeneralizedAlpha(Stepper):
 
     def factorize_for(self, system):
         """The same for constrained systems, whose rows may be redundant."""
+        if isinstance(self.options.solve, Structured):
+            raise NotImplementedError(f"hht: leave out `solve` with constraints; received {self.options.solve!r}.")
         return self.factorize if self.redundant is None else factorize_constrained(system.size, self.redundant)
 
     def advance(self, s, dt, w):
@@ -233,7 +235,8 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         kinematics: of rotations. "chart": the recursion runs on the rotation vector of each step (Cardona, Geradin
             1989, made second order); "lie": on the angular velocity itself (Bruls, Cardona 2010). Simpler, of
             order 2 too, but 4 to 5 times the error on a fast top.
-        solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU. Need not be differentiable.
+        solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU. Need not be differentiable. For
+            large systems `banded(p)` or `conjugate_gradients(iterations)`.
 
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.kernels import staged
-from hhtjax.linear_solve import matrix, solve_by, solve_map
+from hhtjax.linear_solve import invert, solve_map
 from hhtjax.steppers.stepper import Info
 
 
@@ -25,12 +25,8 @@ def linearized_solve(r, path, w, factorize, at=None):
             value = value + tangent(jax.tree.map(jnp.subtract, start, point))
         return value, along, tangent
 
-    def columns(along, tangent):
-        return matrix(lambda dw: tangent(along(dw)), w)
-
     value, along, tangent = staged(expand)(w, at)
-    inverse = factorize(staged(columns)(along, tangent))
-    return w - solve_by(lambda dw: tangent(along(dw)), value, inverse)
+    return w - solve_map(lambda dw: tangent(along(dw)), value, factorize)
 
 
 def newton(r, path, w, s, factorize, tolerance, max_iterations):
@@ -54,7 +50,7 @@ def newton(r, path, w, s, factorize, tolerance, max_iterations):
         def improve(carry):
             w0, value, iterations, _ = carry
             _, tangent = staged(partial(jax.linearize, f))(w0)
-            w1 = w0 - factorize(matrix(tangent, w))(value, trans=0)
+            w1 = w0 - invert(tangent, w, factorize)(value, trans=0)
             value = f(w1)
             converged = jnp.all(jnp.abs(value) <= tolerance) | lost_in_rounding(path(w0), path(w1))
             return w1, value, iterations + 1, converged

@@ -1,0 +1,12 @@
+"""Step sizes as data: one call for all, orders, maps of many members, devices, large systems, real time."""
+
+from experiments.parts import run_experiment
+from experiments.report import Report
+from experiments.sweeps import devices, large, map, one_call, orders, real_time
+
+GROUPS = [map, real_time, one_call], [devices, orders, large]  # two processes if fast
+
+
+def run(report: Report, fast: bool):
+    """All parts."""
+    run_experiment(report, GROUPS, fast)

@@ -1,0 +1,60 @@
+"""A loop whose number of iterations is data, with derivatives forward and reverse."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.core import eval_jaxpr
+
+from hhtjax.checkpointing import checkpoint
+
+SLOTS, LEVELS = 64, 3
+LONGEST = SLOTS**LEVELS  # iterations that can be differentiated
+
+
+def repeat(body, carry, count):
+    """carry -> body(i, carry) for i = 0, ..., count - 1, count a traced integer.
+
+    A plain while loop, so that another count costs no compilation. Its derivatives run through nested loops of fixed
+    length that skip what is beyond count and keep the carry of `SLOTS` iterations on each of `LEVELS` levels, computing
+    the levels below again: one more evaluation for each. Up to LONGEST iterations; beyond it they are NaN.
+    """
+    trace = jax.make_jaxpr(body)(jnp.zeros((), jnp.int32), carry)  # tells what body closes over, integers too
+    structure = jax.tree.structure(carry)
+
+    def traced(i, carry, *constants):
+        return jax.tree.unflatten(structure, eval_jaxpr(trace.jaxpr, constants, i, *jax.tree.leaves(carry)))
+
+    return _repeat(traced, count, carry, trace.consts)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _repeat(body, count, carry, constants):
+    return lax.fori_loop(0, count, lambda i, carry: body(i, carry, *constants), carry)
+
+
+@_repeat.defjvp
+def _(body, primals, tangents):
+    return jax.jvp(partial(_repeat_in_levels, body), primals, tangents)
+
+
+def _repeat_in_levels(body, count, carry, constants):
+    def level(depth):
+        """(first, carry) -> the carry after SLOTS**depth iterations from `first`."""
+        if depth == 0:
+            return lambda i, carry: body(i, carry, *constants)
+        inner = checkpoint(level(depth - 1))
+
+        def run(first, carry):
+            def visit(carry, j):
+                i = first + j * SLOTS ** (depth - 1)
+                return lax.cond(i < count, inner, lambda i, carry: carry, i, carry), None
+
+            return lax.scan(visit, carry, jnp.arange(SLOTS, dtype=jnp.int32))[0]
+
+        return run
+
+    carry = level(LEVELS)(jnp.zeros((), jnp.int32), carry)
+    known = jnp.where(count <= LONGEST, 1.0, jnp.nan)  # a factor, so that derivatives are NaN too
+    return jax.tree.map(lambda x: x * known.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, carry)

@@ -1,0 +1,171 @@
+"""Sweeps that are written to disk as they go, and taken up again where they stopped."""
+
+import hashlib
+import json
+import os
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hhtjax.description import is_concrete
+from hhtjax.sweep import Inputs, run_sweep
+
+
+def sweep_to_disk(
+    folder,
+    system,
+    stepper,
+    q0,
+    v0=None,
+    params=None,
+    *,
+    dts,
+    duration,
+    num_samples,
+    t0=0.0,
+    in_axes=None,
+    chunk=4096,
+    progress=False,
+) -> Path:
+    """The same as `sweep`, `chunk` members at a time, each chunk written to a file of its own in `folder`.
+
+    chunk-00000.npz, ... hold the leaves of the `Solution` by name ("q", "dt", "failure.step", ...), members first;
+    manifest.json the numbers of members and chunks, versions, and a hash of the inputs: of all values, and of the
+    program that XLA is given, so that a changed force is noticed too. A file appears with its whole content or not at
+    all. A sweep that was interrupted, at whatever moment, is continued by the same call, and ends with the same files.
+    One process at a time may write to a folder.
+
+    Args:
+        folder: made if it does not exist.
+        chunk: members in a file, which bounds the memory; progress: one line on stderr for each.
+        The others are those of `sweep`.
+
+    Returns:
+        The folder, to be read by `load_sweep`, or by `numpy.load` file by file.
+
+    Raises:
+        ValueError: the folder holds a sweep of other inputs or versions.
+        OSError: a file cannot be written, such as on a full disk; those before it stay, and the same call goes on.
+        TypeError, ValueError: as `sweep`; also for tracers.
+    """
+    if not isinstance(chunk, (int, np.integer)) or isinstance(chunk, bool) or chunk < 1:
+        raise ValueError(f"sweep_to_disk: `chunk` must be a positive integer; received {chunk!r}.")
+    inputs = Inputs.checked(
+        system, stepper, q0, v0, params, dts=dts, duration=duration, num_samples=num_samples, t0=t0, in_axes=in_axes
+    )
+    if not all(map(is_concrete, jax.tree.leaves(inputs))):
+        raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
+    folder, size = Path(folder), inputs.dts.size
+    places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
+    arguments, keywords = inputs.chunk(places[0]).call()
+    lowered = run_sweep.lower(*arguments, **keywords)
+    _claim(folder, _manifest(inputs, lowered, chunk, len(places)))
+    compiled = None
+    for number, members in enumerate(places):
+        path = folder / f"chunk-{number:05d}.npz"
+        if not _is_whole(path):
+            compiled = compiled or lowered.compile()
+            runs = compiled(*inputs.chunk(members).call()[0])
+            kept = min(chunk, size - number * chunk)
+            _write(path, lambda file, runs=runs, kept=kept: np.savez(file, **_named(runs, kept)))
+        if progress:
+            print(f"[chunk {number + 1} of {len(places)}] {path}", file=sys.stderr, flush=True)
+    return folder
+
+
+def load_sweep(folder) -> dict[str, np.ndarray]:
+    """What `sweep_to_disk` wrote: the leaves of the `Solution` by name, members first.
+
+    Raises:
+        FileNotFoundError: a chunk is missing, because the sweep is not finished.
+    """
+    folder = Path(folder)
+    chunks = json.loads((folder / "manifest.json").read_text())["chunks"]
+    paths = [folder / f"chunk-{number:05d}.npz" for number in range(chunks)]
+    missing = [path.name for path in paths if not path.exists()]
+    if missing:
+        raise FileNotFoundError(
+            f"load_sweep: {len(missing)} of {chunks} chunks are missing in {folder}, the first is {missing[0]}: "
+            "repeat the call of sweep_to_disk, which goes on where it stopped."
+        )
+    parts = []
+    for path in paths:
+        with np.load(path) as part:
+            parts.append(dict(part))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _named(runs, kept) -> dict[str, Any]:
+    """The first members' leaves as NumPy arrays."""
+    leaves = jax.tree_util.tree_leaves_with_path(runs)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(x)[:kept] for path, x in leaves}
+
+
+def _manifest(inputs, lowered, chunk, chunks):
+    from hhtjax import __version__
+
+    digest = hashlib.sha256(lowered.as_text().encode())
+    for x in jax.tree.leaves(inputs):
+        x = np.asarray(x)
+        digest.update(f"{x.shape} {x.dtype}".encode() + x.tobytes())
+    return {
+        "inputs": digest.hexdigest(),
+        "members": int(inputs.dts.size),
+        "chunk": int(chunk),
+        "chunks": chunks,
+        "versions": {"hhtjax": __version__, "jax": jax.__version__, "numpy": np.__version__},
+    }
+
+
+def _claim(folder, manifest):
+    """Writes the manifest, or compares it with the one that is there."""
+    path = folder / "manifest.json"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        _write(path, lambda file: file.write(json.dumps(manifest, indent=1).encode() + b"\n"))
+        return
+    try:
+        found = json.loads(path.read_text())
+    except ValueError:
+        found = {}
+    differ = [key for key in manifest if found.get(key) != manifest[key]]
+    if differ:
+        raise ValueError(
+            f"sweep_to_disk: `folder` {folder} holds another sweep, whose {', '.join(differ)} differ: nothing was "
+            "changed there; choose another folder, or the inputs that it was begun with."
+        )
+
+
+def _is_whole(path):
+    """Whether a chunk is there and can be read, by the checksums inside it."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return file.testzip() is None
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def _write(path, fill):
+    """A file that is there with its whole content, also after a power cut, or not at all."""
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        with open(temporary, "wb") as file:
+            fill(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        if os.name == "posix":
+            descriptor = os.open(path.parent, os.O_RDONLY)
+            os.fsync(descriptor)
+            os.close(descriptor)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(
+            error.errno,
+            f"sweep_to_disk: {path} could not be written ({error.strerror}); the files before it are whole: "
+            "make room, and repeat the call, which goes on where it stopped",
+        ) from error

@@ -1,0 +1,139 @@
+"""Solvers for large systems, whose cost grows with the number of unknowns: `hht(solve=banded(1))`.
+
+They are given the linear map dw -> A dw of a step and never its matrix: a band is found by applying the map to a few
+vectors of ones and zeros, and conjugate gradients only apply it.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.sparse.linalg import cg
+
+from hhtjax.linear_solve import Structured, solve
+
+
+@dataclass(frozen=True)
+class Banded(Structured):
+    """A[i, j] = 0 for |i - j| > half_bandwidth, and elimination without pivoting, as for positive definite A."""
+
+    half_bandwidth: int
+
+    def of_map(self, f, like):
+        """(b, trans=0) -> A^-1 b, or A^-T b."""
+        bands = lax.stop_gradient(find_bands(f, like, self.half_bandwidth))
+        transposed = jnp.stack([jnp.roll(band, i - self.half_bandwidth) for i, band in enumerate(bands)])[::-1]
+        solve_bands = solve_tridiagonal if self.half_bandwidth == 1 else solve_blocks
+        return lambda b, trans=0: solve_bands(transposed if trans else bands, b)
+
+
+@dataclass(frozen=True)
+class ConjugateGradients(Structured):
+    """A symmetric and positive definite; `iterations` of them, however large the residual then is."""
+
+    iterations: int
+
+    def of_map(self, f, like):
+        """(b, trans=0) -> A^-1 b, A being symmetric."""
+        return lambda b, trans=0: cg(f, b, tol=0.0, atol=0.0, maxiter=self.iterations)[0]
+
+
+def banded(half_bandwidth=1) -> Banded:
+    """For the `solve` of a stepper: M and the Jacobians of the force couple unknowns up to `half_bandwidth` apart.
+
+    One step costs 2 half_bandwidth + 1 tangents of the residual and an elimination, all in proportion to the number of
+    unknowns. M has to be diagonal (n,). For chains, frames, beams; unknowns in the order of the leaves of q.
+
+    Raises:
+        ValueError: half_bandwidth is no positive integer.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> def springs(q, v, t, params):
+    ...     return jnp.diff(params["k"] * jnp.diff(q, prepend=0.0), append=0.0)
+    >>> tower = hhtjax.System(jnp.ones(50), springs)
+    >>> def end(solve):
+    ...     stepper = hhtjax.hht(linearize="predictor", solve=solve)
+    ...     start = jnp.linspace(0.0, 1.0, 50), jnp.zeros(50)
+    ...     return hhtjax.simulate(tower, stepper, *start, {"k": 100.0}, dt=0.1, num_steps=20).q[-1]
+    >>> bool(jnp.allclose(end(hhtjax.banded(1)), end(None), atol=1e-12))
+    True
+    """
+    _require_count("banded", "half_bandwidth", half_bandwidth)
+    return Banded(half_bandwidth)
+
+
+def conjugate_gradients(iterations) -> ConjugateGradients:
+    """For the `solve` of a stepper: that many iterations at every step, so that each costs the same.
+
+    Matrix-free: a tangent of the residual for each iteration. What they leave unsolved is an error of the step: compare
+    with more iterations. The number needed grows with the square root of the condition of M + beta h^2 K, that is, with
+    the number of elements that a wave crosses in a step. M has to be diagonal (n,); symmetric stiffness and damping.
+
+    Raises:
+        ValueError: iterations is no positive integer.
+    """
+    _require_count("conjugate_gradients", "iterations", iterations)
+    return ConjugateGradients(iterations)
+
+
+def _require_count(caller, name, value):
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"{caller}: `{name}` must be a positive integer; received {value!r}.")
+
+
+def find_bands(f, like, p):
+    """bands[p + d, i] = A[i, i + d] for |d| <= p, 0 outside of A; from A times 2 p + 1 vectors."""
+    n, width = like.size, 2 * p + 1
+    i = jnp.arange(n)
+    probes = (i[None, :] % width == jnp.arange(width)[:, None]).astype(like.dtype)
+    images = jax.vmap(f)(probes)
+    column = i[None, :] + jnp.arange(-p, p + 1)[:, None]
+    bands = jnp.take_along_axis(images, column % width, axis=0)
+    return jnp.where((column >= 0) & (column < n), bands, 0)
+
+
+def solve_tridiagonal(bands, b):
+    """x with A x = b."""
+    lower, diagonal, upper = bands
+    return lax.linalg.tridiagonal_solve(lower, diagonal, upper, b[:, None])[:, 0]
+
+
+def solve_blocks(bands, b):
+    """x with A x = b, by elimination on the blocks (p, p) of a block tridiagonal A."""
+    p, n = len(bands) // 2, b.size
+    num_blocks = -(-n // p)
+    fill = num_blocks * p - n
+    bands = jnp.pad(bands, ((0, 0), (0, fill)))
+    bands = bands.at[p, n:].set(1)
+    b = jnp.pad(b, (0, fill)).reshape(num_blocks, p)
+    row, column = jnp.arange(p)[:, None], jnp.arange(p)[None, :]
+    rows = bands.reshape(2 * p + 1, num_blocks, p)
+
+    def blocks(shift):
+        """(num_blocks, p, p): the columns `shift` blocks to the right of the diagonal."""
+        d = column - row + shift * p
+        found = rows[jnp.clip(d + p, 0, 2 * p), :, row]
+        return jnp.moveaxis(jnp.where((abs(d) <= p)[:, :, None], found, 0), -1, 0)
+
+    def eliminate(carry, block):
+        upper, y = carry  # of the block above: x = y - upper x_next
+        L, D, U, b = block
+        both = solve_columns(D - L @ upper, jnp.concatenate([U, (b - L @ y)[:, None]], axis=1))
+        carry = both[:, :p], both[:, p]
+        return carry, carry
+
+    def substitute(x, block):
+        upper, y = block
+        x = y - upper @ x
+        return x, x
+
+    zero = jnp.zeros((p, p), b.dtype), jnp.zeros(p, b.dtype)
+    _, eliminated = lax.scan(eliminate, zero, (blocks(-1), blocks(0), blocks(1), b))
+    _, x = lax.scan(substitute, zero[1], eliminated, reverse=True)
+    return x.reshape(-1)[:n]
+
+
+def solve_columns(A, B):
+    """X with A X = B."""
+    return jax.vmap(lambda b: solve(A, b), 1, 1)(B)
