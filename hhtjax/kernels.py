@@ -38,7 +38,7 @@ KNOWN = {
     *("shift_right_logical", "sign", "sine", "slice", "sqrt", "subtract", "tan", "tanh", "transpose", "while", "xor"),
 }
 LARGEST_SUM = 1024  # elements; XLA hands larger ones to another library, and products of matrices
-LARGEST_PRODUCT = 7  # rows and columns
+LARGEST_PRODUCT = 7  # rows, columns, and terms of a sum
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
 MOST_OPERATIONS = 5000  # compiling one function takes longer than in proportion: beyond, minutes
 
@@ -208,17 +208,18 @@ def _small_reduction(op):
 
 
 def _small_product(op):
-    """Of a vector, batched or not, or of tiny matrices."""
+    """Of a vector, batched or not, or of tiny matrices: tiny in rows, columns and what is summed over."""
     dims = stablehlo.DotDimensionNumbers(op.attributes["dot_dimension_numbers"])
-    left = {*dims.lhs_batching_dimensions, *dims.lhs_contracting_dimensions}
-    right = {*dims.rhs_batching_dimensions, *dims.rhs_contracting_dimensions}
-    shapes = [ir.RankedTensorType(x.type).shape for x in op.operands]
-    free = [
-        [n for i, n in enumerate(shape) if i not in bound] for shape, bound in zip(shapes, (left, right), strict=True)
+    batched = dims.lhs_batching_dimensions, dims.rhs_batching_dimensions
+    summed = dims.lhs_contracting_dimensions, dims.rhs_contracting_dimensions
+    shapes = [
+        [n for i, n in enumerate(ir.RankedTensorType(x.type).shape) if i not in skipped]
+        for x, skipped in zip(op.operands, batched, strict=True)
     ]
-    if not all(free):
+    vector = any(len(shape) == len(over) for shape, over in zip(shapes, summed, strict=True))
+    if vector:
         return max(map(_size, op.operands)) <= LARGEST_MATRIX
-    return max(n for shape in free for n in shape) <= LARGEST_PRODUCT
+    return max(n for shape in shapes for n in shape) <= LARGEST_PRODUCT
 
 
 CHECKS = {"dot_general": _small_product, "reduce": _small_reduction, "reduce_window": _small_reduction}

@@ -72,6 +72,7 @@ UNSUPPORTED = {
     "callback": lambda c: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(c.shape, c.dtype), c),
     "dot_general": lambda c: jnp.sum(jnp.ones((20, 20)) @ jnp.ones((20, 20)) * c[0], 1)[:4] / 999,
     "dot_general ": lambda c: jax.vmap(lambda b: jnp.eye(4) @ b)(jnp.outer(jnp.ones(9), c))[3] / 2,
+    "dot_general  ": lambda c: (jnp.ones((4, 8)) * c[0]) @ (jnp.ones((8, 4)) * c[1]) @ c / 99,
     "reduce": lambda c: c / 2 + jnp.sum(jnp.ones(5000) * c[0]) / 9999,
     "gather, in reverse": lambda c: c[(3 * c).astype(int) % 4] / 2,
 }
