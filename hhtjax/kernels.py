@@ -11,21 +11,19 @@ the called function through, operation by operation, and attaches the attribute 
 other than the CPU never see it. The verdict is attached too, for `explain` to read.
 """
 
-import inspect
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxlib import version
 from jaxlib.mlir import ir
 from jaxlib.mlir.dialects import func, stablehlo
 
 ATTRIBUTES = "mhlo.frontend_attributes"
 VERDICT = "hhtjax_kernels"
+TESTED = 0, 10, 2  # the first JAX in which this works; older ones abort, or lose constants of the calls
 KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"  # names of functions; autodiff and vmap keep them
-TESTED = 0, 8  # the first jaxlib whose kernels hold all of KNOWN
 
 # operations the emitter knows, whatever their size
 KNOWN = {
@@ -45,13 +43,15 @@ MOST_OPERATIONS = 5000  # compiling one function takes longer than in proportion
 
 def one_kernel(f, *args):
     """f(*args) of pytrees of arrays, as one kernel where XLA can; the same values otherwise."""
+    if jax.__version_info__ < TESTED:
+        return f(*args)
     f, constants = jax.closure_convert(f, *args)
     return _watch(_named(KERNEL, f)(*_watch(args), *_watch(constants)))
 
 
 def staged(f):
     """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have."""
-    return _named(STAGED, f)
+    return f if jax.__version_info__ < TESTED else _named(STAGED, f)
 
 
 def _named(name, f):
@@ -76,20 +76,26 @@ batching.defvectorized(watch_p)
 
 def _lower(ctx, x):
     """Decides on the call that gives x, and on those before it whose results go to derivatives only."""
-    if not isinstance(x.owner, ir.Block) and _is_undecided(x.owner.operation):
-        module = ctx.module_context
-        for call in [op for op in _operations(module.module.operation) if _is_undecided(op)]:
-            objection = _Inspection(module, call).objection
-            _attach(call, **{VERDICT: f"plain: {objection}" if objection else "one kernel"})
-            if objection is None:
-                _make_kernel(module, call)
+    module = ctx.module_context
+    on_cpu = tuple(module.platforms) == ("cpu",)
+    if on_cpu and not isinstance(x.owner, ir.Block) and _is_undecided(x.owner.operation):
+        before = filter(_is_undecided, _operations(module.module.operation))
+        for call in [x.owner.operation, *before]:
+            if _is_undecided(call):
+                _decide(module, call)
     return [x]
 
 
+def _decide(module, call):
+    objection = _Inspection(module, call).objection
+    _attach(call, **{VERDICT: f"plain: {objection}" if objection else "one kernel"})
+    if objection is None:
+        _make_kernel(module, call)
+
+
 # a cached lowering would not see the call
-uncached: Any = {"cacheable": False} if "cacheable" in inspect.signature(mlir.register_lowering).parameters else {}
-mlir.register_lowering(watch_p, lambda ctx, x: [x], **uncached)
-mlir.register_lowering(watch_p, _lower, platform="cpu", **uncached)
+uncached: Any = {"cacheable": False} if jax.__version_info__ >= TESTED else {}
+mlir.register_lowering(watch_p, _lower, **uncached)
 
 
 def _operations(op):
@@ -163,8 +169,9 @@ class _Inspection:
         self.functions = module.symbol_table
         self.seen = set()
         self.operations = 0
-        supported = tuple(map(int, version.__version__.split(".")[:2])) >= TESTED
-        self.objection = None if supported else f"jaxlib {version.__version__}"
+        self.objection = None
+        if _is_partitioned(module.axis_context):
+            self.object("partitioned over devices; shard_map leaves each its own kernel")
         self.look(call)
 
     def look(self, op):
@@ -193,6 +200,13 @@ class _Inspection:
 
     def object(self, why):
         self.objection = self.objection or why
+
+
+def _is_partitioned(axes):
+    """Whether XLA divides the function among devices, and puts communication into it."""
+    if hasattr(axes, "manual_axes"):  # inside shard_map
+        return set(axes.manual_axes) != set(axes.mesh.axis_names)
+    return (getattr(axes, "num_devices", None) or 1) > 1
 
 
 def _size(value):

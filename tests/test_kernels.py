@@ -1,8 +1,12 @@
 """How a run is cut into kernels changes the compiled program, and nothing else."""
 
+import os
+import subprocess
+import sys
 from functools import partial
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,8 +15,8 @@ import hhtjax
 from hhtjax import kernels
 
 on_cpu = pytest.mark.skipif(
-    jax.default_backend() != "cpu" or jax.version.__version_info__ < (*kernels.TESTED, 0),
-    reason="kernels are cut on the CPU only, by a jaxlib of 0.8 or newer",
+    jax.default_backend() != "cpu" or jax.__version_info__ < kernels.TESTED,
+    reason="kernels are cut on the CPU only, by JAX 0.10.2 or newer",
 )
 N = 5
 x = jnp.linspace(0.1, 1.0, 4)
@@ -39,10 +43,11 @@ def paths(f, *args):
     return hhtjax.explain(f, *args).paths
 
 
+@on_cpu
 def test_one_kernel_gives_what_the_plain_path_gives(monkeypatch):
     one = jax.jit(jax.value_and_grad(loss))(2.0)
-    monkeypatch.setattr(kernels, "TESTED", (99, 0))
-    assert "jaxlib" in paths(jax.grad(loss), 2.0)[0]
+    monkeypatch.setattr(kernels, "KNOWN", frozenset())
+    assert paths(jax.grad(loss), 2.0)[0].startswith("plain: stablehlo.")
     assert np.allclose(one, jax.jit(jax.value_and_grad(loss))(2.0), rtol=1e-12, atol=0)
 
 
@@ -103,6 +108,39 @@ def test_what_xla_cannot_compile_into_one_kernel_runs_plainly(name):
 def test_a_batch_of_thousands_compiles():
     q0 = jnp.outer(jnp.linspace(-1, 1, 5000), jnp.ones(N))
     assert jnp.all(jnp.isfinite(jax.vmap(partial(end, 2.0))(q0)))
+
+
+def test_a_program_for_several_platforms_is_plain():
+    def f(c):
+        return kernels.one_kernel(lambda c: jax.lax.scan(lambda c, _: (jnp.sin(c), None), c, None, 3)[0], c)
+
+    exported = jax.export.export(jax.jit(f), platforms=("cpu", "cuda"))(x)
+    assert "xla_cpu_small_call" not in exported.mlir_module()
+    assert np.allclose(exported.call(x), f(x))
+
+
+SHARDED = """
+import jax, jax.numpy as jnp
+from jax.sharding import NamedSharding, PartitionSpec
+from hhtjax import explain, kernels
+mesh = jax.make_mesh((2,), ("b",))
+x = jnp.arange(8.0)
+def f(c):
+    return kernels.one_kernel(lambda c: jax.lax.scan(lambda c, _: (c - jnp.mean(c) / 2, None), c, None, 3)[0], c)
+sharded = jax.device_put(x, NamedSharding(mesh, PartitionSpec("b")))
+assert jnp.allclose(jax.jit(f)(sharded), f(x))
+assert explain(f, sharded).paths[0].startswith("plain: partitioned"), explain(f, sharded).paths
+by_hand = jax.shard_map(f, mesh=mesh, in_specs=PartitionSpec("b"), out_specs=PartitionSpec("b"), check_vma=False)
+assert explain(by_hand, sharded).paths == ("one kernel",)
+"""
+
+
+@on_cpu
+def test_a_program_divided_among_devices_is_plain():
+    """In a process of its own, for there are two devices."""
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    run = subprocess.run([sys.executable, "-c", SHARDED], env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr[-2000:]
 
 
 @on_cpu

@@ -10,7 +10,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 
 def test_the_code_blocks_run(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    assert len(blocks) == 7
+    assert len(blocks) == 8
     namespace = {}
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         for block in blocks:
@@ -18,6 +18,7 @@ def test_the_code_blocks_run(capsys):
     printed = capsys.readouterr().out
     assert "(501,) (501, 1) (501, 1)" in printed
     assert "converged" in printed
+    assert "loop 1: one kernel" in printed
     assert "nan" not in printed
 
 
