@@ -155,7 +155,7 @@ def correction(system, q, t, params, rows, factorize):
 def jacobian(system, q, t, params):
     """B: (m, n)."""
     Phi = partial(system.constraint, t=t, params=params)
-    _, tangent = staged(partial(jax.linearize, Phi))(q)
+    _, tangent = staged(partial(jax.linearize, Phi), system.size)(q)
     return matrix(lambda x: tangent(system.rate(q, x)), jnp.zeros(system.size, q.dtype))
 
 

@@ -49,9 +49,12 @@ def one_kernel(f, *args):
     return _watch(_named(KERNEL, f)(*_watch(args), *_watch(constants)))
 
 
-def staged(f):
-    """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have."""
-    return f if jax.__version_info__ < TESTED else _named(STAGED, f)
+def staged(f, size):
+    """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have.
+
+    size: number of unknowns. A single one has a single column, which shares nothing.
+    """
+    return f if size == 1 or jax.__version_info__ < TESTED else _named(STAGED, f)
 
 
 def _named(name, f):

@@ -39,7 +39,7 @@ def invert(f, like, factorize):
     """The function (b, trans=0) -> A^-1 b, or A^-T b, of the matrix A of f; it may be constant to autodiff."""
     if isinstance(factorize, Structured):
         return factorize.of_map(f, like)
-    return factorize(staged(partial(matrix, f))(like))
+    return factorize(staged(partial(matrix, f), like.size)(like))
 
 
 def matrix(f, like):

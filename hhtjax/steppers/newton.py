@@ -25,7 +25,7 @@ def linearized_solve(r, path, w, factorize, at=None):
             value = value + tangent(jax.tree.map(jnp.subtract, start, point))
         return value, along, tangent
 
-    value, along, tangent = staged(expand)(w, at)
+    value, along, tangent = staged(expand, w.size)(w, at)
     return w - solve_map(lambda dw: tangent(along(dw)), value, factorize)
 
 
@@ -49,7 +49,7 @@ def newton(r, path, w, s, factorize, tolerance, max_iterations):
 
         def improve(carry):
             w0, value, iterations, _ = carry
-            _, tangent = staged(partial(jax.linearize, f))(w0)
+            _, tangent = staged(partial(jax.linearize, f), w.size)(w0)
             w1 = w0 - invert(tangent, w, factorize)(value, trans=0)
             value = f(w1)
             converged = jnp.all(jnp.abs(value) <= tolerance) | lost_in_rounding(path(w0), path(w1))

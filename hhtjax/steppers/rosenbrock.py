@@ -66,7 +66,7 @@ class Rosenbrock(Stepper):
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 
         def step(s):
-            value, tangent = staged(partial(jax.linearize, r))(s)
+            value, tangent = staged(partial(jax.linearize, r), system.size)(s)
             solve = once if system.linear else factorized(tangent)
             rates = []
             for row, coupling in zip(A, G, strict=True):
