@@ -1,6 +1,5 @@
 """The C that the library is measured against does the same arithmetic, the charts are read rightly, and the pages."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -16,16 +15,8 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from experiments.benchmarks import native  # noqa: E402
-from experiments.benchmarks import page as benchmarks_page  # noqa: E402
 from experiments.benchmarks.chain import FORMULATIONS, chain  # noqa: E402
-from experiments.work_precision import page as work_precision_page  # noqa: E402
 from experiments.work_precision.timing import time_to  # noqa: E402
-
-
-@pytest.mark.parametrize("page", [benchmarks_page, work_precision_page])
-def test_the_page_is_made_of_the_committed_numbers(page):
-    name = page.HERE.name
-    assert (page.HERE / "README.md").read_text() == page.page(json.loads((page.HERE / f"{name}.json").read_text()))
 
 
 @pytest.mark.parametrize("as_printed", [False, True])

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 import hhtjax
+from experiments import diffrax_run
 from experiments.benchmarks.measure import compiled, dashed
 from hhtjax.scenes import double_pendulum
 
@@ -27,25 +28,10 @@ def ours(stepper, k):
 
 def kvaerno(k):
     """The same by diffrax with step-size control."""
-    diffrax = importlib.import_module("diffrax")
     scene = double_pendulum.stiff()
-
-    def rate(t, y, params):
-        q, v = y
-        return v, jnp.linalg.solve(scene.system.mass(q, params), scene.system.force(q, v, t, params))
-
-    found = diffrax.diffeqsolve(
-        diffrax.ODETerm(rate),
-        diffrax.Kvaerno3(),
-        0.0,
-        DURATION,
-        None,
-        (scene.q0, scene.v0),
-        {**scene.params, "k": (k, k)},
-        saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, DURATION, NUM_STEPS + 1)),
-        stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-9),
-        max_steps=4096,
-    )
+    saveat = importlib.import_module("diffrax").SaveAt(ts=jnp.linspace(0.0, DURATION, NUM_STEPS + 1))
+    params = {**scene.params, "k": (k, k)}
+    found = diffrax_run.solve(scene, "Kvaerno3", params, DURATION, saveat=saveat, max_steps=4096)
     return jnp.sum(found.ys[0] ** 2)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import hhtjax
+from experiments import diffrax_run
 from experiments.cardona_geradin1989.index_1 import unconstrained
 from experiments.linearization.scenes import unit_mass
 from experiments.report import COLOURS, MARKERS
@@ -105,26 +106,8 @@ def hht_angles(params, stepper):
 
 def diffrax_steps(params):
     """Steps that Tsit5 takes for 1 s at a relative tolerance of 1e-6, and its angles; None where MAX_STEPS end it."""
-    diffrax = importlib.import_module("diffrax")
-    scene = double_pendulum.stiff()
-
-    def rate(t, y, params):
-        q, v = y
-        return v, jnp.linalg.solve(scene.system.mass(q, params), scene.system.force(q, v, t, params))
-
-    found = diffrax.diffeqsolve(
-        diffrax.ODETerm(rate),
-        diffrax.Tsit5(),
-        0.0,
-        1.0,
-        None,
-        (scene.q0, scene.v0),
-        params,
-        stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-9),
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    done = bool(found.result == diffrax.RESULTS.successful)
+    found = diffrax_run.solve(double_pendulum.stiff(), "Tsit5", params, 1.0, max_steps=MAX_STEPS, throw=False)
+    done = bool(found.result == importlib.import_module("diffrax").RESULTS.successful)
     return int(found.stats["num_steps"]) if done else None, np.asarray(found.ys[0][-1])
 
 
