@@ -46,18 +46,20 @@ def one_kernel(f, *args):
     if jax.__version_info__ < TESTED:
         return f(*args)
     f, constants = jax.closure_convert(f, *args)
-    return _watch(_named(KERNEL, f)(*_watch(args), *_watch(constants)))
+    return _watch(named(KERNEL, f)(*_watch(args), *_watch(constants)))
 
 
-def staged(f, size):
+def staged(f, size=None):
     """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have.
 
-    size: number of unknowns. A single one has a single column, which shares nothing.
+    size: number of unknowns of a Jacobian. A single one has a single column, which shares nothing.
     """
-    return f if size == 1 or jax.__version_info__ < TESTED else _named(STAGED, f)
+    return f if size == 1 or jax.__version_info__ < TESTED else named(STAGED, f)
 
 
-def _named(name, f):
+def named(name, f):
+    """f as a function of this name in the program."""
+
     def call(*args):
         return f(*args)
 

@@ -173,18 +173,19 @@ def _substitute(factors, b, trans=0):
 
 
 def _lu_scalars(A):
-    """The entries of L and U in the place of A's, and the exchanges of rows before, as [(k, i, whether)]."""
+    """L and U in the place of A, the pivots as their reciprocals; the exchanges of rows before, [(k, i, whether)]."""
     n = A.shape[0]
     LU = [[A[i, j] for j in range(n)] for i in range(n)]
     exchanges = []
-    for k in range(n - 1):
+    for k in range(n):
         for i in range(k + 1, n):
             larger = jnp.abs(LU[i][k]) > jnp.abs(LU[k][k])
             exchanges.append((k, i, larger))
             for j in range(n):
                 LU[k][j], LU[i][j] = _exchange(larger, LU[k][j], LU[i][j])
+        LU[k][k] = 1 / LU[k][k]
         for i in range(k + 1, n):
-            LU[i][k] = LU[i][k] / LU[k][k]
+            LU[i][k] = LU[i][k] * LU[k][k]
             for j in range(k + 1, n):
                 LU[i][j] = LU[i][j] - LU[i][k] * LU[k][j]
     return LU, exchanges
@@ -201,12 +202,12 @@ def _substitute_scalars(LU, exchanges, b, trans=0):
             for i in range(k + 1, n):
                 x[i] = x[i] - LU[i][k] * x[k]
         for k in reversed(range(n)):
-            x[k] = x[k] / LU[k][k]
+            x[k] = x[k] * LU[k][k]
             for i in range(k):
                 x[i] = x[i] - LU[i][k] * x[k]
         return jnp.stack(x)
     for k in range(n):
-        x[k] = x[k] / LU[k][k]
+        x[k] = x[k] * LU[k][k]
         for i in range(k + 1, n):
             x[i] = x[i] - LU[k][i] * x[k]
     for k in reversed(range(n)):

@@ -17,6 +17,7 @@ from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.extrapolation import MOST, extrapolated
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel
+from hhtjax.scalars import join, on_scalars, pays, split
 from hhtjax.steppers.stepper import Info, public, require_capable, require_stepper, require_system
 
 
@@ -189,7 +190,8 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
     stepper = stepper.astype(q.dtype)
     take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)  # traced once, wherever it is called
-    advance = counted(take_step, flat, q, t0, dt)
+    advance = on_scalars(counted(take_step, flat, q, t0, dt))
+    keep = on_scalars(partial(saved, flat))
 
     def step(carry):
         carry, info = advance(carry)
@@ -202,7 +204,7 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
             carry, info = step(carry)
         else:
             (carry, info), _ = checkpointed_scan(joined_step, (carry, no_info), save_every)
-        return carry, (saved(flat, carry[0]), info)
+        return carry, (keep(carry[0]), info)
 
     def joined_step(carry, _):
         carry, info = carry
@@ -215,8 +217,10 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
     def run(start, failure):
         return checkpointed_scan(interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every)
 
-    (_, _, failure), (path, info) = one_kernel(run, start, no_failure(no_info))
-    return as_solution(flat, start, path, dt, info, failure)
+    failure = no_failure(no_info)
+    by_scalars = not progress and pays(advance, (start, jnp.zeros((), jnp.int32), failure))
+    (_, _, failure), (path, info) = one_kernel(run, split(start) if by_scalars else start, failure)
+    return as_solution(flat, start, join(path), dt, info, failure)
 
 
 def counted(take_step, flat, q0, t0, dt):

@@ -16,6 +16,7 @@ from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel
 from hhtjax.looping import repeat
+from hhtjax.scalars import join, on_scalars, pays, split
 from hhtjax.simulate import (
     Solution,
     as_solution,
@@ -303,7 +304,8 @@ def _run(system, data, dt, substeps, longest, t0, num_samples):
     flat, q, v = flatten("sweep", system, q0, v0, t0, params)
     stepper = stepper.astype(q.dtype)
     take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)
-    advance = counted(take_step, flat, q, t0, dt)
+    advance = on_scalars(counted(take_step, flat, q, t0, dt))
+    keep = on_scalars(partial(saved, flat))
     start = stepper.begin(flat, q, v, t0, params, dt)
     no_info = neutral_info(jax.eval_shape(take_step, start)[1])
 
@@ -315,10 +317,12 @@ def _run(system, data, dt, substeps, longest, t0, num_samples):
     @checkpoint
     def interval(run, _):
         run, info = repeat(step, (run, no_info), longest)
-        return run, (saved(flat, run[0]), info)
+        return run, (keep(run[0]), info)
 
     def samples(start, failure):
         return lax.scan(interval, (start, jnp.zeros((), jnp.int32), failure), None, num_samples)
 
-    (_, _, failure), (path, info) = one_kernel(samples, start, no_failure(no_info))
-    return as_solution(flat, start, path, dt, info, failure)
+    failure = no_failure(no_info)
+    by_scalars = pays(advance, (start, jnp.zeros((), jnp.int32), failure))
+    (_, _, failure), (path, info) = one_kernel(samples, split(start) if by_scalars else start, failure)
+    return as_solution(flat, start, join(path), dt, info, failure)

@@ -13,6 +13,8 @@ where `jnp` does (`hhtjax.scenes.double_pendulum.stiff(trigonometry=hhtjax.trigo
 import jax
 import jax.numpy as jnp
 
+from hhtjax.kernels import staged
+
 RANGE = 1e5  # largest |x|, rad
 
 # pi/2 in three parts. Whole numbers up to 2^17 times one of the first two, of 36 bits, are exact.
@@ -57,20 +59,40 @@ def sincos(x):
         raise TypeError(f"sincos: `x` must be real; received an array of {x.dtype}.")
     if x.dtype != jnp.float64:
         return jnp.sin(x), jnp.cos(x)
-    turns = jnp.round(x * (2 / jnp.pi))
+    return _in_stages(x)
+
+
+@staged
+def _reduced(x):
+    """r and k; NaN and 0 beyond RANGE."""
+    inside = jnp.abs(x) <= RANGE
+    k = jnp.where(inside, jnp.round(x * (2 / jnp.pi)), 0)
     r = x
     for part in HALF_PI:
-        r = r - turns * part
+        r = r - k * part
+    return jnp.where(inside, r, jnp.nan), k
+
+
+@staged
+def _near_zero(r):
+    """sin r and cos r."""
     z = r * r
-    sine = r + r * z * _polynomial(SINE, z)
-    cosine = 1 - (z / 2 - z * z * _polynomial(COSINE, z))
-    inside = jnp.abs(x) <= RANGE
-    quarter = jnp.where(inside, turns, 0).astype(jnp.int32)
-    odd = quarter & 1 == 1
+    return r + r * z * _polynomial(SINE, z), 1 - (z / 2 - z * z * _polynomial(COSINE, z))
+
+
+@staged
+def _in_stages(x):
+    """sin x and cos x; what both need is computed once."""
+    r, k = _reduced(x)
+    sine, cosine = _near_zero(r)
+    odd, second_half = _is_odd(k), _is_odd(jnp.floor(k / 2))
     sine, cosine = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)
-    sine = jnp.where(quarter & 2 == 0, sine, -sine)
-    cosine = jnp.where((quarter + 1) & 2 == 0, cosine, -cosine)
-    return tuple(jnp.where(inside, y, jnp.nan) for y in (sine, cosine))
+    return jnp.where(second_half, -sine, sine), jnp.where(odd != second_half, -cosine, cosine)
+
+
+def _is_odd(k):
+    """Of whole numbers; in floating point, because conversion to integers takes longer than all the rest."""
+    return jnp.floor(k / 2) != k / 2
 
 
 @sincos.defjvp

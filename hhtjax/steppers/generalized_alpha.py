@@ -94,7 +94,7 @@ def linearization_point(system, params, s, predicted, where):
     if where == "held":
         return held
     M = system.mass(s.q, params)
-    D = M if M.ndim == 1 else jnp.diagonal(M)
+    D = M if M.ndim == 1 else M[jnp.arange(len(M)), jnp.arange(len(M))]
     r_predicted, r_held = (residual(system, params, x) for x in (predicted, held))
     limit = jnp.maximum(jnp.sum(r_held**2 / D), HELD_THRESHOLD**2 * jnp.sum(D * s.w**2))
     use_predictor = jnp.sum(r_predicted**2 / D) <= limit
