@@ -11,10 +11,12 @@ the called function through, operation by operation, and attaches the attribute 
 other than the CPU never see it. The verdict is attached too, for `explain` to read.
 """
 
+from functools import reduce
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxlib.mlir import ir
@@ -37,6 +39,7 @@ KNOWN = {
 }
 LARGEST_SUM = 1024  # elements; XLA hands larger ones to another library, and products of matrices
 LARGEST_PRODUCT = 7  # rows, columns, and terms of a sum
+LARGEST_WRITTEN_OUT = 16  # the same where the product is written as a sum of others
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
 MOST_OPERATIONS = 5000  # compiling one function takes longer than in proportion: beyond, minutes
 
@@ -92,9 +95,11 @@ def _lower(ctx, x):
 
 
 def _decide(module, call):
-    objection = _Inspection(module, call).objection
-    _attach(call, **{VERDICT: f"plain: {objection}" if objection else "one kernel"})
-    if objection is None:
+    found = _Inspection(module, call)
+    _attach(call, **{VERDICT: f"plain: {found.objection}" if found.objection else "one kernel"})
+    if found.objection is None:
+        for product in found.products:
+            _write_out(module, product)
         _make_kernel(module, call)
 
 
@@ -174,6 +179,7 @@ class _Inspection:
         self.functions = module.symbol_table
         self.seen = set()
         self.operations = 0
+        self.products = []  # to be written out
         self.objection = None
         if _is_partitioned(module.axis_context):
             self.object("partitioned over devices; shard_map leaves each its own kernel")
@@ -194,6 +200,8 @@ class _Inspection:
                 self.look(self.functions[callee].operation)
         elif name == "custom_call":
             self.object(ir.StringAttr(op.attributes["call_target_name"]).value)
+        elif name == "dot_general" and _is_written_out(op):
+            self.products.append(op)
         elif dialect == "stablehlo" and name in CHECKS:  # what it holds is scalar
             if not CHECKS[name](op):
                 self.object(f"{name} of {' and '.join(str(x.type) for x in op.operands)}")
@@ -226,19 +234,70 @@ def _small_reduction(op):
     return _size(value) <= LARGEST_SUM or str(ir.RankedTensorType(value.type).element_type) == "i1"
 
 
-def _small_product(op):
-    """Of a vector, batched or not, or of tiny matrices: tiny in rows, columns and what is summed over."""
+def _dimensions(op):
+    """Of both operands of a product: (batched, summed over, the others)."""
     dims = stablehlo.DotDimensionNumbers(op.attributes["dot_dimension_numbers"])
     batched = dims.lhs_batching_dimensions, dims.rhs_batching_dimensions
     summed = dims.lhs_contracting_dimensions, dims.rhs_contracting_dimensions
-    shapes = [
-        [n for i, n in enumerate(ir.RankedTensorType(x.type).shape) if i not in skipped]
-        for x, skipped in zip(op.operands, batched, strict=True)
+    ranks = [ir.RankedTensorType(x.type).rank for x in op.operands]
+    return [
+        (list(b), list(s), [i for i in range(rank) if i not in (*b, *s)])
+        for b, s, rank in zip(batched, summed, ranks, strict=True)
     ]
-    vector = any(len(shape) == len(over) for shape, over in zip(shapes, summed, strict=True))
-    if vector:
+
+
+def _small_product(op, largest=LARGEST_PRODUCT):
+    """Of a vector, batched or not, or of tiny matrices: tiny in rows, columns and what is summed over."""
+    dimensions = _dimensions(op)
+    if not all(rest for _, _, rest in dimensions):
         return max(map(_size, op.operands)) <= LARGEST_MATRIX
-    return max(n for shape in shapes for n in shape) <= LARGEST_PRODUCT
+    shapes = [ir.RankedTensorType(x.type).shape for x in op.operands]
+    lengths = [shape[i] for shape, (_, over, rest) in zip(shapes, dimensions, strict=True) for i in (*over, *rest)]
+    return max(lengths) <= largest
+
+
+def _is_written_out(op):
+    types = {str(ir.RankedTensorType(x.type).element_type) for x in (*op.operands, *op.results)}
+    return not _small_product(op) and _small_product(op, LARGEST_WRITTEN_OUT) and len(types) == 1
+
+
+def _write_out(module, product):
+    """The product as a sum over its terms, each a column times a row, in a function of its own.
+
+    XLA would hand the product as such to another library.
+    """
+    result = ir.RankedTensorType(product.results[0].type)
+    types = [x.type for x in product.operands]
+    with product.location:
+        function = func.FuncOp(STAGED, ir.FunctionType.get(types, [result]), ip=module.ip)
+        function.attributes["sym_visibility"] = ir.StringAttr.get("private")
+        with ir.InsertionPoint(function.add_entry_block()):
+            func.ReturnOp([_sum_of_terms(_dimensions(product), function.arguments, result)])
+        with ir.InsertionPoint(product):
+            call = func.CallOp([result], _insert(module, function), list(product.operands))
+        _attach(call.operation, inlineable="false")
+    product.results[0].replace_all_uses_with(call.results[0])
+    product.erase()
+
+
+def _sum_of_terms(dimensions, operands, result):
+    shapes = [ir.RankedTensorType(x.type).shape for x in operands]
+    (batched, summed, rows), _ = dimensions
+    first = len(batched), len(batched) + len(rows)  # of the result, after the batch
+    terms = []
+    for index in np.ndindex(*(shapes[0][i] for i in summed)):
+        factors = []
+        for x, shape, (batch, over, rest), start in zip(operands, shapes, dimensions, first, strict=True):
+            fixed = dict(zip(over, index, strict=True))
+            low = [fixed.get(i, 0) for i in range(len(shape))]
+            high = [fixed[i] + 1 if i in fixed else n for i, n in enumerate(shape)]
+            kept = [i for i in range(len(shape)) if i not in fixed]
+            part = stablehlo.slice(x, *map(ir.DenseI64ArrayAttr.get, (low, high, [1] * len(shape))))
+            part = stablehlo.reshape(ir.RankedTensorType.get([shape[i] for i in kept], result.element_type), part)
+            place = [batch.index(i) if i in batch else start + rest.index(i) for i in kept]
+            factors.append(stablehlo.broadcast_in_dim(result, part, ir.DenseI64ArrayAttr.get(place)))
+        terms.append(stablehlo.multiply(*factors))
+    return reduce(stablehlo.add, terms)
 
 
 CHECKS = {"dot_general": _small_product, "reduce": _small_reduction, "reduce_window": _small_reduction}

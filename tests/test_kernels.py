@@ -21,6 +21,8 @@ on_cpu = pytest.mark.skipif(
 N = 5
 x = jnp.linspace(0.1, 1.0, 4)
 order = jnp.array([1, 0, 3, 2])
+EIGHTS = jnp.sin(jnp.arange(3.0 * 4 * 5 * 8)).reshape(3, 4, 5, 8)
+ROWS = jnp.ones((3, 4))
 
 
 def links(q, v, t, params):
@@ -64,6 +66,9 @@ SUPPORTED = {
     "a loop": lambda c: jax.lax.while_loop(lambda c: c[0] < 3, lambda c: c + 0.5, c) / 10,
     "indices": lambda c: c[order] + c[(3 * c).astype(int) % 4],
     "matrices of 7": lambda c: ((jnp.ones((7, 7)) * c[0]) @ (jnp.ones((7, 7)) * c[1]))[:4, :4] @ c / 99,
+    "nine rows": lambda c: jax.vmap(lambda b: jnp.eye(4) @ b)(jnp.outer(jnp.ones(9), c))[3] / 2,
+    "eight terms": lambda c: (EIGHTS[0, 0, :4] * c[0]) @ (EIGHTS[1, :, 1].T * c[1]) @ c / 99,
+    "products of blocks": lambda c: jnp.einsum("aibj,cibj->bac", EIGHTS * c[0], EIGHTS[::-1])[1, 1] @ ROWS * c / 99,
     "small products and sums": lambda c: jnp.outer(c, c) @ c / 9 + jnp.sum(c) / 9 + jnp.cumsum(c) / 9,
     "interpolation": lambda c: jnp.interp(c, jnp.arange(10.0), jnp.arange(10.0) ** 2) / 9,
     "random numbers": lambda c: c / 2 + jax.random.normal(jax.random.key(3), (4,)),
@@ -76,8 +81,6 @@ UNSUPPORTED = {
     "fft": lambda c: jnp.abs(jnp.fft.fft(c)) / 9,
     "callback": lambda c: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(c.shape, c.dtype), c),
     "dot_general": lambda c: jnp.sum(jnp.ones((20, 20)) @ jnp.ones((20, 20)) * c[0], 1)[:4] / 999,
-    "dot_general ": lambda c: jax.vmap(lambda b: jnp.eye(4) @ b)(jnp.outer(jnp.ones(9), c))[3] / 2,
-    "dot_general  ": lambda c: (jnp.ones((4, 8)) * c[0]) @ (jnp.ones((8, 4)) * c[1]) @ c / 99,
     "reduce": lambda c: c / 2 + jnp.sum(jnp.ones(5000) * c[0]) / 9999,
     "gather, in reverse": lambda c: c[(3 * c).astype(int) % 4] / 2,
 }
