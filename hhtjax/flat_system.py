@@ -35,10 +35,11 @@ class FlatSystem(NamedTuple):
     constraint: Any = None  # q, t, params -> (m,); None without
     num_constraints: int = 0  # m
     blocks: tuple = ()  # where the rotations are; empty without
+    product: Callable | None = None  # q, w, params -> M(q) w, where the system has its own
 
     def inertia(self, q, w, params):
         """M(q) w."""
-        return matvec(self.mass(q, params), w)
+        return matvec(self.mass(q, params), w) if self.product is None else self.product(q, w, params)
 
     def acceleration(self, q, v, t, params, factorize=factorize):
         """w = M(q)^-1 Q(q, v, t)."""
@@ -157,14 +158,15 @@ def flatten(caller, system, q0, v0, t0, params):
         m = _count_constraints(caller, system.constraint, n, dtype, q0, t0, params)
         constraint = partial(_flat_constraint, system.constraint, unravel, dtype)
 
-    if isinstance(system, LinearSystem):
+    linear = isinstance(system, LinearSystem)
+    if linear:
         for name in ("M", "C", "K"):
             matrix = getattr(system, name)
             if matrix is not None:
                 _check_matrix(caller, name, matrix, n, dtype, params)
     else:
         _check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
-    if isinstance(system, LinearSystem) and system.load is not None:
+    if linear and system.load is not None:
         Q = _evaluate(caller, "force", system.load, t0, params)
     else:
         Q = _evaluate(caller, "force", system.force, q0, v0, t0, params)
@@ -177,12 +179,19 @@ def flatten(caller, system, q0, v0, t0, params):
     def force(q, v, t, params):
         return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, params))[0].astype(dtype)
 
-    linear = isinstance(system, LinearSystem)
-    return FlatSystem(mass, force, n, linear, False, unravel, unravel_rates, constraint, m, blocks), q, v
+    product = None
+    if not linear and system.inertia is not None:
+        _check_like(caller, "inertia", _evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
+        product = partial(_flat_product, system.inertia, unravel, unravel_rates, dtype)
+    return FlatSystem(mass, force, n, linear, False, unravel, unravel_rates, constraint, m, blocks, product), q, v
 
 
 def _flat_constraint(constraint, unravel, dtype, q, t, params):
     return jnp.asarray(constraint(unravel(q), t, params)).astype(dtype)
+
+
+def _flat_product(inertia, unravel, unravel_rates, dtype, q, w, params):
+    return ravel_pytree(inertia(unravel(q), unravel_rates(w), params))[0].astype(dtype)
 
 
 def _check_matrix(caller, name, matrix, n, dtype, *args):

@@ -50,7 +50,7 @@ def _work(jaxpr):
     total = 0
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
-        if name not in ELEMENTWISE | RULES.keys() | {"cond"}:
+        if name not in ELEMENTWISE | RULES.keys():
             return math.inf
         if name in ELEMENTWISE:
             total += eqn.outvars[0].aval.size
@@ -435,6 +435,15 @@ def _while_loop(eqn, *values):
     return back(lax.while_loop(unfinished, body, flat(values[second:])))
 
 
+def _cond(eqn, which, *values):
+    (flat, back), (flat_results, back_results) = _layout(eqn.invars[1:]), _layout(eqn.outvars)
+
+    def branch(closed):
+        return lambda *x: flat_results(_evaluate(closed.jaxpr, closed.consts, back(x)))
+
+    return back_results(lax.switch(which.item(), [branch(closed) for closed in eqn.params["branches"]], *flat(values)))
+
+
 def _custom_linear_solve(eqn, *values):
     lengths, closed = eqn.params["const_lengths"], eqn.params["jaxprs"]
     flat, back = _layout(eqn.outvars)
@@ -478,6 +487,7 @@ def _custom_jvp_call(eqn, *values):
 
 
 CALLS = {
+    "cond": _cond,
     "jit": _call,
     "while": _while_loop,
     "custom_linear_solve": _custom_linear_solve,

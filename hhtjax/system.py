@@ -25,6 +25,9 @@ class System(Description):
         force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v.
         constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), m <= n, rows independent. Then
             M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.
+        inertia: M(q) w without M, `inertia(q, w, params)`, a pytree structured like v: for chains and trees, whose
+            inverse dynamics take fewer operations than their matrix. It replaces the product of `mass` and w, in the
+            steps and in their Jacobians, and is trusted to be equal to it; `mass` is still asked for M itself.
 
     q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
     leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
@@ -32,7 +35,7 @@ class System(Description):
     units do. A System is frozen and hashable; constant arrays in it are leaves of a pytree.
 
     Raises:
-        TypeError: `mass`, `force` or `constraint` is not callable (or an array, for `mass`).
+        TypeError: `mass`, `force`, `constraint` or `inertia` is not callable (or an array, for `mass`).
         ValueError: a constant `mass` of a wrong shape, or not finite.
 
     Example: a pendulum of length 2 m, with q the angle from the downward vertical in rad.
@@ -52,9 +55,12 @@ class System(Description):
     mass: Any
     force: Callable
     constraint: Callable | None = None
+    inertia: Callable | None = None
 
     def __post_init__(self):
         require_function("System", "force", self.force, "force(q, v, t, params)")
+        if self.inertia is not None:
+            require_function("System", "inertia", self.inertia, "inertia(q, w, params)")
         if self.constraint is not None:
             require_function("System", "constraint", self.constraint, "constraint(q, t, params)")
         if callable(self.mass):
@@ -83,7 +89,9 @@ class System(Description):
         require_function("System.from_lagrangian", "lagrangian", lagrangian, "lagrangian(q, v, t, params)")
         if force is not None:
             require_function("System.from_lagrangian", "force", force, "force(q, v, t, params)")
-        return cls(_LagrangianMass(lagrangian), _LagrangianForce(lagrangian, force))
+        return cls(
+            _LagrangianMass(lagrangian), _LagrangianForce(lagrangian, force), inertia=_LagrangianInertia(lagrangian)
+        )
 
 
 @dataclass(frozen=True)
@@ -96,6 +104,19 @@ class _LagrangianMass:
     def __call__(self, q, params):
         zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))
         return jax.hessian(lambda v: self.lagrangian(q, unravel(v), 0.0, params))(zero)
+
+
+@dataclass(frozen=True)
+class _LagrangianInertia:
+    """M(q) w, the derivative of the momentum dL/dv in the direction w: one column of the Hessian, not all."""
+
+    lagrangian: Callable
+
+    def __call__(self, q, w, params):
+        q, w = (jax.tree.map(jnp.asarray, x) for x in (q, w))
+        zero = jax.tree.map(jnp.zeros_like, w)
+        momentum = jax.grad(lambda v: self.lagrangian(q, v, 0.0, params))
+        return jax.jvp(momentum, (zero,), (w,))[1]
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,17 @@ def force_by_2n(q, v, t, params):
     return joint_torques(q, v, params) + weight(q, params) - spin
 
 
-FORMULATIONS = {"N^2 sines": (mass, force), "2 N sines": (mass_by_2n, force_by_2n)}
+def inertia_by_2n(q, w, params):
+    """M(q) w without M: the Jacobian takes products of N x N matrices, and no N x N x N array."""
+    s, c = jnp.sin(q), jnp.cos(q)
+    mu = hanging(q.size, params)
+    return c * (mu @ (c * w)) + s * (mu @ (s * w))
+
+
+FORMULATIONS = {
+    "N^2 sines": System(mass, force),
+    "2 N sines": System(mass_by_2n, force_by_2n, inertia=inertia_by_2n),
+}
 
 
 def chain(N, k=0.0, c=0.0, formulation="2 N sines", duration=1.0) -> Scene:
@@ -68,5 +78,4 @@ def chain(N, k=0.0, c=0.0, formulation="2 N sines", duration=1.0) -> Scene:
         formulation: a key of FORMULATIONS.
     """
     params = {"m": 1 / N, "l": 1 / N, "k": k, "c": c, "g": 9.81}
-    system = System(*FORMULATIONS[formulation])
-    return Scene(system, params, jnp.full(N, np.pi / 3), jnp.zeros(N), duration)
+    return Scene(FORMULATIONS[formulation], params, jnp.full(N, np.pi / 3), jnp.zeros(N), duration)

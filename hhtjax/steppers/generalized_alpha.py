@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from hhtjax import kinematics
 from hhtjax.boundary import require_function, require_number
@@ -95,9 +96,16 @@ def linearization_point(system, params, s, predicted, where):
         return held
     M = system.mass(s.q, params)
     D = M if M.ndim == 1 else M[jnp.arange(len(M)), jnp.arange(len(M))]
-    r_predicted, r_held = (residual(system, params, x) for x in (predicted, held))
-    limit = jnp.maximum(jnp.sum(r_held**2 / D), HELD_THRESHOLD**2 * jnp.sum(D * s.w**2))
-    use_predictor = jnp.sum(r_predicted**2 / D) <= limit
+
+    def size(s):
+        return jnp.sum(residual(system, params, s) ** 2 / D)
+
+    predicted_size = size(predicted)
+    use_predictor = lax.cond(
+        predicted_size <= HELD_THRESHOLD**2 * jnp.sum(D * s.w**2),
+        lambda: jnp.array(True),
+        lambda: predicted_size <= size(held),
+    )
     return jax.tree.map(partial(jnp.where, use_predictor), predicted, held)
 
 
