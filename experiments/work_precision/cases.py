@@ -15,6 +15,7 @@ from experiments.cardona_geradin1989.index_1 import unconstrained
 from hhtjax.kernels import one_kernel
 from hhtjax.linear_solve import solve
 from hhtjax.rotation import hat
+from hhtjax.scalars import join, on_scalars, pays, split
 from hhtjax.scenes import Scene, double_pendulum, duffing, squeezer, top
 
 SAMPLES = 50  # times at which positions are compared
@@ -124,22 +125,24 @@ def flat(q):
 def march(system, stepper, q0, v0, params, duration, substeps):
     """Positions at the sample times, and the number of factorised matrices, substeps of them between samples.
 
-    A loop around `stepper.step`, the step that `hhtjax.simulate` takes, and as one kernel of XLA like there.
+    A loop around `stepper.step`, the step that `hhtjax.simulate` takes, on scalars and as one kernel like there.
     """
 
     def loop(start, params, dt, substeps):
-        def step(_, carry):
+        @on_scalars
+        def advance(carry):
             state, solves = carry
             state, info = stepper.step(system, state, params, dt)
             return state, solves + (1 if info.iterations is None else info.iterations)
 
         def interval(carry, _):
-            carry = jax.lax.fori_loop(0, substeps, step, carry)
-            return carry, flat(carry[0].q)
+            carry = jax.lax.fori_loop(0, substeps, lambda _, carry: advance(carry), carry)
+            return carry, carry[0].q
 
-        return jax.lax.scan(interval, (start, 0), None, SAMPLES)
+        carry = start, jnp.zeros((), jnp.int32)
+        return jax.lax.scan(interval, split(carry) if pays(advance, carry) else carry, None, SAMPLES)
 
     dt = duration / (SAMPLES * substeps)
     start = stepper.init(system, q0, v0, params, dt)
     (_, solves), path = one_kernel(loop, start, params, dt, substeps)
-    return path, solves
+    return jax.vmap(flat)(join(path)), solves
