@@ -22,7 +22,6 @@ N = 5
 x = jnp.linspace(0.1, 1.0, 4)
 order = jnp.array([1, 0, 3, 2])
 EIGHTS = jnp.sin(jnp.arange(3.0 * 4 * 5 * 8)).reshape(3, 4, 5, 8)
-ROWS = jnp.ones((3, 4))
 
 
 def links(q, v, t, params):
@@ -68,7 +67,9 @@ SUPPORTED = {
     "matrices of 7": lambda c: ((jnp.ones((7, 7)) * c[0]) @ (jnp.ones((7, 7)) * c[1]))[:4, :4] @ c / 99,
     "nine rows": lambda c: jax.vmap(lambda b: jnp.eye(4) @ b)(jnp.outer(jnp.ones(9), c))[3] / 2,
     "eight terms": lambda c: (EIGHTS[0, 0, :4] * c[0]) @ (EIGHTS[1, :, 1].T * c[1]) @ c / 99,
-    "products of blocks": lambda c: jnp.einsum("aibj,cibj->bac", EIGHTS * c[0], EIGHTS[::-1])[1, 1] @ ROWS * c / 99,
+    "products of blocks": lambda c: (
+        jnp.einsum("abij,cbdj->baicd", EIGHTS * c[0], EIGHTS[::-1])[1, 1, 2, 2, :4] * c / 99
+    ),
     "small products and sums": lambda c: jnp.outer(c, c) @ c / 9 + jnp.sum(c) / 9 + jnp.cumsum(c) / 9,
     "interpolation": lambda c: jnp.interp(c, jnp.arange(10.0), jnp.arange(10.0) ** 2) / 9,
     "random numbers": lambda c: c / 2 + jax.random.normal(jax.random.key(3), (4,)),

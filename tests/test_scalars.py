@@ -34,7 +34,16 @@ FUNCTIONS = {
     "products": lambda x: (
         (M.astype(x.dtype) @ x) @ (x[:, None] * x[None, :]) + jnp.einsum("i,jk,k->j", x, jnp.outer(x, x), x)
     ),
-    "parts": lambda x: jnp.concatenate([x[1:], x[:1], x[::-1], jnp.append(jnp.diff(x, prepend=0), x.sum())]),
+    "parts": lambda x: jnp.concatenate(
+        [
+            lax.slice(x, (0,), (3,), (2,)),
+            jnp.zeros(3, x.dtype) - x,
+            x[1:],
+            x[:1],
+            x[::-1],
+            jnp.append(jnp.diff(x, prepend=0), x.sum()),
+        ]
+    ),
     "indices": lambda x: x[jnp.array([2, 0])] * x.at[1].set(3.0)[1:] + jnp.pad(x, 1)[:2] + jnp.diag(x)[1, :2],
     "sums": lambda x: jnp.stack(
         [x.sum(), x.prod(), x.max(), jnp.linalg.norm(x), jnp.mean(x**2), jnp.trace(jnp.outer(x, x))]
@@ -50,6 +59,7 @@ FUNCTIONS = {
     "large array": lambda x: jnp.interp(
         x, jnp.linspace(-3, 3, 100, dtype=x.dtype), jnp.linspace(0, 1, 100, dtype=x.dtype) ** 2
     ),
+    "a stage": lambda x: sum(kernels.staged(lambda x, y: (x, x * y, y))(x, x[::-1] ** 2)),
     "integers": lambda x: x * (jnp.arange(3) % 2).astype(x.dtype) + jnp.argmax(x).astype(x.dtype),
 }
 
