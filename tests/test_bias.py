@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.identification.refine import Refined
+from hhtjax.extrapolation import richardson
+from hhtjax.identification.refine import Refined, needed_levels
 
 t = jnp.arange(0.0, 30.0, 0.35)
 K, C = 1.0, 0.04
@@ -29,12 +30,15 @@ def through(stepper, dt):
 
 @pytest.mark.slow
 def test_predicted_bias_is_measured_and_taken_back():
-    """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then next to none."""
+    """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then next to none.
+
+    Numerical damping adds an error of h^3, so that a stepper with it is refined three times, which two would not take out.
+    """
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
     with pytest.warns(hhtjax.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
-        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35, levels=2)
+        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35)
     assert (refined.stepper, refined.dt) == (stepper, 0.35)
-    found, fine = refined.fits
+    found, fine, finest = refined.fits
     bias = hhtjax.step_size_bias(spring, stepper, found.params, 0.35, q=jnp.zeros(1), correct=True)
     assert bias.stiffness_bias[0] == pytest.approx(float(found.params["k"]) / K - 1, rel=0.03)
     assert bias.damping_bias[0] == pytest.approx(float(found.params["c"]) / C - 1, rel=0.03)
@@ -44,11 +48,19 @@ def test_predicted_bias_is_measured_and_taken_back():
     assert float(fine.params["k"] - K) == pytest.approx(float(found.params["k"] - K) / 4, rel=0.05)
     assert refined.fits[0].params["k"] - K > 0.02
     assert float(refined.params["k"]) == pytest.approx(K, abs=2e-4)
-    assert float(refined.params["c"]) == pytest.approx(C, rel=3e-3)  # the numerical damping's h^3
+    assert float(refined.params["c"]) == pytest.approx(C, rel=1e-3)
+    by_two = richardson([fine.params, finest.params], 2)
+    assert abs(by_two["c"] - C) > 5 * abs(refined.params["c"] - C)
     again = Refined.from_json(refined.to_json())
     assert again.stepper == stepper
     assert again.params == refined.params
     assert again.interval()[0]["k"] == refined.interval()[0]["k"]
+
+
+def test_only_numerical_damping_needs_a_third_level():
+    undamped = hhtjax.hht(alpha=0.0), hhtjax.generalized_alpha(rho_inf=1.0), hhtjax.kim_hht(alpha=0.0)
+    damped = hhtjax.hht(alpha=-0.01), hhtjax.rk4(), hhtjax.kim_implicit_euler()
+    assert [needed_levels(stepper) for stepper in (*undamped, *damped)] == [2, 2, 2, 3, 3, 3]
 
 
 def test_the_response_to_forces_is_corrected_too():
