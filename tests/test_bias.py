@@ -32,7 +32,7 @@ def through(stepper, dt):
 def test_predicted_bias_is_measured_and_taken_back():
     """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then next to none.
 
-    Numerical damping adds an error of h^3, so that a stepper with it is refined three times, which two would not take out.
+    Numerical damping adds an error of h^3: so there are three fits, of which two alone would not take it out.
     """
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
     with pytest.warns(hhtjax.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
