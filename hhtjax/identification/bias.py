@@ -44,7 +44,7 @@ class ModeBias(NamedTuple):
     params: Any = None
 
 
-def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct=False) -> ModeBias:
+def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct: Any = False) -> ModeBias:
     """By how much stiffness and damping are off that were fitted through steps of dt.
 
     The system is linearised about (q, v, t): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
