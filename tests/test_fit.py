@@ -155,6 +155,13 @@ def test_damping_follows_the_gain():
     assert result.history.damping[1] == pytest.approx(lam * (1 - (2 * gain - 1) ** 3), rel=1e-9)
 
 
+def test_small_steps_under_damping_are_no_convergence():
+    """Beyond a kink the slope is 1e9 times less than what the damping remembers, and all steps are tiny for a while."""
+    kinked = hhtjax.fit(lambda p: (p + 1e9 * jnp.maximum(p - 1, 0)) * jnp.ones(1), 2.0, covariance=False)
+    assert kinked.converged
+    assert float(kinked.params) == pytest.approx(0.0, abs=1e-6)
+
+
 def test_undetermined_parameters_are_named():
     def residuals(params):
         return {"r": params["a"] * params["b"] * t - 2.0 * t + params["c"] - 1.0}
