@@ -95,6 +95,31 @@ def test_the_bias_of_the_trapezoidal_rule_in_every_mode():
     np.testing.assert_allclose(fitted, [1.0, np.sqrt(3.0)], rtol=1e-12)
 
 
+HANGING = {"g": 9.81, "c": 0.3}
+hanging = hhtjax.System(
+    jnp.full(2, 2.0),
+    lambda q, v, t, p: jnp.stack([0.0 * p["g"], -2.0 * p["g"]]) - p["c"] * v,
+    constraint=lambda q, t, p: jnp.sum(q**2)[None] - 0.25,
+)
+
+
+@pytest.mark.slow
+def test_a_constraint_leaves_the_bias_of_the_minimal_form():
+    """A point mass on a circle of 0.5 m: the multiplier's stiffness is all it has. s is in its real step, too."""
+    stepper, dt, bottom = hhtjax.hht(alpha=-0.1), 0.07, jnp.array([0.0, -0.5])
+    bias = hhtjax.step_size_bias(hanging, stepper, HANGING, dt, q=bottom, correct=True)
+    w, zeta = float(bias.frequency[0]), float(bias.damping[0])
+    s = w * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    assert w**2 * (1 + bias.stiffness_bias[0]) == pytest.approx(HANGING["g"] / 0.5, rel=1e-9)
+    assert 2 * zeta * w * (1 + bias.damping_bias[0]) == pytest.approx(HANGING["c"] / 2.0, rel=1e-9)
+    assert bias.stiffness_bias[0] > 0.01
+    assert float(bias.params["g"]) == pytest.approx(0.5 * w**2, rel=1e-6)
+    assert float(bias.params["c"]) == pytest.approx(2.0 * 2 * zeta * w, rel=1e-6)
+    state = stepper.init(hanging, bottom, jnp.zeros(2), HANGING, dt)
+    mu = np.linalg.eigvals(hhtjax.analysis.amplification_matrix(stepper, hanging, state, HANGING, dt=dt))
+    assert np.min(np.abs(mu - np.exp(s * dt))) < 1e-9
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
@@ -110,9 +135,9 @@ def test_the_bias_of_the_trapezoidal_rule_in_every_mode():
             "step_size_bias: `stepper` must be a stepper such as .* received 'hht'",
         ),
         (
-            lambda: hhtjax.step_size_bias(hhtjax.scenes.pendulum.cartesian().system, hhtjax.hht(), None, 0.1, q=t),
-            NotImplementedError,
-            "step_size_bias: `system` has a constraint",
+            lambda: hhtjax.step_size_bias(hanging, hhtjax.hht(), HANGING, 0.1, q=jnp.array([0.0, -0.6])),
+            ValueError,
+            "step_size_bias: `q` must meet the constraint; received one that is 0.11 away",
         ),
     ],
 )

@@ -224,5 +224,6 @@ def run(report: Report, fast: bool):
     if not fast:
         result, *_ = fit_training(sets.train, SUBSTEPS, 0.0)
         estimate = {name: float(value) for name, value in result.params[0].items()}
-        numbers |= {"others": others(report, sets.train), "far_starts": far_starts(report, sets.train, estimate)}
+        numbers |= {"others": others(report, sets.train), "far_starts_samples": PIECE}
+        numbers["far_starts"] = far_starts(report, sets.train, estimate)
     report.numbers(numbers)
