@@ -66,7 +66,7 @@ def pendulum_pieces(numbers):
 
     def errors(rows):
         return table(
-            ["fitted", *lengths], [[n, *(f"{x:.2f}" for x in row)] for n, row in zip(lengths, rows, strict=True)]
+            ["fitted", *lengths], [[n, *(f"{x:.3f}" for x in row)] for n, row in zip(lengths, rows, strict=True)]
         )
 
     tests = (f"{value:.2f} mrad over {length}" for length, value in numbers["test_mrad"].items())
