@@ -172,7 +172,7 @@ def run(report: Report, fast: bool):
     for name, extra in list(FRICTION.items())[: 1 if fast else None]:
         begin = time.perf_counter()
         params0 = START | dict.fromkeys(extra, (0.0, 0.0))
-        first, records = fit_progressively(params0, train, up_to(SHOWN), covariance=False)
+        first, records = fit_progressively(params0, train, up_to(SCORED[0] if fast else SHOWN), covariance=False)
         result = refit(first, records)
         seconds = time.perf_counter() - begin
         report.progress(f"{name}: {rmse(result.residual, records):.3f} mrad on the training windows, {result.reason}")
