@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import lax
 
@@ -139,7 +140,9 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
 
 def _within(problem, now, lam, longest):
     """The least damping, lam times a power of 4, whose step is within `longest`; that step, and what it predicts."""
-    longest = jnp.minimum(longest, float(jnp.finfo(lam.dtype).max))  # so that inf is too long
+    if np.all(np.isinf(longest)):
+        return lam, *problem.step(now, lam)  # the loop would only cost time to compile
+    longest = np.minimum(longest, np.finfo(lam.dtype).max).astype(lam.dtype)  # so that inf is too long
 
     def too_long(carry):
         return jnp.any(jnp.abs(carry[1]) > longest)
