@@ -1,5 +1,7 @@
 """Least squares: known parameters recovered, uncertainty, stop reasons, and every complaint."""
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -110,6 +112,54 @@ def test_a_step_into_nowhere_is_taken_back():
     result = hhtjax.fit(lambda p: jnp.stack([jnp.log(p) + 3.0, jnp.log(p) + 3.0]), 5.0, covariance=False)
     assert result.converged
     assert float(result.params) == pytest.approx(np.exp(-3.0), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_poor_starts_reach_the_minimum():
+    """A spring set in motion by a force, all 16 starts with every parameter 3 times too large or too small.
+
+    12 do with Marquardt's damping alone, whose first steps make a stiffness or a damping of exp(10) or exp(-10).
+    """
+    time = jnp.linspace(0.0, 1.5, 40)
+
+    def model(p):
+        decay, square = p["c"] / 2, p["k"] - p["c"] ** 2 / 4
+        w = jnp.sqrt(jnp.abs(square))
+        cos, sin = jnp.where(square > 0, jnp.cos(w * time), jnp.cosh(w * time)), jnp.sin(w * time)
+        sin = jnp.where(square > 0, sin, jnp.sinh(w * time)) / w
+        return p["force"] / p["k"] * (1 - jnp.exp(-decay * time) * (cos + decay * sin)) + p["drift"] * time
+
+    true = {"k": 30.0, "c": 1.0, "force": 20.0, "drift": 0.3}
+    measured = model(true) + 1e-3 * jnp.asarray(np.random.default_rng(0).normal(size=40))
+    factors = 3.0 ** np.array(list(product((-1, 1), repeat=4)))
+    starts = {name: x * factors[:, i] for i, (name, x) in enumerate(true.items())}
+    found = hhtjax.multistart(
+        lambda p: model(p) - measured,
+        starts,
+        transforms={"k": hhtjax.positive, "c": hhtjax.positive, "force": None, "drift": None},
+        covariance=False,
+    )
+    assert np.all(found.all.converged)
+    np.testing.assert_allclose(found.all.cost, found.best.cost, rtol=1e-6)
+
+
+def test_damping_follows_the_gain():
+    """A step that does lower the cost, but by a twentieth of what was predicted, is followed by more damping."""
+    result = hhtjax.fit(lambda p: jnp.arctan(p) * jnp.ones(1), 1.35, max_iterations=1, covariance=False)
+    before, after = map(float, result.history.cost)
+    slope, lam = 1 / (1 + 1.35**2), 1e-3
+    predicted = before * (1 - (lam / (1 + lam)) ** 2)
+    assert 1.35 - np.arctan(1.35) / slope < -1  # the step goes far beyond
+    gain = (before - after) / predicted
+    assert 0 < gain < 0.1
+    assert result.history.damping[1] == pytest.approx(lam * (1 - (2 * gain - 1) ** 3), rel=1e-9)
+
+
+def test_small_steps_under_damping_are_no_convergence():
+    """Beyond a kink the slope is 1e9 times less than what the damping remembers, and all steps are tiny for a while."""
+    kinked = hhtjax.fit(lambda p: (p + 1e9 * jnp.maximum(p - 1, 0)) * jnp.ones(1), 2.0, covariance=False)
+    assert kinked.converged
+    assert float(kinked.params) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_undetermined_parameters_are_named():

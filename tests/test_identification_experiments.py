@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -35,9 +36,31 @@ def test_gradients_are_of_second_order_for_every_alpha():
         assert coarse / fine == pytest.approx(4, abs=0.1)
 
 
+def test_measured_systems():
+    """Starts 3 times off, standard errors, Richardson's value, and predictions of an unseen trial."""
+    far = NUMBERS["silverbox_comparison"]["far_starts"]
+    for how in ("a growing part", "windows"):
+        found = far["3 times off"][f"hhtjax.fit_progressively, {how}"]
+        assert found["right"] == found["of"] == 5
+        assert found["slowest_s"] <= 1
+    for name in ("3 times off, others", "2 times off"):
+        assert far[name]["hhtjax.fit_progressively, windows"]["right"] == 20
+    for model in NUMBERS["silverbox"]["models"].values():
+        ratios = [r["cluster"] for r in model["standard_error_over_scatter"].values() if isinstance(r, dict)]
+        assert len(ratios) >= 6
+        assert 0.8 <= min(ratios) <= max(ratios) <= 1.25
+    agreement = NUMBERS["silverbox"]["by_step_size"]["richardson_agreement"]
+    for name in ("alpha 0.0, 2 levels", "alpha -0.05, 3 levels"):
+        assert max(map(abs, agreement[name].values())) < 3e-5
+    pendulum = NUMBERS["double_pendulum_measured"]
+    assert pendulum["chosen_windows_s"] == pendulum["windows_s"] == [0.25, 0.5, 1.0]
+    assert np.all(np.array(list(pendulum["test_mrad"].values())) <= [1.6, 2.5, 7.0])
+    assert pendulum["long_windows_mrad"]["viscous and dry, progressive horizon"] <= 1.6
+
+
 def test_the_page_is_made_from_the_committed_numbers():
     text = (page.HERE / "README.md").read_text()
     assert text == page.page(NUMBERS)
-    for name in ("stiff_joint", "stiff_joint_gradients", "vehicle", "squeezer"):
-        assert f"({name}.png)" in text
-        assert (page.HERE / f"{name}.png").stat().st_size < 200_000
+    for figure in page.HERE.glob("*.png"):
+        assert f"({figure.name})" in text
+        assert figure.stat().st_size < 200_000

@@ -120,8 +120,8 @@ def reconstruct(u):
     return hhtjax.band_limited(jnp.asarray(u), 1 / SAMPLING_RATE)
 
 
-def simulate(params, start, u, samples, substeps, alpha):
-    """Output at `samples` samples of the reconstructed input u, in V, by the non-iterative step."""
+def simulate(params, start, u, samples, substeps, alpha, t0=0.0):
+    """Output at `samples` samples of the reconstructed input u, from time t0 on, in V, by the non-iterative step."""
     solution = hhtjax.simulate(
         SYSTEM,
         hhtjax.hht(alpha, linearize="predictor"),  # smooth in the parameters
@@ -131,6 +131,7 @@ def simulate(params, start, u, samples, substeps, alpha):
         dt=1 / SAMPLING_RATE / substeps,
         num_steps=(samples - 1) * substeps,
         save_every=substeps,
+        t0=t0,
     )
     return solution.q[:, 0]
 
@@ -149,3 +150,16 @@ def training_residuals(record: Record, substeps: int, alpha: float):
         return simulate(params, start, u, len(y), substeps, alpha) - y
 
     return residuals
+
+
+def windows_problem(record: Record, samples: int, substeps: int, alpha: float):
+    """Arguments of `fit` for windows of `samples` sampling periods, one after the other, each with its own start."""
+    u, y = reconstruct(record.u), np.asarray(record.y)
+    first = np.arange(0, len(y) - samples, samples)
+    windows = {"t0": jnp.asarray(first / SAMPLING_RATE), "y": jnp.asarray(y[first[:, None] + np.arange(samples + 1)])}
+    starts = {"y": jnp.asarray(y[first]), "v": jnp.asarray((y[first + 1] - y[first]) * SAMPLING_RATE)}
+
+    def residuals(params, start, window):
+        return simulate(params, start, u, samples + 1, substeps, alpha, window["t0"]) - window["y"]
+
+    return {"residuals": residuals, "records": windows, "starts": starts}

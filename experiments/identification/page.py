@@ -1,4 +1,4 @@
-"""README.md beside this file, made from page.md and the numbers of stiff_joint, vehicle and squeezer.
+"""README.md beside this file, made from page.md and the numbers of six experiments.
 
 `python -m experiments.identification.page`
 """
@@ -13,11 +13,71 @@ from experiments.page import find, table
 HERE = Path(__file__).parent
 SHOWN = ("non-iterative, alpha = 0", "non-iterative, alpha = -0.3", "converged, alpha = 0", "Kim's step, alpha = 0")
 STEPS = 0.04, 0.01, 0.0025  # s
+MEASURED = "silverbox", "silverbox_comparison", "double_pendulum_measured"
+GENERATED = "stiff_joint", "vehicle", "squeezer"
 
 
 def read():
     """{experiment: its numbers}."""
-    return {name: json.loads((HERE / f"{name}.json").read_text()) for name in ("stiff_joint", "vehicle", "squeezer")}
+    return {name: json.loads((HERE / f"{name}.json").read_text()) for name in MEASURED + GENERATED}
+
+
+def silverbox_pieces(numbers):
+    """Tables of Silverbox: scores, errors over scatter, Richardson's values."""
+    sets = {"train": "training", "arrow_full": "arrow, full", "arrow_no_extrapolation": "arrow, no extrapolation"}
+    sets["multisine"] = "multisine"
+    models = numbers["models"]
+    scores = [[name, *(f"{m[f'{part}_mV']:.3f} mV" for part in sets)] for name, m in models.items()]
+    ratios = {
+        name: {p: r for p, r in m["standard_error_over_scatter"].items() if isinstance(r, dict)}
+        for name, m in models.items()
+    }
+    columns = list(ratios["10 parameters"])
+    rows = [[n, *(f"{by[c]['cluster']:.2f}" if c in by else "" for c in columns)] for n, by in ratios.items()]
+    naive = [r["naive"] for by in ratios.values() for r in by.values()]
+    agreement = numbers["by_step_size"]["richardson_agreement"]
+    return {
+        "silverbox": table(["model", *sets.values()], scores),
+        "silverbox_parts": models["10 parameters"]["standard_error_over_scatter"]["parts"],
+        "scatter": table(["model", *columns], rows),
+        "naive_least": min(naive),
+        "naive_most": max(naive),
+        "richardson": table(
+            ["", "k/m", "c/m"], [[n, *(f"{by[x]:.1e}" for x in ("k/m", "c/m"))] for n, by in agreement.items()]
+        ),
+    }
+
+
+def far_table(far):
+    """Starts that arrive, and the slowest, by solver."""
+    rows = [
+        [
+            solver,
+            *(f"{by[solver]['right']} of {by[solver]['of']}, {by[solver]['slowest_s']:.2g} s" for by in far.values()),
+        ]
+        for solver in next(iter(far.values()))
+    ]
+    return table(["", *far], rows)
+
+
+def pendulum_pieces(numbers):
+    """Tables of the measured double pendulum."""
+    lengths = [f"{x:g} s" for x in numbers["windows_s"]]
+
+    def errors(rows):
+        return table(
+            ["fitted", *lengths], [[n, *(f"{x:.3f}" for x in row)] for n, row in zip(lengths, rows, strict=True)]
+        )
+
+    tests = (f"{value:.2f} mrad over {length}" for length, value in numbers["test_mrad"].items())
+    return {
+        "unseen": errors(numbers["unseen_mrad"]),
+        "held_out": errors(numbers["held_out_mrad"]),
+        "test": ", ".join(tests),
+        "long_windows": table(
+            ["friction, fit", "mrad"], [[n, f"{x:.4g}"] for n, x in numbers["long_windows_mrad"].items()]
+        ),
+    }
 
 
 def covered(found):
@@ -48,6 +108,10 @@ def page(numbers):
         (HERE / "page.md")
         .read_text()
         .format(
+            **silverbox_pieces(numbers["silverbox"]),
+            piece=numbers["silverbox_comparison"]["far_starts_samples"],
+            far=far_table(numbers["silverbox_comparison"]["far_starts"]),
+            **pendulum_pieces(numbers["double_pendulum_measured"]),
             stiff_records=stiff["records"],
             stiff_converged=stiff["converged"],
             stiff_cost=stiff["largest_cost_per_residual"],

@@ -31,6 +31,7 @@ from experiments.identification.data import (
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
 from hhtjax.extrapolation import richardson
+from hhtjax.identification.uncertainty import SEGMENTS
 
 SUBSTEPS = 8
 MODELS = {
@@ -94,7 +95,7 @@ def run(report: Report, fast: bool):
         if fast and name != best:
             continue
         report.progress(f"fitting {name} and the initial state to {len(sets.train.y)} samples")
-        result, scores, models[name] = fit_and_score(report, sets, terms)
+        result, scores, models[name] = fit_and_score(report, sets, terms, fast)
         if name == best:
             plot_fit(report, sets, scores)
             plot_parameters(report, result)
@@ -111,7 +112,7 @@ def run(report: Report, fast: bool):
     report.numbers(rounded({**numbers, "by_step_size": step_size_study(report, sets, fast)}))
 
 
-def fit_and_score(report: Report, sets, terms):
+def fit_and_score(report: Report, sets, terms, fast: bool):
     """One model: its fit, its outputs and errors on all sets, and all of it as numbers."""
     result, seconds, compiling = fit_training(sets.train, SUBSTEPS, 0.0, terms, progress=True)
     params, errors = result.params[0], result.standard_errors[0]
@@ -140,7 +141,39 @@ def fit_and_score(report: Report, sets, terms):
         **{f"{name}_in_{UNITS[name]}": float(params[name]) for name in params},
         **{f"standard_error_{name}_in_{UNITS[name]}": float(errors[name]) for name in params},
     }
+    if not fast:
+        numbers["standard_error_over_scatter"] = over_scatter(report, sets.train, result)
     return result, scores, numbers
+
+
+def over_scatter(report: Report, record: Record, result):
+    """Standard errors, cluster and naive, over those seen: the scatter of fits to each of SEGMENTS parts of the record.
+
+    Each part has a free initial state. The mean of as many independent estimates scatters by their deviation over the
+    root of their number, which itself is known to 13 %.
+    """
+    params = result.params[0]
+    problem = data.windows_problem(record, len(record.y) // SEGMENTS - 1, SUBSTEPS, 0.0)
+    scale = {name: SCALE[name] for name in params}, STATE_SCALE
+
+    @jax.jit
+    @jax.vmap
+    def of_part(start, part):
+        fitted = hhtjax.fit(lambda x: problem["residuals"](*x, part), (params, start), scale=scale, covariance=False)
+        return fitted.params[0], fitted.converged
+
+    found, converged = of_part(problem["starts"], problem["records"])
+    count = len(converged)
+    seen = {name: float(np.std(found[name], ddof=1) / np.sqrt(count)) for name in params}
+    naive = result.errors(result.uncertainty.naive)[0]
+    ratios = {
+        n: {"cluster": float(result.standard_errors[0][n]) / e, "naive": float(naive[n]) / e} for n, e in seen.items()
+    }
+    report.progress(f"{int(np.sum(converged))} of {count} parts of the record converged")
+    report.table(
+        ["standard error over scatter", *ratios], [[k, *(r[k] for r in ratios.values())] for k in ("cluster", "naive")]
+    )
+    return ratios | {"parts": count, "converged": int(np.sum(converged))}
 
 
 def step_size_study(report: Report, sets, fast: bool):

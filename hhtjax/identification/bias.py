@@ -24,6 +24,7 @@ from hhtjax.system import LinearSystem
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
 GAIN_WEIGHT = 1e-3  # frequency and damping first; the response to forces with the freedom that they leave
+ON_CONSTRAINT = 1e-6  # largest residual of it
 PROBE = 1e-4  # relative change of the stiffness that shows the response to forces
 
 
@@ -44,25 +45,25 @@ class ModeBias(NamedTuple):
     params: Any = None
 
 
-def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct=False) -> ModeBias:
+def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct: Any = False) -> ModeBias:
     """By how much stiffness and damping are off that were fitted through steps of dt.
 
     The system is linearised about (q, v, t): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
     eigenvalues s' is compared with the s = log(mu)/dt of the nearest eigenvalue mu of the real step's amplification
-    matrix: s is what the data have.
+    matrix: s is what the data have. A constraint is linearised too, and M, C, K, with the stiffness of its forces, are
+    those of the motions that it leaves.
 
     Args:
         system, stepper, dt: what the parameters were fitted through.
         params: the fitted ones.
-        q: an equilibrium, or another point about which the motion is small. v: 0 by default.
+        q: an equilibrium, or another point about which the motion is small, on the constraint. v: 0 by default.
         correct: True returns `params` with the smallest relative changes that give the equations the eigenvalues s
             and, as far as parameters can, the steps' response to forces ("pre-warped"). Parameters that the linear
             part does not depend on stay as they are. Or Booleans for the leaves of params, or for whole branches:
             False for what was not fitted, such as a known mass.
 
     Raises:
-        TypeError, ValueError: dt is no positive number.
-        NotImplementedError: a system with constraints.
+        TypeError, ValueError: dt is no positive number; q does not meet the constraint.
 
     References:
         Cook, Malkus, Plesha, Witt (2002), Sec. 11.13, for the period error of Newmark's method.
@@ -77,8 +78,7 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct=False)
     """
     require_number("step_size_bias", "dt", dt, lambda x: x > 0, "be positive")
     require_stepper("step_size_bias", stepper)
-    if system.constraint is not None:
-        raise NotImplementedError("step_size_bias: `system` has a constraint; give a minimal form of it.")
+    _require_on_constraint(system, params, q, t)
     matrices = _linear_part(system, params, q, v, t)
     fitted = _rates_of_equations(*matrices)
     s = _rates_of_steps(stepper, dt, *matrices)
@@ -92,7 +92,7 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct=False)
 
 
 def _linear_part(system, params, q, v, t):
-    """M, C, K about a state, (n, n) each."""
+    """M, C, K about a state, (n, n) each; with a constraint, of the n - m motions that it leaves."""
     q, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
     v = jnp.zeros_like(q) if v is None else ravel_pytree(v)[0]
 
@@ -101,7 +101,25 @@ def _linear_part(system, params, q, v, t):
 
     M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
     K, C = (-D for D in jax.jacfwd(force, argnums=(0, 1))(q, v))
-    return jnp.diag(M) if M.ndim == 1 else M, C, K
+    M = jnp.diag(M) if M.ndim == 1 else M
+    if system.constraint is None:
+        return M, C, K
+
+    def constraint(q):
+        return system.constraint(unravel(q), t, params)
+
+    B = jax.jacfwd(constraint)(q)
+    L = jnp.linalg.lstsq(B.T, -force(q, v))[0]  # at rest
+    K = K - jax.jacfwd(lambda q: jax.vjp(constraint, q)[1](L)[0])(q)
+    N = jnp.linalg.svd(B)[2][len(B) :].T  # B N = 0
+    return N.T @ M @ N, N.T @ C @ N, N.T @ K @ N
+
+
+def _require_on_constraint(system, params, q, t):
+    if system.constraint is not None:
+        off = np.max(np.abs(system.constraint(q, t, params)))
+        if not off <= ON_CONSTRAINT:
+            raise ValueError(f"step_size_bias: `q` must meet the constraint; received one that is {off:.3g} away.")
 
 
 def _rates_of_equations(M, C, K):

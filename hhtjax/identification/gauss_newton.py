@@ -2,7 +2,9 @@
 
 A problem evaluates a point x into a trial with its cost, and finds from it the damped step
 
-    min_dx |r + J dx|^2 + lam |D dx|^2,      D: the norms of the columns of J
+    min_dx |r + J dx|^2 + lam |D dx|^2,      D: the largest norms that the columns of J have had (More 1978)
+
+so that a parameter which loses its influence on the way does not run away.
 """
 
 from collections.abc import Callable
@@ -47,15 +49,16 @@ def triangle(A):
 
 
 class DenseTrial(NamedTuple):
-    """A point, and the least-squares problem there, its columns scaled to one and reduced to p rows."""
+    """A point, and the least-squares problem there, its columns over D and reduced to p rows."""
 
     x: Any
     r: Any
     J: Any
     cost: Any
     length: Any  # of the residual of the least-squares problem
-    column: Any  # norms of the columns of J
-    s: Any  # singular values of J/column
+    D: Any
+    column: Any  # norms of the columns of J, at most D
+    s: Any  # singular values of J/D
     V: Any
     z: Any  # residual in the basis of the left singular vectors
 
@@ -66,32 +69,33 @@ class Dense(NamedTuple):
     f: Callable
     objective: Objective
 
-    def look(self, x) -> DenseTrial:
-        """The trial at x; its cost is inf where something is not finite."""
+    def look(self, x, D) -> DenseTrial:
+        """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
         r, J = with_jacobian(self.f, x)
         r_hat, J_hat = self.objective.least_squares(r, J)
         finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
         r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
-        column = _norms(J_hat)
+        column = jnp.linalg.norm(J_hat, axis=0)
+        D = jnp.maximum(D, column)
         p = x.size
-        R = triangle(jnp.concatenate([J_hat / column[None, :], r_hat[:, None]], axis=1))
+        R = triangle(jnp.concatenate([J_hat / _or_one(D)[None, :], r_hat[:, None]], axis=1))
         U, s, Vt = jnp.linalg.svd(R[:p, :p])
         cost = jnp.where(finite, self.objective.cost(r), jnp.inf)
-        return DenseTrial(x, r, J, cost, jnp.linalg.norm(R[:, p]), column, s, Vt.T, U.T @ R[:p, p])
+        return DenseTrial(x, r, J, cost, jnp.linalg.norm(R[:, p]), D, column, s, Vt.T, U.T @ R[:p, p])
 
     def step(self, trial, lam):
         """The damped step, and the decrease of the cost that the linear problem predicts."""
         weight = trial.s / jnp.maximum(trial.s**2 + lam, float(jnp.finfo(lam.dtype).tiny))
-        dx = -(trial.V @ (weight * trial.z)) / trial.column
+        dx = -(trial.V @ (weight * trial.z)) / _or_one(trial.D)
         return dx, jnp.sum(trial.z**2 * (1 - (1 - trial.s * weight) ** 2)) / 2
 
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
-        return _cosine(trial.V @ (trial.s * trial.z), trial.length)
+        return _cosine(trial.V @ (trial.s * trial.z), trial)
 
 
 class ArrowTrial(NamedTuple):
-    """A point, and each record's problem, columns scaled to one and reduced to k + p + 1 rows."""
+    """A point, and each record's problem, columns over D and reduced to k + p + 1 rows."""
 
     x: Any
     r: Any  # (records, m)
@@ -99,8 +103,8 @@ class ArrowTrial(NamedTuple):
     J_own: Any  # (records, m, k)
     cost: Any
     length: Any
-    column: Any  # (p,)
-    column_own: Any  # (records, k)
+    D: Any  # like x
+    column: Any  # like x
     R: Any  # (records, k + p + 1, p)
     R_own: Any
     z: Any  # (records, k + p + 1)
@@ -124,8 +128,8 @@ class Arrow(NamedTuple):
         count = jax.tree.leaves(self.records)[0].shape[0]
         return x[: self.p], x[self.p :].reshape(count, -1)
 
-    def look(self, x) -> ArrowTrial:
-        """The trial at x; its cost is inf where something is not finite."""
+    def look(self, x, D) -> ArrowTrial:
+        """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
         shared, own = self.split(x)
 
         def one(own, record):
@@ -139,12 +143,15 @@ class Arrow(NamedTuple):
         finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(both))
         r_hat, both = (jnp.where(finite, y, 0) for y in (r_hat, both))
         both = both.reshape(count, m, -1)
-        column, column_own = _norms(both[:, :, k:].reshape(count * m, -1)), jax.vmap(_norms)(both[:, :, :k])
-        columns = jnp.concatenate([column_own, jnp.broadcast_to(column, (count, self.p))], axis=1)
+        norms = jnp.linalg.norm(both[:, :, k:], axis=(0, 1)), jnp.linalg.norm(both[:, :, :k], axis=1)
+        column = jnp.concatenate([norms[0], norms[1].ravel()])
+        D = jnp.maximum(D, column)
+        shared, own = self.split(_or_one(D))
+        columns = jnp.concatenate([own, jnp.broadcast_to(shared, (count, self.p))], axis=1)
         R = jnp.linalg.qr(jnp.concatenate([both / columns[:, None, :], r_hat.reshape(count, m, 1)], axis=2), mode="r")
         cost = jnp.where(finite, self.objective.cost(r.ravel()), jnp.inf)
         length = jnp.linalg.norm(r_hat)
-        return ArrowTrial(x, r, J, J_own, cost, length, column, column_own, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
+        return ArrowTrial(x, r, J, J_own, cost, length, D, column, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
 
     def step(self, trial, lam):
         """The damped step, and the decrease of the cost that the linear problem predicts."""
@@ -166,13 +173,13 @@ class Arrow(NamedTuple):
         own = -jax.vmap(jax.scipy.linalg.solve_triangular)(T, unmet)
         left = trial.z + jnp.einsum("bip,p->bi", trial.R, shared) + jnp.einsum("bik,bk->bi", trial.R_own, own)
         predicted = (jnp.sum(trial.z**2) - jnp.sum(left**2)) / 2
-        return jnp.concatenate([shared / trial.column, (own / trial.column_own).ravel()]), predicted
+        return jnp.concatenate([shared, own.ravel()]) / _or_one(trial.D), predicted
 
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
         shared = jnp.einsum("bip,bi->p", trial.R, trial.z)
         own = jnp.einsum("bik,bi->bk", trial.R_own, trial.z)
-        return _cosine(jnp.concatenate([shared, own.ravel()]), trial.length)
+        return _cosine(jnp.concatenate([shared, own.ravel()]), trial)
 
     def free_of_own(self, trial):
         """Residuals (records m,) and the part of their shared Jacobian that no own unknown can make up for."""
@@ -185,10 +192,10 @@ class Arrow(NamedTuple):
         return r, rest.reshape(count * m, -1)
 
 
-def _norms(J):
-    norms = jnp.linalg.norm(J, axis=0)
-    return jnp.where(norms == 0, 1, norms)
+def _or_one(x):
+    return jnp.where(x == 0, 1, x)
 
 
-def _cosine(slopes, length):
-    return jnp.max(jnp.abs(slopes)) / jnp.where(length == 0, 1, length)
+def _cosine(slopes, trial):
+    """slopes: (J/D)^T r."""
+    return jnp.max(jnp.abs(slopes) * trial.D / _or_one(trial.column)) / _or_one(trial.length)

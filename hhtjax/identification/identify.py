@@ -6,7 +6,7 @@ with exact derivatives: Levenberg-Marquardt on forward-mode Jacobians for few pa
 optimiser on reverse-mode gradients for many.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,7 @@ def fit(
     starts=None,
     transforms=None,
     scale=None,
-    weights=True,
+    weights: Any = True,
     loss=None,
     prior=None,
     max_iterations=None,
@@ -128,7 +128,7 @@ def multistart(
     *,
     transforms=None,
     scale=None,
-    weights=True,
+    weights: Any = True,
     loss=None,
     prior=None,
     max_iterations=None,

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import lax
 
@@ -89,11 +90,12 @@ class Objective(NamedTuple):
         return r * slope / row, J * row[:, None]
 
 
-def levenberg_marquardt(problem, x, tolerance, max_iterations, progress):
+def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress):
     """Damped Gauss-Newton on a `Dense` or an `Arrow` problem; returns the best trial, the history, and why it ended.
 
-    dx = -(J^T J + lam D)^-1 J^T r with D the diagonal of J^T J; lam shrinks by 8 when a step lowers the cost and grows
-    by 6 when it does not.
+    dx = -(J^T J + lam D^2)^-1 J^T r. With rho the decrease of the cost over that predicted, lam changes by the factor
+    max(1/8, 1 - (2 rho - 1)^3) when a step lowers the cost (Nielsen 1999), and grows by 6 when it does not. Before that
+    it grows until no entry of dx is longer than that of `longest`.
     """
     eps = float(jnp.finfo(x.dtype).eps)
     running = jnp.asarray(RUNNING, jnp.int32)
@@ -104,12 +106,14 @@ def levenberg_marquardt(problem, x, tolerance, max_iterations, progress):
     def improve(carry):
         now, lam, iteration, history, _ = carry
         first = iteration < 0
-        step, predicted = problem.step(now, lam)
-        new = problem.look(now.x + jnp.where(first, 0, step))
+        lam, step, predicted = _within(problem, now, lam, longest)
+        new = problem.look(now.x + jnp.where(first, 0, step), now.D)
         lower = new.cost < now.cost
-        lam = jnp.where(first, lam, jnp.where(lower, lam / 8, lam * 6))
+        gain = (now.cost - new.cost) / predicted
+        damped = lam * jnp.max(jnp.where(now.column > 0, now.D / now.column, 1)) ** 2
+        lam = jnp.where(first, lam, lam * jnp.where(lower, jnp.maximum(1 / 8, 1 - (2 * gain - 1) ** 3), 6))
         iteration = iteration + 1
-        honest = lower | (lam <= 1)  # a step is also small, and changes little, because lam is large
+        honest = damped <= 1  # a step is also small, and changes little, because it is damped
         flat = (predicted <= tolerance * now.cost) & (jnp.abs(now.cost - new.cost) <= tolerance * now.cost)
         short = jnp.all(jnp.abs(step) <= tolerance * (jnp.abs(now.x) + tolerance))
         best = jax.tree.map(partial(jnp.where, lower | first), new, now)
@@ -126,12 +130,28 @@ def levenberg_marquardt(problem, x, tolerance, max_iterations, progress):
         return best, lam, iteration, history, code
 
     # nothing is known before the first evaluation, which is that of the loop: f is compiled once
-    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(problem.look, x))
+    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(problem.look, x, x))
     nothing = nothing._replace(x=x, cost=jnp.asarray(jnp.inf, x.dtype))
     empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
     carry = nothing, jnp.asarray(1e-3, x.dtype), jnp.asarray(-1, jnp.int32), History(empty, empty, empty), running
     best, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
     return best, history, iterations, code
+
+
+def _within(problem, now, lam, longest):
+    """The least damping, lam times a power of 4, whose step is within `longest`; that step, and what it predicts."""
+    if np.all(np.isinf(longest)):
+        return lam, *problem.step(now, lam)  # the loop would only cost time to compile
+    longest = np.minimum(longest, np.finfo(lam.dtype).max).astype(lam.dtype)  # so that inf is too long
+
+    def too_long(carry):
+        return jnp.any(jnp.abs(carry[1]) > longest)
+
+    def damp(carry):
+        lam = 4 * carry[0]
+        return lam, *problem.step(now, lam)
+
+    return lax.while_loop(too_long, damp, (lam / 4, jnp.full_like(now.x, jnp.inf), lam))
 
 
 def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, patience=5):

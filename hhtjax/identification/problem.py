@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.identification import transforms as tf
@@ -55,6 +56,7 @@ class Coordinates:
         self.free = [i for i, T in enumerate(transforms) if T is not tf.fixed]
         start = [transforms[i].coordinate(self.leaves[i], self.scales[i]) for i in self.free]
         self.x0, self.unravel = ravel_pytree(start)
+        self.longest = np.repeat([transforms[i].longest_step for i in self.free], [x.size for x in start])
 
     def free_leaves(self, x):
         """The fitted leaves."""
@@ -116,7 +118,9 @@ def _solve_dense(residuals, options, coordinates, data, limits):
 
     objective = Objective(w, options.loss, m)
     if options.optimizer == LEVENBERG_MARQUARDT:
-        best, history, iterations, code = levenberg_marquardt(Dense(f, objective), coordinates.x0, *limits)
+        best, history, iterations, code = levenberg_marquardt(
+            Dense(f, objective), coordinates.x0, coordinates.longest, *limits
+        )
         x, r, J = best.x, best.r, best.J
     else:
         x, history, iterations, code = descend(f, coordinates.x0, objective, options.optimizer, *limits)
@@ -158,9 +162,9 @@ def _solve_records(residuals, options, coordinates, data, limits):
 
     objective = Objective(w.ravel(), options.loss, w.size)
     problem = Arrow(f, objective, data.records, coordinates.x0.size)
-    best, history, iterations, code = levenberg_marquardt(
-        problem, jnp.concatenate([coordinates.x0, own0.ravel()]), *limits
-    )
+    x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
+    longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
+    best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
     x, own = problem.split(best.x)
     residual, starts, cost = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own), objective.cost(best.r.ravel())
     r, J = problem.free_of_own(best)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.analysis import damping_ratio
 from hhtjax.boundary import require_function, require_number
 from hhtjax.extrapolation import richardson
 from hhtjax.identification import report
@@ -16,6 +17,8 @@ from hhtjax.identification.identify import fit
 from hhtjax.identification.result import NAMED, FitResult
 from hhtjax.steppers.generalized_alpha import Coefficients, Options
 from hhtjax.steppers.stepper import Stepper, require_stepper
+
+UNDAMPED = 1e-6  # damping ratio, rounding of float32 included
 
 
 class StepSizeWarning(UserWarning):
@@ -60,7 +63,7 @@ def _subclasses(base):
         yield from _subclasses(c)
 
 
-def refine(residuals_at, params0, stepper, dt, levels=2, **options: Any) -> Refined:
+def refine(residuals_at, params0, stepper, dt, levels=None, **options: Any) -> Refined:
     """Fits with dt, dt/2 and so on, and extrapolates the parameters to dt = 0.
 
     For a stepper of order p, with the errors h^p, h^(p + 1), ... taken out one by one:
@@ -68,8 +71,8 @@ def refine(residuals_at, params0, stepper, dt, levels=2, **options: Any) -> Refi
         levels = 2    fine + (fine - coarse)/(2^p - 1)
         levels = 3    the same of two such pairs, with p + 1
 
-    The trapezoidal rule, alpha = 0, has no error of h^3, and two levels do. With alpha < 0 its numerical damping has,
-    and three levels make a damping many times better, for four more units of work.
+    A stepper that keeps the energy of an oscillation, like alpha = 0, has no error of h^(p + 1), and two levels do.
+    Numerical damping is such an error: three levels take it out too, for four more units of work.
 
     Parameters belong to the step size they were fitted with: for simulations with dt take `fits[0].params`, for what
     they mean physically `params`.
@@ -77,7 +80,7 @@ def refine(residuals_at, params0, stepper, dt, levels=2, **options: Any) -> Refi
     Args:
         residuals_at: (stepper, dt) -> the function residuals(params) of `fit`.
         params0, options: as in `fit`. Each fit starts where the one before ended.
-        levels: number of fits, at least 2.
+        levels: number of fits, at least 2. None: 3 with numerical damping, else 2.
 
     Warns:
         StepSizeWarning: some parameter is shifted by more than one standard error: names it.
@@ -88,6 +91,7 @@ def refine(residuals_at, params0, stepper, dt, levels=2, **options: Any) -> Refi
     require_function("refine", "residuals_at", residuals_at, "residuals_at(stepper, dt)")
     require_stepper("refine", stepper)
     require_number("refine", "dt", dt, lambda x: x > 0, "be positive")
+    levels = needed_levels(stepper) if levels is None else levels
     if not isinstance(levels, int) or levels < 2:
         raise ValueError(f"refine: `levels` must be an integer of at least 2; received {levels!r}.")
     fits = []
@@ -99,6 +103,11 @@ def refine(residuals_at, params0, stepper, dt, levels=2, **options: Any) -> Refi
     )
     _warn_if_shifted(params, shift, dt)
     return Refined(stepper, dt, tuple(fits), params, shift)
+
+
+def needed_levels(stepper):
+    """3 where an undamped oscillation with w h = 1 is damped by the stepper itself, else 2."""
+    return 2 if float(damping_ratio(stepper, 1.0)) <= UNDAMPED else 3  # it is NaN where none is left
 
 
 def _warn_if_shifted(params, shift, dt):

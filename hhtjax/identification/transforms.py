@@ -6,6 +6,9 @@
     positive      p = exp(x)
     bounded       p = lower + (upper - lower)/(1 + exp(-x))
     fixed         p stays as it is in params0
+
+A step of Levenberg-Marquardt changes the x of a positive or bounded parameter by at most 1: for more, the exponential
+is no straight line.
 """
 
 from dataclasses import dataclass
@@ -21,6 +24,7 @@ class Transform:
     """Base of the transforms; frozen, hashable, and static in a pytree."""
 
     expectation = "be real"
+    longest_step = 1.0  # in x
 
     def __init_subclass__(cls):
         jax.tree_util.register_static(cls)
@@ -41,6 +45,8 @@ class Transform:
 @dataclass(frozen=True)
 class Scaled(Transform):
     """p = scale x, the default."""
+
+    longest_step = np.inf
 
     def parameter(self, x, scale):
         """scale x."""
