@@ -65,6 +65,8 @@ def matvec(A, x):
 def factorize(A):
     """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff."""
     A = lax.stop_gradient(A)
+    if A.shape[-1] == 2:
+        return partial(_cramer, A)
     if A.shape[-1] <= SCALAR:
         return partial(_substitute_scalars, *_lu_scalars(A))
     if A.shape[-1] <= UNROLLED:
@@ -124,7 +126,7 @@ def factorize_least_squares(n):
 def solve(A, b, factorize=factorize):
     """x with A x = b, for A (n, n) and b (n,), differentiable in both.
 
-    LU with partial pivoting: unrolled for n <= 8, LAPACK above. A singular A gives inf or NaN.
+    LU with partial pivoting: unrolled for n <= 8, LAPACK above; Cramer's rule for n = 2. A singular A gives inf or NaN.
 
     >>> import jax.numpy as jnp
     >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
@@ -170,6 +172,15 @@ def _substitute(factors, b, trans=0):
     for k in reversed(range(1, n)):
         x = x - jnp.where(i < k, LU[k] * x[k], 0)
     return jnp.sum(jnp.where(order[:, None] == i[None, :], x[:, None], 0), axis=0)
+
+
+def _cramer(A, b, trans=0):
+    """Cramer's rule for two unknowns: forward stable (Higham 2002, Sec. 1.10.1), with one division."""
+    (p, q), (r, s) = [[A[i, j] for j in range(2)] for i in range(2)]
+    if trans:
+        q, r = r, q
+    inverse = 1 / (p * s - q * r)
+    return jnp.stack([(s * b[0] - q * b[1]) * inverse, (p * b[1] - r * b[0]) * inverse])
 
 
 def _lu_scalars(A):
