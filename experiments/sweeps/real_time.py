@@ -10,7 +10,6 @@ import re
 import threading
 import time
 from collections import Counter
-from importlib.util import find_spec
 
 import jax
 import jax.numpy as jnp
@@ -152,10 +151,9 @@ def run(report, fast):
         step, first, command = step_of(scene, h)
         program = jax.jit(step).lower(first, command).compile()
         empty = jax.jit(lambda state, command: state + 0).lower(first, command).compile()
-        forms = {"empty call": empty, "compiled": program}
-        if find_spec("flatbuffers"):  # jax.export writes by it
-            kept = export.deserialize(bytearray(export.export(jax.jit(step))(first, command).serialize()))
-            forms["exported and reloaded"] = jax.jit(kept.call).lower(first, command).compile()
+        kept = export.deserialize(bytearray(export.export(jax.jit(step))(first, command).serialize()))
+        again = jax.jit(kept.call).lower(first, command).compile()
+        forms = {"empty call": empty, "compiled": program, "exported and reloaded": again}
         for form in forms.values():
             latencies(form, first, command, 100)
         taken = {form: [] for form in forms}
@@ -166,9 +164,7 @@ def run(report, fast):
             samples[name, form] = np.concatenate(taken[form])
             rows.append({"scene": name, "h_s": h, "form": form} | summary(samples[name, form]))
         mine = next(r for r in rows if r["scene"] == name and r["form"] == "compiled")
-        if "exported and reloaded" in forms:
-            again = forms["exported and reloaded"](first, command)
-            mine |= {"exported_is_bitwise_equal": bool(np.array_equal(program(first, command), again))}
+        mine |= {"exported_is_bitwise_equal": bool(np.array_equal(program(first, command), again(first, command)))}
         newton = jax.jit(step_of(scene, h, NEWTON)[0]).lower(first, command).compile()
         mine |= operations(program) | {"newton": operations(newton)}
         report.progress(f"real time: {name}, median {mine['median_us']:.1f} us")

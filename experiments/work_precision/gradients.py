@@ -91,7 +91,7 @@ def our_rows(name, sizes, reverse_sizes, only=FORWARD):
         stepper, levels, _ = ours.METHODS[method]
 
         def loss(s, substeps, stepper=stepper, levels=levels):
-            path, _ = ours.run(system, stepper, levels, q0, v0, duration, scaled(params, s), substeps)
+            path, _ = ours.run(system, stepper, levels, q0, v0, duration, case.size, scaled(params, s), substeps)
             return jnp.mean(path**2)
 
         program = jax.jit(jax.jacfwd(loss))

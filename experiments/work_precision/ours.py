@@ -25,9 +25,13 @@ METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a 
 PLAIN = "rosenbrock", "rowda", "rowda, extrapolate=2", "rk4"  # take the system without constraints and rotations
 
 
-def run(system, stepper, levels, q0, v0, duration, params, substeps):
-    """As `march`, extrapolated."""
-    march_by = partial(march, system, stepper, q0, v0, params, duration)
+def run(system, stepper, levels, q0, v0, duration, size, params, substeps):
+    """As `march`, extrapolated; the first `size` numbers of each position."""
+
+    def march_by(substeps):
+        path, solves = march(system, stepper, q0, v0, params, duration, substeps)
+        return path[:, :size], solves
+
     if levels == 1:
         return march_by(substeps)
     paths, solves = jax.lax.map(march_by, substeps * 2 ** jnp.arange(levels))  # a loop, so that one program serves all
@@ -46,12 +50,12 @@ def entries(name, sizes, only=None):
         start = case.ode if method in PLAIN else (system, q0, v0)
 
         program = jax.jit(
-            partial(run, start[0], stepper, levels, *start[1:], duration)
+            partial(run, start[0], stepper, levels, *start[1:], duration, case.size)
         )  # what stays the same is not passed on
 
         def solve(substeps, program=program, levels=levels, solves=solves):
             path, count = program(params, substeps)
-            return path[:, : case.size], count if solves is None else solves * SAMPLES * substeps * (2**levels - 1)
+            return path, count if solves is None else solves * SAMPLES * substeps * (2**levels - 1)
 
         rows += sweep(name, method, "ours", solve, sizes, lambda n: {"h_s": duration / (SAMPLES * n)})
     return rows
