@@ -16,7 +16,7 @@ from hhtjax.constraints import require_consistent
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.extrapolation import MOST, extrapolated
 from hhtjax.flat_system import flatten, initial_values
-from hhtjax.kernels import one_kernel
+from hhtjax.kernels import one_kernel, staged
 from hhtjax.scalars import join, on_scalars, pays, split
 from hhtjax.steppers.stepper import Info, public, require_capable, require_stepper, require_system
 
@@ -261,9 +261,9 @@ def no_failure(info):
 def _first_failure(failure, count, state, info):
     """The failure so far, or this step's."""
     known = [(i, x) for i, x in enumerate((state.q, state.v, state.w, state.L)) if x is not None]
+    fine = staged(lambda x: [jnp.all(jnp.isfinite(x)) for x in x])([x for _, x in known])
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
-    for i, x in reversed(known):
-        fine = jnp.all(jnp.isfinite(x))
+    for (i, _), fine in reversed(list(zip(known, fine, strict=True))):
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
     failed, newton, row = ~finite, finite, failure.row
     if info.converged is not None:
