@@ -261,9 +261,9 @@ def no_failure(info):
 def _first_failure(failure, count, state, info):
     """The failure so far, or this step's."""
     known = [(i, x) for i, x in enumerate((state.q, state.v, state.w, state.L)) if x is not None]
-    fine = staged(lambda x: [jnp.all(jnp.isfinite(x)) for x in x])([x for _, x in known])
+    checks = staged(lambda values: [jnp.all(jnp.isfinite(x)) for x in values])([x for _, x in known])
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
-    for (i, _), fine in reversed(list(zip(known, fine, strict=True))):
+    for (i, _), fine in reversed(list(zip(known, checks, strict=True))):
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
     failed, newton, row = ~finite, finite, failure.row
     if info.converged is not None:
