@@ -254,6 +254,8 @@ def _custom_linear_solve(eqn, *values):
     flat, back = _layout(eqn.outvars)
     ends = np.cumsum([lengths.matvec, lengths.vecmat, lengths.solve, lengths.transpose_solve])
     *constants, b = [values[start:stop] for start, stop in zip([0, *ends], [*ends, None], strict=True)]
+    if closed.transpose_solve is None or len(b) != len(eqn.outvars):  # no reverse mode, or results beside x
+        return None
 
     def scalar(name, constants):
         function = getattr(closed, name)
