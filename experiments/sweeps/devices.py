@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-MEMBERS, FAST_MEMBERS = 16_384, 300
+MEMBERS, FAST_MEMBERS = 131_072, 300
 REPEATS = 5
 
 
