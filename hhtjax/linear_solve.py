@@ -62,6 +62,12 @@ def matvec(A, x):
     return sum(A[:, j] * x[j] for j in range(1, A.shape[-1])) + A[:, 0] * x[0]
 
 
+def diagonal(A):
+    """Of a full A (n, n), or of a diagonal one (n,), which is its own. jnp.diagonal would ask for the platform."""
+    i = jnp.arange(len(A))
+    return A if A.ndim == 1 else A[i, i]
+
+
 def factorize(A):
     """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff."""
     A = lax.stop_gradient(A)

@@ -221,7 +221,7 @@ ELEMENTWISE = {
 RULES = {
     **dict.fromkeys(ELEMENTWISE, _elementwise),
     **{"broadcast_in_dim": _broadcast_in_dim, "concatenate": _concatenate, "dot_general": _dot_general, "iota": _iota},
-    **{"reshape": _reshape, "squeeze": _reshape, "expand_dims": _reshape, "rev": _rev, "slice": _slice},
+    **{"reshape": _reshape, "squeeze": _reshape, "rev": _rev, "slice": _slice},
     **{"split": _split, "stack": _stack, "transpose": _transpose},
     **{
         "gather": _moved(0),

@@ -50,7 +50,7 @@ def _work(jaxpr):
     total = 0
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
-        if name not in RULES | CALLS:
+        if name not in RULES and name not in CALLS:
             return math.inf
         if name in ELEMENTWISE:
             total += eqn.outvars[0].aval.size
@@ -70,11 +70,16 @@ def split(tree):
     return jax.tree.map(lambda x: Scalars(tuple(pieces(x).flat), x.shape) if x.ndim and is_small(x) else x, tree)
 
 
+def split_if_it_pays(f, tree):
+    """The same where f of the tree is better evaluated so; else the tree."""
+    return split(tree) if pays(f, tree) else tree
+
+
 def join(tree):
     """The tree with arrays for its `Scalars`; what they are stacked along comes first."""
 
     def joined(x):
-        if not isinstance(x, Scalars):
+        if not _is_scalars(x):
             return x
         array = jnp.stack(x.elements, axis=-1)
         return array.reshape(*array.shape[:-1], *x.shape)

@@ -17,7 +17,7 @@ from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.extrapolation import MOST, extrapolated
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel, staged
-from hhtjax.scalars import join, on_scalars, pays, split
+from hhtjax.scalars import join, on_scalars, split_if_it_pays
 from hhtjax.steppers.stepper import Info, public, require_capable, require_stepper, require_system
 
 
@@ -188,13 +188,10 @@ def simulate(
 def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every, progress):
     flat, q, v = flatten("simulate", system, q0, v0, t0, params)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
-    stepper = stepper.astype(q.dtype)
-    take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)  # traced once, wherever it is called
-    advance = on_scalars(counted(take_step, flat, q, t0, dt))
-    keep = on_scalars(partial(saved, flat))
+    loop = loop_of(flat, stepper, q, v, t0, params, dt)
 
     def step(carry):
-        carry, info = advance(carry)
+        carry, info = loop.advance(carry)
         if progress:
             show_progress(carry[1], num_steps, "step")
         return carry, info
@@ -203,24 +200,41 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every,
         if save_every == 1:
             carry, info = step(carry)
         else:
-            (carry, info), _ = checkpointed_scan(joined_step, (carry, no_info), save_every)
-        return carry, (keep(carry[0]), info)
+            (carry, info), _ = checkpointed_scan(joined_step, (carry, loop.no_info), save_every)
+        return carry, (loop.keep(carry[0]), info)
 
     def joined_step(carry, _):
         carry, info = carry
         carry, new = step(carry)
         return (carry, join_info(info, new)), None
 
+    def run(carry):
+        return checkpointed_scan(interval, carry, num_steps // save_every)
+
+    # a callback keeps XLA from making one kernel
+    carry = loop.carry if progress else split_if_it_pays(loop.advance, loop.carry)
+    (_, _, failure), (path, info) = one_kernel(run, carry)
+    return as_solution(flat, loop.carry[0], join(path), dt, info, failure)
+
+
+class Loop(NamedTuple):
+    """What a run is made of. carry: (state, number of steps, first failure), before the first; advance: carry -> carry,
+    Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged."""
+
+    carry: Any
+    advance: Any
+    keep: Any
+    no_info: Info
+
+
+def loop_of(flat, stepper, q, v, t0, params, dt):
+    """The loop over a stepper's steps; its functions work on scalars too."""
+    stepper = stepper.astype(q.dtype)
+    take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)  # traced once, wherever it is called
     start = stepper.begin(flat, q, v, t0, params, dt)
     no_info = neutral_info(jax.eval_shape(take_step, start)[1])
-
-    def run(start, failure):
-        return checkpointed_scan(interval, (start, jnp.zeros((), jnp.int32), failure), num_steps // save_every)
-
-    failure = no_failure(no_info)
-    by_scalars = not progress and pays(advance, (start, jnp.zeros((), jnp.int32), failure))
-    (_, _, failure), (path, info) = one_kernel(run, split(start) if by_scalars else start, failure)
-    return as_solution(flat, start, join(path), dt, info, failure)
+    carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
+    return Loop(carry, on_scalars(counted(take_step, flat, q, t0, dt)), on_scalars(partial(saved, flat)), no_info)
 
 
 def counted(take_step, flat, q0, t0, dt):

@@ -16,17 +16,8 @@ from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel
 from hhtjax.looping import repeat
-from hhtjax.scalars import join, on_scalars, pays, split
-from hhtjax.simulate import (
-    Solution,
-    as_solution,
-    counted,
-    join_info,
-    neutral_info,
-    no_failure,
-    saved,
-    show_progress,
-)
+from hhtjax.scalars import join, split_if_it_pays
+from hhtjax.simulate import Solution, as_solution, join_info, loop_of, show_progress
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
@@ -302,27 +293,20 @@ def _run(system, data, dt, substeps, longest, t0, num_samples):
     """One member; it rests from `substeps` to `longest`, where its block still works."""
     stepper, q0, v0, params = data
     flat, q, v = flatten("sweep", system, q0, v0, t0, params)
-    stepper = stepper.astype(q.dtype)
-    take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)
-    advance = on_scalars(counted(take_step, flat, q, t0, dt))
-    keep = on_scalars(partial(saved, flat))
-    start = stepper.begin(flat, q, v, t0, params, dt)
-    no_info = neutral_info(jax.eval_shape(take_step, start)[1])
+    loop = loop_of(flat, stepper, q, v, t0, params, dt)
 
     def step(i, carry):
-        run, info = advance(carry[0])
+        run, info = loop.advance(carry[0])
         new = run, join_info(carry[1], info)
         return jax.tree.map(partial(jnp.where, i < substeps), new, carry)
 
     @checkpoint
     def interval(run, _):
-        run, info = repeat(step, (run, no_info), longest)
-        return run, (keep(run[0]), info)
+        run, info = repeat(step, (run, loop.no_info), longest)
+        return run, (loop.keep(run[0]), info)
 
-    def samples(start, failure):
-        return lax.scan(interval, (start, jnp.zeros((), jnp.int32), failure), None, num_samples)
+    def samples(carry):
+        return lax.scan(interval, carry, None, num_samples)
 
-    failure = no_failure(no_info)
-    by_scalars = pays(advance, (start, jnp.zeros((), jnp.int32), failure))
-    (_, _, failure), (path, info) = one_kernel(samples, split(start) if by_scalars else start, failure)
-    return as_solution(flat, start, join(path), dt, info, failure)
+    (_, _, failure), (path, info) = one_kernel(samples, split_if_it_pays(loop.advance, loop.carry))
+    return as_solution(flat, loop.carry[0], join(path), dt, info, failure)

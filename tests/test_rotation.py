@@ -58,7 +58,7 @@ def transposed(A):
     return np.swapaxes(A, -1, -2)
 
 
-def close(x, y, tolerance):
+def assert_close(x, y, tolerance):
     np.testing.assert_allclose(x, y, rtol=0, atol=tolerance)
 
 
@@ -106,21 +106,21 @@ def test_derivatives_of_coefficients(order):
     exact = np.array([exact_coefficients(x, order) for x in X]).T
     error = np.abs(np.array(batched(forward)(X)) - exact)
     assert np.all(error < np.where(X < 1, 1e-13 * np.abs(exact), 1e-14))
-    close(batched(backward)(X), weights @ exact, 1e-14)
+    assert_close(batched(backward)(X), weights @ exact, 1e-14)
 
 
 def test_hat_is_the_cross_product_and_vee_its_inverse():
     x, y = np.random.default_rng(0).standard_normal((2, 3))
     np.testing.assert_array_equal(hat(x), cross(x))
-    close(hat(x) @ y, np.cross(x, y), 2 * EPS)
+    assert_close(hat(x) @ y, np.cross(x, y), 2 * EPS)
     np.testing.assert_array_equal(vee(hat(x)), x)
-    close(vee(hat(x) + np.outer(y, y)), x, 4 * EPS)
+    assert_close(vee(hat(x) + np.outer(y, y)), x, 4 * EPS)
 
 
 def test_exp_is_the_matrix_exponential():
     R = batched(exp)(ALL)
-    close(R, turns(ALL), 4e-15)
-    close(R, scipy.linalg.expm(np.array([cross(psi) for psi in ALL])), 1e-13)
+    assert_close(R, turns(ALL), 4e-15)
+    assert_close(R, scipy.linalg.expm(np.array([cross(psi) for psi in ALL])), 1e-13)
 
 
 @pytest.mark.parametrize(("longest", "roundings"), [(1.0, 4), (10.0, 16)])
@@ -128,8 +128,8 @@ def test_exp_is_orthogonal_to_rounding(longest, roundings):
     psi = np.random.default_rng(2).uniform(-1, 1, (20000, 3)) * longest / np.sqrt(3)
     R = np.asarray(batched(exp)(psi))
     eye = np.broadcast_to(EYE, R.shape)
-    close(transposed(R) @ R, eye, roundings * EPS)
-    close(R @ batched(exp)(-psi), eye, roundings * EPS)
+    assert_close(transposed(R) @ R, eye, roundings * EPS)
+    assert_close(R @ batched(exp)(-psi), eye, roundings * EPS)
     assert np.all(np.linalg.det(R) > 0)
 
 
@@ -137,16 +137,16 @@ def test_tangent_is_the_integral_of_exp():
     """T(psi) = integral over s from 0 to 1 of exp(-s psi), by Gauss' rule."""
     s, weights = np.polynomial.legendre.leggauss(40)
     integral = sum(w / 2 * turns(-(1 + s) / 2 * ALL) for s, w in zip(s, weights, strict=True))
-    close(batched(tangent)(ALL), integral, 4e-15)
+    assert_close(batched(tangent)(ALL), integral, 4e-15)
 
 
 def test_identities():
     """T psi = T^T psi = psi, R T = T^T, T T^-1 = I."""
     R, T, inverse = (np.asarray(batched(f)(ALL)) for f in (exp, tangent, inverse_tangent))
-    close(np.einsum("pij,pj->pi", T, ALL), ALL, 2e-14)
-    close(np.einsum("pji,pj->pi", T, ALL), ALL, 2e-14)
-    close(R @ T, transposed(T), 4e-15)
-    close(T @ inverse, np.broadcast_to(EYE, T.shape), 2e-14)
+    assert_close(np.einsum("pij,pj->pi", T, ALL), ALL, 2e-14)
+    assert_close(np.einsum("pji,pj->pi", T, ALL), ALL, 2e-14)
+    assert_close(R @ T, transposed(T), 4e-15)
+    assert_close(T @ inverse, np.broadcast_to(EYE, T.shape), 2e-14)
 
 
 def test_inverse_tangent_has_a_pole_at_two_pi():
@@ -166,16 +166,16 @@ def test_log_undoes_exp_with_relative_accuracy():
 
 def test_log_of_random_rotations():
     R = Rotation.random(20000, rng=3)
-    close(batched(log)(R.as_matrix()), R.as_rotvec(), 6e-15)
+    assert_close(batched(log)(R.as_matrix()), R.as_rotvec(), 6e-15)
 
 
 def test_log_at_pi():
     """Of the two vectors the one whose largest component is positive, where the matrix is exactly symmetric."""
     R = 2 * AXES[:, :, None] * AXES[:, None, :] - EYE
     largest = np.take_along_axis(AXES, np.argmax(np.abs(AXES), axis=1)[:, None], axis=1)
-    close(batched(log)(R), pi * AXES * np.sign(largest), 4e-15)
+    assert_close(batched(log)(R), pi * AXES * np.sign(largest), 4e-15)
     rounded = batched(exp)(pi * AXES)
-    close(batched(exp)(batched(log)(rounded)), rounded, 4e-15)
+    assert_close(batched(exp)(batched(log)(rounded)), rounded, 4e-15)
 
 
 @cache
@@ -217,8 +217,8 @@ def test_derivatives(f, order):
         return before(VECTORS + step) - before(VECTORS - step)
 
     differences = [(8 * difference(h * e) - difference(2 * h * e)) / (12 * h) for e in EYE]
-    close(derivative, np.stack(differences, axis=-1), 1e-11)
-    close(reverse(f, weights)(VECTORS), contract(derivative, weights), 1e-13)
+    assert_close(derivative, np.stack(differences, axis=-1), 1e-11)
+    assert_close(reverse(f, weights)(VECTORS), contract(derivative, weights), 1e-13)
 
 
 @pytest.mark.parametrize("f", [exp, tangent, inverse_tangent])
@@ -241,7 +241,7 @@ def test_derivatives_at_zero(f, factors, order):
         products = [np.linalg.multi_dot([EYE, *(P[i] for i in p), EYE]) for p in permutations(directions)]
         exact[:, :, *directions] = factors[order - 1] * np.mean(products, axis=0)
     at_zero = forward(f, order)(VECTORS)[np.linalg.norm(VECTORS, axis=1) < 1e-100]
-    close(at_zero, np.broadcast_to(exact, at_zero.shape), 1e-15)
+    assert_close(at_zero, np.broadcast_to(exact, at_zero.shape), 1e-15)
 
 
 @pytest.mark.parametrize("order", [1, *(pytest.param(order, marks=pytest.mark.slow) for order in (2, 3))])
@@ -253,15 +253,15 @@ def test_derivatives_of_log(order):
 
     psi, weights = np.concatenate([VECTORS, NEAR_PI]), random_weights(3, order)
     exact = np.broadcast_to(EYE if order == 1 else np.zeros((3,) * (order + 1)), (len(psi),) + (3,) * (order + 1))
-    close(forward(identity, order)(psi), exact, 1e-14 * 10 ** (order - 1))
-    close(reverse(identity, weights)(psi), contract(exact, weights), 1e-14 * 10 ** (order - 1))
+    assert_close(forward(identity, order)(psi), exact, 1e-14 * 10 ** (order - 1))
+    assert_close(reverse(identity, weights)(psi), contract(exact, weights), 1e-14 * 10 ** (order - 1))
 
 
 def test_derivative_of_log_is_the_inverse_tangent():
     """d log(R exp(eps)) = T^-1(psi) d eps at eps = 0; at pi too, where psi is what log returns."""
     R = batched(exp)(np.concatenate([VECTORS, NEAR_PI, pi * AXES]))
     derivative = batched(lambda R: jax.jacrev(lambda eps: log(R @ exp(eps)))(jnp.zeros(3)))
-    close(derivative(R), batched(inverse_tangent)(batched(log)(R)), 1e-14)
+    assert_close(derivative(R), batched(inverse_tangent)(batched(log)(R)), 1e-14)
 
 
 def test_rates_along_a_motion():
@@ -279,8 +279,8 @@ def test_rates_along_a_motion():
     psidot, psiddot = np.random.default_rng(4).standard_normal((2, *VECTORS.shape))
     Rdot, Omdot = jax.jit(jax.vmap(motion))(VECTORS, psidot, psiddot)
     R, T = batched(exp)(VECTORS), np.asarray(batched(tangent)(VECTORS))
-    close(Rdot, R @ batched(hat)(np.einsum("pij,pj->pi", T, psidot)), 1e-14)
-    close(Omdot, np.einsum("pij,pj->pi", T, psiddot) + jax.vmap(tangent_rate)(VECTORS, psidot), 1e-13)
+    assert_close(Rdot, R @ batched(hat)(np.einsum("pij,pj->pi", T, psidot)), 1e-14)
+    assert_close(Omdot, np.einsum("pij,pj->pi", T, psiddot) + jax.vmap(tangent_rate)(VECTORS, psidot), 1e-13)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -296,21 +296,21 @@ def test_a_million_compositions(change, corrected, bound, dtype):
         return orthonormalize(R) if corrected else R
 
     R = np.asarray(jax.jit(lambda R: lax.fori_loop(0, 10**6, turn, R))(jnp.eye(3, dtype=dtype)), float)
-    close(R.T @ R, EYE, bound * np.finfo(dtype).eps)
+    assert_close(R.T @ R, EYE, bound * np.finfo(dtype).eps)
 
 
 @pytest.mark.parametrize("size", [1e-3, 1e-5])
 def test_orthonormalize_squares_the_distance(size):
     R = batched(exp)(LONG) + size * np.random.default_rng(5).uniform(-1, 1, (len(LONG), 3, 3))
     U, _, V = np.linalg.svd(R)
-    close(batched(orthonormalize)(R), U @ V, 6 * size**2)
+    assert_close(batched(orthonormalize)(R), U @ V, 6 * size**2)
 
 
 def test_derivative_of_orthonormalize_is_the_tangent_part():
     R = exp(jnp.array([0.4, -2.0, 1.0]))
     dR = np.random.default_rng(6).standard_normal((3, 3))
     material = R.T @ dR
-    close(jax.jvp(orthonormalize, (R,), (dR,))[1], R @ (material - material.T) / 2, 1e-14)
+    assert_close(jax.jvp(orthonormalize, (R,), (dR,))[1], R @ (material - material.T) / 2, 1e-14)
 
 
 @pytest.mark.parametrize("check", [is_rotation, jax.jit(is_rotation)])
@@ -338,7 +338,7 @@ def test_dtype_is_kept(f):
 @pytest.mark.parametrize("f", FUNCTIONS)
 def test_vmap_is_a_loop(f):
     x = VECTORS if f in VECTOR_FUNCTIONS else turns(VECTORS)
-    close(batched(f)(x), [jax.jit(f)(xi) for xi in x], 1e-15)
+    assert_close(batched(f)(x), [jax.jit(f)(xi) for xi in x], 1e-15)
 
 
 @pytest.mark.parametrize("f", [*FUNCTIONS, tangent_rate, is_rotation])

@@ -15,7 +15,7 @@ from experiments.cardona_geradin1989.index_1 import unconstrained
 from hhtjax.kernels import one_kernel
 from hhtjax.linear_solve import solve
 from hhtjax.rotation import hat
-from hhtjax.scalars import join, on_scalars, pays, split
+from hhtjax.scalars import join, on_scalars, split_if_it_pays
 from hhtjax.scenes import Scene, double_pendulum, duffing, squeezer, top
 
 SAMPLES = 50  # times at which positions are compared
@@ -140,7 +140,7 @@ def march(system, stepper, q0, v0, params, duration, substeps):
             return carry, carry[0].q
 
         carry = start, jnp.zeros((), jnp.int32)
-        return jax.lax.scan(interval, split(carry) if pays(advance, carry) else carry, None, SAMPLES)
+        return jax.lax.scan(interval, split_if_it_pays(advance, carry), None, SAMPLES)
 
     dt = duration / (SAMPLES * substeps)
     start = stepper.init(system, q0, v0, params, dt)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
-from hhtjax.linear_solve import matvec
+from hhtjax.linear_solve import diagonal, matvec
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import Info, State
 
@@ -49,7 +49,7 @@ def report(system, params, s, info, row):
 
 def directions(M, B):
     """D: (n, m)."""
-    d = M if M.ndim == 1 else jnp.diagonal(M)
+    d = diagonal(M)
     return B.T / jnp.where(d == 0, 1, d)[:, None]
 
 
