@@ -17,8 +17,9 @@ from jax import lax
 
 from hhtjax.description import is_concrete
 from hhtjax.flat_system import flatten, initial_values
+from hhtjax.jacobian import matrix
 from hhtjax.kernels import staged
-from hhtjax.linear_solve import RANK_TOLERANCE, UNROLLED, factorize, factorize_least_squares, matrix, matvec, solve_map
+from hhtjax.linear_solve import RANK_TOLERANCE, UNROLLED, factorize, factorize_least_squares, matvec, solve_map
 
 MAX_ITERATIONS = 50
 CONSISTENT = 1e-6  # relative distance of initial values from consistent ones that passes

@@ -6,11 +6,11 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
+from hhtjax.jacobian import matrix
 from hhtjax.kernels import staged
 
 UNROLLED = 8
@@ -40,11 +40,6 @@ def invert(f, like, factorize):
     if isinstance(factorize, Structured):
         return factorize.of_map(f, like)
     return factorize(staged(partial(matrix, f), like.size)(like))
-
-
-def matrix(f, like):
-    """The matrix of a linear map f of vectors like `like`."""
-    return jax.vmap(f, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
 
 
 def _solve(f, b, inverse):

@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import Literal
 
+from hhtjax.jacobian import alone
 from hhtjax.kernels import STAGED, TESTED, named
 from hhtjax.pieces import ELEMENTWISE, RULES, arranged, each, is_in_pieces, is_known, is_small, pieces, whole
 
@@ -143,19 +144,8 @@ def _apply(eqn, values):
         results = RULES[name](eqn, *values)
     if results is None:
         arrays = [whole(value, x.aval) for value, x in zip(values, eqn.invars, strict=True)]
-        results = map(pieces, _alone(eqn)(*arrays))
+        results = map(pieces, alone(eqn)(*arrays))
     return results
-
-
-def _alone(eqn):
-    """The operation as a function of its arrays, to a list."""
-
-    def f(*arrays):
-        with eqn.ctx.manager:
-            results = eqn.primitive.bind(*arrays, **eqn.primitive.get_bind_params(eqn.params))
-        return results if eqn.primitive.multiple_results else [results]
-
-    return f
 
 
 # Functions within functions.
@@ -290,7 +280,7 @@ def _custom_jvp_call(eqn, *values):
     @call.defjvp
     def _(x, dx):
         shapes = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-        rule = jax.make_jaxpr(lambda x, dx: jax.jvp(_alone(eqn), x, dx))(shapes, shapes)
+        rule = jax.make_jaxpr(lambda x, dx: jax.jvp(alone(eqn), x, dx))(shapes, shapes)
         results = _evaluate(rule.jaxpr, rule.consts, [*back(x), *back(dx)])
         half = len(results) // 2
         return flat_results(results[:half]), flat_results(results[half:])

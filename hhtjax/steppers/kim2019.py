@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from hhtjax import kinematics
 from hhtjax.constraints import acceleration_and_multipliers, reaction
 from hhtjax.description import is_concrete
-from hhtjax.linear_solve import factorize, matrix, solve
+from hhtjax.jacobian import matrix
+from hhtjax.linear_solve import factorize, solve
 from hhtjax.steppers.generalized_alpha import Options, check_options, require_alpha
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.stepper import Info, State, Stepper
