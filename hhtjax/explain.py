@@ -27,7 +27,7 @@ def explain(f, *args) -> Explanation:
     """Compiles f(*args), which calls `simulate`, and tells how its loops over steps run.
 
     On the CPU each becomes one kernel if XLA can compile it so, several times faster on a small system, and a list of
-    kernels if not, as on other platforms: with LAPACK (more than 8 unknowns), sort, indices from an array
+    kernels if not, as on other platforms: with LAPACK (more than 16 unknowns), sort, indices from an array
     under reverse mode, large products and sums, or a callback such as progress=True. Values differ by rounding. With
     JAX before 0.10.2 every loop is plain, and no path is told.
 

@@ -8,7 +8,8 @@ only what its emitter knows: with LAPACK, sort, scatter or a large product, comp
 
 So it is decided when the program is lowered, with vmap and autodiff done: an identity on the results of the call looks
 the called function through, operation by operation, and attaches the attribute only if it knows them all. Platforms
-other than the CPU never see it. The verdict is attached too, for `explain` to read.
+other than the CPU never see it. The verdict is attached too, for `explain` to read. A function may come in two forms,
+one for either case, of which the program keeps one.
 """
 
 from functools import reduce
@@ -17,6 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxlib.mlir import ir
@@ -60,6 +62,11 @@ def staged(f, size=None):
     return f if size == 1 or jax.__version_info__ < TESTED else named(STAGED, f)
 
 
+def choose(inside, outside, *args):
+    """inside(*args) in one kernel, outside(*args) elsewhere: two ways to the same values."""
+    return lax.cond(inside_p.bind(jax.tree.leaves(args)[0]), inside, outside, *args)
+
+
 def named(name, f):
     """f as a function of this name in the program."""
 
@@ -73,6 +80,18 @@ def named(name, f):
 def _watch(tree):
     """An identity on either side of a call: whatever autodiff makes of it, one is behind the call or its transpose."""
     return jax.tree.map(lambda x: watch_p.bind(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x, tree)
+
+
+inside_p = Primitive("hhtjax_inside")  # whether a kernel holds it; the operand keeps it where the choice is
+inside_p.def_impl(lambda x: jnp.array(False))
+inside_p.def_abstract_eval(lambda x: x.update(shape=(), dtype=np.dtype(bool), weak_type=False))
+batching.primitive_batchers[inside_p] = lambda values, axes: (inside_p.bind(*values), None)
+
+
+def _lower_inside(ctx, x):
+    no = mlir.ir_constant(np.bool_(False))
+    _attach(no.owner, hhtjax_inside="unless a kernel takes the other branch")
+    return [no]
 
 
 watch_p = Primitive("hhtjax_watch")
@@ -98,6 +117,8 @@ def _decide(module, call):
     found = _Inspection(module, call)
     _attach(call, **{VERDICT: f"plain: {found.objection}" if found.objection else "one kernel"})
     if found.objection is None:
+        for choice in found.choices:
+            _take(choice, 1)
         for product in found.products:
             _write_out(module, product)
         _make_kernel(module, call)
@@ -106,6 +127,7 @@ def _decide(module, call):
 # a cached lowering would not see the call
 uncached: Any = {"cacheable": False} if jax.__version_info__ >= TESTED else {}
 mlir.register_lowering(watch_p, _lower, **uncached)
+mlir.register_lowering(inside_p, _lower_inside, **uncached)
 
 
 def _operations(op):
@@ -161,6 +183,26 @@ def _make_kernel(module, call):
         call.attributes["callee"] = _insert(module, between)
 
 
+def _is_choice(op):
+    """A conditional on `inside_p`, that is, on its value as an integer within bounds."""
+    if op.name != "stablehlo.case":
+        return False
+    index = op.operands[0].owner
+    while index.name in ("stablehlo.convert", "stablehlo.clamp"):
+        index = index.operands[len(index.operands) // 2].owner
+    return ATTRIBUTES in index.attributes and "hhtjax_inside" in index.attributes[ATTRIBUTES]
+
+
+def _take(case, branch):
+    """The branch in the place of the conditional."""
+    *body, end = case.regions[branch].blocks[0].operations
+    for op in body:
+        op.operation.move_before(case)
+    for result, value in zip(case.results, end.operands, strict=True):
+        result.replace_all_uses_with(value)
+    case.erase()
+
+
 def _insert(module, function):
     """Into the module, under a name that is free: the reference to it."""
     return ir.FlatSymbolRefAttr.get(module.symbol_table.insert(function).value)
@@ -180,6 +222,7 @@ class _Inspection:
         self.seen = set()
         self.operations = 0
         self.products = []  # to be written out
+        self.choices = []  # between the forms of a function
         self.objection = None
         if _is_partitioned(module.axis_context):
             self.object("partitioned over devices; shard_map leaves each its own kernel")
@@ -198,6 +241,10 @@ class _Inspection:
             if callee not in self.seen:
                 self.seen.add(callee)
                 self.look(self.functions[callee].operation)
+        elif _is_choice(op):
+            self.choices.append(op)
+            for inner in op.regions[1].blocks[0]:
+                self.look(inner.operation)
         elif name == "custom_call":
             self.object(ir.StringAttr(op.attributes["call_target_name"]).value)
         elif name == "dot_general" and _is_written_out(op):

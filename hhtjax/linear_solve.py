@@ -1,7 +1,8 @@
 """Small dense solves that XLA can fuse; LAPACK above a size.
 
 A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
-up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones.
+up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones; up to
+`LOOPED` it is a loop in a kernel, and LAPACK's elsewhere.
 """
 
 from functools import partial
@@ -11,9 +12,10 @@ from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
 from hhtjax.jacobian import matrix
-from hhtjax.kernels import staged
+from hhtjax.kernels import choose, staged
 
 UNROLLED = 8
+LOOPED = 16
 SCALAR = 4  # beyond, scalar operations are so many that compiling them takes long
 RANK_TOLERANCE = (
     1e-9  # relative size of a singular value below which columns count as dependent; 100 roundings in float32
@@ -72,6 +74,10 @@ def factorize(A):
         return partial(_substitute_scalars, *_lu_scalars(A))
     if A.shape[-1] <= UNROLLED:
         return partial(_substitute, _lu(A))
+    if A.shape[-1] <= LOOPED:
+        factors = choose(_lu_in_a_loop, _lu_of_lapack, A)
+        ways = _substitute, _by_lapack
+        return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
     return partial(lu_solve, lu_factor(A))
 
 
@@ -154,25 +160,74 @@ def _lu(A):
     return A, order
 
 
+def _lu_in_a_loop(A):
+    """The same."""
+    n = A.shape[0]
+    i = jnp.arange(n)
+
+    def eliminate(k, carry):
+        A, order = carry
+        pivot = jnp.argmax(jnp.where(i >= k, jnp.abs(A[:, k]), -1))
+        exchange = jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))
+        A, order = A[exchange], order[exchange]
+        factor = jnp.where(i > k, A[:, k] / A[k, k], 0)[:, None]
+        below = (i[None, :] == k) & (i[:, None] > k)
+        A = jnp.where(below, factor, A - factor * jnp.where(i > k, A[k], 0)[None, :])
+        return A, order
+
+    return lax.fori_loop(0, n - 1, eliminate, (A, i))
+
+
 def _substitute(factors, b, trans=0):
     """x with L U x = b[order]; for trans=1, x with x[order] = z and (L U)^T z = b."""
     LU, order = factors
     n = LU.shape[0]
     i = jnp.arange(n)
-    x = b if trans else b[order]
-    if not trans:
-        for k in range(n - 1):
-            x = x - jnp.where(i > k, LU[:, k] * x[k], 0)
-        for k in reversed(range(n)):
-            pivot = x[k] / LU[k, k]
-            x = jnp.where(i == k, pivot, x - jnp.where(i < k, LU[:, k] * pivot, 0))
-        return x
-    for k in range(n):
+    loop = lax.fori_loop if n > UNROLLED else _written_out
+
+    def forward(k, x):
+        return x - jnp.where(i > k, LU[:, k] * x[k], 0)
+
+    def backward(j, x):
+        k = n - 1 - j
         pivot = x[k] / LU[k, k]
-        x = jnp.where(i == k, pivot, x - jnp.where(i > k, LU[k] * pivot, 0))
-    for k in reversed(range(1, n)):
-        x = x - jnp.where(i < k, LU[k] * x[k], 0)
+        return jnp.where(i == k, pivot, x - jnp.where(i < k, LU[:, k] * pivot, 0))
+
+    def forward_transposed(k, x):
+        pivot = x[k] / LU[k, k]
+        return jnp.where(i == k, pivot, x - jnp.where(i > k, LU[k] * pivot, 0))
+
+    def backward_transposed(j, x):
+        k = n - 1 - j
+        return x - jnp.where(i < k, LU[k] * x[k], 0)
+
+    if not trans:
+        return loop(0, n, backward, loop(0, n - 1, forward, b[order]))
+    x = loop(0, n - 1, backward_transposed, loop(0, n, forward_transposed, b))
     return jnp.sum(jnp.where(order[:, None] == i[None, :], x[:, None], 0), axis=0)
+
+
+def _written_out(start, stop, body, x):
+    for k in range(start, stop):
+        x = body(k, x)
+    return x
+
+
+def _lu_of_lapack(A):
+    """The same as `_lu`."""
+    LU, _, order = lax.linalg.lu(A)
+    return LU, order.astype(jnp.arange(0).dtype)
+
+
+def _by_lapack(factors, b, trans=0):
+    """The same as `_substitute`."""
+    LU, order = factors
+    substitute = partial(lax.linalg.triangular_solve, left_side=True, transpose_a=bool(trans))
+    lower, upper = {"lower": True, "unit_diagonal": True}, {"lower": False}
+    x = (b if trans else b[order])[:, None]
+    for triangle in (upper, lower) if trans else (lower, upper):
+        x = substitute(LU, x, **triangle)
+    return x[jnp.argsort(order), 0] if trans else x[:, 0]
 
 
 def _cramer(A, b, trans=0):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hhtjax import explain, kernels
 from hhtjax.linear_solve import (
     UNROLLED,
     factorize,
@@ -232,6 +233,33 @@ def test_one_factorisation_serves_many_right_hand_sides_and_the_transpose(factor
     plain, transposed = jax.jit(many)(A, b)
     assert np.allclose(plain, np.linalg.solve(A, b + np.sin(b)), rtol=1e-11, atol=1e-12)
     assert np.allclose(transposed, np.linalg.solve(A.T, b), rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.skipif(jax.__version_info__ < kernels.TESTED, reason="this JAX makes no kernels")
+@pytest.mark.parametrize("made", [zero_diagonal, permuted, bad_rows])
+def test_elimination_is_a_loop_inside_a_kernel_and_lapack_s_elsewhere(made):
+    """Both forms, both directions, a batch, and the derivatives; none leaves the other's traces in the program."""
+
+    def many(A, b):
+        inverse = factorize(A)
+        return inverse(b), inverse(b, trans=1), jax.grad(lambda b: jnp.sum(jnp.sin(solve(A, b))))(b)
+
+    def inside(A, b):
+        return kernels.one_kernel(many, A, b)
+
+    A, b = made(UNROLLED + 4)
+    x = np.linalg.solve(A, b)
+    expected = x, np.linalg.solve(A.T, b), np.linalg.solve(A.T, np.cos(x))
+    for f in (many, inside):
+        compiled = jax.jit(f).lower(A, b).compile()
+        assert ("getrf" in compiled.as_text()) == (f is many)
+        assert "conditional" not in compiled.as_text()
+        for found, known in zip(compiled(A, b), expected, strict=True):
+            np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-9 * np.abs(known).max())
+    batch = jax.jit(jax.vmap(inside))(np.stack([A, A.T, A]), np.stack([b, b, 2 * b]))
+    np.testing.assert_allclose(batch[0][1], expected[1], rtol=1e-9, atol=1e-9 * np.abs(expected[1]).max())
+    np.testing.assert_allclose(batch[0][2], 2 * x, rtol=1e-9, atol=1e-9 * np.abs(x).max())
+    assert explain(jax.vmap(inside), A[None], b[None]).paths == ("one kernel",)
 
 
 @pytest.mark.parametrize(("n", "name", "once"), [(3, "abs", 6), (5, "abs", 14), (UNROLLED + 1, "lu", 1)])
