@@ -188,9 +188,10 @@ def _is_choice(op):
     if op.name != "stablehlo.case":
         return False
     index = op.operands[0].owner
-    while index.name in ("stablehlo.convert", "stablehlo.clamp"):
+    while not isinstance(index, ir.Block) and index.name in ("stablehlo.convert", "stablehlo.clamp"):
         index = index.operands[len(index.operands) // 2].owner
-    return ATTRIBUTES in index.attributes and "hhtjax_inside" in index.attributes[ATTRIBUTES]
+    known = {} if isinstance(index, ir.Block) else index.attributes
+    return ATTRIBUTES in known and "hhtjax_inside" in known[ATTRIBUTES]
 
 
 def _take(case, branch):

@@ -133,7 +133,8 @@ def factorize_least_squares(n):
 def solve(A, b, factorize=factorize):
     """x with A x = b, for A (n, n) and b (n,), differentiable in both.
 
-    LU with partial pivoting: unrolled for n <= 8, LAPACK above; Cramer's rule for n = 2. A singular A gives inf or NaN.
+    LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (module docstring); Cramer's rule for n = 2.
+    A singular A gives inf or NaN.
 
     >>> import jax.numpy as jnp
     >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]

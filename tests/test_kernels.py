@@ -53,6 +53,15 @@ def test_one_kernel_gives_what_the_plain_path_gives(monkeypatch):
 
 
 @on_cpu
+def test_a_conditional_on_an_argument_stays():
+    def f(i, x):
+        return kernels.one_kernel(lambda i, x: jax.lax.switch(i, [jnp.sin, jnp.cos], x), i, x)
+
+    assert [float(jax.jit(f)(i, 0.5)) for i in (0, 1)] == pytest.approx([np.sin(0.5), np.cos(0.5)], rel=1e-15)
+    assert paths(f, 1, 0.5) == ("one kernel",)
+
+
+@on_cpu
 def test_derivatives_and_batches_are_one_kernel_too():
     assert paths(jax.grad(loss), 2.0) == ("one kernel", "one kernel")
     assert paths(lambda p: jax.jvp(loss, (p,), (p,)), 2.0) == ("one kernel",)

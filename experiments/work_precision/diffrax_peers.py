@@ -57,16 +57,16 @@ def entries(name, everything, tolerances=TOLERANCES, sizes=SIZES):
         kinds += [("ImplicitEuler", False)] + [(solver, True) for solver in CONSTANT]
     rows = []
     for solver, fixed in kinds:
+        settings = sizes if fixed else tolerances
+        numbers = {x: jnp.asarray(case.scene.duration / (SAMPLES * x) if fixed else x) for x in settings}
 
-        def solve(setting, solver=solver, fixed=fixed):
-            h = case.scene.duration / (SAMPLES * setting) if fixed else setting
-            y, steps, fine = run(case.rate, solver, fixed, *arguments, h)
+        def solve(setting, solver=solver, fixed=fixed, numbers=numbers):
+            y, steps, fine = run(case.rate, solver, fixed, *arguments, numbers[setting])
             if not fine:
                 return None, None
             return np.asarray(y)[:, : case.size], STAGES[solver] * steps if solver in STAGES else None
 
         kind = "constant" if fixed else "PID"
-        settings = sizes if fixed else tolerances
         tried = partial(sweep, name, f"diffrax {solver}, {kind}", "diffrax", solve, settings)
         rows += tried(
             lambda x, fixed=fixed: {"h_s": case.scene.duration / (SAMPLES * x)} if fixed else {"tolerance": x}

@@ -43,6 +43,7 @@ def entries(name, sizes, only=None):
     case = cases()[name]
     system, params, q0, v0, duration = case.scene
     params = jax.tree.map(jnp.asarray, params)
+    counts = {n: jnp.asarray(n) for n in sizes}  # a Python number would be made an array in every call
     rows = []
     for method, (stepper, levels, solves) in METHODS.items():
         if only is not None and method not in only:
@@ -54,7 +55,7 @@ def entries(name, sizes, only=None):
         )  # what stays the same is not passed on
 
         def solve(substeps, program=program, levels=levels, solves=solves):
-            path, count = program(params, substeps)
+            path, count = program(params, counts[substeps])
             return path, count if solves is None else solves * SAMPLES * substeps * (2**levels - 1)
 
         rows += sweep(name, method, "ours", solve, sizes, lambda n: {"h_s": duration / (SAMPLES * n)})

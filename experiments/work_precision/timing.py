@@ -9,7 +9,7 @@ from experiments.work_precision.cases import rms_error
 
 LONGEST = 0.3  # s, of a run; nothing finer is tried after one that takes longer, or eight times as long if it is wrong
 FINEST = 1e-9  # error, below which nothing finer is tried
-REPEATS = 5
+REPEATS = 50
 PATIENCE = 0.08  # s, for the repeats of a run
 
 
