@@ -234,17 +234,25 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     start = stepper.begin(flat, q, v, t0, params, dt)
     no_info = neutral_info(jax.eval_shape(take_step, start)[1])
     carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    return Loop(carry, on_scalars(counted(take_step, flat, q, t0, dt)), on_scalars(partial(saved, flat)), no_info)
+    advance = on_scalars(counted(take_step, flat, q, t0, dt))
+    return Loop(carry, advance, on_scalars(partial(saved, flat)), no_info)
 
 
-def counted(take_step, flat, q0, t0, dt):
-    """The step of a run, on (state, number of steps, first failure); also its `Info`."""
+def advance_from(flat, stepper, q0, params, t, dt, count):
+    """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken."""
+    take_step = stepper.astype(q0.dtype).bind(flat, params, dt)
+    return on_scalars(counted(take_step, flat, q0, t, dt, count))
+
+
+def counted(take_step, flat, q0, t0, dt, before=None):
+    """The step of a run, on (state, number of steps, first failure); also its `Info`. before: steps taken at t0."""
 
     def step(carry):
         state, count, failure = carry
         state, info = take_step(state)
         count = count + 1
-        state = state._replace(t=t0 + count.astype(dt.dtype) * dt)  # no rounding piles up
+        taken = count if before is None else count - before
+        state = state._replace(t=t0 + taken.astype(dt.dtype) * dt)  # no rounding piles up
         if flat.first_order:
             state = state._replace(q=q0)  # stays zero
         return (state, count, _first_failure(failure, count, state, info)), info
