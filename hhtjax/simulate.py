@@ -45,7 +45,8 @@ class Solution(NamedTuple):
 
     t: (K + 1,). q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order
     system y, y' and None.
-    multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L. dt: the step size.
+    multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L.
+    dt: the step size; (K,) of a sweep over `times`, one for each interval.
     info: `Info` for each of the K intervals between saved times: largest residual, number of Newton
     iterations, all converged; None where the method has nothing to tell.
     failure: the first step that failed, as data; `check` turns it into an error.
@@ -80,7 +81,7 @@ class Solution(NamedTuple):
         if not bad.any():
             return
         member = tuple(int(i) for i in np.argwhere(bad)[0])
-        step, dt, start = (np.asarray(x)[member] for x in (bad, self.dt, self.t[..., 0]))
+        step, time = bad[member], self._time_of(bad[member], member)
         failed = f"({np.count_nonzero(bad)} of {bad.size} failed)"
         which = f"member {', '.join(map(str, member))} {failed}, " if member else ""
         why = (
@@ -88,7 +89,7 @@ class Solution(NamedTuple):
             if strays[member]
             else self._why(member)
         )
-        raise SimulationError(f"simulate: {which}step {step} (to t = {start + step * dt:.6g}) failed: {why}.")
+        raise SimulationError(f"simulate: {which}step {step} (to t = {time:.6g}) failed: {why}.")
 
     def _why(self, member):
         """What `failure` says of one member of a batch."""
@@ -113,8 +114,23 @@ class Solution(NamedTuple):
         for q in map(np.asarray, jax.tree.leaves(self.q)):
             with np.errstate(invalid="ignore"):
                 far |= (abs(q - np.take(q, [0], axis)) > reach).any(axis=tuple(range(axis + 1, q.ndim)))
-        elapsed = np.take_along_axis(t, far.argmax(axis)[..., None], axis)[..., 0] - t[..., 0]
-        return np.rint(elapsed / np.asarray(self.dt)).astype(int)
+        return np.take_along_axis(self._steps_taken(), far.argmax(axis)[..., None], axis)[..., 0]
+
+    def _steps_taken(self):
+        """How many steps come before each saved time."""
+        t, dt = np.asarray(self.t), np.asarray(self.dt)
+        with np.errstate(all="ignore"):  # a traced dt may be anything
+            if dt.ndim < t.ndim:
+                return np.rint((t - t[..., :1]) / dt[..., None]).astype(int)
+            counts = np.rint(np.nan_to_num(np.diff(t) / dt, nan=1)).astype(int)
+        return np.cumsum(np.insert(counts, 0, 0, axis=-1), axis=-1)
+
+    def _time_of(self, step, member):
+        """The time at which a step of a member of a batch ends."""
+        taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
+        dt = np.broadcast_to(np.asarray(self.dt)[member], t[1:].shape)
+        i = np.clip(np.searchsorted(taken, step) - 1, 0, dt.size - 1)
+        return t[i] + (step - taken[i]) * dt[i]
 
 
 def simulate(
@@ -357,24 +373,28 @@ def interpolate(solution, times) -> Interpolant:
     if not is_real(times):
         raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
     times = jnp.asarray(times).astype(t.dtype)
-    start, end, H = t[0], t[-1], t[1] - t[0]
+    start, end = t[0], t[-1]
     slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
     outside = ~((times >= start - slack) & (times <= end + slack))
     if is_concrete(outside) and np.any(outside):
         bad = np.asarray(times)[np.asarray(outside)].flat[0]
         raise ValueError(f"interpolate: `times` must lie in [{start:.6g}, {end:.6g}]; received {bad:.6g}.")
-    i = jnp.clip(jnp.floor((times - start) / H).astype(jnp.int32), 0, t.shape[0] - 2)
+    i = jnp.clip(jnp.searchsorted(t, times, side="right") - 1, 0, t.shape[0] - 2)
+    H = t[i + 1] - t[i]
     x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
 
+    def on_axes(x, y):
+        return x.reshape(x.shape + (1,) * (y.ndim - 1))
+
     def hermite(y, slope):
-        s = x.reshape(x.shape + (1,) * (y.ndim - 1))
-        return y[i] + kinematics.hermite(y[i + 1] - y[i], H * slope[i], H * slope[i + 1], s)
+        s, h = on_axes(x, y), on_axes(H, y)
+        return y[i] + kinematics.hermite(y[i + 1] - y[i], h * slope[i], h * slope[i + 1], s)
 
     def position(q, v):
         if not kinematics.is_rotation(q.shape, v.shape):
             return hermite(q, v)
-        s = x.reshape(x.shape + (1,) * (v.ndim - 1))
-        return kinematics.interpolate_rotation(q[i], q[i + 1], H * v[i], H * v[i + 1], s)
+        s, h = on_axes(x, v), on_axes(H, v)
+        return kinematics.interpolate_rotation(q[i], q[i + 1], h * v[i], h * v[i + 1], s)
 
     first_order = solution.acceleration is None
     v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)

@@ -114,11 +114,11 @@ class Inputs(NamedTuple):
         dts = _require_step_sizes(dts)
         (q0, v0), mapped = _initial_values(system, q0, v0, params, stepper, in_axes, dts.size)
         if times is None:
-            _require_steps_within(dts, duration, duration, num_samples)
+            _require_steps_within(dts, 0.0, duration, num_samples)
         else:
             times = _require_times(times, t0, jax.tree.leaves(q0)[0].dtype)
             num_samples = times.size
-            _require_steps_within(dts, times[-1] - t0)
+            _require_steps_within(dts, t0, times[-1])
         data = stepper, q0, v0, params
         require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
         if system.constraint is not None:
@@ -204,16 +204,16 @@ def _require_step_sizes(dts):
     return dts
 
 
-def _require_steps_within(dts, span, duration=None, num_samples=None):
+def _require_steps_within(dts, start, end, num_samples=None):
     """An error for step sizes that are not positive, take too many steps, or exceed the distance of equal samples."""
-    if not (is_concrete(dts) and is_concrete(span)):
+    if not all(map(is_concrete, (dts, start, end))):
         return
-    h, limit, at_most = np.asarray(dts, float), np.inf, ""
+    h, span = np.asarray(dts, float), float(end) - float(start)
+    limit, at_most = np.inf, ""
     if num_samples is not None:
-        limit = float(duration) / num_samples
+        limit = span / num_samples
         at_most = (
-            f", and at most {limit:.6g}, the distance of the samples (duration={float(duration):.6g}, "
-            f"num_samples={num_samples})"
+            f", and at most {limit:.6g}, the distance of the samples (duration={span:.6g}, num_samples={num_samples})"
         )
     fine = (h > 0) & (h <= limit * (1 + 1e-6))
     if not fine.all():
