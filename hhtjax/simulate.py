@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax import kinematics
 from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpointed_scan
 from hhtjax.constraints import require_consistent
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import is_concrete
 from hhtjax.extrapolation import MOST, extrapolated
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel, staged
@@ -123,7 +122,7 @@ class Solution(NamedTuple):
             if dt.ndim < t.ndim:
                 return np.rint((t - t[..., :1]) / dt[..., None]).astype(int)
             counts = np.rint(np.nan_to_num(np.diff(t) / dt, nan=1)).astype(int)
-        return np.cumsum(np.insert(counts, 0, 0, axis=-1), axis=-1)
+        return np.insert(np.cumsum(counts, axis=-1), 0, 0, axis=-1)
 
     def _time_of(self, step, member):
         """The time at which a step of a member of a batch ends."""
@@ -338,64 +337,3 @@ def show_progress(count, total, what):
 
     due = (count % every == 0) | (count == total)
     lax.cond(due, lambda: jax.debug.callback(show, count), lambda: None)
-
-
-class Interpolant(NamedTuple):
-    """Position and velocity at the times asked for, with these as leading axis; of a first-order system y and None."""
-
-    q: Any
-    v: Any
-
-
-def interpolate(solution, times) -> Interpolant:
-    """Dense output: q and v at arbitrary times inside the run, differentiable in all.
-
-    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration); for a rotation, of
-    the rotation vector from the saved one before. Their error is O(H^4), H the spacing of the saved times.
-
-    Args:
-        solution: of one run (vmap this function for a batch).
-        times: scalar or array, inside [solution.t[0], solution.t[-1]] up to rounding.
-
-    Raises:
-        ValueError: a time outside the run. For tracers the result is NaN there.
-
-    >>> import jax.numpy as jnp, hhtjax
-    >>> ball = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: 0 * q - 9.81)
-    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.array([0.0]), jnp.array([10.0]), dt=0.1, num_steps=10)
-    >>> round(float(hhtjax.interpolate(run, 0.25).q[0]), 5)                 # 10 t - 9.81 t^2/2
-    2.19344
-    """
-    t = solution.t
-    if t.ndim != 1:
-        raise ValueError(f"interpolate: `solution` must be of one run (vmap over a batch); received t of {t.shape}.")
-    times = times if is_array(times) else np.asarray(times)
-    if not is_real(times):
-        raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
-    times = jnp.asarray(times).astype(t.dtype)
-    start, end = t[0], t[-1]
-    slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
-    outside = ~((times >= start - slack) & (times <= end + slack))
-    if is_concrete(outside) and np.any(outside):
-        bad = np.asarray(times)[np.asarray(outside)].flat[0]
-        raise ValueError(f"interpolate: `times` must lie in [{start:.6g}, {end:.6g}]; received {bad:.6g}.")
-    i = jnp.clip(jnp.searchsorted(t, times, side="right") - 1, 0, t.shape[0] - 2)
-    H = t[i + 1] - t[i]
-    x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
-
-    def on_axes(x, y):
-        return x.reshape(x.shape + (1,) * (y.ndim - 1))
-
-    def hermite(y, slope):
-        s, h = on_axes(x, y), on_axes(H, y)
-        return y[i] + kinematics.hermite(y[i + 1] - y[i], h * slope[i], h * slope[i + 1], s)
-
-    def position(q, v):
-        if not kinematics.is_rotation(q.shape, v.shape):
-            return hermite(q, v)
-        s, h = on_axes(x, v), on_axes(H, v)
-        return kinematics.interpolate_rotation(q[i], q[i + 1], h * v[i], h * v[i + 1], s)
-
-    first_order = solution.acceleration is None
-    v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)
-    return Interpolant(jax.tree.map(position, solution.q, solution.v), v)

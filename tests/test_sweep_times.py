@@ -41,7 +41,7 @@ def by_hand(scene, times, dt, t0):
     step = jax.jit(lambda state, h: stepper.step(system, state, params, h)[0])
     spans = np.diff(times, prepend=t0)
     counts = np.maximum(np.ceil(spans / dt - 1e-12), 1).astype(int)
-    state = stepper.init(system, q0, v0, params, spans[0] / counts[0], t0)
+    state = jax.jit(lambda h: stepper.init(system, q0, v0, params, h, t0))(spans[0] / counts[0])
     found = [state]
     for end, span, n in zip(times, spans, counts, strict=True):
         for i in range(n):
