@@ -93,7 +93,7 @@ def test_the_work_is_about_the_sum_over_the_members():
         return -q
 
     system = hhtjax.System(ONE, counting)
-    runs = hhtjax.sweep(system, hhtjax.rk4(), ONE, ZERO, dts=DTS[:-1], times=[0.001, 1.0, 1.02])
+    runs = hhtjax.sweep(system, hhtjax.rk4(), ONE, ZERO, dts=DTS[::-1][1:], times=[0.001, 1.0, 1.02])
     jax.effects_barrier()
     lanes, stages = 4, 4
     iterations, steps = lanes * len(counted) / stages, np.sum(np.diff(runs.t) / np.asarray(runs.dt))
@@ -145,11 +145,15 @@ def test_a_failure_is_named_by_step_and_time():
     runs = broken_runs(TIMES, np.array([0.02, 0.3]))
     with pytest.raises(hhtjax.SimulationError, match=r"member 0 \(2 of 2 failed\), step 26 \(to t = 2.50208\) failed"):
         runs.check()
-    with pytest.raises(hhtjax.SimulationError, match=r"member 0 .*, step 7 \(to t = 2.13\) .* farther than 0.03"):
-        runs.check(reach=0.03)
+    for reach, where in ((0.03, r"step 7 \(to t = 2.13\)"), (0.01, r"step 5 \(to t = 2.1\)")):
+        with pytest.raises(hhtjax.SimulationError, match=rf"member 0 .*, {where} .* farther than {reach}"):
+            runs.check(reach=reach)
 
 
-@pytest.mark.parametrize(("times", "good"), [([2.1, 2.2, 2.2, 2.3, 2.4], 2), ([2.1, 2.05, 2.2, 2.3, np.inf], 1)])
+@pytest.mark.parametrize(
+    ("times", "good"),
+    [([2.1, 2.2, 2.2, 2.3, 2.4], 2), ([2.1, 2.05, 2.2, 2.3, 2.4], 1), ([2.1, 2.2, 2.3, 2.4, np.inf], 4)],
+)
 def test_traced_times_that_do_not_increase_and_step_sizes_that_are_negative_are_failures(times, good):
     runs = broken_runs(np.array(times), np.array([0.02, -1.0]))
     np.testing.assert_array_equal(np.isfinite(runs.q[0, :, 0]), np.arange(6) <= good)
