@@ -118,11 +118,13 @@ class Solution(NamedTuple):
     def _steps_taken(self):
         """How many steps come before each saved time."""
         t, dt = np.asarray(self.t), np.asarray(self.dt)
-        with np.errstate(all="ignore"):  # a traced dt may be anything
+        with np.errstate(all="ignore"):  # what was traced may be anything
             if dt.ndim < t.ndim:
-                return np.rint((t - t[..., :1]) / dt[..., None]).astype(int)
-            counts = np.rint(np.nan_to_num(np.diff(t) / dt, nan=1)).astype(int)
-        return np.insert(np.cumsum(counts, axis=-1), 0, 0, axis=-1)
+                taken = (t - t[..., :1]) / dt[..., None]
+            else:
+                counts = np.nan_to_num(np.rint(np.diff(t) / dt), nan=1)
+                taken = np.insert(np.cumsum(counts, axis=-1), 0, 0, axis=-1)
+        return np.rint(np.nan_to_num(taken, posinf=0, neginf=0)).astype(int)
 
     def _time_of(self, step, member):
         """The time at which a step of a member of a batch ends."""

@@ -59,10 +59,10 @@ def sweep(
         system, stepper, q0, v0, params, t0: as for `simulate`.
         dts: (B,) step sizes, positive, at most H. Their number B is part of the program, their values are data.
         duration: positive. num_samples: K, the number of samples after the start.
-        times: (K,), in their place: strictly increasing, after t0; data too. Steps end at each, other than with SciPy's
-            `t_eval`, and dts are upper bounds, like its `max_step`: where one is larger than H, also infinite, the step
-            is H. The `hht` family stays of order 2 as dts shrink between given times; where single steps lead from
-            sample to sample, those of unequal size add an error of first order, unless alpha = 0.
+        times: (K,), in the place of both: strictly increasing, after t0; data too. Steps end at each: unlike SciPy's
+            `t_eval` they shorten steps, and dts are upper bounds, like its `max_step`. A dt larger than H, or infinite,
+            takes the one step H. The `hht` family is of order 2 as dts shrink between given times; where there is one
+            step from sample to sample, unequal ones add an error of first order unless alpha = 0.
         in_axes: what else differs between members: (stepper, q0, v0, params), each 0 where all its arrays have a
             leading axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A stepper with an
             axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
