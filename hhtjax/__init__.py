@@ -8,6 +8,7 @@ from hhtjax.band_limited import band_limited as band_limited
 from hhtjax.band_limited import band_limited_motion as band_limited_motion
 from hhtjax.band_limited import spline_gain_error as spline_gain_error
 from hhtjax.constraints import consistent_initial as consistent_initial
+from hhtjax.dense_output import interpolate as interpolate
 from hhtjax.explain import explain as explain
 from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
 from hhtjax.identification.arguments import Gaussian as Gaussian
@@ -30,7 +31,6 @@ from hhtjax.identification.windows import windows as windows
 from hhtjax.identification.windows import wrap_angle as wrap_angle
 from hhtjax.sampled import sampled as sampled
 from hhtjax.simulate import SimulationError as SimulationError
-from hhtjax.simulate import interpolate as interpolate
 from hhtjax.simulate import simulate as simulate
 from hhtjax.steppers.collocation import collocation as collocation
 from hhtjax.steppers.collocation import wilson as wilson

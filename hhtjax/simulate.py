@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax import kinematics
 from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpointed_scan
 from hhtjax.constraints import require_consistent
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import is_concrete
 from hhtjax.extrapolation import MOST, extrapolated
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel, staged
@@ -45,7 +44,8 @@ class Solution(NamedTuple):
 
     t: (K + 1,). q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order
     system y, y' and None.
-    multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L. dt: the step size.
+    multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L.
+    dt: the step size; (K,) of a sweep over `times`, one for each interval.
     info: `Info` for each of the K intervals between saved times: largest residual, number of Newton
     iterations, all converged; None where the method has nothing to tell.
     failure: the first step that failed, as data; `check` turns it into an error.
@@ -80,7 +80,7 @@ class Solution(NamedTuple):
         if not bad.any():
             return
         member = tuple(int(i) for i in np.argwhere(bad)[0])
-        step, dt, start = (np.asarray(x)[member] for x in (bad, self.dt, self.t[..., 0]))
+        step, time = bad[member], self._time_of(bad[member], member)
         failed = f"({np.count_nonzero(bad)} of {bad.size} failed)"
         which = f"member {', '.join(map(str, member))} {failed}, " if member else ""
         why = (
@@ -88,7 +88,7 @@ class Solution(NamedTuple):
             if strays[member]
             else self._why(member)
         )
-        raise SimulationError(f"simulate: {which}step {step} (to t = {start + step * dt:.6g}) failed: {why}.")
+        raise SimulationError(f"simulate: {which}step {step} (to t = {time:.6g}) failed: {why}.")
 
     def _why(self, member):
         """What `failure` says of one member of a batch."""
@@ -113,8 +113,25 @@ class Solution(NamedTuple):
         for q in map(np.asarray, jax.tree.leaves(self.q)):
             with np.errstate(invalid="ignore"):
                 far |= (abs(q - np.take(q, [0], axis)) > reach).any(axis=tuple(range(axis + 1, q.ndim)))
-        elapsed = np.take_along_axis(t, far.argmax(axis)[..., None], axis)[..., 0] - t[..., 0]
-        return np.rint(elapsed / np.asarray(self.dt)).astype(int)
+        return np.take_along_axis(self._steps_taken(), far.argmax(axis)[..., None], axis)[..., 0]
+
+    def _steps_taken(self):
+        """How many steps come before each saved time."""
+        t, dt = np.asarray(self.t), np.asarray(self.dt)
+        with np.errstate(all="ignore"):  # what was traced may be anything
+            if dt.ndim < t.ndim:
+                taken = (t - t[..., :1]) / dt[..., None]
+            else:
+                counts = np.nan_to_num(np.rint(np.diff(t) / dt), nan=1)
+                taken = np.insert(np.cumsum(counts, axis=-1), 0, 0, axis=-1)
+        return np.rint(np.nan_to_num(taken, posinf=0, neginf=0)).astype(int)
+
+    def _time_of(self, step, member):
+        """The time at which a step of a member of a batch ends."""
+        taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
+        dt = np.broadcast_to(np.asarray(self.dt)[member], t[1:].shape)
+        i = np.clip(np.searchsorted(taken, step) - 1, 0, dt.size - 1)
+        return t[i] + (step - taken[i]) * dt[i]
 
 
 def simulate(
@@ -234,17 +251,25 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     start = stepper.begin(flat, q, v, t0, params, dt)
     no_info = neutral_info(jax.eval_shape(take_step, start)[1])
     carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    return Loop(carry, on_scalars(counted(take_step, flat, q, t0, dt)), on_scalars(partial(saved, flat)), no_info)
+    advance = on_scalars(counted(take_step, flat, q, t0, dt))
+    return Loop(carry, advance, on_scalars(partial(saved, flat)), no_info)
 
 
-def counted(take_step, flat, q0, t0, dt):
-    """The step of a run, on (state, number of steps, first failure); also its `Info`."""
+def advance_from(flat, stepper, q0, params, t, dt, count):
+    """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken."""
+    take_step = stepper.astype(q0.dtype).bind(flat, params, dt)
+    return on_scalars(counted(take_step, flat, q0, t, dt, count))
+
+
+def counted(take_step, flat, q0, t0, dt, before=None):
+    """The step of a run, on (state, number of steps, first failure); also its `Info`. before: steps taken at t0."""
 
     def step(carry):
         state, count, failure = carry
         state, info = take_step(state)
         count = count + 1
-        state = state._replace(t=t0 + count.astype(dt.dtype) * dt)  # no rounding piles up
+        taken = count if before is None else count - before
+        state = state._replace(t=t0 + taken.astype(dt.dtype) * dt)  # no rounding piles up
         if flat.first_order:
             state = state._replace(q=q0)  # stays zero
         return (state, count, _first_failure(failure, count, state, info)), info
@@ -314,60 +339,3 @@ def show_progress(count, total, what):
 
     due = (count % every == 0) | (count == total)
     lax.cond(due, lambda: jax.debug.callback(show, count), lambda: None)
-
-
-class Interpolant(NamedTuple):
-    """Position and velocity at the times asked for, with these as leading axis; of a first-order system y and None."""
-
-    q: Any
-    v: Any
-
-
-def interpolate(solution, times) -> Interpolant:
-    """Dense output: q and v at arbitrary times inside the run, differentiable in all.
-
-    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration); for a rotation, of
-    the rotation vector from the saved one before. Their error is O(H^4), H the spacing of the saved times.
-
-    Args:
-        solution: of one run (vmap this function for a batch).
-        times: scalar or array, inside [solution.t[0], solution.t[-1]] up to rounding.
-
-    Raises:
-        ValueError: a time outside the run. For tracers the result is NaN there.
-
-    >>> import jax.numpy as jnp, hhtjax
-    >>> ball = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: 0 * q - 9.81)
-    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.array([0.0]), jnp.array([10.0]), dt=0.1, num_steps=10)
-    >>> round(float(hhtjax.interpolate(run, 0.25).q[0]), 5)                 # 10 t - 9.81 t^2/2
-    2.19344
-    """
-    t = solution.t
-    if t.ndim != 1:
-        raise ValueError(f"interpolate: `solution` must be of one run (vmap over a batch); received t of {t.shape}.")
-    times = times if is_array(times) else np.asarray(times)
-    if not is_real(times):
-        raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
-    times = jnp.asarray(times).astype(t.dtype)
-    start, end, H = t[0], t[-1], t[1] - t[0]
-    slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
-    outside = ~((times >= start - slack) & (times <= end + slack))
-    if is_concrete(outside) and np.any(outside):
-        bad = np.asarray(times)[np.asarray(outside)].flat[0]
-        raise ValueError(f"interpolate: `times` must lie in [{start:.6g}, {end:.6g}]; received {bad:.6g}.")
-    i = jnp.clip(jnp.floor((times - start) / H).astype(jnp.int32), 0, t.shape[0] - 2)
-    x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
-
-    def hermite(y, slope):
-        s = x.reshape(x.shape + (1,) * (y.ndim - 1))
-        return y[i] + kinematics.hermite(y[i + 1] - y[i], H * slope[i], H * slope[i + 1], s)
-
-    def position(q, v):
-        if not kinematics.is_rotation(q.shape, v.shape):
-            return hermite(q, v)
-        s = x.reshape(x.shape + (1,) * (v.ndim - 1))
-        return kinematics.interpolate_rotation(q[i], q[i + 1], H * v[i], H * v[i + 1], s)
-
-    first_order = solution.acceleration is None
-    v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)
-    return Interpolant(jax.tree.map(position, solution.q, solution.v), v)

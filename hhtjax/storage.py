@@ -24,8 +24,9 @@ def sweep_to_disk(
     params=None,
     *,
     dts,
-    duration,
-    num_samples,
+    duration=None,
+    num_samples=None,
+    times=None,
     t0=0.0,
     in_axes=None,
     chunk=4096,
@@ -54,9 +55,8 @@ def sweep_to_disk(
     """
     if not isinstance(chunk, (int, np.integer)) or isinstance(chunk, bool) or chunk < 1:
         raise ValueError(f"sweep_to_disk: `chunk` must be a positive integer; received {chunk!r}.")
-    inputs = Inputs.checked(
-        system, stepper, q0, v0, params, dts=dts, duration=duration, num_samples=num_samples, t0=t0, in_axes=in_axes
-    )
+    grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
+    inputs = Inputs.checked(system, stepper, q0, v0, params, dts=dts, in_axes=in_axes, **grid)
     if not all(map(is_concrete, jax.tree.leaves(inputs))):
         raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
     folder, size = Path(folder), inputs.dts.size

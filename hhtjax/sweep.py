@@ -12,12 +12,20 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from hhtjax.boundary import require_number
 from hhtjax.checkpointing import checkpoint
 from hhtjax.constraints import examine, require_consistent
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import is_array, is_concrete
 from hhtjax.flat_system import flatten, initial_values
 from hhtjax.kernels import one_kernel
 from hhtjax.looping import repeat
+from hhtjax.sample_times import (
+    fit_to_samples,
+    fit_to_times,
+    require_one_grid,
+    require_step_sizes,
+    require_steps_within,
+    require_times,
+)
 from hhtjax.scalars import join, split_if_it_pays
-from hhtjax.simulate import Solution, as_solution, join_info, loop_of, show_progress
+from hhtjax.simulate import Solution, advance_from, as_solution, join_info, loop_of, show_progress
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
@@ -31,24 +39,30 @@ def sweep(
     params=None,
     *,
     dts,
-    duration,
-    num_samples,
+    duration=None,
+    num_samples=None,
+    times=None,
     t0=0.0,
     in_axes=None,
     mesh=None,
     progress=False,
 ) -> Solution:
-    """Runs `system` once for each of `dts`, all over [t0, t0 + duration], sampled at common times.
+    """Runs `system` once for each of `dts`, all from t0 on, sampled at common times.
 
-    Each step size is made smaller, if need be, so that a whole number of steps lands on every sample, at distances
-    H = duration/num_samples: h = H/ceil(H/dt), reported as `sweep.dt`. Members are sorted by their number of steps and
-    run in blocks, vectorised, each block for as many steps as its longest member needs: the work is about the sum over
-    the members. A member that fails is named by `check()` and leaves the others as they are.
+    These are `num_samples` at distances H = duration/num_samples, or `times`, at any distances H from one to the next.
+    Each step size is made smaller, if need be, so that a whole number of steps lands on every sample: h = H/ceil(H/dt),
+    reported as `sweep.dt`. Members are sorted by their number of steps and run in blocks, vectorised, each block for as
+    many steps as its longest member needs: the work is about the sum over the members. A member that fails is named by
+    `check()` and leaves the others as they are.
 
     Args:
         system, stepper, q0, v0, params, t0: as for `simulate`.
         dts: (B,) step sizes, positive, at most H. Their number B is part of the program, their values are data.
         duration: positive. num_samples: K, the number of samples after the start.
+        times: (K,), in the place of both: strictly increasing, after t0; data too. Steps end at each: unlike SciPy's
+            `t_eval` they shorten steps, and dts are upper bounds, like its `max_step`. A dt larger than H, or infinite,
+            takes the one step H. The `hht` family is of order 2 as dts shrink between given times; where there is one
+            step from sample to sample, unequal ones add an error of first order unless alpha = 0.
         in_axes: what else differs between members: (stepper, q0, v0, params), each 0 where all its arrays have a
             leading axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A stepper with an
             axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
@@ -58,15 +72,17 @@ def sweep(
 
     Returns:
         A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for
-        all; dt (B,), the step sizes used; failure.step counts each member's own steps.
+        all; dt (B,), the step sizes used, or (B, K), those before each of `times`; failure.step counts each member's
+        own steps.
 
-    Compiled once for each system, stepper, structure, B and num_samples. To be used inside jit and under vmap over
-    all but dts; differentiable, forward and reverse, in all that `simulate` is, except that the dts only choose the
-    number of steps. Derivatives cost several runs, and are NaN for members with more than 262144 steps between samples;
-    those of a failed member are not finite, nor are those in what it shares with others.
+    Compiled once for each system, stepper, structure, B and K. To be used inside jit and under vmap over all but dts
+    and times; differentiable, forward and reverse, in all that `simulate` is, and in times, except that the dts only
+    choose the number of steps. Derivatives cost several runs, and are NaN for members with more than 262144 steps
+    between samples; those of a failed member are not finite, nor are those in what it shares with others.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape or value; those of `simulate`.
+        NotImplementedError: `times` for a stepper that needs equal steps, `houbolt` or `park`; those of `simulate`.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: -params["k"] * q)
@@ -79,9 +95,8 @@ def sweep(
     >>> [round(float(q), 4) for q in runs.q[:, -1, 0]]                        # cos(2) = -0.4161
     [-0.4101, -0.4157, -0.4161]
     """
-    inputs = Inputs.checked(
-        system, stepper, q0, v0, params, dts=dts, duration=duration, num_samples=num_samples, t0=t0, in_axes=in_axes
-    )
+    grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
+    inputs = Inputs.checked(system, stepper, q0, v0, params, dts=dts, in_axes=in_axes, **grid)
     return inputs.run(mesh=mesh, progress=progress)
 
 
@@ -95,24 +110,29 @@ class Inputs(NamedTuple):
     t0: Any
     mapped: tuple
     num_samples: int
+    times: Any = None
 
     @classmethod
-    def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes):
+    def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes, times=None):
         """An error that names what is wrong, or the inputs."""
         require_system("sweep", system)
         require_stepper("sweep", stepper)
-        if not isinstance(num_samples, (int, np.integer)) or isinstance(num_samples, bool) or num_samples < 1:
-            raise ValueError(f"sweep: `num_samples` must be a positive integer; received {num_samples!r}.")
-        require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
-        dts = _require_step_sizes(dts, duration, num_samples)
+        require_one_grid(stepper, duration, num_samples, times)
+        dts = require_step_sizes(dts)
         (q0, v0), mapped = _initial_values(system, q0, v0, params, stepper, in_axes, dts.size)
+        if times is None:
+            require_steps_within(dts, 0.0, duration, num_samples)
+        else:
+            times = require_times(times, t0, jax.tree.leaves(q0)[0].dtype)
+            num_samples = times.size
+            require_steps_within(dts, t0, times[-1])
         data = stepper, q0, v0, params
         require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
         if system.constraint is not None:
             _require_consistent(system, data, mapped, t0)
-        duration, t0 = (float(x) if is_concrete(x) else x for x in (duration, t0))
-        return cls(system, data, dts, duration, t0, mapped, int(num_samples))
+        duration, t0 = (x if x is None or not is_concrete(x) else float(x) for x in (duration, t0))
+        return cls(system, data, dts, duration, t0, mapped, int(num_samples), times)
 
     def chunk(self, members):
         """The same for the members of these numbers."""
@@ -128,35 +148,13 @@ class Inputs(NamedTuple):
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": _lanes(dts.size)}
-        return (self.system, data, dts, self.duration, self.t0), {**static, "mesh": mesh, "progress": progress}
+        arguments = self.system, data, dts, self.duration, self.t0, self.times
+        return arguments, {**static, "mesh": mesh, "progress": progress}
 
     def run(self, **options):
         """The sweep."""
         arguments, keywords = self.call(**options)
         return run_sweep(*arguments, **keywords)
-
-
-def _require_step_sizes(dts, duration, num_samples):
-    """dts as an array (B,), checked as far as they are known."""
-    dts = dts if is_array(dts) else np.asarray(dts)
-    if not is_real(dts):
-        raise TypeError(f"sweep: `dts` must be real numbers; received {dts!r}.")
-    if dts.ndim != 1 or not dts.size:
-        raise ValueError(f"sweep: `dts` must have shape (B,), one step size for each member; received {dts.shape}.")
-    if is_concrete(dts) and is_concrete(duration):
-        H = float(duration) / num_samples
-        h = np.asarray(dts, float)
-        if not np.all((h > 0) & (h <= H * (1 + 1e-6))):
-            bad = int(np.argmin((h > 0) & (h <= H * (1 + 1e-6))))
-            raise ValueError(
-                f"sweep: `dts` must be positive, and at most {H:.6g}, the distance of the samples (duration="
-                f"{float(duration):.6g}, num_samples={num_samples}); received dts[{bad}] = {h[bad]:.6g}."
-            )
-        if duration / h.min() >= 2**31:
-            raise ValueError(
-                f"sweep: `dts` must take fewer than 2^31 steps; received dts[{h.argmin()}] = {h.min():.6g}."
-            )
-    return dts
 
 
 def _initial_values(system, q0, v0, params, stepper, in_axes, size):
@@ -238,29 +236,34 @@ def _lanes(size):
 
 
 @partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress"))
-def run_sweep(system, data, dts, duration, t0, *, mapped, num_samples, lanes, mesh, progress):
+def run_sweep(system, data, dts, duration, t0, times, *, mapped, num_samples, lanes, mesh, progress):
     """The sweep of `Inputs`, compiled."""
     dtype = jax.tree.leaves(data[1])[0].dtype
-    dts, duration, t0 = (jnp.asarray(x).astype(dtype) for x in (dts, duration, t0))
-    H = duration / num_samples
-    substeps, dts = _fit_to_samples(dts, H)
-    order = jnp.argsort(-substeps)
+    dts, duration, t0, times = jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), (dts, duration, t0, times))
+    if times is None:
+        H = duration / num_samples
+        substeps, dts = fit_to_samples(dts, H)
+        order = jnp.argsort(-substeps)
+    else:
+        times = jnp.concatenate([t0[None], times])
+        substeps, dts = fit_to_times(dts, times)
+        order = jnp.argsort(-jnp.sum(substeps, axis=1))
     hands = 1 if mesh is None else mesh.size
-    rounds = -(-dts.size // (lanes * hands))
+    rounds = -(-len(dts) // (lanes * hands))
     dealt = np.arange(rounds * hands * lanes).reshape(rounds, hands, lanes).swapaxes(0, 1)  # whole blocks, like cards
-    members = order[np.minimum(dealt, dts.size - 1)]  # the last one fills the last blocks
+    members = order[np.minimum(dealt, len(dts) - 1)]  # the last one fills the last blocks
     leaves, structure = jax.tree.flatten(data)
     axes = [0 if flag else None for flag in mapped]
 
     def member(leaves, dt, substeps, longest):
-        return _run(system, jax.tree.unflatten(structure, leaves), dt, substeps, longest, t0, num_samples)
+        return _run(system, jax.tree.unflatten(structure, leaves), dt, substeps, longest, t0, num_samples, times)
 
     def block(leaves, dts, substeps, numbered):
         number, members = numbered
         if progress:
             show_progress(number + 1, rounds, "block")
         mine = [x[members] if flag else x for x, flag in zip(leaves, mapped, strict=True)]
-        longest = jnp.max(substeps[members])
+        longest = jnp.max(substeps[members], axis=0)
         return jax.vmap(member, (axes, 0, 0, None))(mine, dts[members], substeps[members], longest)
 
     def hand(members, *data):
@@ -277,36 +280,42 @@ def run_sweep(system, data, dts, duration, t0, *, mapped, num_samples, lanes, me
     runs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[back], runs)
     if mesh is not None:
         runs = lax.with_sharding_constraint(runs, NamedSharding(mesh, PartitionSpec()))
-    t = jnp.broadcast_to(t0 + H * jnp.arange(num_samples + 1).astype(dtype), (dts.size, num_samples + 1))
-    return runs._replace(t=t)
+    if times is None:
+        times = t0 + H * jnp.arange(num_samples + 1).astype(dtype)
+    return runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))
 
 
-def _fit_to_samples(dts, H):
-    """The numbers of steps between two samples, and the step sizes; NaN where a traced dt is not in (0, H]."""
-    slack = 64 * float(jnp.finfo(dts.dtype).eps)
-    fine = (dts > 0) & (dts <= H * (1 + 1e-6))
-    substeps = jnp.maximum(jnp.ceil(H / jnp.where(fine, dts, H) * (1 - slack)), 1).astype(jnp.int32)
-    return substeps, jnp.where(fine, H / substeps.astype(dts.dtype), jnp.nan)
+def _run(system, data, dt, substeps, longest, t0, num_samples, times):
+    """One member; it rests from `substeps` to `longest`, where its block still works.
 
-
-def _run(system, data, dt, substeps, longest, t0, num_samples):
-    """One member; it rests from `substeps` to `longest`, where its block still works."""
+    With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval.
+    """
     stepper, q0, v0, params = data
     flat, q, v = flatten("sweep", system, q0, v0, t0, params)
-    loop = loop_of(flat, stepper, q, v, t0, params, dt)
+    intervals = None if times is None else (times[:-1], dt, substeps, longest)
+    loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
 
-    def step(i, carry):
-        run, info = loop.advance(carry[0])
-        new = run, join_info(carry[1], info)
-        return jax.tree.map(partial(jnp.where, i < substeps), new, carry)
+    def pace(run, interval):
+        """The step, and how many of them this member takes, and its block."""
+        if interval is None:
+            return loop.advance, substeps, longest
+        t, h, mine, most = interval
+        return advance_from(flat, stepper, q, params, t, h, run[1]), mine, most
 
     @checkpoint
-    def interval(run, _):
+    def interval(run, here):
+        advance, substeps, longest = pace(run, here)
+
+        def step(i, carry):
+            run, info = advance(carry[0])
+            new = run, join_info(carry[1], info)
+            return jax.tree.map(partial(jnp.where, i < substeps), new, carry)
+
         run, info = repeat(step, (run, loop.no_info), longest)
         return run, (loop.keep(run[0]), info)
 
     def samples(carry):
-        return lax.scan(interval, carry, None, num_samples)
+        return lax.scan(interval, carry, intervals, num_samples)
 
     (_, _, failure), (path, info) = one_kernel(samples, split_if_it_pays(loop.advance, loop.carry))
     return as_solution(flat, loop.carry[0], join(path), dt, info, failure)

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.boundary import require_function
+from hhtjax.dense_output import interpolate
 from hhtjax.flat_system import flatten
-from hhtjax.simulate import Solution, interpolate
+from hhtjax.simulate import Solution
 from hhtjax.system import LinearSystem, System
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.boundary import require_number
-from hhtjax.simulate import interpolate
+from hhtjax.dense_output import interpolate
 
 
 class Windows(NamedTuple):

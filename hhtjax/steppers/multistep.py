@@ -34,6 +34,8 @@ class Multistep(Stepper):
     order: int
     options: Options
 
+    needs_equal_steps = True
+
     def advance(self, system, s, past, dt, w):
         """q and v at t + dt, given the acceleration there."""
         raise NotImplementedError

@@ -67,6 +67,7 @@ class Stepper(Description):
     order: int  # of convergence of q and v in dt
     solves_constraints = False
     solves_rotations = False
+    needs_equal_steps = False  # what it remembers belongs to steps of one size
     redundant: str | None = None  # how constraints that depend on each other are solved
 
     def begin(self, system, q, v, t, params, dt) -> State:
