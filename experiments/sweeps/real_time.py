@@ -199,7 +199,7 @@ def figure(samples, path):
         left.loglog(1e6 * x, share, color=COLOURS[i], ls=("-", "--", ":")[i % 3], label=", ".join(key))
     left.axvline(1e6 * PERIOD, color="black", lw=1)
     left.set(xlabel="latency (µs)", ylabel="share of calls that took longer", ylim=(0.5 / x.size, 1.2))
-    left.legend(fontsize=7)
+    left.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.18), ncol=2)
     right.plot(PERIOD * np.arange(len(path)), path, label="first link")
     right.axhline(0.5, color="black", ls=":", label="target")
     right.set(xlabel="time (s)", ylabel="angle (rad)", title="controller and plant in two threads")
