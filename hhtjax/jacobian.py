@@ -9,7 +9,6 @@ So every value carries `Terms`: for each axis of it, the parts of its derivative
 along that axis, or else one full array. Operations that have no rule here run on whole columns, as with vmap.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial, reduce
 from operator import add
@@ -18,8 +17,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import Literal
 
+from hhtjax.jaxprs import alone, evaluate
 from hhtjax.kernels import TESTED
 
 MOST_TERMS = 4  # beyond, a full array is no more work
@@ -56,6 +55,12 @@ class Terms:
             return both
         return Terms(self.n, self.shape, full=both.whole())  # to carry both would be twice the work
 
+    def apart(self, axes):
+        """The terms along these axes, and all the rest."""
+        found = {key: y for key, y in self.along.items() if key[0] in axes}
+        others = {key: y for key, y in self.along.items() if key not in found}
+        return found, Terms(self.n, self.shape, others, self.full)
+
     def whole(self):
         """dy/dx as an array (n, *shape)."""
         shape, total = (self.n, *self.shape), self.full
@@ -74,20 +79,13 @@ def matrix(f, like):
     if like.size == 1 or jax.__version_info__ < TESTED:
         return jax.vmap(f, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
     trace = jax.make_jaxpr(f)(like)
-    (result,) = _evaluate(trace.jaxpr, trace.consts, [Terms(like.size, like.shape, {(0, 0): jnp.ones_like(like)})])
+    (result,) = _evaluate(trace, Terms(like.size, like.shape, {(0, 0): jnp.ones_like(like)}))
     return result.whole().T if isinstance(result, Terms) else jnp.zeros((*result.shape, like.size), result.dtype)
 
 
-def _evaluate(jaxpr, consts, values):
+def _evaluate(closed, *values):
     """The values of a jaxpr's results; `Terms` for what depends on the unknowns."""
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *values], strict=True))
-
-    def read(atom):
-        return atom.val if isinstance(atom, Literal) else known[atom]
-
-    for eqn in jaxpr.eqns:
-        known.update(zip(eqn.outvars, _apply(eqn, [read(x) for x in eqn.invars]), strict=True))
-    return [read(x) for x in jaxpr.outvars]
+    return evaluate(closed.jaxpr, [*closed.consts, *values], _apply)
 
 
 def _apply(eqn, values):
@@ -101,17 +99,6 @@ def _apply(eqn, values):
 
 def _depends(value):
     return isinstance(value, Terms)
-
-
-def alone(eqn) -> Callable:
-    """One operation of a jaxpr as a function of its arrays, to a list."""
-
-    def f(*arrays):
-        with eqn.ctx.manager:
-            results = eqn.primitive.bind(*arrays, **eqn.primitive.get_bind_params(eqn.params))
-        return results if eqn.primitive.multiple_results else [results]
-
-    return f
 
 
 def _by_columns(eqn, values):
@@ -129,16 +116,18 @@ def _each(eqn, x):
     return [x.map(lambda y: alone(eqn)(y)[0], x.shape)]
 
 
-def _fit(x, shape):
-    """The `Terms` x broadcast to a shape, as operations on elements do with axes of length 1."""
-    if x.shape == shape:
-        return x
-    new = len(shape) - len(x.shape)
+def _spread(x, shape, to):
+    """The `Terms` x broadcast: its axis i becomes to[i]. One of length 1 is repeated, and then tells no unknown."""
     return x.map(
-        lambda y: jnp.broadcast_to(y, shape),
+        lambda y: lax.broadcast_in_dim(y, shape, to),
         shape,
-        lambda axis, offset: (axis + new, offset) if x.shape[axis] == shape[axis + new] else None,
+        lambda axis, offset: (to[axis], offset) if x.shape[axis] == shape[to[axis]] else None,
     )
+
+
+def _fit(x, shape):
+    """The same as operations on elements do it."""
+    return x if x.shape == shape else _spread(x, shape, range(len(shape) - len(x.shape), len(shape)))
 
 
 def _add(eqn, *values):
@@ -168,14 +157,7 @@ def _select(eqn, which, *cases):
 
 
 def _broadcast(eqn, x, *sizes):
-    to, shape = eqn.params["broadcast_dimensions"], eqn.params["shape"]
-    return [
-        x.map(
-            lambda y: lax.broadcast_in_dim(y, shape, to),
-            shape,
-            lambda axis, offset: (to[axis], offset) if x.shape[axis] == shape[to[axis]] else None,
-        )
-    ]
+    return [_spread(x, eqn.params["shape"], eqn.params["broadcast_dimensions"])]
 
 
 def _reshape(eqn, x, *sizes):
@@ -256,8 +238,7 @@ def _unknown_first(y, axis, offset, n):
 def _reduce_sum(eqn, x):
     axes, shape = eqn.params["axes"], eqn.outvars[0].aval.shape
     kept = [i for i in range(len(x.shape)) if i not in axes]
-    summed = {key: y for key, y in x.along.items() if key[0] in axes}
-    rest = Terms(x.n, x.shape, {key: y for key, y in x.along.items() if key not in summed}, x.full)
+    summed, rest = x.apart(axes)
     result = rest.map(lambda y: y.sum(axes), shape, lambda axis, offset: (kept.index(axis), offset))
     for (axis, offset), y in summed.items():
         y = y.sum([i for i in axes if i != axis], keepdims=True)
@@ -277,8 +258,7 @@ def _dot_general(eqn, x, y):
 
     free = [[i for i in range(len(z.shape)) if i not in (*o, *b)] for z, o, b in zip((x, y), over, batch, strict=True)]
     place = [*batch[side], *([None] * len(free[0]) if side else []), *free[side]]  # of our axes in the result
-    summed = {key: z for key, z in terms.along.items() if key[0] in over[side]}
-    rest = Terms(terms.n, terms.shape, {key: z for key, z in terms.along.items() if key not in summed}, terms.full)
+    summed, rest = terms.apart(over[side])
     result = rest.map(product, shape, lambda axis, offset: (place.index(axis), offset))
     for (axis, offset), z in summed.items():  # the sum over this axis has one term for each unknown
         i = over[side].index(axis)
@@ -290,8 +270,7 @@ def _dot_general(eqn, x, y):
 
 
 def _call(eqn, *values):
-    closed = eqn.params["jaxpr"]
-    return _evaluate(closed.jaxpr, closed.consts, values)
+    return _evaluate(eqn.params["jaxpr"], *values)
 
 
 RULES = {

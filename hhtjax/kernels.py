@@ -90,7 +90,7 @@ batching.primitive_batchers[inside_p] = lambda values, axes: (inside_p.bind(*val
 
 def _lower_inside(ctx, x):
     no = mlir.ir_constant(np.bool_(False))
-    _attach(no.owner, hhtjax_inside="unless a kernel takes the other branch")
+    _attach(no.owner, **{inside_p.name: "unless a kernel takes the other branch"})
     return [no]
 
 
@@ -118,7 +118,7 @@ def _decide(module, call):
     _attach(call, **{VERDICT: f"plain: {found.objection}" if found.objection else "one kernel"})
     if found.objection is None:
         for choice in found.choices:
-            _take(choice, 1)
+            _take_form_inside(choice)
         for product in found.products:
             _write_out(module, product)
         _make_kernel(module, call)
@@ -191,12 +191,17 @@ def _is_choice(op):
     while not isinstance(index, ir.Block) and index.name in ("stablehlo.convert", "stablehlo.clamp"):
         index = index.operands[len(index.operands) // 2].owner
     known = {} if isinstance(index, ir.Block) else index.attributes
-    return ATTRIBUTES in known and "hhtjax_inside" in known[ATTRIBUTES]
+    return ATTRIBUTES in known and inside_p.name in known[ATTRIBUTES]
 
 
-def _take(case, branch):
-    """The branch in the place of the conditional."""
-    *body, end = case.regions[branch].blocks[0].operations
+def _form_inside(case):
+    """What is done inside a kernel."""
+    return list(case.regions[1].blocks[0].operations)
+
+
+def _take_form_inside(case):
+    """It in the place of the conditional."""
+    *body, end = _form_inside(case)
     for op in body:
         op.operation.move_before(case)
     for result, value in zip(case.results, end.operands, strict=True):
@@ -244,7 +249,7 @@ class _Inspection:
                 self.look(self.functions[callee].operation)
         elif _is_choice(op):
             self.choices.append(op)
-            for inner in op.regions[1].blocks[0]:
+            for inner in _form_inside(op):
                 self.look(inner.operation)
         elif name == "custom_call":
             self.object(ir.StringAttr(op.attributes["call_target_name"]).value)

@@ -75,7 +75,7 @@ def factorize(A):
     if A.shape[-1] <= UNROLLED:
         return partial(_substitute, _lu(A))
     if A.shape[-1] <= LOOPED:
-        factors = choose(_lu_in_a_loop, _lu_of_lapack, A)
+        factors = choose(_lu, _lu_of_lapack, A)
         ways = _substitute, _by_lapack
         return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
     return partial(lu_solve, lu_factor(A))
@@ -146,37 +146,35 @@ def solve(A, b, factorize=factorize):
 def _lu(A):
     """L below the diagonal and U on and above it, and the order of the rows: A[order] = L U."""
     n = A.shape[0]
-    order = jnp.arange(n)
-    row, column = order[:, None], order[None, :]
-    for k in range(n - 1):
-        largest, pivot = jnp.abs(A[k, k]), jnp.asarray(k, order.dtype)
-        for i in range(k + 1, n):  # scalars rather than argmax: a reduction would end the fusion
-            candidate = jnp.abs(A[i, k])
-            larger = candidate > largest
-            largest, pivot = jnp.where(larger, candidate, largest), jnp.where(larger, i, pivot)
-        exchange = jnp.where(row[:, 0] == k, pivot, jnp.where(row[:, 0] == pivot, k, row[:, 0]))
-        A, order = A[exchange], order[exchange]
-        factor = jnp.where(row > k, A[:, k : k + 1] / A[k, k], 0)
-        A = jnp.where(column > k, A - factor * A[k : k + 1], jnp.where((column == k) & (row > k), factor, A))
-    return A, order
-
-
-def _lu_in_a_loop(A):
-    """The same."""
-    n = A.shape[0]
     i = jnp.arange(n)
+    row, column = i[:, None], i[None, :]
+    loop, find_pivot = (lax.fori_loop, _pivot) if n > UNROLLED else (_written_out, _pivot_by_scalars)
 
     def eliminate(k, carry):
         A, order = carry
-        pivot = jnp.argmax(jnp.where(i >= k, jnp.abs(A[:, k]), -1))
+        pivot = find_pivot(A, k)
         exchange = jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))
         A, order = A[exchange], order[exchange]
-        factor = jnp.where(i > k, A[:, k] / A[k, k], 0)[:, None]
-        below = (i[None, :] == k) & (i[:, None] > k)
-        A = jnp.where(below, factor, A - factor * jnp.where(i > k, A[k], 0)[None, :])
-        return A, order
+        factor = jnp.where(row > k, A[:, k][:, None] / A[k, k], 0)
+        changed = A - factor * A[k][None, :]
+        return jnp.where(column > k, changed, jnp.where((column == k) & (row > k), factor, A)), order
 
-    return lax.fori_loop(0, n - 1, eliminate, (A, i))
+    return loop(0, n - 1, eliminate, (A, i))
+
+
+def _pivot(A, k):
+    """Row of the largest element of column k on or below the diagonal."""
+    return jnp.argmax(jnp.where(jnp.arange(len(A)) >= k, jnp.abs(A[:, k]), -1))
+
+
+def _pivot_by_scalars(A, k):
+    """The same without argmax: a reduction would end the fusion."""
+    largest, pivot = jnp.abs(A[k, k]), jnp.asarray(k, jnp.result_type(int))
+    for i in range(k + 1, len(A)):
+        candidate = jnp.abs(A[i, k])
+        larger = candidate > largest
+        largest, pivot = jnp.where(larger, candidate, largest), jnp.where(larger, i, pivot)
+    return pivot
 
 
 def _substitute(factors, b, trans=0):
@@ -217,7 +215,7 @@ def _written_out(start, stop, body, x):
 def _lu_of_lapack(A):
     """The same as `_lu`."""
     LU, _, order = lax.linalg.lu(A)
-    return LU, order.astype(jnp.arange(0).dtype)
+    return LU, order.astype(jnp.result_type(int))
 
 
 def _by_lapack(factors, b, trans=0):

@@ -16,9 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import Literal
 
-from hhtjax.jacobian import alone
+from hhtjax.jaxprs import alone, evaluate
 from hhtjax.kernels import STAGED, TESTED, named
 from hhtjax.pieces import ELEMENTWISE, RULES, arranged, each, is_in_pieces, is_known, is_small, pieces, whole
 
@@ -123,15 +122,7 @@ def _as_scalars(value, like):
 
 def _evaluate(jaxpr, consts, values):
     """The values of a jaxpr's results."""
-    values = [*map(pieces, consts), *values]
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], values, strict=True))
-
-    def read(atom):
-        return pieces(np.asarray(atom.val)) if isinstance(atom, Literal) else known[atom]
-
-    for eqn in jaxpr.eqns:
-        known.update(zip(eqn.outvars, _apply(eqn, [read(x) for x in eqn.invars]), strict=True))
-    return [read(x) for x in jaxpr.outvars]
+    return evaluate(jaxpr, [*map(pieces, consts), *values], _apply, lambda x: pieces(np.asarray(x)))
 
 
 def _apply(eqn, values):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import zoo
 
 import hhtjax
 from hhtjax.looping import LONGEST, SLOTS, repeat
@@ -58,14 +59,9 @@ def test_new_values_are_not_compiled_anew():
 
 
 def test_the_work_is_about_the_sum_over_the_members():
-    counted = []
-
-    def counting(q, v, t, params):
-        jax.debug.callback(lambda: counted.append(1))
-        return -q
-
+    system, counted = zoo.counting_oscillator()
     dts = np.logspace(-3, -1, 31)
-    runs = hhtjax.sweep(hhtjax.System(ONE, counting), hhtjax.rk4(), ONE, ZERO, dts=dts, duration=1.0, num_samples=2)
+    runs = hhtjax.sweep(system, hhtjax.rk4(), ONE, ZERO, dts=dts, duration=1.0, num_samples=2)
     jax.effects_barrier()
     iterations, steps = len(counted) / 4, np.sum(1 / np.asarray(runs.dt))
     assert steps <= iterations < 1.05 * steps

@@ -86,13 +86,7 @@ def test_times_are_data():
 
 
 def test_the_work_is_about_the_sum_over_the_members():
-    counted = []
-
-    def counting(q, v, t, params):
-        jax.debug.callback(lambda: counted.append(1))
-        return -q
-
-    system = hhtjax.System(ONE, counting)
+    system, counted = zoo.counting_oscillator()
     runs = hhtjax.sweep(system, hhtjax.rk4(), ONE, ZERO, dts=DTS[::-1][1:], times=[0.001, 1.0, 1.02])
     jax.effects_barrier()
     lanes, stages = 4, 4

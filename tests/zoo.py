@@ -28,6 +28,17 @@ def forced(q, v, t, params):
     return double_pendulum.force(q, v, t, params) + jnp.array([3.0 * jnp.sin(5.0 * t), 2.0 * jnp.cos(3.0 * t)])
 
 
+def counting_oscillator():
+    """A mass on a spring, and a list that grows by one with each evaluation of its force."""
+    counted = []
+
+    def force(q, v, t, params):
+        jax.debug.callback(lambda: counted.append(1))
+        return -q
+
+    return hhtjax.System(np.ones(1), force), counted
+
+
 def _double_pendulum():
     scene = double_pendulum.free()
     return Problem(scene.system, scene.params, jnp.array([0.3, -0.2]), jnp.array([0.5, -1.0]), 1.0)

@@ -1,0 +1,32 @@
+"""A traced function, evaluated anew with other values than arrays."""
+
+from collections.abc import Callable
+
+from jax.extend.core import Literal
+
+
+def evaluate(jaxpr, values, apply, of_literal=lambda x: x):
+    """The values of a jaxpr's results.
+
+    values: of its constants and arguments; apply: (operation, values) -> values of its results; of_literal: number in
+    the program -> value.
+    """
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], values, strict=True))
+
+    def read(atom):
+        return of_literal(atom.val) if isinstance(atom, Literal) else known[atom]
+
+    for eqn in jaxpr.eqns:
+        known.update(zip(eqn.outvars, apply(eqn, [read(x) for x in eqn.invars]), strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def alone(eqn) -> Callable:
+    """One operation of a jaxpr as a function of its arrays, to a list."""
+
+    def f(*arrays):
+        with eqn.ctx.manager:
+            results = eqn.primitive.bind(*arrays, **eqn.primitive.get_bind_params(eqn.params))
+        return results if eqn.primitive.multiple_results else [results]
+
+    return f
