@@ -19,6 +19,7 @@ from jax import lax
 
 from hhtjax.jaxprs import alone, evaluate
 from hhtjax.kernels import STAGED, TESTED, named
+from hhtjax.stages import in_stages
 from hhtjax.pieces import ELEMENTWISE, RULES, arranged, each, is_in_pieces, is_known, is_small, pieces, whole
 
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
@@ -156,7 +157,7 @@ def _call(eqn, *values):
         after.append(refill)
         return found
 
-    found = named(name, call)(*given)
+    found = in_stages(name, call, *given)
     return after[-1](found)
 
 
