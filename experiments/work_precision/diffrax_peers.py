@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from experiments.work_precision.cases import SAMPLES, cases
 from experiments.work_precision.timing import sweep
@@ -26,14 +27,14 @@ def make_solver(name, fixed):
     return solver(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-10)) if fixed and implicit else solver()
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def run(rate, name, fixed, y0, params, times, setting):
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def run(rate, unravel, name, fixed, y0, params, times, setting):
     """Positions and velocities at the times, number of steps, success; setting: tolerance, or step size."""
     import diffrax  # pyright: ignore[reportMissingImports]
 
     controller = diffrax.ConstantStepSize() if fixed else diffrax.PIDController(rtol=setting, atol=1e-2 * setting)
     found = diffrax.diffeqsolve(
-        diffrax.ODETerm(rate),
+        diffrax.ODETerm(lambda t, y, vector: rate(t, y, unravel(vector))),
         make_solver(name, fixed),
         0.0,
         times[-1],
@@ -51,7 +52,8 @@ def run(rate, name, fixed, y0, params, times, setting):
 def entries(name, everything, tolerances=TOLERANCES, sizes=SIZES):
     """Rows of all solvers on a case; everything: constant steps and implicit Euler too."""
     case = cases()[name]
-    arguments = jax.tree.map(jnp.asarray, (case.y0, case.scene.params, case.times))
+    vector, unravel = ravel_pytree(case.scene.params)  # as to ours
+    arguments = jnp.asarray(case.y0), vector, jnp.asarray(case.times)
     kinds = [(solver, False) for solver in CONTROLLED]
     if everything:
         kinds += [("ImplicitEuler", False)] + [(solver, True) for solver in CONSTANT]
@@ -61,7 +63,7 @@ def entries(name, everything, tolerances=TOLERANCES, sizes=SIZES):
         numbers = {x: jnp.asarray(case.scene.duration / (SAMPLES * x) if fixed else x) for x in settings}
 
         def solve(setting, solver=solver, fixed=fixed, numbers=numbers):
-            y, steps, fine = run(case.rate, solver, fixed, *arguments, numbers[setting])
+            y, steps, fine = run(case.rate, unravel, solver, fixed, *arguments, numbers[setting])
             if not fine:
                 return None, None
             return np.asarray(y)[:, : case.size], STAGES[solver] * steps if solver in STAGES else None

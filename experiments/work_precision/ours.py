@@ -4,11 +4,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 import hhtjax
 from experiments.work_precision.cases import SAMPLES, cases, march
 from experiments.work_precision.timing import sweep
 from hhtjax.extrapolation import richardson
+from hhtjax.kernels import one_kernel
 
 SMOOTH = hhtjax.hht(linearize="predictor")
 METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a step if it does not count them
@@ -42,7 +44,7 @@ def entries(name, sizes, only=None):
     """Rows of all methods on a case."""
     case = cases()[name]
     system, params, q0, v0, duration = case.scene
-    params = jax.tree.map(jnp.asarray, params)
+    vector, unravel = ravel_pytree(params)  # a call takes longer with every array that it is handed
     counts = {n: jnp.asarray(n) for n in sizes}  # a Python number would be made an array in every call
     rows = []
     for method, (stepper, levels, solves) in METHODS.items():
@@ -50,12 +52,12 @@ def entries(name, sizes, only=None):
             continue
         start = case.ode if method in PLAIN else (system, q0, v0)
 
-        program = jax.jit(
-            partial(run, start[0], stepper, levels, *start[1:], duration, case.size)
-        )  # what stays the same is not passed on
+        # what stays the same is not passed on
+        fixed = partial(run, start[0], stepper, levels, *start[1:], duration, case.size)
+        program = jax.jit(lambda vector, n, fixed=fixed: one_kernel(lambda x, n: fixed(unravel(x), n), vector, n))
 
         def solve(substeps, program=program, levels=levels, solves=solves):
-            path, count = program(params, counts[substeps])
+            path, count = program(vector, counts[substeps])
             return path, count if solves is None else solves * SAMPLES * substeps * (2**levels - 1)
 
         rows += sweep(name, method, "ours", solve, sizes, lambda n: {"h_s": duration / (SAMPLES * n)})
