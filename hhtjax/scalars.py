@@ -18,9 +18,9 @@ import numpy as np
 from jax import lax
 
 from hhtjax.jaxprs import alone, evaluate
-from hhtjax.kernels import STAGED, TESTED, named
-from hhtjax.stages import in_stages
+from hhtjax.kernels import STAGED, TESTED
 from hhtjax.pieces import ELEMENTWISE, RULES, arranged, each, is_in_pieces, is_known, is_small, pieces, whole
+from hhtjax.stages import in_stages
 
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
 

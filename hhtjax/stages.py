@@ -9,6 +9,7 @@ call.
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax.extend.core import Literal
 
 from hhtjax.jaxprs import alone, evaluate
@@ -39,7 +40,7 @@ def in_stages(name, f, *args):
         stage = _stage(eqns, known, wanted)
         call = named(name, lambda *x, stage=stage: evaluate(stage, x, lambda eqn, x: alone(eqn)(*x)))
         known.update(zip(stage.outvars, call(*(known[x] for x in stage.invars)), strict=True))
-    return [x.val if isinstance(x, Literal) else known[x] for x in results]
+    return [jnp.asarray(x.val) if isinstance(x, Literal) else known[x] for x in results]
 
 
 def _each_once(jaxpr):
