@@ -43,7 +43,7 @@ LARGEST_SUM = 1024  # elements; XLA hands larger ones to another library, and pr
 LARGEST_PRODUCT = 7  # rows, columns, and terms of a sum
 LARGEST_WRITTEN_OUT = 16  # the same where the product is written as a sum of others
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
-MOST_OPERATIONS = 5000  # compiling one function takes longer than in proportion: beyond, minutes
+MOST_OPERATIONS = 16000  # of more, compiling takes too long
 
 
 def one_kernel(f, *args):
@@ -57,7 +57,7 @@ def one_kernel(f, *args):
 def staged(f, size=None):
     """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have.
 
-    size: number of unknowns of a Jacobian. A single one has a single column, which shares nothing.
+    size: number of unknowns. With a single one, of which a Jacobian has one column, nothing is shared.
     """
     return f if size == 1 or jax.__version_info__ < TESTED else named(STAGED, f)
 

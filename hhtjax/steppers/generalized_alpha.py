@@ -26,6 +26,7 @@ from hhtjax import kinematics
 from hhtjax.boundary import require_function, require_number
 from hhtjax.constraints import check_redundant, factorize_constrained
 from hhtjax.description import is_concrete
+from hhtjax.kernels import staged
 from hhtjax.linear_solve import Structured, diagonal, factorize, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.newton import linearized_solve, newton
@@ -96,6 +97,7 @@ def linearization_point(system, params, s, predicted, where):
         return held
     D = diagonal(system.mass(s.q, params))
 
+    @staged
     def size(s):
         return jnp.sum(residual(system, params, s) ** 2 / D)
 
