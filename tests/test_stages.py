@@ -98,10 +98,18 @@ def test_the_program_has_each_sine_once():
     assert [program.count(f" {name}(") for name in ("sine", "cosine")] == [2, 1]
 
 
-def test_a_step_of_the_double_pendulum_has_three_angles():
-    scene = double_pendulum.free()
-    stepper, dt = hhtjax.hht(linearize="predictor"), jnp.asarray(1e-3)
+@pytest.mark.parametrize(
+    ("stepper", "sines", "cosines"),
+    [
+        (hhtjax.hht(linearize="predictor"), 3, 3),  # r with its derivative: of two angles and of their difference
+        (hhtjax.rowda(), 3 + 2, 3 + 2 * 3),  # and two of r
+        (hhtjax.rk4(), 4, 4 * 3),
+    ],
+    ids=["hht", "rowda", "rk4"],
+)
+def test_work_of_a_step_of_the_double_pendulum(stepper, sines, cosines):
+    scene, dt = double_pendulum.free(), jnp.asarray(1e-3)
     state = split(stepper.init(scene.system, scene.q0, scene.v0, scene.params, dt))
     step = on_scalars(lambda state: stepper.step(scene.system, state, scene.params, dt)[0])
     done = list(names(jax.make_jaxpr(step)(state).jaxpr))
-    assert done.count("sin") == done.count("cos") == 3
+    assert (done.count("sin"), done.count("cos")) == (sines, cosines)

@@ -89,7 +89,7 @@ class Rosenbrock(Stepper):
 
             rates, started, before = [], (s, value), A[0]
             for row, coupling in zip(A, G, strict=True):
-                if row is not before:
+                if row != before:
                     started, before = staged(partial(start, row))(rates), row
                 rates.append(staged(partial(stage, coupling))(rates, *started))
             return moved(dt, b, rates), Info()
