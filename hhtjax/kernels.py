@@ -43,7 +43,7 @@ LARGEST_SUM = 1024  # elements; XLA hands larger ones to another library, and pr
 LARGEST_PRODUCT = 7  # rows, columns, and terms of a sum
 LARGEST_WRITTEN_OUT = 16  # the same where the product is written as a sum of others
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
-MOST_OPERATIONS = 5000  # of more, compiling takes longer, or fails: gradients of a chain of bodies, "Fusion kind not implemented"
+MOST_OPERATIONS = 5000  # of more, compiling takes long, or fails: gradients of a chain of bodies
 
 
 def one_kernel(f, *args):
