@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import zoo
 from jax import lax
 
 from experiments.benchmarks.chain import FORMULATIONS, chain
@@ -78,13 +79,8 @@ def test_one_unknown_and_single_precision():
 
 def largest_array(f, *args):
     """Elements of the largest array in a program, functions within it included."""
-
-    def largest(jaxpr):
-        sizes = [x.aval.size for eqn in jaxpr.eqns for x in eqn.outvars]
-        inner = [x for eqn in jaxpr.eqns for x in jax.tree.leaves(list(eqn.params.values())) if hasattr(x, "eqns")]
-        return max([1, *sizes, *map(largest, inner)])
-
-    return largest(jax.make_jaxpr(f)(*args).jaxpr)
+    program = jax.make_jaxpr(f)(*args).jaxpr
+    return max(1, *(x.aval.size for eqn in zoo.everywhere(program) for x in eqn.outvars))
 
 
 @old

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import zoo
 from jax import lax
 
 import hhtjax
@@ -173,16 +174,8 @@ def test_simulate_takes_scalars_where_they_pay():
         jaxpr = jax.make_jaxpr(
             lambda q: hhtjax.simulate(scene.system, hhtjax.hht(), q, scene.v0, scene.params, dt=1e-3, num_steps=50)
         )(scene.q0)
-        scans = [x for x in everywhere(jaxpr.jaxpr) if x.primitive.name == "scan"]
+        scans = [x for x in zoo.everywhere(jaxpr.jaxpr) if x.primitive.name == "scan"]
         return {v.aval.shape for x in scans for v in x.params["jaxpr"].jaxpr.invars}
 
     assert shapes(double_pendulum.free()) == {()}
     assert (3,) in shapes(slider_crank.free())
-
-
-def everywhere(jaxpr):
-    for eqn in jaxpr.eqns:
-        yield eqn
-        for inner in jax.tree.leaves(list(eqn.params.values())):
-            if hasattr(inner, "eqns"):
-                yield from everywhere(inner)

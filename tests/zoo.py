@@ -39,6 +39,15 @@ def counting_oscillator():
     return hhtjax.System(np.ones(1), force), counted
 
 
+def everywhere(jaxpr):
+    """Its operations, those of functions within it included."""
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in jax.tree.leaves(list(eqn.params.values())):
+            if hasattr(inner, "eqns"):
+                yield from everywhere(inner)
+
+
 def _double_pendulum():
     scene = double_pendulum.free()
     return Problem(scene.system, scene.params, jnp.array([0.3, -0.2]), jnp.array([0.5, -1.0]), 1.0)
