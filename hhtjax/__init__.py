@@ -4,13 +4,6 @@ from hhtjax import analysis as analysis
 from hhtjax import rotation as rotation
 from hhtjax import scenes as scenes
 from hhtjax import trigonometry as trigonometry
-from hhtjax.band_limited import band_limited as band_limited
-from hhtjax.band_limited import band_limited_motion as band_limited_motion
-from hhtjax.band_limited import spline_gain_error as spline_gain_error
-from hhtjax.constraints import consistent_initial as consistent_initial
-from hhtjax.dense_output import interpolate as interpolate
-from hhtjax.explain import explain as explain
-from hhtjax.flat_system import PrecisionWarning as PrecisionWarning
 from hhtjax.identification.arguments import Gaussian as Gaussian
 from hhtjax.identification.bias import step_size_bias as step_size_bias
 from hhtjax.identification.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
@@ -29,9 +22,14 @@ from hhtjax.identification.transforms import positive as positive
 from hhtjax.identification.windows import measure as measure
 from hhtjax.identification.windows import windows as windows
 from hhtjax.identification.windows import wrap_angle as wrap_angle
-from hhtjax.sampled import sampled as sampled
-from hhtjax.simulate import SimulationError as SimulationError
-from hhtjax.simulate import simulate as simulate
+from hhtjax.numerics.structured_solve import banded as banded
+from hhtjax.numerics.structured_solve import conjugate_gradients as conjugate_gradients
+from hhtjax.runs.interpolate import interpolate as interpolate
+from hhtjax.runs.simulate import simulate as simulate
+from hhtjax.runs.solution import SimulationError as SimulationError
+from hhtjax.runs.sweep import sweep as sweep
+from hhtjax.runs.sweep_to_disk import load_sweep as load_sweep
+from hhtjax.runs.sweep_to_disk import sweep_to_disk as sweep_to_disk
 from hhtjax.steppers.collocation import collocation as collocation
 from hhtjax.steppers.collocation import wilson as wilson
 from hhtjax.steppers.explicit import rk4 as rk4
@@ -48,13 +46,16 @@ from hhtjax.steppers.multistep import park as park
 from hhtjax.steppers.rosenbrock import rosenbrock as rosenbrock
 from hhtjax.steppers.rosenbrock import rowda as rowda
 from hhtjax.steppers.splitting import operator_splitting as operator_splitting
-from hhtjax.storage import load_sweep as load_sweep
-from hhtjax.storage import sweep_to_disk as sweep_to_disk
-from hhtjax.structured_solve import banded as banded
-from hhtjax.structured_solve import conjugate_gradients as conjugate_gradients
-from hhtjax.sweep import sweep as sweep
-from hhtjax.system import FirstOrderSystem as FirstOrderSystem
-from hhtjax.system import LinearSystem as LinearSystem
-from hhtjax.system import System as System
+from hhtjax.systems.band_limited import band_limited as band_limited
+from hhtjax.systems.band_limited import band_limited_motion as band_limited_motion
+from hhtjax.systems.band_limited import spline_gain_error as spline_gain_error
+from hhtjax.systems.consistent import consistent_initial as consistent_initial
+from hhtjax.systems.initial_values import PrecisionWarning as PrecisionWarning
+from hhtjax.systems.sampled import sampled as sampled
+from hhtjax.systems.system import FirstOrderSystem as FirstOrderSystem
+from hhtjax.systems.system import LinearSystem as LinearSystem
+from hhtjax.systems.system import System as System
+from hhtjax.xla import explain as explain
+from hhtjax.xla import plain as plain
 
 __version__ = "0.1.0"

@@ -23,7 +23,7 @@ from math import factorial
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_real
 
 GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3

@@ -13,7 +13,7 @@ where `jnp` does (`hhtjax.scenes.double_pendulum.stiff(trigonometry=hhtjax.trigo
 import jax
 import jax.numpy as jnp
 
-from hhtjax.kernels import staged
+from hhtjax.xla import staged
 
 RANGE = 1e5  # largest |x|, rad
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.extrapolation import richardson
 from hhtjax.identification.refine import Refined, needed_levels
+from hhtjax.numerics.richardson import richardson
 
 t = jnp.arange(0.0, 30.0, 0.35)
 K, C = 1.0, 0.04

@@ -13,9 +13,9 @@ from scipy.integrate import solve_ivp
 from test_gradients import check_gradient
 
 import hhtjax
-from hhtjax.constraints import acceleration_and_multipliers, violation
-from hhtjax.flat_system import flatten
 from hhtjax.scenes import Scene, four_bars, squeezer
+from hhtjax.systems.constraints import acceleration_and_multipliers, violation
+from hhtjax.systems.flat_system import flatten
 
 SQUEEZER = json.loads((Path(__file__).parent / "data" / "squeezer.json").read_text())
 # arrays all, so that runs with others in their place share a compilation

@@ -8,8 +8,8 @@ from zoo import PROBLEMS, as_data, reference, run
 
 import hhtjax
 from hhtjax import rotation
-from hhtjax.extrapolation import extrapolated
-from hhtjax.simulate import Failure, Solution
+from hhtjax.runs.extrapolate import extrapolated
+from hhtjax.runs.simulate import Failure, Solution
 from hhtjax.steppers.stepper import Info
 
 DUFFING = PROBLEMS["forced Duffing"]

@@ -7,7 +7,7 @@ import pytest
 
 import hhtjax
 from hhtjax import System
-from hhtjax.flat_system import flatten
+from hhtjax.systems.flat_system import flatten
 
 MU = jnp.array([[3.0, 2.0, 1.0], [2.0, 2.0, 1.0], [1.0, 1.0, 1.0]])
 

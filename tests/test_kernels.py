@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax import kernels
+from hhtjax.xla import gate, kernels
 
 on_cpu = pytest.mark.skipif(
-    jax.default_backend() != "cpu" or jax.__version_info__ < kernels.TESTED,
+    jax.default_backend() != "cpu" or not gate.is_on(),
     reason="kernels are cut on the CPU only, by JAX 0.10.2 or newer",
 )
 N = 5
@@ -135,7 +135,8 @@ def test_a_program_for_several_platforms_is_plain():
 SHARDED = """
 import jax, jax.numpy as jnp
 from jax.sharding import NamedSharding, PartitionSpec
-from hhtjax import explain, kernels
+from hhtjax import explain
+from hhtjax.xla import gate, kernels
 mesh = jax.make_mesh((2,), ("b",))
 x = jnp.arange(8.0)
 def f(c):

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hhtjax import explain, kernels
-from hhtjax.linear_solve import (
+from hhtjax import explain
+from hhtjax.numerics.linear_solve import (
     UNROLLED,
     factorize,
     factorize_least_squares,
@@ -15,6 +15,7 @@ from hhtjax.linear_solve import (
     solve,
     solve_map,
 )
+from hhtjax.xla import gate, kernels
 
 SIZES = range(1, 13)
 
@@ -235,7 +236,7 @@ def test_one_factorisation_serves_many_right_hand_sides_and_the_transpose(factor
     assert np.allclose(transposed, np.linalg.solve(A.T, b), rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.skipif(jax.__version_info__ < kernels.TESTED, reason="this JAX makes no kernels")
+@pytest.mark.skipif(not gate.is_on(), reason="this JAX makes no kernels")
 @pytest.mark.parametrize("made", [zero_diagonal, permuted, bad_rows])
 def test_elimination_is_a_loop_inside_a_kernel_and_lapack_s_elsewhere(made):
     """Both forms, both directions, a batch, and the derivatives; none leaves the other's traces in the program."""

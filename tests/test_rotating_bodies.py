@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from test_gradients import check_gradients
 
 import hhtjax
-from hhtjax import kinematics
 from hhtjax.rotation import cross, exp, hat, vee
 from hhtjax.scenes import top
+from hhtjax.systems import kinematics
 
 E1, E3 = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
 ARM, TIP = np.array([0.1, -0.05, 0.3]), np.array([0.05, 0.2, 0.6])

@@ -8,11 +8,11 @@ import zoo
 from jax import lax
 
 import hhtjax
-from hhtjax import kernels, scalars
-from hhtjax.scalars import Scalars, join, on_scalars, pays, split
 from hhtjax.scenes import double_pendulum, slider_crank
+from hhtjax.xla import gate, kernels, scalars
+from hhtjax.xla.scalars import Scalars, by_scalars, join, pays, split
 
-old = pytest.mark.skipif(jax.__version_info__ < kernels.TESTED, reason="plain arrays with this version of JAX")
+old = pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")
 M = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 3.0]])
 
 
@@ -56,7 +56,7 @@ FUNCTIONS = {
     "own rule": lambda x: twice_as_steep(x) * x,
     "own rule of one": lambda x: twice_as_steep(x[0]) * x,
     "polynomial sines": lambda x: hhtjax.trigonometry.sin(x) * hhtjax.trigonometry.cos(2 * x[1]),
-    "solve": lambda x: hhtjax.linear_solve.solve(M.astype(x.dtype) * (1 + x[0] ** 2), x),
+    "solve": lambda x: hhtjax.numerics.linear_solve.solve(M.astype(x.dtype) * (1 + x[0] ** 2), x),
     "conjugate gradients": lambda x: jax.scipy.sparse.linalg.cg(lambda y: M.astype(x.dtype) @ y * (1 + x[0] ** 2), x)[
         0
     ],
@@ -69,15 +69,15 @@ FUNCTIONS = {
 }
 
 
-def by_scalars(f):
-    return lambda x: join(on_scalars(f)(split(x)))
+def through_scalars(f):
+    return lambda x: join(by_scalars(f)(split(x)))
 
 
 @old
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_same_values_and_derivatives(name):
     f, x = FUNCTIONS[name], jnp.array([0.7, -1.3, 0.4])
-    g = by_scalars(f)
+    g = through_scalars(f)
 
     def everything(f):
         def all_of(x, dx):
@@ -100,7 +100,7 @@ def test_same_values_and_derivatives(name):
 @old
 def test_a_rule_for_derivatives_is_kept():
     x = jnp.array([0.7, -1.3, 0.4])
-    np.testing.assert_allclose(jnp.diag(jax.jacrev(by_scalars(twice_as_steep))(x)), 2 * jnp.cos(x), rtol=1e-15)
+    np.testing.assert_allclose(jnp.diag(jax.jacrev(through_scalars(twice_as_steep))(x)), 2 * jnp.cos(x), rtol=1e-15)
 
 
 def operations(f, *args):
@@ -110,9 +110,9 @@ def operations(f, *args):
 @old
 def test_what_is_known_costs_nothing():
     x = split(jnp.array([0.7, -1.3, 0.4]))
-    assert operations(on_scalars(lambda x: jnp.eye(3) @ x + jnp.zeros(3) - 0 * x), x) == []
-    assert operations(on_scalars(lambda x: jnp.concatenate([x, x])[jnp.array([4, 0])].reshape(2, 1)), x) == []
-    assert operations(on_scalars(lambda x: jnp.array([[0.0, 2.0, 0.0]]) @ x), x) == ["mul"]
+    assert operations(by_scalars(lambda x: jnp.eye(3) @ x + jnp.zeros(3) - 0 * x), x) == []
+    assert operations(by_scalars(lambda x: jnp.concatenate([x, x])[jnp.array([4, 0])].reshape(2, 1)), x) == []
+    assert operations(by_scalars(lambda x: jnp.array([[0.0, 2.0, 0.0]]) @ x), x) == ["mul"]
 
 
 @old

@@ -9,7 +9,7 @@ import pytest
 from zoo import PROBLEMS, STEPPERS, run
 
 import hhtjax
-from hhtjax.checkpointing import checkpointed_scan
+from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.scenes import double_pendulum
 
 DUFFING = PROBLEMS["forced Duffing"]

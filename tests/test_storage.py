@@ -61,14 +61,14 @@ def test_what_is_read_is_what_sweep_returns(whole):
 
 def main(folder):
     """What the process that is killed runs: slowly, and it says what it has done."""
-    written = hhtjax.storage._write
+    written = hhtjax.runs.sweep_to_disk._write
 
     def slowly(path, fill):
         time.sleep(0.05)
         written(path, fill)
         print(path.name, flush=True)
 
-    hhtjax.storage._write = slowly
+    hhtjax.runs.sweep_to_disk._write = slowly
     write(folder)
 
 

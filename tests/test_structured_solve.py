@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import hhtjax
+from hhtjax.numerics.structured_solve import Banded
 from hhtjax.scenes import pendulum
-from hhtjax.structured_solve import Banded
 
 SOLVES = {"tridiagonal": hhtjax.banded(1), "blocks": hhtjax.banded(2), "cg": hhtjax.conjugate_gradients(40)}
 

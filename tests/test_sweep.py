@@ -9,9 +9,9 @@ import pytest
 import zoo
 
 import hhtjax
-from hhtjax.looping import LONGEST, SLOTS, repeat
+from hhtjax.numerics.counted_loop import LONGEST, SLOTS, repeat
+from hhtjax.runs.sweep import run_sweep
 from hhtjax.scenes import pendulum
-from hhtjax.sweep import run_sweep
 
 DTS = np.array([0.1, 0.013, 0.0017, 0.02, 0.05])
 STEPPER = hhtjax.hht(alpha=-0.05, linearize="predictor")

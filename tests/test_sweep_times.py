@@ -9,8 +9,8 @@ import pytest
 import zoo
 
 import hhtjax
+from hhtjax.runs.sweep import run_sweep
 from hhtjax.scenes import pendulum
-from hhtjax.sweep import run_sweep
 
 ONE, ZERO = np.ones(1), np.zeros(1)
 TIMES = 2 + np.array([0.1, 0.13, 0.6, 0.601, 1.3])  # from t0 = 2

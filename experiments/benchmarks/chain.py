@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 
 def hanging(N, params):

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import hhtjax
-from hhtjax.linear_solve import solve
+from hhtjax.numerics.linear_solve import solve
 
 
 def violation(system, q, v, t, params):

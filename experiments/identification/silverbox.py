@@ -30,8 +30,8 @@ from experiments.identification.data import (
 )
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
-from hhtjax.extrapolation import richardson
 from hhtjax.identification.uncertainty import SEGMENTS
+from hhtjax.numerics.richardson import richardson
 
 SUBSTEPS = 8
 MODELS = {

@@ -10,7 +10,7 @@ from jax import jvp
 
 from experiments.report import COLOURS, side_by_side
 from hhtjax import System, conventional_hht, hht, kim_hht, rk4
-from hhtjax.linear_solve import solve
+from hhtjax.numerics.linear_solve import solve
 from hhtjax.scenes import double_pendulum
 
 DURATION = 1.0  # s

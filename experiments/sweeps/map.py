@@ -17,8 +17,8 @@ import hhtjax
 from experiments.benchmarks import native
 from experiments.benchmarks.measure import least_seconds, temporary_bytes
 from hhtjax import trigonometry
+from hhtjax.runs.sweep import Inputs, run_sweep
 from hhtjax.scenes import double_pendulum
-from hhtjax.sweep import Inputs, run_sweep
 
 DURATION = 1.0
 SCALES = np.logspace(-2, 2, 20)

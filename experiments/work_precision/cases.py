@@ -12,11 +12,10 @@ from scipy.integrate import solve_ivp
 import hhtjax
 from experiments.benchmarks.chain import chain
 from experiments.cardona_geradin1989.index_1 import unconstrained
-from hhtjax.kernels import one_kernel
-from hhtjax.linear_solve import solve
+from hhtjax.numerics.linear_solve import solve
 from hhtjax.rotation import hat
-from hhtjax.scalars import join, on_scalars, split_if_it_pays
 from hhtjax.scenes import Scene, double_pendulum, duffing, squeezer, top
+from hhtjax.xla import on_scalars, one_kernel
 
 SAMPLES = 50  # times at which positions are compared
 TRIGONOMETRY = hhtjax.trigonometry
@@ -128,21 +127,19 @@ def march(system, stepper, q0, v0, params, duration, substeps):
     A loop around `stepper.step`, the step that `hhtjax.simulate` takes, on scalars and as one kernel like there.
     """
 
-    def loop(start, params, dt, substeps):
-        @on_scalars
-        def advance(carry):
-            state, solves = carry
-            state, info = stepper.step(system, state, params, dt)
-            return state, solves + (1 if info.iterations is None else info.iterations)
-
-        def interval(carry, _):
-            carry = jax.lax.fori_loop(0, substeps, lambda _, carry: advance(carry), carry)
-            return carry, carry[0].q
-
-        carry = start, jnp.zeros((), jnp.int32)
-        return jax.lax.scan(interval, split_if_it_pays(advance, carry), None, SAMPLES)
-
     dt = duration / (SAMPLES * substeps)
+
+    def advance(carry):
+        state, solves = carry
+        state, info = stepper.step(system, state, params, dt)
+        return state, solves + (1 if info.iterations is None else info.iterations)
+
+    def interval(carry, _):
+        carry = jax.lax.fori_loop(0, substeps, lambda _, carry: step(carry), carry)
+        return carry, carry[0].q
+
     start = stepper.init(system, q0, v0, params, dt)
-    (_, solves), path = one_kernel(loop, start, params, dt, substeps)
-    return jax.vmap(flat)(join(path)), solves
+    form = on_scalars(advance, (start, jnp.zeros((), jnp.int32)))
+    step = form.of(advance)
+    (_, solves), path = one_kernel(lambda carry: jax.lax.scan(interval, carry, None, SAMPLES), form.tree)
+    return jax.vmap(flat)(form.joined(path)), solves

@@ -24,11 +24,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax import kinematics
 from hhtjax.analysis.checks import require_real
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.steppers.stepper import State, require_stepper, require_system
-from hhtjax.system import FirstOrderSystem, System
+from hhtjax.systems import kinematics
+from hhtjax.systems.system import FirstOrderSystem, System
 
 INFINITE = 1e17  # a frequency whose inverse is lost in rounding, and whose square fits into float32
 

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.boundary import require_number
-from hhtjax.flat_system import initial_values
+from hhtjax.checks import require_number
 from hhtjax.steppers.stepper import require_stepper
+from hhtjax.systems.initial_values import initial_values
 
 
 class ObservedOrder(NamedTuple):

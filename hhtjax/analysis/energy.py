@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.boundary import require_function
-from hhtjax.dense_output import interpolate
-from hhtjax.flat_system import flatten
-from hhtjax.simulate import Solution
-from hhtjax.system import LinearSystem, System
+from hhtjax.checks import require_function
+from hhtjax.runs.interpolate import interpolate
+from hhtjax.runs.solution import Solution
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.system import LinearSystem, System
 
 
 class EnergyBalance(NamedTuple):

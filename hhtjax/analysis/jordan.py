@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hhtjax.analysis.checks import require_matrix
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 
 
 class Eigenvalue(NamedTuple):

@@ -9,11 +9,12 @@ import numpy as np
 from hhtjax.analysis.amplification import eigenvalues
 from hhtjax.analysis.oscillator import damping_ratio, period_elongation
 from hhtjax.analysis.resolution import step_size_by_runs
-from hhtjax.boundary import require_number
-from hhtjax.constraints import acceleration_and_multipliers, jacobian
-from hhtjax.flat_system import flatten, initial_values
+from hhtjax.checks import require_number
 from hhtjax.steppers.stepper import require_capable, require_stepper
-from hhtjax.system import LinearSystem, System
+from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.system import LinearSystem, System
 
 # of suggest_step_size
 GRID = np.geomspace(1e-5, 1e6, 600)  # |lambda| h

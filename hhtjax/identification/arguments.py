@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from hhtjax.boundary import require_function
+from hhtjax.checks import require_function
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.least_squares import LOSSES

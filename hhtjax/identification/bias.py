@@ -18,9 +18,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis import amplification_matrix
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.steppers.stepper import require_stepper
-from hhtjax.system import LinearSystem
+from hhtjax.systems.system import LinearSystem
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
 GAIN_WEIGHT = 1e-3  # frequency and damping first; the response to forces with the freedom that they leave

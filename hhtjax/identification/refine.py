@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.analysis import damping_ratio
-from hhtjax.boundary import require_function, require_number
-from hhtjax.extrapolation import richardson
+from hhtjax.checks import require_function, require_number
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import NAMED, FitResult
+from hhtjax.numerics.richardson import richardson
 from hhtjax.steppers.generalized_alpha import Coefficients, Options
 from hhtjax.steppers.stepper import Stepper, require_stepper
 

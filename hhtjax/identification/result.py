@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.least_squares import COST, GRADIENT, REASONS, STEP, History

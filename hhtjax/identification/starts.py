@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.band_limited import band_limited_motion
-from hhtjax.boundary import require_function
-from hhtjax.flat_system import flatten
+from hhtjax.checks import require_function
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
+from hhtjax.systems.band_limited import band_limited_motion
+from hhtjax.systems.flat_system import flatten
 
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 

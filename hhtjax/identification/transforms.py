@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 
 
 class Transform:

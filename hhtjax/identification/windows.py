@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.boundary import require_number
-from hhtjax.dense_output import interpolate
+from hhtjax.checks import require_number
+from hhtjax.runs.interpolate import interpolate
 
 
 class Windows(NamedTuple):

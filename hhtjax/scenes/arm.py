@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.rotation import GENERATORS
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
 

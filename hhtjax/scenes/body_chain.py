@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.rotation import cross, exp
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 
 def inertia(params):

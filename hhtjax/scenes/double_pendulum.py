@@ -10,7 +10,7 @@ from functools import cache, partial
 import jax.numpy as jnp
 
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
 

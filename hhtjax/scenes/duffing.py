@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 
 def mass(q, params):

@@ -18,9 +18,9 @@ References:
 
 import jax.numpy as jnp
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 GRAVITY = 9.81
 

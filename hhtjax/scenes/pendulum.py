@@ -11,9 +11,9 @@ point with a horizontal velocity, by default as in Cardona, Geradin (1989), Sec.
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 GRAVITY = 9.81
 DURATION = 1.0

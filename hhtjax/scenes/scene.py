@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from hhtjax.system import LinearSystem, System
+from hhtjax.systems.system import LinearSystem, System
 
 
 class Scene(NamedTuple):

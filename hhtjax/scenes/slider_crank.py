@@ -10,7 +10,7 @@ g acts along -y. A spring k and a damper c act on the slider, the spring at rest
 import jax.numpy as jnp
 
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
 

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 
 def along(angle):

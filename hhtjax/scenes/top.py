@@ -13,11 +13,11 @@ The first needs 3 unknowns a step and the second 9, or 12 when stabilised. L (N)
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.boundary import require_number
-from hhtjax.linear_solve import matvec
+from hhtjax.checks import require_number
+from hhtjax.numerics.linear_solve import matvec
 from hhtjax.rotation import cross
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.system import System
 
 DURATION = 0.5
 

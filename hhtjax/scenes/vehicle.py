@@ -17,10 +17,10 @@ tyre is relieved of all its static load, as on the default one.
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.boundary import require_number
-from hhtjax.sampled import sampled
+from hhtjax.checks import require_number
 from hhtjax.scenes.scene import Scene
-from hhtjax.system import System
+from hhtjax.systems.sampled import sampled
+from hhtjax.systems.system import System
 
 SAMPLING_PERIOD = 1e-3  # s, of the road
 SHORTEST, LONGEST = 0.35, 90.0  # m, the waves of the road: the range of ISO 8608

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from hhtjax.boundary import require_number
-from hhtjax.linear_solve import factorize
+from hhtjax.checks import require_number
+from hhtjax.numerics.linear_solve import factorize
 from hhtjax.steppers.generalized_alpha import Options, check_options, residual
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.stepper import State, Stepper

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
-from hhtjax.linear_solve import diagonal, matvec
+from hhtjax.numerics.linear_solve import diagonal, matvec
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import Info, State
+from hhtjax.systems.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
 
 
 def begin_constrained(method, system, q, v, t, params, dt):

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from hhtjax.kernels import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.xla import staged
 
 
 @dataclass(frozen=True, eq=False)

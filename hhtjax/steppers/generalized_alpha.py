@@ -22,15 +22,15 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax import kinematics
-from hhtjax.boundary import require_function, require_number
-from hhtjax.constraints import check_redundant, factorize_constrained
+from hhtjax.checks import require_function, require_number
 from hhtjax.description import is_concrete
-from hhtjax.kernels import staged
-from hhtjax.linear_solve import Structured, diagonal, factorize, factorize_with
+from hhtjax.numerics.linear_solve import Structured, diagonal, factorize, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.systems import kinematics
+from hhtjax.systems.constraints import check_redundant, factorize_constrained
+from hhtjax.xla import staged
 
 LINEARIZATIONS = ("predictor", "held", "state", "auto")
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred

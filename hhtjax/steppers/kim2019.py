@@ -10,14 +10,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hhtjax import kinematics
-from hhtjax.constraints import acceleration_and_multipliers, reaction
 from hhtjax.description import is_concrete
-from hhtjax.jacobian import matrix
-from hhtjax.linear_solve import factorize, solve
+from hhtjax.numerics.linear_solve import factorize, solve
 from hhtjax.steppers.generalized_alpha import Options, check_options, require_alpha
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.systems import kinematics
+from hhtjax.systems.constraints import acceleration_and_multipliers, reaction
+from hhtjax.xla import linear_map
 
 
 def linearize_at_state(system, params, s):
@@ -28,8 +28,8 @@ def linearize_at_state(system, params, s):
 
     zero = jnp.zeros_like(s.q)
     Q, tangent = jax.linearize(forces, s.q, s.v)
-    Q_q = matrix(lambda x: tangent(x, zero), zero)
-    Q_v = matrix(lambda x: tangent(zero, x), zero)
+    Q_q = linear_map(lambda x: tangent(x, zero), zero)
+    Q_v = linear_map(lambda x: tangent(zero, x), zero)
     Ma_q = jax.jacfwd(lambda q: system.inertia(q, s.w, params))(s.q)
     M = system.mass(s.q, params)
     return jnp.diag(M) if M.ndim == 1 else M, Q, Q_q, Q_v, Ma_q

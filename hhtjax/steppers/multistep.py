@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.linear_solve import factorize
+from hhtjax.numerics.linear_solve import factorize
 from hhtjax.steppers.generalized_alpha import Options, check_options, residual
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.rosenbrock import rosenbrock

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.kernels import staged
-from hhtjax.linear_solve import invert, solve_map
+from hhtjax.numerics.linear_solve import invert, solve_map
 from hhtjax.steppers.stepper import Info
+from hhtjax.xla import staged
 
 
 def linearized_solve(r, path, w, factorize, at=None):

@@ -19,11 +19,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.boundary import require_number
-from hhtjax.kernels import staged
-from hhtjax.linear_solve import factorize, factorize_map
+from hhtjax.checks import require_number
+from hhtjax.numerics.linear_solve import factorize, factorize_map
 from hhtjax.steppers.generalized_alpha import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.xla import staged
 
 
 class Tableau(NamedTuple):

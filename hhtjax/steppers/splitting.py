@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description import is_concrete
-from hhtjax.linear_solve import matvec, solve
+from hhtjax.numerics.linear_solve import matvec, solve
 from hhtjax.steppers.generalized_alpha import require_alpha
 from hhtjax.steppers.stepper import Info, State, Stepper
 

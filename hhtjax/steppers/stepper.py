@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hhtjax import kinematics
 from hhtjax.description import Description
-from hhtjax.flat_system import flatten, initial_values
-from hhtjax.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.systems import kinematics
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 
 
 class State(NamedTuple):

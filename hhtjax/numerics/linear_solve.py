@@ -11,8 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
-from hhtjax.jacobian import matrix
-from hhtjax.kernels import choose, staged
+from hhtjax.xla import choose, linear_map, staged
 
 UNROLLED = 8
 LOOPED = 16
@@ -41,7 +40,7 @@ def invert(f, like, factorize):
     """The function (b, trans=0) -> A^-1 b, or A^-T b, of the matrix A of f; it may be constant to autodiff."""
     if isinstance(factorize, Structured):
         return factorize.of_map(f, like)
-    return factorize(staged(partial(matrix, f), like.size)(like))
+    return factorize(staged(partial(linear_map, f), like.size)(like))
 
 
 def _solve(f, b, inverse):

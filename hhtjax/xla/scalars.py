@@ -11,16 +11,18 @@ It comes before vmap and autodiff, which then see scalars. An operation that has
 import math
 from dataclasses import dataclass
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.jaxprs import alone, evaluate
-from hhtjax.kernels import STAGED, TESTED
-from hhtjax.pieces import ELEMENTWISE, RULES, arranged, each, is_in_pieces, is_known, is_small, pieces, whole
-from hhtjax.stages import in_stages
+from hhtjax.xla.gate import is_on
+from hhtjax.xla.interpreter import alone, evaluate
+from hhtjax.xla.kernels import STAGED
+from hhtjax.xla.scalar_rules import ELEMENTWISE, RULES, arranged, each, is_in_pieces, is_known, is_small, pieces, whole
+from hhtjax.xla.sharing import in_stages
 
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
 
@@ -39,7 +41,7 @@ def pays(f, *args):
 
     Operations that are not known may keep XLA from making one kernel of a loop; without one, scalars take longer.
     """
-    if jax.default_backend() != "cpu" or jax.__version_info__ < TESTED:
+    if jax.default_backend() != "cpu" or not is_on():
         return False
     if all(jnp.size(x) == 1 for x in jax.tree.leaves(args)):
         return False
@@ -71,9 +73,24 @@ def split(tree):
     return jax.tree.map(lambda x: Scalars(tuple(pieces(x).flat), x.shape) if x.ndim and is_small(x) else x, tree)
 
 
-def split_if_it_pays(f, tree):
-    """The same where f of the tree is better evaluated so; else the tree."""
-    return split(tree) if pays(f, tree) else tree
+class Form(NamedTuple):
+    """How functions of a tree are evaluated. tree: with `Scalars` for its small arrays, or as it was; `of` gives the
+    form of a function, and `joined` arrays again."""
+
+    tree: Any
+
+    def of(self, f):
+        """f of such trees, to such trees."""
+        return by_scalars(f)
+
+    def joined(self, tree):
+        """Any such tree as arrays; what its scalars are stacked along comes first."""
+        return join(tree)
+
+
+def on_scalars(f, tree):
+    """The form in which f of the tree is better evaluated: on scalars where that pays, else on arrays."""
+    return Form(split(tree) if pays(f, tree) else tree)
 
 
 def join(tree):
@@ -88,7 +105,7 @@ def join(tree):
     return jax.tree.map(joined, tree, is_leaf=_is_scalars)
 
 
-def on_scalars(f):
+def by_scalars(f):
     """f of trees that `split` made, to such trees; f itself of trees it left alone."""
 
     def g(*args):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from hhtjax.kernels import VERDICT
+from hhtjax.xla.lowering import VERDICT
 
 
 class Explanation(NamedTuple):

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.boundary import require_function
+from hhtjax.checks import require_function
 from hhtjax.description import Description, is_array, is_concrete, is_real
-from hhtjax.linear_solve import matvec
+from hhtjax.numerics.linear_solve import matvec
 
 
 @dataclass(frozen=True, eq=False)

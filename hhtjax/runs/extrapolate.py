@@ -1,40 +1,15 @@
-"""Richardson's extrapolation over the step size: values, and whole runs."""
+"""Richardson's extrapolation of whole runs, at their common saved times."""
 
 from functools import partial, reduce
-from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 
-from hhtjax import kinematics, rotation
+from hhtjax import rotation
+from hhtjax.numerics.richardson import richardson, take_out
+from hhtjax.systems import kinematics
 
 MOST = 4  # levels; rounding and work grow with each
-
-
-def richardson(values, order, combine=None):
-    """Richardson's value of pytrees that belong to h, h/2, h/4, ..., with errors h^order, h^(order + 1), ...
-
-        fine + (fine - coarse)/(2^p - 1),    p = order, order + 1, ...
-
-    combine: (gain, coarse, fine) -> fine + gain (fine - coarse), in place of that on each leaf.
-
-    >>> [round(richardson([1 + h**2 + h**3 for h in (0.4, 0.2, 0.1)][:levels], 2), 6) + 0.0 for levels in (2, 3)]
-    [0.989333, 1.0]
-    """
-    combine = combine or _on_leaves
-    while len(values) > 1:
-        gain = 1 / (2**order - 1)
-        values = [combine(gain, coarse, fine) for coarse, fine in pairwise(values)]
-        order += 1
-    return values[0]
-
-
-def _on_leaves(gain, coarse, fine):
-    return jax.tree.map(partial(_take_out, gain), coarse, fine)
-
-
-def _take_out(gain, coarse, fine):
-    return fine + gain * (fine - coarse)
 
 
 def extrapolated(run, levels, order, join):
@@ -67,7 +42,7 @@ def _combine(solutions, order, join):
 
 
 def _positions(v, gain, coarse, fine):
-    """`_take_out` of saved positions."""
+    """`take_out` of saved positions."""
 
     def turn(coarse, fine):
         shape = fine.shape
@@ -75,7 +50,7 @@ def _positions(v, gain, coarse, fine):
         return beyond(*(R.reshape(-1, 3, 3) for R in (coarse, fine))).reshape(shape)
 
     def leaf(v, coarse, fine):
-        return turn(coarse, fine) if kinematics.is_rotation(fine.shape, v.shape) else _take_out(gain, coarse, fine)
+        return turn(coarse, fine) if kinematics.is_rotation(fine.shape, v.shape) else take_out(gain, coarse, fine)
 
     return jax.tree.map(leaf, v, coarse, fine)
 

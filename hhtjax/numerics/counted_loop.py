@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.core import eval_jaxpr
 
-from hhtjax.checkpointing import checkpoint
+from hhtjax.numerics.checkpointed_scan import checkpoint
 
 SLOTS, LEVELS = 64, 3
 LONGEST = SLOTS**LEVELS  # iterations that can be differentiated

@@ -1,33 +1,27 @@
-"""How XLA:CPU shall cut a program into kernels: a loop as one, and a barrier that fusion does not cross.
+"""How XLA:CPU shall cut a program into kernels, decided when it is lowered.
 
-XLA:CPU runs a loop body as a list of kernels. Each costs a call, and so does every buffer between them: on a small
-mechanism several times what the arithmetic costs. And what is fused is evaluated anew in every user: the sines of a
-system once for every column of its Jacobian. Attributes of a call change both. One that is not inlined is computed
-once; one that bears `xla_cpu_small_call` is compiled into one kernel, with all its loops. Such a kernel must hold
-only what its emitter knows: with LAPACK, sort, scatter or a large product, compilation fails.
+Attributes of a call change what XLA makes of it. One that is not inlined is computed once; one that bears
+`xla_cpu_small_call` is compiled into one kernel, with all its loops. Such a kernel must hold only what its emitter
+knows: with LAPACK, sort, scatter or a large product, compilation fails.
 
-So it is decided when the program is lowered, with vmap and autodiff done: an identity on the results of the call looks
-the called function through, operation by operation, and attaches the attribute only if it knows them all. Platforms
-other than the CPU never see it. The verdict is attached too, for `explain` to read. A function may come in two forms,
-one for either case, of which the program keeps one.
+So the called function is looked through, operation by operation, with vmap and autodiff done, and the attribute is
+attached only if all are known. Platforms other than the CPU never see it. The verdict is attached too, for `explain` to
+read. A function may come in two forms, one for either case, of which the program keeps one.
 """
 
 from functools import reduce
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import mlir
 from jaxlib.mlir import ir
 from jaxlib.mlir.dialects import func, stablehlo
 
+from hhtjax.xla.gate import is_possible
+from hhtjax.xla.kernels import KERNEL, STAGED, inside_p, watch_p
+
 ATTRIBUTES = "mhlo.frontend_attributes"
 VERDICT = "hhtjax_kernels"
-TESTED = 0, 10, 2  # the first JAX in which this works; older ones abort, or lose constants of the calls
-KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"  # names of functions; autodiff and vmap keep them
 
 # operations the emitter knows, whatever their size
 KNOWN = {
@@ -46,59 +40,10 @@ LARGEST_MATRIX = 4096  # elements of one that meets a vector
 MOST_OPERATIONS = 5000  # of more, compiling takes long, or fails: gradients of a chain of bodies
 
 
-def one_kernel(f, *args):
-    """f(*args) of pytrees of arrays, as one kernel where XLA can; the same values otherwise."""
-    if jax.__version_info__ < TESTED:
-        return f(*args)
-    f, constants = jax.closure_convert(f, *args)
-    return _watch(named(KERNEL, f)(*_watch(args), *_watch(constants)))
-
-
-def staged(f, size=None):
-    """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have.
-
-    size: number of unknowns. With a single one, of which a Jacobian has one column, nothing is shared.
-    """
-    return f if size == 1 or jax.__version_info__ < TESTED else named(STAGED, f)
-
-
-def choose(inside, outside, *args):
-    """inside(*args) in one kernel, outside(*args) elsewhere: two ways to the same values."""
-    return lax.cond(inside_p.bind(jax.tree.leaves(args)[0]), inside, outside, *args)
-
-
-def named(name, f):
-    """f as a function of this name in the program."""
-
-    def call(*args):
-        return f(*args)
-
-    call.__name__ = name
-    return jax.jit(call)
-
-
-def _watch(tree):
-    """An identity on either side of a call: whatever autodiff makes of it, one is behind the call or its transpose."""
-    return jax.tree.map(lambda x: watch_p.bind(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x, tree)
-
-
-inside_p = Primitive("hhtjax_inside")  # whether a kernel holds it; the operand keeps it where the choice is
-inside_p.def_impl(lambda x: jnp.array(False))
-inside_p.def_abstract_eval(lambda x: x.update(shape=(), dtype=np.dtype(bool), weak_type=False))
-batching.primitive_batchers[inside_p] = lambda values, axes: (inside_p.bind(*values), None)
-
-
 def _lower_inside(ctx, x):
     no = mlir.ir_constant(np.bool_(False))
     _attach(no.owner, **{inside_p.name: "unless a kernel takes the other branch"})
     return [no]
-
-
-watch_p = Primitive("hhtjax_watch")
-watch_p.def_impl(lambda x: x)
-watch_p.def_abstract_eval(lambda x: x)
-ad.deflinear2(watch_p, lambda cotangent, _: (watch_p.bind(cotangent),))
-batching.defvectorized(watch_p)
 
 
 def _lower(ctx, x):
@@ -122,12 +67,6 @@ def _decide(module, call):
         for product in found.products:
             _write_out(module, product)
         _make_kernel(module, call)
-
-
-# a cached lowering would not see the call
-uncached: Any = {"cacheable": False} if jax.__version_info__ >= TESTED else {}
-mlir.register_lowering(watch_p, _lower, **uncached)
-mlir.register_lowering(inside_p, _lower_inside, **uncached)
 
 
 def _operations(op):
@@ -354,3 +293,9 @@ def _sum_of_terms(dimensions, operands, result):
 
 
 CHECKS = {"dot_general": _small_product, "reduce": _small_reduction, "reduce_window": _small_reduction}
+
+
+# a cached lowering would not see the call
+uncached: Any = {"cacheable": False} if is_possible else {}
+mlir.register_lowering(watch_p, _lower, **uncached)
+mlir.register_lowering(inside_p, _lower_inside, **uncached)

@@ -1,21 +1,17 @@
-"""A system on vectors, as the steppers see it, and the checks of what a user hands over."""
+"""A system on vectors, as the steppers see it, and the checks of what its functions return."""
 
-import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax import kinematics
-from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.linear_solve import factorize, matvec, solve
-from hhtjax.system import FirstOrderSystem, LinearSystem, as_matrix
-
-ORTHOGONAL = 1e-6  # largest entry of R^T R - I that passes for a rotation; 100 roundings in float32
+from hhtjax.checks import describe
+from hhtjax.numerics.linear_solve import factorize, matvec, solve
+from hhtjax.systems import kinematics
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, as_matrix
 
 
 class FlatSystem(NamedTuple):
@@ -57,75 +53,6 @@ class FlatSystem(NamedTuple):
     def tidy(self, state):
         """The state at the end of a step, its rotations orthogonal to rounding."""
         return state._replace(q=kinematics.orthonormalize(self.blocks, state.q))
-
-
-class PrecisionWarning(UserWarning):
-    """The state is in single precision."""
-
-
-def initial_values(caller, system, q0, v0):
-    """q0 and v0 as arrays of one float dtype, checked; v0 is None for a first-order system."""
-    first_order = isinstance(system, FirstOrderSystem)
-    if first_order:
-        if v0 is not None:
-            raise ValueError(f"{caller}: `v0` must be left out for a FirstOrderSystem; received {v0!r}.")
-        v0 = q0
-    if not sum(np.size(x) for x in jax.tree.leaves(q0)):
-        raise ValueError(f"{caller}: `q0` must hold at least one number; received {q0!r}.")
-    structure = jax.tree.structure(q0)
-    if jax.tree.structure(v0) != structure:
-        raise ValueError(
-            f"{caller}: `v0` must be a pytree structured like q0, {structure}; received {jax.tree.structure(v0)}."
-        )
-    dtypes = set()
-    for name, values in (("q0", q0), ("v0", v0)):
-        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
-            where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
-            if not is_array(leaf) and (isinstance(leaf, bool) or not isinstance(leaf, (int, float, complex))):
-                raise TypeError(f"{where} must be an array or a number; received {leaf!r}.")
-            dtype = getattr(leaf, "dtype", None) or np.result_type(leaf)
-            if not is_real(leaf) or dtype in (jnp.float16, jnp.bfloat16):
-                raise TypeError(f"{where} must be float32 or float64; received {dtype}.")
-            if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
-                raise ValueError(f"{where} must be finite; received {leaf!r}.")
-            if is_array(leaf) and jnp.issubdtype(dtype, jnp.floating):
-                dtypes.add(jnp.result_type(leaf))  # what JAX makes of it: float32 without x64
-    for (path, q), v in zip(jax.tree_util.tree_leaves_with_path(q0), jax.tree.leaves(v0), strict=True):
-        if kinematics.is_rotation(jnp.shape(q), jnp.shape(v)):
-            _require_rotations(f"{caller}: `q0{jax.tree_util.keystr(path)}`", q)
-        elif jnp.shape(q) != jnp.shape(v):
-            rotation = ", but (3,) for a rotation (3, 3)" if jnp.shape(q)[-2:] == (3, 3) else ""
-            raise ValueError(
-                f"{caller}: `v0` must have the shapes of q0, {describe(q0)}{rotation}; received {describe(v0)}."
-            )
-    if len(dtypes) > 1:
-        raise TypeError(f"{caller}: `q0` and `v0` must share one dtype; received {describe(q0)} and {describe(v0)}.")
-    dtype = dtypes.pop() if dtypes else jnp.result_type(float)
-    if dtype == jnp.float32:
-        warnings.warn(
-            f"{caller}: in float32 expect about 4 correct digits at best, fewer on stiff systems and small steps: "
-            "for float64 call jax.config.update('jax_enable_x64', True) before creating arrays.",
-            PrecisionWarning,
-            stacklevel=3,
-        )
-    q0, v0 = (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0))
-    return q0, None if first_order else v0
-
-
-def _require_rotations(where, R):
-    """An error for matrices that are not orthogonal, or are reflections; tracers pass."""
-    if not is_concrete(R):
-        return
-    R = np.asarray(R)
-    tolerance = max(ORTHOGONAL, 100 * np.finfo(R.dtype).eps) if R.dtype.kind == "f" else ORTHOGONAL
-    error = np.max(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)))
-    if error > tolerance:
-        raise ValueError(
-            f"{where} must be a rotation, because its velocity has 3 components; received a matrix R whose "
-            f"R^T R differs from I by {error:.3g}: hhtjax.rotation.exp(psi) gives rotations."
-        )
-    if np.any(np.linalg.det(R) < 0):
-        raise ValueError(f"{where} must be a rotation; received a reflection, det R = -1.")
 
 
 def flatten(caller, system, q0, v0, t0, params):
@@ -248,13 +175,3 @@ def _evaluate(caller, name, function, *args):
     except Exception as error:
         error.add_note(f"{caller}: raised while tracing `{name}` with " + ", ".join(describe(x) for x in args) + ".")
         raise
-
-
-def describe(x):
-    """A pytree in words: path, shape and dtype of each leaf."""
-    words = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(x):
-        known = hasattr(leaf, "shape") or isinstance(leaf, (int, float, complex))
-        what = f"shape {jnp.shape(leaf)} {jnp.result_type(leaf)}" if known else repr(leaf)
-        words.append(f"{jax.tree_util.keystr(path)}: {what}" if path else what)
-    return ", ".join(words) or "nothing"

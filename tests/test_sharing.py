@@ -8,11 +8,11 @@ import zoo
 from jax import lax
 
 import hhtjax
-from hhtjax import kernels, stages
-from hhtjax.scalars import on_scalars, split
 from hhtjax.scenes import double_pendulum
+from hhtjax.xla import gate, kernels, sharing
+from hhtjax.xla.scalars import by_scalars, split
 
-pytestmark = pytest.mark.skipif(jax.__version_info__ < kernels.TESTED, reason="plain arrays with this version of JAX")
+pytestmark = pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")
 
 
 def bounce(x, y):
@@ -35,7 +35,7 @@ FUNCTIONS = {
 
 
 def in_stages(f):
-    return lambda *args: stages.in_stages(kernels.STAGED, f, *args)
+    return lambda *args: sharing.in_stages(kernels.STAGED, f, *args)
 
 
 def names(jaxpr):
@@ -107,6 +107,6 @@ def test_the_program_has_each_sine_once():
 def test_work_of_a_step_of_the_double_pendulum(stepper, sines, cosines):
     scene, dt = double_pendulum.free(), jnp.asarray(1e-3)
     state = split(stepper.init(scene.system, scene.q0, scene.v0, scene.params, dt))
-    step = on_scalars(lambda state: stepper.step(scene.system, state, scene.params, dt)[0])
+    step = by_scalars(lambda state: stepper.step(scene.system, state, scene.params, dt)[0])
     done = names(jax.make_jaxpr(step)(state).jaxpr)
     assert (done.count("sin"), done.count("cos")) == (sines, cosines)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_concrete, is_real
 
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax import kinematics
 from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.systems import kinematics
 
 
 class Interpolant(NamedTuple):

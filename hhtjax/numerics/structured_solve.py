@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.scipy.sparse.linalg import cg
 
-from hhtjax.linear_solve import Structured, solve
+from hhtjax.numerics.linear_solve import Structured, solve
 
 
 @dataclass(frozen=True)

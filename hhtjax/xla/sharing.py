@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
-from hhtjax.jaxprs import alone, evaluate
-from hhtjax.kernels import named
-from hhtjax.pieces import ELEMENTWISE
+from hhtjax.xla.interpreter import alone, evaluate
+from hhtjax.xla.kernels import named
+from hhtjax.xla.scalar_rules import ELEMENTWISE
 
 FUNCTIONS = {  # that take long
     *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "erf", "exp", "exp2", "expm1"),

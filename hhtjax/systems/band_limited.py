@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.boundary import require_number
+from hhtjax.checks import require_number
 from hhtjax.description import is_real
-from hhtjax.sampled import Sampled, sampled
+from hhtjax.systems.sampled import Sampled, sampled
 
 
 def band_limited(values, dt, factor=8, t0=0.0) -> Sampled:

@@ -8,14 +8,13 @@ import zoo
 from jax import lax
 
 from experiments.benchmarks.chain import FORMULATIONS, chain
-from hhtjax import jacobian, kernels
-from hhtjax.jacobian import matrix
+from hhtjax.xla import gate, linear_map, linear_maps
 
 N = 6
 A = jnp.asarray(np.random.default_rng(0).standard_normal((N, N)))
 B = jnp.asarray(np.random.default_rng(1).standard_normal((N, N, 3)))
 C = A[0]
-old = pytest.mark.skipif(jax.__version_info__ < kernels.TESTED, reason="this JAX takes unit vectors one by one")
+old = pytest.mark.skipif(not gate.is_on(), reason="this JAX takes unit vectors one by one")
 
 MAPS = {
     "itself": lambda x: x,
@@ -66,13 +65,13 @@ def test_matrix_of(name):
     def f(x):
         return jnp.concatenate([jnp.ravel(y) for y in jax.tree.leaves(MAPS[name](x))])
 
-    found, expected = jax.jit(lambda: (matrix(f, C), jax.vmap(f, out_axes=1)(jnp.eye(N))))()
+    found, expected = jax.jit(lambda: (linear_map(f, C), jax.vmap(f, out_axes=1)(jnp.eye(N))))()
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
 
 
 def test_one_unknown_and_single_precision():
-    assert matrix(lambda x: 3 * x, jnp.ones(1)).tolist() == [[3.0]]
-    found = matrix(lambda x: jnp.diff(x) * jnp.float32(2), jnp.ones(3, jnp.float32))
+    assert linear_map(lambda x: 3 * x, jnp.ones(1)).tolist() == [[3.0]]
+    found = linear_map(lambda x: jnp.diff(x) * jnp.float32(2), jnp.ones(3, jnp.float32))
     assert found.dtype == jnp.float32
     assert found.tolist() == [[-2, 2, 0], [0, -2, 2]]
 
@@ -91,13 +90,13 @@ def test_work_of_a_chain(formulation, monkeypatch):
 
     def stiffness(q):
         tangent = jax.linearize(lambda q: scene.system.force(q, 0.1 * q, 0.0, scene.params), q)[1]
-        return matrix(tangent, q)
+        return linear_map(tangent, q)
 
     def refuse(eqn, values):
         raise AssertionError(f"{eqn.primitive} on whole columns")
 
     expected = jax.jacfwd(lambda q: scene.system.force(q, 0.1 * q, 0.0, scene.params))(scene.q0)
-    monkeypatch.setattr(jacobian, "_by_columns", refuse)
+    monkeypatch.setattr(linear_maps, "_by_columns", refuse)
     np.testing.assert_allclose(stiffness(scene.q0), expected, rtol=1e-12, atol=1e-12)
     assert largest_array(stiffness, scene.q0) == 9**2
     cost = jax.jit(stiffness).lower(scene.q0).compile().cost_analysis()

@@ -1,5 +1,6 @@
 """Checks of arguments that every floor makes: they name the caller, the argument, and what was received."""
 
+import jax
 import jax.numpy as jnp
 
 from hhtjax.description import is_concrete, is_real
@@ -25,3 +26,13 @@ def require_function(caller, name, value, signature):
             f"{caller}: `{name}` must be hashable, because it is static under jit; received {value!r}. "
             "Pass arrays through params."
         ) from None
+
+
+def describe(x):
+    """A pytree in words: path, shape and dtype of each leaf."""
+    words = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(x):
+        known = hasattr(leaf, "shape") or isinstance(leaf, (int, float, complex))
+        what = f"shape {jnp.shape(leaf)} {jnp.result_type(leaf)}" if known else repr(leaf)
+        words.append(f"{jax.tree_util.keystr(path)}: {what}" if path else what)
+    return ", ".join(words) or "nothing"

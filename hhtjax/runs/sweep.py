@@ -9,14 +9,13 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hhtjax.boundary import require_number
-from hhtjax.checkpointing import checkpoint
-from hhtjax.constraints import examine, require_consistent
+from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_concrete
-from hhtjax.flat_system import flatten, initial_values
-from hhtjax.kernels import one_kernel
-from hhtjax.looping import repeat
-from hhtjax.sample_times import (
+from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.numerics.counted_loop import repeat
+from hhtjax.runs.loop import advance_from, as_solution, join_info, loop_of, show_progress
+from hhtjax.runs.solution import Solution
+from hhtjax.runs.sweep_grid import (
     fit_to_samples,
     fit_to_times,
     require_one_grid,
@@ -24,9 +23,11 @@ from hhtjax.sample_times import (
     require_steps_within,
     require_times,
 )
-from hhtjax.scalars import join, split_if_it_pays
-from hhtjax.simulate import Solution, advance_from, as_solution, join_info, loop_of, show_progress
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.systems.consistent import examine, require_consistent
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.initial_values import initial_values
+from hhtjax.xla import on_scalars, one_kernel
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 
@@ -294,13 +295,15 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
     flat, q, v = flatten("sweep", system, q0, v0, t0, params)
     intervals = None if times is None else (times[:-1], dt, substeps, longest)
     loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
+    form = on_scalars(loop.advance, loop.carry)
+    keep = form.of(loop.keep)
 
     def pace(run, interval):
         """The step, and how many of them this member takes, and its block."""
         if interval is None:
-            return loop.advance, substeps, longest
+            return form.of(loop.advance), substeps, longest
         t, h, mine, most = interval
-        return advance_from(flat, stepper, q, params, t, h, run[1]), mine, most
+        return form.of(advance_from(flat, stepper, q, params, t, h, run[1])), mine, most
 
     @checkpoint
     def interval(run, here):
@@ -312,10 +315,10 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
             return jax.tree.map(partial(jnp.where, i < substeps), new, carry)
 
         run, info = repeat(step, (run, loop.no_info), longest)
-        return run, (loop.keep(run[0]), info)
+        return run, (keep(run[0]), info)
 
     def samples(carry):
         return lax.scan(interval, carry, intervals, num_samples)
 
-    (_, _, failure), (path, info) = one_kernel(samples, split_if_it_pays(loop.advance, loop.carry))
-    return as_solution(flat, loop.carry[0], join(path), dt, info, failure)
+    (_, _, failure), (path, info) = one_kernel(samples, form.tree)
+    return as_solution(flat, loop.carry[0], form.joined(path), dt, info, failure)

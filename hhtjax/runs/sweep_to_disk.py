@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from hhtjax.description import is_concrete
-from hhtjax.sweep import Inputs, run_sweep
+from hhtjax.runs.sweep import Inputs, run_sweep
 
 
 def sweep_to_disk(

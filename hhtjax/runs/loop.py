@@ -1,0 +1,119 @@
+"""What a run is made of: the step that counts, watches and saves, for one run as for a sweep."""
+
+import sys
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.runs.solution import Failure, Solution
+from hhtjax.steppers.stepper import Info, public
+from hhtjax.xla import staged
+
+
+class Loop(NamedTuple):
+    """What a run is made of. carry: (state, number of steps, first failure), before the first; advance: carry -> carry,
+    Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged."""
+
+    carry: Any
+    advance: Any
+    keep: Any
+    no_info: Info
+
+
+def loop_of(flat, stepper, q, v, t0, params, dt):
+    """The loop over a stepper's steps."""
+    stepper = stepper.astype(q.dtype)
+    take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)  # traced once, wherever it is called
+    start = stepper.begin(flat, q, v, t0, params, dt)
+    no_info = neutral_info(jax.eval_shape(take_step, start)[1])
+    carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
+    return Loop(carry, counted(take_step, flat, q, t0, dt), partial(saved, flat), no_info)
+
+
+def advance_from(flat, stepper, q0, params, t, dt, count):
+    """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken."""
+    take_step = stepper.astype(q0.dtype).bind(flat, params, dt)
+    return counted(take_step, flat, q0, t, dt, count)
+
+
+def counted(take_step, flat, q0, t0, dt, before=None):
+    """The step of a run, on (state, number of steps, first failure); also its `Info`. before: steps taken at t0."""
+
+    def step(carry):
+        state, count, failure = carry
+        state, info = take_step(state)
+        count = count + 1
+        taken = count if before is None else count - before
+        state = state._replace(t=t0 + taken.astype(dt.dtype) * dt)  # no rounding piles up
+        if flat.first_order:
+            state = state._replace(q=q0)  # stays zero
+        return (state, count, _first_failure(failure, count, state, info)), info
+
+    return step
+
+
+def saved(flat, state):
+    """What a run saves of a state."""
+    state = public(flat, state)
+    return state.t, state.q, state.v, state.w, state.L
+
+
+def as_solution(flat, start, path, dt, info, failure):
+    """The start and the path after it as a `Solution`."""
+    t, q, *rates, L = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
+    q = jax.vmap(flat.unravel)(q)
+    v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in rates)
+    return Solution(t, q, v, w, L, dt, info, failure)
+
+
+def no_failure(info):
+    """What `Solution.failure` says of a run in which all went well."""
+    none = jnp.zeros((), jnp.int32)
+    return Failure(none, jnp.array(False), none, info.dependent_row)
+
+
+def _first_failure(failure, count, state, info):
+    """The failure so far, or this step's."""
+    known = [(i, x) for i, x in enumerate((state.q, state.v, state.w, state.L)) if x is not None]
+    checks = staged(lambda values: [jnp.all(jnp.isfinite(x)) for x in values])([x for _, x in known])
+    quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
+    for (i, _), fine in reversed(list(zip(known, checks, strict=True))):
+        quantity, finite = jnp.where(fine, quantity, i), finite & fine
+    failed, newton, row = ~finite, finite, failure.row
+    if info.converged is not None:
+        failed = failed | ~info.converged
+    if info.dependent_row is not None:
+        failed, newton = failed | (info.dependent_row > 0), newton & (info.dependent_row == 0)
+    first = failed & (failure.step == 0)
+    if info.dependent_row is not None:
+        row = jnp.where(first, info.dependent_row, failure.row)
+    step, quantity = (jnp.where(first, new, old) for new, old in ((count, failure.step), (quantity, failure.quantity)))
+    return Failure(step, jnp.where(first, newton, failure.newton), quantity, row)
+
+
+def neutral_info(shapes):
+    """What `join_info` leaves unchanged."""
+    return Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
+
+
+def join_info(info, new):
+    """Info of several steps as one: largest residuals, number of iterations, all converged."""
+    join = {"iterations": jnp.add, "converged": jnp.logical_and}
+    pairs = {name: (x, getattr(new, name)) for name, x in info._asdict().items() if x is not None}
+    return info._replace(**{name: join.get(name, jnp.maximum)(*pair) for name, pair in pairs.items()})
+
+
+def show_progress(count, total, what):
+    """A bar on stderr, about a hundred times in a run."""
+    every = max(1, total // 100)
+
+    def show(count):
+        done = int(count) * 40 // total
+        end = "\n" if int(count) == total else ""
+        print(f"\r[{'#' * done:<40}] {what} {int(count)} of {total}", end=end, file=sys.stderr, flush=True)
+
+    due = (count % every == 0) | (count == total)
+    lax.cond(due, lambda: jax.debug.callback(show, count), lambda: None)

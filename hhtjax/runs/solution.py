@@ -1,0 +1,124 @@
+"""What a run returns, and how it tells of a step that failed."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hhtjax.checks import require_number
+from hhtjax.description import is_concrete
+from hhtjax.steppers.stepper import Info
+
+
+class SimulationError(RuntimeError):
+    """A run in which a step failed; raised by `Solution.check`."""
+
+
+class Failure(NamedTuple):
+    """The first step that failed. step: its number, from 1, or 0 if none did; newton: True if Newton's
+    iteration failed while the state was still finite; quantity: index into QUANTITIES of the first that is not finite;
+    row: number, from 1, of the constraint that came to depend on those before it, 0 if none did, None without
+    constraints."""
+
+    step: Any
+    newton: Any
+    quantity: Any
+    row: Any = None
+
+
+QUANTITIES = "the position q", "the velocity v", "the acceleration", "the vector of multipliers"
+
+
+class Solution(NamedTuple):
+    """A trajectory at its saved times, the start included.
+
+    t: (K + 1,). q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order
+    system y, y' and None.
+    multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L.
+    dt: the step size; (K,) of a sweep over `times`, one for each interval.
+    info: `Info` for each of the K intervals between saved times: largest residual, number of Newton
+    iterations, all converged; None where the method has nothing to tell.
+    failure: the first step that failed, as data; `check` turns it into an error.
+    """
+
+    t: Any
+    q: Any
+    v: Any
+    acceleration: Any
+    multipliers: Any
+    dt: Any
+    info: Info
+    failure: Failure
+
+    def check(self, reach=None):
+        """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
+
+        reach: how far q may get from its start, in any coordinate and its unit. A run that gets farther has blown up,
+        although it is finite still, and is named by the first saved time. By default q may go anywhere.
+
+        For a batch made by vmap, names the first bad member. Not to be called inside jit.
+        """
+        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t)))):
+            raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
+        steps = np.asarray(self.failure.step)
+        strays = np.zeros_like(steps)
+        if reach is not None:
+            require_number("check", "reach", reach, lambda x: x > 0, "be positive")
+            strays = self._first_beyond(reach)
+            strays = np.where((steps > 0) & (steps <= strays), 0, strays)
+        bad = np.where(strays > 0, strays, steps)
+        if not bad.any():
+            return
+        member = tuple(int(i) for i in np.argwhere(bad)[0])
+        step, time = bad[member], self._time_of(bad[member], member)
+        failed = f"({np.count_nonzero(bad)} of {bad.size} failed)"
+        which = f"member {', '.join(map(str, member))} {failed}, " if member else ""
+        why = (
+            f"the position q is farther than {reach:g} from its start. Take a smaller dt, or a method that damps"
+            if strays[member]
+            else self._why(member)
+        )
+        raise SimulationError(f"simulate: {which}step {step} (to t = {time:.6g}) failed: {why}.")
+
+    def _why(self, member):
+        """What `failure` says of one member of a batch."""
+        _, newton, quantity, row = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        if newton:
+            return (
+                "Newton's iteration did not converge; the state is still finite. Take a smaller dt, or more "
+                "max_iterations, or a larger tolerance"
+            )
+        if row:
+            return (
+                f"row {row - 1} of the constraint depends on the rows before it: the position is singular. Give the "
+                'stepper redundant="least_squares", or formulate the constraint anew'
+            )
+        names = ("the position", "y", "y'") if self.acceleration is None else QUANTITIES
+        return f"{names[quantity]} is not finite. Take a smaller dt, or another linearize=, or a method that damps"
+
+    def _first_beyond(self, reach):
+        """Step of the first saved time at which q is farther than `reach` from its start; 0 if none is."""
+        t, axis = np.asarray(self.t), self.t.ndim - 1
+        far: Any = np.zeros(t.shape, bool)
+        for q in map(np.asarray, jax.tree.leaves(self.q)):
+            with np.errstate(invalid="ignore"):
+                far |= (abs(q - np.take(q, [0], axis)) > reach).any(axis=tuple(range(axis + 1, q.ndim)))
+        return np.take_along_axis(self._steps_taken(), far.argmax(axis)[..., None], axis)[..., 0]
+
+    def _steps_taken(self):
+        """How many steps come before each saved time."""
+        t, dt = np.asarray(self.t), np.asarray(self.dt)
+        with np.errstate(all="ignore"):  # what was traced may be anything
+            if dt.ndim < t.ndim:
+                taken = (t - t[..., :1]) / dt[..., None]
+            else:
+                counts = np.nan_to_num(np.rint(np.diff(t) / dt), nan=1)
+                taken = np.insert(np.cumsum(counts, axis=-1), 0, 0, axis=-1)
+        return np.rint(np.nan_to_num(taken, posinf=0, neginf=0)).astype(int)
+
+    def _time_of(self, step, member):
+        """The time at which a step of a member of a batch ends."""
+        taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
+        dt = np.broadcast_to(np.asarray(self.dt)[member], t[1:].shape)
+        i = np.clip(np.searchsorted(taken, step) - 1, 0, dt.size - 1)
+        return t[i] + (step - taken[i]) * dt[i]

@@ -1,0 +1,129 @@
+"""Constraints Phi(q, t) = 0: their rates, their reactions, and which of them depend on each other.
+
+    M(q) w = Q(q, v, t) + B^T L,    B = dPhi/dq
+
+A multiplier L_i is the reaction that constraint i exerts along its own gradient: of the unit of force for a Phi in
+units of length. (The IVP test set writes -B^T lambda: its multipliers are the negatives of these.)
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from hhtjax.numerics.linear_solve import (
+    RANK_TOLERANCE,
+    UNROLLED,
+    factorize,
+    factorize_least_squares,
+    matvec,
+    solve_map,
+)
+from hhtjax.xla import linear_map, staged
+
+
+def violation(system, q, v, t, params):
+    """Phi, and dPhi/dt = B v + Phi_t: (m,) each."""
+    return jax.jvp(lambda q, t: system.constraint(q, t, params), (q, t), (system.rate(q, v), jnp.ones_like(t)))
+
+
+def curvature(system, q, v, t, params):
+    """The part of the second time derivative of Phi that w does not enter: (m,)."""
+
+    def rate(q, t):
+        return violation(system, q, v, t, params)[1]
+
+    return jax.jvp(rate, (q, t), (system.rate(q, v), jnp.ones_like(t)))[1]
+
+
+def reaction(system, q, t, params, L):
+    """B^T L: (n,)."""
+    _, pull = jax.vjp(lambda q: system.constraint(q, t, params), q)
+    return pull_back(system, q, pull(L)[0])
+
+
+def pull_back(system, q, gradient):
+    """The force (n,) of a gradient with respect to q: the same, and the material moment for rotations."""
+    zero = jnp.zeros(system.size, q.dtype)
+    return jax.linear_transpose(lambda v: system.rate(q, v), zero)(gradient)[0]
+
+
+def saddle_point(system, q, t, params, force, rows, factorize=factorize):
+    """(x, L) with M x - B^T L = force and B x = rows: the index-1 system for accelerations, and all projections."""
+    n = system.size
+    _, tangent = jax.linearize(lambda q: system.constraint(q, t, params), q)
+
+    def f(z):
+        x, L = z[:n], z[n:]
+        reactions = reaction(system, q, t, params, L)
+        return jnp.concatenate([system.inertia(q, x, params) - reactions, tangent(system.rate(q, x))])
+
+    z = solve_map(f, jnp.concatenate([force, rows]), factorize)
+    return z[:n], z[n:]
+
+
+def acceleration_and_multipliers(system, q, v, t, params, factorize=factorize):
+    """w and L at a state that satisfies Phi = 0 and dPhi/dt = 0."""
+    Q = system.force(q, v, t, params)
+    return saddle_point(system, q, t, params, Q, -curvature(system, q, v, t, params), factorize)
+
+
+def jacobian(system, q, t, params):
+    """B: (m, n)."""
+    Phi = partial(system.constraint, t=t, params=params)
+    _, tangent = staged(partial(jax.linearize, Phi), system.size)(q)
+    return linear_map(lambda x: tangent(system.rate(q, x)), jnp.zeros(system.size, q.dtype))
+
+
+def check_redundant(caller, redundant):
+    """An error for what is no value of `redundant`."""
+    if redundant not in (None, "least_squares"):
+        raise ValueError(f'{caller}: `redundant` must be None or "least_squares"; received {redundant!r}.')
+
+
+def factorize_constrained(n, redundant):
+    """The factorisation for n coordinates and their multipliers."""
+    return factorize if redundant is None else factorize_least_squares(n)
+
+
+def require_independent(caller, B):
+    """An error that names the rows of B that depend on each other."""
+    size = np.linalg.norm(B, axis=1)
+    empty = np.flatnonzero(~(np.isfinite(size) & (size > 0))).tolist()
+    if empty:
+        raise ValueError(
+            f"{caller}: `constraint` rows {empty} have no gradient in q at the start, or not a finite one."
+        )
+    left, values, _ = np.linalg.svd(B / size[:, None])
+    dependent = left[:, values < RANK_TOLERANCE]
+    if dependent.size:
+        rows = np.flatnonzero(np.abs(dependent).max(axis=1) > 1e-6).tolist()
+        rank = len(values) - dependent.shape[1]
+        raise ValueError(
+            f"{caller}: `constraint` rows {rows} depend on each other at the start (rank {rank} of {len(values)}): "
+            'drop the redundant ones, or keep them with redundant="least_squares".'
+        )
+
+
+def dependent_row(B):
+    """Number, from 1, of the first row of B (m, n) that depends on those above it, to a part in 1e6; 0 for none.
+
+    The pivots of an elimination on the cosines between the rows: sin^2 of the angle to the span of the rows above.
+    """
+    m, limit = B.shape[0], 1e4 * float(jnp.finfo(B.dtype).eps)
+    size = jnp.sqrt(jnp.sum(B**2, axis=1, keepdims=True))
+    B = B / jnp.where(size == 0, 1, size)
+    G = jax.vmap(partial(matvec, B))(B)
+
+    def eliminate(k, G):
+        return G - jnp.where(jnp.arange(m) > k, G[:, k] / jnp.maximum(G[k, k], limit), 0)[:, None] * G[k][None, :]
+
+    if m <= UNROLLED:
+        for k in range(m - 1):
+            G = eliminate(k, G)
+    else:
+        G = lax.fori_loop(0, m - 1, eliminate, G)
+    dependent = jnp.diagonal(G) < limit
+    return jnp.min(jnp.where(dependent, jnp.arange(1, m + 1), m + 1)) % (m + 1)

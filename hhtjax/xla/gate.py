@@ -1,0 +1,62 @@
+"""Whether the machinery is on: with the versions of JAX that it is tested with, and unless a user says no."""
+
+import os
+from contextlib import contextmanager
+
+import jax
+
+VARIABLE = "HHTJAX_PLAIN"  # 1: off; 0: on, also with a JAX newer than those tested
+OLDEST = 0, 10, 2  # the first JAX in which this works; older ones abort, or lose constants of the calls
+NEWEST = 0, 10, 2  # the last one with which the conformance tests have passed
+
+is_possible = jax.__version_info__ >= OLDEST
+# part of the key under which JAX keeps a compiled function, so that both forms of it can be there
+_plain = jax.make_user_context(default_value=False) if is_possible else None
+
+
+@contextmanager
+def plain():
+    """Everything inside runs on plain JAX: for who doubts a number, or looks for the cause of one.
+
+    Functions traced inside are kept apart from those traced outside, so a jitted function gives the plain result inside
+    and the fast one outside. The environment variable HHTJAX_PLAIN=1 does the same for a whole process.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> ball = hhtjax.System(mass=jnp.array([1.0, 2.0]), force=lambda q, v, t, c: -9.81 - c * v)
+    >>> def fall():
+    ...     return hhtjax.simulate(ball, hhtjax.hht(), jnp.ones(2), jnp.zeros(2), 0.1, dt=0.01, num_steps=50).q[-1]
+    >>> with hhtjax.plain():
+    ...     expected = fall()
+    >>> bool(jnp.allclose(fall(), expected, rtol=1e-12))
+    True
+    """
+    if _plain is None:
+        yield
+    else:
+        with _plain(True):
+            yield
+
+
+def why_off():
+    """Why the machinery is off, in words; None where it is on."""
+    version = jax.__version__
+    if not is_possible:
+        return f"JAX {version} is older than {_words(OLDEST)}"
+    assert _plain is not None
+    if _plain.value:
+        return "inside hhtjax.plain()"
+    wish = os.environ.get(VARIABLE, "")
+    if wish == "1":
+        return f"{VARIABLE}=1"
+    if jax.__version_info__ > NEWEST and wish != "0":
+        return f"JAX {version} is newer than {_words(NEWEST)}, the last one tested; {VARIABLE}=0 tries it all the same"
+    return None
+
+
+def is_on():
+    """Whether the machinery may change how a program runs."""
+    return why_off() is None
+
+
+def _words(version):
+    return ".".join(map(str, version))

@@ -1,0 +1,67 @@
+"""Names by which a program tells where kernels shall be: a loop as one, and a barrier that fusion does not cross.
+
+XLA:CPU runs a loop body as a list of kernels. Each costs a call, and so does every buffer between them: on a small
+mechanism several times what the arithmetic costs. And what is fused is evaluated anew in every user: the sines of a
+system once for every column of its Jacobian. So functions get names here, which autodiff and vmap keep, and an identity
+stands on either side of a loop: when the program is lowered, with vmap and autodiff done, it lets lowering.py decide.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching
+
+from hhtjax.xla.gate import is_on
+
+KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"  # names of functions; autodiff and vmap keep them
+
+
+def one_kernel(f, *args):
+    """f(*args) of pytrees of arrays, as one kernel where XLA can; the same values otherwise."""
+    if not is_on():
+        return f(*args)
+    f, constants = jax.closure_convert(f, *args)
+    return _watch(named(KERNEL, f)(*_watch(args), *_watch(constants)))
+
+
+def staged(f, size=None):
+    """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have.
+
+    size: number of unknowns. With a single one, of which a Jacobian has one column, nothing is shared.
+    """
+    return f if size == 1 or not is_on() else named(STAGED, f)
+
+
+def choose(inside, outside, *args):
+    """inside(*args) in one kernel, outside(*args) elsewhere: two ways to the same values."""
+    return lax.cond(inside_p.bind(jax.tree.leaves(args)[0]), inside, outside, *args)
+
+
+def named(name, f):
+    """f as a function of this name in the program."""
+
+    def call(*args):
+        return f(*args)
+
+    call.__name__ = name
+    return jax.jit(call)
+
+
+def _watch(tree):
+    """An identity on either side of a call: whatever autodiff makes of it, one is behind the call or its transpose."""
+    return jax.tree.map(lambda x: watch_p.bind(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x, tree)
+
+
+inside_p = Primitive("hhtjax_inside")  # whether a kernel holds it; the operand keeps it where the choice is
+inside_p.def_impl(lambda x: jnp.array(False))
+inside_p.def_abstract_eval(lambda x: x.update(shape=(), dtype=np.dtype(bool), weak_type=False))
+batching.primitive_batchers[inside_p] = lambda values, axes: (inside_p.bind(*values), None)
+
+
+watch_p = Primitive("hhtjax_watch")
+watch_p.def_impl(lambda x: x)
+watch_p.def_abstract_eval(lambda x: x)
+ad.deflinear2(watch_p, lambda cotangent, _: (watch_p.bind(cotangent),))
+batching.defvectorized(watch_p)
