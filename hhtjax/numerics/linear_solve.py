@@ -8,10 +8,11 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 from functools import partial
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
-from hhtjax.xla import choose, linear_map, staged
+from hhtjax.xla import choose, linear_map, staged, structural
 
 UNROLLED = 8
 LOOPED = 16
@@ -132,12 +133,13 @@ def factorize_least_squares(n):
 def solve(A, b, factorize=factorize):
     """x with A x = b, for A (n, n) and b (n,), differentiable in both.
 
-    LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (module docstring); Cramer's rule for n = 2.
-    A singular A gives inf or NaN.
+        LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (module docstring); Cramer's rule for n = 2.
+        A singular A gives inf or NaN.
 
-    >>> import jax.numpy as jnp
-    >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
-    [2.0, 1.0]
+        >>> import jax.numpy as jnp
+    import numpy as np
+        >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
+        [2.0, 1.0]
     """
     return _solve(lambda x: matvec(A, x), b, factorize(A))
 
@@ -154,7 +156,7 @@ def _lu(A):
         pivot = find_pivot(A, k)
         exchange = jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))
         A, order = A[exchange], order[exchange]
-        factor = jnp.where(row > k, A[:, k][:, None] / A[k, k], 0)
+        factor = jnp.where(row > k, A[:, k][:, None] / A[k, k], structural(np.zeros((), A.dtype)))
         changed = A - factor * A[k][None, :]
         return jnp.where(column > k, changed, jnp.where((column == k) & (row > k), factor, A)), order
 
