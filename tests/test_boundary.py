@@ -187,8 +187,8 @@ def test_the_ends_of_the_ranges_belong_to_them(make, ends):
 
 
 OPTIONS = [
-    ("iterations", ValueError, "must be a positive integer or None", (0, -1, 1.0, True, "1")),
-    ("linearize", ValueError, "must be one of predictor, held, state, auto", ("tangent", 3, ["auto"])),
+    ("iterations", ValueError, "must be a positive integer", (0, -1, 1.0, True, "1")),
+    ("linearize", ValueError, 'must be "predictor", "held", "state" or "auto"', ("tangent", 3, ["auto"])),
     ("max_iterations", ValueError, "must be a positive integer", (0, -1, 1.5, True, None)),
     ("start", ValueError, 'must be "corrected" or "simple"', ("exact", 3)),
     ("solve", TypeError, "must be a function solve(A, b)", (3, "lu")),
