@@ -111,7 +111,7 @@ def test_each_constraint_of_a_mechanism_has_the_spectrum_at_infinity(scene, form
     stepper = hhtjax.hht(alpha, formulation=formulation)
     state = jax.jit(stepper.init)(scene.system, scene.q0, scene.v0, scene.params, dt)
     m = state.L.size
-    A = analysis.amplification_matrix(stepper, scene.system, state, scene.params, dt=dt)
+    A = analysis.amplification_matrix(scene.system, stepper, state, scene.params, dt=dt)
     found = {round(x.value.real, 6) + 0.0: x.blocks for x in analysis.jordan_structure(A)}
     assert found[round(alpha / (1 + alpha), 6)] == m * (1,)
     if formulation == "index3":
@@ -168,7 +168,7 @@ TOP = top.minimal()
 def test_tangent_of_a_step_predicts_what_becomes_of_a_perturbation(system, q0, v0, params):
     dt, stepper = 0.01, hhtjax.hht(-0.1, linearize="predictor", kinematics="lie")
     state = jax.jit(stepper.init)(system, q0, v0, params, dt)
-    A = np.asarray(analysis.amplification_matrix(stepper, system, state, params, dt=dt))
+    A = np.asarray(analysis.amplification_matrix(system, stepper, state, params, dt=dt))
 
     @jax.jit
     def central_difference(x):
@@ -191,7 +191,7 @@ def test_scaled_tangent_depends_on_rate_times_dt_only(system, v0):
     stepper, matrices = hhtjax.hht(-0.1), []
     for rate, dt in ((0.6, 1.0), (60.0, 0.01)):
         state = jax.jit(stepper.init)(system, jnp.zeros(1), v0, rate, dt)
-        matrices.append(analysis.amplification_matrix(stepper, system, state, rate, dt=dt))
+        matrices.append(analysis.amplification_matrix(system, stepper, state, rate, dt=dt))
     np.testing.assert_allclose(*matrices, atol=1e-13)
     if v0 is not None:
         np.testing.assert_allclose(matrices[0], analysis.oscillator_matrix(stepper, 0.6, 0.05), atol=1e-13)
@@ -255,7 +255,7 @@ SUGGEST = partial(analysis.suggest_step_size, SPRING, hhtjax.hht(), jnp.ones(1),
         (lambda: analysis.overshoot(hhtjax.hht(), 1.0, np.inf), ValueError, "`damping` must be finite"),
         (lambda: analysis.constraint_matrix(hhtjax.rk4()), NotImplementedError, "cannot solve the `constraint`"),
         (
-            lambda: analysis.amplification_matrix(hhtjax.hht(), SPRING, None, dt=0.1),
+            lambda: analysis.amplification_matrix(SPRING, hhtjax.hht(), None, dt=0.1),
             TypeError,
             "`state` must be a State",
         ),

@@ -5,6 +5,7 @@ import json
 import os
 import sys
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_integer
-from hhtjax.description import is_concrete
+from hhtjax.description import VERSION, is_concrete
 from hhtjax.runs.sweep import Inputs, run_sweep
 
 
@@ -106,8 +107,6 @@ def _named(runs, kept) -> dict[str, Any]:
 
 
 def _manifest(inputs, lowered, chunk, chunks):
-    from hhtjax import __version__
-
     digest = hashlib.sha256(lowered.as_text().encode())
     for x in jax.tree.leaves(inputs):
         x = np.asarray(x)
@@ -117,7 +116,7 @@ def _manifest(inputs, lowered, chunk, chunks):
         "members": int(inputs.dts.size),
         "chunk": chunk,
         "chunks": chunks,
-        "versions": {"hhtjax": __version__, "jax": jax.__version__, "numpy": np.__version__},
+        "versions": {"hhtjax": VERSION, "jax": version("jax"), "numpy": np.__version__},
     }
 
 

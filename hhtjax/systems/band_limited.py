@@ -9,7 +9,7 @@ from hhtjax.description import is_real
 from hhtjax.systems.sampled import Sampled, sampled
 
 
-def band_limited(values, dt, factor=8, t0=0.0) -> Sampled:
+def band_limited(values, dt, *, factor=8, t0=0.0) -> Sampled:
     """The function of time through `values[k]` at t0 + k dt that holds no frequency above 1/(2 dt).
 
     The samples less the line through the first and the last one, continued as an odd function, are a Fourier series.
