@@ -133,13 +133,12 @@ def factorize_least_squares(n):
 def solve(A, b, factorize=factorize):
     """x with A x = b, for A (n, n) and b (n,), differentiable in both.
 
-        LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (module docstring); Cramer's rule for n = 2.
-        A singular A gives inf or NaN.
+    LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (module docstring); Cramer's rule for n = 2.
+    A singular A gives inf or NaN.
 
-        >>> import jax.numpy as jnp
-    import numpy as np
-        >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
-        [2.0, 1.0]
+    >>> import jax.numpy as jnp
+    >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
+    [2.0, 1.0]
     """
     return _solve(lambda x: matvec(A, x), b, factorize(A))
 
@@ -149,6 +148,7 @@ def _lu(A):
     n = A.shape[0]
     i = jnp.arange(n)
     row, column = i[:, None], i[None, :]
+    nothing = structural(np.zeros((), A.dtype))
     loop, find_pivot = (lax.fori_loop, _pivot) if n > UNROLLED else (_written_out, _pivot_by_scalars)
 
     def eliminate(k, carry):
@@ -156,7 +156,7 @@ def _lu(A):
         pivot = find_pivot(A, k)
         exchange = jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))
         A, order = A[exchange], order[exchange]
-        factor = jnp.where(row > k, A[:, k][:, None] / A[k, k], structural(np.zeros((), A.dtype)))
+        factor = jnp.where(row > k, A[:, k][:, None] / A[k, k], nothing)
         changed = A - factor * A[k][None, :]
         return jnp.where(column > k, changed, jnp.where((column == k) & (row > k), factor, A)), order
 

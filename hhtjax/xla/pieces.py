@@ -26,8 +26,8 @@ ZEROS: dict[Any, Any] = {np.dtype(np.float64): _Zero64(0), np.dtype(np.float32):
 
 
 def is_small(aval):
-    """Whether arrays like this are taken to pieces."""
-    return math.prod(aval.shape) <= LARGEST and not jnp.issubdtype(aval.dtype, jax.dtypes.extended)
+    """Whether arrays like this are taken to pieces; empty ones, which hold nothing to move, are not."""
+    return 0 < math.prod(aval.shape) <= LARGEST and not jnp.issubdtype(aval.dtype, jax.dtypes.extended)
 
 
 def is_in_pieces(value):
@@ -71,8 +71,6 @@ def whole(value, aval):
     """The array of a value."""
     if not is_in_pieces(value):
         return value
-    if not value.size:
-        return jnp.zeros(aval.shape, aval.dtype)
     elements = [as_scalar(x, aval.dtype) for x in value.flat]
     return jnp.stack(elements).reshape(aval.shape) if aval.shape else elements[0]
 

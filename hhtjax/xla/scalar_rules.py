@@ -114,7 +114,7 @@ def _reduction(name):
     def rule(eqn, x):
         axes, out = eqn.params["axes"], eqn.outvars[0].aval
         rows = _rows(x, [i for i in range(x.ndim) if i not in axes], axes)
-        return [arranged([_fold(name, out.dtype, row) for row in rows], out.shape)] if x.size else None
+        return [arranged([_fold(name, out.dtype, row) for row in rows], out.shape)]
 
     return rule
 
@@ -127,7 +127,7 @@ def _rows(x, first, last):
 
 def _dot_general(eqn, x, y):
     out = eqn.outvars[0].aval
-    if not (x.size and y.size) or any(v.aval.dtype != out.dtype for v in eqn.invars):
+    if any(v.aval.dtype != out.dtype for v in eqn.invars):
         return None
     over, batch = eqn.params["dimension_numbers"]
     rows = []
