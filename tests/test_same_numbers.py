@@ -48,7 +48,7 @@ PROGRAMS = {
     "fill value of a gather": (chain_with_a_fixed_end, jnp.array([0.1, 0.2, 0.3]), hhtjax.rk4()),
     "scatter that computes": (one_through_a_sine, jnp.array([0.7, -1.3, 0.4]), hhtjax.rk4()),
     "sign of a zero": (bearing, jnp.array([0.0, 0.3]), hhtjax.rk4()),
-    "zero times NaN": (masked_root, jnp.array([1.0, 0.2, 1.0]), hhtjax.rk4()),
+    "zero times NaN": (masked_root, jnp.array([1.0, 0.505, 1.0]), hhtjax.rk4()),
 }
 
 
@@ -58,7 +58,7 @@ def test_a_run_is_the_same_with_and_without(name):
     system = hhtjax.System(np.ones(q0.size), force)
 
     def run(q0):
-        return hhtjax.simulate(system, stepper, q0, 0.1 * q0, dt=0.05, num_steps=6)
+        return hhtjax.simulate(system, stepper, q0, 0.1 * q0, dt=0.1, num_steps=6)
 
     fast = run(q0)
     with hhtjax.plain():
@@ -71,6 +71,6 @@ def test_a_run_is_the_same_with_and_without(name):
 
 def test_zero_times_nan_is_told():
     force, q0, stepper = PROGRAMS["zero times NaN"]
-    run = hhtjax.simulate(hhtjax.System(np.ones(3), force), stepper, q0, 0.1 * q0, dt=0.05, num_steps=6)
+    run = hhtjax.simulate(hhtjax.System(np.ones(3), force), stepper, q0, 0.1 * q0, dt=0.1, num_steps=6)
     with pytest.raises(hhtjax.SimulationError, match="not finite"):
         run.check()
