@@ -44,6 +44,14 @@ def invert(f, like, factorize):
     return factorize(staged(partial(linear_map, f), like.size)(like))
 
 
+def invert_and_bound(f, like, factorize):
+    """`invert`, and the function x -> |A| |x|, what the rows of A x are sums of; where no A is formed, |A x|."""
+    if isinstance(factorize, Structured):
+        return factorize.of_map(f, like), lambda x: jnp.abs(f(x))
+    A = staged(partial(linear_map, f), like.size)(like)
+    return factorize(A), lambda x: matvec(jnp.abs(A), jnp.abs(x))
+
+
 def _solve(f, b, inverse):
     return lax.custom_linear_solve(
         f, b, solve=lambda _, y: inverse(y, trans=0), transpose_solve=lambda _, y: inverse(y, trans=1)

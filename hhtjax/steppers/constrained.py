@@ -76,7 +76,7 @@ def bind_constrained(method, system, params, dt):
 
         z = jnp.concatenate([s.w, s.L] + [jnp.zeros(m, s.q.dtype)] * ggl)
         if options.iterations is None:
-            z, info = newton(r, path, z, s, factorize, options.tolerance, options.max_iterations)
+            z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
         else:
             for _ in range(options.iterations):
                 z = linearized_solve(r, path, z, factorize)
