@@ -25,7 +25,7 @@ from hhtjax.identification.arguments import (
     first_bad,
 )
 from hhtjax.identification.identifiability import warn_undetermined
-from hhtjax.identification.least_squares import BAD_START
+from hhtjax.identification.least_squares import BAD_START, NO_INFLUENCE
 from hhtjax.identification.problem import Data, solve
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.uncertainty import SEGMENTS
@@ -184,6 +184,8 @@ def _finished(caller, result, weights):
         raise ValueError(
             f"{caller}: `residuals` must be finite at params0; received {first_bad(result.residual)}{missing}."
         )
+    if result.code == NO_INFLUENCE:
+        raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")
     if result.uncertainty is not None:
         size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
         warn_undetermined(caller, result.params, result.free, result.uncertainty, size, stacklevel=3)
