@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.identification.refine import Refined, needed_levels
+from hhtjax.identification.refinement import Refined, needed_levels
 from hhtjax.numerics.richardson import richardson
 
 t = jnp.arange(0.0, 30.0, 0.35)

@@ -28,7 +28,7 @@ from hhtjax.identification.identifiability import warn_undetermined
 from hhtjax.identification.least_squares import BAD_START, NO_INFLUENCE
 from hhtjax.identification.problem import Data, solve
 from hhtjax.identification.result import FitResult
-from hhtjax.identification.uncertainty import SEGMENTS
+from hhtjax.identification.sandwich import SEGMENTS
 
 
 def fit(
@@ -78,7 +78,7 @@ def fit(
             residual and Jacobian columns. With optax: the relative change of the cost, five times running.
         covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
         segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
-            residuals are cut for the cluster covariance (`hhtjax.identification.uncertainty`).
+            residuals are cut for the cluster covariance (`hhtjax.identification.sandwich`).
         progress: print cost and step after every iteration, to stderr.
 
     Returns:

@@ -12,7 +12,7 @@ from hhtjax.identification import transforms as tf
 from hhtjax.identification.gauss_newton import with_jacobian
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
-from hhtjax.identification.uncertainty import SEGMENTS
+from hhtjax.identification.sandwich import SEGMENTS
 
 
 class Score(NamedTuple):
