@@ -26,6 +26,20 @@ import numpy as np
 from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_real
 
+__all__ = [
+    "cross",
+    "exp",
+    "hat",
+    "inverse_tangent",
+    "is_rotation",
+    "log",
+    "orthonormalize",
+    "product",
+    "tangent",
+    "tangent_rate",
+    "vee",
+]
+
 GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
 )

@@ -35,7 +35,9 @@ def test_predicted_bias_is_measured_and_taken_back():
     Numerical damping adds an error of h^3: so there are three fits, of which two alone would not take it out.
     """
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
-    with pytest.warns(hhtjax.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
+    with pytest.warns(
+        hhtjax.identification.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"
+    ):
         refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35)
     assert (refined.stepper, refined.dt) == (stepper, 0.35)
     found, fine, finest = refined.fits
@@ -116,7 +118,7 @@ def test_a_constraint_leaves_the_bias_of_the_minimal_form():
     assert float(bias.params["g"]) == pytest.approx(0.5 * w**2, rel=1e-6)
     assert float(bias.params["c"]) == pytest.approx(2.0 * 2 * zeta * w, rel=1e-6)
     state = stepper.init(hanging, bottom, jnp.zeros(2), HANGING, dt)
-    mu = np.linalg.eigvals(hhtjax.analysis.amplification_matrix(stepper, hanging, state, HANGING, dt=dt))
+    mu = np.linalg.eigvals(hhtjax.analysis.amplification_matrix(hanging, stepper, state, HANGING, dt=dt))
     assert np.min(np.abs(mu - np.exp(s * dt))) < 1e-9
 
 

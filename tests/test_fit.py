@@ -204,7 +204,7 @@ def test_undetermined_parameters_are_named():
         return {"r": params["a"] * params["b"] * t - 2.0 * t + params["c"] - 1.0}
 
     said = r"no standard error for a, b, unused\[0\]: .* a, b only through their product; unused\[0\] not at all"
-    with pytest.warns(hhtjax.IdentifiabilityWarning, match=said):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=said):
         result = hhtjax.fit(residuals, {"a": 1.0, "b": 1.5, "c": 0.3, "unused": jnp.ones(1)})
     assert float(result.params["a"] * result.params["b"]) == pytest.approx(2.0, rel=1e-6)
     assert np.isinf(result.standard_errors["a"])
@@ -213,7 +213,7 @@ def test_undetermined_parameters_are_named():
 
 
 def test_as_many_residuals_as_parameters():
-    with pytest.warns(hhtjax.IdentifiabilityWarning, match="as many residuals as parameters"):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match="as many residuals as parameters"):
         result = hhtjax.fit(lambda p: p - jnp.array([1.0, 2.0]), jnp.zeros(2))
     np.testing.assert_allclose(result.params, [1.0, 2.0])
     assert np.isinf(result.standard_errors).all()

@@ -16,10 +16,10 @@ that autodiff knows to be zero) may be left out. A rule names the parameters of 
 it does not understand runs on whole arrays.
 """
 
-from hhtjax.xla.explanation import explain
+from hhtjax.xla.explanation import Explanation, explain
 from hhtjax.xla.gate import plain
 from hhtjax.xla.kernels import choose, one_kernel, staged
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.scalars import on_scalars
 
-__all__ = ["choose", "explain", "linear_map", "on_scalars", "one_kernel", "plain", "staged"]
+__all__ = ["Explanation", "choose", "explain", "linear_map", "on_scalars", "one_kernel", "plain", "staged"]
