@@ -35,7 +35,9 @@ def test_predicted_bias_is_measured_and_taken_back():
     Numerical damping adds an error of h^3: so there are three fits, of which two alone would not take it out.
     """
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
-    with pytest.warns(hhtjax.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
+    with pytest.warns(
+        hhtjax.identification.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"
+    ):
         refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35)
     assert (refined.stepper, refined.dt) == (stepper, 0.35)
     found, fine, finest = refined.fits

@@ -162,12 +162,49 @@ def test_small_steps_under_damping_are_no_convergence():
     assert float(kinked.params) == pytest.approx(0.0, abs=1e-6)
 
 
+def lorenz(p, duration):
+    """Of which residuals grow by exp(0.9 t): here by 1e10."""
+
+    def rate(s):
+        return jnp.stack([10 * (s[1] - s[0]), s[0] * (p - s[2]) - s[1], s[0] * s[1] - 8 / 3 * s[2]])
+
+    def step(s, _):
+        middle = s + 0.005 * rate(s)
+        s = s + 0.01 * rate(middle)
+        return s, s
+
+    return jax.lax.scan(step, jnp.array([1.0, 1.0, 20.0]), None, length=round(100 * duration))[1]
+
+
+@pytest.mark.parametrize("duration", [25.0, 35.0])
+def test_a_small_step_into_a_steep_gradient_is_no_convergence(duration):
+    """Chaos calls every step small. The minimum itself is known by its gradient, or by a residual that is rounding."""
+    data = lorenz(28.0, duration)
+
+    def residuals(p):
+        return lorenz(p, duration) - data
+
+    lost = hhtjax.fit(residuals, 28.00001, covariance=False)
+    r, J = jnp.ravel(residuals(lost.params)), jnp.ravel(jax.jacfwd(residuals)(lost.params))
+    cosine = jnp.abs(r @ J) / jnp.linalg.norm(r) / jnp.linalg.norm(J)
+    assert not lost.converged or cosine < 1e-3
+    assert lost.iterations > 1
+    assert hhtjax.fit(residuals, 28.0, covariance=False).converged
+
+
+@pytest.mark.usefixtures("_promotion")
+@pytest.mark.parametrize("optimizer", [None, optax.lbfgs()])
+def test_residuals_that_do_not_depend_on_the_parameters_are_told(optimizer):
+    with pytest.raises(ValueError, match="fit: `residuals` must depend on params; their derivatives .* all zero"):
+        hhtjax.fit(lambda p: jnp.ones(4), {"k": 1.0}, optimizer, covariance=False)
+
+
 def test_undetermined_parameters_are_named():
     def residuals(params):
         return {"r": params["a"] * params["b"] * t - 2.0 * t + params["c"] - 1.0}
 
     said = r"no standard error for a, b, unused\[0\]: .* a, b only through their product; unused\[0\] not at all"
-    with pytest.warns(hhtjax.IdentifiabilityWarning, match=said):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=said):
         result = hhtjax.fit(residuals, {"a": 1.0, "b": 1.5, "c": 0.3, "unused": jnp.ones(1)})
     assert float(result.params["a"] * result.params["b"]) == pytest.approx(2.0, rel=1e-6)
     assert np.isinf(result.standard_errors["a"])
@@ -176,7 +213,7 @@ def test_undetermined_parameters_are_named():
 
 
 def test_as_many_residuals_as_parameters():
-    with pytest.warns(hhtjax.IdentifiabilityWarning, match="as many residuals as parameters"):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match="as many residuals as parameters"):
         result = hhtjax.fit(lambda p: p - jnp.array([1.0, 2.0]), jnp.zeros(2))
     np.testing.assert_allclose(result.params, [1.0, 2.0])
     assert np.isinf(result.standard_errors).all()

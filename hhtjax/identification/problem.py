@@ -14,7 +14,7 @@ from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options, check_
 from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
 from hhtjax.identification.least_squares import Objective, descend, levenberg_marquardt
 from hhtjax.identification.result import FitResult
-from hhtjax.identification.uncertainty import count_segments, uncertainty, variance_inflation
+from hhtjax.identification.sandwich import count_segments, uncertainty, variance_inflation
 
 
 class Data(NamedTuple):

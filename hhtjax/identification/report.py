@@ -15,7 +15,8 @@ from hhtjax.steppers.stepper import Stepper
 def summary(result) -> str:
     """The text of `FitResult.summary`."""
     size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
-    lines = [f"{result.reason}; {int(result.iterations)} iterations, cost {float(result.cost):.6g}, {size} residuals"]
+    cost = f"cost {float(result.cost):.6g}, {float(result.history.cost[0]):.6g} at the start"
+    lines = [f"{result.reason}; {int(result.iterations)} iterations, {cost}, {size} residuals"]
     names, values = parameter_names(result.params), _flat(result.params)
     rows = [["parameter", "estimate"]]
     columns = []
