@@ -13,7 +13,7 @@ from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_concrete
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
-from hhtjax.runs.loop import advance_from, as_solution, join_info, loop_of, show_progress
+from hhtjax.runs.loop import advance_from, as_solution, loop_of, show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_grid import (
     fit_to_samples,
@@ -23,7 +23,7 @@ from hhtjax.runs.sweep_grid import (
     require_steps_within,
     require_times,
 )
-from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.steppers.stepper import join_info, require_capable, require_stepper, require_system
 from hhtjax.systems.consistent import examine, require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
