@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.xla import gate, inspection, kernels, trial
+from hhtjax.xla import gate, inspection, kernels
 
 on_cpu = pytest.mark.skipif(
     jax.default_backend() != "cpu" or not gate.is_on(),

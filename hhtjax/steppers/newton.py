@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.numerics.linear_solve import invert_and_bound, solve_map
+from hhtjax.numerics.linear_solve import Trusted, invert_and_bound, solve_map
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems import kinematics
 from hhtjax.xla import staged
@@ -17,7 +17,7 @@ SHAKE, NOISE, SHAKES = 2, 32, 3  # roundings by which a state is changed; how mu
 
 
 def linearized_solve(r, path, w, factorize, at=None):
-    """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)).
+    """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)), and its `Info`.
 
     One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
     """
@@ -31,7 +31,22 @@ def linearized_solve(r, path, w, factorize, at=None):
         return value, along, tangent
 
     value, along, tangent = staged(expand, w.size)(w, at)
-    return w - solve_map(lambda dw: tangent(along(dw)), value, factorize)
+
+    def f(dw):
+        return tangent(along(dw))
+
+    dw = solve_map(f, value, factorize)
+    return w - dw, told(factorize, left_by(factorize, f, value, dw))
+
+
+def left_by(factorize, f, b, x):
+    """What x leaves of b = f(x), relative to it; None for the library's own solve, which needs no proof."""
+    return factorize.leaves(f, b, x) if isinstance(factorize, Trusted) else None
+
+
+def told(factorize, left, info=Info()):  # noqa: B008 (a tuple)
+    """The `Info` of a step with a solve that left so much."""
+    return info if left is None else info._replace(solve_residual=left, solved=factorize.accepts(left))
 
 
 def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
@@ -46,31 +61,36 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
 
     def search(f, w):
         def unfinished(carry):
-            _, value, iterations, converged = carry
+            _, value, iterations, converged, _ = carry
             return ~converged & (iterations < max_iterations) & jnp.all(jnp.isfinite(value))
 
         def improve(carry):
-            w0, _, iterations, _ = carry
+            w0, _, iterations, _, left = carry
             before, tangent = staged(partial(jax.linearize, f), w.size)(w0)
             inverse, terms = invert_and_bound(tangent, w, factorize)
-            w1 = w0 - inverse(before, trans=0)
+            dw = inverse(before, trans=0)
+            w1 = w0 - dw
             value = f(w1)
             limit = jnp.minimum(tolerance, RELATIVE * terms(w1))
             large = jnp.abs(value) > limit
             stalled = jnp.any(large & (jnp.abs(value) > 0.5 * jnp.abs(before)))
             small = ~jnp.any(large) | is_rounding(system, r, s, path(w1), value, limit, stalled)
-            return w1, value, iterations + 1, small
+            if left is not None:
+                left = jnp.maximum(left, left_by(factorize, tangent, before, dw))
+            return w1, value, iterations + 1, small, left
 
-        begin = w, jnp.zeros_like(w), jnp.zeros((), jnp.int32), jnp.array(False)
-        w, value, iterations, converged = lax.while_loop(unfinished, improve, begin)
+        left = jnp.zeros((), w.dtype) if isinstance(factorize, Trusted) else None
+        begin = w, jnp.zeros_like(w), jnp.zeros((), jnp.int32), jnp.array(False), left
+        w, value, iterations, converged, left = lax.while_loop(unfinished, improve, begin)
         # as floats: custom_root cannot differentiate past integers
-        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype))
+        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype), left)
 
     def tangent_solve(g, y):
         return solve_map(g, y, factorize)
 
-    w, (size, iterations, converged) = lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
-    return w, Info(size, iterations.astype(jnp.int32), converged > 0)
+    w, told_by_search = lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
+    size, iterations, converged, left = told_by_search
+    return w, told(factorize, left, Info(size, iterations.astype(jnp.int32), converged > 0))
 
 
 def is_rounding(system, r, s0, s1, value, limit, ask):
