@@ -195,7 +195,7 @@ def test_a_small_step_into_a_steep_gradient_is_no_convergence(duration):
 @pytest.mark.usefixtures("_promotion")
 @pytest.mark.parametrize("optimizer", [None, optax.lbfgs()])
 def test_residuals_that_do_not_depend_on_the_parameters_are_told(optimizer):
-    with pytest.raises(ValueError, match="fit: `residuals` must depend on params; their derivatives .* all zero"):
+    with pytest.raises(ValueError, match="fit: `residuals` must depend on params; their derivatives at params0"):
         hhtjax.fit(lambda p: jnp.ones(4), {"k": 1.0}, optimizer, covariance=False)
 
 

@@ -199,9 +199,8 @@ def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, pat
         quiet = jnp.where(jnp.abs(before - value) <= tolerance * value, quiet + 1, 0)
         code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(quiet >= patience, COST, code)
-        code = jnp.where(
-            jnp.all(gradient == 0), jnp.where((iteration == 0) & (value > 0), NO_INFLUENCE, GRADIENT), code
-        )
+        level = jnp.where((iteration == 0) & (value > 0), NO_INFLUENCE, GRADIENT)
+        code = jnp.where(jnp.all(gradient == 0), level, code)
         code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
         if progress:
             _show(iteration, value, step)

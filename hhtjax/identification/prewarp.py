@@ -68,7 +68,7 @@ def prewarped(params, flags, linear_part, rates, target, stiffness, free):
     def apart(x):
         off = np.concatenate([np.ravel(y) for y in unlike(x)])
         off[len(target.rates) :] *= GAIN_WEIGHT
-        return np.concatenate([off.real, off.imag])
+        return np.concatenate([np.real(off), np.imag(off)])
 
     start = np.zeros(len(at))
     x = _least_change(apart, start)
