@@ -88,10 +88,9 @@ class Objective(NamedTuple):
         """
         if self.loss is None:
             return self.scaled(r), self.scaled(J)
-        J, pull, bend = self.estimating(r, J)
-        slope = self.losses(r)[1]
-        row = jnp.sqrt(jnp.maximum(bend, LEAST_BEND * slope))
-        return pull / jnp.where(row == 0, 1, row), J * row[:, None]
+        r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
+        row = jnp.sqrt(jnp.maximum(slope + 2 * curvature * r**2, LEAST_BEND * slope))
+        return slope * r / jnp.where(row == 0, 1, row), J * row[:, None]
 
     def estimating(self, r, J):
         """w J, and the first and second derivative of the loss of each weighted residual (None without a loss: 1).
