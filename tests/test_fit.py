@@ -1,5 +1,6 @@
 """Least squares: known parameters recovered, uncertainty, stop reasons, and every complaint."""
 
+import math
 from itertools import product
 
 import jax
@@ -195,7 +196,7 @@ def test_a_small_step_into_a_steep_gradient_is_no_convergence(duration):
 @pytest.mark.usefixtures("_promotion")
 @pytest.mark.parametrize("optimizer", [None, optax.lbfgs()])
 def test_residuals_that_do_not_depend_on_the_parameters_are_told(optimizer):
-    with pytest.raises(ValueError, match="fit: `residuals` must depend on params; their derivatives .* all zero"):
+    with pytest.raises(ValueError, match="fit: `residuals` must depend on params; their derivatives at params0"):
         hhtjax.fit(lambda p: jnp.ones(4), {"k": 1.0}, optimizer, covariance=False)
 
 
@@ -204,8 +205,14 @@ def test_undetermined_parameters_are_named():
         return {"r": params["a"] * params["b"] * t - 2.0 * t + params["c"] - 1.0}
 
     said = r"no standard error for a, b, unused\[0\]: .* a, b only through their product; unused\[0\] not at all"
-    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=said):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=said) as warned:
         result = hhtjax.fit(residuals, {"a": 1.0, "b": 1.5, "c": 0.3, "unused": jnp.ones(1)})
+    assert warned[0].filename == __file__
+    lines = result.summary().splitlines()
+    assert lines[2].split() == ["a", f"{float(result.params['a']):.6g}", "undetermined"]
+    why = "undetermined: a, b, unused[0]: the residuals determine a, b only through their product; unused[0] not at all"
+    assert why in lines
+    assert "correlation" not in result.summary()
     assert float(result.params["a"] * result.params["b"]) == pytest.approx(2.0, rel=1e-6)
     assert np.isinf(result.standard_errors["a"])
     assert np.isfinite(result.standard_errors["c"])
@@ -217,6 +224,21 @@ def test_as_many_residuals_as_parameters():
         result = hhtjax.fit(lambda p: p - jnp.array([1.0, 2.0]), jnp.zeros(2))
     np.testing.assert_allclose(result.params, [1.0, 2.0])
     assert np.isinf(result.standard_errors).all()
+
+
+DATA = jnp.zeros(5)
+
+
+def against_a_global(p):
+    return p - DATA
+
+
+def test_a_function_is_known_by_its_identity(monkeypatch):
+    """Other data behind the same name are not seen; another function, or records, see them."""
+    assert float(hhtjax.fit(against_a_global, 2.0).params) == pytest.approx(0.0, abs=1e-9)
+    monkeypatch.setitem(globals(), "DATA", jnp.ones(5))
+    assert float(hhtjax.fit(against_a_global, 2.0).params) == pytest.approx(0.0, abs=1e-9)
+    assert float(hhtjax.fit(lambda p: against_a_global(p), 2.0).params) == pytest.approx(1.0)
 
 
 GOOD = jnp.zeros(4)
@@ -234,6 +256,20 @@ def rooted(p):
         (lambda: hhtjax.fit(lambda p: GOOD, {}), ValueError, "`params0` must hold at least one number; received {}"),
         (lambda: hhtjax.fit(lambda p: GOOD, {"k": 1j}), TypeError, r"`params0\['k'\]` must be a real .* received 1j"),
         (lambda: hhtjax.fit(lambda p: GOOD, {"k": "1"}), TypeError, r"`params0\['k'\]` must be a real .* received '1'"),
+        (
+            lambda: hhtjax.fit(lambda p: GOOD, np.array(["k"])),
+            TypeError,
+            r"`params0` must be a real .* received array",
+        ),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": len}), TypeError, r"`params0\['k'\]` must be a real .* function len"),
+        (lambda: hhtjax.fit(lambda p: {"r": "4"}, 1.0), TypeError, r"return real arrays; received '4' at \['r'\]"),
+        (
+            lambda: hhtjax.fit(lambda p: np.sin(p) + GOOD, 1.0),
+            TypeError,
+            "traceable by JAX, with jax.numpy in place of",
+        ),
+        (lambda: hhtjax.fit(lambda p: math.sin(p) + GOOD, 1.0), TypeError, "`residuals` must be traceable by JAX"),
+        (lambda: hhtjax.fit(lambda p: p if p > 0 else -p, 1.0), TypeError, "`residuals` must be traceable by JAX"),
         (lambda: hhtjax.fit(lambda p: GOOD, jnp.ones(2, complex)), TypeError, "`params0` must be real; received compl"),
         (lambda: hhtjax.fit(lambda p: GOOD, {"k": jnp.nan}), ValueError, r"`params0\['k'\]` must be finite; .* nan"),
         (lambda: hhtjax.fit(lambda p: GOOD, 1.0, max_iterations=0), ValueError, "`max_iterations` .* received 0"),

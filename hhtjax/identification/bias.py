@@ -59,8 +59,8 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t0=0.0, correct: Any 
         params: the fitted ones.
         q: an equilibrium, or another point about which the motion is small, on the constraint. v: 0 by default.
         correct: True returns `params` with the smallest relative changes that give the equations the eigenvalues s
-            and the steps' response to forces ("pre-warped"). This takes the bias out of all of them, if they can follow:
-            of a driven motion with masses, or gains of forces, that were fitted too, in every mode; and of the free
+            and the steps' response to forces ("pre-warped"). That takes the bias out of all of them where they can
+            follow: with masses fitted as well, entry by entry of M if there are several modes; or in the free
             vibration of one mode. Otherwise the fit was a compromise between response and eigenvalues that depends on
             the motion: then the frequencies alone are given back, damping stays as fitted, and a warning says so.
             Parameters that the linear part does not depend on stay as they are. Or Booleans for the leaves of params,

@@ -81,6 +81,10 @@ def fit(
             residuals are cut for the cluster covariance (`hhtjax.identification.sandwich`).
         progress: print cost and step after every iteration, to stderr.
 
+    A function is traced once, and then known by its identity: data that it reads from outside are part of the program,
+    and that an array has changed in place or a name been bound anew goes unnoticed. For other data make another
+    function, `lambda params: residuals(params, data)`, or pass them as `records`.
+
     Returns:
         A `FitResult`. Inside jit or vmap, look at `result.code`; outside, trouble is raised or warned about.
 
@@ -188,6 +192,6 @@ def _finished(caller, result, weights):
         raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")
     if result.uncertainty is not None:
         size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
-        warn_undetermined(caller, result.params, result.free, result.uncertainty, size, stacklevel=3)
+        warn_undetermined(caller, result.params, result.free, result.uncertainty, size, stacklevel=4)
     done = int(result.iterations) + 1
     return result._replace(history=jax.tree.map(lambda x: x[:done], result.history), segments=int(result.segments))

@@ -88,10 +88,9 @@ class Objective(NamedTuple):
         """
         if self.loss is None:
             return self.scaled(r), self.scaled(J)
-        J, pull, bend = self.estimating(r, J)
-        slope = self.losses(r)[1]
-        row = jnp.sqrt(jnp.maximum(bend, LEAST_BEND * slope))
-        return pull / jnp.where(row == 0, 1, row), J * row[:, None]
+        r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
+        row = jnp.sqrt(jnp.maximum(slope + 2 * curvature * r**2, LEAST_BEND * slope))
+        return slope * r / jnp.where(row == 0, 1, row), J * row[:, None]
 
     def estimating(self, r, J):
         """w J, and the first and second derivative of the loss of each weighted residual (None without a loss: 1).
@@ -199,9 +198,8 @@ def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, pat
         quiet = jnp.where(jnp.abs(before - value) <= tolerance * value, quiet + 1, 0)
         code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(quiet >= patience, COST, code)
-        code = jnp.where(
-            jnp.all(gradient == 0), jnp.where((iteration == 0) & (value > 0), NO_INFLUENCE, GRADIENT), code
-        )
+        level = jnp.where((iteration == 0) & (value > 0), NO_INFLUENCE, GRADIENT)
+        code = jnp.where(jnp.all(gradient == 0), level, code)
         code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
         if progress:
             _show(iteration, value, step)

@@ -59,16 +59,18 @@ def prewarped(params, flags, linear_part, rates, target, stiffness, free):
         return params, linear_part(params)
 
     def matrices(x):
-        return map(np.asarray, moved(x)[1])
+        M, C, K = moved(x)[1]
+        return np.asarray(M), np.asarray(C), np.asarray(K)
 
     def unlike(x):
-        now = motion(rates, *matrices(x), stiffness)
+        M, C, K = matrices(x)
+        now = motion(rates, M, C, K, stiffness)
         return now.rates / target.rates - 1, (now.response - target.response) / np.linalg.norm(target.response, axis=0)
 
     def apart(x):
         off = np.concatenate([np.ravel(y) for y in unlike(x)])
         off[len(target.rates) :] *= GAIN_WEIGHT
-        return np.concatenate([off.real, off.imag])
+        return np.concatenate([np.real(off), np.imag(off)])
 
     start = np.zeros(len(at))
     x = _least_change(apart, start)
