@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import hhtjax
-from hhtjax.identification.least_squares import BAD_START
+from hhtjax.identification.progress import BAD_START
 
 t = jnp.linspace(0.0, 3.0, 40)
 NOISE = 0.02 * np.random.default_rng(1).normal(size=t.size)
@@ -147,7 +147,7 @@ def test_many_parameters_take_an_optax_optimiser():
         ({"loss": "hubert"}, ValueError, "`loss` must be one of huber, soft_l1, cauchy, a function .* 'hubert'"),
         ({"prior": {"a": 1.0, "rate": None, "offset": None}}, TypeError, "`prior` must hold Gaussian.* received 1.0"),
         ({"prior": hhtjax.Gaussian(0.0, -1.0)}, ValueError, "`prior` must have a positive deviation; received -1.0"),
-        ({"segments": 1}, ValueError, "`segments` must be an integer of at least 2; received 1"),
+        ({"segments": 1}, ValueError, "`segments` must be an integer, 2 or more; received 1"),
     ],
 )
 def test_bad_options_are_named(options, error, message):

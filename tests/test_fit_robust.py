@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import hhtjax
-from hhtjax.identification.least_squares import LOSSES, Objective
+from hhtjax.identification.losses import LOSSES, Objective
 
 x = jnp.linspace(0.0, 10.0, 500)
 random = np.random.default_rng(0)

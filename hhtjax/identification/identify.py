@@ -6,6 +6,7 @@ with exact derivatives: Levenberg-Marquardt on forward-mode Jacobians for few pa
 optimiser on reverse-mode gradients for many.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -25,29 +26,29 @@ from hhtjax.identification.arguments import (
     first_bad,
 )
 from hhtjax.identification.identifiability import warn_undetermined
-from hhtjax.identification.least_squares import BAD_START, NO_INFLUENCE
 from hhtjax.identification.problem import Data, solve
+from hhtjax.identification.progress import BAD_START, NO_INFLUENCE
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 
 
 def fit(
-    residuals,
-    params0,
-    optimizer=None,
+    residuals: Callable[..., Any],
+    params0: Any,
+    optimizer: Any = None,
     *,
-    records=None,
-    starts=None,
-    transforms=None,
-    scale=None,
+    records: Any = None,
+    starts: Any = None,
+    transforms: Any = None,
+    scale: Any = None,
     weights: Any = True,
-    loss=None,
-    prior=None,
-    max_iterations=None,
-    tolerance=1e-8,
-    covariance=True,
-    segments=SEGMENTS,
-    progress=False,
+    loss: str | Callable[[Any], Any] | None = None,
+    prior: Any = None,
+    max_iterations: int | None = None,
+    tolerance: float = 1e-8,
+    covariance: bool = True,
+    segments: int = SEGMENTS,
+    progress: bool = False,
 ) -> FitResult:
     """The parameters that minimise the sum of squares of `residuals(params)`.
 
@@ -126,19 +127,19 @@ class Multistart(NamedTuple):
 
 
 def multistart(
-    residuals,
-    starts,
-    optimizer=None,
+    residuals: Callable[..., Any],
+    starts: Any,
+    optimizer: Any = None,
     *,
-    transforms=None,
-    scale=None,
+    transforms: Any = None,
+    scale: Any = None,
     weights: Any = True,
-    loss=None,
-    prior=None,
-    max_iterations=None,
-    tolerance=1e-8,
-    covariance=True,
-    segments=SEGMENTS,
+    loss: str | Callable[[Any], Any] | None = None,
+    prior: Any = None,
+    max_iterations: int | None = None,
+    tolerance: float = 1e-8,
+    covariance: bool = True,
+    segments: int = SEGMENTS,
 ) -> Multistart:
     """`fit` from several starts at once, vectorised.
 
