@@ -122,6 +122,17 @@ def test_many_starts_find_the_lowest_minimum():
     np.testing.assert_array_equal(np.flatnonzero(found.all.code == BAD_START), [4])
 
 
+def test_a_start_without_influence_is_no_best_one():
+    """Its cost is the lowest, and no derivative leads away from it."""
+
+    def residuals(p):
+        return jnp.where(p < 0, 0.1, p - 2.0 + jnp.array([1.0, -1.0, 1.0]))
+
+    assert float(hhtjax.multistart(residuals, jnp.array([-1.0, 1.0])).best.params) == pytest.approx(5 / 3)
+    with pytest.raises(ValueError, match="multistart: `residuals` must depend on params"):
+        hhtjax.multistart(residuals, jnp.array([-1.0, -2.0]))
+
+
 def test_many_parameters_take_an_optax_optimiser():
     """The program of 100 parameters is one reverse pass, and no Jacobian of 100 columns."""
     target = jnp.linspace(1.0, 2.0, 100)
