@@ -12,7 +12,7 @@ from hhtjax.identification import transforms as tf
 from hhtjax.identification.gauss_newton import with_jacobian
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
-from hhtjax.identification.uncertainty import SEGMENTS
+from hhtjax.identification.sandwich import SEGMENTS
 
 
 class Score(NamedTuple):
@@ -53,7 +53,7 @@ def score_test(residuals, params, candidates, segments=SEGMENTS) -> Score:
     >>> y = 2.0 * x + 0.5 * x**3 + 0.1 * jax.random.normal(jax.random.key(0), (400,))
     >>> model = lambda p, extra: p * x + extra["square"] * x**2 + extra["cube"] * x**3 - y
     >>> absent = {"square": 0.0, "cube": 0.0}
-    >>> found = hhtjax.score_test(model, hhtjax.fit(lambda p: model(p, absent), 1.0).params, absent)
+    >>> found = hhtjax.identification.score_test(model, hhtjax.fit(lambda p: model(p, absent), 1.0).params, absent)
     >>> dict(zip(found.names, (found.statistic > 10.8).tolist()))
     {'cube': True, 'square': False}
     """
@@ -82,7 +82,7 @@ def score_test(residuals, params, candidates, segments=SEGMENTS) -> Score:
 
 class Profile(NamedTuple):
     """values: of the parameter, and cost: the least one with it held there, (values,). deviance: 2 (cost - that of the
-    fit)/variance of a residual, corrected for correlated residuals; 3.84 bounds the 95 % interval."""
+    fit)/variance, scaled so that its parabola is that of the standard error; 3.84 bounds the 95 % interval."""
 
     values: Any
     cost: Any
@@ -121,12 +121,8 @@ def profile(residuals, result, name, values, **options: Any) -> Profile:
         )
         costs.append(float(held.cost))
         params = jax.tree.leaves(held.params)
-    size = sum(np.size(x) for x in leaves)
-    m = sum(np.size(x) for x in jax.tree.leaves(result.residual))
     row = int(np.flatnonzero(_flags(leaves, at))[0])
-    naive = result.embed(result.uncertainty.naive)[row, row]
-    inflation = float(result.covariance[row, row] / naive)
-    variance = 2 * float(result.cost) / (m - size) * inflation
+    variance = float(result.covariance[row, row] / result.embed(result.uncertainty.inverse)[row, row])
     return Profile(np.asarray(values), np.asarray(costs), 2 * (np.asarray(costs) - float(result.cost)) / variance)
 
 
@@ -144,7 +140,7 @@ def prediction_errors(predict, result, noise=0.0):
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.arange(100.0)
     >>> result = hhtjax.fit(lambda p: p * jnp.ones(100) - jnp.sin(t), 0.0)
-    >>> bool(hhtjax.prediction_errors(lambda p: 3 * p, result) == 3 * result.standard_errors)
+    >>> bool(hhtjax.identification.prediction_errors(lambda p: 3 * p, result) == 3 * result.standard_errors)
     True
     """
     x, unravel = ravel_pytree(result.params)
