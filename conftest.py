@@ -1,4 +1,4 @@
-"""For every test and doctest: double precision, no silent promotion of ranks or dtypes, and programs compiled quickly."""
+"""For every test and doctest: double precision, no silent promotion of ranks or dtypes, programs compiled quickly."""
 
 import ctypes
 import gc
