@@ -25,6 +25,7 @@ def residuals(params):
     return model(params) - MEASURED
 
 
+@pytest.mark.slow
 def test_transforms_keep_parameters_where_they_belong():
     """The same minimum in other coordinates, with the same errors; a bound that is felt; a fixed leaf untouched."""
     start = {"a": 20.0, "rate": 0.1, "offset": 0.0}
@@ -58,6 +59,7 @@ def test_no_coordinate_leaves_the_domain_of_its_transform(dtype):
         assert T.parameter(T.coordinate(p, 1.0), 1.0)[1] == pytest.approx(float(p[1]))
 
 
+@pytest.mark.slow
 def test_missing_samples_and_weights():
     """A missing sample, NaN or not, is as good as none; a weight of 2 as good as four samples."""
     gone = np.arange(t.size) % 3 == 0
@@ -106,6 +108,7 @@ def test_a_prior_is_one_more_measurement():
     assert float(result.standard_errors[0]) < 0.1 < np.sqrt(np.linalg.inv(X.T @ X)[0, 0])
 
 
+@pytest.mark.slow
 def test_many_starts_find_the_lowest_minimum():
     """One of them is none, which inside vmap is a flag."""
 

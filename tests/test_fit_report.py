@@ -54,6 +54,7 @@ def test_profile_is_the_parabola_of_the_standard_error(result):
         hhtjax.identification.profile(residuals, result, "k", values)
 
 
+@pytest.mark.slow
 def test_the_score_test_predicts_the_refit():
     def with_kink(params, candidates):
         return residuals(params | {"rest": (0.3,)})["y"] + (candidates["kink"] - 0.6) * jnp.maximum(x - 0.5, 0.0)

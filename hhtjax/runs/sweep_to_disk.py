@@ -14,7 +14,8 @@ import numpy as np
 
 from hhtjax.checks import require_integer
 from hhtjax.description import VERSION, is_concrete
-from hhtjax.runs.sweep import Inputs, run_sweep
+from hhtjax.runs.sweep import run_sweep
+from hhtjax.runs.sweep_inputs import Inputs
 
 
 def sweep_to_disk(

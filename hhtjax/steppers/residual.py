@@ -36,9 +36,14 @@ def hht_coefficients(alpha):
     return coefficients(0.0, -alpha)
 
 
+def weighted(weight, x):
+    """weight x; nothing at all, not even a product, for a weight that is the number 0."""
+    return 0.0 if isinstance(weight, float) and weight == 0 else weight * x
+
+
 def advance(c, s, dt, w):
     """Displacement from q, and the rest at t + dt, as an affine function of the new acceleration w."""
-    a = ((1 - c.alpha_f) * w + c.alpha_f * s.w - c.alpha_m * s.a) / (1 - c.alpha_m)
+    a = (weighted(1 - c.alpha_f, w) + weighted(c.alpha_f, s.w) - weighted(c.alpha_m, s.a)) / (1 - c.alpha_m)
     x = dt * s.v + dt**2 * ((0.5 - c.beta) * s.a + c.beta * a)
     v = s.v + dt * ((1 - c.gamma) * s.a + c.gamma * a)
     return x, v, w, a
