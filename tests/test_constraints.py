@@ -154,6 +154,7 @@ def test_multipliers_of_a_pendulum(formulation):
     np.testing.assert_allclose(energy, energy[0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_linear_solve_of_the_users_own():
     def by_numpy(A, b):
         return jnp.linalg.solve(A, b)
@@ -162,6 +163,7 @@ def test_a_linear_solve_of_the_users_own():
     np.testing.assert_allclose(run().q, theirs.q, rtol=1e-11, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_redundant_constraints_by_least_squares():
     """The same constraint twice: half of the multiplier each, and the same motion."""
 
@@ -180,6 +182,7 @@ def test_redundant_constraints_by_least_squares():
     np.testing.assert_allclose(path.multipliers.sum(axis=1), single.multipliers[:, 0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_singular_position_on_the_way_is_named():
     """Rows that are parallel at t = 1: the run names the step to there or from there, as rounding has it, and the row;
     least squares goes on."""

@@ -61,6 +61,7 @@ def test_a_conditional_on_an_argument_stays():
     assert paths(f, 1, 0.5) == ("one kernel",)
 
 
+@pytest.mark.slow
 @on_cpu
 def test_derivatives_and_batches_are_one_kernel_too():
     assert paths(jax.grad(loss), 2.0) == ("one kernel", "one kernel")
@@ -149,6 +150,7 @@ assert explain(by_hand, sharded).paths == ("one kernel",)
 """
 
 
+@pytest.mark.slow
 @on_cpu
 def test_a_program_divided_among_devices_is_plain():
     """In a process of its own, for there are two devices."""

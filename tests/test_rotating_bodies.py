@@ -249,6 +249,7 @@ def test_gradients(constrained):
     check_gradients(loss, [arguments, arguments | {"Om": 0 * one}])
 
 
+@pytest.mark.slow
 def test_dense_output():
     """Between saved times R is a rotation, right to the fourth order of their spacing."""
     scene = top.minimal(spin=20.0)
@@ -265,6 +266,7 @@ def test_dense_output():
     assert np.all(np.log2(np.array(errors[1]) / np.array(errors[0])) > 3.6)
 
 
+@pytest.mark.slow
 def test_float32_and_batches():
     """The dtype is kept; a batch is its members."""
     inertia = np.array([1.0, 2.0, 3.0], np.float32)
@@ -319,6 +321,7 @@ def test_bad_input():
             call()
 
 
+@pytest.mark.slow
 def test_inconsistent_velocity():
     """Of the rod of the top, named with its size and with the way out."""
     scene = top.constrained()

@@ -96,6 +96,7 @@ def test_coefficients():
     assert np.all(error[4] < 5e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ORDERS)
 def test_derivatives_of_coefficients(order):
     """Forward, with relative errors of the series and absolute ones beyond; and reverse, of a random combination."""
@@ -117,6 +118,7 @@ def test_hat_is_the_cross_product_and_vee_its_inverse():
     assert_close(vee(hat(x) + np.outer(y, y)), x, 4 * EPS)
 
 
+@pytest.mark.slow
 def test_exp_is_the_matrix_exponential():
     R = batched(exp)(ALL)
     assert_close(R, turns(ALL), 4e-15)
@@ -206,7 +208,7 @@ def random_weights(shape, order):
     return [rng.uniform(-1, 1, shape), *rng.uniform(-1, 1, (order - 1, 3))]
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("order", [1, *(pytest.param(order, marks=pytest.mark.slow) for order in (2, 3))])
 @pytest.mark.parametrize("f", [exp, tangent, inverse_tangent])
 def test_derivatives(f, order):
     """Forward mode, reverse mode, and fourth-order central differences of the derivative before."""
