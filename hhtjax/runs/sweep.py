@@ -280,7 +280,7 @@ def run_sweep(system, data, dts, duration, t0, times, *, mapped, num_samples, la
     back = jnp.asarray(np.argsort(dealt.ravel()))[jnp.argsort(order)]
     if mesh is not None:  # gathered before they are put in order: a sum over devices would lose the sign of zeros
         runs = lax.with_sharding_constraint(runs, NamedSharding(mesh, PartitionSpec()))
-    runs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[back], runs)
+    runs = jax.tree.map(lambda x: x.reshape(dealt.size, *x.shape[2:])[back], runs)
     if times is None:
         times = t0 + H * jnp.arange(num_samples + 1).astype(dtype)
     return runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))

@@ -50,6 +50,8 @@ def whole(value, aval):
     """The array of a value."""
     if not is_in_pieces(value):
         return value
+    if not value.size:
+        return jnp.zeros(aval.shape, aval.dtype)
     elements = [jnp.asarray(x, aval.dtype) for x in value.flat]
     return jnp.stack(elements).reshape(aval.shape) if aval.shape else elements[0]
 

@@ -69,8 +69,12 @@ def _work(jaxpr):
 
 
 def split(tree):
-    """The tree with `Scalars` for its small arrays."""
-    return jax.tree.map(lambda x: Scalars(tuple(pieces(x).flat), x.shape) if x.ndim and is_small(x) else x, tree)
+    """The tree with `Scalars` for its small arrays; scalars and empty arrays stay."""
+
+    def scalars(x):
+        return Scalars(tuple(pieces(x).flat), x.shape) if x.ndim and x.size and is_small(x) else x
+
+    return jax.tree.map(scalars, tree)
 
 
 class Form(NamedTuple):
@@ -132,8 +136,8 @@ def _dtype(x):
 
 
 def _as_scalars(value, like):
-    if not is_in_pieces(value):
-        return value
+    if not is_in_pieces(value) or not value.size:
+        return whole(value, like)
     elements = tuple(jnp.asarray(x, like.dtype) for x in value.flat)
     return Scalars(elements, like.shape) if like.shape else elements[0]
 
@@ -229,6 +233,8 @@ def _layout(variables):
 
 
 def _while_loop(eqn, *values):
+    if eqn.params["cond_jaxpr"].out_avals[0].shape:  # a batch, whose members end at different times
+        return None
     params, flat, back = eqn.params, *_layout(eqn.outvars)
     first = params["cond_nconsts"]
     second = first + params["body_nconsts"]
