@@ -311,7 +311,7 @@ def test_shared_values_are_computed_once():
         def run(x):
             return kernels.one_kernel(lambda x: jax.lax.scan(body, x, None, 99)[0], x)
 
-        return jax.jit(run).lower(jnp.ones(N)).compile().as_text().count(" sine(")
+        return str(jax.jit(run).lower(jnp.ones(N)).compile().as_text()).count(" sine(")
 
     assert sines(partial(kernels.staged, size=N)) == 1
     assert sines(partial(kernels.staged, size=1)) == 2  # fused into both users
