@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import hhtjax
-from hhtjax.identification.least_squares import BAD_START
+from hhtjax.identification.progress import BAD_START
 
 t = jnp.linspace(0.0, 3.0, 40)
 NOISE = 0.02 * np.random.default_rng(1).normal(size=t.size)
@@ -125,6 +125,17 @@ def test_many_starts_find_the_lowest_minimum():
     np.testing.assert_array_equal(np.flatnonzero(found.all.code == BAD_START), [4])
 
 
+def test_a_start_without_influence_is_no_best_one():
+    """Its cost is the lowest, and no derivative leads away from it."""
+
+    def residuals(p):
+        return jnp.where(p < 0, 0.1, p - 2.0 + jnp.array([1.0, -1.0, 1.0]))
+
+    assert float(hhtjax.multistart(residuals, jnp.array([-1.0, 1.0])).best.params) == pytest.approx(5 / 3)
+    with pytest.raises(ValueError, match="multistart: `residuals` must depend on params"):
+        hhtjax.multistart(residuals, jnp.array([-1.0, -2.0]))
+
+
 def test_many_parameters_take_an_optax_optimiser():
     """The program of 100 parameters is one reverse pass, and no Jacobian of 100 columns."""
     target = jnp.linspace(1.0, 2.0, 100)
@@ -150,7 +161,7 @@ def test_many_parameters_take_an_optax_optimiser():
         ({"loss": "hubert"}, ValueError, "`loss` must be one of huber, soft_l1, cauchy, a function .* 'hubert'"),
         ({"prior": {"a": 1.0, "rate": None, "offset": None}}, TypeError, "`prior` must hold Gaussian.* received 1.0"),
         ({"prior": hhtjax.Gaussian(0.0, -1.0)}, ValueError, "`prior` must have a positive deviation; received -1.0"),
-        ({"segments": 1}, ValueError, "`segments` must be an integer of at least 2; received 1"),
+        ({"segments": 1}, ValueError, "`segments` must be an integer, 2 or more; received 1"),
     ],
 )
 def test_bad_options_are_named(options, error, message):
