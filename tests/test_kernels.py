@@ -322,7 +322,9 @@ GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged", "hhtjax_one_ke
 
 def of_all_kinds(params):
     """A run by a function that was jitted outside, with a choice, stages, scalars and a matrix of a linear map."""
-    return jax.value_and_grad(jax.jit(lambda p: jax.jit(loss)(p)))(params)
+    return jax.value_and_grad(
+        jax.jit(lambda p: jax.jit(loss)(p * kernels.choose(jnp.sign, jnp.sign, jax.lax.stop_gradient(p))))
+    )(params)
 
 
 @on_cpu
