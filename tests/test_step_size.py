@@ -100,7 +100,7 @@ def test_modes_that_only_decay_are_no_answer_for_a_nonlinear_system():
         return -100 * q - 50 * jnp.tanh(v / 1e-3)
 
     system, start = hhtjax.System(np.ones(1), force), (jnp.ones(1), jnp.zeros(1))
-    with pytest.raises(ValueError, match="no mode of the `system` oscillates or grows at q0, v0.*give a `duration`"):
+    with pytest.raises(ValueError, match=r"no mode of the `system` oscillates or grows at q0, v0.*give a `duration`"):
         analysis.suggest_step_size(system, hhtjax.hht(), *start)
     moving = analysis.suggest_step_size(system, hhtjax.hht(), start[0], jnp.ones(1))
     assert moving.dt < 0.1

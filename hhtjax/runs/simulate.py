@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_number, require_params
 from hhtjax.description import is_concrete
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.extrapolate import MOST, extrapolated
@@ -71,6 +71,7 @@ def simulate(
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
+    require_params("simulate", params)
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
     q0, v0 = initial_values("simulate", system, q0, v0)

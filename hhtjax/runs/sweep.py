@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_number, require_params
 from hhtjax.description import is_array, is_concrete
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
@@ -118,6 +118,7 @@ class Inputs(NamedTuple):
         """An error that names what is wrong, or the inputs."""
         require_system("sweep", system)
         require_stepper("sweep", stepper)
+        require_params("sweep", params)
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
         dts = require_step_sizes(dts)
