@@ -128,3 +128,17 @@ def test_a_gradient_that_is_rounding_is_none():
         ValueError, match=r"`constraint` rows \[1\] have no gradient in q at the start but for rounding"
     ):
         run(System(np.ones(2), pull, constraint))
+
+
+def test_functions_are_told_apart_by_identity():
+    """What the docstring of `simulate` says of globals, and of the way round."""
+    stiffness = [1.0]
+
+    def define():
+        return lambda q, v, t, params: -stiffness[0] * q
+
+    force = define()
+    before = run(System(np.ones(2), force)).q
+    stiffness[0] = 2.0
+    np.testing.assert_array_equal(run(System(np.ones(2), force)).q, before)
+    assert (run(System(np.ones(2), define())).q[-1] < before[-1]).all()

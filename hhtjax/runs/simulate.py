@@ -46,7 +46,9 @@ def simulate(
     Differentiable, forward and reverse, in dt, t0, params, q0, v0 and the numbers of the stepper; reverse
     mode computes the steps again, in blocks, and its memory grows with the square root of num_steps.
     Compiled once for each system, stepper, structure, num_steps and save_every; a new dt, q0 or params
-    costs no compilation.
+    costs no compilation. Functions are told apart by identity, here as in `fit`: one that reads a global variable, or
+    data around it, keeps the values of its first call. Pass through params what may change, or define the function
+    anew, or call `jax.clear_caches()`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate

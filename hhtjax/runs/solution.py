@@ -105,7 +105,8 @@ class Solution(NamedTuple):
                 f"row {row - 1} of the constraint depends on the rows before it: the position is singular. Give the "
                 'stepper redundant="least_squares", or formulate the constraint anew'
             )
-        if not all(np.isfinite(np.asarray(x)[(*member, 0)]).all() for x in jax.tree.leaves(self.acceleration)):
+        started = [x for x in jax.tree.leaves(self.acceleration) if is_concrete(x)]
+        if not all(np.isfinite(np.asarray(x)[(*member, 0)]).all() for x in started):
             return (
                 "the acceleration is not finite at the start already: there the mass is singular, or a function of the "
                 "system not finite"
