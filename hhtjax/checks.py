@@ -1,16 +1,20 @@
 """Checks of arguments that every floor makes: they name the caller, the argument, and what was received."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import is_concrete, is_real
+from hhtjax.description import is_array, is_concrete, is_real
 
 
 def require_number(caller, name, value, valid, expectation):
     """The value as it is, if it is a real scalar within its range; a tracer passes unchecked."""
     if not is_real(value) or jnp.ndim(value) != 0:
-        raise TypeError(f"{caller}: `{name}` must be a real number; received {value!r}.")
+        large = is_array(value) and jnp.ndim(value) and (jnp.size(value) > 4 or not is_concrete(value))
+        shown = f"an array of shape {jnp.shape(value)}" if large else repr(value)
+        raise TypeError(f"{caller}: `{name}` must be a real number; received {shown}.")
     if is_concrete(value) and not valid(value):
         raise ValueError(f"{caller}: `{name}` must {expectation}; received {value}.")
     return value
@@ -35,6 +39,39 @@ def require_function(caller, name, value, signature):
             f"{caller}: `{name}` must be hashable, because it is static under jit; received {value!r}. "
             "Pass arrays through params."
         ) from None
+    names = _argument_names(value)
+    if _in_other_order(names, signature[signature.index("(") + 1 : -1].split(", ")):
+        raise TypeError(
+            f"{caller}: `{name}` must be a function {signature}; received one with the arguments ({', '.join(names)})."
+        )
+
+
+def _argument_names(function):
+    try:
+        return list(inspect.signature(function).parameters)
+    except (TypeError, ValueError):  # it does not tell
+        return []
+
+
+def _in_other_order(names, expected):
+    """Whether a time, by its name, is in the place of something else, or q and v change places."""
+    names = ["t" if name == "time" else name for name in names[: len(expected)]]
+    places = {name: i for i, name in enumerate(names) if name in expected}
+    if "t" in places and places["t"] != expected.index("t"):
+        return True
+    return "q" in places and "v" in places and places["q"] > places["v"]
+
+
+def require_params(caller, params):
+    """An error that names what is no number among the params: text, functions, objects."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        data = is_array(leaf) or hasattr(leaf, "__jax_array__") or isinstance(leaf, (bool, int, float, complex))
+        if not data or (isinstance(leaf, np.ndarray) and leaf.dtype.kind in "OUSMm"):
+            shown = f"an array of {leaf.dtype}" if isinstance(leaf, np.ndarray) else repr(leaf)
+            raise TypeError(
+                f"{caller}: `params{jax.tree_util.keystr(path)}` must be an array or a number; received {shown}. What "
+                "is none of them belongs into the functions of the system."
+            )
 
 
 def describe(x):

@@ -97,7 +97,8 @@ def _energy_balance(system, solution, params, potential):
     def over_interval(first, between, last, H):
         """Simpson's rule; a held input has the value that it has inside."""
         inside = held.held_at(params, between[2])
-        return H / 6 * (power(*first, inside) + 4 * power(*between, inside) + power(*last, inside))
+        P, P_middle, P_end = (power(q, v, t, L, inside) for q, v, t, L in (first, between, last))
+        return H / 6 * (P + 4 * P_middle + P_end)
 
     work = jnp.cumsum(jax.vmap(over_interval)(first, at_middle, last, H))
     work = jnp.concatenate([jnp.zeros_like(t[:1]), work])

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_integer, require_number
+from hhtjax.checks import require_integer, require_number, require_params
 from hhtjax.description import is_concrete
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.extrapolate import MOST, extrapolated
@@ -46,7 +46,9 @@ def simulate(
     Differentiable, forward and reverse, in dt, t0, params, q0, v0 and the numbers of the stepper; reverse
     mode computes the steps again, in blocks, and its memory grows with the square root of num_steps.
     Compiled once for each system, stepper, structure, num_steps and save_every; a new dt, q0 or params
-    costs no compilation.
+    costs no compilation. Functions are told apart by identity, here as in `fit`: one that reads a global variable, or
+    data around it, keeps the values of its first call. Pass through params what may change, or define the function
+    anew, or call `jax.clear_caches()`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate
@@ -70,6 +72,7 @@ def simulate(
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
+    require_params("simulate", params)
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
     q0, v0 = initial_values("simulate", system, q0, v0)

@@ -62,6 +62,10 @@ class Solution(NamedTuple):
         """
         if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t)))):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
+        dt = np.asarray(self.dt)
+        if not np.all(np.isfinite(dt) & (dt > 0)):
+            bad = dt[~(np.isfinite(dt) & (dt > 0))].flat[0]
+            raise SimulationError(f"simulate: `dt` must be positive and finite; it was {bad:g}.")
         steps = np.asarray(self.failure.step)
         strays = np.zeros_like(steps)
         if reach is not None:
@@ -100,6 +104,12 @@ class Solution(NamedTuple):
             return (
                 f"row {row - 1} of the constraint depends on the rows before it: the position is singular. Give the "
                 'stepper redundant="least_squares", or formulate the constraint anew'
+            )
+        started = [x for x in jax.tree.leaves(self.acceleration) if is_concrete(x)]
+        if not all(np.isfinite(np.asarray(x)[(*member, 0)]).all() for x in started):
+            return (
+                "the acceleration is not finite at the start already: there the mass is singular, or a function of the "
+                "system not finite"
             )
         names = ("the position", "y", "y'") if self.acceleration is None else QUANTITIES
         return f"{names[quantity]} is not finite. Take a smaller dt, or another linearize=, or a method that damps"

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_number, require_params
 from hhtjax.description import is_array, is_concrete
 from hhtjax.runs.sweep_grid import require_one_grid, require_step_sizes, require_steps_within, require_times
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
@@ -34,6 +34,7 @@ class Inputs(NamedTuple):
         """An error that names what is wrong, or the inputs."""
         require_system("sweep", system)
         require_stepper("sweep", stepper)
+        require_params("sweep", params)
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
         dts = require_step_sizes(dts)

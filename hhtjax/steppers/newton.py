@@ -75,8 +75,8 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
             large = jnp.abs(value) > limit
             stalled = jnp.any(large & (jnp.abs(value) > 0.5 * jnp.abs(before)))
             small = ~jnp.any(large) | is_rounding(system, r, s, path(w1), value, limit, stalled)
-            if left is not None:
-                left = jnp.maximum(left, left_by(factorize, tangent, before, dw))
+            if isinstance(factorize, Trusted):
+                left = jnp.maximum(left, factorize.leaves(tangent, before, dw))
             return w1, value, iterations + 1, small, left
 
         left = jnp.zeros((), w.dtype) if isinstance(factorize, Trusted) else None

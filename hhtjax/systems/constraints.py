@@ -23,6 +23,8 @@ from hhtjax.numerics.linear_solve import (
 )
 from hhtjax.xla import linear_map, staged
 
+GRADIENT = 64  # roundings below which the gradient of a constraint is none
+
 
 def violation(system, q, v, t, params):
     """Phi, and dPhi/dt = B v + Phi_t: (m,) each."""
@@ -91,10 +93,11 @@ def factorize_constrained(n, redundant):
 def require_independent(caller, B):
     """An error that names the rows of B that depend on each other."""
     size = np.linalg.norm(B, axis=1)
-    empty = np.flatnonzero(~(np.isfinite(size) & (size > 0))).tolist()
+    empty = np.flatnonzero(~(np.isfinite(size) & (size > GRADIENT * np.finfo(B.dtype).eps))).tolist()
     if empty:
         raise ValueError(
-            f"{caller}: `constraint` rows {empty} have no gradient in q at the start, or not a finite one."
+            f"{caller}: `constraint` rows {empty} have no gradient in q at the start but for rounding, or not a finite "
+            "one."
         )
     left, values, _ = np.linalg.svd(B / size[:, None])
     dependent = left[:, values < RANK_TOLERANCE]

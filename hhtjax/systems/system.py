@@ -13,6 +13,9 @@ from hhtjax.checks import require_function
 from hhtjax.description import Description, is_array, is_concrete, is_real
 from hhtjax.numerics.linear_solve import matvec
 
+LARGEST_CHECKED = 256  # rows of a constant mass matrix whose eigenvalues are looked at
+SYMMETRIC = 1e-6  # relative size of M - M^T that passes
+
 
 @dataclass(frozen=True, eq=False)
 class System(Description):
@@ -36,7 +39,7 @@ class System(Description):
 
     Raises:
         TypeError: `mass`, `force`, `constraint` or `inertia` is not callable (or an array, for `mass`).
-        ValueError: a constant `mass` of a wrong shape, or not finite.
+        ValueError: a constant `mass` of a wrong shape, not finite, not symmetric or not positive definite.
 
     Example: a pendulum of length 2 m, with q the angle from the downward vertical in rad.
 
@@ -66,7 +69,9 @@ class System(Description):
         if callable(self.mass):
             require_function("System", "mass", self.mass, "mass(q, params)")
         else:
-            object.__setattr__(self, "mass", _constant_matrix("System", "mass", self.mass))
+            mass = _constant_matrix("System", "mass", self.mass)
+            _require_mass("System", "mass", mass, self.constraint is not None)
+            object.__setattr__(self, "mass", mass)
 
     @classmethod
     def from_lagrangian(cls, lagrangian, force=None):
@@ -175,6 +180,16 @@ class LinearSystem(Description):
             else:
                 matrix = _constant_matrix("LinearSystem", name, matrix)
             object.__setattr__(self, name, matrix)
+        known = [name for name in "MCK" if is_array(getattr(self, name))]
+        for name in known[1:]:
+            n, shape = len(getattr(self, known[0])), getattr(self, name).shape
+            if shape[0] != n:
+                raise ValueError(
+                    f"LinearSystem: `{name}` must have shape ({n}, {n}), or ({n},) for a diagonal, to fit "
+                    f"`{known[0]}`; received shape {shape}."
+                )
+        if is_array(self.M):
+            _require_mass("LinearSystem", "M", self.M)
         if force is not None:
             require_function("LinearSystem", "force", force, "force(t, params)")
         object.__setattr__(self, "load", force)
@@ -258,3 +273,24 @@ def _constant_matrix(caller, name, received):
     if is_concrete(value) and not np.all(np.isfinite(value)):
         raise ValueError(f"{caller}: `{name}` must be finite; received {value!r}.")
     return value
+
+
+def _require_mass(caller, name, M, massless=False):
+    """An error for a constant M that is not symmetric, or not positive definite; with constraints it may be singular.
+
+    In units in which its diagonal is 1. Tracers pass, and what is too large for a look at each run.
+    """
+    if not is_concrete(M) or len(M) > LARGEST_CHECKED:
+        return
+    M = np.asarray(M)
+    d = M if M.ndim == 1 else np.diagonal(M)
+    smallest, rounding = np.min(d), 0.0
+    if M.ndim == 2 and smallest > 0:
+        scaled = M / np.sqrt(np.outer(d, d))
+        if np.max(np.abs(scaled - scaled.T)) > SYMMETRIC:
+            raise ValueError(f"{caller}: `{name}` must be symmetric; received one that differs from its transpose.")
+        smallest = np.linalg.eigvalsh(scaled)[0]
+        rounding = 4 * len(M) * float(np.finfo(np.result_type(M, np.float32)).eps)
+    if smallest < -rounding or (not massless and smallest <= rounding):
+        what = "singular" if smallest >= -rounding else "not"
+        raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is {what}.")
