@@ -13,7 +13,7 @@ import pytest
 
 # Most of the time goes into compiling small programs, which need not run fast. `XLA_FLAGS=` of one's own comes first.
 QUICK = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": "false"}
-LARGE = 1_000_000_000  # bytes of a test process, above which it forgets its compiled programs
+LARGE = 600_000_000  # bytes of a test process, above which it forgets its compiled programs
 
 
 def is_known(flag):

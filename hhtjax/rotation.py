@@ -20,6 +20,7 @@ Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 
 from math import factorial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -49,7 +50,7 @@ C4, C5 = ([1 / factorial(2 * j + k) for j in TERMS] for k in (4, 5))
 ARCTANGENT = [1 / (2 * k + 1) for k in range(16)]  # arctan(z) / z in powers of -z^2: likewise for z < 1/4
 
 
-def hat(x):
+def hat(x) -> jax.Array:
     """The matrix (3, 3) of the cross product with x (3,): hat(x) y = x cross y.
 
     >>> print(hat(jnp.array([1.0, 2.0, 3.0])))
@@ -61,7 +62,7 @@ def hat(x):
     return jnp.sum(x[:, None, None] * structural(GENERATORS.astype(x.dtype)), axis=0)
 
 
-def vee(X):
+def vee(X) -> jax.Array:
     """The inverse of `hat`: x (3,) with hat(x) = X; if X (3, 3) is not skew, that of (X - X^T)/2.
 
     >>> print(vee(hat(jnp.array([1.0, 2.0, 3.0]))))
@@ -71,7 +72,7 @@ def vee(X):
     return jnp.sum(X[None, :, :] * structural(GENERATORS.astype(X.dtype)), axis=(1, 2)) / 2
 
 
-def exp(psi):
+def exp(psi) -> jax.Array:
     """R (3, 3) = I + c1 P + c2 P^2, the rotation by psi (3,), in rad (Rodrigues); orthogonal to rounding.
 
     >>> print((exp(jnp.array([0.0, 0.0, jnp.pi / 2])) @ jnp.array([1.0, 0.0, 0.0])).round(6) + 0.0)
@@ -82,7 +83,7 @@ def exp(psi):
     return _polynomial(psi, c1, c2)
 
 
-def log(R):
+def log(R) -> jax.Array:
     """psi (3,), in rad, with exp(psi) = R and |psi| <= pi, for a rotation R (3, 3). Accurate to rounding at all angles.
 
     At |psi| = pi, where psi and -psi are the same rotation, the largest component of the result is positive if R is
@@ -110,7 +111,7 @@ def log(R):
     return 2 * jnp.where(small, series, jnp.arctan2(far, q0) / far) * q
 
 
-def tangent(psi):
+def tangent(psi) -> jax.Array:
     """T (3, 3) = I - c2 P + c3 P^2 for psi (3,), in rad: Om = T psidot is the rate of R0 exp(psi), for any constant R0.
 
     T^T takes moments from material components to those that work on psi. det T = 2 c2, so T is singular at 2 pi.
@@ -124,7 +125,7 @@ def tangent(psi):
     return _polynomial(psi, -c2, c3)
 
 
-def inverse_tangent(psi):
+def inverse_tangent(psi) -> jax.Array:
     """T^-1 (3, 3) = I + P/2 + d P^2 for psi (3,), in rad: psidot = T^-1 Om.
 
     It grows without bound towards |psi| = 2 pi, where T is singular: there the result is inf, NaN or only rounding.
@@ -139,7 +140,7 @@ def inverse_tangent(psi):
     return _polynomial(psi, 0.5, inverse_coefficient(jnp.sum(psi**2)))
 
 
-def tangent_rate(psi, psidot):
+def tangent_rate(psi, psidot) -> jax.Array:
     """Tdot psidot (3,), in rad/s^2, while psi (3,) changes by psidot (3,), in rad/s: Omdot = T psiddot + Tdot psidot.
 
         Tdot psidot = xdot (-dc2/dx P + dc3/dx P^2) psidot + c3 psidot x (psi x psidot),    xdot = 2 psi.psidot
@@ -154,7 +155,7 @@ def tangent_rate(psi, psidot):
     return jnp.sum(psi * psidot) * stretch + c3 * cross(psidot, first)
 
 
-def orthonormalize(R):
+def orthonormalize(R) -> jax.Array:
     """R (3, 3) with its distance from the nearest rotation squared: one step R (3 I - R^T R)/2 of Newton and Schulz.
 
     For products of many rotations, whose rounding errors add up. At a rotation, its derivative takes dR to the part
@@ -179,7 +180,7 @@ def is_rotation(R, tolerance):
     return (error <= tolerance) & (jnp.linalg.det(R) > 0)
 
 
-def product(A, B):
+def product(A, B) -> jax.Array:
     """A B (3, 3) elementwise: XLA fuses it, and keeps float32 at full precision on every device.
 
     >>> print(product(hat(jnp.array([1.0, 0.0, 0.0])), jnp.eye(3))[2])
@@ -188,7 +189,7 @@ def product(A, B):
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
 
-def cross(x, y):
+def cross(x, y) -> jax.Array:
     """x cross y, for (3,) each; of scalars, which XLA fuses better than the gathers of jnp.cross."""
     (a, b, c), (d, e, f) = x, y
     return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d])

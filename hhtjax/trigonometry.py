@@ -42,7 +42,7 @@ COSINE = (
 
 
 @jax.custom_jvp
-def sincos(x):
+def sincos(x) -> tuple[jax.Array, jax.Array]:
     """(sin x, cos x) for x in rad, elementwise.
 
         x = k pi/2 + r,  |r| <= pi/4,    sin r = r + r^3 S(r^2),    cos r = 1 - r^2/2 + r^4 C(r^2)
@@ -111,11 +111,11 @@ def _polynomial(coefficients, z):
     return value
 
 
-def sin(x):
+def sin(x) -> jax.Array:
     """The sine of `sincos`."""
     return sincos(x)[0]
 
 
-def cos(x):
+def cos(x) -> jax.Array:
     """The cosine of `sincos`."""
     return sincos(x)[1]

@@ -56,7 +56,7 @@ CONSTRAINT = System(np.ones(1), _nothing, _itself)
 TEST_EQUATION = FirstOrderSystem(_complex_product)
 
 
-def amplification_matrix(system, stepper, state, params=None, *, dt):
+def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Array:
     """A, the derivative of one step at a state, with respect to x = (q, h v, h^2 w, h^2 a, h^2 L, memory): (k, k).
 
     Constrained or not: of a nonlinear system it is the tangent of the flow of the step, which near an equilibrium, or
@@ -134,7 +134,7 @@ def _carried(step, state, increments):
     return np.concatenate([np.full(x.size, c) for x, c in zip(leaves, changed[1:], strict=True)])  # without t
 
 
-def oscillator_matrix(stepper, frequency, damping=0.0):
+def oscillator_matrix(stepper, frequency, damping=0.0) -> jax.Array:
     """A of the test oscillator, on (q, h v, h^2 w, h^2 a, memory) as far as the stepper carries them: (k, k).
 
     Args:
@@ -176,7 +176,7 @@ def oscillator_params(caller, frequency, damping):
     return 2 * zeta * W, W**2
 
 
-def constraint_matrix(stepper):
+def constraint_matrix(stepper) -> jax.Array:
     """A of one coordinate that a constraint holds, q = 0, on (q, h v, h^2 w, h^2 a, h^2 L): (5, 5), the same for all h.
 
     On B q, B v, B w, B a any constrained system at an equilibrium has this matrix, once for each constraint. In the

@@ -60,7 +60,7 @@ def _blocks(A, members, tolerance):
     return tuple(int(np.sum(at_least > i)) for i in range(at_least[0]))
 
 
-def transient_growth(matrix, num_steps, near=None):
+def transient_growth(matrix, num_steps, near=None) -> np.ndarray:
     """|D23| of Cardona, Geradin (1989), Fig. 1, from the powers of A, for n = 0 .. num_steps: (num_steps + 1,).
 
     What A^n does in the invariant subspace of an eigenvalue mu beyond multiplying by mu^n, relative to the first step:

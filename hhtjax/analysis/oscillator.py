@@ -22,7 +22,7 @@ def _principal_rate(caller, stepper, frequency, damping):
     return jnp.log(jnp.where(principal.imag > 0, principal, jnp.nan))
 
 
-def spectral_radius(stepper, frequency, damping=0.0):
+def spectral_radius(stepper, frequency, damping=0.0) -> jax.Array:
     """Largest modulus of the eigenvalues of `oscillator_matrix`: of the shape of frequency and damping, broadcast.
 
     To 1e-10, up to W = 1e6. But at W > 1e4 three roots of `generalized_alpha` and of `kim_hht(0.0)` come close to each
@@ -42,7 +42,7 @@ def spectral_radius(stepper, frequency, damping=0.0):
     return jnp.max(jnp.abs(oscillator_roots("spectral_radius", stepper, frequency, damping)), axis=-1)
 
 
-def damping_ratio(stepper, frequency, damping=0.0):
+def damping_ratio(stepper, frequency, damping=0.0) -> jax.Array:
     """The damping ratio that the discrete oscillator has, -Re(r)/|r| with r = log(principal eigenvalue).
 
     For damping = 0 all of it is the method's. The principal eigenvalue is the one that oscillates fastest; NaN where
@@ -61,7 +61,7 @@ def damping_ratio(stepper, frequency, damping=0.0):
     return -rate.real / jnp.abs(rate)
 
 
-def period_elongation(stepper, frequency, damping=0.0):
+def period_elongation(stepper, frequency, damping=0.0) -> jax.Array:
     """Relative error of the natural period, W/|r| - 1 with r = log(principal eigenvalue) as in `damping_ratio`.
 
     Args, raises: as in `spectral_radius`.
@@ -74,7 +74,7 @@ def period_elongation(stepper, frequency, damping=0.0):
     return jnp.asarray(frequency).astype(rate.real.dtype) / jnp.abs(rate) - 1
 
 
-def overshoot(stepper, frequency, damping=0.0):
+def overshoot(stepper, frequency, damping=0.0) -> jax.Array:
     """Largest factor by which the first step, from a start as in `simulate`, raises |(W q, h v)|, the root of energy.
 
     At most 1 for the motion itself and for the trapezoidal rule. HHT overshoots in velocity, in proportion to W; such
@@ -108,7 +108,7 @@ def _overshoot(stepper, c, k):
     return jnp.vectorize(factor)(c, k)
 
 
-def stability_region(stepper, z):
+def stability_region(stepper, z) -> jax.Array:
     """Spectral radius of the step for y' = lambda y at z = h lambda, complex; stable where it is <= 1. Shaped like z.
 
     Of what y feels: not of the a of `kim_hht`, for example, whose recursion y never meets.

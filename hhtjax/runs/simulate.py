@@ -1,6 +1,7 @@
 """A run: one scan over the steps."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,15 +13,27 @@ from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.extrapolate import MOST, extrapolated
 from hhtjax.runs.loop import as_solution, loop_of, show_progress
 from hhtjax.runs.solution import Solution
-from hhtjax.steppers.stepper import join_info, require_capable, require_stepper, require_system
+from hhtjax.steppers.stepper import Stepper, join_info, require_capable, require_stepper, require_system
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import on_scalars, one_kernel
 
 
 def simulate(
-    system, stepper, q0, v0=None, params=None, *, dt, num_steps, t0=0.0, save_every=1, progress=False, extrapolate=1
+    system: System | LinearSystem | FirstOrderSystem,
+    stepper: Stepper,
+    q0: Any,
+    v0: Any = None,
+    params: Any = None,
+    *,
+    dt: Any,
+    num_steps: int,
+    t0: Any = 0.0,
+    save_every: int = 1,
+    progress: bool = False,
+    extrapolate: int = 1,
 ) -> Solution:
     """Steps `system` from (q0, v0) at t0, num_steps times by dt.
 

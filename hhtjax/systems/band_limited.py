@@ -40,7 +40,7 @@ def band_limited(values, dt, *, factor=8, t0=0.0) -> Sampled:
     return sampled(fine + line(n * factor), dt / factor, t0)
 
 
-def band_limited_motion(values, dt, cutoff):
+def band_limited_motion(values, dt, cutoff) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Position, velocity and acceleration at the samples of a measured motion, without frequencies above `cutoff`.
 
     The series is that of `band_limited`, cut off and differentiated. At both ends its second derivative is zero, so
@@ -95,7 +95,7 @@ def _odd_series(values):
     return line, jnp.fft.rfft(jnp.concatenate([rest, -rest[-2:0:-1]]), axis=0)
 
 
-def spline_gain_error(frequency, dt, order=3):
+def spline_gain_error(frequency, dt, order=3) -> float:
     """Relative error of the amplitude of a harmonic of `frequency` that `sampled(..., order)` reconstructs.
 
         order 0: 1 - sinc(f dt), late by dt/2 besides,    order 1: 1 - sinc^2(f dt),

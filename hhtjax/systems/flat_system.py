@@ -60,19 +60,10 @@ def flatten(caller, system, q0, v0, t0, params):
 
     Runs while tracing, so it checks shapes and structures and costs nothing at run time.
     """
-    q, unravel = ravel_pytree(q0)
-    n, dtype = q.size, q.dtype
     if isinstance(system, FirstOrderSystem):
-        _check_like(caller, "rate", _evaluate(caller, "rate", system.rate, q0, t0, params), "q0", q0, dtype)
-
-        def rate(q, v, t, params):
-            return ravel_pytree(system.rate(unravel(v), t, params))[0].astype(dtype)
-
-        def mass(q, params):
-            return jnp.ones(n, dtype)
-
-        return FlatSystem(mass, rate, n, False, True, unravel, unravel), jnp.zeros_like(q), q
-
+        return _flatten_first_order(caller, system, q0, t0, params)
+    q, unravel = ravel_pytree(q0)
+    dtype = q.dtype
     v, unravel_rates = ravel_pytree(v0)
     n, blocks = v.size, kinematics.layout(q0, v0)
     if blocks and (isinstance(system, LinearSystem) or getattr(system.mass, "is_lagrangian", False)):
@@ -86,18 +77,7 @@ def flatten(caller, system, q0, v0, t0, params):
         constraint = partial(_flat_constraint, system.constraint, unravel, dtype)
 
     linear = isinstance(system, LinearSystem)
-    if linear:
-        for name in ("M", "C", "K"):
-            matrix = getattr(system, name)
-            if matrix is not None:
-                _check_matrix(caller, name, matrix, n, dtype, params)
-    else:
-        _check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
-    if linear and system.load is not None:
-        Q = _evaluate(caller, "force", system.load, t0, params)
-    else:
-        Q = _evaluate(caller, "force", system.force, q0, v0, t0, params)
-    _check_like(caller, "force", Q, "v0", v0, dtype)
+    _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params)
 
     def mass(q, params):
         M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
@@ -111,6 +91,37 @@ def flatten(caller, system, q0, v0, t0, params):
         _check_like(caller, "inertia", _evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
         product = partial(_flat_product, system.inertia, unravel, unravel_rates, dtype)
     return FlatSystem(mass, force, n, linear, False, unravel, unravel_rates, constraint, m, blocks, product), q, v
+
+
+def _flatten_first_order(caller, system, y0, t0, params):
+    """y' = rate is a system of unit mass whose velocity is y, and whose position is nothing."""
+    y, unravel = ravel_pytree(y0)
+    n, dtype = y.size, y.dtype
+    _check_like(caller, "rate", _evaluate(caller, "rate", system.rate, y0, t0, params), "q0", y0, dtype)
+
+    def rate(q, v, t, params):
+        return ravel_pytree(system.rate(unravel(v), t, params))[0].astype(dtype)
+
+    def mass(q, params):
+        return jnp.ones(n, dtype)
+
+    return FlatSystem(mass, rate, n, False, True, unravel, unravel), jnp.zeros_like(y), y
+
+
+def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params):
+    """Shapes of what the functions of a system return."""
+    if linear:
+        for name in ("M", "C", "K"):
+            matrix = getattr(system, name)
+            if matrix is not None:
+                _check_matrix(caller, name, matrix, n, dtype, params)
+    else:
+        _check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
+    if linear and system.load is not None:
+        Q = _evaluate(caller, "force", system.load, t0, params)
+    else:
+        Q = _evaluate(caller, "force", system.force, q0, v0, t0, params)
+    _check_like(caller, "force", Q, "v0", v0, dtype)
 
 
 def _flat_constraint(constraint, unravel, dtype, q, t, params):

@@ -35,14 +35,7 @@ def initial_values(caller, system, q0, v0):
     dtypes = set()
     for name, values in (("q0", q0), ("v0", v0)):
         for path, leaf in jax.tree_util.tree_leaves_with_path(values):
-            where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
-            if not is_array(leaf) and (isinstance(leaf, bool) or not isinstance(leaf, (int, float, complex))):
-                raise TypeError(f"{where} must be an array or a number; received {leaf!r}.")
-            dtype = getattr(leaf, "dtype", None) or np.result_type(leaf)
-            if not is_real(leaf) or dtype in (jnp.float16, jnp.bfloat16):
-                raise TypeError(f"{where} must be float32 or float64; received {dtype}.")
-            if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
-                raise ValueError(f"{where} must be finite; received {leaf!r}.")
+            dtype = _require_finite(f"{caller}: `{name}{jax.tree_util.keystr(path)}`", leaf)
             if is_array(leaf) and jnp.issubdtype(dtype, jnp.floating):
                 dtypes.add(jnp.result_type(leaf))  # what JAX makes of it: float32 without x64
     for (path, q), v in zip(jax.tree_util.tree_leaves_with_path(q0), jax.tree.leaves(v0), strict=True):
@@ -65,6 +58,18 @@ def initial_values(caller, system, q0, v0):
         )
     q0, v0 = (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0))
     return q0, None if first_order else v0
+
+
+def _require_finite(where, leaf):
+    """The dtype of a leaf, or an error for what is no array of finite numbers of single or double precision."""
+    if not is_array(leaf) and (isinstance(leaf, bool) or not isinstance(leaf, (int, float, complex))):
+        raise TypeError(f"{where} must be an array or a number; received {leaf!r}.")
+    dtype = getattr(leaf, "dtype", None) or np.result_type(leaf)
+    if not is_real(leaf) or dtype in (jnp.float16, jnp.bfloat16):
+        raise TypeError(f"{where} must be float32 or float64; received {dtype}.")
+    if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
+        raise ValueError(f"{where} must be finite; received {leaf!r}.")
+    return dtype
 
 
 def _require_rotations(where, R):
