@@ -1,61 +1,57 @@
-"""hhtjax: differentiable, functional time integrators for multibody dynamics."""
+"""hhtjax: differentiable, functional time integrators for multibody dynamics.
 
-from hhtjax import analysis as analysis
-from hhtjax import rotation as rotation
-from hhtjax import scenes as scenes
-from hhtjax import trigonometry as trigonometry
-from hhtjax.identification.arguments import Gaussian as Gaussian
-from hhtjax.identification.bias import step_size_bias as step_size_bias
-from hhtjax.identification.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
-from hhtjax.identification.identify import fit as fit
-from hhtjax.identification.identify import multistart as multistart
-from hhtjax.identification.inference import prediction_errors as prediction_errors
-from hhtjax.identification.inference import profile as profile
-from hhtjax.identification.inference import score_test as score_test
-from hhtjax.identification.refine import StepSizeWarning as StepSizeWarning
-from hhtjax.identification.refine import refine as refine
-from hhtjax.identification.starts import equation_error as equation_error
-from hhtjax.identification.starts import fit_progressively as fit_progressively
-from hhtjax.identification.transforms import bounded as bounded
-from hhtjax.identification.transforms import fixed as fixed
-from hhtjax.identification.transforms import positive as positive
-from hhtjax.identification.windows import measure as measure
-from hhtjax.identification.windows import windows as windows
-from hhtjax.identification.windows import wrap_angle as wrap_angle
-from hhtjax.numerics.structured_solve import banded as banded
-from hhtjax.numerics.structured_solve import conjugate_gradients as conjugate_gradients
-from hhtjax.runs.interpolate import interpolate as interpolate
-from hhtjax.runs.simulate import simulate as simulate
-from hhtjax.runs.solution import SimulationError as SimulationError
-from hhtjax.runs.sweep import sweep as sweep
-from hhtjax.runs.sweep_to_disk import load_sweep as load_sweep
-from hhtjax.runs.sweep_to_disk import sweep_to_disk as sweep_to_disk
-from hhtjax.steppers.collocation import collocation as collocation
-from hhtjax.steppers.collocation import wilson as wilson
-from hhtjax.steppers.explicit import rk4 as rk4
-from hhtjax.steppers.generalized_alpha import bossak as bossak
-from hhtjax.steppers.generalized_alpha import generalized_alpha as generalized_alpha
-from hhtjax.steppers.generalized_alpha import hht as hht
-from hhtjax.steppers.generalized_alpha import newmark as newmark
-from hhtjax.steppers.implicit_euler import implicit_euler as implicit_euler
-from hhtjax.steppers.kim2019 import conventional_hht as conventional_hht
-from hhtjax.steppers.kim2019 import kim_hht as kim_hht
-from hhtjax.steppers.kim2019 import kim_implicit_euler as kim_implicit_euler
-from hhtjax.steppers.multistep import houbolt as houbolt
-from hhtjax.steppers.multistep import park as park
-from hhtjax.steppers.rosenbrock import rosenbrock as rosenbrock
-from hhtjax.steppers.rosenbrock import rowda as rowda
-from hhtjax.steppers.splitting import operator_splitting as operator_splitting
-from hhtjax.systems.band_limited import band_limited as band_limited
-from hhtjax.systems.band_limited import band_limited_motion as band_limited_motion
-from hhtjax.systems.band_limited import spline_gain_error as spline_gain_error
-from hhtjax.systems.consistent import consistent_initial as consistent_initial
-from hhtjax.systems.initial_values import PrecisionWarning as PrecisionWarning
-from hhtjax.systems.sampled import sampled as sampled
-from hhtjax.systems.system import FirstOrderSystem as FirstOrderSystem
-from hhtjax.systems.system import LinearSystem as LinearSystem
-from hhtjax.systems.system import System as System
-from hhtjax.xla import explain as explain
-from hhtjax.xla import plain as plain
+A system, a stepper, one run, and derivatives through all of it: `System`, `hht`, `simulate`, `fit`. What a step does to
+a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`.
+"""
 
-__version__ = "0.1.0"
+from hhtjax import analysis, identification, rotation, scenes, trigonometry
+from hhtjax.description import VERSION as __version__
+from hhtjax.identification.arguments import Gaussian
+from hhtjax.identification.bias import step_size_bias
+from hhtjax.identification.identifiability import IdentifiabilityWarning
+from hhtjax.identification.identify import fit, multistart
+from hhtjax.identification.inference import prediction_errors, profile, score_test
+from hhtjax.identification.measured import measure, windows, wrap_angle
+from hhtjax.identification.refinement import StepSizeWarning, refine
+from hhtjax.identification.result import FitResult
+from hhtjax.identification.starts import equation_error, fit_progressively
+from hhtjax.identification.transforms import bounded, fixed, positive
+from hhtjax.numerics.structured_solve import banded, conjugate_gradients
+from hhtjax.runs.interpolate import Interpolant, interpolate
+from hhtjax.runs.simulate import simulate
+from hhtjax.runs.solution import Failure, SimulationError, Solution
+from hhtjax.runs.sweep import sweep
+from hhtjax.runs.sweep_to_disk import load_sweep, sweep_to_disk
+from hhtjax.steppers.collocation import collocation, wilson
+from hhtjax.steppers.explicit import rk4
+from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, newmark
+from hhtjax.steppers.implicit_euler import implicit_euler
+from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_euler
+from hhtjax.steppers.multistep import houbolt, park
+from hhtjax.steppers.rosenbrock import rosenbrock, rowda
+from hhtjax.steppers.splitting import operator_splitting
+from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.systems.band_limited import band_limited, band_limited_motion, spline_gain_error
+from hhtjax.systems.consistent import ConsistentInitial, consistent_initial
+from hhtjax.systems.initial_values import PrecisionWarning
+from hhtjax.systems.sampled import Sampled, sampled
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.xla import Explanation, explain, plain
+
+__all__ = [  # noqa: RUF022
+    "__version__", "analysis", "identification", "rotation", "scenes", "trigonometry",
+    # systems
+    "FirstOrderSystem", "LinearSystem", "System", "PrecisionWarning", "ConsistentInitial", "consistent_initial",
+    "Sampled", "band_limited", "band_limited_motion", "sampled", "spline_gain_error",
+    # steppers
+    "Info", "State", "Stepper", "banded", "conjugate_gradients",
+    "bossak", "collocation", "conventional_hht", "generalized_alpha", "hht", "houbolt", "implicit_euler", "kim_hht",
+    "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
+    # runs
+    "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
+    "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
+    # identification
+    "FitResult", "Gaussian", "IdentifiabilityWarning", "StepSizeWarning",
+    "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart", "positive",
+    "prediction_errors", "profile", "refine", "score_test", "step_size_bias", "windows", "wrap_angle",
+]  # fmt: skip

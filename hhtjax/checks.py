@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import is_concrete, is_real
 
@@ -13,6 +14,14 @@ def require_number(caller, name, value, valid, expectation):
     if is_concrete(value) and not valid(value):
         raise ValueError(f"{caller}: `{name}` must {expectation}; received {value}.")
     return value
+
+
+def require_integer(caller, name, value, least=1):
+    """The value as a Python integer, if it is one and not less than `least`."""
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
+        kind = {0: "an integer, 0 or more", 1: "a positive integer"}.get(least, f"an integer, {least} or more")
+        raise ValueError(f"{caller}: `{name}` must be {kind}; received {value!r}.")
+    return int(value)
 
 
 def require_function(caller, name, value, signature):

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+VERSION = "0.1.0"  # of the library
+
 
 def is_array(x):
     """Arrays, NumPy scalars and tracers are data; Python numbers are part of the program."""

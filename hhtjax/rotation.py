@@ -25,6 +25,21 @@ import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_real
+from hhtjax.xla import structural
+
+__all__ = [
+    "cross",
+    "exp",
+    "hat",
+    "inverse_tangent",
+    "is_rotation",
+    "log",
+    "orthonormalize",
+    "product",
+    "tangent",
+    "tangent_rate",
+    "vee",
+]
 
 GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
@@ -43,7 +58,7 @@ def hat(x):
      [-2.  1.  0.]]
     """
     x = _real("hat", "x", x, (3,))
-    return jnp.sum(x[:, None, None] * jnp.asarray(GENERATORS, x.dtype), axis=0)
+    return jnp.sum(x[:, None, None] * structural(GENERATORS.astype(x.dtype)), axis=0)
 
 
 def vee(X):
@@ -53,7 +68,7 @@ def vee(X):
     [1. 2. 3.]
     """
     X = _real("vee", "X", X, (3, 3))
-    return jnp.sum(X[None, :, :] * jnp.asarray(GENERATORS, X.dtype), axis=(1, 2)) / 2
+    return jnp.sum(X[None, :, :] * structural(GENERATORS.astype(X.dtype)), axis=(1, 2)) / 2
 
 
 def exp(psi):
@@ -81,7 +96,7 @@ def log(R):
     """
     R = _real("log", "R", R, (3, 3))
     trace, v = jnp.trace(R), vee(R - R.T)
-    block = R + R.T + (1 - trace) * jnp.eye(3, dtype=R.dtype)
+    block = R + R.T + (1 - trace) * structural(np.eye(3, dtype=R.dtype))
     products = jnp.block([[(1 + trace)[None, None], v[None, :]], [v[:, None], block]])  # 4 q q^T
     q = products[jnp.argmax(jnp.diag(products))]  # a multiple of the quaternion
     q = jnp.where(q[0] < 0, -q, q)
@@ -149,7 +164,7 @@ def orthonormalize(R):
     0.9998
     """
     R = _real("orthonormalize", "R", R, (3, 3))
-    return R - product(R, product(R.T, R) - jnp.eye(3, dtype=R.dtype)) / 2
+    return R - product(R, product(R.T, R) - structural(np.eye(3, dtype=R.dtype))) / 2
 
 
 def is_rotation(R, tolerance):
@@ -213,7 +228,7 @@ def _power_series(coefficients, x):
 
 def _polynomial(psi, f, g):
     """I + f P + g P^2."""
-    eye = jnp.eye(3, dtype=psi.dtype)
+    eye = structural(np.eye(3, dtype=psi.dtype))
     return eye + f * hat(psi) + g * (psi[:, None] * psi[None, :] - jnp.sum(psi**2) * eye)
 
 

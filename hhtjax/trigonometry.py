@@ -15,6 +15,8 @@ import jax.numpy as jnp
 
 from hhtjax.xla import staged
 
+__all__ = ["cos", "sin", "sincos"]
+
 RANGE = 1e5  # largest |x|, rad
 
 # pi/2 in three parts. Whole numbers up to 2^17 times one of the first two, of 36 bits, are exact.

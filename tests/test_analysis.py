@@ -1,91 +1,20 @@
 """What the steps do to linear motions, against closed forms that share no code with them."""
 
-from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_forms import CLOSED_FORMS
 from jax.flatten_util import ravel_pytree
+from zoo import as_data
 
 import hhtjax
 from hhtjax import analysis
 from hhtjax.scenes import pendulum, squeezer, top
 
 FREQUENCIES = np.geomspace(1e-3, 1e6, 46)
-
-
-def as_data(stepper):
-    """The same stepper with its coefficients as arrays, so that the whole family is compiled once."""
-    return replace(stepper, coefficients=jax.tree.map(jnp.asarray, stepper.coefficients))
-
-
-def refined_roots(polynomial):
-    """Roots in extended precision, by Newton from those of NumPy: close ones lose half of the digits otherwise."""
-    roots, slope = np.roots(polynomial.astype(float)).astype(np.clongdouble), np.polyder(polynomial)
-    for _ in range(12):
-        value = np.polyval(polynomial, roots)
-        roots = roots - np.where(value == 0, 0, value) / np.where(value == 0, 1, np.polyval(slope, roots))
-    return roots
-
-
-def family_roots(alpha_m, alpha_f, beta, gamma, W, zeta):
-    """Of the three-step form: Newmark's formulas, the weights, and w = -2 zeta W v - W^2 q, with (q, v, a) ~ mu^n."""
-    alpha_m, alpha_f, beta, gamma, W, zeta = map(np.longdouble, (alpha_m, alpha_f, beta, gamma, W, zeta))
-    difference, v = np.array([1, -1], np.longdouble), np.array([gamma, 1 - gamma])
-    q = np.polyadd(v, np.polymul([beta, 0.5 - beta], difference))
-    load = np.polyadd(2 * zeta * W * np.polymul(v, difference), W**2 * q)
-    inertia = np.polymul(np.polymul([1 - alpha_m, alpha_m], difference), difference)
-    return refined_roots(np.polyadd(inertia, np.polymul([1 - alpha_f, alpha_f], load)) / max(1, W**2))
-
-
-def kim_roots(alpha, W, zeta):
-    """Of Eq. 10-14, on (q, v, a); characteristic polynomial by Faddeev and LeVerrier."""
-    alpha, W, zeta = map(np.longdouble, (alpha, W, zeta))
-    beta, gamma = (1 - alpha) ** 2 / 4, np.longdouble(0.5) - alpha
-    q, v, a = eye = np.eye(3, dtype=np.longdouble)
-    Jq, Jv = -(1 + alpha) * W**2, -(1 + alpha) * 2 * zeta * W
-    drift = v + (1 - 2 * beta / gamma) / 2 * a
-    dv = (-2 * zeta * W * v - W**2 * q + gamma * Jq * drift) / (1 - gamma * Jv - beta * Jq)
-    A = np.array([q + drift + beta / gamma * dv, v + dv, dv / gamma + (1 - 1 / gamma) * a])
-    polynomial, B = [np.longdouble(1)], 0 * eye
-    for k in range(1, 4):
-        B = A @ B + polynomial[-1] * eye
-        polynomial.append(-np.trace(A @ B) / k)
-    return refined_roots(np.array(polynomial))
-
-
-def first_order_roots(stability_function, W, zeta):
-    """R(z) at the two z = W (-zeta +- i sqrt(1 - zeta^2))."""
-    return stability_function(np.clongdouble(W * (-zeta + 1j * np.sqrt(1 - zeta**2))))[None]
-
-
-def hht_roots(alpha):
-    return partial(family_roots, 0, -alpha, (1 - alpha) ** 2 / 4, 0.5 - alpha)
-
-
-RHO = 0.8
-CLOSED_FORMS = {
-    "hht(0)": (as_data(hhtjax.hht(0.0)), hht_roots(0.0)),
-    "hht(-.05)": (as_data(hhtjax.hht(-0.05)), hht_roots(-0.05)),
-    "hht(-.3)": (as_data(hhtjax.hht(-0.3)), hht_roots(-0.3)),
-    "newmark(.3025, .6)": (as_data(hhtjax.newmark(0.3025, 0.6)), partial(family_roots, 0, 0, 0.3025, 0.6)),
-    "bossak(-.1)": (as_data(hhtjax.bossak(-0.1)), partial(family_roots, -0.1, 0, 1.1**2 / 4, 0.6)),
-    "generalized_alpha(.8)": (
-        as_data(hhtjax.generalized_alpha(RHO)),
-        partial(
-            family_roots, (2 * RHO - 1) / (RHO + 1), RHO / (RHO + 1), 1 / (RHO + 1) ** 2, (3 - RHO) / (RHO + 1) / 2
-        ),
-    ),
-    "operator_splitting(-.1)": (hhtjax.operator_splitting(-0.1), hht_roots(-0.1)),
-    "kim_hht(-.1)": (hhtjax.kim_hht(-0.1), partial(kim_roots, -0.1)),
-    "implicit_euler": (hhtjax.implicit_euler(), partial(first_order_roots, lambda z: 1 / (1 - z))),
-    "rk4": (
-        hhtjax.rk4(),
-        partial(first_order_roots, lambda z: 1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))),
-    ),
-}
 
 
 @pytest.mark.parametrize("name", CLOSED_FORMS)
@@ -182,7 +111,7 @@ def test_each_constraint_of_a_mechanism_has_the_spectrum_at_infinity(scene, form
     stepper = hhtjax.hht(alpha, formulation=formulation)
     state = jax.jit(stepper.init)(scene.system, scene.q0, scene.v0, scene.params, dt)
     m = state.L.size
-    A = analysis.amplification_matrix(stepper, scene.system, state, scene.params, dt=dt)
+    A = analysis.amplification_matrix(scene.system, stepper, state, scene.params, dt=dt)
     found = {round(x.value.real, 6) + 0.0: x.blocks for x in analysis.jordan_structure(A)}
     assert found[round(alpha / (1 + alpha), 6)] == m * (1,)
     if formulation == "index3":
@@ -239,7 +168,7 @@ TOP = top.minimal()
 def test_tangent_of_a_step_predicts_what_becomes_of_a_perturbation(system, q0, v0, params):
     dt, stepper = 0.01, hhtjax.hht(-0.1, linearize="predictor", kinematics="lie")
     state = jax.jit(stepper.init)(system, q0, v0, params, dt)
-    A = np.asarray(analysis.amplification_matrix(stepper, system, state, params, dt=dt))
+    A = np.asarray(analysis.amplification_matrix(system, stepper, state, params, dt=dt))
 
     @jax.jit
     def central_difference(x):
@@ -262,7 +191,7 @@ def test_scaled_tangent_depends_on_rate_times_dt_only(system, v0):
     stepper, matrices = hhtjax.hht(-0.1), []
     for rate, dt in ((0.6, 1.0), (60.0, 0.01)):
         state = jax.jit(stepper.init)(system, jnp.zeros(1), v0, rate, dt)
-        matrices.append(analysis.amplification_matrix(stepper, system, state, rate, dt=dt))
+        matrices.append(analysis.amplification_matrix(system, stepper, state, rate, dt=dt))
     np.testing.assert_allclose(*matrices, atol=1e-13)
     if v0 is not None:
         np.testing.assert_allclose(matrices[0], analysis.oscillator_matrix(stepper, 0.6, 0.05), atol=1e-13)
@@ -326,7 +255,7 @@ SUGGEST = partial(analysis.suggest_step_size, SPRING, hhtjax.hht(), jnp.ones(1),
         (lambda: analysis.overshoot(hhtjax.hht(), 1.0, np.inf), ValueError, "`damping` must be finite"),
         (lambda: analysis.constraint_matrix(hhtjax.rk4()), NotImplementedError, "cannot solve the `constraint`"),
         (
-            lambda: analysis.amplification_matrix(hhtjax.hht(), SPRING, None, dt=0.1),
+            lambda: analysis.amplification_matrix(SPRING, hhtjax.hht(), None, dt=0.1),
             TypeError,
             "`state` must be a State",
         ),

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import check_gradient
 from scipy.integrate import solve_ivp
-from test_gradients import check_gradient
 
 import hhtjax
 from hhtjax.scenes import Scene, double_pendulum

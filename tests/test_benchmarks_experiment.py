@@ -1,22 +1,15 @@
 """The C that the library is measured against does the same arithmetic, the charts are read rightly, and the pages."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hhtjax
+from experiments.benchmarks import native
+from experiments.benchmarks.chain import FORMULATIONS, chain
+from experiments.work_precision.timing import time_to
 from hhtjax.scenes import double_pendulum
-
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from experiments.benchmarks import native  # noqa: E402
-from experiments.benchmarks.chain import FORMULATIONS, chain  # noqa: E402
-from experiments.work_precision.timing import time_to  # noqa: E402
 
 
 @pytest.mark.parametrize("as_printed", [False, True])

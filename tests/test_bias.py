@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.identification.refine import Refined, needed_levels
+from hhtjax.identification.refinement import Refined, needed_levels
 from hhtjax.numerics.richardson import richardson
 
 t = jnp.arange(0.0, 30.0, 0.35)
@@ -116,7 +116,7 @@ def test_a_constraint_leaves_the_bias_of_the_minimal_form():
     assert float(bias.params["g"]) == pytest.approx(0.5 * w**2, rel=1e-6)
     assert float(bias.params["c"]) == pytest.approx(2.0 * 2 * zeta * w, rel=1e-6)
     state = stepper.init(hanging, bottom, jnp.zeros(2), HANGING, dt)
-    mu = np.linalg.eigvals(hhtjax.analysis.amplification_matrix(stepper, hanging, state, HANGING, dt=dt))
+    mu = np.linalg.eigvals(hhtjax.analysis.amplification_matrix(hanging, stepper, state, HANGING, dt=dt))
     assert np.min(np.abs(mu - np.exp(s * dt))) < 1e-9
 
 

@@ -5,7 +5,8 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_boundary import EYE, ONE, SINGLE, SPRING, STEPPERS, ZERO, check_message, pull, run
+from helpers import EYE, ONE, SINGLE, SPRING, ZERO, check_message, pull, run
+from zoo import STEPPERS
 
 from hhtjax import LinearSystem, PrecisionWarning, System
 
@@ -29,7 +30,7 @@ RESULTS = [
 @pytest.mark.parametrize(("error", "message", "system"), RESULTS)
 def test_shapes_of_mass_and_force_are_checked(error, message, system):
     check_message(error, f"simulate: {message}", lambda: run(system))
-    check_message(error, f"init: {message}", lambda: STEPPERS["hht"].init(system, ONE, ZERO, None, dt=0.1))
+    check_message(error, f"init: {message}", lambda: STEPPERS["hht auto"].init(system, ONE, ZERO, None, dt=0.1))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "complex128", "bool"])
@@ -109,16 +110,16 @@ def test_a_constraint_is_refused_where_it_would_be_ignored():
 @pytest.mark.parametrize(("q0", "v0"), [(ONE, np.zeros(2)), ({"a": 1.0}, {"b": 1.0})])
 def test_init_checks_that_v0_is_like_q0(q0, v0):
     with pytest.raises(ValueError, match=r"init: `v0` must .* q0.*; received"):
-        STEPPERS["hht"].init(SPRING, q0, v0, None, dt=0.1)
+        STEPPERS["hht auto"].init(SPRING, q0, v0, None, dt=0.1)
 
 
 def test_init_takes_integers_as_simulate_does():
-    state = STEPPERS["hht"].init(SPRING, np.array([1]), np.array([0]), None, dt=0.1)
+    state = STEPPERS["hht auto"].init(SPRING, np.array([1]), np.array([0]), None, dt=0.1)
     assert state.q.dtype == state.v.dtype == state.w.dtype == jnp.float64
     assert state.w[0] == -4.0
 
 
 def test_step_names_itself():
-    state = STEPPERS["hht"].init(SPRING, ONE, ZERO, None, dt=0.1)
+    state = STEPPERS["hht auto"].init(SPRING, ONE, ZERO, None, dt=0.1)
     wrong = System(ONE, lambda q, v, t, params: (q,))
-    check_message(ValueError, f"step: {FORCE_LIKE} [0]", lambda: STEPPERS["hht"].step(wrong, state, None, dt=0.1))
+    check_message(ValueError, f"step: {FORCE_LIKE} [0]", lambda: STEPPERS["hht auto"].step(wrong, state, None, dt=0.1))

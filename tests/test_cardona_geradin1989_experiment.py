@@ -1,18 +1,16 @@
 """The Cardona and Geradin experiment: what its committed numbers must show, its page, and a part of it, run."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+from experiments.cardona_geradin1989 import page, squeezer, work_precision
+from experiments.cardona_geradin1989.pendulum import exact, run_method
+from experiments.page import find
 
-from experiments.cardona_geradin1989 import page, squeezer, work_precision  # noqa: E402
-from experiments.cardona_geradin1989.pendulum import exact, run_method  # noqa: E402
-from experiments.page import find  # noqa: E402
+ROOT = Path(__file__).parents[1]
 
 HERE = ROOT / "experiments" / "cardona_geradin1989"
 COMMITTED = json.loads((HERE / "cardona_geradin1989.json").read_text())

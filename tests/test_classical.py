@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_order import slope
+from helpers import slope
 
 import hhtjax
 

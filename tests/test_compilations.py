@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_description import DESCRIPTIONS, ONE, TWO, lagrangian, pull, run
+from descriptions import DESCRIPTIONS, ONE, TWO, lagrangian, pull, run
 
 import hhtjax
 from hhtjax import LinearSystem, System

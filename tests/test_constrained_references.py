@@ -7,8 +7,8 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from index_1 import SCENES, UPRIGHT, flat, index_1, path, times
 from scipy.integrate import solve_ivp
-from test_constrained_scenes import SCENES, UPRIGHT, flat, index_1, path, times
 
 from hhtjax.scenes import four_bars, pendulum, squeezer
 

@@ -1,18 +1,11 @@
 """A sweep over several devices and several processes has the bits of a sweep on one."""
 
-import sys
-from pathlib import Path
-
 import jax
 import numpy as np
 import pytest
 
 import hhtjax
-
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from experiments.sweeps.devices import case, swept  # noqa: E402
+from experiments.sweeps.devices import case, swept
 
 MEMBERS = 300
 

@@ -59,7 +59,6 @@ def test_silverbox_on_the_measured_record():
     """Full training record, 8 steps per sample, 6 parameters: the errors that this model reaches."""
     if not (DATA / "silverbox").is_dir():
         pytest.skip("the measured Silverbox record is not here: set HHTJAX_DATA to the folder that holds silverbox/")
-    sys.path.insert(0, str(ROOT))
     from experiments.identification import data, silverbox
 
     sets = data.load(fast=False)

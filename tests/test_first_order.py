@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import check_gradient, tight
 from scipy.integrate import solve_ivp
-from test_gradients import check_gradient, tight
 from zoo import STEPPERS, Problem, as_data, end
 
 import hhtjax

@@ -1,13 +1,12 @@
 """Forward mode = reverse mode = central differences, for every stepper and every kind of argument."""
 
-from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
+from helpers import check_gradient, path_loss, tight
 from zoo import PROBLEMS, STEPPERS
 
 import hhtjax
@@ -18,66 +17,6 @@ DAMPING = {
     "generalized_alpha": lambda x, **options: hhtjax.generalized_alpha(rho_inf=x, **options),
     "kim_hht": lambda x, **_: hhtjax.kim_hht(alpha=x),
 }
-
-
-def tight(stepper):
-    """Newton to rounding, where there is one: central differences see its tolerance."""
-    if getattr(stepper, "options", None) is None:
-        return stepper
-    return replace(stepper, options=stepper.options._replace(tolerance=1e-13))
-
-
-def check_gradient(loss, arguments):
-    """Compares the three derivatives of loss(arguments), a pytree of numbers; returns the forward one, a vector."""
-    return check_gradients(loss, [arguments])[0]
-
-
-def check_gradients(loss, points):
-    """The same at several points, compiled once."""
-    unravel = ravel_pytree(points[0])[1]
-    points = [np.asarray(ravel_pytree(x)[0]) for x in points]
-    eye = np.eye(points[0].size)
-
-    def f(x):
-        return loss(unravel(x))
-
-    @jax.jit  # one program gives the derivative and, for the differences, the values
-    def value_and_forward(x):
-        return jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 0))(eye)
-
-    gradient = jax.jit(jax.grad(f))
-    return [_check_gradient(value_and_forward, gradient, x0) for x0 in points]
-
-
-def _check_gradient(value_and_forward, gradient, x0):
-    reverse, forward = gradient(x0), np.asarray(value_and_forward(x0)[1])
-    size = np.maximum(np.abs(forward), 1e-3 * np.max(np.abs(forward)))
-    assert np.all(np.isfinite(forward))
-    assert np.max(np.abs(reverse - forward) / size) < 1e-10
-    for i, value in enumerate(x0):
-        h = 1e-4 * (abs(value) or 1.0)
-        e = h * np.eye(x0.size)[i]
-
-        def at(shift, e=e):
-            return float(value_and_forward(x0 + shift * e)[0])
-
-        # fourth order, so that truncation and rounding both stay below 1e-7
-        central = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)
-        assert abs(central - forward[i]) < 1e-6 * size[i], (i, central, forward[i])
-    return forward
-
-
-def path_loss(problem, stepper, num_steps, save_every):
-    """A loss of the whole path, of positions, velocities and accelerations."""
-
-    def loss(arguments):
-        params, q0, v0, dt, t0 = arguments
-        path = hhtjax.simulate(
-            problem.system, stepper, q0, v0, params, dt=dt, t0=t0, num_steps=num_steps, save_every=save_every
-        )
-        return jnp.sum(path.q**2) + 0.3 * jnp.sum(path.v**2) + 0.1 * jnp.sum(path.acceleration**2) + jnp.sum(path.t)
-
-    return loss
 
 
 @pytest.mark.parametrize("name", STEPPERS)

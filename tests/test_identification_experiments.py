@@ -1,16 +1,10 @@
 """The identification experiments: what their committed numbers must show, and their page."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
-from experiments.identification import page  # noqa: E402
-from experiments.page import find  # noqa: E402
+from experiments.identification import page
+from experiments.page import find
 
 NUMBERS = page.read()
 

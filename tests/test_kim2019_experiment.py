@@ -1,17 +1,15 @@
 """The Kim 2019 experiment: what it must show, from its own parts in their fast form; and its page."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+from experiments.kim2019 import alpha, linear, order, page, repaired, stability, tables
+from experiments.report import Report
 
-from experiments.kim2019 import alpha, linear, order, page, repaired, stability, tables  # noqa: E402
-from experiments.report import Report  # noqa: E402
+ROOT = Path(__file__).parents[1]
 
 HERE = ROOT / "experiments" / "kim2019"
 COMMITTED = json.loads((HERE / "kim2019.json").read_text())

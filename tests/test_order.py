@@ -4,7 +4,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from zoo import PROBLEMS, STEPPERS, as_data, end, reference
+from helpers import slope
+from zoo import PROBLEMS, STEPPERS
 
 import hhtjax
 
@@ -20,15 +21,6 @@ FORMS = {
     **{name: {"linearize": name} for name in ("predictor", "held", "state", "auto")},
     "auto, corrected start": {"linearize": "auto", "start": "corrected"},
 }
-STEPS = 200, 400
-
-
-def slope(problem, stepper):
-    """log2 of the ratio of the errors at the end with STEPS steps."""
-    ends = [end(PROBLEMS[problem], as_data(stepper), n) for n in STEPS]
-    assert all(converged for _, converged in ends)
-    errors = [np.linalg.norm(state.q - reference(problem)) for state, _ in ends]
-    return np.log2(errors[0] / errors[1])
 
 
 @pytest.mark.slow

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_boundary import INF, NAN, ONE, STEPPERS, ZERO, check_message, run
+from helpers import INF, NAN, ONE, ZERO, check_message, run
+from zoo import STEPPERS
 
 import hhtjax
 from hhtjax import SimulationError, System

@@ -2,14 +2,11 @@
 
 import importlib
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
 LARGEST = {".png": 200_000, ".gif": 400_000}  # bytes
 
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import check_gradient
 from jax.extend.core import jaxprs_in_params
-from test_gradients import check_gradient
 from zoo import PROBLEMS, reference, run
 
 import hhtjax

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import check_gradients
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from test_gradients import check_gradients
 
 import hhtjax
 from hhtjax.rotation import cross, exp, hat, vee

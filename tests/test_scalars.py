@@ -9,7 +9,7 @@ from jax import lax
 
 import hhtjax
 from hhtjax.scenes import double_pendulum, slider_crank
-from hhtjax.xla import gate, kernels, scalars
+from hhtjax.xla import gate, kernels, scalars, structural
 from hhtjax.xla.scalars import Scalars, by_scalars, join, pays, split
 
 old = pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")
@@ -110,9 +110,39 @@ def operations(f, *args):
 @old
 def test_what_is_known_costs_nothing():
     x = split(jnp.array([0.7, -1.3, 0.4]))
-    assert operations(by_scalars(lambda x: jnp.eye(3) @ x + jnp.zeros(3) - 0 * x), x) == []
+    assert operations(by_scalars(lambda x: 1 * x / 1 - 0.0 + -0.0), x) == []
+    assert operations(by_scalars(lambda x: structural(np.eye(3)) @ x + structural(np.zeros(3))), x) == []
+    assert operations(by_scalars(lambda x: -structural(np.zeros(3)) * x / 2 + x), x) == []
     assert operations(by_scalars(lambda x: jnp.concatenate([x, x])[jnp.array([4, 0])].reshape(2, 1)), x) == []
-    assert operations(by_scalars(lambda x: jnp.array([[0.0, 2.0, 0.0]]) @ x), x) == ["mul"]
+    assert operations(by_scalars(lambda x: structural(np.array([[0.0, 2.0, 0.0]])) @ x), x) == ["mul"]
+    assert operations(by_scalars(lambda x: jnp.array([[0.0, 2.0]]) @ x[:2]), x) == ["mul", "mul", "add"]
+
+
+SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan])
+IEEE = {
+    "0 * x": lambda x: np.zeros(7) * x,
+    "x * 0": lambda x: x * np.zeros(7),
+    "x * 1": lambda x: x * 1.0,
+    "0 / x": lambda x: np.zeros(7) / x,
+    "x / 1": lambda x: x / np.ones(7),
+    "0 - x": lambda x: np.zeros(7) - x,
+    "-0 - x": lambda x: -np.zeros(7) - x,
+    "x - 0": lambda x: x - 0.0,
+    "x - -0": lambda x: x - -0.0,
+    "x + -0": lambda x: x + -0.0,
+    "power 0": lambda x: x**0 + x**0.0,
+    "largest": lambda x: jnp.maximum(x, -0.0),
+    "chosen": lambda x: jnp.where(np.arange(7) % 2 == 0, x, 0.0) * np.zeros(7),
+}
+
+
+@old
+@pytest.mark.parametrize("name", IEEE)
+def test_elementwise_operations_are_ieee(name):
+    """Signs of zeros, NaN and infinities are those of the same program on arrays, compiled alike."""
+    found, expected = (np.asarray(jax.jit(f)(SPECIAL)) for f in (through_scalars(IEEE[name]), IEEE[name]))
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(np.signbit(found), np.signbit(expected))
 
 
 @old

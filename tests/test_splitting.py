@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_gradients import check_gradient, path_loss
+from helpers import check_gradient, path_loss
 from zoo import PROBLEMS, Problem, run
 
 import hhtjax

@@ -1,19 +1,17 @@
 """How large a step each method survives: pinned, so that it cannot shrink unseen."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+from experiments.cells import FARTHEST
+from experiments.stability.gallery import METHODS, simulate_all
+from experiments.stability.grades import plain
+from experiments.stability.scenes import all_cases
 
-from experiments.cells import FARTHEST  # noqa: E402
-from experiments.stability.gallery import METHODS, simulate_all  # noqa: E402
-from experiments.stability.grades import plain  # noqa: E402
-from experiments.stability.scenes import all_cases  # noqa: E402
+ROOT = Path(__file__).parents[1]
 
 # "boundaries" of stability.json, from `python -m experiments stability`: for each scene and method, and for alpha = 0,
 # -0.05 and -0.3, the fewest steps from which on every run stays bounded; null where the finest does not

@@ -1,13 +1,11 @@
 """The stability experiment: what its committed numbers must show, and its page."""
 
 import json
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+from experiments.page import find
 
-from experiments.page import find  # noqa: E402
+ROOT = Path(__file__).parents[1]
 
 HERE = ROOT / "experiments" / "stability"
 COMMITTED = json.loads((HERE / "stability.json").read_text())

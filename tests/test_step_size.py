@@ -5,7 +5,8 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_analysis import as_data, hht_roots
+from closed_forms import hht_roots
+from zoo import as_data
 
 import hhtjax
 from hhtjax import analysis

@@ -1,12 +1,9 @@
 """The experiment on sweeps: what its committed numbers must show, and its page."""
 
 import json
-import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
-
 
 HERE = ROOT / "experiments" / "sweeps"
 COMMITTED = json.loads((HERE / "sweeps.json").read_text())

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import check_gradient
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 from scipy.signal import welch
-from test_gradients import check_gradient
 
 import hhtjax
 from hhtjax.scenes import vehicle

@@ -44,7 +44,7 @@ def tangent(scene, alpha, formulation):
     """A of the first step of a mechanism."""
     stepper = hht(alpha, formulation=formulation)
     state = stepper.init(scene.system, scene.q0, scene.v0, scene.params, TANGENT_DT)
-    return amplification_matrix(stepper, scene.system, state, scene.params, dt=TANGENT_DT)
+    return amplification_matrix(scene.system, stepper, state, scene.params, dt=TANGENT_DT)
 
 
 @partial(jax.jit, static_argnames="formulation")

@@ -17,7 +17,8 @@ import hhtjax
 from experiments.benchmarks import native
 from experiments.benchmarks.measure import least_seconds, temporary_bytes
 from hhtjax import trigonometry
-from hhtjax.runs.sweep import Inputs, run_sweep
+from hhtjax.runs.sweep import run_sweep
+from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.scenes import double_pendulum
 
 DURATION = 1.0

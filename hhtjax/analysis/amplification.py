@@ -56,7 +56,7 @@ CONSTRAINT = System(np.ones(1), _nothing, _itself)
 TEST_EQUATION = FirstOrderSystem(_complex_product)
 
 
-def amplification_matrix(stepper, system, state, params=None, *, dt):
+def amplification_matrix(system, stepper, state, params=None, *, dt):
     """A, the derivative of one step at a state, with respect to x = (q, h v, h^2 w, h^2 a, h^2 L, memory): (k, k).
 
     Constrained or not: of a nonlinear system it is the tangent of the flow of the step, which near an equilibrium, or
@@ -65,7 +65,7 @@ def amplification_matrix(stepper, system, state, params=None, *, dt):
     the tangent that `operator_splitting` keeps. Of a rotation, q is the displacement: R exp(q).
 
     Args:
-        stepper, system, params, dt: as in `simulate`.
+        system, stepper, params, dt: as in `simulate`.
         state: a `State`, of `stepper.init` or `stepper.step`.
 
     Differentiable; goes under jit and vmap.
@@ -77,21 +77,21 @@ def amplification_matrix(stepper, system, state, params=None, *, dt):
     >>> spring = hhtjax.LinearSystem(M=jnp.ones(1), K=jnp.full(1, 4.0))
     >>> euler = hhtjax.implicit_euler()
     >>> state = euler.init(spring, jnp.zeros(1), jnp.zeros(1), None, dt=0.5)
-    >>> A = hhtjax.analysis.amplification_matrix(euler, spring, state, dt=0.5)
+    >>> A = hhtjax.analysis.amplification_matrix(spring, euler, state, dt=0.5)
     >>> print(A[:2, :2])                                             # of (q, h v): 1/(1 + (2 h)^2) [[1, 1], [-1, 1]]
     [[ 0.5  0.5]
      [-0.5  0.5]]
     """
-    require_stepper("amplification_matrix", stepper)
     require_system("amplification_matrix", system)
+    require_stepper("amplification_matrix", stepper)
     if not isinstance(state, State):
         raise TypeError(f"amplification_matrix: `state` must be a State, as of stepper.init; received {state!r}.")
     require_number("amplification_matrix", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    return _amplification_matrix(stepper, system, jax.tree.map(jnp.asarray, state), params, dt)
+    return _amplification_matrix(system, stepper, jax.tree.map(jnp.asarray, state), params, dt)
 
 
 @jax.jit
-def _amplification_matrix(stepper, system, state, params, dt):
+def _amplification_matrix(system, stepper, state, params, dt):
     q, unravel_q = ravel_pytree(state.q)
     blocks = kinematics.layout(state.q, state.v)
     x, unravel = ravel_pytree(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))
@@ -165,7 +165,7 @@ def oscillator_tangent(stepper, c, k):
     """A of the oscillator with damping c and stiffness k, at rest; h = 1."""
     zero = jnp.zeros(1, c.dtype)
     state = stepper.init(OSCILLATOR, zero, zero, (c, k), 1.0)
-    return amplification_matrix(stepper, OSCILLATOR, state, (c, k), dt=1.0)
+    return amplification_matrix(OSCILLATOR, stepper, state, (c, k), dt=1.0)
 
 
 def oscillator_params(caller, frequency, damping):
@@ -207,7 +207,7 @@ def constraint_matrix(stepper):
 def _constraint(stepper):
     zero = jnp.zeros(1)
     state = stepper.init(CONSTRAINT, zero, zero, None, 1.0)
-    return amplification_matrix(stepper, CONSTRAINT, state, dt=1.0)
+    return amplification_matrix(CONSTRAINT, stepper, state, dt=1.0)
 
 
 @jax.jit

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hhtjax.analysis.checks import require_matrix
-from hhtjax.checks import require_number
+from hhtjax.checks import require_integer, require_number
 
 
 class Eigenvalue(NamedTuple):
@@ -79,8 +79,7 @@ def transient_growth(matrix, num_steps, near=None):
     (5, 2.241)
     """
     A = require_matrix("transient_growth", matrix)
-    if not isinstance(num_steps, (int, np.integer)) or isinstance(num_steps, bool) or num_steps < 1:
-        raise ValueError(f"transient_growth: `num_steps` must be a positive integer; received {num_steps!r}.")
+    num_steps = require_integer("transient_growth", "num_steps", num_steps)
     found = jordan_structure(A)
     value, blocks = found[0] if near is None else min(found, key=lambda x: abs(x.value - near))
     if blocks[0] == 1:

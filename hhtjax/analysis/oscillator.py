@@ -137,7 +137,7 @@ def stability_region(stepper, z):
 def _stability_region(stepper, z):
     def radius(z):
         state = stepper.init(TEST_EQUATION, jnp.zeros(2, z.real.dtype), None, z, 1.0)
-        A = amplification_matrix(stepper, TEST_EQUATION, state, z, dt=1.0)
+        A = amplification_matrix(TEST_EQUATION, stepper, state, z, dt=1.0)
         A = jax.lax.complex(A[::2, ::2], A[1::2, ::2])  # the real form of complex numbers, undone
         felt = jnp.arange(len(A)) == 0  # by y
         for _ in A:

@@ -45,10 +45,10 @@ class ModeBias(NamedTuple):
     params: Any = None
 
 
-def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct: Any = False) -> ModeBias:
+def step_size_bias(system, stepper, params, dt, q, v=None, t0=0.0, correct: Any = False) -> ModeBias:
     """By how much stiffness and damping are off that were fitted through steps of dt.
 
-    The system is linearised about (q, v, t): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
+    The system is linearised about (q, v, t0): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
     eigenvalues s' is compared with the s = log(mu)/dt of the nearest eigenvalue mu of the real step's amplification
     matrix: s is what the data have. A constraint is linearised too, and M, C, K, with the stiffness of its forces, are
     those of the motions that it leaves.
@@ -78,8 +78,8 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct: Any =
     """
     require_number("step_size_bias", "dt", dt, lambda x: x > 0, "be positive")
     require_stepper("step_size_bias", stepper)
-    _require_on_constraint(system, params, q, t)
-    matrices = _linear_part(system, params, q, v, t)
+    _require_on_constraint(system, params, q, t0)
+    matrices = _linear_part(system, params, q, v, t0)
     fitted = _rates_of_equations(*matrices)
     s = _rates_of_steps(stepper, dt, *matrices)
     w = np.abs(s)
@@ -88,7 +88,7 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t=0.0, correct: Any =
     bias = ModeBias(w, -np.real(s) / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
     if correct is False:
         return bias
-    return bias._replace(params=_corrected(system, stepper, params, dt, (q, v, t), matrices, correct))
+    return bias._replace(params=_corrected(system, stepper, params, dt, (q, v, t0), matrices, correct))
 
 
 def _linear_part(system, params, q, v, t):
@@ -135,7 +135,7 @@ def _rates_of_steps(stepper, dt, M, C, K):
     """log(mu)/dt of the steps, in the order of the equations' eigenvalues."""
     linear, rest = LinearSystem(M, C, K), jnp.zeros(len(M))
     state = stepper.init(linear, rest, rest, None, dt)
-    mu = np.linalg.eigvals(np.asarray(amplification_matrix(stepper, linear, state, dt=dt)))
+    mu = np.linalg.eigvals(np.asarray(amplification_matrix(linear, stepper, state, dt=dt)))
     mu = mu[mu.imag > 0]
     return np.array([np.log(mu[np.argmin(np.abs(mu - np.exp(s * dt)))]) / dt for s in _rates_of_equations(M, C, K)])
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.identification.least_squares import Objective
+from hhtjax.identification.least_squares import LEAST_BEND, Objective
 
 PART = 512  # rows
 
@@ -182,14 +182,22 @@ class Arrow(NamedTuple):
         return _cosine(jnp.concatenate([shared, own.ravel()]), trial)
 
     def free_of_own(self, trial):
-        """Residuals (records m,) and the part of their shared Jacobian that no own unknown can make up for."""
+        """What `Objective.estimating` says of the residuals, with the part of J that no own unknown can make up for."""
         count, m, k = trial.J_own.shape
         both = jnp.concatenate([trial.J_own, trial.J], axis=2).reshape(count * m, -1)
-        r, both = self.objective.least_squares(trial.r.ravel(), both)
-        both = both.reshape(count, m, -1)
-        Q, _ = jnp.linalg.qr(both[:, :, :k])
-        rest = both[:, :, k:] - Q @ (jnp.swapaxes(Q, 1, 2) @ both[:, :, k:])
-        return r, rest.reshape(count * m, -1)
+        both, pull, bend = self.objective.estimating(trial.r.ravel(), both)
+
+        def project(both, bend):
+            Q, J = jnp.linalg.qr(both[:, :k])[0], both[:, k:]
+            if bend is None:
+                return J - Q @ (Q.T @ J)
+            h, U = jnp.linalg.eigh(Q.T @ (bend[:, None] * Q))
+            slopes = U.T @ Q.T @ (bend[:, None] * J)
+            return J - Q @ (U @ (slopes / jnp.maximum(h, LEAST_BEND)[:, None]))
+
+        bends = None if bend is None else bend.reshape(count, m)
+        rest = jax.vmap(project, in_axes=(0, None if bend is None else 0))(both.reshape(count, m, -1), bends)
+        return rest.reshape(count * m, -1), pull, bend
 
 
 def _or_one(x):

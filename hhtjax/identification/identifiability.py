@@ -5,6 +5,8 @@ import warnings
 import jax
 import numpy as np
 
+BEYOND = "the loss is flat there, with residuals beyond its bend (`weights` is one over the noise)"
+
 
 class IdentifiabilityWarning(UserWarning):
     """The residuals do not determine every parameter."""
@@ -79,6 +81,6 @@ def warn_undetermined(caller, params, free, uncertainty, num_residuals, stacklev
         values = np.concatenate([np.ravel(x) for x in jax.tree.leaves(params)])[free]
         s, directions = uncertainty.singular_values, uncertainty.directions
         combinations = undetermined_combinations(names, values, s, directions, num_residuals)
-        why = f"the residuals determine {'; '.join(combinations)}"
+        why = f"the residuals determine {'; '.join(combinations)}" if combinations else BEYOND
     message = f"{caller}: no standard error for {', '.join(names[flags])}: {why}."
     warnings.warn(message, IdentifiabilityWarning, stacklevel=stacklevel)

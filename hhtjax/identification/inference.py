@@ -82,7 +82,7 @@ def score_test(residuals, params, candidates, segments=SEGMENTS) -> Score:
 
 class Profile(NamedTuple):
     """values: of the parameter, and cost: the least one with it held there, (values,). deviance: 2 (cost - that of the
-    fit)/variance of a residual, corrected for correlated residuals; 3.84 bounds the 95 % interval."""
+    fit)/variance, scaled so that its parabola is that of the standard error; 3.84 bounds the 95 % interval."""
 
     values: Any
     cost: Any
@@ -121,12 +121,8 @@ def profile(residuals, result, name, values, **options: Any) -> Profile:
         )
         costs.append(float(held.cost))
         params = jax.tree.leaves(held.params)
-    size = sum(np.size(x) for x in leaves)
-    m = sum(np.size(x) for x in jax.tree.leaves(result.residual))
     row = int(np.flatnonzero(_flags(leaves, at))[0])
-    naive = result.embed(result.uncertainty.naive)[row, row]
-    inflation = float(result.covariance[row, row] / naive)
-    variance = 2 * float(result.cost) / (m - size) * inflation
+    variance = float(result.covariance[row, row] / result.embed(result.uncertainty.inverse)[row, row])
     return Profile(np.asarray(values), np.asarray(costs), 2 * (np.asarray(costs) - float(result.cost)) / variance)
 
 

@@ -36,6 +36,7 @@ def soft_l1(z):
     return 2 * z / (jnp.sqrt(1 + z) + 1)
 
 
+LEAST_BEND = 0.1  # share of rho' that rho' + 2 rho'' z is taken to have at least, in a step
 LOSSES = {"huber": huber, "soft_l1": soft_l1, "cauchy": jnp.log1p}
 
 
@@ -79,15 +80,25 @@ class Objective(NamedTuple):
         return jnp.sum(self.losses(r)[0]) / 2
 
     def least_squares(self, r, J):
-        """(r, J) of the ordinary least-squares problem with the same gradient J^T r and Gauss-Newton matrix J^T J.
+        """(r, J) of an ordinary least-squares problem with the same gradient J^T r.
 
-        Triggs et al. (2000), Sec. 4.3: the rows of J are scaled by sqrt(rho' + 2 rho'' z), kept positive.
+        The rows of J are scaled by sqrt(rho' + 2 rho'' z) (Triggs et al. 2000, Sec. 4.3), but not far below the
+        sqrt(rho') of iterative reweighting: so the length of r stays that of the gradient's own residual.
+        """
+        if self.loss is None:
+            return self.scaled(r), self.scaled(J)
+        J, pull, bend = self.estimating(r, J)
+        slope = self.losses(r)[1]
+        row = jnp.sqrt(jnp.maximum(bend, LEAST_BEND * slope))
+        return pull / jnp.where(row == 0, 1, row), J * row[:, None]
+
+    def estimating(self, r, J):
+        """w J, and the first and second derivative of the loss of each weighted residual (None without a loss: 1).
+
+        With them J^T pull is the gradient of the cost, and J^T diag(bend) J its second derivative.
         """
         r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
-        if self.loss is None:
-            return r, J
-        row = jnp.sqrt(jnp.maximum(slope + 2 * curvature * r**2, float(jnp.finfo(r.dtype).eps)))
-        return r * slope / row, J * row[:, None]
+        return J, slope * r, None if self.loss is None else slope + 2 * curvature * r**2
 
 
 def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress):

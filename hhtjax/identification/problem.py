@@ -29,8 +29,8 @@ class Data(NamedTuple):
 
 
 class _Solved(NamedTuple):
-    """x and what belongs to it. r, J: of the linear problem there, J None if not asked for; r_leaves: r as a pytree's
-    leaves, of the given sizes; present: how many rows are not missing."""
+    """x and what belongs to it. J, pull, bend: of `Objective.estimating` there, J None if not asked for; leaves: pull
+    as a pytree's leaves, of the given sizes; present: how many rows are not missing."""
 
     x: Any
     cost: Any
@@ -39,9 +39,10 @@ class _Solved(NamedTuple):
     code: Any
     residual: Any
     starts: Any
-    r: Any
     J: Any
-    r_leaves: Any
+    pull: Any
+    bend: Any
+    leaves: Any
     sizes: list
     present: Any
 
@@ -92,8 +93,8 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
     if options.covariance:
         segments = count_segments(found.sizes, options.segments)
         J = found.J / coordinates.slope(found.x)[None, :]
-        tau = variance_inflation(found.r_leaves)
-        believed = uncertainty(J, found.r, found.present, found.sizes, segments, tau)
+        tau = variance_inflation(found.leaves)
+        believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau)
     ended = found.residual, found.cost, found.history, found.iterations, found.code
     return FitResult(coordinates.params(found.x), *ended, options.transforms, believed, segments, found.starts)
 
@@ -125,24 +126,12 @@ def _solve_dense(residuals, options, coordinates, data, limits):
     else:
         x, history, iterations, code = descend(f, coordinates.x0, objective, options.optimizer, *limits)
         r, J = with_jacobian(f, x) if options.covariance else (f(x), None)
-    residual, cost = unravel(r[:m]), objective.cost(r)
+    residual, cost, pull, bend = unravel(r[:m]), objective.cost(r), r, None
     if J is not None:
-        r, J = objective.least_squares(r, J)
-    sizes = [math.prod(leaf.shape) for leaf in leaves]
-    return _Solved(
-        x,
-        cost,
-        history,
-        iterations,
-        code,
-        residual,
-        None,
-        r,
-        J,
-        jax.tree.leaves(unravel(r[:m])),
-        sizes,
-        jnp.sum(w != 0),
-    )
+        J, pull, bend = objective.estimating(r, J)
+    sizes, of_pull = [math.prod(leaf.shape) for leaf in leaves], jax.tree.leaves(unravel(pull[:m]))
+    ended = x, cost, history, iterations, code, residual, None
+    return _Solved(*ended, J, pull, bend, of_pull, sizes, jnp.sum(w != 0))
 
 
 def _solve_records(residuals, options, coordinates, data, limits):
@@ -167,7 +156,8 @@ def _solve_records(residuals, options, coordinates, data, limits):
     best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
     x, own = problem.split(best.x)
     residual, starts, cost = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own), objective.cost(best.r.ravel())
-    r, J = problem.free_of_own(best)
-    r_leaves = jax.tree.leaves(jax.vmap(unravel)(r.reshape(w.shape)))
+    J, pull, bend = problem.free_of_own(best)
+    of_pull = jax.tree.leaves(jax.vmap(unravel)(pull.reshape(w.shape)))
     present = jnp.sum(w != 0) - own0.size  # each start has used up as many residuals as it has entries
-    return _Solved(x, cost, history, iterations, code, residual, starts, r, J, r_leaves, [w.size], present)
+    ended = x, cost, history, iterations, code, residual, starts
+    return _Solved(*ended, J, pull, bend, of_pull, [w.size], present)

@@ -12,6 +12,9 @@ With the Jacobian J and the residual r at the estimate, each covariance is a san
 (Liang and Zeger 1986, with the correction "CR2" of Bell and McCaffrey 2002: S has no bias for white residuals.) A
 combination of parameters that a single segment determines, such as its initial state, leaves no residual to estimate
 its variance from: there, that of the autocorrelated S stands in. A prior adds its own precision to S.
+
+With a loss rho (Huber 1981, Ch. 7, an M-estimate) psi(r), half the derivative of rho(r^2), stands for r in S, and
+J^T diag(psi'(r)) J for J^T J outside of it.
 """
 
 import math
@@ -23,6 +26,7 @@ import numpy as np
 from hhtjax.identification.gauss_newton import triangle
 
 SEGMENTS = 32
+FLAT = 1e-6  # curvature of the cost beside that of the sum of squares, at which a loss counts as flat
 ALONE = 0.75  # share of the information on a combination of parameters, above which its segment has taken it all
 
 
@@ -32,7 +36,8 @@ class Uncertainty(NamedTuple):
     cluster: None where there are no more segments than parameters. singular_values: (p,), of the Jacobian with columns
     scaled to one, largest first: a small one belongs to a combination of parameters that hardly matters. directions:
     (p, p), a row for each: the change of the parameters, in their units. undetermined: (p,), parameters in a
-    combination that does not matter at all; their variance is inf, and their covariances are 0.
+    combination that does not matter at all; their variance is inf, and their covariances are 0. inverse: of the second
+    derivative of the cost, J^T diag(psi') J.
     """
 
     cluster: Any
@@ -41,6 +46,7 @@ class Uncertainty(NamedTuple):
     singular_values: Any
     directions: Any
     undetermined: Any
+    inverse: Any = None
 
     @property
     def covariance(self):
@@ -61,11 +67,13 @@ def count_segments(sizes, segments):
     return max(-(-n // -(-n // segments)) for n in sizes if n)
 
 
-def uncertainty(J, r, present, sizes, segments, tau) -> Uncertainty:
+def uncertainty(J, r, bend, present, sizes, segments, tau) -> Uncertainty:
     """All of the above.
 
     Args:
-        J, r: (m + k, p), (m + k,), in units of parameters; the last k rows are priors, and missing rows are zero.
+        J, r: (m + k, p), (m + k,), in units of parameters; the last k rows are priors, and missing rows are zero. With
+            a loss, r is psi.
+        bend: psi', (m + k,); None for 1.
         present: number of rows that are not missing.
         sizes: of the raveled residual leaves, m together. Each is cut into equal parts, and the k-th parts of all
             leaves, which belong to the same times, are one segment; `segments` of them, by `count_segments`.
@@ -77,23 +85,39 @@ def uncertainty(J, r, present, sizes, segments, tau) -> Uncertainty:
     column = jnp.where(norms == 0, 1, norms)
     _, s, Vt = jnp.linalg.svd(triangle(J / column[None, :]))
     seen = s > 10 * J.shape[0] * eps * s[0]
-    undetermined = jnp.any(~seen[:, None] & (jnp.abs(Vt) > 1e-6), axis=0) | (present == p)
     T = Vt.T * jnp.where(seen, 1 / jnp.where(seen, s, 1), 0)[None, :]  # coordinates in which J^T J = 1
     J = J @ (T / column[:, None])
+    inverse, flat = _inverse_curvature(J, bend, T, seen)
+    undetermined = jnp.any(~seen[:, None] & (jnp.abs(Vt) > 1e-6), axis=0) | flat | (present == p)
     prior = J[m:].T @ J[m:]
     J, r = J[:m], r[:m]
     s2 = jnp.sum(r**2) / jnp.maximum(present - p, 1).astype(J.dtype)
 
-    def covariance(S):
-        C = T @ (S + prior) @ T.T / jnp.outer(column, column)
+    def in_units(C):
+        C = T @ C @ T.T / jnp.outer(column, column)
         both = undetermined[:, None] & undetermined[None, :]
         C = jnp.where(undetermined[:, None] | undetermined[None, :], 0, C)
         return jnp.where(both & jnp.eye(p, dtype=bool), jnp.inf, C)
 
+    def covariance(S):
+        return in_units(inverse @ (S + prior) @ inverse)
+
     white = s2 * J.T @ J
     cluster = covariance(_clusters(J, r, sizes, segments, tau * s2)) if segments > p else None
-    directions = Vt / column[None, :]
-    return Uncertainty(cluster, covariance(white), covariance(tau * white), s, directions, undetermined)
+    directions, naive = Vt / column[None, :], covariance(white)
+    return Uncertainty(cluster, naive, covariance(tau * white), s, directions, undetermined, in_units(inverse))
+
+
+def _inverse_curvature(J, bend, T, seen):
+    """(J^T diag(bend) J)^-1 for J^T J = 1, and whether a parameter is part of a direction in which it vanishes."""
+    p = len(seen)
+    if bend is None:
+        return jnp.eye(p, dtype=J.dtype), jnp.zeros(p, bool)
+    h, U = jnp.linalg.eigh(J.T @ (bend[:, None] * J) + jnp.diag(jnp.where(seen, 0, 1).astype(J.dtype)))
+    flat = h <= FLAT
+    share = jnp.abs(T @ U) / jnp.max(jnp.abs(T), initial=1e-300)
+    inverse = jnp.where(flat, 0, 1 / jnp.where(flat, 1, h))
+    return (U * inverse[None, :]) @ U.T, jnp.any(flat[None, :] & (share > 1e-6), axis=1)
 
 
 def _clusters(J, r, sizes, segments, variance):

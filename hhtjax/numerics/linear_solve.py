@@ -8,10 +8,11 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 from functools import partial
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
-from hhtjax.xla import choose, linear_map, staged
+from hhtjax.xla import choose, linear_map, staged, structural
 
 UNROLLED = 8
 LOOPED = 16
@@ -147,6 +148,7 @@ def _lu(A):
     n = A.shape[0]
     i = jnp.arange(n)
     row, column = i[:, None], i[None, :]
+    nothing = structural(np.zeros((), A.dtype))
     loop, find_pivot = (lax.fori_loop, _pivot) if n > UNROLLED else (_written_out, _pivot_by_scalars)
 
     def eliminate(k, carry):
@@ -154,7 +156,7 @@ def _lu(A):
         pivot = find_pivot(A, k)
         exchange = jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))
         A, order = A[exchange], order[exchange]
-        factor = jnp.where(row > k, A[:, k][:, None] / A[k, k], 0)
+        factor = jnp.where(row > k, A[:, k][:, None] / A[k, k], nothing)
         changed = A - factor * A[k][None, :]
         return jnp.where(column > k, changed, jnp.where((column == k) & (row > k), factor, A)), order
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.scipy.sparse.linalg import cg
 
+from hhtjax.checks import require_integer
 from hhtjax.numerics.linear_solve import Structured, solve
 
 
@@ -59,8 +60,7 @@ def banded(half_bandwidth=1) -> Banded:
     >>> bool(jnp.allclose(end(hhtjax.banded(1)), end(None), atol=1e-12))
     True
     """
-    _require_count("banded", "half_bandwidth", half_bandwidth)
-    return Banded(half_bandwidth)
+    return Banded(require_integer("banded", "half_bandwidth", half_bandwidth))
 
 
 def conjugate_gradients(iterations) -> ConjugateGradients:
@@ -73,13 +73,7 @@ def conjugate_gradients(iterations) -> ConjugateGradients:
     Raises:
         ValueError: iterations is no positive integer.
     """
-    _require_count("conjugate_gradients", "iterations", iterations)
-    return ConjugateGradients(iterations)
-
-
-def _require_count(caller, name, value):
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"{caller}: `{name}` must be a positive integer; received {value!r}.")
+    return ConjugateGradients(require_integer("conjugate_gradients", "iterations", iterations))
 
 
 def find_bands(f, like, p):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_integer, require_number
 from hhtjax.description import is_concrete
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.extrapolate import MOST, extrapolated
@@ -64,9 +64,8 @@ def simulate(
     """
     require_system("simulate", system)
     require_stepper("simulate", stepper)
-    for name, value in (("num_steps", num_steps), ("save_every", save_every)):
-        if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"simulate: `{name}` must be a positive integer; received {value!r}.")
+    num_steps = require_integer("simulate", "num_steps", num_steps)
+    save_every = require_integer("simulate", "save_every", save_every)
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
@@ -80,7 +79,7 @@ def simulate(
     dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew
 
     def run(k):
-        sizes = {"num_steps": k * int(num_steps), "save_every": k * int(save_every)}
+        sizes = {"num_steps": k * num_steps, "save_every": k * save_every}
         return _simulate(system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress)
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)

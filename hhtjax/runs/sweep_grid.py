@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_integer, require_number
 from hhtjax.description import is_array, is_concrete, is_real
 
 
@@ -23,8 +23,7 @@ def require_one_grid(stepper, duration, num_samples, times):
                 "`duration` and `num_samples`, or another stepper."
             )
         return
-    if not isinstance(num_samples, (int, np.integer)) or isinstance(num_samples, bool) or num_samples < 1:
-        raise ValueError(f"sweep: `num_samples` must be a positive integer; received {num_samples!r}.")
+    require_integer("sweep", "num_samples", num_samples)
     require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
 
 

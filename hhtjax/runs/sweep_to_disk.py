@@ -5,14 +5,17 @@ import json
 import os
 import sys
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from hhtjax.description import is_concrete
-from hhtjax.runs.sweep import Inputs, run_sweep
+from hhtjax.checks import require_integer
+from hhtjax.description import VERSION, is_concrete
+from hhtjax.runs.sweep import run_sweep
+from hhtjax.runs.sweep_inputs import Inputs
 
 
 def sweep_to_disk(
@@ -53,8 +56,7 @@ def sweep_to_disk(
         OSError: a file cannot be written, such as on a full disk; those before it stay, and the same call goes on.
         TypeError, ValueError: as `sweep`; also for tracers.
     """
-    if not isinstance(chunk, (int, np.integer)) or isinstance(chunk, bool) or chunk < 1:
-        raise ValueError(f"sweep_to_disk: `chunk` must be a positive integer; received {chunk!r}.")
+    chunk = require_integer("sweep_to_disk", "chunk", chunk)
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, dts=dts, in_axes=in_axes, **grid)
     if not all(map(is_concrete, jax.tree.leaves(inputs))):
@@ -106,8 +108,6 @@ def _named(runs, kept) -> dict[str, Any]:
 
 
 def _manifest(inputs, lowered, chunk, chunks):
-    from hhtjax import __version__
-
     digest = hashlib.sha256(lowered.as_text().encode())
     for x in jax.tree.leaves(inputs):
         x = np.asarray(x)
@@ -115,9 +115,9 @@ def _manifest(inputs, lowered, chunk, chunks):
     return {
         "inputs": digest.hexdigest(),
         "members": int(inputs.dts.size),
-        "chunk": int(chunk),
+        "chunk": chunk,
         "chunks": chunks,
-        "versions": {"hhtjax": __version__, "jax": jax.__version__, "numpy": np.__version__},
+        "versions": {"hhtjax": VERSION, "jax": version("jax"), "numpy": np.__version__},
     }
 
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_integer, require_number
 from hhtjax.rotation import cross, exp
 from hhtjax.scenes.scene import Scene
 from hhtjax.systems.system import System
@@ -59,9 +59,8 @@ def body_chain(bodies=3, spin=5.0) -> Scene:
     >>> (body_chain(bodies=2).q0["x"].round(3) + 0.0).tolist()
     [[0.217, 0.0, -0.125], [0.65, 0.0, -0.375]]
     """
-    require_number("body_chain", "bodies", bodies, lambda n: n >= 1 and float(n).is_integer(), "be a positive integer")
     require_number("body_chain", "spin", spin, np.isfinite, "be finite")
-    N = int(bodies)
+    N = require_integer("body_chain", "bodies", bodies)
     params = {"m": jnp.array(1.0), "l": jnp.array(0.5), "r": jnp.array(0.05), "g": jnp.array(9.81)}
     R = exp(jnp.array([0.0, -np.pi / 3, 0.0]))
     x = -params["l"] * (jnp.arange(N, dtype=R.dtype) + 0.5)[:, None] * R[None, :, 2]

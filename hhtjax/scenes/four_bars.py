@@ -18,7 +18,7 @@ References:
 
 import jax.numpy as jnp
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_integer
 from hhtjax.scenes.scene import Scene
 from hhtjax.systems.system import System
 
@@ -57,13 +57,13 @@ def four_bars(loops=2) -> Scene:
     """N = loops squares of 1 m bars of 1 kg, whose upper row starts at 1 m/s.
 
     Raises:
-        TypeError, ValueError: loops is no positive integer.
+        ValueError: loops is no positive integer.
 
     >>> four_bars(loops=2).q0.tolist()
     [[0.0, 1.0], [1.0, 1.0], [2.0, 1.0]]
     """
-    require_number("four_bars", "loops", loops, lambda n: n >= 1 and float(n).is_integer(), "be a positive integer")
-    along = jnp.arange(int(loops) + 1, dtype=jnp.result_type(float))
+    loops = require_integer("four_bars", "loops", loops)
+    along = jnp.arange(loops + 1, dtype=jnp.result_type(float))
     ones = jnp.ones_like(along)
     params = {"m": 1.0, "l": 1.0, "g": GRAVITY}
     q0, v0 = jnp.stack([along, ones], axis=1), jnp.stack([ones, jnp.zeros_like(ones)], axis=1)

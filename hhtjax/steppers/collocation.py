@@ -16,8 +16,9 @@ from typing import Any
 
 from hhtjax.checks import require_number
 from hhtjax.numerics.linear_solve import factorize
-from hhtjax.steppers.generalized_alpha import Options, check_options, residual
 from hhtjax.steppers.newton import newton
+from hhtjax.steppers.options import Options, check_options
+from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import State, Stepper
 
 
@@ -106,4 +107,5 @@ def wilson(theta: Any = 1.4, tolerance=1e-10, max_iterations=20) -> Collocation:
 def _collocation(caller, beta, theta, tolerance, max_iterations):
     beta = require_number(caller, "beta", beta, lambda x: 0 < x <= 0.25, "lie in (0, 1/4]")
     theta = require_number(caller, "theta", theta, lambda x: x >= 1, "be 1 or more")
-    return Collocation(beta, theta, check_options(caller, Options(None, None, tolerance, max_iterations)))
+    options = check_options(caller, iterations=None, tolerance=tolerance, max_iterations=max_iterations)
+    return Collocation(beta, theta, options)

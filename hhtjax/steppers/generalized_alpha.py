@@ -1,113 +1,52 @@
-"""The generalised-alpha family: one residual, coefficients as data, with and without iterations.
+"""The generalised-alpha family, with and without iterations: the step, the method, and its constructors.
 
-State (q, v, w, a) with w the acceleration and a the algorithmic one (Arnold and Bruls 2007):
-
-    q1 = q + h v + h^2 [(1/2 - beta) a + beta a1]
-    v1 = v + h [(1 - gamma) a + gamma a1]
-    (1 - alpha_m) a1 + alpha_m a = (1 - alpha_f) w1 + alpha_f w
-    r(w1) = M(q1) w1 - Q(q1, v1, t1) = 0
-
-Second order for every alpha, for M(q) and for explicit time. (The form printed in the literature,
-M(q1) a1 = (1 + alpha) Q1 - alpha Q0, is first order once M depends on q and alpha is not 0.)
-
-On rotations the first two lines give the rotation vector of the increment, from zero, and its rate: see kinematics.py.
+The formulas are in residual.py; constraints are in constrained.py, and add rows to the residual.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
-from hhtjax.checks import require_function, require_number
+from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
-from hhtjax.numerics.linear_solve import Structured, diagonal, factorize, factorize_with
+from hhtjax.numerics.linear_solve import Structured, factorize, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
+from hhtjax.steppers.linearization import linearization_point
 from hhtjax.steppers.newton import linearized_solve, newton
+from hhtjax.steppers.options import Options, check_options, require_alpha, takes_options
+from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.systems import kinematics
-from hhtjax.systems.constraints import check_redundant, factorize_constrained
-from hhtjax.xla import staged
-
-LINEARIZATIONS = ("predictor", "held", "state", "auto")
-HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
+from hhtjax.systems.constraints import factorize_constrained
 
 
-class Coefficients(NamedTuple):
-    """alpha_m, alpha_f, beta, gamma of the formulas above; numbers, or tracers to differentiate."""
+def step(method, system, params, factorize, where, dt, s):
+    """From s to t + dt by one Newton step from the constant-acceleration predictor: one Jacobian, one solve.
 
-    alpha_m: Any
-    alpha_f: Any
-    beta: Any
-    gamma: Any
-
-
-class Options(NamedTuple):
-    """How the residual is solved; `hht` documents the fields."""
-
-    iterations: int | None = 1
-    linearize: str | None = None
-    tolerance: float = 1e-10
-    max_iterations: int = 20
-    start: str | None = None
-    formulation: str = "ggl"
-    redundant: str | None = None
-    kinematics: str = "chart"
-    solve: Callable | None = None
+    Or by as many as `iterations` says; None: by the converged method.
+    """
+    options, r = method.options, partial(residual, system, params)
+    path = partial(method.arrive, system, s, dt)  # the state at t + dt, given its acceleration
+    if options.iterations is None:
+        w, info = newton(r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
+        return system.tidy(path(w)), info
+    at = linearization_point(system, params, s, path(s.w), where)
+    w = linearized_solve(r, path, s.w, factorize, at)
+    for _ in range(options.iterations - 1):
+        w = linearized_solve(r, path, w, factorize)
+    s1 = path(w)
+    if where == "state" and options.iterations == 1:
+        s1 = refresh(system, params, method.coefficients, s1, factorize)
+    return system.tidy(s1), Info()
 
 
-class Keywords(TypedDict, total=False):
-    """The same, as the keyword arguments of the constructors."""
-
-    iterations: int | None
-    linearize: str | None
-    tolerance: float
-    max_iterations: int
-    start: str | None
-    formulation: str
-    redundant: str | None
-    kinematics: str
-    solve: Callable | None
-
-
-def advance(c, s, dt, w):
-    """Displacement from q, and the rest at t + dt, as an affine function of the new acceleration w."""
-    a = ((1 - c.alpha_f) * w + c.alpha_f * s.w - c.alpha_m * s.a) / (1 - c.alpha_m)
-    x = dt * s.v + dt**2 * ((0.5 - c.beta) * s.a + c.beta * a)
-    v = s.v + dt * ((1 - c.gamma) * s.a + c.gamma * a)
-    return x, v, w, a
-
-
-def residual(system, params, s):
-    """M(q) w - Q(q, v, t): zero on the trajectory."""
-    return system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
-
-
-def linearization_point(system, params, s, predicted, where):
-    """The state at t1 about which the non-iterative step expands r; None for the predictor itself."""
-    if where == "predictor":
-        return None
-    if where == "state":
-        return s._replace(t=predicted.t)
-    held = s._replace(t=predicted.t, q=system.move(s.q, (predicted.t - s.t) * s.v))
-    if where == "held":
-        return held
-    D = diagonal(system.mass(s.q, params))
-
-    @staged
-    def size(s):
-        return jnp.sum(residual(system, params, s) ** 2 / D)
-
-    predicted_size = size(predicted)
-    use_predictor = lax.cond(
-        predicted_size <= HELD_THRESHOLD**2 * jnp.sum(D * s.w**2),
-        lambda: jnp.array(True),
-        lambda: predicted_size <= size(held),
-    )
-    return jax.tree.map(partial(jnp.where, use_predictor), predicted, held)
+def refresh(system, params, c, s, factorize):
+    """The state with the acceleration that its q and v ask for: w = M^-1 Q."""
+    w = system.acceleration(s.q, s.v, s.t, params, factorize)
+    return s._replace(w=w, a=s.a + (1 - c.alpha_f) / (1 - c.alpha_m) * (w - s.w))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,37 +114,22 @@ class GeneralizedAlpha(Stepper):
         """The step; for a linear system its matrix is factorised here, once."""
         if system.num_constraints:
             return bind_constrained(self, system, params, dt)
-        r = partial(residual, system, params)
-        options, c = self.options, self.coefficients
-        factorize, where = self.factorize, options.linearize
-        if system.linear:
-            where = "predictor"  # all points of linearisation are one
-            zero = jnp.zeros(system.size, dt.dtype)
-            rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
-            inverse = self.factorize(jax.jacfwd(lambda w: r(self.arrive(system, rest, dt, w)))(zero))
+        if not system.linear:
+            return partial(step, self, system, params, self.factorize, self.options.linearize, dt)
+        # all points of linearisation are one
+        return partial(step, self, system, params, self.factorize_once(system, params, dt), "predictor", dt)
 
-            def factorize(A):  # A is this same matrix
-                return inverse
-
-        def step(s):
-            path = partial(self.arrive, system, s, dt)
-            if options.iterations is None:
-                w, info = newton(r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
-                return system.tidy(path(w)), info
-            at = linearization_point(system, params, s, path(s.w), where)
-            w = linearized_solve(r, path, s.w, factorize, at)
-            for _ in range(options.iterations - 1):
-                w = linearized_solve(r, path, w, factorize)
-            s1 = path(w)
-            if where == "state" and options.iterations == 1:  # refresh: the acceleration of the new state
-                w = system.acceleration(s1.q, s1.v, s1.t, params, factorize)
-                s1 = s1._replace(w=w, a=s1.a + (1 - c.alpha_f) / (1 - c.alpha_m) * (w - s1.w))
-            return system.tidy(s1), Info()
-
-        return step
+    def factorize_once(self, system, params, dt):
+        """The factorised matrix of a linear system, in the place of `factorize`."""
+        zero = jnp.zeros(system.size, dt.dtype)
+        rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
+        path = partial(self.arrive, system, rest, dt)
+        inverse = self.factorize(jax.jacfwd(lambda w: residual(system, params, path(w)))(zero))
+        return lambda A: inverse  # A is this same matrix
 
 
-def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+@takes_options
+def hht(alpha: Any = -0.05, **options: Any) -> GeneralizedAlpha:
     """HHT-alpha, by default non-iterative: one Jacobian, one factorisation, one solve per step.
 
         alpha_m = 0,  alpha_f = -alpha,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -261,10 +185,11 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     ValueError: hht: `alpha` must lie in [-1/3, 0]; received 0.2.
     """
     alpha = require_alpha("hht", alpha)
-    return _member("hht", Coefficients(0.0, -alpha, (1 - alpha) ** 2 / 4, 0.5 - alpha), 2, options)
+    return GeneralizedAlpha(hht_coefficients(alpha), 2, check_options("hht", **options))
 
 
-def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+@takes_options
+def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Any) -> GeneralizedAlpha:
     """Newmark(beta, gamma): alpha_m = alpha_f = 0. The default is the trapezoidal rule.
 
     Order 2 for gamma = 1/2, else 1 (and gamma > 1/2 damps). A-stable for 2 beta >= gamma >= 1/2.
@@ -283,10 +208,11 @@ def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> 
     beta = require_number("newmark", "beta", beta, lambda x: 0 < x <= 1, "lie in (0, 1]")
     gamma = require_number("newmark", "gamma", gamma, lambda x: 0.5 <= x <= 1, "lie in [1/2, 1]")
     order = 2 if is_concrete(gamma) and gamma == 0.5 else 1
-    return _member("newmark", Coefficients(0.0, 0.0, beta, gamma), order, options)
+    return GeneralizedAlpha(Coefficients(0.0, 0.0, beta, gamma), order, check_options("newmark", **options))
 
 
-def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+@takes_options
+def bossak(alpha: Any = -0.1, **options: Any) -> GeneralizedAlpha:
     """Bossak (Wood, Bossak, Zienkiewicz): HHT's weighting put on the inertia instead of the forces.
 
         alpha_m = alpha,  alpha_f = 0,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -305,10 +231,11 @@ def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     -0.1
     """
     alpha = require_number("bossak", "alpha", alpha, lambda x: -1 <= x <= 0, "lie in [-1, 0]")
-    return _member("bossak", Coefficients(alpha, 0.0, (1 - alpha) ** 2 / 4, 0.5 - alpha), 2, options)
+    return GeneralizedAlpha(coefficients(alpha, 0.0), 2, check_options("bossak", **options))
 
 
-def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+@takes_options
+def generalized_alpha(rho_inf: Any = 0.8, **options: Any) -> GeneralizedAlpha:
     """Chung and Hulbert's generalised-alpha: least low-frequency damping for a given one at infinity.
 
         alpha_m = (2 rho - 1)/(rho + 1),  alpha_f = rho/(rho + 1),
@@ -328,49 +255,5 @@ def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> Genera
     Coefficients(alpha_m=0.5, alpha_f=0.5, beta=0.25, gamma=0.5)
     """
     rho = require_number("generalized_alpha", "rho_inf", rho_inf, lambda x: 0 <= x <= 1, "lie in [0, 1]")
-    alpha_m, alpha_f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
-    shift = alpha_f - alpha_m
-    return _member("generalized_alpha", Coefficients(alpha_m, alpha_f, (1 + shift) ** 2 / 4, 0.5 + shift), 2, options)
-
-
-def require_alpha(caller, alpha):
-    """HHT's alpha as it is, if it lies in its range."""
-    return require_number(caller, "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")
-
-
-def _member(caller, coefficients, order, keywords):
-    for name in keywords:
-        if name not in Options._fields:
-            raise TypeError(f"{caller}: unknown option {name!r}; the options are {', '.join(Options._fields)}.")
-    return GeneralizedAlpha(coefficients, order, check_options(caller, Options(**keywords)))
-
-
-def check_options(caller, options):
-    """The options with the default of `linearize` filled in, or an error that names what is wrong."""
-    iterations, linearize, tolerance, max_iterations, start, formulation, redundant, kinematics, solve = options
-    if iterations is not None and (not isinstance(iterations, int) or isinstance(iterations, bool) or iterations < 1):
-        raise ValueError(f"{caller}: `iterations` must be a positive integer or None; received {iterations!r}.")
-    if linearize is None:
-        linearize = "auto" if iterations == 1 else "predictor"
-    if linearize not in LINEARIZATIONS:
-        raise ValueError(f"{caller}: `linearize` must be one of {', '.join(LINEARIZATIONS)}; received {linearize!r}.")
-    if iterations is None and linearize != "predictor":
-        raise ValueError(
-            f"{caller}: with iterations=None, Newton starts from the predictor: leave `linearize` out; "
-            f"received {linearize!r}."
-        )
-    require_number(caller, "tolerance", tolerance, lambda x: x > 0, "be positive")
-    if not isinstance(max_iterations, int) or isinstance(max_iterations, bool) or max_iterations < 1:
-        raise ValueError(f"{caller}: `max_iterations` must be a positive integer; received {max_iterations!r}.")
-    if start not in (None, "corrected", "simple"):
-        raise ValueError(f'{caller}: `start` must be "corrected" or "simple"; received {start!r}.')
-    if formulation not in ("ggl", "index3"):
-        raise ValueError(f'{caller}: `formulation` must be "ggl" or "index3"; received {formulation!r}.')
-    check_redundant(caller, redundant)
-    if redundant is not None and solve is not None:
-        raise ValueError(f"{caller}: `redundant` brings its own solver: leave out `solve`, or `redundant`.")
-    if kinematics not in ("chart", "lie"):
-        raise ValueError(f'{caller}: `kinematics` must be "chart" or "lie"; received {kinematics!r}.')
-    if solve is not None:
-        require_function(caller, "solve", solve, "solve(A, b)")
-    return options._replace(linearize=linearize)
+    weights = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
+    return GeneralizedAlpha(coefficients(*weights), 2, check_options("generalized_alpha", **options))

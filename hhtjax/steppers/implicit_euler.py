@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 
-from hhtjax.steppers.generalized_alpha import Coefficients, GeneralizedAlpha, Options, check_options
+from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
+from hhtjax.steppers.options import check_options
+from hhtjax.steppers.residual import Coefficients
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,5 +30,6 @@ def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=No
     >>> hhtjax.implicit_euler().order
     1
     """
-    options = Options(iterations, "predictor", tolerance, max_iterations, "simple", solve=solve)
-    return ImplicitEuler(Coefficients(0.0, 0.0, 1.0, 1.0), 1, check_options("implicit_euler", options))
+    newton = {"iterations": iterations, "tolerance": tolerance, "max_iterations": max_iterations}
+    options = check_options("implicit_euler", **newton, linearize="predictor", start="simple", solve=solve)
+    return ImplicitEuler(Coefficients(0.0, 0.0, 1.0, 1.0), 1, options)

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 
 from hhtjax.description import is_concrete
 from hhtjax.numerics.linear_solve import factorize, solve
-from hhtjax.steppers.generalized_alpha import Options, check_options, require_alpha
 from hhtjax.steppers.newton import newton
+from hhtjax.steppers.options import Options, check_options, require_alpha
+from hhtjax.steppers.residual import hht_coefficients
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import acceleration_and_multipliers, reaction
@@ -49,7 +50,7 @@ class KimHHT(Stepper):
     def bind(self, system, params, dt):
         """Eq. 10-14. The field w of the state holds a, which the recursion (12) carries on."""
         alpha = self.alpha
-        beta, gamma = (1 - alpha) ** 2 / 4, 0.5 - alpha
+        beta, gamma = hht_coefficients(alpha)[2:]
 
         def step(s):
             M, Q, Q_q, Q_v, Ma_q = linearize_at_state(system, params, s)
@@ -85,7 +86,7 @@ class ConventionalHHT(Stepper):
     def bind(self, system, params, dt):
         """Eq. 5-7, with Eq. 1 for q1 and v1. The field w of the state holds a."""
         alpha = self.alpha
-        beta, gamma = (1 - alpha) ** 2 / 4, 0.5 - alpha
+        beta, gamma = hht_coefficients(alpha)[2:]
         late = (1 + alpha) * dt if self.fictive_time else dt
 
         n, m = system.size, system.num_constraints
@@ -196,7 +197,7 @@ def conventional_hht(alpha: Any = 0.0, fictive_time=True, tolerance=1e-10, max_i
     alpha = require_alpha("conventional_hht", alpha)
     if not isinstance(fictive_time, bool):
         raise TypeError(f"conventional_hht: `fictive_time` must be True or False; received {fictive_time!r}.")
-    options = check_options("conventional_hht", Options(None, None, tolerance, max_iterations))
+    options = check_options("conventional_hht", iterations=None, tolerance=tolerance, max_iterations=max_iterations)
     return ConventionalHHT(alpha, _order(alpha), fictive_time, options)
 
 

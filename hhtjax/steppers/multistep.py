@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.linear_solve import factorize
-from hhtjax.steppers.generalized_alpha import Options, check_options, residual
 from hhtjax.steppers.newton import newton
+from hhtjax.steppers.options import Options, check_options
+from hhtjax.steppers.residual import residual
 from hhtjax.steppers.rosenbrock import rosenbrock
 from hhtjax.steppers.stepper import Info, State, Stepper
 
@@ -118,7 +119,7 @@ def houbolt(tolerance=1e-10, max_iterations=20) -> Houbolt:
     >>> hhtjax.houbolt().order
     2
     """
-    return Houbolt(2, check_options("houbolt", Options(None, None, tolerance, max_iterations)))
+    return Houbolt(2, check_options("houbolt", iterations=None, tolerance=tolerance, max_iterations=max_iterations))
 
 
 def park(tolerance=1e-10, max_iterations=20) -> Park:
@@ -144,4 +145,4 @@ def park(tolerance=1e-10, max_iterations=20) -> Park:
     >>> hhtjax.park().order
     2
     """
-    return Park(2, check_options("park", Options(None, None, tolerance, max_iterations)))
+    return Park(2, check_options("park", iterations=None, tolerance=tolerance, max_iterations=max_iterations))

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from hhtjax.checks import require_number
 from hhtjax.numerics.linear_solve import factorize, factorize_map
-from hhtjax.steppers.generalized_alpha import residual
+from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.xla import staged
 

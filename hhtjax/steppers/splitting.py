@@ -13,7 +13,8 @@ import jax.numpy as jnp
 
 from hhtjax.description import is_concrete
 from hhtjax.numerics.linear_solve import matvec, solve
-from hhtjax.steppers.generalized_alpha import require_alpha
+from hhtjax.steppers.options import require_alpha
+from hhtjax.steppers.residual import hht_coefficients
 from hhtjax.steppers.stepper import Info, State, Stepper
 
 
@@ -46,7 +47,7 @@ class OperatorSplitting(Stepper):
     def bind(self, system, params, dt):
         """The step. The field w of the state holds a."""
         alpha = self.alpha
-        beta, gamma = (1 - alpha) ** 2 / 4, 0.5 - alpha
+        beta, gamma = hht_coefficients(alpha)[2:]
 
         def step(s):
             K, C, P0 = s.memory

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_integer, require_number
 from hhtjax.description import is_real
 from hhtjax.systems.sampled import Sampled, sampled
 
 
-def band_limited(values, dt, factor=8, t0=0.0) -> Sampled:
+def band_limited(values, dt, *, factor=8, t0=0.0) -> Sampled:
     """The function of time through `values[k]` at t0 + k dt that holds no frequency above 1/(2 dt).
 
     The samples less the line through the first and the last one, continued as an odd function, are a Fourier series.
@@ -32,8 +32,7 @@ def band_limited(values, dt, factor=8, t0=0.0) -> Sampled:
     >>> abs(float(hhtjax.band_limited(u, 1.0)(t) - exact)) < 0.01 < abs(float(hhtjax.sampled(u, 1.0)(t) - exact))
     True
     """
-    if not isinstance(factor, int) or isinstance(factor, bool) or factor < 1:
-        raise ValueError(f"band_limited: `factor` must be a positive integer; received {factor!r}.")
+    factor = require_integer("band_limited", "factor", factor)
     sampled(values, dt, t0)  # checks them
     line, spectrum = _odd_series(values)
     n = spectrum.shape[0] - 1

@@ -1,11 +1,12 @@
 """How a run becomes one kernel: the only reader of jaxprs, of MLIR, and of JAX's version.
 
-Its door has seven names. The rest of the library works as well on plain JAX, several times slower.
+Its door has eight names. The rest of the library works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
+    structural(x)             x, whose zeros are such by structure
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     explain(f, *args)         what became of the loops of a program
     plain()                   a context without all that
@@ -16,10 +17,20 @@ that autodiff knows to be zero) may be left out. A rule names the parameters of 
 it does not understand runs on whole arrays.
 """
 
-from hhtjax.xla.explanation import explain
+from hhtjax.xla.explanation import Explanation, explain
 from hhtjax.xla.gate import plain
-from hhtjax.xla.kernels import choose, one_kernel, staged
+from hhtjax.xla.kernels import choose, one_kernel, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.scalars import on_scalars
 
-__all__ = ["choose", "explain", "linear_map", "on_scalars", "one_kernel", "plain", "staged"]
+__all__ = [
+    "Explanation",
+    "choose",
+    "explain",
+    "linear_map",
+    "on_scalars",
+    "one_kernel",
+    "plain",
+    "staged",
+    "structural",
+]

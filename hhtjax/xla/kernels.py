@@ -39,6 +39,14 @@ def choose(inside, outside, *args):
     return lax.cond(inside_p.bind(jax.tree.leaves(args)[0]), inside, outside, *args)
 
 
+def structural(x):
+    """The array x, whose zeros are such by structure, as in a unit vector: their products may be left out of sums.
+
+    So the sum of 0 y and z is z, also where y is infinite or not a number.
+    """
+    return structural_p.bind(x) if is_on() else jnp.asarray(x)
+
+
 def named(name, f):
     """f as a function of this name in the program."""
 
@@ -58,6 +66,13 @@ inside_p = Primitive("hhtjax_inside")  # whether a kernel holds it; the operand 
 inside_p.def_impl(lambda x: jnp.array(False))
 inside_p.def_abstract_eval(lambda x: x.update(shape=(), dtype=np.dtype(bool), weak_type=False))
 batching.primitive_batchers[inside_p] = lambda values, axes: (inside_p.bind(*values), None)
+
+
+structural_p = Primitive("hhtjax_structural")
+structural_p.def_impl(jnp.asarray)
+structural_p.def_abstract_eval(lambda x: x)
+ad.deflinear2(structural_p, lambda cotangent, _: (cotangent,))
+batching.defvectorized(structural_p)
 
 
 watch_p = Primitive("hhtjax_watch")

@@ -9,10 +9,8 @@ So every value carries `Terms`: for each axis of it, the parts of its derivative
 along that axis, or else one full array. Operations that have no rule here run on whole columns, as with vmap.
 """
 
-from dataclasses import dataclass, field
 from functools import partial, reduce
 from operator import add
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,58 +18,8 @@ from jax import lax
 
 from hhtjax.xla.gate import is_on
 from hhtjax.xla.interpreter import alone, evaluate
-
-MOST_TERMS = 4  # beyond, a full array is no more work
-
-
-@dataclass
-class Terms:
-    """dy/dx of an array y of this shape with respect to n unknowns x: the sum over (axis, offset) of
-
-    dy[index]/dx[k] = along[axis, offset][index] where k = index[axis] + offset, and zero elsewhere;
-    and dy[index]/dx[k] = full[k, index].
-    """
-
-    n: int
-    shape: tuple
-    along: dict = field(default_factory=dict)
-    full: Any = None
-
-    def map(self, f, shape, keys=lambda axis, offset: (axis, offset)):
-        """The same of f(y), for a linear f that keeps indices along our axes apart, but may move them.
-
-        keys: (axis, offset) before -> after, or None where f does not keep them apart.
-        """
-        moved = {key: keys(*key) for key in self.along}
-        along = {new: f(self.along[key]) for key, new in moved.items() if new is not None}
-        rest = Terms(self.n, self.shape, {key: self.along[key] for key, new in moved.items() if new is None}, self.full)
-        return Terms(self.n, shape, along, jax.vmap(f)(rest.whole()) if rest.along or rest.full is not None else None)
-
-    def __add__(self, other):
-        keys = {**self.along, **other.along}
-        along = {key: _sum(self.along.get(key), other.along.get(key)) for key in keys}
-        both = Terms(self.n, self.shape, along, _sum(self.full, other.full))
-        if both.full is None and len(along) <= MOST_TERMS:
-            return both
-        return Terms(self.n, self.shape, full=both.whole())  # to carry both would be twice the work
-
-    def apart(self, axes):
-        """The terms along these axes, and all the rest."""
-        found = {key: y for key, y in self.along.items() if key[0] in axes}
-        others = {key: y for key, y in self.along.items() if key not in found}
-        return found, Terms(self.n, self.shape, others, self.full)
-
-    def whole(self):
-        """dy/dx as an array (n, *shape)."""
-        shape, total = (self.n, *self.shape), self.full
-        for (axis, offset), y in self.along.items():
-            k, i = (lax.broadcasted_iota(jnp.int32, shape, j) for j in (0, axis + 1))
-            total = _sum(total, jnp.where(k == i + offset, y[None], 0))
-        return total
-
-
-def _sum(x, y):
-    return y if x is None else x if y is None else x + y
+from hhtjax.xla.parameters import is_understood
+from hhtjax.xla.terms import Terms, zero_like
 
 
 def linear_map(f, like):
@@ -92,7 +40,7 @@ def _apply(eqn, values):
     """The results of one operation."""
     if not any(map(_depends, values)):
         return alone(eqn)(*values)
-    rule = RULES.get(eqn.primitive.name)
+    rule = RULES.get(eqn.primitive.name) if is_understood(eqn) else None
     results = None if rule is None else rule(eqn, *values)
     return _by_columns(eqn, values) if results is None else results
 
@@ -140,18 +88,22 @@ def _add(eqn, *values):
 
 def _multiply(eqn, x, y):
     shape = eqn.outvars[0].aval.shape
+    if _depends(x) and _depends(y):
+        return None
     x, y = (x, y) if _depends(x) else (y, x)
     return [_fit(x, shape).map(lambda z: z * y, shape)]
 
 
 def _divide(eqn, x, y):
     shape = eqn.outvars[0].aval.shape
-    return [_fit(x, shape).map(lambda z: z / y, shape)]
+    return None if _depends(y) else [_fit(x, shape).map(lambda z: z / y, shape)]
 
 
 def _select(eqn, which, *cases):
     def chosen(y, case):
-        return lax.select_n(which, *(y if i == case else jnp.zeros_like(y) for i in range(len(cases))))
+        return lax.select_n(
+            which, *(y if i == case else jnp.broadcast_to(zero_like(y), y.shape) for i in range(len(cases)))
+        )
 
     return [reduce(add, [x.map(partial(chosen, case=i), x.shape) for i, x in enumerate(cases) if _depends(x)])]
 
@@ -162,6 +114,8 @@ def _broadcast(eqn, x, *sizes):
 
 def _reshape(eqn, x, *sizes):
     """Axes of length 1 come and go; others, where they are joined or divided, are kept apart no longer."""
+    if eqn.params.get("dimensions") is not None and eqn.primitive.name == "reshape":
+        return None
     shape = eqn.outvars[0].aval.shape
     old, new = ([i for i, length in enumerate(s) if length != 1] for s in (x.shape, shape))
     same = [x.shape[i] for i in old] == [shape[i] for i in new]
@@ -205,7 +159,7 @@ def _split(eqn, x):
 def _put(x, shape, config):
     """Among zeros."""
     return x.map(
-        lambda y: lax.pad(y, jnp.zeros((), y.dtype), config),
+        lambda y: lax.pad(y, zero_like(y), config),
         shape,
         lambda axis, offset: (axis, offset - config[axis][0]) if config[axis][2] == 0 else None,
     )
@@ -232,7 +186,7 @@ def _concatenate(eqn, *values):
 def _unknown_first(y, axis, offset, n):
     """A term along `axis` as an array whose first axis is that of the unknowns, once this axis is summed over."""
     y = jnp.moveaxis(y, axis, 0)
-    return lax.pad(y, jnp.zeros((), y.dtype), [(offset, n - offset - len(y), 0), *[(0, 0, 0)] * (y.ndim - 1)])
+    return lax.pad(y, zero_like(y), [(offset, n - offset - len(y), 0), *[(0, 0, 0)] * (y.ndim - 1)])
 
 
 def _reduce_sum(eqn, x):

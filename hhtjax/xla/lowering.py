@@ -18,7 +18,7 @@ from jaxlib.mlir import ir
 from jaxlib.mlir.dialects import func, stablehlo
 
 from hhtjax.xla.gate import is_possible
-from hhtjax.xla.kernels import KERNEL, STAGED, inside_p, watch_p
+from hhtjax.xla.kernels import KERNEL, STAGED, inside_p, structural_p, watch_p
 
 ATTRIBUTES = "mhlo.frontend_attributes"
 VERDICT = "hhtjax_kernels"
@@ -299,3 +299,4 @@ CHECKS = {"dot_general": _small_product, "reduce": _small_reduction, "reduce_win
 uncached: Any = {"cacheable": False} if is_possible else {}
 mlir.register_lowering(watch_p, _lower, **uncached)
 mlir.register_lowering(inside_p, _lower_inside, **uncached)
+mlir.register_lowering(structural_p, lambda ctx, x: [x])

@@ -1,6 +1,7 @@
-"""Arithmetic on small arrays taken to pieces: NumPy arrays of objects, which are scalars, traced or known.
+"""Arithmetic on arrays in pieces.
 
-What moves numbers about costs nothing, and neither does a product with a known zero or one.
+What moves numbers about costs nothing. What is done with numbers is what the program says, IEEE, with the signs of
+zeros, NaN and infinities: only x * 1, x / 1, x - 0 and x + -0 are x. With structural zeros it is less (pieces.py).
 """
 
 import math
@@ -11,53 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-LARGEST = 64  # numbers in an array that is taken to pieces; larger ones stay whole
-
-
-def is_small(aval):
-    """Whether arrays like this are taken to pieces."""
-    return math.prod(aval.shape) <= LARGEST and not jnp.issubdtype(aval.dtype, jax.dtypes.extended)
-
-
-def is_in_pieces(value):
-    """Or whole."""
-    return isinstance(value, np.ndarray) and value.dtype == object
-
-
-def is_known(x):
-    """Whether an element is a number, and no tracer."""
-    return isinstance(x, np.generic)
-
-
-def arranged(elements, shape):
-    """The pieces of an array of this shape."""
-    found = np.empty(len(elements), object)
-    for i, x in enumerate(elements):  # one by one: NumPy would ask a tracer for its array
-        found[i] = x
-    return found.reshape(shape)
-
-
-def pieces(x):
-    """A small array taken to pieces; a large one as it is."""
-    if isinstance(x, (np.ndarray, np.generic, int, float, complex)):
-        x = np.asarray(x)
-    if not is_small(x):
-        return x
-    return arranged([x[i] if x.shape else x[()] for i in np.ndindex(*x.shape)], x.shape)
-
-
-def whole(value, aval):
-    """The array of a value."""
-    if not is_in_pieces(value):
-        return value
-    elements = [jnp.asarray(x, aval.dtype) for x in value.flat]
-    return jnp.stack(elements).reshape(aval.shape) if aval.shape else elements[0]
-
-
-def each(f, value):
-    """f of every element."""
-    return arranged([f(x) for x in value.flat], value.shape) if is_in_pieces(value) else f(value)
-
+from hhtjax.xla.parameters import ELEMENTWISE
+from hhtjax.xla.pieces import ZEROS, arranged, each, is_known, is_structural, pieces, unmarked
 
 # Rules: (operation, values) -> the values of the results, or None for whole arrays.
 
@@ -70,40 +26,78 @@ def _elementwise(eqn, *values):
 
 def _scalar(eqn, dtype, *x):
     """One operation on scalars, or what is known without it."""
-    name = eqn.primitive.name
-    if name == "select_n" and is_known(x[0]):
-        return x[1 + int(x[0])]
-    found = _without(name, dtype, *x)
-    return eqn.primitive.bind(*x, **eqn.params) if found is None else found
+    found = _without(eqn.primitive.name, dtype, *x)
+    if found is None:
+        with eqn.ctx.manager:
+            found = eqn.primitive.bind(*map(unmarked, x), **eqn.params)
+    return found
 
 
 def _without(name, dtype, *x):
     """What is known of the result of an operation, or None."""
-    if name in NUMPY and all(map(is_known, x)):
-        return dtype.type(NUMPY[name](*x))
-    return SHORT[name](dtype, *x) if name in SHORT and jnp.issubdtype(dtype, jnp.inexact) else None
+    found = SHORT[name](dtype, *x) if name in SHORT else None
+    if found is None and name in NUMPY and all(map(is_known, x)):
+        found = NUMPY[name](dtype, *x)
+    return found
 
 
 def _is(x, number):
-    return is_known(x) and x == number
+    """Whether an element is this number, the sign of a zero included; integers have no such sign."""
+    if isinstance(x, np.floating):
+        return x == number and np.signbit(x) == np.signbit(number)
+    return isinstance(x, np.integer) and x == number
 
 
 def _product(dtype, x, y):
-    if _is(x, 0) or _is(y, 0):
-        return dtype.type(0)
+    if is_structural(x) or is_structural(y):
+        return ZEROS[dtype]
     return y if _is(x, 1) else x if _is(y, 1) else None
 
 
 def _sum(dtype, x, y):
-    return y if _is(x, 0) else x if _is(y, 0) else None
+    if is_structural(x) or is_structural(y):
+        return y if is_structural(x) else x
+    return y if _is(x, -0.0) else x if _is(y, -0.0) else None
 
 
 def _difference(dtype, x, y):
-    return x if _is(y, 0) else lax.neg(y) if _is(x, 0) else None
+    if is_structural(y) or _is(y, 0.0):
+        return x
+    return lax.neg(y) if _is(x, -0.0) and not is_known(y) else None
 
 
 def _quotient(dtype, x, y):
-    return dtype.type(0) if _is(x, 0) else x if _is(y, 1) else None
+    return ZEROS[dtype] if is_structural(x) else x if _is(y, 1) else None
+
+
+def _negative(dtype, x):
+    return x if is_structural(x) else None
+
+
+def _converted(dtype, x):
+    return ZEROS.get(dtype) if is_structural(x) else None
+
+
+def _selected(dtype, which, *cases):
+    if not is_known(which) or not 0 <= int(which) < len(cases):
+        return None
+    return cases[int(which)]
+
+
+def _exactly(f):
+    """A function of NumPy that gives what XLA does, bit for bit."""
+    return lambda dtype, *x: dtype.type(f(*x))
+
+
+def _converted_number(dtype, x):
+    """A known number in another type; XLA's own way where it does not fit, or where there is a choice."""
+    if jnp.issubdtype(dtype, jnp.integer) and jnp.issubdtype(x.dtype, jnp.floating):
+        limits = jnp.iinfo(dtype)
+        if not limits.min < x < limits.max:
+            return None
+    if any(jnp.issubdtype(d, jnp.complexfloating) for d in (dtype, x.dtype)):
+        return None
+    return dtype.type(x)
 
 
 def _fold(name, dtype, x):
@@ -120,7 +114,7 @@ def _reduction(name):
     def rule(eqn, x):
         axes, out = eqn.params["axes"], eqn.outvars[0].aval
         rows = _rows(x, [i for i in range(x.ndim) if i not in axes], axes)
-        return [arranged([_fold(name, out.dtype, row) for row in rows], out.shape)] if x.size else None
+        return [arranged([_fold(name, out.dtype, row) for row in rows], out.shape)]
 
     return rule
 
@@ -133,7 +127,7 @@ def _rows(x, first, last):
 
 def _dot_general(eqn, x, y):
     out = eqn.outvars[0].aval
-    if not (x.size and y.size) or any(v.aval.dtype != out.dtype for v in eqn.invars):
+    if any(v.aval.dtype != out.dtype for v in eqn.invars):
         return None
     over, batch = eqn.params["dimension_numbers"]
     rows = []
@@ -149,6 +143,11 @@ def _dot_general(eqn, x, y):
 
 
 def _reshape(eqn, x):
+    order = eqn.params["dimensions"]
+    return [(x if order is None else x.transpose(order)).reshape(eqn.outvars[0].aval.shape)]
+
+
+def _squeeze(eqn, x):
     return [x.reshape(eqn.outvars[0].aval.shape)]
 
 
@@ -189,39 +188,52 @@ def _iota(eqn):
     return [pieces(np.indices(out.shape)[axis].astype(out.dtype))]
 
 
+def _structural(eqn, x):
+    dtype = eqn.outvars[0].aval.dtype
+    return [each(lambda x: ZEROS.get(dtype, x) if is_known(x) and x == 0 else x, x)]
+
+
 def _moved(*moves):
-    """Of what moves elements to places that are known: asked where it takes the numbers of the elements."""
+    """Of what moves elements to places that are known: asked where it takes the numbers of the elements.
+
+    The numbers start at 1; what comes from outside an array is the fill value, 0.
+    """
 
     def rule(eqn, *values):
         if not all(is_known(x) for i, value in enumerate(values) if i not in moves for x in value.flat):
             return None
-        dtype = eqn.invars[0].aval.dtype
-        if not jnp.issubdtype(dtype, jnp.floating):
-            return None
-        elements = np.concatenate([values[i].ravel() for i in moves])
-        numbers = iter(np.split(np.arange(elements.size, dtype=dtype), np.cumsum([values[i].size for i in moves])))
+        elements = np.concatenate([arranged([_filling(eqn)], (1,)), *(values[i].ravel() for i in moves)])
+        counts = np.cumsum([1, *(values[i].size for i in moves)])[:-1]
+        numbers = iter(np.split(np.arange(elements.size, dtype=np.int32), counts)[1:])
         arrays = [
             next(numbers).reshape(value.shape) if i in moves else np.asarray(value.tolist(), x.aval.dtype)
             for i, (value, x) in enumerate(zip(values, eqn.invars, strict=True))
         ]
+        params = {**eqn.params, "fill_value": 0} if "fill_value" in eqn.params else eqn.params
         with jax.ensure_compile_time_eval():
-            taken = np.asarray(eqn.primitive.bind(*arrays, **eqn.params))
-        return [elements[taken.astype(int)]] if np.isfinite(taken).all() else None  # NaN: outside the array
+            taken = np.asarray(eqn.primitive.bind(*arrays, **params))
+        return [elements[taken]]
 
     return rule
 
 
-ELEMENTWISE = {
-    *("abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil"),
-    *("clamp", "convert_element_type", "copy", "cos", "cosh", "div", "eq", "erf", "exp", "exp2", "expm1", "floor"),
-    *("ge", "gt", "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne"),
-    *("neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt"),
-    *("square", "stop_gradient", "sub", "tan", "tanh", "xor"),
-}
+def _filling(eqn):
+    """What a gather puts in the place of elements that are not there."""
+    dtype, value = eqn.invars[0].aval.dtype, eqn.params.get("fill_value")
+    if value is not None:
+        return dtype.type(value)
+    if jnp.issubdtype(dtype, jnp.inexact):
+        return dtype.type(np.nan)
+    if jnp.issubdtype(dtype, jnp.bool_):
+        return np.bool_(True)
+    limits = jnp.iinfo(dtype)
+    return dtype.type(limits.min if jnp.issubdtype(dtype, jnp.signedinteger) else limits.max)
+
+
 RULES = {
     **dict.fromkeys(ELEMENTWISE, _elementwise),
     **{"broadcast_in_dim": _broadcast_in_dim, "concatenate": _concatenate, "dot_general": _dot_general, "iota": _iota},
-    **{"reshape": _reshape, "squeeze": _reshape, "rev": _rev, "slice": _slice},
+    **{"reshape": _reshape, "squeeze": _squeeze, "rev": _rev, "slice": _slice},
     **{"split": _split, "stack": _stack, "transpose": _transpose},
     **{
         "gather": _moved(0),
@@ -232,14 +244,21 @@ RULES = {
     },
     **{f"reduce_{kind}": _reduction(kind) for kind in ("max", "min", "and", "or")},
     **{"reduce_sum": _reduction("add"), "reduce_prod": _reduction("mul")},
+    "hhtjax_structural": _structural,
 }
+# of known numbers; without "max" and "min", which may choose between zeros of different signs
 NUMPY = {
-    **{"add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative},
-    **{"eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater},
-    **{"ge": np.greater_equal, "and": np.bitwise_and, "or": np.bitwise_or, "max": np.maximum, "min": np.minimum},
-    "convert_element_type": lambda x: x,
+    **{"add": _exactly(np.add), "add_any": _exactly(np.add), "sub": _exactly(np.subtract)},
+    **{"mul": _exactly(np.multiply), "neg": _exactly(np.negative), "abs": _exactly(np.abs)},
+    **{"eq": _exactly(np.equal), "ne": _exactly(np.not_equal), "lt": _exactly(np.less)},
+    **{"le": _exactly(np.less_equal), "gt": _exactly(np.greater), "ge": _exactly(np.greater_equal)},
+    **{"and": _exactly(np.bitwise_and), "or": _exactly(np.bitwise_or), "copy": _exactly(lambda x: x)},
+    "convert_element_type": _converted_number,
 }
-SHORT = {"mul": _product, "add": _sum, "add_any": _sum, "sub": _difference, "div": _quotient}
+SHORT = {
+    **{"mul": _product, "add": _sum, "add_any": _sum, "sub": _difference, "div": _quotient, "neg": _negative},
+    **{"select_n": _selected, "convert_element_type": _converted},
+}
 LAX = {
     **{"add": lax.add, "mul": lax.mul, "max": lax.max, "min": lax.min},
     **{"and": lax.bitwise_and, "or": lax.bitwise_or},

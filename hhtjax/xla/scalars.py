@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from hhtjax.xla.gate import is_on
 from hhtjax.xla.interpreter import alone, evaluate
-from hhtjax.xla.kernels import STAGED
-from hhtjax.xla.scalar_rules import ELEMENTWISE, RULES, arranged, each, is_in_pieces, is_known, is_small, pieces, whole
-from hhtjax.xla.sharing import in_stages
+from hhtjax.xla.parameters import ELEMENTWISE, is_understood
+from hhtjax.xla.pieces import arranged, as_scalar, is_in_pieces, is_small, pieces, whole
+from hhtjax.xla.scalar_calls import CALLS
+from hhtjax.xla.scalar_rules import RULES
 
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
 
@@ -116,7 +116,7 @@ def by_scalars(f):
         trace, like = jax.make_jaxpr(f, return_shape=True)(*structure.unflatten(shapes))
         values = [arranged(x.elements, x.shape) if _is_scalars(x) else pieces(x) for x in leaves]
         with np.errstate(all="ignore"):
-            values = _evaluate(trace.jaxpr, trace.consts, values)
+            values = _run(trace, values)
         leaves, structure = jax.tree.flatten(like)
         return structure.unflatten(map(_as_scalars, values, leaves))
 
@@ -134,173 +134,26 @@ def _dtype(x):
 def _as_scalars(value, like):
     if not is_in_pieces(value):
         return value
-    elements = tuple(jnp.asarray(x, like.dtype) for x in value.flat)
+    elements = tuple(as_scalar(x, like.dtype) for x in value.flat)
     return Scalars(elements, like.shape) if like.shape else elements[0]
 
 
-def _evaluate(jaxpr, consts, values):
-    """The values of a jaxpr's results."""
-    return evaluate(jaxpr, [*map(pieces, consts), *values], _apply, lambda x: pieces(np.asarray(x)))
+def _run(closed, values):
+    """The values of the results of a closed jaxpr."""
+    return evaluate(closed.jaxpr, [*map(pieces, closed.consts), *values], _apply, lambda x: pieces(np.asarray(x)))
 
 
 def _apply(eqn, values):
     """The results of one operation."""
     name = eqn.primitive.name
     results = None
-    if name in CALLS:
-        results = CALLS[name](eqn, *values)
+    if not is_understood(eqn):
+        pass
+    elif name in CALLS:
+        results = CALLS[name](_run, eqn, *values)
     elif name in RULES and all(map(is_in_pieces, values)) and all(is_small(x.aval) for x in eqn.outvars):
         results = RULES[name](eqn, *values)
     if results is None:
         arrays = [whole(value, x.aval) for value, x in zip(values, eqn.invars, strict=True)]
         results = map(pieces, alone(eqn)(*arrays))
     return results
-
-
-# Functions within functions.
-
-
-def _call(eqn, *values):
-    """A staged function stays a call, of scalars."""
-    closed, name = eqn.params["jaxpr"], eqn.params["name"]
-    if not name.startswith(STAGED):
-        return _evaluate(closed.jaxpr, closed.consts, values)
-    given, fill = _unknowns(values)
-    after = []
-
-    def call(*arrays):
-        results = _evaluate(closed.jaxpr, closed.consts, fill(arrays))
-        found, refill = _unknowns(results, dict(zip(map(id, arrays), given, strict=True)))
-        after.append(refill)
-        return found
-
-    found = in_stages(name, call, *given)
-    return after[-1](found)
-
-
-@dataclass(frozen=True)
-class _Place:
-    index: int
-
-
-def _unknowns(values, passed=()):
-    """What is not known in the values, each once, and the function that puts others in its place.
-
-    passed: {id of a tracer: what it stands for}, which is put there instead.
-    """
-    found, places = [], {}
-
-    def place(x):
-        if is_known(x):
-            return x
-        if id(x) in passed:
-            return passed[id(x)]
-        if id(x) not in places:
-            places[id(x)] = _Place(len(found))
-            found.append(x)
-        return places[id(x)]
-
-    template = [each(place, value) for value in values]
-
-    def fill(new):
-        return [each(lambda x: new[x.index] if isinstance(x, _Place) else x, value) for value in template]
-
-    return found, fill
-
-
-def _layout(variables):
-    """Values of such variables as a list of arrays, and back."""
-    avals = [x.aval for x in variables]
-
-    def flat(values):
-        pairs = zip(values, avals, strict=True)
-        return [jnp.asarray(x, aval.dtype) for v, aval in pairs for x in (v.flat if is_in_pieces(v) else [v])]
-
-    def back(arrays):
-        arrays = iter(arrays)
-        return [
-            arranged([next(arrays) for _ in range(math.prod(aval.shape))], aval.shape)
-            if is_small(aval)
-            else next(arrays)
-            for aval in avals
-        ]
-
-    return flat, back
-
-
-def _while_loop(eqn, *values):
-    params, flat, back = eqn.params, *_layout(eqn.outvars)
-    first = params["cond_nconsts"]
-    second = first + params["body_nconsts"]
-
-    def unfinished(carry):
-        closed = params["cond_jaxpr"]
-        return _evaluate(closed.jaxpr, closed.consts, [*values[:first], *back(carry)])[0].item()
-
-    def body(carry):
-        closed = params["body_jaxpr"]
-        return flat(_evaluate(closed.jaxpr, closed.consts, [*values[first:second], *back(carry)]))
-
-    return back(lax.while_loop(unfinished, body, flat(values[second:])))
-
-
-def _cond(eqn, which, *values):
-    (flat, back), (flat_results, back_results) = _layout(eqn.invars[1:]), _layout(eqn.outvars)
-
-    def branch(closed):
-        return lambda *x: flat_results(_evaluate(closed.jaxpr, closed.consts, back(x)))
-
-    return back_results(lax.switch(which.item(), [branch(closed) for closed in eqn.params["branches"]], *flat(values)))
-
-
-def _custom_linear_solve(eqn, *values):
-    lengths, closed = eqn.params["const_lengths"], eqn.params["jaxprs"]
-    flat, back = _layout(eqn.outvars)
-    ends = np.cumsum([lengths.matvec, lengths.vecmat, lengths.solve, lengths.transpose_solve])
-    *constants, b = [values[start:stop] for start, stop in zip([0, *ends], [*ends, None], strict=True)]
-    if closed.transpose_solve is None or len(b) != len(eqn.outvars):  # no reverse mode, or results beside x
-        return None
-
-    def scalar(name, constants):
-        function = getattr(closed, name)
-        return lambda x: flat(_evaluate(function.jaxpr, function.consts, [*constants, *back(x)]))
-
-    matvec, _, solve, transpose_solve = map(scalar, lengths._fields, constants)
-    return back(
-        lax.custom_linear_solve(
-            matvec, flat(b), solve=lambda _, b: solve(b), transpose_solve=lambda _, b: transpose_solve(b)
-        )
-    )
-
-
-def _custom_jvp_call(eqn, *values):
-    """A function with a rule of its own for derivatives, which serves scalars too."""
-    if not any(x.aval.shape for x in eqn.invars) or not all(
-        jnp.issubdtype(x.aval.dtype, jnp.floating) for x in eqn.invars
-    ):
-        return None
-    closed = eqn.params["call_jaxpr"]
-    (flat, back), (flat_results, back_results) = _layout(eqn.invars), _layout(eqn.outvars)
-
-    @jax.custom_jvp
-    def call(*x):
-        return flat_results(_evaluate(closed.jaxpr, closed.consts, back(x)))
-
-    @call.defjvp
-    def _(x, dx):
-        shapes = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-        rule = jax.make_jaxpr(lambda x, dx: jax.jvp(alone(eqn), x, dx))(shapes, shapes)
-        results = _evaluate(rule.jaxpr, rule.consts, [*back(x), *back(dx)])
-        half = len(results) // 2
-        return flat_results(results[:half]), flat_results(results[half:])
-
-    return back_results(call(*flat(values)))
-
-
-CALLS = {
-    "cond": _cond,
-    "jit": _call,
-    "while": _while_loop,
-    "custom_linear_solve": _custom_linear_solve,
-    "custom_jvp_call": _custom_jvp_call,
-}

@@ -14,7 +14,7 @@ from jax.extend.core import Literal
 
 from hhtjax.xla.interpreter import alone, evaluate
 from hhtjax.xla.kernels import named
-from hhtjax.xla.scalar_rules import ELEMENTWISE
+from hhtjax.xla.parameters import ELEMENTWISE, is_understood
 
 FUNCTIONS = {  # that take long
     *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "erf", "exp", "exp2", "expm1"),
@@ -53,7 +53,7 @@ def _each_once(jaxpr):
     for eqn in jaxpr.eqns:
         eqn = eqn.replace(invars=renamed(eqn.invars))
         key = eqn
-        if eqn.primitive.name in ELEMENTWISE:
+        if eqn.primitive.name in ELEMENTWISE and is_understood(eqn):
             operands = [(repr(x.val), x.aval) if isinstance(x, Literal) else x for x in eqn.invars]
             key = (eqn.primitive, *operands, *eqn.params.items())
         before = done.setdefault(key, eqn)

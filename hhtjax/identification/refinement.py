@@ -15,7 +15,8 @@ from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import NAMED, FitResult
 from hhtjax.numerics.richardson import richardson
-from hhtjax.steppers.generalized_alpha import Coefficients, Options
+from hhtjax.steppers.options import Options
+from hhtjax.steppers.residual import Coefficients
 from hhtjax.steppers.stepper import Stepper, require_stepper
 
 UNDAMPED = 1e-6  # damping ratio, rounding of float32 included

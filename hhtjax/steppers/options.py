@@ -1,0 +1,85 @@
+"""The options of the generalised-alpha family: their names, kinds and defaults, and what is wrong with a value."""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_type_hints
+
+from hhtjax.checks import require_function, require_integer, require_number
+from hhtjax.systems.constraints import check_redundant
+
+Constructor = TypeVar("Constructor", bound=Callable)
+
+
+class Options(NamedTuple):
+    """How the residual is solved; `hht` documents the fields."""
+
+    iterations: int | None = 1
+    linearize: Literal["predictor", "held", "state", "auto"] | None = None
+    tolerance: float = 1e-10
+    max_iterations: int = 20
+    start: Literal["corrected", "simple"] | None = None
+    formulation: Literal["ggl", "index3"] = "ggl"
+    redundant: Literal["least_squares"] | None = None
+    kinematics: Literal["chart", "lie"] = "chart"
+    solve: Callable | None = None
+
+
+def takes_options(constructor: Constructor) -> Constructor:
+    """A constructor whose `**options` are these: help() and completion list them, an unknown name is an error."""
+    name, own = constructor.__name__, inspect.signature(constructor)
+    kinds = get_type_hints(Options)
+
+    @wraps(constructor)
+    def checked(*arguments, **keywords):
+        for given in keywords:
+            if given not in own.parameters and given not in Options._fields:
+                raise TypeError(f"{name}: unknown option {given!r}; the options are {', '.join(Options._fields)}.")
+        return constructor(*arguments, **keywords)
+
+    listed = (
+        inspect.Parameter(field, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kinds[field])
+        for field, default in Options._field_defaults.items()
+    )
+    first = [x for x in own.parameters.values() if x.kind is not inspect.Parameter.VAR_KEYWORD]
+    checked.__signature__ = own.replace(parameters=[*first, *listed])  # pyright: ignore[reportAttributeAccessIssue]
+    return checked  # pyright: ignore[reportReturnType]
+
+
+def check_options(caller, **keywords: Any) -> Options:
+    """`Options` with the default of `linearize` filled in, or an error that names what is wrong."""
+    options = Options(**keywords)
+    if options.iterations is not None:
+        options = options._replace(iterations=require_integer(caller, "iterations", options.iterations))
+    if options.linearize is None:
+        options = options._replace(linearize="auto" if options.iterations == 1 else "predictor")
+    _require_one_of(caller, "linearize", options)
+    if options.iterations is None and options.linearize != "predictor":
+        raise ValueError(
+            f"{caller}: with iterations=None, Newton starts from the predictor: leave `linearize` out; "
+            f"received {options.linearize!r}."
+        )
+    require_number(caller, "tolerance", options.tolerance, lambda x: x > 0, "be positive")
+    options = options._replace(max_iterations=require_integer(caller, "max_iterations", options.max_iterations))
+    for name in ("start", "formulation", "kinematics"):
+        _require_one_of(caller, name, options)
+    check_redundant(caller, options.redundant)
+    if options.redundant is not None and options.solve is not None:
+        raise ValueError(f"{caller}: `redundant` brings its own solver: leave out `solve`, or `redundant`.")
+    if options.solve is not None:
+        require_function(caller, "solve", options.solve, "solve(A, b)")
+    return options
+
+
+def _require_one_of(caller, name, options):
+    value, kind = getattr(options, name), get_type_hints(Options)[name]
+    optional = type(None) in get_args(kind)
+    words = get_args(get_args(kind)[0] if optional else kind)
+    if not (value is None and optional) and value not in words:
+        *others, last = (f'"{word}"' for word in words)
+        raise ValueError(f"{caller}: `{name}` must be {', '.join(others)} or {last}; received {value!r}.")
+
+
+def require_alpha(caller, alpha):
+    """HHT's alpha as it is, if it lies in its range."""
+    return require_number(caller, "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")

@@ -1,0 +1,130 @@
+"""What several test files share: a spring to spoil, messages of errors, three ways to a derivative, a slope."""
+
+import re
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from zoo import PROBLEMS, STEPPERS, as_data, end, reference
+
+import hhtjax
+from hhtjax import System, simulate
+
+NAN, INF = float("nan"), float("inf")
+ONE, ZERO = np.ones(1), np.zeros(1)
+SINGLE = ONE.astype(np.float32)
+EYE = np.eye(2)
+COMPLEX = np.array([1j])
+STEPS = 200, 400
+
+
+def pull(q, v, t, params):
+    """Springs of stiffness 4 on every coordinate."""
+    return jax.tree.map(lambda x: -4.0 * x, q)
+
+
+def lagrangian(q, v, t, params):
+    """Of `pull`, with unit masses."""
+    return 0.5 * jnp.sum(v**2) - 2.0 * jnp.sum(q**2)
+
+
+class Unhashable:
+    """A function that cannot be a key of JAX's cache."""
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __call__(self, *args):
+        return args[0]
+
+    def __repr__(self):
+        return "Unhashable()"
+
+
+SPRING = System(ONE, pull)
+
+
+def run(system=SPRING, stepper=STEPPERS["rk4"], q0=ONE, v0=ZERO, params=None, dt=0.1, num_steps=4, **options):
+    """A short run, of which the tests spoil one argument."""
+    return simulate(system, stepper, q0, v0, params, dt=dt, num_steps=num_steps, **options)
+
+
+def check_message(error, message, call):
+    """`message` must be part of the text of the error that call() raises."""
+    with pytest.raises(error, match=re.escape(message)):
+        call()
+
+
+def with_tolerance(stepper, tolerance):
+    """The same, Newton's tolerance changed, where there is one."""
+    if getattr(stepper, "options", None) is None:
+        return stepper
+    return replace(stepper, options=stepper.options._replace(tolerance=tolerance))
+
+
+def tight(stepper):
+    """Newton to rounding, where there is one: central differences see its tolerance."""
+    return with_tolerance(stepper, 1e-13)
+
+
+def check_gradient(loss, arguments):
+    """Compares the three derivatives of loss(arguments), a pytree of numbers; returns the forward one, a vector."""
+    return check_gradients(loss, [arguments])[0]
+
+
+def check_gradients(loss, points):
+    """The same at several points, compiled once."""
+    unravel = ravel_pytree(points[0])[1]
+    points = [np.asarray(ravel_pytree(x)[0]) for x in points]
+    eye = np.eye(points[0].size)
+
+    def f(x):
+        return loss(unravel(x))
+
+    @jax.jit  # one program gives the derivative and, for the differences, the values
+    def value_and_forward(x):
+        return jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 0))(eye)
+
+    gradient = jax.jit(jax.grad(f))
+    return [_check_gradient(value_and_forward, gradient, x0) for x0 in points]
+
+
+def _check_gradient(value_and_forward, gradient, x0):
+    reverse, forward = gradient(x0), np.asarray(value_and_forward(x0)[1])
+    size = np.maximum(np.abs(forward), 1e-3 * np.max(np.abs(forward)))
+    assert np.all(np.isfinite(forward))
+    assert np.max(np.abs(reverse - forward) / size) < 1e-10
+    for i, value in enumerate(x0):
+        h = 1e-4 * (abs(value) or 1.0)
+        e = h * np.eye(x0.size)[i]
+
+        def at(shift, e=e):
+            return float(value_and_forward(x0 + shift * e)[0])
+
+        # fourth order, so that truncation and rounding both stay below 1e-7
+        central = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)
+        assert abs(central - forward[i]) < 1e-6 * size[i], (i, central, forward[i])
+    return forward
+
+
+def path_loss(problem, stepper, num_steps, save_every):
+    """A loss of the whole path, of positions, velocities and accelerations."""
+
+    def loss(arguments):
+        params, q0, v0, dt, t0 = arguments
+        path = hhtjax.simulate(
+            problem.system, stepper, q0, v0, params, dt=dt, t0=t0, num_steps=num_steps, save_every=save_every
+        )
+        return jnp.sum(path.q**2) + 0.3 * jnp.sum(path.v**2) + 0.1 * jnp.sum(path.acceleration**2) + jnp.sum(path.t)
+
+    return loss
+
+
+def slope(problem, stepper):
+    """log2 of the ratio of the errors at the end with STEPS steps."""
+    ends = [end(PROBLEMS[problem], as_data(stepper), n) for n in STEPS]
+    assert all(converged for _, converged in ends)
+    errors = [np.linalg.norm(state.q - reference(problem)) for state, _ in ends]
+    return np.log2(errors[0] / errors[1])

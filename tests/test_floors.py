@@ -1,0 +1,118 @@
+"""The house: imports run downwards, the machinery has one door, and files are small."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import hhtjax.xla
+
+ROOT = Path(__file__).parents[1]
+HOUSE = ROOT / "hhtjax"
+FLOORS = [  # each imports from those before it, and from its own room
+    ["description", "checks"],
+    ["xla"],
+    ["numerics", "rotation", "trigonometry"],
+    ["systems"],
+    ["steppers"],
+    ["runs"],
+    ["analysis"],
+    ["identification"],
+    ["scenes"],
+    ["__init__"],
+]
+FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+NEIGHBOURS = {("checks", "description")}  # on one floor
+INTERNALS = ("jax.extend", "jax.interpreters", "jax._src", "jaxlib")  # of JAX, for the machinery alone
+DOOR = [[name] for name in hhtjax.xla.__all__]
+FILES = {path: ast.parse(path.read_text()) for path in sorted(HOUSE.rglob("*.py"))}
+EVERYWHERE = [path for folder in ("hhtjax", "experiments", "tests") for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+def room(path):
+    return path.relative_to(HOUSE).parts[0].removesuffix(".py")
+
+
+def imports(tree):
+    """Dotted names of all that is imported, anywhere in a file: a.b for `import a.b`, a.b.c for `from a.b import c`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{'.' * node.level}{node.module or ''}.{name.name}" for name in node.names)
+
+
+def within(name, parents):
+    return any(name == parent or name.startswith(f"{parent}.") for parent in parents)
+
+
+def allowed(here, there):
+    """Whether a file of one room may import from another room."""
+    return here == there or FLOOR[there] < FLOOR[here] or (here, there) in NEIGHBOURS
+
+
+def breaches(path, tree):
+    """What a file imports against the order of the house."""
+    here = room(path)
+    for name in imports(tree):
+        first, *rest = name.split(".")
+        if first == "hhtjax":
+            there = rest[0] if rest and rest[0] in FLOOR else "__init__"
+            if not allowed(here, there):
+                yield f"{here} is below {there}: {name}"
+            if there == "xla" != here and rest[1:] not in DOOR:
+                yield f"past the door of xla: {name}"
+        elif here != "xla" and within(name, INTERNALS):
+            yield f"inside JAX: {name}"
+    for node in ast.walk(tree):
+        written = ast.unparse(node) if isinstance(node, ast.Attribute) else ""
+        if here != "xla" and (written == "jax.__version__" or within(written, INTERNALS)):
+            yield f"inside JAX: {written}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(HOUSE)))
+def test_imports_run_downwards_and_through_the_door(path):
+    assert not list(breaches(path, FILES[path]))
+
+
+@pytest.mark.parametrize(
+    ("where", "line"),
+    [
+        ("description.py", "from hhtjax.checks import require_integer"),
+        ("checks.py", "from hhtjax.xla import staged"),
+        ("numerics/new.py", "from hhtjax import rotation"),
+        ("rotation.py", "def f():\n    import hhtjax"),
+        ("systems/new.py", "from hhtjax.steppers.stepper import State"),
+        ("runs/new.py", "from hhtjax import __version__"),
+        ("runs/new.py", "from hhtjax.xla.kernels import staged"),
+        ("runs/new.py", "import hhtjax.xla.kernels"),
+        ("steppers/new.py", "from jax.extend.core import primitives"),
+        ("steppers/new.py", "from jax.interpreters import mlir"),
+        ("steppers/new.py", "import jax\n\nx = jax.interpreters.mlir.ir"),
+        ("analysis/new.py", "import jaxlib"),
+        ("analysis/new.py", "import jax\n\nold = jax.__version__ < '0.10'"),
+    ],
+)
+def test_a_breach_is_seen(where, line):
+    assert list(breaches(HOUSE / where, ast.parse(line)))
+
+
+def test_the_top_of_the_house_is_small():
+    entries = {path.name for path in HOUSE.iterdir() if path.name != "__pycache__"}
+    assert len(entries) <= 14, entries
+    assert {name.removesuffix(".py") for name in entries} == FLOOR.keys() | {"py.typed"}
+
+
+def test_files_and_functions_are_small():
+    """300 lines a file; 40 lines a function, its docstring and the functions inside it not counted."""
+    large = []
+    for path in EVERYWHERE:
+        text = path.read_text()
+        if text.count("\n") > 300:
+            large.append(f"{path.relative_to(ROOT)}: {text.count(chr(10))} lines")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                start = node.body[0].end_lineno if ast.get_docstring(node) else node.lineno
+                if node.end_lineno - start > 40:
+                    large.append(f"{path.relative_to(ROOT)}: {node.name}, {node.end_lineno - start} lines")
+    assert not large
