@@ -4,6 +4,7 @@ What NumPy does otherwise than XLA (integer division, gather, scatter, LAPACK) i
 operation once. A witness independent of hhtjax: nothing of it is imported here.
 """
 
+import math
 from functools import reduce
 
 import jax
@@ -18,12 +19,10 @@ class Numbers:
     """How operations are evaluated.
 
     noise: a generator by which each result of arithmetic, and each term of a sum, is disturbed by a few roundings.
-    lenient: a factor of zero gives zero, whatever the other; "sums": in sums of products only.
     """
 
-    def __init__(self, noise=None, lenient=False):
+    def __init__(self, noise=None):
         self.noise = noise
-        self.lenient = lenient
 
     def __call__(self, closed, *args):
         """Values of the results of a closed jaxpr."""
@@ -47,16 +46,14 @@ class Numbers:
         inexact = np.issubdtype(eqn.outvars[0].aval.dtype, np.inexact)
         if self.noise is not None and name in SUMS:
             values = [self.disturbed(x) for x in values]
-        if self.lenient is True and name == "mul" and inexact:
-            results = [np.where((values[0] == 0) | (values[1] == 0), 0, values[0] * values[1])]
-        elif name in ARITHMETIC and (inexact or name not in INEXACT):
+        if name in ARITHMETIC and (inexact or name not in INEXACT):
             results = [ARITHMETIC[name](eqn.params, *values)]
         elif name in MOVES:
             return MOVES[name](eqn, *values)
         elif name in PLACES and eqn.params.get("update_jaxpr") is None:
             results = PLACES[name](eqn, *values) or by_jax(eqn, values)
         elif name == "dot_general" and all(x.dtype == eqn.outvars[0].aval.dtype for x in values):
-            results = [self.dot_general(eqn, *values)]
+            results = [_dot_general(eqn, *values)]
         else:
             results = by_jax(eqn, values)
         return [self.disturbed(y) for y in results] if self.noise is not None and name not in QUIET else results
@@ -66,35 +63,26 @@ class Numbers:
             return x
         return (x * (1 + np.finfo(x.dtype).eps * self.noise.uniform(-2, 2, x.shape))).astype(x.dtype)
 
-    def dot_general(self, eqn, x, y):
-        (over, batch), letters = eqn.params["dimension_numbers"], iter("abcdefghijklmnopqrstuvwxyz")
-        names = [[""] * x.ndim, [""] * y.ndim]
-        for pairs in (batch, over):
-            for i, j in zip(*pairs, strict=True):
-                names[0][i] = names[1][j] = next(letters)
-        free = []
-        for side in names:
-            for i, letter in enumerate(side):
-                if not letter:
-                    side[i] = next(letters)
-                    free.append(side[i])
-        result = [names[0][i] for i in batch[0]] + free
-        if self.lenient:
-            return _lenient_sum_of_products(x, y, names, result)
-        return np.einsum(f"{''.join(names[0])},{''.join(names[1])}->{''.join(result)}", x, y)
 
-
-def _lenient_sum_of_products(x, y, names, result):
-    every = result + [a for a in names[0] if a not in result]
-    aligned = [
-        z.transpose(np.argsort([every.index(a) for a in n])).reshape([
-            z.shape[n.index(a)] if a in n else 1 for a in every
-        ])
-        for z, n in zip((x, y), names, strict=True)
-    ]
-    with np.errstate(all="ignore"):
-        terms = np.where((aligned[0] == 0) | (aligned[1] == 0), 0, aligned[0] * aligned[1])
-    return terms.sum(tuple(range(len(result), len(every))))
+def _dot_general(eqn, x, y):
+    (over, batch), letters = eqn.params["dimension_numbers"], iter("abcdefghijklmnopqrstuvwxyz")
+    names = [[""] * x.ndim, [""] * y.ndim]
+    for pairs in (batch, over):
+        for i, j in zip(*pairs, strict=True):
+            names[0][i] = names[1][j] = next(letters)
+    result = [names[0][i] for i in batch[0]]
+    for side in names:
+        for i, letter in enumerate(side):
+            if not letter:
+                side[i] = next(letters)
+                result.append(side[i])
+    every = result + [names[0][i] for i in over[0]]
+    aligned = []
+    for z, side in zip((x, y), names, strict=True):
+        order = sorted(range(z.ndim), key=lambda i: every.index(side[i]))  # noqa: B023
+        lengths = [z.shape[side.index(a)] if a in side else 1 for a in every]
+        aligned.append(z.transpose(order).reshape(lengths))
+    return _sum({"axes": range(len(result), len(every))}, aligned[0] * aligned[1])
 
 
 def by_jax(eqn, values):
@@ -118,9 +106,16 @@ def _while(self, params, *values):
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     of_cond, of_body, carry = values[:first], values[first:second], list(values[second:])
     for _ in range(1000):
-        if not self(params["cond_jaxpr"], *of_cond, *carry)[0]:
+        goes_on = self(params["cond_jaxpr"], *of_cond, *carry)[0]
+        if not goes_on.any():
             return carry
-        carry = self(params["body_jaxpr"], *of_body, *carry)
+        after = self(params["body_jaxpr"], *of_body, *carry)
+        if goes_on.ndim:  # a batch of loops
+            after = [
+                np.where(goes_on.reshape(goes_on.shape + (1,) * (y.ndim - goes_on.ndim)), y, x)
+                for x, y in zip(carry, after, strict=True)
+            ]
+        carry = after
     raise ValueError("a loop without end")
 
 
@@ -182,6 +177,14 @@ def _away(x):
     return np.where(np.abs(x - down) >= 0.5, down + np.copysign(1, x), down)
 
 
+def _sum(params, x):
+    """From 0, so that a sum of -0 is 0; but one term alone is the sum."""
+    axes = tuple(params["axes"])
+    if math.prod(x.shape[i] for i in axes) == 1:
+        return x.reshape([n for i, n in enumerate(x.shape) if i not in axes])
+    return np.add.reduce(x, axes, initial=x.dtype.type(0))
+
+
 def _larger(x, y):
     """0 is larger than -0."""
     return np.where((x == 0) & (y == 0), x + y, np.maximum(x, y)) if x.dtype.kind == "f" else np.maximum(x, y)
@@ -230,15 +233,14 @@ ARITHMETIC = {
     **{"xor": _plain(np.bitwise_xor), "max": _plain(_larger), "min": _plain(_smaller)},
     **{"pow": _plain(np.power), "rem": _plain(np.fmod), "clamp": _plain(lambda a, x, b: _smaller(_larger(x, a), b))},
     "round": lambda params, x: np.rint(x) if params["rounding_method"] == lax.RoundingMethod.TO_NEAREST_EVEN else _away(x),
-    "reduce_sum": lambda params, x: np.add.reduce(x, tuple(params["axes"]), initial=x.dtype.type(0)),
+    "reduce_sum": lambda params, x: _sum(params, x),
     **{"copy": _plain(np.copy), "stop_gradient": _plain(np.copy)},
     "reduce_prod": lambda params, x: np.multiply.reduce(x, tuple(params["axes"]), initial=x.dtype.type(1)),
     "reduce_max": lambda params, x: _greatest(x, tuple(params["axes"])),
     "reduce_min": lambda params, x: -_greatest(-x, tuple(params["axes"])) if x.dtype.kind == "f" else np.minimum.reduce(
         x, tuple(params["axes"]), initial=_extreme(x.dtype)[1]
     ),
-    "reduce_or": _over_axes(np.any),
-    "reduce_and": _over_axes(np.all),
+    **{"reduce_or": _over_axes(np.bitwise_or.reduce), "reduce_and": _over_axes(np.bitwise_and.reduce)},
 }
 SUMS = ("reduce_sum", "dot_general", "cumsum", "reduce_prod", "cumprod", "cumlogsumexp", "reduce_window_sum")
 INEXACT = ("div", "rem", "pow", "integer_pow", "round")  # NumPy does otherwise with integers
