@@ -41,6 +41,21 @@ def side_by_side(functions):
         return list(pool.map(lambda function: function(), functions))
 
 
+def as_json(x, indent=0):
+    """JSON with lists of numbers, and dicts of few, on one line each."""
+    line = json.dumps(x)
+    if not isinstance(x, (dict, list)) or not x:
+        return line
+    leaves = not any(isinstance(y, (dict, list)) for y in (x.values() if isinstance(x, dict) else x))
+    if leaves and (isinstance(x, list) or indent + len(line) <= 120):
+        return line
+    inner, outer = "\n" + (indent + 1) * " ", "\n" + indent * " "
+    if isinstance(x, list):
+        return f"[{inner}{f',{inner}'.join(as_json(y, indent + 1) for y in x)}{outer}]"
+    lines = (f"{json.dumps(key)}: {as_json(y, indent + 1)}" for key, y in x.items())
+    return f"{{{inner}{f',{inner}'.join(lines)}{outer}}}"
+
+
 class Report:
     """Collects what an experiment has to show."""
 
@@ -72,7 +87,7 @@ class Report:
     def numbers(self, values: dict):
         """Saves numbers as JSON, named after the experiment."""
         path = self.out / f"{self.name}.json"
-        path.write_text(json.dumps(values, indent=1) + "\n")
+        path.write_text(as_json(values) + "\n")
         self.written.append(path)
 
     def close(self):

@@ -8,11 +8,9 @@ from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
 from hhtjax.identification.arguments import Gaussian
 from hhtjax.identification.bias import step_size_bias
-from hhtjax.identification.identifiability import IdentifiabilityWarning
 from hhtjax.identification.identify import fit, multistart
-from hhtjax.identification.inference import prediction_errors, profile, score_test
-from hhtjax.identification.measured import measure, windows, wrap_angle
-from hhtjax.identification.refinement import StepSizeWarning, refine
+from hhtjax.identification.measured import measure, windows
+from hhtjax.identification.refinement import refine
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
@@ -51,7 +49,6 @@ __all__ = [  # noqa: RUF022
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
     "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
     # identification
-    "FitResult", "Gaussian", "IdentifiabilityWarning", "StepSizeWarning",
-    "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart", "positive",
-    "prediction_errors", "profile", "refine", "score_test", "step_size_bias", "windows", "wrap_angle",
+    "FitResult", "Gaussian", "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
+    "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip

@@ -1,11 +1,12 @@
 """What the step size does to stiffness and damping: predicted, measured on exact data, and taken back."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.identification.refinement import Refined, needed_levels
+from hhtjax.identification.refinement import Refined, StepSizeWarning, needed_levels
 from hhtjax.numerics.richardson import richardson
 
 t = jnp.arange(0.0, 30.0, 0.35)
@@ -35,7 +36,7 @@ def test_predicted_bias_is_measured_and_taken_back():
     Numerical damping adds an error of h^3: so there are three fits, of which two alone would not take it out.
     """
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
-    with pytest.warns(hhtjax.StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
+    with pytest.warns(StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
         refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35)
     assert (refined.stepper, refined.dt) == (stepper, 0.35)
     found, fine, finest = refined.fits
@@ -93,6 +94,83 @@ def test_the_bias_of_the_trapezoidal_rule_in_every_mode():
     np.testing.assert_allclose(bias.damping_bias, 1 / np.cos(x) ** 2 - 1, rtol=1e-3)
     fitted = bias.frequency * np.sqrt(1 + bias.stiffness_bias)
     np.testing.assert_allclose(fitted, [1.0, np.sqrt(3.0)], rtol=1e-12)
+
+
+ENTRIES = {"M": jnp.array([1.0, 0.0, 1.0]), "C": jnp.array([1.0, -0.4, 0.4]), "K": jnp.array([250.0, -150.0, 150.0])}
+CHAIN = {"k1": 100.0, "k2": 150.0, "c1": 0.6, "c2": 0.4}
+
+
+def symmetric(x):
+    return jnp.stack([x[:2], x[1:]])
+
+
+def driven_pair(entries_of):
+    """A system of 2 coordinates, the second driven; entries_of: params -> those of M, C, K."""
+
+    def force(q, v, t, p):
+        u = p["u"](t)
+        return jnp.stack([0 * u, u]) - symmetric(entries_of(p)["K"]) @ q - symmetric(entries_of(p)["C"]) @ v
+
+    return hhtjax.System(lambda q, p: symmetric(entries_of(p)["M"]), force)
+
+
+def fitted_through_steps(system, true, dt, exact=20):
+    """Params as fitted to a record of steps of dt/exact, through steps of dt; input of many sines past both modes."""
+    stepper, rest, count = hhtjax.hht(alpha=0.0), jnp.zeros(2), 1000
+    rate, phase = np.linspace(2.0, 28.0, 60)[:, None], np.random.default_rng(0).uniform(0, 2 * np.pi, (60, 1))
+    u = jnp.asarray(np.sin(rate * dt / exact * np.arange((count + 2) * exact) + phase).sum(axis=0))
+    fine = true | {"u": hhtjax.sampled(u, dt / exact)}
+    run = hhtjax.simulate(system, stepper, rest, rest, fine, dt=dt / exact, num_steps=count * exact, save_every=exact)
+    u = hhtjax.sampled(u[::exact], dt)
+
+    def residuals(p):
+        return hhtjax.simulate(system, stepper, rest, rest, p | {"u": u}, dt=dt, num_steps=count).q - run.q
+
+    scale = jax.tree.map(lambda x: jnp.full_like(x, jnp.max(jnp.abs(x))), true)
+    found = hhtjax.fit(residuals, jax.tree.map(jnp.asarray, true), scale=scale, covariance=False)
+    assert found.converged
+    return found.params | {"u": u}
+
+
+@pytest.mark.slow
+def test_two_driven_modes_with_free_masses_lose_their_bias():
+    """w h = 0.15 and 0.43. All entries of M, C, K, which can follow whatever the steps do."""
+    pair, dt = driven_pair(lambda p: p), 0.0227
+    fitted = fitted_through_steps(pair, ENTRIES, dt)
+    correct = dict.fromkeys(ENTRIES, True) | {"u": False}
+    found = hhtjax.step_size_bias(pair, hhtjax.hht(alpha=0.0), fitted, dt, jnp.zeros(2), correct=correct)
+    for name, true in ENTRIES.items():
+        before, after = (np.linalg.norm(x[name] - true) / np.linalg.norm(true) for x in (fitted, found.params))
+        assert before > 0.01
+        assert after < 0.15 * before
+
+
+@pytest.mark.slow
+def test_two_driven_modes_with_known_masses_have_their_stiffness_corrected():
+    """The gain of the steps is in no parameter: damping makes up for some of it, by how much no eigenvalue knows."""
+
+    def entries_of(p):
+        k1, k2, c1, c2 = (p[name] for name in CHAIN)
+        return {"M": ENTRIES["M"], "C": jnp.stack([c1 + c2, -c2, c2]), "K": jnp.stack([k1 + k2, -k2, k2])}
+
+    chain, dt = driven_pair(entries_of), 0.0227
+    fitted = fitted_through_steps(chain, CHAIN, dt)
+    correct = dict.fromkeys(CHAIN, True) | {"u": False}
+    with pytest.warns(StepSizeWarning, match="damping .* stays as it is; `refine` corrects it"):
+        found = hhtjax.step_size_bias(chain, hhtjax.hht(alpha=0.0), fitted, dt, jnp.zeros(2), correct=correct)
+    before, after = (
+        {name: abs(float(p[name]) / true - 1) for name, true in CHAIN.items()} for p in (fitted, found.params)
+    )
+    assert before["k2"] > 0.03
+    assert after["k1"] < 0.2 * before["k1"]
+    assert after["k2"] < 0.1 * before["k2"]
+    assert after["c1"] == pytest.approx(before["c1"], rel=0.05)
+    assert after["c2"] == pytest.approx(before["c2"], abs=1e-3)
+    damping_only = dict.fromkeys(CHAIN, False) | {"c1": True, "c2": True, "u": False}
+    with pytest.warns(StepSizeWarning):
+        found = hhtjax.step_size_bias(chain, hhtjax.hht(alpha=0.0), fitted, dt, jnp.zeros(2), correct=damping_only)
+    for name in CHAIN:
+        assert float(found.params[name]) == pytest.approx(float(fitted[name]), rel=1e-9)
 
 
 HANGING = {"g": 9.81, "c": 0.3}

@@ -1,5 +1,6 @@
 """Least squares: known parameters recovered, uncertainty, stop reasons, and every complaint."""
 
+import math
 from itertools import product
 
 import jax
@@ -162,13 +163,56 @@ def test_small_steps_under_damping_are_no_convergence():
     assert float(kinked.params) == pytest.approx(0.0, abs=1e-6)
 
 
+def lorenz(p, duration):
+    """Of which residuals grow by exp(0.9 t): here by 1e10."""
+
+    def rate(s):
+        return jnp.stack([10 * (s[1] - s[0]), s[0] * (p - s[2]) - s[1], s[0] * s[1] - 8 / 3 * s[2]])
+
+    def step(s, _):
+        middle = s + 0.005 * rate(s)
+        s = s + 0.01 * rate(middle)
+        return s, s
+
+    return jax.lax.scan(step, jnp.array([1.0, 1.0, 20.0]), None, length=round(100 * duration))[1]
+
+
+@pytest.mark.parametrize("duration", [25.0, 35.0])
+def test_a_small_step_into_a_steep_gradient_is_no_convergence(duration):
+    """Chaos calls every step small. The minimum itself is known by its gradient, or by a residual that is rounding."""
+    data = lorenz(28.0, duration)
+
+    def residuals(p):
+        return lorenz(p, duration) - data
+
+    lost = hhtjax.fit(residuals, 28.00001, covariance=False)
+    r, J = jnp.ravel(residuals(lost.params)), jnp.ravel(jax.jacfwd(residuals)(lost.params))
+    cosine = jnp.abs(r @ J) / jnp.linalg.norm(r) / jnp.linalg.norm(J)
+    assert not lost.converged or cosine < 1e-3
+    assert lost.iterations > 1
+    assert hhtjax.fit(residuals, 28.0, covariance=False).converged
+
+
+@pytest.mark.usefixtures("_promotion")
+@pytest.mark.parametrize("optimizer", [None, optax.lbfgs()])
+def test_residuals_that_do_not_depend_on_the_parameters_are_told(optimizer):
+    with pytest.raises(ValueError, match="fit: `residuals` must depend on params; their derivatives at params0"):
+        hhtjax.fit(lambda p: jnp.ones(4), {"k": 1.0}, optimizer, covariance=False)
+
+
 def test_undetermined_parameters_are_named():
     def residuals(params):
         return {"r": params["a"] * params["b"] * t - 2.0 * t + params["c"] - 1.0}
 
     said = r"no standard error for a, b, unused\[0\]: .* a, b only through their product; unused\[0\] not at all"
-    with pytest.warns(hhtjax.IdentifiabilityWarning, match=said):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=said) as warned:
         result = hhtjax.fit(residuals, {"a": 1.0, "b": 1.5, "c": 0.3, "unused": jnp.ones(1)})
+    assert warned[0].filename == __file__
+    lines = result.summary().splitlines()
+    assert lines[2].split() == ["a", f"{float(result.params['a']):.6g}", "undetermined"]
+    why = "undetermined: a, b, unused[0]: the residuals determine a, b only through their product; unused[0] not at all"
+    assert why in lines
+    assert "correlation" not in result.summary()
     assert float(result.params["a"] * result.params["b"]) == pytest.approx(2.0, rel=1e-6)
     assert np.isinf(result.standard_errors["a"])
     assert np.isfinite(result.standard_errors["c"])
@@ -176,10 +220,25 @@ def test_undetermined_parameters_are_named():
 
 
 def test_as_many_residuals_as_parameters():
-    with pytest.warns(hhtjax.IdentifiabilityWarning, match="as many residuals as parameters"):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match="as many residuals as parameters"):
         result = hhtjax.fit(lambda p: p - jnp.array([1.0, 2.0]), jnp.zeros(2))
     np.testing.assert_allclose(result.params, [1.0, 2.0])
     assert np.isinf(result.standard_errors).all()
+
+
+DATA = jnp.zeros(5)
+
+
+def against_a_global(p):
+    return p - DATA
+
+
+def test_a_function_is_known_by_its_identity(monkeypatch):
+    """Other data behind the same name are not seen; another function, or records, see them."""
+    assert float(hhtjax.fit(against_a_global, 2.0).params) == pytest.approx(0.0, abs=1e-9)
+    monkeypatch.setitem(globals(), "DATA", jnp.ones(5))
+    assert float(hhtjax.fit(against_a_global, 2.0).params) == pytest.approx(0.0, abs=1e-9)
+    assert float(hhtjax.fit(lambda p: against_a_global(p), 2.0).params) == pytest.approx(1.0)
 
 
 GOOD = jnp.zeros(4)
@@ -197,6 +256,20 @@ def rooted(p):
         (lambda: hhtjax.fit(lambda p: GOOD, {}), ValueError, "`params0` must hold at least one number; received {}"),
         (lambda: hhtjax.fit(lambda p: GOOD, {"k": 1j}), TypeError, r"`params0\['k'\]` must be a real .* received 1j"),
         (lambda: hhtjax.fit(lambda p: GOOD, {"k": "1"}), TypeError, r"`params0\['k'\]` must be a real .* received '1'"),
+        (
+            lambda: hhtjax.fit(lambda p: GOOD, np.array(["k"])),
+            TypeError,
+            r"`params0` must be a real .* received array",
+        ),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": len}), TypeError, r"`params0\['k'\]` must be a real .* function len"),
+        (lambda: hhtjax.fit(lambda p: {"r": "4"}, 1.0), TypeError, r"return real arrays; received '4' at \['r'\]"),
+        (
+            lambda: hhtjax.fit(lambda p: np.sin(p) + GOOD, 1.0),
+            TypeError,
+            "traceable by JAX, with jax.numpy in place of",
+        ),
+        (lambda: hhtjax.fit(lambda p: math.sin(p) + GOOD, 1.0), TypeError, "`residuals` must be traceable by JAX"),
+        (lambda: hhtjax.fit(lambda p: p if p > 0 else -p, 1.0), TypeError, "`residuals` must be traceable by JAX"),
         (lambda: hhtjax.fit(lambda p: GOOD, jnp.ones(2, complex)), TypeError, "`params0` must be real; received compl"),
         (lambda: hhtjax.fit(lambda p: GOOD, {"k": jnp.nan}), ValueError, r"`params0\['k'\]` must be finite; .* nan"),
         (lambda: hhtjax.fit(lambda p: GOOD, 1.0, max_iterations=0), ValueError, "`max_iterations` .* received 0"),

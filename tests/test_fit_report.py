@@ -43,10 +43,10 @@ def test_profile_is_the_parabola_of_the_standard_error(result):
     """Naive errors, for which the white likelihood is right."""
     sigma = float(result.standard_errors["rate"])
     values = float(result.params["rate"]) + sigma * np.array([-1.0, 0.0, 1.0])
-    found = hhtjax.profile(residuals, result, "rate", values)
+    found = hhtjax.identification.profile(residuals, result, "rate", values)
     np.testing.assert_allclose(found.deviance, [1, 0, 1], atol=0.06)
     with pytest.raises(ValueError, match=r"profile: `name` must be one of a, rate; received 'k'"):
-        hhtjax.profile(residuals, result, "k", values)
+        hhtjax.identification.profile(residuals, result, "k", values)
 
 
 def test_the_score_test_predicts_the_refit():
@@ -57,7 +57,7 @@ def test_the_score_test_predicts_the_refit():
     params = {"a": 1.0, "rate": 1.0}
     without = hhtjax.fit(lambda p: with_kink(p, absent), params, covariance=False)
     both = hhtjax.fit(lambda u: with_kink(*u), (params, absent), covariance=False)
-    found = hhtjax.score_test(with_kink, without.params, absent)
+    found = hhtjax.identification.score_test(with_kink, without.params, absent)
     assert found.names == ["kink"]
     assert found.statistic[0] > 10.8
     assert found.estimate[0] == pytest.approx(float(both.params[1]["kink"]), rel=0.2)

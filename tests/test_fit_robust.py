@@ -84,7 +84,7 @@ def test_standard_errors_are_the_scatter(loss):
 def test_profile_is_the_parabola_of_the_robust_error():
     result = hhtjax.fit(spoilt_line, NEAR, weights=WEIGHT, loss="huber")
     values = float(result.params["a"]) + float(result.standard_errors["a"]) * np.array([-1.0, 0.0, 1.0])
-    found = hhtjax.profile(spoilt_line, result, "a", values, weights=WEIGHT, loss="huber")
+    found = hhtjax.identification.profile(spoilt_line, result, "a", values, weights=WEIGHT, loss="huber")
     np.testing.assert_allclose(found.deviance, [1, 0, 1], atol=0.15)
 
 
@@ -112,7 +112,7 @@ def test_robust_errors_with_eliminated_starts_are_those_of_the_dense_fit():
 def test_a_loss_without_curvature_has_no_standard_error():
     """Two clusters of residuals beyond the bend of the loss, at +-10: between them the cost is level."""
     data = jnp.where(jnp.arange(40) < 20, 10.0, -10.0)
-    with pytest.warns(hhtjax.IdentifiabilityWarning, match="no standard error for params: the loss is flat"):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match="error for params: the loss is flat"):
         result = hhtjax.fit(lambda p: p - data, 0.5, loss="huber")
     assert result.converged
     assert np.isinf(result.standard_errors)

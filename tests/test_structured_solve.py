@@ -86,3 +86,80 @@ def test_what_they_do_not_solve_is_refused():
         for value in (0, -1, 1.5, True):
             with pytest.raises(ValueError, match=f"{make.__name__}: `{name}` must be a positive integer"):
                 make(value)
+
+
+PAIRS = 701 * np.eye(8) - 300 * (np.eye(8, k=2) + np.eye(8, k=-2))  # springs of next neighbours: half-bandwidth 2
+
+
+def pairs(q, v, t, params):
+    """They, and a hardening spring of each coordinate."""
+    return -(PAIRS @ q) - q**3
+
+
+def run_pairs(n=8, num_steps=3, **options):
+    stepper = hhtjax.hht(**options)
+    return hhtjax.simulate(
+        hhtjax.System(np.ones(n), pairs), stepper, np.linspace(0, 1, n) ** 2, np.zeros(n), dt=0.1, num_steps=num_steps
+    )
+
+
+def halved(A, b):
+    """No solve at all."""
+    return b / 2
+
+
+WRONG = {"banded": hhtjax.banded(1), "cg": hhtjax.conjugate_gradients(1), "user": halved}
+
+
+@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("iterations", [1, None])
+def test_a_solve_that_leaves_a_residual_fails_by_name(name, iterations):
+    run = run_pairs(solve=WRONG[name], iterations=iterations, num_steps=1)
+    assert run.info.solve_residual.max() > 1e-3
+    with pytest.raises(
+        hhtjax.SimulationError, match=r"step 1 .*the linear solve of the step leaves a residual of [0-9.]+ of"
+    ):
+        run.check()
+
+
+def by_lu(A, b):
+    return jnp.linalg.solve(A, b)
+
+
+@pytest.mark.parametrize("solve", [hhtjax.banded(2), hhtjax.conjugate_gradients(20), by_lu])
+def test_one_that_solves_reports_rounding_and_passes(solve):
+    run = run_pairs(solve=solve)
+    run.check()
+    assert run.info.solve_residual.max() < 1e-12
+    assert run.info.solved.all()
+    own = run_pairs()
+    assert own.info.solve_residual is None
+    assert own.failure.solve is None
+    np.testing.assert_allclose(run.q, own.q, rtol=1e-9, atol=1e-12)
+
+
+def test_inexact_solves_are_accepted_to_a_tolerance():
+    loose = run_pairs(solve=hhtjax.conjugate_gradients(3, tolerance=0.5), iterations=None)
+    loose.check()
+    assert loose.info.solve_residual.max() > 1e-6
+    np.testing.assert_allclose(loose.q, run_pairs(iterations=None).q, rtol=1e-9, atol=1e-12)
+    for make in (hhtjax.banded, hhtjax.conjugate_gradients):
+        with pytest.raises(ValueError, match=f"{make.__name__}: `tolerance` must be positive; received 0.0"):
+            make(1, tolerance=0.0)
+
+
+def test_of_a_linear_system_a_batch_and_a_sweep():
+    n = 8
+    system = hhtjax.LinearSystem(np.ones(n), None, PAIRS)
+    stepper = hhtjax.hht(solve=hhtjax.banded(1))
+    start = np.linspace(0, 1, n) ** 2, np.zeros(n)
+
+    def run(scale):
+        return hhtjax.simulate(system, stepper, start[0] * scale, start[1], dt=0.1, num_steps=2)
+
+    batch = jax.vmap(run)(jnp.array([0.0, 1.0]))  # at rest there is nothing to solve
+    with pytest.raises(hhtjax.SimulationError, match=r"member 1 \(1 of 2 failed\), step 1 .*the linear solve"):
+        batch.check()
+    runs = hhtjax.sweep(system, stepper, *start, dts=jnp.array([0.1, 1e-5]), duration=0.1, num_samples=1)
+    with pytest.raises(hhtjax.SimulationError, match="the linear solve"):
+        runs.check()

@@ -49,7 +49,7 @@ def errors(num_steps):
 
     def residuals(params, start, record):
         run = pendulum_data.simulate(params, start["q"], start["v"], DT, num_steps)
-        return hhtjax.wrap_angle(hhtjax.interpolate(run, record.t).q - params["offset"] - record.y)
+        return hhtjax.identification.wrap_angle(hhtjax.interpolate(run, record.t).q - params["offset"] - record.y)
 
     return residuals
 

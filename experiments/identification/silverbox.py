@@ -30,7 +30,7 @@ from experiments.identification.data import (
 )
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
-from hhtjax.identification.uncertainty import SEGMENTS
+from hhtjax.identification.sandwich import SEGMENTS
 from hhtjax.numerics.richardson import richardson
 
 SUBSTEPS = 8

@@ -84,6 +84,18 @@ def factors(entries, limit):
     return np.array([a / m for a, m in pairs if a and m])
 
 
+def misses(entries):
+    """The cases without contact whose advised step is beyond 1.5 of the measured one, or missing."""
+    found = []
+    for e in entries:
+        for limit, measured in e["measured_s"].items():
+            advised = e["advised_s"][limit]
+            if not e["contact"] and measured and (not advised or not 1 / 1.5 < advised / measured < 1.5):
+                which = {key: e[key] for key in ("scene", "method", "alpha")}
+                found.append({**which, "limit": limit, "advised_over_measured": advised and advised / measured})
+    return found
+
+
 def run(report, fast):
     """Advice for some methods on all scenes."""
     outcomes, sizes, _ = results(report, fast)
@@ -116,4 +128,5 @@ def run(report, fast):
     }
     totals = {key: sum(e[key] for e in entries) for key in ("silently_wrong", "flagged", "flagged_by_modes")}
     print(summary, totals, flush=True)
-    return {"summary": summary, "totals": totals, "entries": entries}
+    methods = len({e["method"] for e in entries})
+    return {"methods": methods, "summary": summary, "totals": totals, "misses": misses(entries)}

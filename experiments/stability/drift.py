@@ -125,7 +125,8 @@ def run(report, fast):
     report.table(["scene, method", "quantity", "error"], rows)
     if not fast:
         report.figure("stability_drift", figure(entries, num_steps))
-    return {"alpha": ALPHA, "num_steps": num_steps, "entries": entries}
+    kept = [{key: x for key, x in e.items() if key != "path"} for e in entries]
+    return {"alpha": ALPHA, "num_steps": num_steps, "entries": kept}
 
 
 def figure(entries, num_steps):

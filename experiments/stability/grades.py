@@ -50,15 +50,10 @@ def plain(method):
 
 
 def cells(outcomes, sizes):
-    """Errors with three digits, and for each alpha a letter of LETTERS for each step size, the coarsest first."""
-
-    def rounded(x):
-        return [[float(f"{y:.3g}") if np.isfinite(y) else None for y in row] for row in x]
-
+    """For each method and alpha a letter of LETTERS for each step size, the coarsest first."""
     return {
         scene: {
             "num_steps": sizes[scene],
-            "error": {plain(m): rounded(x.error) for m, x in by_method.items()},
             "grades": {plain(m): ["".join(LETTERS[i] for i in row) for row in x.grade.T] for m, x in by_method.items()},
         }
         for scene, by_method in outcomes.items()

@@ -31,12 +31,9 @@ def misses(entries):
     """The cases beyond a factor of 1.5, in words."""
     found = []
     for e in entries:
-        for limit, measured in e["measured_s"].items():
-            advised = e["advised_s"][limit]
-            if not e["contact"] and measured and (not advised or not 1 / 1.5 < advised / measured < 1.5):
-                ratio = "none advised" if not advised else f"{advised / measured:.2f}"
-                alpha = "" if e["alpha"] is None else f", alpha = {e['alpha']:g}"
-                found.append(f"* {e['scene']}, {e['method']}{alpha}, {100 * float(limit):g} %: {ratio}")
+        ratio = "none advised" if e["advised_over_measured"] is None else f"{e['advised_over_measured']:.2f}"
+        alpha = "" if e["alpha"] is None else f", alpha = {e['alpha']:g}"
+        found.append(f"* {e['scene']}, {e['method']}{alpha}, {100 * float(e['limit']):g} %: {ratio}")
     return "\n".join(["Beyond that factor:\n", *found]) if found else "None is beyond that factor."
 
 
@@ -78,7 +75,7 @@ def page(numbers):
         .read_text()
         .format(
             scenes=len(scenes),
-            methods=len(first["error"]),
+            methods=len(first["grades"]),
             halvings=len(first["num_steps"]),
             cells=sum(len(row) for scene in scenes.values() for x in scene["grades"].values() for row in x),
             tuned_scenes=gallery["tuned_scenes"],
@@ -93,9 +90,9 @@ def page(numbers):
             wrong=advice["totals"]["silently_wrong"],
             flagged=advice["totals"]["flagged"],
             flagged_by_modes=advice["totals"]["flagged_by_modes"],
-            advised_methods=len({e["method"] for e in advice["entries"]}),
+            advised_methods=advice["methods"],
             advice=advice_table(advice["summary"]),
-            misses=misses(advice["entries"]),
+            misses=misses(advice["misses"]),
             spin_duration=spin["duration_s"],
             spin=table(
                 ["method", *(f"{n} steps" for n in spin["num_steps"])],

@@ -137,8 +137,24 @@ def check_records(caller, records, starts, prior, optimizer):
     return starts
 
 
-def check_residuals(caller, shapes, p):
-    """shapes: the residuals as shapes and dtypes; p: number of parameters."""
+def check_residuals(caller, residuals, p, *args):
+    """The shapes and dtypes of residuals(*args), if they are good for p parameters."""
+
+    def real(*args):
+        result = residuals(*args)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(result):
+            if not (is_array(leaf) or isinstance(leaf, (int, float))):
+                where = f" at {jax.tree_util.keystr(path)}" if path else ""
+                raise TypeError(f"{caller}: `residuals` must return real arrays; received {leaf!r}{where}.")
+        return result
+
+    try:
+        shapes = jax.eval_shape(real, *args)
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        raise TypeError(
+            f"{caller}: `residuals` must be traceable by JAX, with jax.numpy in place of NumPy, float() and `if` "
+            f"wherever params come in; received {residuals!r}, whose error stands above."
+        ) from error
     leaves = jax.tree.leaves(shapes)
     for leaf in leaves:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -148,6 +164,7 @@ def check_residuals(caller, shapes, p):
         raise ValueError(
             f"{caller}: `residuals` must return at least as many numbers as there are parameters, {p}; received {m}."
         )
+    return shapes
 
 
 def spread_weights(caller, weights, shapes):
@@ -173,7 +190,7 @@ def check_weights(caller, weights):
     """Finite numbers, or Booleans: True to keep, False for a missing sample."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(weights):
         where = f"{caller}: `weights{jax.tree_util.keystr(path)}`"
-        if jnp.asarray(leaf).dtype != bool:
+        if not isinstance(leaf, bool) and np.dtype(getattr(leaf, "dtype", float)).kind != "b":
             check_real(where, leaf)
             if is_concrete(leaf) and np.any(np.asarray(leaf) < 0):
                 raise ValueError(f"{where} must not be negative; received {np.min(leaf)}.")
@@ -181,7 +198,8 @@ def check_weights(caller, weights):
 
 def check_real(where, leaf):
     """An error unless `leaf` is a finite real number or array."""
-    if not (is_array(leaf) or isinstance(leaf, (int, float))) or isinstance(leaf, bool):
+    text = isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biufcV"  # V: the floats of 8 and 16 bits of JAX
+    if not (is_array(leaf) or isinstance(leaf, (int, float))) or isinstance(leaf, bool) or text:
         raise TypeError(f"{where} must be a real number or array; received {leaf!r}.")
     if not is_real(leaf):
         raise TypeError(f"{where} must be real; received {jnp.result_type(leaf)}.")

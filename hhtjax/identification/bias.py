@@ -10,6 +10,7 @@ parameters have eigenvalues s' that are wrong by as much. For HHT with alpha = 0
 and the response to a force is wrong too, by 1 + (w h)^2/3 + ...: where the force is known, so is the mass.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,13 +20,13 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis import amplification_matrix
 from hhtjax.checks import require_number
+from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import require_stepper
 from hhtjax.systems.system import LinearSystem
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
-GAIN_WEIGHT = 1e-3  # frequency and damping first; the response to forces with the freedom that they leave
 ON_CONSTRAINT = 1e-6  # largest residual of it
-PROBE = 1e-4  # relative change of the stiffness that shows the response to forces
+DRIVEN = 64  # steps from t, in which a force that depends on the time has changed
 
 
 class ModeBias(NamedTuple):
@@ -58,9 +59,15 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t0=0.0, correct: Any 
         params: the fitted ones.
         q: an equilibrium, or another point about which the motion is small, on the constraint. v: 0 by default.
         correct: True returns `params` with the smallest relative changes that give the equations the eigenvalues s
-            and, as far as parameters can, the steps' response to forces ("pre-warped"). Parameters that the linear
-            part does not depend on stay as they are. Or Booleans for the leaves of params, or for whole branches:
-            False for what was not fitted, such as a known mass.
+            and the steps' response to forces ("pre-warped"). That takes the bias out of all of them where they can
+            follow: with masses fitted as well, entry by entry of M if there are several modes; or in the free
+            vibration of one mode. Otherwise the fit was a compromise between response and eigenvalues that depends on
+            the motion: then the frequencies alone are given back, damping stays as fitted, and a warning says so.
+            Parameters that the linear part does not depend on stay as they are. Or Booleans for the leaves of params,
+            or for whole branches: False for what was not fitted, such as a known mass.
+
+    Warns:
+        StepSizeWarning: params cannot follow. `refine` takes their bias out, from two fits or three.
 
     Raises:
         TypeError, ValueError: dt is no positive number; q does not meet the constraint.
@@ -88,7 +95,25 @@ def step_size_bias(system, stepper, params, dt, q, v=None, t0=0.0, correct: Any 
     bias = ModeBias(w, -np.real(s) / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
     if correct is False:
         return bias
-    return bias._replace(params=_corrected(system, stepper, params, dt, (q, v, t0), matrices, correct))
+
+    def linear_part(params):
+        return _linear_part(system, params, q, v, t0)
+
+    target = motion(partial(_rates_of_steps, stepper, dt), *matrices, matrices[2])
+    free = len(s) == 1 and not _is_driven(system, params, q, v, t0, dt)
+    corrected = prewarped(params, correct, linear_part, _rates_of_equations, target, matrices[2], free)
+    return bias._replace(params=corrected)
+
+
+def _is_driven(system, params, q, v, t, dt):
+    """Whether the force at a state depends on the time."""
+    v = jax.tree.map(jnp.zeros_like, q) if v is None else v
+
+    def force(t):
+        return ravel_pytree(system.force(q, v, t, params))[0]
+
+    forces = jax.vmap(force)(t + dt * jnp.arange(float(DRIVEN)))
+    return bool(jnp.any(forces != forces[:1]))
 
 
 def _linear_part(system, params, q, v, t):
@@ -138,39 +163,3 @@ def _rates_of_steps(stepper, dt, M, C, K):
     mu = np.linalg.eigvals(np.asarray(amplification_matrix(linear, stepper, state, dt=dt)))
     mu = mu[mu.imag > 0]
     return np.array([np.log(mu[np.argmin(np.abs(mu - np.exp(s * dt)))]) / dt for s in _rates_of_equations(M, C, K)])
-
-
-def _corrected(system, stepper, params, dt, state, matrices, correct):
-    """Gauss-Newton steps of least relative change towards the rates of the steps, and their change with stiffness.
-
-    A force -eps K q changes s by as much as the system responds to forces: so no force needs to be applied.
-    """
-    _, _, K0 = matrices
-
-    def with_response(rates, M, C, K):
-        plus, minus = (rates(M, C, K + sign * PROBE * K0) for sign in (1, -1))
-        return np.concatenate([rates(M, C, K), (plus - minus) / (2 * PROBE)])
-
-    target = with_response(lambda *matrices: _rates_of_steps(stepper, dt, *matrices), *matrices)
-    weight = np.repeat([1.0, GAIN_WEIGHT], len(target) // 2)
-    params = jax.tree.map(lambda p: jnp.asarray(p, jnp.result_type(float)), params)
-    fitted, unravel = ravel_pytree(params)
-    repeated = jax.tree.map(
-        lambda flag, branch: jax.tree.map(lambda p: jnp.full(p.shape, flag), branch), correct, params
-    )
-    at = np.flatnonzero(ravel_pytree(repeated)[0])
-
-    @jax.jit
-    def moved(x):
-        params = unravel(fitted.at[at].multiply(1 + x))
-        return params, _linear_part(system, params, *state)
-
-    def apart(x):
-        off = weight * (with_response(_rates_of_equations, *map(np.asarray, moved(x)[1])) / target - 1)
-        return np.concatenate([off.real, off.imag])
-
-    x = np.zeros(len(at))
-    for _ in range(4):
-        J = np.stack([(apart(x + e) - apart(x - e)) / 2e-5 for e in 1e-5 * np.eye(len(x))], axis=1)
-        x = x - np.linalg.lstsq(J, apart(x), rcond=1e-5)[0]
-    return moved(x)[0]

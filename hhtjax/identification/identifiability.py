@@ -69,12 +69,13 @@ def _phrase(names, direction, values):
     return f"{joined} not along {terms}"
 
 
-def warn_undetermined(caller, params, free, uncertainty, num_residuals, stacklevel):
-    """An `IdentifiabilityWarning` that names parameters and combinations; silent where all are determined."""
+def why_undetermined(params, free, uncertainty, num_residuals):
+    """Names of the parameters without a standard error, and why: "the residuals determine a, b only through their
+    product". Nothing, where all have one."""
     flags = np.asarray(uncertainty.undetermined)
-    if not flags.any():
-        return
     names = np.asarray(parameter_names(params))[free]
+    if not flags.any():
+        return [], ""
     if num_residuals == len(names):
         why = "there are as many residuals as parameters, so their variance cannot be estimated"
     else:
@@ -82,5 +83,12 @@ def warn_undetermined(caller, params, free, uncertainty, num_residuals, stacklev
         s, directions = uncertainty.singular_values, uncertainty.directions
         combinations = undetermined_combinations(names, values, s, directions, num_residuals)
         why = f"the residuals determine {'; '.join(combinations)}" if combinations else BEYOND
-    message = f"{caller}: no standard error for {', '.join(names[flags])}: {why}."
-    warnings.warn(message, IdentifiabilityWarning, stacklevel=stacklevel)
+    return names[flags].tolist(), why
+
+
+def warn_undetermined(caller, params, free, uncertainty, num_residuals, stacklevel):
+    """An `IdentifiabilityWarning` that names parameters and combinations; silent where all are determined."""
+    names, why = why_undetermined(params, free, uncertainty, num_residuals)
+    if names:
+        message = f"{caller}: no standard error for {', '.join(names)}: {why}."
+        warnings.warn(message, IdentifiabilityWarning, stacklevel=stacklevel)

@@ -25,10 +25,10 @@ from hhtjax.identification.arguments import (
     first_bad,
 )
 from hhtjax.identification.identifiability import warn_undetermined
-from hhtjax.identification.least_squares import BAD_START
+from hhtjax.identification.least_squares import BAD_START, NO_INFLUENCE
 from hhtjax.identification.problem import Data, solve
 from hhtjax.identification.result import FitResult
-from hhtjax.identification.uncertainty import SEGMENTS
+from hhtjax.identification.sandwich import SEGMENTS
 
 
 def fit(
@@ -78,8 +78,12 @@ def fit(
             residual and Jacobian columns. With optax: the relative change of the cost, five times running.
         covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
         segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
-            residuals are cut for the cluster covariance (`hhtjax.identification.uncertainty`).
+            residuals are cut for the cluster covariance (`hhtjax.identification.sandwich`).
         progress: print cost and step after every iteration, to stderr.
+
+    A function is traced once, and then known by its identity: data that it reads from outside are part of the program,
+    and that an array has changed in place or a name been bound anew goes unnoticed. For other data make another
+    function, `lambda params: residuals(params, data)`, or pass them as `records`.
 
     Returns:
         A `FitResult`. Inside jit or vmap, look at `result.code`; outside, trouble is raised or warned about.
@@ -184,8 +188,10 @@ def _finished(caller, result, weights):
         raise ValueError(
             f"{caller}: `residuals` must be finite at params0; received {first_bad(result.residual)}{missing}."
         )
+    if result.code == NO_INFLUENCE:
+        raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")
     if result.uncertainty is not None:
         size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
-        warn_undetermined(caller, result.params, result.free, result.uncertainty, size, stacklevel=3)
+        warn_undetermined(caller, result.params, result.free, result.uncertainty, size, stacklevel=4)
     done = int(result.iterations) + 1
     return result._replace(history=jax.tree.map(lambda x: x[:done], result.history), segments=int(result.segments))

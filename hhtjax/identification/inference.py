@@ -12,7 +12,7 @@ from hhtjax.identification import transforms as tf
 from hhtjax.identification.gauss_newton import with_jacobian
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
-from hhtjax.identification.uncertainty import SEGMENTS
+from hhtjax.identification.sandwich import SEGMENTS
 
 
 class Score(NamedTuple):
@@ -53,7 +53,7 @@ def score_test(residuals, params, candidates, segments=SEGMENTS) -> Score:
     >>> y = 2.0 * x + 0.5 * x**3 + 0.1 * jax.random.normal(jax.random.key(0), (400,))
     >>> model = lambda p, extra: p * x + extra["square"] * x**2 + extra["cube"] * x**3 - y
     >>> absent = {"square": 0.0, "cube": 0.0}
-    >>> found = hhtjax.score_test(model, hhtjax.fit(lambda p: model(p, absent), 1.0).params, absent)
+    >>> found = hhtjax.identification.score_test(model, hhtjax.fit(lambda p: model(p, absent), 1.0).params, absent)
     >>> dict(zip(found.names, (found.statistic > 10.8).tolist()))
     {'cube': True, 'square': False}
     """
@@ -140,7 +140,7 @@ def prediction_errors(predict, result, noise=0.0):
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.arange(100.0)
     >>> result = hhtjax.fit(lambda p: p * jnp.ones(100) - jnp.sin(t), 0.0)
-    >>> bool(hhtjax.prediction_errors(lambda p: 3 * p, result) == 3 * result.standard_errors)
+    >>> bool(hhtjax.identification.prediction_errors(lambda p: 3 * p, result) == 3 * result.standard_errors)
     True
     """
     x, unravel = ravel_pytree(result.params)

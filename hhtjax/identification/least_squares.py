@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jax import lax
 
-RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START = range(7)
+RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE = range(8)
 REASONS = {
     RUNNING: "still running",
     COST: "converged: the cost changes by less than tolerance",
@@ -23,6 +23,7 @@ REASONS = {
     LIMIT: "stopped: max_iterations reached",
     STUCK: "stopped: no step lowers the cost",
     BAD_START: "failed: the residual is not finite at params0",
+    NO_INFLUENCE: "failed: no parameter changes the residual at params0",
 }
 
 
@@ -87,10 +88,9 @@ class Objective(NamedTuple):
         """
         if self.loss is None:
             return self.scaled(r), self.scaled(J)
-        J, pull, bend = self.estimating(r, J)
-        slope = self.losses(r)[1]
-        row = jnp.sqrt(jnp.maximum(bend, LEAST_BEND * slope))
-        return pull / jnp.where(row == 0, 1, row), J * row[:, None]
+        r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
+        row = jnp.sqrt(jnp.maximum(slope + 2 * curvature * r**2, LEAST_BEND * slope))
+        return slope * r / jnp.where(row == 0, 1, row), J * row[:, None]
 
     def estimating(self, r, J):
         """w J, and the first and second derivative of the loss of each weighted residual (None without a loss: 1).
@@ -124,16 +124,19 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
         damped = lam * jnp.max(jnp.where(now.column > 0, now.D / now.column, 1)) ** 2
         lam = jnp.where(first, lam, lam * jnp.where(lower, jnp.maximum(1 / 8, 1 - (2 * gain - 1) ** 3), 6))
         iteration = iteration + 1
+        best = jax.tree.map(partial(jnp.where, lower | first), new, now)
         honest = damped <= 1  # a step is also small, and changes little, because it is damped
+        honest &= _settled(problem, best, history.cost[0], tolerance)
         flat = (predicted <= tolerance * now.cost) & (jnp.abs(now.cost - new.cost) <= tolerance * now.cost)
         short = jnp.all(jnp.abs(step) <= tolerance * (jnp.abs(now.x) + tolerance))
-        best = jax.tree.map(partial(jnp.where, lower | first), new, now)
         code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(~lower & (lam > 1 / eps), STUCK, code)
         code = jnp.where(honest & short, STEP, code)
         code = jnp.where(honest & flat, COST, code)
-        code = jnp.where(first, jnp.where(jnp.isfinite(new.cost), running, BAD_START), code)
-        code = jnp.where((code != BAD_START) & (problem.cosine(best) <= tolerance), GRADIENT, code)
+        code = jnp.where(first, running, code)
+        code = jnp.where(problem.cosine(best) <= tolerance, GRADIENT, code)
+        code = jnp.where(first & jnp.all(best.column == 0), NO_INFLUENCE, code)
+        code = jnp.where(first & ~jnp.isfinite(new.cost), BAD_START, code)
         taken = jnp.where(lower & ~first, jnp.max(jnp.abs(step)), 0)
         history = _record(history, iteration, best.cost, taken, lam)
         if progress:
@@ -147,6 +150,17 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
     carry = nothing, jnp.asarray(1e-3, x.dtype), jnp.asarray(-1, jnp.int32), History(empty, empty, empty), running
     best, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
     return best, history, iterations, code
+
+
+def _settled(problem, best, start, tolerance):
+    """Whether small steps mean a minimum: the gradient is small too, or the residual next to nothing.
+
+    Without that, a residual with a derivative of 1e10, as of a chaotic run, would call its first step small.
+    """
+    reach = jnp.linalg.norm(best.column * jnp.maximum(jnp.abs(best.x), 1))  # of parameters changed by themselves
+    rounding = 10 * float(jnp.finfo(reach.dtype).eps) * reach
+    nothing = (best.cost <= tolerance * start) | (best.length <= rounding)
+    return nothing | (problem.cosine(best) <= 10 * jnp.sqrt(tolerance))
 
 
 def _within(problem, now, lam, longest):
@@ -184,7 +198,8 @@ def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, pat
         quiet = jnp.where(jnp.abs(before - value) <= tolerance * value, quiet + 1, 0)
         code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(quiet >= patience, COST, code)
-        code = jnp.where(jnp.all(gradient == 0), GRADIENT, code)
+        level = jnp.where((iteration == 0) & (value > 0), NO_INFLUENCE, GRADIENT)
+        code = jnp.where(jnp.all(gradient == 0), level, code)
         code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
         if progress:
             _show(iteration, value, step)

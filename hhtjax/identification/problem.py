@@ -14,7 +14,7 @@ from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options, check_
 from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
 from hhtjax.identification.least_squares import Objective, descend, levenberg_marquardt
 from hhtjax.identification.result import FitResult
-from hhtjax.identification.uncertainty import count_segments, uncertainty, variance_inflation
+from hhtjax.identification.sandwich import count_segments, uncertainty, variance_inflation
 
 
 class Data(NamedTuple):
@@ -101,8 +101,7 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
 
 def _solve_dense(residuals, options, coordinates, data, limits):
     """One residual function of all parameters, with priors as further rows."""
-    shapes = jax.eval_shape(residuals, coordinates.params(coordinates.x0))
-    check_residuals("fit", shapes, coordinates.x0.size)
+    shapes = check_residuals("fit", residuals, coordinates.x0.size, coordinates.params(coordinates.x0))
     leaves = spread_weights("fit", data.weights, shapes)
     w, unravel = ravel_pytree(jax.tree.unflatten(jax.tree.structure(shapes), leaves))
     m = w.size
@@ -140,8 +139,8 @@ def _solve_records(residuals, options, coordinates, data, limits):
     _, unravel_start = ravel_pytree(one)
     own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
     every = jax.vmap(residuals, in_axes=(None, 0, 0))
-    shapes = jax.eval_shape(every, coordinates.params(coordinates.x0), data.starts, data.records)
-    check_residuals("fit", shapes, coordinates.x0.size + own0.size)
+    unknowns, params0 = coordinates.x0.size + own0.size, coordinates.params(coordinates.x0)
+    shapes = check_residuals("fit", every, unknowns, params0, data.starts, data.records)
     weights = jax.tree.unflatten(jax.tree.structure(shapes), spread_weights("fit", data.weights, shapes))
     w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)
     _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], weights))

@@ -23,7 +23,7 @@ UNDAMPED = 1e-6  # damping ratio, rounding of float32 included
 
 
 class StepSizeWarning(UserWarning):
-    """The step size shifts an estimate by more than its standard error."""
+    """The step size shifts an estimate by more than its standard error, or by what cannot be taken out."""
 
 
 class Refined(NamedTuple):

@@ -1,21 +1,21 @@
 """A fit for readers: a text table, charts, and JSON."""
 
-from dataclasses import fields
-from typing import Any, cast
+from dataclasses import fields, is_dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.identifiability import parameter_names
-from hhtjax.steppers.stepper import Stepper
+from hhtjax.identification.identifiability import parameter_names, why_undetermined
 
 
 def summary(result) -> str:
     """The text of `FitResult.summary`."""
     size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
-    lines = [f"{result.reason}; {int(result.iterations)} iterations, cost {float(result.cost):.6g}, {size} residuals"]
+    cost = f"cost {float(result.cost):.6g}, {float(result.history.cost[0]):.6g} at the start"
+    lines = [f"{result.reason}; {int(result.iterations)} iterations, {cost}, {size} residuals"]
     names, values = parameter_names(result.params), _flat(result.params)
     rows = [["parameter", "estimate"]]
     columns = []
@@ -23,10 +23,7 @@ def summary(result) -> str:
         rows[0] += ["standard error", "95 % interval", "error / naive"]
         lower, upper = map(_flat, result.interval())
         errors, naive = _flat(result.standard_errors), _flat(result.errors(result.uncertainty.naive))
-        columns = [
-            ["fixed", "", ""] if not free else [f"{e:.3g}", f"{low:.6g} .. {high:.6g}", f"{e / n:.2f}" if n else ""]
-            for free, e, low, high, n in zip(result.free, errors, lower, upper, naive, strict=True)
-        ]
+        columns = [_columns(*row) for row in zip(result.free, errors, lower, upper, naive, strict=True)]
     for i, (name, value) in enumerate(zip(names, values, strict=True)):
         rows.append([name, f"{value:.6g}", *(columns[i] if columns else [])])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -36,12 +33,25 @@ def summary(result) -> str:
     return "\n".join(lines)
 
 
+def _columns(free, error, lower, upper, naive):
+    """Standard error, interval, and the ratio to the naive error, in words."""
+    if not free:
+        return ["fixed", "", ""]
+    if np.isinf(error):
+        return ["undetermined", "", ""]
+    return [f"{error:.3g}", f"{lower:.6g} .. {upper:.6g}", f"{error / naive:.2f}" if naive else ""]
+
+
 def _remarks(result, names):
     believed = result.uncertainty
     kind = f"cluster sandwich over {result.segments} segments" if believed.cluster is not None else "autocorrelated"
     remarks = [f"standard errors: {kind}"]
+    size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
+    unknown, why = why_undetermined(result.params, result.free, believed, size)
+    if unknown:
+        remarks.append(f"undetermined: {', '.join(unknown)}: {why}")
     R = np.abs(np.asarray(result.correlation)) * (1 - np.eye(len(names)))
-    if len(names) > 1:
+    if np.sum(result.free) - len(unknown) > 1:
         i, j = np.unravel_index(np.argmax(R), R.shape)
         remarks.append(f"largest correlation: {float(result.correlation[i, j]):+.3f} between {names[i]} and {names[j]}")
     s = np.asarray(believed.singular_values)
@@ -85,7 +95,7 @@ def _flat(tree):
 TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}
 
 
-def encode(x):
+def encode(x: Any) -> Any:
     """A pytree of named tuples, dicts, lists, tuples, arrays, transforms and steppers, as what JSON can hold."""
     if x is None or isinstance(x, (int, float, str)):
         return x
@@ -95,9 +105,8 @@ def encode(x):
         return {"transform": next(name for name, T in TRANSFORMS.items() if T is x)}
     if isinstance(x, dict):
         return {"dict": {name: encode(y) for name, y in x.items()}}
-    if isinstance(x, Stepper):
-        names = [field.name for field in fields(cast(Any, x))]  # each is a dataclass
-        return {type(x).__name__: {name: encode(getattr(x, name)) for name in names}}
+    if is_dataclass(x):
+        return {type(x).__name__: {field.name: encode(getattr(x, field.name)) for field in fields(x)}}
     if names := getattr(x, "_fields", None):
         return {type(x).__name__: {name: encode(y) for name, y in zip(names, x, strict=True)}}
     if isinstance(x, (list, tuple)):

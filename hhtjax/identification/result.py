@@ -13,7 +13,7 @@ from hhtjax.checks import require_number
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.least_squares import COST, GRADIENT, REASONS, STEP, History
-from hhtjax.identification.uncertainty import Uncertainty, correlation
+from hhtjax.identification.sandwich import Uncertainty, correlation
 
 
 class FitResult(NamedTuple):

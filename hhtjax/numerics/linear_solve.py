@@ -5,7 +5,10 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 `LOOPED` it is a loop in a kernel, and LAPACK's elsewhere.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -42,6 +45,14 @@ def invert(f, like, factorize):
     if isinstance(factorize, Structured):
         return factorize.of_map(f, like)
     return factorize(staged(partial(linear_map, f), like.size)(like))
+
+
+def invert_and_bound(f, like, factorize):
+    """`invert`, and the function x -> |A| |x|, what the rows of A x are sums of; where no A is formed, |A x|."""
+    if isinstance(factorize, Structured):
+        return factorize.of_map(f, like), lambda x: jnp.abs(f(x))
+    A = staged(partial(linear_map, f), like.size)(like)
+    return factorize(A), lambda x: matvec(jnp.abs(A), jnp.abs(x))
 
 
 def _solve(f, b, inverse):
@@ -81,7 +92,38 @@ def factorize(A):
     return partial(lu_solve, lu_factor(A))
 
 
-class Structured:
+class Trusted:
+    """A `factorize` whose results are taken on trust, and which therefore tells what it leaves unsolved.
+
+    tolerance: of the residual relative to the right-hand side, in the 2-norm; None: 1e-6, in float32 1e-3.
+    """
+
+    tolerance: Any = None
+
+    def leaves(self, f, b, x):
+        """What x leaves of b = f(x), relative to b."""
+        left, size = (jnp.sqrt(jnp.sum(y**2)) for y in (f(x) - b, b))
+        return lax.stop_gradient(jnp.where(left == 0, 0, left / size))
+
+    def accepts(self, left):
+        """Whether so much may be left; what is not a number is for others to tell."""
+        tolerance = self.tolerance
+        return ~(left > (max(1e-6, 1e4 * float(jnp.finfo(left.dtype).eps)) if tolerance is None else tolerance))
+
+
+@dataclass(frozen=True)
+class Given(Trusted):
+    """A `factorize` from a function that does its work."""
+
+    function: Callable
+    tolerance: Any = None
+
+    def __call__(self, A):
+        """(b, trans=0) -> A^-1 b, or A^-T b."""
+        return self.function(A)
+
+
+class Structured(Trusted):
     """A `factorize` that is given the linear map f itself: `of_map(f, like)` is what `invert` promises."""
 
     def of_map(self, f, like):
@@ -102,7 +144,16 @@ def factorize_with(solve):
         A = lax.stop_gradient(A)
         return lambda b, trans=0: solve(A.T if trans else A, b)
 
-    return factorize
+    return Given(factorize)
+
+
+def reuse(factorize, inverse):
+    """A `factorize` of the same kind for a matrix that has been factorised: `inverse` is what it gave."""
+
+    def known(A):
+        return inverse
+
+    return Given(known, factorize.tolerance) if isinstance(factorize, Trusted) else known
 
 
 def factorize_least_squares(n):

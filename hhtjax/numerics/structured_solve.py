@@ -5,13 +5,14 @@ vectors of ones and zeros, and conjugate gradients only apply it.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.sparse.linalg import cg
 
-from hhtjax.checks import require_integer
+from hhtjax.checks import require_integer, require_number
 from hhtjax.numerics.linear_solve import Structured, solve
 
 
@@ -20,6 +21,7 @@ class Banded(Structured):
     """A[i, j] = 0 for |i - j| > half_bandwidth, and elimination without pivoting, as for positive definite A."""
 
     half_bandwidth: int
+    tolerance: Any = None
 
     def of_map(self, f, like):
         """(b, trans=0) -> A^-1 b, or A^-T b."""
@@ -34,20 +36,26 @@ class ConjugateGradients(Structured):
     """A symmetric and positive definite; `iterations` of them, however large the residual then is."""
 
     iterations: int
+    tolerance: Any = None
 
     def of_map(self, f, like):
         """(b, trans=0) -> A^-1 b, A being symmetric."""
         return lambda b, trans=0: cg(f, b, tol=0.0, atol=0.0, maxiter=self.iterations)[0]
 
 
-def banded(half_bandwidth=1) -> Banded:
+def banded(half_bandwidth=1, tolerance=None) -> Banded:
     """For the `solve` of a stepper: M and the Jacobians of the force couple unknowns up to `half_bandwidth` apart.
 
     One step costs 2 half_bandwidth + 1 tangents of the residual and an elimination, all in proportion to the number of
     unknowns. M has to be diagonal (n,). For chains, frames, beams; unknowns in the order of the leaves of q.
 
+    Args:
+        half_bandwidth: a positive integer. Where it is too small, the solve leaves a residual.
+        tolerance: of this residual, relative to the right-hand side (2-norm); 1e-6 by default, 1e-3 in float32. A step
+            above it is a failure that `solution.check()` names; `solution.info.solve_residual` has the largest.
+
     Raises:
-        ValueError: half_bandwidth is no positive integer.
+        ValueError: half_bandwidth is no positive integer, or tolerance not positive.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> def springs(q, v, t, params):
@@ -60,20 +68,32 @@ def banded(half_bandwidth=1) -> Banded:
     >>> bool(jnp.allclose(end(hhtjax.banded(1)), end(None), atol=1e-12))
     True
     """
-    return Banded(require_integer("banded", "half_bandwidth", half_bandwidth))
+    half_bandwidth = require_integer("banded", "half_bandwidth", half_bandwidth)
+    return Banded(half_bandwidth, _tolerance("banded", tolerance))
 
 
-def conjugate_gradients(iterations) -> ConjugateGradients:
+def conjugate_gradients(iterations, tolerance=None) -> ConjugateGradients:
     """For the `solve` of a stepper: that many iterations at every step, so that each costs the same.
 
-    Matrix-free: a tangent of the residual for each iteration. What they leave unsolved is an error of the step: compare
-    with more iterations. The number needed grows with the square root of the condition of M + beta h^2 K, that is, with
-    the number of elements that a wave crosses in a step. M has to be diagonal (n,); symmetric stiffness and damping.
+    Matrix-free: a tangent of the residual for each iteration. What they leave unsolved is an error of the step. The
+    number needed grows with the square root of the condition of M + beta h^2 K, that is, with the number of elements
+    that a wave crosses in a step. M has to be diagonal (n,); symmetric stiffness and damping.
+
+    Args:
+        iterations: a positive integer.
+        tolerance: as in `banded`. Solves meant to be inexact need a larger one: with Newton's iteration 0.1 is enough
+            for the motion, while derivatives are as exact as the solve.
 
     Raises:
-        ValueError: iterations is no positive integer.
+        ValueError: iterations is no positive integer, or tolerance not positive.
     """
-    return ConjugateGradients(require_integer("conjugate_gradients", "iterations", iterations))
+    iterations = require_integer("conjugate_gradients", "iterations", iterations)
+    return ConjugateGradients(iterations, _tolerance("conjugate_gradients", tolerance))
+
+
+def _tolerance(caller, value):
+    """As a number, which is part of the program."""
+    return None if value is None else float(require_number(caller, "tolerance", value, lambda x: x > 0, "be positive"))
 
 
 def find_bands(f, like, p):

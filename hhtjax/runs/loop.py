@@ -72,7 +72,7 @@ def as_solution(flat, start, path, dt, info, failure):
 def no_failure(info):
     """What `Solution.failure` says of a run in which all went well."""
     none = jnp.zeros((), jnp.int32)
-    return Failure(none, jnp.array(False), none, info.dependent_row)
+    return Failure(none, jnp.array(False), none, info.dependent_row, info.solve_residual)
 
 
 def _first_failure(failure, count, state, info):
@@ -82,28 +82,25 @@ def _first_failure(failure, count, state, info):
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
     for (i, _), fine in reversed(list(zip(known, checks, strict=True))):
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
-    failed, newton, row = ~finite, finite, failure.row
+    failed, newton, row, left = ~finite, finite, failure.row, failure.solve
     if info.converged is not None:
         failed = failed | ~info.converged
     if info.dependent_row is not None:
         failed, newton = failed | (info.dependent_row > 0), newton & (info.dependent_row == 0)
+    if info.solved is not None:
+        failed, newton = failed | ~info.solved, newton & info.solved
     first = failed & (failure.step == 0)
     if info.dependent_row is not None:
         row = jnp.where(first, info.dependent_row, failure.row)
+    if info.solved is not None:
+        left = jnp.where(first & finite & ~info.solved, info.solve_residual, failure.solve)
     step, quantity = (jnp.where(first, new, old) for new, old in ((count, failure.step), (quantity, failure.quantity)))
-    return Failure(step, jnp.where(first, newton, failure.newton), quantity, row)
+    return Failure(step, jnp.where(first, newton, failure.newton), quantity, row, left)
 
 
 def neutral_info(shapes):
     """What `join_info` leaves unchanged."""
     return Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
-
-
-def join_info(info, new):
-    """Info of several steps as one: largest residuals, number of iterations, all converged."""
-    join = {"iterations": jnp.add, "converged": jnp.logical_and}
-    pairs = {name: (x, getattr(new, name)) for name, x in info._asdict().items() if x is not None}
-    return info._replace(**{name: join.get(name, jnp.maximum)(*pair) for name, pair in pairs.items()})
 
 
 def show_progress(count, total, what):

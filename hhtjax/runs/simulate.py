@@ -10,9 +10,9 @@ from hhtjax.checks import require_integer, require_number
 from hhtjax.description import is_concrete
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.extrapolate import MOST, extrapolated
-from hhtjax.runs.loop import as_solution, join_info, loop_of, show_progress
+from hhtjax.runs.loop import as_solution, loop_of, show_progress
 from hhtjax.runs.solution import Solution
-from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.steppers.stepper import join_info, require_capable, require_stepper, require_system
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values

@@ -18,12 +18,14 @@ class Failure(NamedTuple):
     """The first step that failed. step: its number, from 1, or 0 if none did; newton: True if Newton's
     iteration failed while the state was still finite; quantity: index into QUANTITIES of the first that is not finite;
     row: number, from 1, of the constraint that came to depend on those before it, 0 if none did, None without
-    constraints."""
+    constraints. solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the
+    solve is the library's own."""
 
     step: Any
     newton: Any
     quantity: Any
     row: Any = None
+    solve: Any = None
 
 
 QUANTITIES = "the position q", "the velocity v", "the acceleration", "the vector of multipliers"
@@ -82,7 +84,13 @@ class Solution(NamedTuple):
 
     def _why(self, member):
         """What `failure` says of one member of a batch."""
-        _, newton, quantity, row = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        _, newton, quantity, row, left = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        if left:
+            return (
+                f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "
+                "half_bandwidth of banded(), more iterations of conjugate_gradients(), or another solve(A, b); a "
+                "larger `tolerance` of the first two accepts it"
+            )
         if newton:
             return (
                 "Newton's iteration did not converge; the state is still finite. Take a smaller dt, or more "

@@ -10,10 +10,11 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
-from hhtjax.runs.loop import advance_from, as_solution, join_info, loop_of, show_progress
+from hhtjax.runs.loop import advance_from, as_solution, loop_of, show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
+from hhtjax.steppers.stepper import join_info
 from hhtjax.systems.flat_system import flatten
 from hhtjax.xla import on_scalars, one_kernel
 

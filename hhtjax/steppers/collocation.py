@@ -49,7 +49,7 @@ class Collocation(Stepper):
             def path(w):
                 return newmark_step(s, theta * dt, w, beta)
 
-            w, info = newton(r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
+            w, info = newton(system, r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
             return newmark_step(s, dt, s.w + (w - s.w) / theta, beta), info
 
         return step

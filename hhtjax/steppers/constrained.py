@@ -19,7 +19,7 @@ from jax import lax
 
 from hhtjax.numerics.linear_solve import diagonal, matvec
 from hhtjax.steppers.newton import linearized_solve, newton
-from hhtjax.steppers.stepper import Info, State
+from hhtjax.steppers.stepper import State, join_info
 from hhtjax.systems.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
 
 
@@ -76,11 +76,12 @@ def bind_constrained(method, system, params, dt):
 
         z = jnp.concatenate([s.w, s.L] + [jnp.zeros(m, s.q.dtype)] * ggl)
         if options.iterations is None:
-            z, info = newton(r, path, z, s, factorize, options.tolerance, options.max_iterations)
+            z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
         else:
-            for _ in range(options.iterations):
-                z = linearized_solve(r, path, z, factorize)
-            info = Info()
+            z, info = linearized_solve(r, path, z, factorize)
+            for _ in range(options.iterations - 1):
+                z, more = linearized_solve(r, path, z, factorize)
+                info = join_info(info, more)
         s1 = system.tidy(path(z))
         return s1, report(system, params, s1, info, None if method.redundant else dependent(s, s1, B))
 

@@ -114,7 +114,7 @@ class ConventionalHHT(Stepper):
                 return jnp.concatenate([now, system.constraint(s1.q, s1.t, params) / (beta * dt**2)])
 
             z = jnp.concatenate([s.w, s.L]) if m else s.w
-            z, info = newton(r, path, z, s, factorize, self.options.tolerance, self.options.max_iterations)
+            z, info = newton(system, r, path, z, s, factorize, self.options.tolerance, self.options.max_iterations)
             return system.tidy(path(z)._replace(memory=None)), info
 
         return step

@@ -61,7 +61,7 @@ class Multistep(Stepper):
                 q, v = self.advance(system, s, past, dt, w)
                 return State(s.t + dt, q, v, w)
 
-            w, info = newton(r, path, s.w, s, factorize, self.options.tolerance, self.options.max_iterations)
+            w, info = newton(system, r, path, s.w, s, factorize, self.options.tolerance, self.options.max_iterations)
             return path(w), info
 
         def step(s):

@@ -4,15 +4,20 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from hhtjax.numerics.linear_solve import invert, solve_map
+from hhtjax.numerics.linear_solve import Trusted, invert_and_bound, solve_map
 from hhtjax.steppers.stepper import Info
+from hhtjax.systems import kinematics
 from hhtjax.xla import staged
+
+RELATIVE = 1e-6  # of the terms of a row, above which its residual is never small
+SHAKE, NOISE, SHAKES = 2, 32, 3  # roundings by which a state is changed; how much more than that passes; how often
 
 
 def linearized_solve(r, path, w, factorize, at=None):
-    """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)).
+    """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)), and its `Info`.
 
     One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
     """
@@ -26,43 +31,101 @@ def linearized_solve(r, path, w, factorize, at=None):
         return value, along, tangent
 
     value, along, tangent = staged(expand, w.size)(w, at)
-    return w - solve_map(lambda dw: tangent(along(dw)), value, factorize)
+
+    def f(dw):
+        return tangent(along(dw))
+
+    dw = solve_map(f, value, factorize)
+    return w - dw, told(factorize, left_by(factorize, f, value, dw))
 
 
-def newton(r, path, w, s, factorize, tolerance, max_iterations):
-    """Newton on r(path(w)) from w until max|r| <= tolerance or a correction is lost in rounding; s: the state before.
+def left_by(factorize, f, b, x):
+    """What x leaves of b = f(x), relative to it; None for the library's own solve, which needs no proof."""
+    return factorize.leaves(f, b, x) if isinstance(factorize, Trusted) else None
+
+
+def told(factorize, left, info=Info()):  # noqa: B008 (a tuple)
+    """The `Info` of a step with a solve that left so much."""
+    return info if left is None else info._replace(solve_residual=left, solved=factorize.accepts(left))
+
+
+def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
+    """Newton on r(path(w)) from w, s being the state before, until each row of r is small beside its own terms:
+
+        |r_i| <= tolerance and |r_i| <= RELATIVE (|A| |w|)_i,    or each is no larger than rounding makes it.
+
+    So no row is measured by the forces of another. The second is asked where an iteration no longer halves a row.
 
     Differentiated by the implicit-function theorem, forward and reverse.
     """
 
-    def lost_in_rounding(s0, s1):
-        """Whether q, and h v, change by less than they are rounded to."""
-        h = s1.t - s.t
-        size = jnp.maximum(jnp.max(jnp.abs(s1.q)), h * jnp.max(jnp.abs(s1.v)))
-        change = jnp.maximum(jnp.max(jnp.abs(s1.q - s0.q)), h * jnp.max(jnp.abs(s1.v - s0.v)))
-        return change <= 4 * float(jnp.finfo(s.w.dtype).eps) * size
-
     def search(f, w):
         def unfinished(carry):
-            _, value, iterations, converged = carry
+            _, value, iterations, converged, _ = carry
             return ~converged & (iterations < max_iterations) & jnp.all(jnp.isfinite(value))
 
         def improve(carry):
-            w0, value, iterations, _ = carry
-            _, tangent = staged(partial(jax.linearize, f), w.size)(w0)
-            w1 = w0 - invert(tangent, w, factorize)(value, trans=0)
+            w0, _, iterations, _, left = carry
+            before, tangent = staged(partial(jax.linearize, f), w.size)(w0)
+            inverse, terms = invert_and_bound(tangent, w, factorize)
+            dw = inverse(before, trans=0)
+            w1 = w0 - dw
             value = f(w1)
-            converged = jnp.all(jnp.abs(value) <= tolerance) | lost_in_rounding(path(w0), path(w1))
-            return w1, value, iterations + 1, converged
+            limit = jnp.minimum(tolerance, RELATIVE * terms(w1))
+            large = jnp.abs(value) > limit
+            stalled = jnp.any(large & (jnp.abs(value) > 0.5 * jnp.abs(before)))
+            small = ~jnp.any(large) | is_rounding(system, r, s, path(w1), value, limit, stalled)
+            if left is not None:
+                left = jnp.maximum(left, left_by(factorize, tangent, before, dw))
+            return w1, value, iterations + 1, small, left
 
-        value = f(w)
-        begin = w, value, jnp.zeros((), jnp.int32), jnp.all(jnp.abs(value) <= tolerance)
-        w, value, iterations, converged = lax.while_loop(unfinished, improve, begin)
+        left = jnp.zeros((), w.dtype) if isinstance(factorize, Trusted) else None
+        begin = w, jnp.zeros_like(w), jnp.zeros((), jnp.int32), jnp.array(False), left
+        w, value, iterations, converged, left = lax.while_loop(unfinished, improve, begin)
         # as floats: custom_root cannot differentiate past integers
-        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype))
+        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype), left)
 
     def tangent_solve(g, y):
         return solve_map(g, y, factorize)
 
-    w, (size, iterations, converged) = lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
-    return w, Info(size, iterations.astype(jnp.int32), converged > 0)
+    w, told_by_search = lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
+    size, iterations, converged, left = told_by_search
+    return w, told(factorize, left, Info(size, iterations.astype(jnp.int32), converged > 0))
+
+
+def is_rounding(system, r, s0, s1, value, limit, ask):
+    """If asked, whether each row of r is below its limit, or changes by as much where s1 is rounded otherwise.
+
+    A loop, and no condition: of those that vmap makes it takes the steps that some member needs.
+    """
+    sizes = term_sizes(system, s0, s1)
+
+    def unsettled(carry):
+        i, allowed = carry
+        return ask & (i < SHAKES) & ~jnp.all(jnp.abs(value) <= allowed)
+
+    def shake(carry):
+        i, allowed = carry
+        shaken = s1._replace(**{name: getattr(s1, name) + _shake(size, i) for name, size in sizes.items()})
+        return i + 1, jnp.maximum(allowed, NOISE * jnp.abs(r(shaken) - value))
+
+    _, allowed = lax.while_loop(unsettled, shake, (jnp.zeros((), jnp.int32), limit))
+    return ask & jnp.all(jnp.abs(value) <= allowed)
+
+
+def term_sizes(system, s0, s1):
+    """Sizes of what the numbers of the state s1, reached from s0, are sums of, and their roundings relative to."""
+    h = s1.t - s0.t
+    w = jnp.abs(s0.w) + jnp.abs(s1.w)
+    v = jnp.abs(s0.v) + jnp.abs(s1.v) + h * w
+    sizes = {"q": kinematics.terms(system.blocks, s0.q, s1.q, h * v), "v": v, "w": w}
+    return sizes if s1.L is None else sizes | {"L": jnp.abs(s0.L) + jnp.abs(s1.L)}
+
+
+def _shake(size, i):
+    """A few roundings, of both signs and uneven, so that equal terms do not cancel; others for each i."""
+    k, golden = np.arange(size.size), 0.618034
+    first = (0.75 + golden * k % 0.5) * np.where(k % 2, -1, 1)
+    more = (0.75 + golden**2 * k % 0.5) * np.where(k % 3, 1, -1)
+    unit = SHAKE * float(jnp.finfo(size.dtype).eps)
+    return size * (jnp.asarray(unit * first, size.dtype) + i.astype(size.dtype) * jnp.asarray(unit * more, size.dtype))

@@ -41,6 +41,8 @@ class Info(NamedTuple):
     constraint: max-norm of Phi at the end of the step; constraint_rate: of dPhi/dt.
     dependent_row: number, from 1, of the first constraint that depends on those before it at the start of the step;
         0 while B has full rank.
+    solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
+        trust (`banded`, `conjugate_gradients`, a given function); solved: whether that is within its tolerance.
     """
 
     residual: Any = None
@@ -49,6 +51,15 @@ class Info(NamedTuple):
     constraint: Any = None
     constraint_rate: Any = None
     dependent_row: Any = None
+    solve_residual: Any = None
+    solved: Any = None
+
+
+def join_info(info, new):
+    """Info of several steps as one: largest residuals, number of iterations, all converged."""
+    join = {"iterations": jnp.add, "converged": jnp.logical_and, "solved": jnp.logical_and}
+    pairs = {name: (x, getattr(new, name)) for name, x in info._asdict().items() if x is not None}
+    return info._replace(**{name: join.get(name, jnp.maximum)(*pair) for name, pair in pairs.items()})
 
 
 class Stepper(Description):

@@ -55,6 +55,11 @@ def rate(blocks, q, v):
     return _each(blocks, lambda q, v: v, lambda R, Om: rotation.product(R, rotation.hat(Om)), q, v)
 
 
+def terms(blocks, q0, q1, x):
+    """Sizes of what q1 is the sum of, q0 and a displacement up to x: (n,) of positions, 1 for those of rotations."""
+    return _each(blocks, lambda q0, q1, x: jnp.abs(q0) + jnp.abs(q1) + x, lambda R, *_: jnp.ones_like(R), q0, q1, x)
+
+
 def orthonormalize(blocks, q):
     """q with the rounding errors of its rotations squared."""
     return _each(blocks, lambda q: q, rotation.orthonormalize, q)

@@ -1,0 +1,117 @@
+"""What a function holds that cannot be part of one kernel, and what in it is to be changed first."""
+
+from jaxlib.mlir import ir
+
+from hhtjax.xla.kernels import STAGED, inside_p
+from hhtjax.xla.products import element_type, is_small_product, is_small_sum, is_to_write_out
+
+ATTRIBUTES = "mhlo.frontend_attributes"
+
+# operations the emitter knows, whatever their size
+PROVEN = {
+    *("abs", "add", "and", "atan2", "broadcast_in_dim", "case", "ceil", "clamp", "compare", "concatenate", "constant"),
+    *("convert", "cosine", "divide", "dynamic_slice", "dynamic_update_slice", "exponential", "exponential_minus_one"),
+    *("floor", "gather", "if", "iota", "is_finite", "log", "log_plus_one", "logistic", "maximum", "minimum"),
+    *("multiply", "negate", "not", "optimization_barrier", "or", "pad", "power", "remainder", "reshape", "return"),
+    *("reverse", "round_nearest_afz", "round_nearest_even", "rsqrt", "select", "sign", "sine", "slice", "sqrt"),
+    *("subtract", "tan", "tanh", "transpose", "while", "xor"),
+}
+# those it should know: a kernel that holds one is compiled on trial
+KNOWN = {
+    *("bitcast_convert", "cbrt", "complex", "count_leading_zeros", "imag", "popcnt", "real", "shift_left"),
+    *("shift_right_arithmetic", "shift_right_logical"),
+}
+# those it knows if they are small
+CHECKS = {"dot_general": is_small_product, "reduce": is_small_sum, "reduce_window": is_small_sum}
+PROVEN_TYPES = {"f32", "f64", "i1", "i32", "i64", "ui32", "ui64"}
+MOST_OPERATIONS = 5000  # of more, compiling takes long, or fails: gradients of a chain of bodies
+
+
+class Inspection:
+    """Looks through a function and all it calls.
+
+    objection: the first thing that cannot be in one kernel, in words, or None; is_proven: all else is known to compile;
+    finished: names of the functions, each after those that it calls; stages: {name of a staged function: its calls};
+    products: to be written out; choices: between two forms of a function.
+    """
+
+    def __init__(self, functions, call, is_partitioned=False):
+        self.functions = functions
+        self.seen, self.finished = set(), []
+        self.operations = 0
+        self.stages, self.products, self.choices = {}, [], []
+        self.is_proven = True
+        self.objection = "partitioned over devices; shard_map leaves each its own kernel" if is_partitioned else None
+        self.look(call)
+
+    def look(self, op):
+        """Notes what `op` is, and looks into it."""
+        self.operations += 1
+        if self.operations > MOST_OPERATIONS:
+            self.object(f"more than {MOST_OPERATIONS} operations")
+        dialect, _, name = op.name.partition(".")
+        if op.name == "func.call":
+            self._look_into_call(op)
+        elif is_choice(op):
+            self.choices.append(op)
+            self._look_at_all(form_inside(op))
+        elif name == "custom_call":
+            self.object(ir.StringAttr(op.attributes["call_target_name"]).value)
+        elif name == "dot_general" and is_to_write_out(op):
+            self.products.append(op)
+        elif dialect == "stablehlo" and name in CHECKS:  # what it holds is scalar
+            if not CHECKS[name](op):
+                self.object(f"{name} of {' and '.join(str(x.type) for x in op.operands)}")
+            self.is_proven &= _types(op) <= PROVEN_TYPES
+        elif (dialect == "stablehlo" and name in PROVEN | KNOWN) or dialect in ("chlo", "func"):
+            self.is_proven &= name not in KNOWN and _types(op) <= PROVEN_TYPES
+            self._look_at_all(directly_in(op))
+        else:
+            self.object(op.name)
+
+    def _look_into_call(self, op):
+        if callee(op).startswith(STAGED):
+            self.stages.setdefault(callee(op), []).append(op)
+        if callee(op) not in self.seen:
+            self.seen.add(callee(op))
+            self.look(self.functions[callee(op)].operation)
+            self.finished.append(callee(op))
+
+    def _look_at_all(self, operations):
+        for op in operations:
+            self.look(op)
+
+    def object(self, why):
+        """Keeps the first reason."""
+        self.objection = self.objection or why
+
+
+def directly_in(op):
+    """The operations one level below."""
+    return [x.operation for region in op.regions for block in region for x in block]
+
+
+def callee(call):
+    """Name of the function called."""
+    return ir.FlatSymbolRefAttr(call.attributes["callee"]).value
+
+
+def _types(op):
+    """Of the elements of its results and operands."""
+    return {element_type(x) for x in (*op.operands, *op.results) if isinstance(x.type, ir.RankedTensorType)}
+
+
+def is_choice(op):
+    """A conditional on `inside_p`, that is, on its value as an integer within bounds."""
+    if op.name != "stablehlo.case":
+        return False
+    index = op.operands[0].owner
+    while not isinstance(index, ir.Block) and index.name in ("stablehlo.convert", "stablehlo.clamp"):
+        index = index.operands[len(index.operands) // 2].owner
+    known = {} if isinstance(index, ir.Block) else index.attributes
+    return ATTRIBUTES in known and inside_p.name in known[ATTRIBUTES]
+
+
+def form_inside(case):
+    """What is done inside a kernel, the return at its end included."""
+    return [x.operation for x in case.regions[1].blocks[0]]
