@@ -217,17 +217,18 @@ class Case:
         return trace, self.args, expected, ahead, behind
 
 
-def compare(f, args, rng=None, count=None, columns=COLUMNS):
-    """The differences of a function. rng: which columns are taken, one for each mode; else all."""
+def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
+    """The differences of a function.
+
+    rng: by which one column is taken for each mode, else all; count: of verdicts, updated; batched: columns under vmap.
+    """
     count = Counter() if count is None else count
     case = Case(f, args)
-    pick = (lambda x: x) if rng is None else (lambda x: [rng.choice(x)])
-    todo = [(name, "derivatives", case.derivatives) for name in pick(list(columns))]
-    todo += [(name, "vmap", case.batch) for name in pick(list(columns))]
-    if case.mode is both and case.sizes[True]:
-        todo += [(name, "matrix", case.jacobian) for name in pick(["plain", "whole"])]
-    for name, mode, make in todo:
-        column = {"plain": lambda f: f, **columns}[name]
+    todo = {("derivatives", case.derivatives): tuple(COLUMNS), ("vmap", case.batch): batched}
+    if case.mode is both:
+        todo["matrix", case.jacobian] = "alone", "whole"
+    for (mode, make), name in [(key, x) for key, xs in todo.items() for x in (xs if rng is None else [rng.choice(xs)])]:
+        column = COLUMNS.get(name, lambda f: f)
         try:
             trace, at, reference, *directions = make(column)
             found = Numbers()(trace, *at)
@@ -237,8 +238,9 @@ def compare(f, args, rng=None, count=None, columns=COLUMNS):
             continue
         if directions:
             with np.errstate(all="ignore"):
-                found = [found[0].astype(float) @ directions[0], found[0].astype(float).T @ directions[1]]
-        verdict, expected = judge(found, reference, 0 if directions else sum(case.lengths[:2]), case.rtol)
+                M = found[0].astype(float)
+                found = [np.where(np.isfinite(A).all(1), A @ d, np.nan) for A, d in zip((M, M.T), directions, strict=True)]
+        verdict, expected = judge(found, reference, 0 if directions else max(1, sum(case.lengths[:2])), case.rtol)
         count[verdict] += 1
         if verdict.startswith("different"):
             yield Difference(name, mode, found, expected)
@@ -249,11 +251,11 @@ def judge(found, reference, values, rtol):
     expected = reference(Numbers())
     if len(found) != len(expected):
         return "different number of results", expected
-    spread = None
+    spread, is_matrix = None, values == 0
     worst = "same"
     for i, (a, b) in enumerate(zip(found, expected, strict=True)):
         if i >= values and a.shape == b.shape:
-            known = ~np.isnan(b)
+            known = ~np.isnan(b) & ~(np.isnan(a) & is_matrix)
             a, b = np.where(known, a, 0), np.where(known, b, 0)
         near = is_close(a, b, rtol)
         if near and (i >= values or np.array_equal(signs(a), signs(b))):

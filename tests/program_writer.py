@@ -6,6 +6,7 @@ refuses is left out. The text is the program: it runs by itself below `HEADER`.
 
 import math
 import random
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -17,8 +18,6 @@ HEADER = """\
 from functools import partial
 import jax, jax.numpy as jnp, numpy as np
 from jax import lax
-jax.config.update("jax_enable_x64", True)
-
 @jax.custom_jvp
 def steep(x):
     return jnp.sin(x)
@@ -35,6 +34,13 @@ SHAPES = (
 )
 NUMBERS = ("0.0", "0.0", "1.0", "1.0", "-0.0", "2.0", "-1.0", "0.5", "-0.75", "1.3", "3.0", "0.1")
 KEPT = 20  # elements of the largest array, now and then 30 times as many
+
+
+@contextmanager
+def usual_promotion():
+    """As for users: operands of different ranks and dtypes are taken."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
 
 
 class Refused(Exception):
