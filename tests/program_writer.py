@@ -161,11 +161,14 @@ def _scope():
     return scope
 
 
-def program(rng, depth, refused=None):
-    """Text and arguments of a program of this many lines."""
-    shapes = [SHAPES[rng.randrange(len(SHAPES))] for _ in range(2)]
-    args = [np.array([rng.choice([0.0, 1.0, -0.0, rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5)])
-                      for _ in range(math.prod(s))]).reshape(s) for s in shapes]
+def _array(rng, shape):
+    return np.array([rng.choice([0.0, 1.0, -0.0, rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5)])
+                     for _ in range(math.prod(shape))]).reshape(shape)  # fmt: skip
+
+
+def program(rng, depth, refused=None, args=None):
+    """Text and arguments of a program of this many lines. args: x and y, else drawn by chance."""
+    args = [_array(rng, SHAPES[rng.randrange(len(SHAPES))]) for _ in range(2)] if args is None else list(args)
     args.append(np.array([rng.randint(-1, 4) for _ in range(3)], np.int32))
     texts = []
 

@@ -14,6 +14,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
+import whole_runs  # noqa: E402
 from columns import compare  # noqa: E402
 from program_writer import HEADER, function, program  # noqa: E402
 
@@ -78,6 +79,7 @@ def main(argv=None):
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--header", action="store_true", help="print what stands above every program")
     parser.add_argument("--all", action="store_true", help="every difference, not only the first of each kind")
+    parser.add_argument("--whole-runs", type=int, default=0, metavar="K", help="compiled runs of random systems, after")
     options = parser.parse_args(argv)
     if options.header:
         print(HEADER)
@@ -103,6 +105,8 @@ def main(argv=None):
         print(n, "x", kind)
     print(f"{options.count} programs, {different} differences")
     print(f"{seconds:.0f} s, {options.count / seconds:.1f} programs a second;", dict(count))
+    if options.whole_runs:
+        whole_runs.main(options.whole_runs, options.seed)
 
 
 if __name__ == "__main__":
