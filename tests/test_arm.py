@@ -81,6 +81,7 @@ def test_formulations_agree():
     assert_equal_to_rounding(Q, Q_by_autodiff)
 
 
+@pytest.mark.slow
 def test_formulations_have_the_same_gradients():
     """In all params but the axes, which are no free numbers, and in the symmetric part of the inertias."""
     params = random_chain(2, 2)

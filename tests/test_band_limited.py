@@ -11,6 +11,7 @@ k = np.arange(600)
 BETWEEN = 100.0 + np.arange(0, 400, 0.137)
 
 
+@pytest.mark.slow
 def test_harmonics_below_half_the_sampling_rate_are_met():
     """Two channels, 0.05 and 0.4 of the sampling rate, away from the ends; and every sample is met."""
 

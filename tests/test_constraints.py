@@ -1,7 +1,6 @@
 """Constraints: orders, drift, multipliers, the squeezer, consistent starts, gradients, and what bad input gets."""
 
 import json
-import re
 from functools import cache, partial
 from pathlib import Path
 
@@ -154,6 +153,7 @@ def test_multipliers_of_a_pendulum(formulation):
     np.testing.assert_allclose(energy, energy[0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_linear_solve_of_the_users_own():
     def by_numpy(A, b):
         return jnp.linalg.solve(A, b)
@@ -162,6 +162,7 @@ def test_a_linear_solve_of_the_users_own():
     np.testing.assert_allclose(run().q, theirs.q, rtol=1e-11, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_redundant_constraints_by_least_squares():
     """The same constraint twice: half of the multiplier each, and the same motion."""
 
@@ -180,6 +181,7 @@ def test_redundant_constraints_by_least_squares():
     np.testing.assert_allclose(path.multipliers.sum(axis=1), single.multipliers[:, 0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_singular_position_on_the_way_is_named():
     """Rows that are parallel at t = 1: the run names the step to there or from there, as rounding has it, and the row;
     least squares goes on."""
@@ -279,69 +281,3 @@ def test_batches_equal_loops_and_pytrees_equal_vectors():
     tree, flat = hhtjax.simulate(system, hhtjax.hht(-0.1), q0, v0, PARAMS, dt=0.01, num_steps=20), run()
     np.testing.assert_allclose(tree.q["swing"], flat.q[:, 1:], rtol=1e-12)
     np.testing.assert_allclose(tree.multipliers, flat.multipliers, rtol=1e-12)
-
-
-simulate = partial(hhtjax.simulate, dt=0.01, num_steps=1)
-
-
-def constrained(phi):
-    return hhtjax.System(jnp.ones(2), lambda q, v, t, params: -q, phi)
-
-
-def run_from(phi, q0, v0):
-    return lambda: simulate(constrained(phi), hhtjax.hht(), jnp.array(q0), jnp.array(v0))
-
-
-def project(phi):
-    return lambda: hhtjax.consistent_initial(constrained(phi), jnp.ones(2), jnp.ones(2))
-
-
-def level(q, t, params):
-    return q[:1] - 1.0
-
-
-ONE, ZERO = (1.0, 1.0), (0.0, 0.0)
-AWAY = "1 away from consistent values; hhtjax.consistent_initial gives them."
-SHAPE = "simulate: `constraint` must return an array (m,) with 1 <= m <= 2"
-BAD = [
-    (SHAPE, run_from(lambda q, t, params: q[0], ONE, ONE)),
-    (SHAPE, run_from(lambda q, t, params: jnp.tile(q, 2), ONE, ONE)),
-    (f"simulate: `q0` violates the constraint: max|Phi| = 1, {AWAY}", run_from(level, (2.0, 2.0), ZERO)),
-    (f"simulate: `v0` violates the constraint: max|dPhi/dt| = 1, {AWAY}", run_from(level, ONE, ONE)),
-    (
-        "simulate: `constraint` rows [1] have no gradient in q",
-        run_from(lambda q, t, params: jnp.array([q[0] - 1.0, 0.0 * t]), ONE, ZERO),
-    ),
-    ("consistent_initial: no q with Phi(q, t) = 0 found", project(lambda q, t, params: q[:1] ** 2 + 1.0)),
-    ("consistent_initial: `system` must have a constraint", project(None)),
-    ('hht: `formulation` must be "ggl" or "index3"', lambda: hhtjax.hht(formulation="index2")),
-]
-
-
-@pytest.mark.parametrize(("message", "call"), BAD, ids=lambda x: x[:40] if isinstance(x, str) else "")
-def test_bad_input(message, call):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        call()
-
-
-def test_initial_values_known_while_tracing_are_checked_there():
-    good, bad, rest, system = jnp.ones(2), 2 * jnp.ones(2), jnp.zeros(2), constrained(level)
-
-    def end(start, dt):
-        return hhtjax.simulate(system, hhtjax.hht(), start, rest, dt=dt, num_steps=1).q[-1]
-
-    assert np.allclose(jax.jit(partial(end, good))(0.1), end(good, 0.1), rtol=1e-12)
-    with pytest.raises(ValueError, match="`q0` violates the constraint"):
-        jax.jit(partial(end, bad))(0.1)
-
-
-@pytest.mark.parametrize("where", ["held", "state"])
-def test_other_points_of_linearisation_are_refused(where):
-    with pytest.raises(ValueError, match=f"hht: with constraints, leave `linearize` out.*; received {where!r}"):
-        simulate(constrained(level), hhtjax.hht(linearize=where), jnp.ones(2), jnp.zeros(2))
-
-
-@pytest.mark.parametrize("name", ["kim_hht", "rk4"])
-def test_other_steppers_refuse(name):
-    with pytest.raises(NotImplementedError, match=r"simulate: .* cannot solve the `constraint`; use hht\(\)"):
-        simulate(constrained(level), getattr(hhtjax, name)(), jnp.ones(2), jnp.zeros(2))

@@ -19,6 +19,7 @@ def springs_and_weight(q, t, params):
     return weight + k1 * q[0] ** 2 / 2 + k2 * (q[1] - q[0]) ** 2 / 2
 
 
+@pytest.mark.slow
 def test_the_balance_of_a_driven_and_damped_double_pendulum_closes_with_the_order_of_the_method():
     """With V and without; what is work without V is work or potential energy with it."""
     problem = PROBLEMS["forced double pendulum"]

@@ -162,6 +162,7 @@ def test_newton_does_not_loosen_by_what_y_piled_up():
     assert first(1e18) == pytest.approx(first(0.0), abs=1e-11)
 
 
+@pytest.mark.slow
 def test_dense_output_is_of_order_four():
     def error(n):
         path = run(SYSTEM, hhtjax.rk4(), 8 * n, save_every=8)

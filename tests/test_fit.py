@@ -80,6 +80,7 @@ def test_scale_sets_the_steps_of_an_optax_optimiser():
     assert float(scaled.params["large"]) == pytest.approx(1.0, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_float32_stays_float32():
     start = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), START)
     data = model(TRUE).astype(jnp.float32)

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import hhtjax
-from hhtjax.identification.least_squares import BAD_START
+from hhtjax.identification.progress import BAD_START
 
 t = jnp.linspace(0.0, 3.0, 40)
 NOISE = 0.02 * np.random.default_rng(1).normal(size=t.size)
@@ -25,6 +25,7 @@ def residuals(params):
     return model(params) - MEASURED
 
 
+@pytest.mark.slow
 def test_transforms_keep_parameters_where_they_belong():
     """The same minimum in other coordinates, with the same errors; a bound that is felt; a fixed leaf untouched."""
     start = {"a": 20.0, "rate": 0.1, "offset": 0.0}
@@ -58,6 +59,7 @@ def test_no_coordinate_leaves_the_domain_of_its_transform(dtype):
         assert T.parameter(T.coordinate(p, 1.0), 1.0)[1] == pytest.approx(float(p[1]))
 
 
+@pytest.mark.slow
 def test_missing_samples_and_weights():
     """A missing sample, NaN or not, is as good as none; a weight of 2 as good as four samples."""
     gone = np.arange(t.size) % 3 == 0
@@ -106,6 +108,7 @@ def test_a_prior_is_one_more_measurement():
     assert float(result.standard_errors[0]) < 0.1 < np.sqrt(np.linalg.inv(X.T @ X)[0, 0])
 
 
+@pytest.mark.slow
 def test_many_starts_find_the_lowest_minimum():
     """One of them is none, which inside vmap is a flag."""
 
@@ -120,6 +123,17 @@ def test_many_starts_find_the_lowest_minimum():
     assert float(np.nanmax(found.all.cost[:4])) > 1.0
     assert found.best.history.cost.shape == (int(found.best.iterations) + 1,)
     np.testing.assert_array_equal(np.flatnonzero(found.all.code == BAD_START), [4])
+
+
+def test_a_start_without_influence_is_no_best_one():
+    """Its cost is the lowest, and no derivative leads away from it."""
+
+    def residuals(p):
+        return jnp.where(p < 0, 0.1, p - 2.0 + jnp.array([1.0, -1.0, 1.0]))
+
+    assert float(hhtjax.multistart(residuals, jnp.array([-1.0, 1.0])).best.params) == pytest.approx(5 / 3)
+    with pytest.raises(ValueError, match="multistart: `residuals` must depend on params"):
+        hhtjax.multistart(residuals, jnp.array([-1.0, -2.0]))
 
 
 def test_many_parameters_take_an_optax_optimiser():
@@ -147,7 +161,7 @@ def test_many_parameters_take_an_optax_optimiser():
         ({"loss": "hubert"}, ValueError, "`loss` must be one of huber, soft_l1, cauchy, a function .* 'hubert'"),
         ({"prior": {"a": 1.0, "rate": None, "offset": None}}, TypeError, "`prior` must hold Gaussian.* received 1.0"),
         ({"prior": hhtjax.Gaussian(0.0, -1.0)}, ValueError, "`prior` must have a positive deviation; received -1.0"),
-        ({"segments": 1}, ValueError, "`segments` must be an integer of at least 2; received 1"),
+        ({"segments": 1}, ValueError, "`segments` must be an integer, 2 or more; received 1"),
     ],
 )
 def test_bad_options_are_named(options, error, message):

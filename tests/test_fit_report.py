@@ -42,6 +42,11 @@ def test_summary_and_json(result):
 def test_profile_is_the_parabola_of_the_standard_error(result):
     """Naive errors, for which the white likelihood is right."""
     sigma = float(result.standard_errors["rate"])
+    bare = result._replace(uncertainty=None)
+    with pytest.raises(ValueError, match="prediction_errors: `result` must have a covariance"):
+        hhtjax.identification.prediction_errors(lambda p: p["a"], bare)
+    with pytest.raises(ValueError, match="profile: `result` must have a covariance"):
+        hhtjax.identification.profile(residuals, bare, "rate", [1.0])
     values = float(result.params["rate"]) + sigma * np.array([-1.0, 0.0, 1.0])
     found = hhtjax.identification.profile(residuals, result, "rate", values)
     np.testing.assert_allclose(found.deviance, [1, 0, 1], atol=0.06)
@@ -49,6 +54,7 @@ def test_profile_is_the_parabola_of_the_standard_error(result):
         hhtjax.identification.profile(residuals, result, "k", values)
 
 
+@pytest.mark.slow
 def test_the_score_test_predicts_the_refit():
     def with_kink(params, candidates):
         return residuals(params | {"rest": (0.3,)})["y"] + (candidates["kink"] - 0.6) * jnp.maximum(x - 0.5, 0.0)

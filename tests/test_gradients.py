@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import check_gradient, path_loss, tight
-from zoo import PROBLEMS, STEPPERS
+from zoo import PROBLEMS, STEPPERS, each
 
 import hhtjax
 
@@ -19,7 +19,7 @@ DAMPING = {
 }
 
 
-@pytest.mark.parametrize("name", STEPPERS)
+@pytest.mark.parametrize("name", each(STEPPERS))
 def test_gradients_on_the_duffing_oscillator(name):
     """In one plain loop: more steps would be checkpointed, as they are on the double pendulum."""
     problem = PROBLEMS["forced Duffing"]
@@ -59,6 +59,7 @@ def test_gradient_with_respect_to_kims_alpha():
     check_gradient(loss, jnp.asarray(-0.1))
 
 
+@pytest.mark.slow
 def test_nested_checkpointing_changes_no_gradient():
     """Against the same steps under one plain scan, which counts the first num_steps."""
     problem = PROBLEMS["forced Duffing"]
@@ -107,6 +108,7 @@ def test_second_derivative_through_the_converged_step():
     assert float(jax.jit(jax.jacfwd(jax.grad(loss)))(1.0)) == pytest.approx(float(central), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_memory_of_reverse_mode_grows_with_the_square_root():
     """By XLA's own count; the saved path itself is left out by keeping the end only."""
     scene = hhtjax.scenes.double_pendulum.stiff()

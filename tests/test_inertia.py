@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from zoo import each
 
 import hhtjax
 from hhtjax import System
@@ -41,13 +42,14 @@ def run(system, stepper, m=2.0):
     return hhtjax.simulate(system, stepper, Q0, V0, {"m": m}, dt=0.01, num_steps=20).q["q"]
 
 
-@pytest.mark.parametrize("name", STEPPERS)
+@pytest.mark.parametrize("name", each(STEPPERS, quick=["auto"]))
 def test_the_motion_is_the_same(name):
     stepper = STEPPERS[name]
     exact, found = (run(System(mass, force, inertia=own), stepper) for own in (None, inertia))
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 if name in ("newton", "conventional") else 1e-13)
 
 
+@pytest.mark.slow
 def test_so_is_its_gradient():
     exact, found = (
         jax.grad(lambda m: jnp.sum(run(System(mass, force, inertia=own), hhtjax.hht(), m) ** 2))(2.0)  # noqa: B023
@@ -63,6 +65,7 @@ def test_it_stands_in_the_place_of_the_matrix():
     np.testing.assert_allclose(flat.inertia(q, w, {"m": 2.0}), 2 * mass(Q0, {"m": 2.0}) @ w, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_lagrangians_have_one():
     def lagrangian(q, v, t, params):
         return (1 + q[0] ** 2) * v[0] ** 2 + v[0] * v[1] * jnp.sin(q[1]) + params * v[1] ** 2 - q @ q + t * v[0]

@@ -1,8 +1,10 @@
 """How a run is cut into kernels changes the compiled program, and nothing else."""
 
 import os
+import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import jax
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.xla import gate, inspection, kernels
+from hhtjax.xla import gate, inspection, kernels, lowering, trial
 
 on_cpu = pytest.mark.skipif(
     jax.default_backend() != "cpu" or not gate.is_on(),
@@ -21,6 +23,7 @@ on_cpu = pytest.mark.skipif(
 N = 5
 x = jnp.linspace(0.1, 1.0, 4)
 order = jnp.array([1, 0, 3, 2])
+BATCH = jnp.cos(jnp.arange(6.0 * 3 * 3)).reshape(6, 3, 3)
 EIGHTS = jnp.sin(jnp.arange(3.0 * 4 * 5 * 8)).reshape(3, 4, 5, 8)
 
 
@@ -42,6 +45,13 @@ def loss(params):
 
 def paths(f, *args):
     return hhtjax.explain(f, *args).paths
+
+
+def run(f, *args):
+    """f(*args), of which functions are taken as they are, and the verdicts; compiled once."""
+    arrays = [x for x in args if not callable(x)]
+    lowered = jax.jit(lambda *arrays: f(*(x for x in args if callable(x)), *arrays)).lower(*arrays)
+    return lowered.compile()(*arrays), tuple(re.findall(f'{lowering.VERDICT} = "([^"]*)"', lowered.as_text()))
 
 
 @on_cpu
@@ -79,6 +89,12 @@ SUPPORTED = {
     "products of blocks": lambda c: (
         jnp.einsum("abij,cbdj->baicd", EIGHTS * c[0], EIGHTS[::-1])[1, 1, 2, 2, :4] * c / 99
     ),
+    "batched products": lambda c: jnp.sum(BATCH * c[0] @ jnp.swapaxes(BATCH, 1, 2), (0, 1))[:1] * c / 99,
+    "one factor batched": lambda c: jnp.sum(BATCH * c[0] @ BATCH[0], (0, 1))[:1] * c / 99,
+    "a chain of transforms": lambda c: jax.lax.associative_scan(jnp.matmul, BATCH * c[0])[-1, 0, :1] * c / 99,
+    "sums over several axes": lambda c: jnp.sum(EIGHTS[:, :, :, None] * c[0], (0, 2, 3))[:, 0] * c / 99,
+    "4095 numbers": lambda c: c / 2 + jnp.sum(jnp.sin(jnp.arange(4095.0) * c[0])) / 9999,
+    "cube roots, on trial": lambda c: jnp.cbrt(c) / 2,
     "small products and sums": lambda c: jnp.outer(c, c) @ c / 9 + jnp.sum(c) / 9 + jnp.cumsum(c) / 9,
     "interpolation": lambda c: jnp.interp(c, jnp.arange(10.0), jnp.arange(10.0) ** 2) / 9,
     "random numbers": lambda c: c / 2 + jax.random.normal(jax.random.key(3), (4,)),
@@ -91,7 +107,8 @@ UNSUPPORTED = {
     "fft": lambda c: jnp.abs(jnp.fft.fft(c)) / 9,
     "callback": lambda c: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(c.shape, c.dtype), c),
     "dot_general": lambda c: jnp.sum(jnp.ones((40, 40)) @ jnp.ones((40, 40)) * c[0], 1)[:4] / 999,
-    "reduce": lambda c: c / 2 + jnp.sum(jnp.ones(5000) * c[0]) / 9999,
+    "reduce": lambda c: c / 2 + jnp.sum(jnp.sin(jnp.arange(4096.0) * c[0])) / 9999,
+    "a product of 4096": lambda c: c / 2 + jnp.arange(4096.0) @ jnp.sin(jnp.arange(4096.0) * c[0]) / 1e8,
     "gather, in reverse": lambda c: c[(3 * c).astype(int) % 4] / 2,
 }
 
@@ -115,6 +132,133 @@ def test_what_xla_cannot_compile_into_one_kernel_runs_plainly(name):
     assert verdict == "one kernel" if name in SUPPORTED else verdict.startswith("plain")
     if name.strip() in ("sort", "dot_general", "reduce"):
         assert name.strip() in verdict
+
+
+DIMENSIONS = [
+    # batch, terms, rows, columns: every axis of its own, or several
+    ((), (3,), (3,), (3,)),
+    ((6,), (3,), (3,), (3,)),
+    ((), (6,), (2, 6), (6,)),
+    ((2, 5), (4,), (4,), (9, 4)),
+    ((3,), (2, 3), (5, 2), (7,)),
+    ((1,), (1,), (9,), (9,)),
+    ((), (9,), (1,), (4, 2)),
+    ((4,), (33,), (2,), (3,)),
+    ((50,), (20,), (20,), ()),
+    ((70,), (60,), (), ()),
+    ((), (), (40,), (40,)),
+    ((), (), (3,), (2, 3)),
+]
+
+
+def product(lengths):
+    """einsum over such axes, in another order in the factors, and factors for it."""
+    batch, terms, rows, columns = ["abcdefgh"[2 * i : 2 * i + len(x)] for i, x in enumerate(lengths)]
+    sizes = dict(zip(batch + terms + rows + columns, sum(lengths, ()), strict=True))
+    names = rows[::-1] + terms + batch, columns + batch + terms[::-1]
+    shapes = [[sizes[i] for i in x] for x in names]
+    factors = [jnp.sin(jnp.arange(1.0, 1.0 + np.prod(shape))).reshape(shape) for shape in shapes]
+    return partial(jnp.einsum, f"{names[0]},{names[1]}->{batch}{rows}{columns}"), factors
+
+
+@on_cpu
+def test_every_product_compiles_in_value_and_reverse():
+    """Batched or not; and what autodiff and vmap make of it."""
+
+    def all_of(cut):
+        found = []
+        for f, (A, B) in map(product, DIMENSIONS):
+            f = partial(cut, f)
+            found += [f(A, B), jax.vmap(f, (0, None))(jnp.stack([A, 2 * A]), B)]
+            found += jax.grad(lambda A, B, f=f: jnp.sum(jnp.sin(f(A, B))), (0, 1))(A, B)
+        return found
+
+    one, verdicts = run(all_of, kernels.one_kernel)
+    for x, y in zip(one, run(all_of, lambda f, *args: f(*args))[0], strict=True):
+        assert np.allclose(x, y, rtol=1e-12, atol=1e-12)
+    assert sum(verdict == "one kernel" for verdict in verdicts) >= 36, verdicts  # not three that are too large
+
+
+def rotations(angles):
+    """About the third axis, (k, 3, 3)."""
+    c, s, zero, one = jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles), jnp.ones_like(angles)
+    return jnp.stack([jnp.stack(row, -1) for row in ([c, -s, zero], [s, c, zero], [zero, zero, one])], -2)
+
+
+def force(q, v, t, p):
+    """Of what forward kinematics is made."""
+    R = rotations(q)
+    end = R[0] @ R[1] @ R[2] @ jnp.ones(3)
+    ones = jnp.sum(jnp.ones((2, 6, 6)) @ (jnp.ones((6, 6)) * q[0]))
+    return -p * (jnp.sum(R @ jnp.swapaxes(R, 1, 2)[::-1], (1, 2)) + end + q * ones / 999)
+
+
+@on_cpu
+def test_forces_with_products_of_matrices_are_one_kernel():
+    system = hhtjax.System(jnp.ones(3), force)
+
+    def end(p, q0):
+        return jnp.sum(hhtjax.simulate(system, hhtjax.hht(), q0, 0 * q0, p, dt=0.02, num_steps=9).q[-1] ** 2)
+
+    def all_of(p):
+        return jax.value_and_grad(end, (0, 1))(p, q0), jax.vmap(end, (0, None))(jnp.array([1.0, p]), q0)
+
+    q0 = jnp.linspace(0.1, 1.0, 3)
+    one, verdicts = run(all_of, 2.0)
+    assert set(verdicts) == {"one kernel"}
+    with hhtjax.plain():
+        expected, verdicts = run(all_of, 2.0)
+    assert set(verdicts) == set()
+    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(expected), strict=True):
+        assert np.allclose(x, y, rtol=1e-11, atol=1e-13)
+
+
+@on_cpu
+@pytest.mark.parametrize("bad", ["sort", "lapack", "dot_general"])
+def test_what_the_inspection_lets_through_falls_back_all_the_same(bad, monkeypatch):
+    """As when a new XLA refuses what the one before compiled: the program runs, and says why it is plain."""
+    calls = [f"lapack_d{name}_ffi" for name in ("getrf", "trsm")]
+    monkeypatch.setattr(inspection, "KNOWN", inspection.KNOWN | {"sort", "scatter", "fft", "custom_call", *calls})
+    monkeypatch.setattr(inspection, "CHECKS", inspection.CHECKS | {"dot_general": lambda op: True})
+    monkeypatch.setattr(inspection, "PROVEN_TYPES", frozenset())
+    monkeypatch.setattr(inspection.Inspection, "look_into_custom_call", lambda self, op: None)
+    body = UNSUPPORTED[bad]
+
+    def loop(c):
+        return jax.lax.scan(lambda c, _: (body(c), None), c, None, 3)[0]
+
+    def all_of(f):
+        return f(x), jax.grad(lambda c: jnp.sum(f(c)))(x), jax.vmap(f)(jnp.stack([x, 2 * x]))
+
+    def cut():
+        return all_of(lambda c: kernels.one_kernel(loop, c))
+
+    found, verdicts = run(cut)
+    assert sum(x.startswith("plain: XLA refused: ") for x in verdicts) >= 3, verdicts
+    for one, expected in zip(jax.tree.leaves(found), jax.tree.leaves(run(all_of, loop)[0]), strict=True):
+        assert np.allclose(one, expected, rtol=1e-12)
+
+
+@on_cpu
+def test_common_programs_are_compiled_without_a_trial(monkeypatch):
+    monkeypatch.setattr(trial, "_refusal", lambda text: pytest.fail("a trial"))
+    assert set(paths(jax.vmap(jax.grad(loss)), jnp.ones(3))) == {"one kernel"}
+    with pytest.raises(pytest.fail.Exception):
+        paths(lambda c: kernels.one_kernel(jnp.cbrt, c), x)
+
+
+@on_cpu
+def test_a_stage_of_a_large_batch_is_not_divided_among_threads():
+    """XLA would call what kernels are not linked with."""
+    c = jnp.linspace(0.1, 1.0, 10**5)
+
+    def f(c):
+        def body(c, _):
+            return kernels.staged(lambda c: jnp.sin(c) * c)(c) + c / 2, None
+
+        return kernels.one_kernel(lambda c: jax.lax.scan(body, c, None, 2)[0], c)
+
+    assert jnp.all(jnp.isfinite(jax.jit(f)(c)))
 
 
 @on_cpu
@@ -167,7 +311,78 @@ def test_shared_values_are_computed_once():
         def run(x):
             return kernels.one_kernel(lambda x: jax.lax.scan(body, x, None, 99)[0], x)
 
-        return jax.jit(run).lower(jnp.ones(N)).compile().as_text().count(" sine(")
+        return str(jax.jit(run).lower(jnp.ones(N)).compile().as_text()).count(" sine(")
 
     assert sines(partial(kernels.staged, size=N)) == 1
     assert sines(partial(kernels.staged, size=1)) == 2  # fused into both users
+
+
+GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged", "hhtjax_one_kernel", "hhtjax_inside", "hhtjax_kernels"
+
+
+def of_all_kinds(params):
+    """A run by a function that was jitted outside, with a choice, stages, scalars and a matrix of a linear map."""
+    return jax.value_and_grad(jax.jit(lambda p: jax.jit(loss)(p)))(params)
+
+
+@on_cpu
+def test_plain_leaves_nothing_of_the_machinery():
+    fast = jax.jit(of_all_kinds)
+    first = fast(2.0)
+    assert "xla_cpu_small_call" in fast.lower(2.0).as_text()
+    with hhtjax.plain():
+        assert not [x for x in GIVEN_AWAY if x in fast.lower(2.0).as_text()]
+        assert paths(of_all_kinds, 2.0) == ("plain: inside hhtjax.plain()",) * 2
+        assert np.allclose(fast(2.0), first, rtol=1e-12, atol=0)
+    assert fast(2.0) == first
+    assert "xla_cpu_small_call" in fast.lower(2.0).as_text()
+
+
+@on_cpu
+def test_plain_holds_for_its_own_thread():
+    def is_on_in_plain():
+        with hhtjax.plain():
+            return gate.is_on(), paths(lambda params: end(params), 2.0)
+
+    with ThreadPoolExecutor(1) as other:
+        with hhtjax.plain():
+            assert other.submit(gate.is_on).result()
+            assert not gate.is_on()
+        assert other.submit(is_on_in_plain).result() == (False, ("plain: inside hhtjax.plain()",))
+        assert other.submit(gate.is_on).result()
+
+
+@on_cpu
+def test_a_sweep_gives_the_same_without_the_machinery():
+    system = hhtjax.System(jnp.arange(1.0, N + 1), links)
+    q0, dts = jnp.linspace(0.1, 1.0, N), jnp.array([0.01, 0.02, 0.05])
+
+    def sweep():
+        return hhtjax.sweep(system, hhtjax.hht(), q0, 0 * q0, 2.0, dts=dts, duration=1.0, num_samples=4).q
+
+    fast = sweep()
+    with hhtjax.plain():
+        assert np.allclose(sweep(), fast, rtol=1e-12, atol=1e-14)
+
+
+@on_cpu
+@pytest.mark.parametrize(
+    ("version", "wish", "why"),
+    [
+        ((99, 0, 0), "", "plain: JAX .* is newer than 0.10.2, the last one tested; HHTJAX_PLAIN=0 tries it"),
+        ((99, 0, 0), "0", "one kernel"),
+        (jax.__version_info__, "1", "plain: HHTJAX_PLAIN=1"),
+        (jax.__version_info__, "0", "one kernel"),
+    ],
+)
+def test_the_environment_and_the_version_of_jax(version, wish, why, monkeypatch):
+    monkeypatch.setattr(jax, "__version_info__", version)
+    monkeypatch.setenv(gate.VARIABLE, wish)
+    (path,) = paths(lambda params: end(params), 2.0)  # new for JAX
+    assert re.match(why, path)
+
+
+def test_a_wish_that_is_none(monkeypatch):
+    monkeypatch.setenv(gate.VARIABLE, "yes")
+    with pytest.raises(ValueError, match="HHTJAX_PLAIN must be 0 or 1; received 'yes'"):
+        end(2.0)

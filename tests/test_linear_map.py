@@ -82,6 +82,7 @@ def largest_array(f, *args):
     return max(1, *(x.aval.size for eqn in zoo.everywhere(program) for x in eqn.outvars))
 
 
+@pytest.mark.slow
 @old
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_work_of_a_chain(formulation, monkeypatch):

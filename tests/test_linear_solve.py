@@ -4,79 +4,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matrices import (
+    KINDS,
+    SIZES,
+    backward_error,
+    bad_rows,
+    compiled,
+    cyclic,
+    permuted,
+    random_matrix,
+    spd,
+    zero_diagonal,
+)
 
 from hhtjax import explain
 from hhtjax.numerics.linear_solve import (
     UNROLLED,
     factorize,
-    factorize_least_squares,
     factorize_with,
     matvec,
     solve,
     solve_map,
 )
 from hhtjax.xla import gate, kernels
-
-SIZES = range(1, 13)
-
-
-def random_matrix(n, seed=0):
-    """A random matrix, and a right-hand side."""
-    rng = np.random.default_rng([n, seed])
-    return rng.standard_normal((n, n)), rng.standard_normal(n)
-
-
-def zero_diagonal(n):
-    """A random matrix with zeros where elimination without pivoting would divide."""
-    A, b = random_matrix(n, 1)
-    return (A if n == 1 else A - np.diag(np.diag(A))), b
-
-
-def permuted(n):
-    """A well conditioned triangular matrix with its rows in random order: every pivot must be looked for."""
-    A, b = random_matrix(n, 2)
-    order = np.random.default_rng(n).permutation(n)
-    return (np.triu(A, 1) * 0.3 + np.diag(1.0 + np.arange(n)))[order], b
-
-
-def cyclic(n):
-    """A permutation that moves every row, scaled: exact in floating point."""
-    return np.roll(np.diag(2.0 ** np.arange(n)), 1, axis=0), np.arange(1.0, n + 1)
-
-
-def equal_pivots(n):
-    """All candidates for the first pivot of equal size and of both signs."""
-    A, b = random_matrix(n, 3)
-    A[:, 0] = np.where(np.arange(n) % 2, -1.0, 1.0)
-    return A, b
-
-
-def bad_rows(n):
-    """Rows whose sizes differ by up to 1e12, as of coordinates in different units."""
-    A, b = random_matrix(n, 4)
-    scale = 10.0 ** np.linspace(-6, 6, n)
-    return A * scale[:, None], b * scale
-
-
-def bad_columns(n):
-    """Unknowns whose sizes differ by up to 1e12."""
-    A, b = random_matrix(n, 5)
-    return A * 10.0 ** np.linspace(6, -6, n), b
-
-
-def spd(n):
-    """Symmetric positive definite, as a mass matrix."""
-    A, b = random_matrix(n, 6)
-    return A @ A.T + np.eye(n), b
-
-
-compiled = jax.jit(solve)
-KINDS = [random_matrix, zero_diagonal, permuted, cyclic, equal_pivots, bad_rows, bad_columns, spd]
-
-
-def backward_error(A, x, b):
-    """Largest relative change of a row of A and b that makes x exact (Skeel)."""
-    return np.max(np.abs(A @ x - b) / (np.abs(A) @ np.abs(x) + np.abs(b)))
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -322,39 +272,3 @@ def test_a_linear_map_is_solved_and_differentiated_through_the_map(factors, n):
     found, expected = jax.jit(derivatives)(0.1, b)
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert np.allclose(x, y, rtol=1e-10, atol=1e-12)
-
-
-# ---------------------------------------------------------------------------------------------- matvec
-
-
-@jax.jit
-def products(A, x):
-    """A x; its diagonal version; two of them by vmap; and its derivatives with respect to x and A."""
-    return (
-        matvec(A, x),
-        matvec(jnp.diagonal(A), x),
-        jax.vmap(matvec)(jnp.stack([A, 2 * A]), jnp.stack([x, x])),
-        jax.jacfwd(matvec, argnums=1)(A, x),
-        jax.grad(lambda A: jnp.sum(matvec(A, x)))(A),
-    )
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("n", [1, UNROLLED, UNROLLED + 1])
-def test_products(n, dtype):
-    A, x = (y.astype(dtype) for y in random_matrix(n))
-    expected = A @ x, np.diag(A) * x, np.stack([A @ x, 2 * A @ x]), A, np.broadcast_to(x, (n, n))
-    for y, z in zip(jax.device_get(products(A, x)), expected, strict=True):
-        assert y.dtype == dtype
-        assert y.shape == z.shape
-        assert np.max(np.abs(y - z)) < 100 * np.finfo(dtype).eps
-
-
-@pytest.mark.parametrize("trans", [0, 1])
-def test_least_squares_solves_what_lost_rank(trans):
-    """A row of B twice: A x = b and A^T x = b for b in range, and the two multipliers alike."""
-    M, B = np.array([[4.0, 1.0], [1.0, 3.0]]), np.array([[1.0, 2.0], [1.0, 2.0]])
-    A = np.block([[M, -B.T], [B, np.zeros((2, 2))]])
-    b = (A.T if trans else A) @ np.array([1.0, -2.0, 3.0, 5.0])
-    x = factorize_least_squares(2)(jnp.asarray(A))(jnp.asarray(b), trans=trans)
-    np.testing.assert_allclose(x, [1.0, -2.0, 4.0, 4.0], rtol=1e-12)

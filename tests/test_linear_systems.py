@@ -137,6 +137,7 @@ def test_linear_system_equals_the_general_one(n, form):
     np.testing.assert_allclose(linear(PARAMS), general(PARAMS), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_linear_system_has_the_gradient_of_the_general_one(derivative):
     ours, theirs = (jax.jit(derivative(end))(PARAMS) for end in end_of_linear_and_general(3))

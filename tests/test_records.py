@@ -23,6 +23,7 @@ CLEAN = jax.vmap(lambda a: wave({"decay": 0.3, "w": 3.0}, {"a": a, "phase": 0.2}
 MEASURED = (CLEAN + NOISE).at[1, 4].set(jnp.nan)
 
 
+@pytest.mark.slow
 def test_eliminated_starts_are_those_of_the_dense_fit():
     """Shared parameters, starts, cost, and the naive covariance that starts leave to the shared ones."""
     present = jnp.isfinite(MEASURED)

@@ -82,6 +82,7 @@ def test_order_of_position_and_acceleration_with_a_mass_that_changes(name, order
     assert np.log2(np.divide(*errors)) == pytest.approx(order, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_linear_system_equals_the_general_one_with_derivatives_and_factorises_once():
     n = 9
     K = 40 * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))

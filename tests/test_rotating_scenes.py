@@ -27,6 +27,7 @@ def constrained_top():
     return hhtjax.simulate(scene.system, hhtjax.hht(-0.05), *scene[2:4], scene.params, dt=0.005, num_steps=100)
 
 
+@pytest.mark.slow
 def test_constrained_top():
     """Within 6 mm of the exact place of the disk at 0.5 s, after 12 turns; rod and rate of the rod kept."""
     run = constrained_top()
@@ -50,6 +51,7 @@ def test_literal_constrained_top():
         assert np.max(np.abs(run.q["x"][-1] - exact)) == pytest.approx(error, rel=0.01)
 
 
+@pytest.mark.slow
 def test_minimal_top():
     """The same motion without a constraint, at a step that resolves the fast forward nutation; order 2 in x."""
     scene, exact = top.minimal(), read_top()[0.1]

@@ -1,9 +1,6 @@
 """Rotations: values against SciPy and exact series, derivatives against each other, differences and identities."""
 
-from fractions import Fraction
-from functools import cache
-from itertools import permutations
-from math import comb, factorial, perm, pi
+from math import pi
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +8,30 @@ import numpy as np
 import pytest
 import scipy.linalg
 from jax import lax
+from rotations import (
+    ALL,
+    AXES,
+    EPS,
+    EYE,
+    FUNCTIONS,
+    LONG,
+    NEAR_PI,
+    VECTOR_FUNCTIONS,
+    VECTORS,
+    X,
+    assert_close,
+    batched,
+    cross,
+    exact_coefficients,
+    six,
+    transposed,
+    turns,
+)
 from scipy.spatial.transform import Rotation
 
 from hhtjax.rotation import (
-    coefficients,
     exp,
     hat,
-    inverse_coefficient,
     inverse_tangent,
     is_rotation,
     log,
@@ -26,65 +40,6 @@ from hhtjax.rotation import (
     tangent_rate,
     vee,
 )
-
-EPS = np.finfo(float).eps
-EYE = np.eye(3)
-AXES = np.concatenate([EYE, -EYE, Rotation.random(6, rng=1).as_matrix()[:, 0]])
-ANGLES = 0.0, 1e-160, 1e-12, 1e-8, 1e-5, 1e-3, 0.489, 0.491, 0.999, 1.001, 2.0, 3.0  # rad; the branches meet inside
-VECTORS = np.concatenate([angle * AXES for angle in ANGLES])
-NEAR_PI = np.concatenate([angle * AXES for angle in (pi - 1e-3, pi - 1e-6, pi - 1e-9, pi - 1e-12)])
-LONG = np.concatenate([angle * AXES for angle in (pi, 4.0, 6.0, 7.0, 20.0)])
-ALL = np.concatenate([VECTORS, NEAR_PI, LONG])
-VECTOR_FUNCTIONS = hat, exp, tangent, inverse_tangent
-FUNCTIONS = *VECTOR_FUNCTIONS, vee, log, orthonormalize
-ORDERS = 1, 2, pytest.param(3, marks=pytest.mark.slow)  # of derivatives
-
-
-@cache
-def batched(f):
-    return jax.jit(jax.vmap(f))
-
-
-def cross(x):
-    """NumPy's cross product as a matrix."""
-    return np.cross(x, -EYE)
-
-
-def turns(psi):
-    return Rotation.from_rotvec(psi).as_matrix()
-
-
-def transposed(A):
-    return np.swapaxes(A, -1, -2)
-
-
-def assert_close(x, y, tolerance):
-    np.testing.assert_allclose(x, y, rtol=0, atol=tolerance)
-
-
-def six(x):
-    """c1, ..., c5, and d of T^-1."""
-    return *coefficients(x), inverse_coefficient(x)
-
-
-def exact_coefficients(x, derivative):
-    """The six, or a derivative of them with respect to x, from rational series: exact to rounding."""
-    x, terms = Fraction(x), range(40)
-
-    def value(series, n):
-        return sum((-1) ** k * c * perm(k, n) * x ** (k - n) for k, c in enumerate(series) if k >= n)
-
-    c = {n: [Fraction(1, factorial(2 * k + n)) for k in terms] for n in range(1, 6)}
-    e = [y - 2 * z for y, z in zip(c[3], c[4], strict=True)]
-    d = []
-    for n in range(derivative + 1):  # Leibniz on 2 c2 d = e
-        d.append(
-            (value(e, n) / 2 - sum(comb(n, i) * value(c[2], i) * d[n - i] for i in range(1, n + 1))) / value(c[2], 0)
-        )
-    return [float(f) for f in (*(value(c[n], derivative) for n in c), d[-1])]
-
-
-X = np.concatenate([[0.0], np.geomspace(1e-16, 0.9, 40), 1 + np.linspace(-1e-9, 1e-9, 5), np.linspace(1.1, 36.0, 40)])
 
 
 def test_coefficients():
@@ -96,19 +51,6 @@ def test_coefficients():
     assert np.all(error[4] < 5e-14)
 
 
-@pytest.mark.parametrize("order", ORDERS)
-def test_derivatives_of_coefficients(order):
-    """Forward, with relative errors of the series and absolute ones beyond; and reverse, of a random combination."""
-    weights = np.random.default_rng(order).uniform(-1, 1, 6)
-    forward, backward = six, lambda x: sum(w * f for w, f in zip(weights, six(x), strict=True))
-    for _ in range(order):
-        forward, backward = jax.jacfwd(forward), jax.grad(backward)
-    exact = np.array([exact_coefficients(x, order) for x in X]).T
-    error = np.abs(np.array(batched(forward)(X)) - exact)
-    assert np.all(error < np.where(X < 1, 1e-13 * np.abs(exact), 1e-14))
-    assert_close(batched(backward)(X), weights @ exact, 1e-14)
-
-
 def test_hat_is_the_cross_product_and_vee_its_inverse():
     x, y = np.random.default_rng(0).standard_normal((2, 3))
     np.testing.assert_array_equal(hat(x), cross(x))
@@ -117,6 +59,7 @@ def test_hat_is_the_cross_product_and_vee_its_inverse():
     assert_close(vee(hat(x) + np.outer(y, y)), x, 4 * EPS)
 
 
+@pytest.mark.slow
 def test_exp_is_the_matrix_exponential():
     R = batched(exp)(ALL)
     assert_close(R, turns(ALL), 4e-15)
@@ -176,92 +119,6 @@ def test_log_at_pi():
     assert_close(batched(log)(R), pi * AXES * np.sign(largest), 4e-15)
     rounded = batched(exp)(pi * AXES)
     assert_close(batched(exp)(batched(log)(rounded)), rounded, 4e-15)
-
-
-@cache
-def forward(f, order):
-    """All derivatives of this order: f's shape, then (3,) for each."""
-    for _ in range(order):
-        f = jax.jacfwd(f)
-    return batched(f)
-
-
-def reverse(f, weights):
-    """In reverse mode all through: the gradient of f . weights[0], of that . weights[1], and so on."""
-    for w in weights:
-        f = jax.grad(lambda x, f=f, w=w: jnp.sum(w * f(x)))
-    return batched(f)
-
-
-def contract(derivative, weights):
-    """What `reverse` gives, from all derivatives (points, ...)."""
-    for w in weights:
-        axes = range(1, 1 + w.ndim)
-        derivative = np.tensordot(derivative, w, (axes, range(w.ndim)))
-    return derivative
-
-
-def random_weights(shape, order):
-    rng = np.random.default_rng(order)
-    return [rng.uniform(-1, 1, shape), *rng.uniform(-1, 1, (order - 1, 3))]
-
-
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("f", [exp, tangent, inverse_tangent])
-def test_derivatives(f, order):
-    """Forward mode, reverse mode, and fourth-order central differences of the derivative before."""
-    h, weights = 1e-3, random_weights((3, 3), order)
-    derivative, before = np.asarray(forward(f, order)(VECTORS)), forward(f, order - 1)
-
-    def difference(step):
-        return before(VECTORS + step) - before(VECTORS - step)
-
-    differences = [(8 * difference(h * e) - difference(2 * h * e)) / (12 * h) for e in EYE]
-    assert_close(derivative, np.stack(differences, axis=-1), 1e-11)
-    assert_close(reverse(f, weights)(VECTORS), contract(derivative, weights), 1e-13)
-
-
-@pytest.mark.parametrize("f", [exp, tangent, inverse_tangent])
-def test_derivatives_of_long_vectors_are_finite(f):
-    """The series, not taken there, would overflow."""
-    psi = np.array([3000.0, -1000.0, 2000.0], np.float32)
-    for derivative in (jax.jacfwd(f), jax.jacrev(f)):
-        assert np.all(np.isfinite(jax.jit(derivative)(psi)))
-
-
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize(
-    ("f", "factors"), [(exp, (1, 1, 1)), (tangent, (-1 / 2, 1 / 3, -1 / 4)), (inverse_tangent, (1 / 2, 1 / 6, 0))]
-)
-def test_derivatives_at_zero(f, factors, order):
-    """Those of I + the sum over k of factors[k - 1] P^k / k!."""
-    P = [cross(e) for e in EYE]
-    exact = np.zeros((3, 3) + (3,) * order)
-    for directions in np.ndindex((3,) * order):
-        products = [np.linalg.multi_dot([EYE, *(P[i] for i in p), EYE]) for p in permutations(directions)]
-        exact[:, :, *directions] = factors[order - 1] * np.mean(products, axis=0)
-    at_zero = forward(f, order)(VECTORS)[np.linalg.norm(VECTORS, axis=1) < 1e-100]
-    assert_close(at_zero, np.broadcast_to(exact, at_zero.shape), 1e-15)
-
-
-@pytest.mark.parametrize("order", [1, *(pytest.param(order, marks=pytest.mark.slow) for order in (2, 3))])
-def test_derivatives_of_log(order):
-    """log(exp(psi)) = psi: the first derivative is I and the next ones are 0."""
-
-    def identity(psi):
-        return log(exp(psi))
-
-    psi, weights = np.concatenate([VECTORS, NEAR_PI]), random_weights(3, order)
-    exact = np.broadcast_to(EYE if order == 1 else np.zeros((3,) * (order + 1)), (len(psi),) + (3,) * (order + 1))
-    assert_close(forward(identity, order)(psi), exact, 1e-14 * 10 ** (order - 1))
-    assert_close(reverse(identity, weights)(psi), contract(exact, weights), 1e-14 * 10 ** (order - 1))
-
-
-def test_derivative_of_log_is_the_inverse_tangent():
-    """d log(R exp(eps)) = T^-1(psi) d eps at eps = 0; at pi too, where psi is what log returns."""
-    R = batched(exp)(np.concatenate([VECTORS, NEAR_PI, pi * AXES]))
-    derivative = batched(lambda R: jax.jacrev(lambda eps: log(R @ exp(eps)))(jnp.zeros(3)))
-    assert_close(derivative(R), batched(inverse_tangent)(batched(log)(R)), 1e-14)
 
 
 def test_rates_along_a_motion():

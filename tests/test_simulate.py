@@ -88,6 +88,7 @@ def test_dense_output_is_of_order_four():
     np.testing.assert_allclose(np.log2(error(10) / error(20)), 4, atol=0.15)
 
 
+@pytest.mark.slow
 def test_dense_output_meets_the_saved_states_and_keeps_trees():
     q0 = {"b": jnp.asarray(0.2), "a": jnp.array([[0.5, 0.1]])}
     v0 = jax.tree.map(jnp.zeros_like, q0)
@@ -101,6 +102,7 @@ def test_dense_output_meets_the_saved_states_and_keeps_trees():
     assert hhtjax.interpolate(path, jnp.zeros((3, 4))).q["a"].shape == (3, 4, 1, 2)
 
 
+@pytest.mark.slow
 def test_dense_output_is_differentiable():
     """In the times, where the derivative of q is close to v, and in a parameter."""
     path = run(DUFFING, hhtjax.hht(), 2000)
@@ -124,6 +126,7 @@ def test_dense_output_outside_a_traced_run_is_nan():
     np.testing.assert_array_equal(np.isnan(values), [True, False, True])
 
 
+@pytest.mark.slow
 def test_progress_changes_neither_result_nor_gradient(capfd):
     @partial(jax.jit, static_argnums=1)
     def loss(k, progress):
@@ -158,6 +161,7 @@ def dampers(q, v, t, params):
     return jnp.stack([first - second, second])
 
 
+@pytest.mark.slow
 def test_lagrangian_system_equals_the_one_by_hand():
     problem = PROBLEMS["forced double pendulum"]
     derived = hhtjax.System.from_lagrangian(pendulum_lagrangian, dampers)

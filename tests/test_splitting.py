@@ -177,6 +177,7 @@ def test_softening_is_stable_for_every_step_size(alpha):
         assert late < 2 * early
 
 
+@pytest.mark.slow
 @every_form
 def test_gradients(modified):
     problem = PROBLEMS["forced Duffing"]
@@ -196,6 +197,7 @@ def test_gradients_on_the_double_pendulum(modified):
     check_gradient(path_loss(problem, operator_splitting(-0.1, modified), 40, 40), arguments)
 
 
+@pytest.mark.slow
 @every_form
 def test_jit_equals_eager_through_init_and_step(modified):
     problem = PROBLEMS["forced double pendulum"]

@@ -9,6 +9,7 @@ import hhtjax
 from hhtjax.scenes import double_pendulum
 
 
+@pytest.mark.slow
 def test_the_equation_of_motion_gives_stiffness_and_damping_without_a_guess():
     """Of a double pendulum with M(q), as a dict whose keys sort otherwise, with 0.1 mrad of noise; 20 times off."""
     scene = double_pendulum.free()

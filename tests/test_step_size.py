@@ -92,3 +92,16 @@ def test_modes_of_a_constrained_system_satisfy_its_constraints():
     assert [mode.frequency for mode in found.modes] == [pytest.approx((9.81 / 0.5 + 25) ** 0.5, rel=1e-9)]
     assert found.dt == found.modes[0].largest_dt
     assert found.modes[0].resolved
+
+
+def test_modes_that_only_decay_are_no_answer_for_a_nonlinear_system():
+    """10 rad/s, at rest within steep friction: linearised there it creeps, and a step of seconds would resolve that."""
+
+    def force(q, v, t, params):
+        return -100 * q - 50 * jnp.tanh(v / 1e-3)
+
+    system, start = hhtjax.System(np.ones(1), force), (jnp.ones(1), jnp.zeros(1))
+    with pytest.raises(ValueError, match="no mode of the `system` oscillates or grows at q0, v0.*give a `duration`"):
+        analysis.suggest_step_size(system, hhtjax.hht(), *start)
+    moving = analysis.suggest_step_size(system, hhtjax.hht(), start[0], jnp.ones(1))
+    assert moving.dt < 0.1

@@ -28,6 +28,7 @@ PARAMS = {"k": 4.0, "c": 0.1}
 sweep = partial(hhtjax.sweep, SPRING, STEPPER, ONE, ZERO, dts=DTS, duration=1.0, num_samples=4)
 
 
+@pytest.mark.slow
 def test_each_member_is_its_own_run_sampled_at_common_times():
     runs = sweep(PARAMS, t0=2.0)
     runs.check()

@@ -156,6 +156,7 @@ def test_traced_times_that_do_not_increase_and_step_sizes_that_are_negative_are_
         runs.check()
 
 
+@pytest.mark.slow
 def test_dense_output_between_the_times():
     """Motions of second degree are exact for every step, and for cubics between samples."""
     ball = hhtjax.System(ONE, lambda q, v, t, params: 0 * q - 9.81)
@@ -167,6 +168,7 @@ def test_dense_output_between_the_times():
         np.testing.assert_allclose(found.v[member, :, 0], 1 - 9.81 * t, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_on_disk(tmp_path):
     def write(times):
         return hhtjax.sweep_to_disk(

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from zoo import PROBLEMS, STEPPERS, run
+from zoo import PROBLEMS, STEPPERS, as_data, each, run
 
 import hhtjax
 
-every_stepper = pytest.mark.parametrize("name", STEPPERS)
+every_stepper = pytest.mark.parametrize("name", each(STEPPERS))
 
 
 @every_stepper
@@ -61,7 +61,7 @@ def test_dtype_is_kept(name, dtype):
         warnings.simplefilter("ignore", category=hhtjax.PrecisionWarning)
         path = hhtjax.simulate(
             problem.system,
-            STEPPERS[name],
+            as_data(STEPPERS[name]),
             problem.q0.astype(dtype),
             problem.v0.astype(dtype),
             problem.params,
@@ -70,54 +70,60 @@ def test_dtype_is_kept(name, dtype):
         )
     path.check()
     assert {x.dtype for x in (path.t, path.q, path.v, path.acceleration, path.dt)} == {jnp.dtype(dtype)}
-    np.testing.assert_allclose(path.q, run(problem._replace(duration=0.6), STEPPERS[name], 30).q, atol=1e-4)
+    np.testing.assert_allclose(path.q, run(problem._replace(duration=0.6), as_data(STEPPERS[name]), 30).q, atol=1e-4)
+
+
+def vector(x):  # rows: a.x, b
+    return jnp.append(x["a"]["x"], x["b"])
+
+
+def tree(x):
+    return {"b": x[1], "a": {"x": x[:1]}}
+
+
+VECTORS = PROBLEMS["forced double pendulum"]._replace(duration=0.04)
+TREES = VECTORS._replace(
+    system=hhtjax.System(
+        lambda q, params: VECTORS.system.mass(vector(q), params),
+        lambda q, v, t, params: tree(VECTORS.system.force(vector(q), vector(v), t, params)),
+    ),
+    q0=tree(VECTORS.q0),
+    v0=tree(VECTORS.v0),
+)
 
 
 @every_stepper
 def test_trees_are_kept_and_rows_follow_the_sorted_keys(name):
     """A dict whose keys sort differently from their insertion, against the same system on a vector."""
-    problem = PROBLEMS["forced double pendulum"]._replace(duration=0.04)
-
-    def vector(x):  # rows: a.x, b
-        return jnp.append(x["a"]["x"], x["b"])
-
-    def tree(x):
-        return {"b": x[1], "a": {"x": x[:1]}}
-
-    system = hhtjax.System(
-        lambda q, params: problem.system.mass(vector(q), params),
-        lambda q, v, t, params: tree(problem.system.force(vector(q), vector(v), t, params)),
-    )
-    q0, v0 = tree(problem.q0), tree(problem.v0)
-    ours = run(problem._replace(system=system, q0=q0, v0=v0), STEPPERS[name], 2)
-    flat = run(problem, STEPPERS[name], 2)
+    ours, flat = (run(problem, as_data(STEPPERS[name]), 2) for problem in (TREES, VECTORS))
     for x in (ours.q, ours.v, ours.acceleration):
-        assert jax.tree.structure(x) == jax.tree.structure(q0)
+        assert jax.tree.structure(x) == jax.tree.structure(TREES.q0)
     assert ours.q["a"]["x"].shape == (3, 1)
     assert ours.q["b"].shape == (3,)
     np.testing.assert_allclose(ours.q["a"]["x"][:, 0], flat.q[:, 0], rtol=1e-10)
     np.testing.assert_allclose(ours.q["b"], flat.q[:, 1], rtol=1e-10)
 
 
+def coupled(q, v, t, params):
+    return -jnp.array([[2.0, -1.0], [-1.0, 2.0]]) @ q - 0.1 * q**3
+
+
+MASS = jnp.array([2.0, 3.0])
+COUPLED = [
+    hhtjax.System(mass, coupled)
+    for mass in (MASS, jnp.diag(MASS), lambda q, params: MASS, lambda q, params: jnp.diag(MASS))
+]
+
+
 @every_stepper
 def test_a_diagonal_mass_equals_the_full_one(name):
-    def force(q, v, t, params):
-        return -jnp.array([[2.0, -1.0], [-1.0, 2.0]]) @ q - 0.1 * q**3
-
-    q0, v0 = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
-    ends = [
-        hhtjax.simulate(hhtjax.System(mass, force), STEPPERS[name], q0, v0, dt=0.05, num_steps=20).q[-1]
-        for mass in (
-            jnp.array([2.0, 3.0]),
-            jnp.diag(jnp.array([2.0, 3.0])),
-            lambda q, params: jnp.array([2.0, 3.0]),
-            lambda q, params: jnp.diag(jnp.array([2.0, 3.0])),
-        )
-    ]
+    q0, v0, stepper = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), as_data(STEPPERS[name])
+    ends = [hhtjax.simulate(system, stepper, q0, v0, dt=0.05, num_steps=20).q[-1] for system in COUPLED]
     for end in ends[1:]:
         np.testing.assert_allclose(end, ends[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_more_unknowns_than_are_unrolled():
     """n = 12 through LAPACK, with a coupled mass, against its modes."""
     n = 12
@@ -131,6 +137,7 @@ def test_more_unknowns_than_are_unrolled():
     np.testing.assert_allclose(path.q[-1], exact, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_users_solve_is_used():
     calls = []
 

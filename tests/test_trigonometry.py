@@ -42,6 +42,7 @@ def test_beyond_the_range_there_is_no_number():
         assert np.isnan(found).all()
 
 
+@pytest.mark.slow
 def test_derivatives_forward_and_reverse_of_first_and_second_order():
     x = jnp.linspace(-7.0, 7.0, 29)
     for ours, theirs, slope in (

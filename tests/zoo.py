@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 import hhtjax
@@ -90,6 +91,11 @@ STEPPERS = {
     "rowda": hhtjax.rowda(),
     "rk4": hhtjax.rk4(),
 }
+
+
+def each(names, quick=("hht auto", "hht converged", "rowda", "rk4")):
+    """Names to run a test over, of which the fast tests take only the quick ones."""
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
 @cache

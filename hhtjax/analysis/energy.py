@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from hhtjax.checks import require_function
 from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.solution import Solution
+from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.system import LinearSystem, System
 
@@ -72,7 +73,7 @@ def _energy_balance(system, solution, params, potential):
         V = jnp.zeros_like(t) if potential is None else potential(flat.unravel(q), t, params)
         return jnp.dot(v, flat.inertia(q, v, params)) / 2, jnp.asarray(V).astype(t.dtype)
 
-    def power(q, v, t, L):
+    def power(q, v, t, L, params):
         """P; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
         along = flat.rate(q, v), jnp.ones_like(t)
         _, (T_q, V_dot) = jax.jvp(lambda q, t: energies(q, v, t), (q, t), along)
@@ -86,11 +87,20 @@ def _energy_balance(system, solution, params, potential):
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
     between = interpolate(solution, middle)
     at_ends = _vectors(solution.q), _vectors(solution.v), t
-    P = jax.vmap(power)(*at_ends, L)
-    P_middle = jax.vmap(power)(
-        _vectors(between.q), _vectors(between.v), middle, None if L is None else (L[1:] + L[:-1]) / 2
-    )
-    work = jnp.concatenate([jnp.zeros_like(t[:1]), jnp.cumsum(H / 6 * (P[1:] + 4 * P_middle + P[:-1]))])
+    v_middle = _vectors(between.v)
+    if held.holds(params) and not flat.blocks:  # accelerations jump: of the cubic through q and v the slope
+        q, v = _vectors(solution.q), _vectors(solution.v)
+        v_middle = 1.5 * jnp.diff(q, axis=0) / H[:, None] - (v[1:] + v[:-1]) / 4
+    at_middle = _vectors(between.q), v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
+    first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L)) for part in (slice(-1), slice(1, None)))
+
+    def over_interval(first, between, last, H):
+        """Simpson's rule; a held input has the value that it has inside."""
+        inside = held.held_at(params, between[2])
+        return H / 6 * (power(*first, inside) + 4 * power(*between, inside) + power(*last, inside))
+
+    work = jnp.cumsum(jax.vmap(over_interval)(first, at_middle, last, H))
+    work = jnp.concatenate([jnp.zeros_like(t[:1]), work])
     T, V = jax.vmap(energies)(*at_ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
 

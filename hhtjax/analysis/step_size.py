@@ -80,11 +80,12 @@ def suggest_step_size(
     oscillator, and counts as resolved where |log(mu)/(lambda h) - 1| <= tolerance: the errors of period and of
     damping ratio together. (A real lambda is put into xddot = lambda xdot.) The step is the largest that resolves
 
-        highest = None    every mode that oscillates or grows, or where none does, the slowest decay;
+        highest = None    every mode that oscillates or grows, or where none does, of a LinearSystem, the slowest decay;
         highest           every mode of |lambda| <= highest, in rad/s,
 
     and for which no mode that decays grows in the steps, resolved or not. That is quick, and no more than a guide: it
-    knows neither how long the motion lasts, nor how large each mode is, nor what comes later.
+    knows neither how long the motion lasts, nor how large each mode is, nor what comes later. So where all modes of a
+    nonlinear system decay at the state (at rest within steep friction, say), there is no answer, but an error.
 
     With `duration`, runs with 8, 16, 32, ... steps are made until the RMS error of q, relative to its motion about its
     mean, stays within the tolerance over [t0, t0 + duration], and the step is the largest that does. It costs about
@@ -99,8 +100,9 @@ def suggest_step_size(
         duration: s; without `highest`.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; a system without a time scale of its own (unless
-            there is a duration); a tolerance out of reach; JAX in single precision.
+        TypeError, ValueError: an argument of a wrong kind or value; a system without a time scale of its own, or a
+            nonlinear one whose modes all decay (unless there is a duration); a tolerance out of reach; JAX in single
+            precision.
         NotImplementedError: constraints or rotations that the stepper does not know.
 
     Example: masses on a soft and on a stiff spring. The stiff one dictates, unless it is given up.
@@ -136,7 +138,7 @@ def suggest_step_size(
         reach.append((_reach(error > tolerance), _reach(radius > STABLE_RADIUS) if rate.real <= 0 else np.inf))
     resolved, stable = np.reshape(reach, (-1, 2)).T / abs(rates)
     if duration is None:
-        dt, reason = _modal_step(rates, resolved, stable, tolerance, highest)
+        dt, reason = _modal_step(rates, resolved, stable, tolerance, highest, isinstance(system, LinearSystem))
     else:
         dt, most = step_size_by_runs(system, stepper, q0, v0, params, float(t0), float(duration), tolerance)
         reason = f"keeps q within {tolerance:g} of its motion over {duration:g} s, by runs of up to {most} steps"
@@ -151,12 +153,17 @@ def suggest_step_size(
     return StepSize(dt, reason, tuple(modes))
 
 
-def _modal_step(rates, resolved, stable, tolerance, highest):
+def _modal_step(rates, resolved, stable, tolerance, highest, linear):
     """The largest step that resolves the chosen modes and keeps all from growing, and why it is no larger."""
     caller, size = "suggest_step_size", abs(rates)
     if not len(rates):
         raise ValueError(f"{caller}: the `system` has no time scale of its own at q0, v0: take another state.")
     moves = (rates.imag > 0) | (rates.real > 0)
+    if highest is None and not linear and not moves.any():
+        raise ValueError(
+            f"{caller}: no mode of the `system` oscillates or grows at q0, v0, and what decays there need not be what "
+            "limits the step of the motion: give a `duration`, take another state, or say up to which `highest`."
+        )
     chosen = size <= highest if highest is not None else moves if moves.any() else size == size[0]
     if not chosen.any():
         raise ValueError(f"{caller}: `highest` must reach the slowest mode, {size[0]:.4g} rad/s; received {highest}.")

@@ -6,14 +6,17 @@ from hhtjax.identification.identifiability import IdentifiabilityWarning
 from hhtjax.identification.identify import Multistart, fit, multistart
 from hhtjax.identification.inference import Profile, Score, prediction_errors, profile, score_test
 from hhtjax.identification.measured import Windows, measure, windows, wrap_angle
+from hhtjax.identification.progress import History
 from hhtjax.identification.refinement import Refined, StepSizeWarning, refine
 from hhtjax.identification.result import FitResult
+from hhtjax.identification.sandwich import Uncertainty
 from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
 
 __all__ = [
     "FitResult",
     "Gaussian",
+    "History",
     "IdentifiabilityWarning",
     "ModeBias",
     "Multistart",
@@ -21,6 +24,7 @@ __all__ = [
     "Refined",
     "Score",
     "StepSizeWarning",
+    "Uncertainty",
     "Windows",
     "bounded",
     "equation_error",

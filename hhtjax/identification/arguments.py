@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from hhtjax.checks import require_function
+from hhtjax.checks import require_function, require_integer
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.least_squares import LOSSES
+from hhtjax.identification.losses import LOSSES
 
 FEW = 64  # parameters up to which a forward-mode Jacobian is the cheaper derivative
 LEVENBERG_MARQUARDT = "levenberg_marquardt"
@@ -59,10 +59,8 @@ def check_options(
         raise ValueError(f"{caller}: `loss` must be one of {', '.join(LOSSES)}, a function or None; received {loss!r}.")
     if max_iterations is None:
         max_iterations = 50 if optimizer == LEVENBERG_MARQUARDT else 1000
-    for name, value, least in (("max_iterations", max_iterations, 1), ("segments", segments, 2)):
-        if not isinstance(value, int) or value < least:
-            words = "a positive integer" if least == 1 else f"an integer of at least {least}"
-            raise ValueError(f"{caller}: `{name}` must be {words}; received {value!r}.")
+    max_iterations = require_integer(caller, "max_iterations", max_iterations)
+    segments = require_integer(caller, "segments", segments, 2)
     rho = LOSSES.get(loss) if isinstance(loss, str) else loss
     return Options(optimizer, transforms, rho, max_iterations, covariance, segments, progress)
 

@@ -21,8 +21,8 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.analysis import amplification_matrix
 from hhtjax.checks import require_number
 from hhtjax.identification.prewarp import motion, prewarped
-from hhtjax.steppers.stepper import require_stepper
-from hhtjax.systems.system import LinearSystem
+from hhtjax.steppers.stepper import Stepper, require_stepper
+from hhtjax.systems.system import LinearSystem, System
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
 ON_CONSTRAINT = 1e-6  # largest residual of it
@@ -46,7 +46,16 @@ class ModeBias(NamedTuple):
     params: Any = None
 
 
-def step_size_bias(system, stepper, params, dt, q, v=None, t0=0.0, correct: Any = False) -> ModeBias:
+def step_size_bias(
+    system: System | LinearSystem,
+    stepper: Stepper,
+    params: Any,
+    dt: float,
+    q: Any,
+    v: Any = None,
+    t0: float = 0.0,
+    correct: Any = False,
+) -> ModeBias:
     """By how much stiffness and damping are off that were fitted through steps of dt.
 
     The system is linearised about (q, v, t0): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its

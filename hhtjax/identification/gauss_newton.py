@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.identification.least_squares import LEAST_BEND, Objective
+from hhtjax.identification.losses import LEAST_BEND, Objective
 
 PART = 512  # rows
 

@@ -6,6 +6,7 @@ with exact derivatives: Levenberg-Marquardt on forward-mode Jacobians for few pa
 optimiser on reverse-mode gradients for many.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -25,29 +26,29 @@ from hhtjax.identification.arguments import (
     first_bad,
 )
 from hhtjax.identification.identifiability import warn_undetermined
-from hhtjax.identification.least_squares import BAD_START, NO_INFLUENCE
 from hhtjax.identification.problem import Data, solve
+from hhtjax.identification.progress import BAD_START, NO_INFLUENCE
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 
 
 def fit(
-    residuals,
-    params0,
-    optimizer=None,
+    residuals: Callable[..., Any],
+    params0: Any,
+    optimizer: Any = None,
     *,
-    records=None,
-    starts=None,
-    transforms=None,
-    scale=None,
+    records: Any = None,
+    starts: Any = None,
+    transforms: Any = None,
+    scale: Any = None,
     weights: Any = True,
-    loss=None,
-    prior=None,
-    max_iterations=None,
-    tolerance=1e-8,
-    covariance=True,
-    segments=SEGMENTS,
-    progress=False,
+    loss: str | Callable[[Any], Any] | None = None,
+    prior: Any = None,
+    max_iterations: int | None = None,
+    tolerance: float = 1e-8,
+    covariance: bool = True,
+    segments: int = SEGMENTS,
+    progress: bool = False,
 ) -> FitResult:
     """The parameters that minimise the sum of squares of `residuals(params)`.
 
@@ -70,12 +71,14 @@ def fit(
         weights: w, for each leaf of the residuals, or for whole branches: numbers, or arrays over their leading
             axes; one over the standard deviation of the noise. 0 or False: a missing sample, whose residual may be NaN.
         loss: rho, robust against outliers: "huber", "soft_l1", "cauchy", or an elementwise function with
-            rho(z) = z for small z. It bends where w r is about 1, so that weights matter. None: rho(z) = z.
+            rho(z) = z for small z. It bends where w r is about 1, so that weights matter; standard errors are those of
+            an M-estimate. None: rho(z) = z.
         prior: for each leaf of params0, or for whole branches: `Gaussian(mean, deviation)`, or None. It adds
             1/2 ((p - mean)/deviation)^2, so that w r should have unit variance.
         max_iterations: default 50, or 1000 with an optax optimiser.
-        tolerance: relative, on the change of the cost, on the scaled step and on the cosine between
-            residual and Jacobian columns. With optax: the relative change of the cost, five times running.
+        tolerance: relative, on the cosine between residual and Jacobian columns; or, where that is less than
+            10 sqrt(tolerance), on the change of the cost and on the scaled step. With optax: the relative change of
+            the cost, five times running.
         covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
         segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
             residuals are cut for the cluster covariance (`hhtjax.identification.sandwich`).
@@ -90,7 +93,8 @@ def fit(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; a start that a transform excludes; no free parameter;
-            residuals that are not finite at params0, and not declared missing; more parameters than residuals.
+            residuals that are not finite at params0, and not declared missing; that do not depend on any parameter
+            there; or that JAX cannot trace; more parameters than residuals.
 
     Warns:
         IdentifiabilityWarning: the Jacobian at the solution lacks rank: names the parameters concerned, and the
@@ -126,19 +130,19 @@ class Multistart(NamedTuple):
 
 
 def multistart(
-    residuals,
-    starts,
-    optimizer=None,
+    residuals: Callable[..., Any],
+    starts: Any,
+    optimizer: Any = None,
     *,
-    transforms=None,
-    scale=None,
+    transforms: Any = None,
+    scale: Any = None,
     weights: Any = True,
-    loss=None,
-    prior=None,
-    max_iterations=None,
-    tolerance=1e-8,
-    covariance=True,
-    segments=SEGMENTS,
+    loss: str | Callable[[Any], Any] | None = None,
+    prior: Any = None,
+    max_iterations: int | None = None,
+    tolerance: float = 1e-8,
+    covariance: bool = True,
+    segments: int = SEGMENTS,
 ) -> Multistart:
     """`fit` from several starts at once, vectorised.
 
@@ -169,7 +173,8 @@ def multistart(
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
     every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
-    cost = jnp.where((every.code == BAD_START) | jnp.isnan(every.cost), jnp.inf, every.cost)
+    failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
+    cost = jnp.where(failed, jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)
     return Multistart(_finished("multistart", best, weights) if is_concrete(best.code) else best, every)
 

@@ -1,5 +1,6 @@
 """Questions to a fit: which term is missing, how far one parameter can go, how sure a prediction is."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -7,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.checks import require_function
+from hhtjax.checks import require_function, require_integer
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.gauss_newton import with_jacobian
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
+from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 
 
@@ -28,7 +30,7 @@ class Score(NamedTuple):
     estimate: Any
 
 
-def score_test(residuals, params, candidates, segments=SEGMENTS) -> Score:
+def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: Any, segments: int = SEGMENTS) -> Score:
     """Which further terms a model needs, from one Jacobian and without fitting any of them.
 
     With x a candidate's column of the Jacobian, less its projection on the columns of the fitted parameters,
@@ -43,7 +45,7 @@ def score_test(residuals, params, candidates, segments=SEGMENTS) -> Score:
         segments: how many.
 
     Raises:
-        TypeError: residuals is no function.
+        TypeError, ValueError: residuals is no function; segments is no integer, 2 or more.
 
     References:
         Rao (1948); with sandwich variance, Boos, Am. Stat. 46 (1992).
@@ -58,6 +60,7 @@ def score_test(residuals, params, candidates, segments=SEGMENTS) -> Score:
     {'cube': True, 'square': False}
     """
     require_function("score_test", "residuals", residuals, "residuals(params, candidates)")
+    segments = require_integer("score_test", "segments", segments, 2)
     params, candidates = (
         jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), y) for y in (params, candidates)
     )
@@ -89,7 +92,7 @@ class Profile(NamedTuple):
     deviance: Any
 
 
-def profile(residuals, result, name, values, **options: Any) -> Profile:
+def profile(residuals: Callable[..., Any], result: FitResult, name: str, values: Any, **options: Any) -> Profile:
     """The profile likelihood of one parameter: the cost with it held at each value, and all others refitted.
 
     Args:
@@ -98,8 +101,9 @@ def profile(residuals, result, name, values, **options: Any) -> Profile:
         name: of a scalar parameter, as in `result.summary()`. values: where to hold it.
 
     Raises:
-        ValueError: no parameter of that name, or one that is no scalar leaf or was fixed.
+        ValueError: no parameter of that name, or one that is no scalar leaf or was fixed; a fit without covariance.
     """
+    believed = _uncertainty("profile", result)
     leaves, structure = jax.tree.flatten(result.params)
     names = [parameter_names(jax.tree.unflatten(structure, [x if i == k else None for k, x in enumerate(leaves)]))
              for i in range(len(leaves))]  # fmt: skip
@@ -122,20 +126,29 @@ def profile(residuals, result, name, values, **options: Any) -> Profile:
         costs.append(float(held.cost))
         params = jax.tree.leaves(held.params)
     row = int(np.flatnonzero(_flags(leaves, at))[0])
-    variance = float(result.covariance[row, row] / result.embed(result.uncertainty.inverse)[row, row])
+    variance = float(result.covariance[row, row] / result.embed(believed.inverse)[row, row])
     return Profile(np.asarray(values), np.asarray(costs), 2 * (np.asarray(costs) - float(result.cost)) / variance)
+
+
+def _uncertainty(caller, result):
+    if result.uncertainty is None:
+        raise ValueError(f"{caller}: `result` must have a covariance; received a fit made with covariance=False.")
+    return result.uncertainty
 
 
 def _flags(leaves, at):
     return np.concatenate([np.full(np.size(x), i == at) for i, x in enumerate(leaves)])
 
 
-def prediction_errors(predict, result, noise=0.0):
+def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: float = 0.0) -> Any:
     """Standard errors of `predict(params)`, a pytree like it: root of diag(J C J^T) + noise^2.
 
     Args:
         predict: params -> any pytree of real arrays, such as the output at another input.
         result: of `fit`, with its covariance C. noise: standard deviation of a new measurement's noise.
+
+    Raises:
+        ValueError: a fit without covariance.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.arange(100.0)
@@ -143,6 +156,7 @@ def prediction_errors(predict, result, noise=0.0):
     >>> bool(hhtjax.identification.prediction_errors(lambda p: 3 * p, result) == 3 * result.standard_errors)
     True
     """
+    _uncertainty("prediction_errors", result)
     x, unravel = ravel_pytree(result.params)
     shapes = jax.eval_shape(predict, result.params)
     _, unravel_output = ravel_pytree(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))

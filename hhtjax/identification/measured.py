@@ -8,6 +8,7 @@ import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.runs.interpolate import interpolate
+from hhtjax.runs.solution import Solution
 
 
 class Windows(NamedTuple):
@@ -23,7 +24,7 @@ class Windows(NamedTuple):
     begin: Any
 
 
-def windows(t, y, duration, present=None) -> Windows:
+def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
     """A record cut into windows of `duration`, one after the other; what is left at the end is dropped.
 
     Args:
@@ -69,7 +70,7 @@ def windows(t, y, duration, present=None) -> Windows:
     return Windows(t[index] - begin[:, None], y[index], present[index] & real, begin)
 
 
-def wrap_angle(angle):
+def wrap_angle(angle: Any) -> Any:
     """The same angle in [-pi, pi): for the difference of two angles of which one has lost its whole turns.
 
     >>> round(float(wrap_angle(6.0)), 4)                                          # 6 - 2 pi
@@ -78,7 +79,7 @@ def wrap_angle(angle):
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
 
 
-def measure(solution, times, gain=1.0, offset=0.0, delay=0.0):
+def measure(solution: Solution, times: Any, gain: Any = 1.0, offset: Any = 0.0, delay: Any = 0.0) -> Any:
     """What sensors of position show at `times`: gain q(t - delay) + offset, at the start of the run for earlier times.
 
     gain, offset and delay (s, a number) are ordinary parameters of a fit: of a signal's gain and a model's stiffness

@@ -11,8 +11,10 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options, check_residuals, spread_weights
+from hhtjax.identification.descent import descend
 from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
-from hhtjax.identification.least_squares import Objective, descend, levenberg_marquardt
+from hhtjax.identification.least_squares import levenberg_marquardt
+from hhtjax.identification.losses import Objective
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import count_segments, uncertainty, variance_inflation
 

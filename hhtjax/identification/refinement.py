@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.analysis import damping_ratio
-from hhtjax.checks import require_function, require_number
+from hhtjax.checks import require_function, require_integer, require_number
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
@@ -39,7 +40,7 @@ class Refined(NamedTuple):
     params: Any
     shift: Any
 
-    def interval(self, level=0.95):
+    def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """The interval of the last fit about `params`: two pytrees like them."""
         return self.fits[-1]._replace(params=self.params).interval(level)
 
@@ -52,7 +53,7 @@ class Refined(NamedTuple):
         return json.dumps(report.encode(self))
 
     @staticmethod
-    def from_json(text) -> "Refined":
+    def from_json(text: str) -> "Refined":
         """What `to_json` wrote."""
         classes = Refined, Coefficients, Options, *_subclasses(Stepper)
         return report.decode(json.loads(text), NAMED | {c.__name__: c for c in classes})
@@ -64,7 +65,14 @@ def _subclasses(base):
         yield from _subclasses(c)
 
 
-def refine(residuals_at, params0, stepper, dt, levels=None, **options: Any) -> Refined:
+def refine(
+    residuals_at: Callable[[Stepper, float], Callable[..., Any]],
+    params0: Any,
+    stepper: Stepper,
+    dt: float,
+    levels: int | None = None,
+    **options: Any,
+) -> Refined:
     """Fits with dt, dt/2 and so on, and extrapolates the parameters to dt = 0.
 
     For a stepper of order p, with the errors h^p, h^(p + 1), ... taken out one by one:
@@ -92,9 +100,7 @@ def refine(residuals_at, params0, stepper, dt, levels=None, **options: Any) -> R
     require_function("refine", "residuals_at", residuals_at, "residuals_at(stepper, dt)")
     require_stepper("refine", stepper)
     require_number("refine", "dt", dt, lambda x: x > 0, "be positive")
-    levels = needed_levels(stepper) if levels is None else levels
-    if not isinstance(levels, int) or levels < 2:
-        raise ValueError(f"refine: `levels` must be an integer of at least 2; received {levels!r}.")
+    levels = needed_levels(stepper) if levels is None else require_integer("refine", "levels", levels, 2)
     fits = []
     for level in range(levels):
         fits.append(fit(residuals_at(stepper, dt / 2**level), fits[-1].params if fits else params0, **options))

@@ -50,7 +50,7 @@ def _remarks(result, names):
     unknown, why = why_undetermined(result.params, result.free, believed, size)
     if unknown:
         remarks.append(f"undetermined: {', '.join(unknown)}: {why}")
-    R = np.abs(np.asarray(result.correlation)) * (1 - np.eye(len(names)))
+    R = np.triu(np.abs(np.asarray(result.correlation)), 1)
     if np.sum(result.free) - len(unknown) > 1:
         i, j = np.unravel_index(np.argmax(R), R.shape)
         remarks.append(f"largest correlation: {float(result.correlation[i, j]):+.3f} between {names[i]} and {names[j]}")

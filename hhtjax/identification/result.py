@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_number
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.least_squares import COST, GRADIENT, REASONS, STEP, History
+from hhtjax.identification.progress import COST, GRADIENT, REASONS, STEP, History
 from hhtjax.identification.sandwich import Uncertainty, correlation
 
 
@@ -42,7 +42,7 @@ class FitResult(NamedTuple):
     starts: Any = None
 
     @property
-    def converged(self):
+    def converged(self) -> Any:
         """Whether a tolerance was met."""
         return (self.code == COST) | (self.code == STEP) | (self.code == GRADIENT)
 
@@ -52,23 +52,23 @@ class FitResult(NamedTuple):
         return REASONS[int(self.code)]
 
     @property
-    def free(self):
+    def free(self) -> np.ndarray:
         """Whether each entry of ravel_pytree(params) was fitted, (p,)."""
         leaves = zip(self.transforms, jax.tree.leaves(self.params), strict=True)
         return np.concatenate([np.full(np.size(x), T is not tf.fixed) for T, x in leaves])
 
     @property
-    def covariance(self):
+    def covariance(self) -> Any:
         """(p, p), or None."""
         return None if self.uncertainty is None else self.embed(self.uncertainty.covariance)
 
     @property
-    def standard_errors(self):
+    def standard_errors(self) -> Any:
         """Structured like params, or None."""
         return None if self.uncertainty is None else self.errors(self.uncertainty.covariance)
 
     @property
-    def correlation(self):
+    def correlation(self) -> Any:
         """Of the estimates, (p, p), or None."""
         return None if self.uncertainty is None else correlation(self.covariance)
 
@@ -83,7 +83,7 @@ class FitResult(NamedTuple):
         _, unravel = ravel_pytree(self.params)
         return unravel(jnp.sqrt(jnp.diagonal(self.embed(covariance))))
 
-    def interval(self, level=0.95):
+    def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Lower and upper ends of each parameter's confidence interval, two pytrees like params.
 
         Student's t with segments - 1 degrees of freedom, symmetric in the coordinate that was fitted: for a
@@ -114,7 +114,7 @@ class FitResult(NamedTuple):
         """
         return report.summary(self)
 
-    def plot(self, sampling_rate=1.0):
+    def plot(self, sampling_rate: float = 1.0) -> Any:
         """A figure: residual and its spectrum (of the first channel), intervals, correlations. Needs matplotlib."""
         return report.plot(self, sampling_rate)
 
@@ -123,7 +123,7 @@ class FitResult(NamedTuple):
         return json.dumps(report.encode(self))
 
     @staticmethod
-    def from_json(text) -> "FitResult":
+    def from_json(text: str) -> "FitResult":
         """What `to_json` wrote. params of dicts, lists and tuples."""
         return report.decode(json.loads(text), NAMED)
 

@@ -12,11 +12,12 @@ from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.band_limited import band_limited_motion
 from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.system import System
 
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
 
-def equation_error(system, values, dt, cutoff, t0=0.0) -> Callable:
+def equation_error(system: System, values: Any, dt: float, cutoff: float, t0: float = 0.0) -> Callable[[Any], Any]:
     """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
 
     Nothing is simulated, and most parameters enter linearly: so the fit converges from anywhere, and its estimate is a
@@ -61,7 +62,9 @@ def equation_error(system, values, dt, cutoff, t0=0.0) -> Callable:
     return residuals
 
 
-def fit_progressively(problem_at, params0, horizons, **options: Any) -> FitResult:
+def fit_progressively(
+    problem_at: Callable[[Any, FitResult | None], dict[str, Any]], params0: Any, horizons: Any, **options: Any
+) -> FitResult:
     """One `fit` after the other, each to a longer part of the data, and each from where the one before ended.
 
     Over a short part a motion depends on its parameters almost linearly; over a long or chaotic one the cost has many
@@ -94,7 +97,8 @@ def fit_progressively(problem_at, params0, horizons, **options: Any) -> FitResul
     params, result = params0, None
     for i, horizon in enumerate(horizons):
         last = i == len(horizons) - 1
-        result = fit(params0=params, **problem_at(horizon, result), **options | ({} if last else {"covariance": False}))
+        rest: dict[str, Any] = options if last else options | {"covariance": False}
+        result = fit(params0=params, **problem_at(horizon, result), **rest)
         params = result.params
     assert result is not None
     return result

@@ -116,7 +116,7 @@ positive = Positive()
 fixed = Fixed()
 
 
-def bounded(lower, upper) -> Bounded:
+def bounded(lower: float, upper: float) -> Bounded:
     """A transform that keeps a parameter strictly between two numbers.
 
     Raises:

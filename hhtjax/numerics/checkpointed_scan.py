@@ -36,7 +36,7 @@ def checkpointed_scan(body, carry, length):
         return lax.scan(run_chunk, carry, None, chunks)
 
     carry, ys = lax.scan(checkpoint(run_block), carry, None, blocks)
-    ys = jax.tree.map(lambda y: y.reshape(-1, *y.shape[3:]), ys)
+    ys = jax.tree.map(lambda y: y.reshape(math.prod(y.shape[:3]), *y.shape[3:]), ys)
     if rest:
         carry, tail = lax.scan(body, carry, None, rest)
         ys = jax.tree.map(lambda y, z: jnp.concatenate([y, z]), ys, tail)

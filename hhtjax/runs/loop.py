@@ -10,6 +10,7 @@ from jax import lax
 
 from hhtjax.runs.solution import Failure, Solution
 from hhtjax.steppers.stepper import Info, public
+from hhtjax.systems import held
 from hhtjax.xla import staged
 
 
@@ -26,8 +27,8 @@ class Loop(NamedTuple):
 def loop_of(flat, stepper, q, v, t0, params, dt):
     """The loop over a stepper's steps."""
     stepper = stepper.astype(q.dtype)
-    take_step = jax.jit(stepper.bind(flat, params, dt), inline=True)  # traced once, wherever it is called
-    start = stepper.begin(flat, q, v, t0, params, dt)
+    take_step = jax.jit(held.bind(stepper, flat, params, dt), inline=True)  # traced once, wherever it is called
+    start = stepper.begin(flat, q, v, t0, held.before(params, t0, dt), dt)
     no_info = neutral_info(jax.eval_shape(take_step, start)[1])
     carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
     return Loop(carry, counted(take_step, flat, q, t0, dt), partial(saved, flat), no_info)
@@ -35,7 +36,7 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
 
 def advance_from(flat, stepper, q0, params, t, dt, count):
     """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken."""
-    take_step = stepper.astype(q0.dtype).bind(flat, params, dt)
+    take_step = held.bind(stepper.astype(q0.dtype), flat, params, dt)
     return counted(take_step, flat, q0, t, dt, count)
 
 

@@ -126,7 +126,7 @@ def run_sweep(system, data, dts, duration, t0, times, *, mapped, num_samples, la
 
     runs = (hand if mesh is None else _by_many(hand, mesh))(members, leaves, dts, substeps)
     back = jnp.asarray(np.argsort(dealt.ravel()))[jnp.argsort(order)]
-    runs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[back], runs)
+    runs = jax.tree.map(lambda x: x.reshape(dealt.size, *x.shape[2:])[back], runs)
     if times is None:
         times = t0 + H * jnp.arange(num_samples + 1).astype(dtype)
     return runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))

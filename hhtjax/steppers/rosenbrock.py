@@ -48,8 +48,7 @@ class Rosenbrock(Stepper):
 
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""
-        g, A, G, b = self.tableau
-        r = partial(residual, system, params)
+        g, r = self.tableau.g, partial(residual, system, params)
         zero, instant = jnp.zeros(system.size, dt.dtype), jnp.zeros_like(dt)
 
         def factorized(tangent):
@@ -58,43 +57,50 @@ class Rosenbrock(Stepper):
 
             return factorize_map(implicit, zero, factorize)
 
-        def increment(weights, rates):
-            """dt times the weighted sum of the rates of q, of v and of w."""
-            return [dt * sum((x * k[i] for x, k in zip(weights, rates, strict=False)), zero) for i in range(3)]
-
         if system.linear:
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 
         def step(s):
             value, tangent = staged(partial(jax.linearize, r), system.size)(s)
             solve = once if system.linear else factorized(tangent)
-
-            def moved(h, weights, rates):
-                """The state after the rates so weighted, at the time t + h."""
-                y = zip((s.q, s.v, s.w), increment(weights, rates), strict=True)
-                return State(s.t + h, *(x + dx for x, dx in y))
-
-            def start(row, rates):
-                """Where a stage starts, and r there."""
-                at = moved(sum(row) * dt, row, rates)
-                return at, r(at)
-
-            def stage(coupling, rates, at, value):
-                """Its rates."""
-                zq, zv, zw = increment(coupling, rates)
-                kq = at.v + zv
-                shift = State((g + sum(coupling)) * dt, zq + g * dt * kq, zv, -at.w)
-                kv = -solve(value + tangent(shift))
-                return kq + g * dt * kv, kv, (kv - at.w - zw) / (g * dt)
-
-            rates, started, before = [], (s, value), A[0]
-            for row, coupling in zip(A, G, strict=True):
-                if row != before:
-                    started, before = staged(partial(start, row))(rates), row
-                rates.append(staged(partial(stage, coupling))(rates, *started))
-            return moved(dt, b, rates), Info()
+            return stages(self.tableau, s, dt, r, value, tangent, solve), Info()
 
         return step
+
+
+def stages(tableau, s, dt, r, value, tangent, solve):
+    """The state at t + dt, by the formulas at the top of this file; value, tangent: of r at s."""
+    g, A, G, b = tableau
+    zero = jnp.zeros(s.q.size, s.q.dtype)
+
+    def increment(weights, rates):
+        """dt times the weighted sum of the rates of q, of v and of w."""
+        return [dt * sum((x * k[i] for x, k in zip(weights, rates, strict=False)), zero) for i in range(3)]
+
+    def moved(h, weights, rates):
+        """The state after the rates so weighted, at the time t + h."""
+        y = zip((s.q, s.v, s.w), increment(weights, rates), strict=True)
+        return State(s.t + h, *(x + dx for x, dx in y))
+
+    def start(row, rates):
+        """Where a stage starts, and r there."""
+        at = moved(sum(row) * dt, row, rates)
+        return at, r(at)
+
+    def stage(coupling, rates, at, value):
+        """Its rates."""
+        zq, zv, zw = increment(coupling, rates)
+        kq = at.v + zv
+        shift = State((g + sum(coupling)) * dt, zq + g * dt * kq, zv, -at.w)
+        kv = -solve(value + tangent(shift))
+        return kq + g * dt * kv, kv, (kv - at.w - zw) / (g * dt)
+
+    rates, started, before = [], (s, value), A[0]
+    for row, coupling in zip(A, G, strict=True):
+        if row != before:
+            started, before = staged(partial(start, row))(rates), row
+        rates.append(staged(partial(stage, coupling))(rates, *started))
+    return moved(dt, b, rates)
 
 
 def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import Description
-from hhtjax.systems import kinematics
+from hhtjax.systems import held, kinematics
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
@@ -100,14 +100,14 @@ class Stepper(Description):
         require_capable("init", system, self, q0, v0)
         flat, q, v = flatten("init", system, q0, v0, t0, params)
         dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
-        return _unravel(flat, self.astype(q.dtype).begin(flat, q, v, t0, params, dt))
+        return _unravel(flat, self.astype(q.dtype).begin(flat, q, v, t0, held.before(params, t0, dt), dt))
 
     def step(self, system, state, params, dt) -> tuple[State, Info]:
         """State one step dt after `state`, and what the step tells about itself."""
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params)
         w = ravel_pytree(state.v if flat.first_order else state.w)[0]
         a = None if state.a is None else ravel_pytree(state.a)[0]
-        step = self.astype(q.dtype).bind(flat, params, jnp.asarray(dt).astype(q.dtype))
+        step = held.bind(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
         state, info = step(State(state.t, q, v, w, a, state.L, state.memory))
         return _unravel(flat, state), info
 

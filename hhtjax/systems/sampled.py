@@ -49,6 +49,10 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
         order: 0, each value held until the next, as a D/A converter does; 1, linear; 3, cubic spline, twice
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
+    A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order
+    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). What is saved at a jump is the
+    acceleration before it; `interpolate` uses it for v after it too.
+
     Outside [t0, t0 + (samples - 1) dt] the nearest end value is held. Differentiable in values and t.
     An input enters a simulation only through its values at the steps: with a step shorter than dt the
     reconstruction between the samples matters, and the cubic one is far better on smooth signals.

@@ -13,7 +13,8 @@ Its door has eight names. The rest of the library works as well on plain JAX, se
 
 The contract: the same program gives the same numbers with and without, to rounding; signed zeros, NaN and infinities
 included. One licence: inside a sum of products a term with a factor that is zero by structure (a unit vector, a tangent
-that autodiff knows to be zero) may be left out. A rule names the parameters of its operation that it understands; what
+that autodiff knows to be zero) may be left out, and the sign of a sum that is zero is rounding (XLA itself takes x + 0
+for x). A rule names the parameters of its operation that it understands; what
 it does not understand runs on whole arrays.
 """
 

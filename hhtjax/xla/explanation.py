@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import jax
 
+from hhtjax.xla.gate import why_off
+from hhtjax.xla.kernels import LOOP
 from hhtjax.xla.lowering import VERDICT
 
 
@@ -28,8 +30,9 @@ def explain(f, *args) -> Explanation:
 
     On the CPU each becomes one kernel if XLA can compile it so, several times faster on a small system, and a list of
     kernels if not, as on other platforms: with LAPACK (more than 16 unknowns), sort, indices from an array
-    under reverse mode, large products and sums, or a callback such as progress=True. Values differ by rounding. With
-    JAX before 0.10.2 every loop is plain, and no path is told.
+    under reverse mode, large products and sums, a callback such as progress=True, or whatever XLA refused on trial.
+    Values differ by rounding. Inside `hhtjax.plain()`, or with a JAX that this is not tested with, every path is plain,
+    and says so.
 
     Args:
         f: any function; a gradient or a vmap has loops of its own.
@@ -47,6 +50,8 @@ def explain(f, *args) -> Explanation:
     lowered = jax.jit(f).lower(*args)
     compiled = lowered.compile()
     seconds = time.perf_counter() - start
-    paths = tuple(re.findall(rf'{VERDICT} = "([^"]*)"', lowered.as_text()))
+    off = f"plain: {why_off() or 'inside hhtjax.plain()'}"
+    found = re.findall(rf'{VERDICT} = "([^"]*)"|call @{LOOP}', lowered.as_text())
+    paths = tuple(verdict or off for verdict in found)
     memory: Any = compiled.memory_analysis()
     return Explanation(paths, seconds, None if memory is None else memory.temp_size_in_bytes)

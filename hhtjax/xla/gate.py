@@ -19,7 +19,9 @@ def plain():
     """Everything inside runs on plain JAX: for who doubts a number, or looks for the cause of one.
 
     Functions traced inside are kept apart from those traced outside, so a jitted function gives the plain result inside
-    and the fast one outside. The environment variable HHTJAX_PLAIN=1 does the same for a whole process.
+    and the fast one outside; of several threads it holds for the one that is inside. The environment variable
+    HHTJAX_PLAIN=1, set before the first run, does the same for a whole process; HHTJAX_PLAIN=0 tries the fast way also
+    with a JAX newer than those tested. `explain` tells which way was taken, and why.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0, 2.0]), force=lambda q, v, t, c: -9.81 - c * v)
@@ -46,6 +48,8 @@ def why_off():
     if _plain.value:
         return "inside hhtjax.plain()"
     wish = os.environ.get(VARIABLE, "")
+    if wish not in ("", "0", "1"):
+        raise ValueError(f"hhtjax: the environment variable {VARIABLE} must be 0 or 1; received {wish!r}.")
     if wish == "1":
         return f"{VARIABLE}=1"
     if jax.__version_info__ > NEWEST and wish != "0":

@@ -56,7 +56,7 @@ class Inspection:
             self.choices.append(op)
             self._look_at_all(form_inside(op))
         elif name == "custom_call":
-            self.object(ir.StringAttr(op.attributes["call_target_name"]).value)
+            self.look_into_custom_call(op)
         elif name == "dot_general" and is_to_write_out(op):
             self.products.append(op)
         elif dialect == "stablehlo" and name in CHECKS:  # what it holds is scalar
@@ -76,6 +76,9 @@ class Inspection:
             self.seen.add(callee(op))
             self.look(self.functions[callee(op)].operation)
             self.finished.append(callee(op))
+
+    def look_into_custom_call(self, op):
+        self.object(ir.StringAttr(op.attributes["call_target_name"]).value)
 
     def _look_at_all(self, operations):
         for op in operations:

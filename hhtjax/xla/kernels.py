@@ -15,13 +15,15 @@ from jax.interpreters import ad, batching
 
 from hhtjax.xla.gate import is_on
 
-KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"  # names of functions; autodiff and vmap keep them
+# names of functions; autodiff and vmap keep them
+KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"
+LOOP = "hhtjax_loop"  # where the machinery is off: a name for `explain` to find, and nothing else
 
 
 def one_kernel(f, *args):
     """f(*args) of pytrees of arrays, as one kernel where XLA can; the same values otherwise."""
     if not is_on():
-        return f(*args)
+        return named(LOOP, f)(*args)
     f, constants = jax.closure_convert(f, *args)
     return _watch(named(KERNEL, f)(*_watch(args), *_watch(constants)))
 
@@ -36,6 +38,8 @@ def staged(f, size=None):
 
 def choose(inside, outside, *args):
     """inside(*args) in one kernel, outside(*args) elsewhere: two ways to the same values."""
+    if not is_on():
+        return outside(*args)
     return lax.cond(inside_p.bind(jax.tree.leaves(args)[0]), inside, outside, *args)
 
 

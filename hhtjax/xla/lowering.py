@@ -105,22 +105,26 @@ def _may_be_divided(call):
 
 
 def _as_stage(function):
-    """The function with a second result."""
+    """The function with a second result, an element that costs nothing to have."""
     (body,) = function.regions[0]
     with function.location:
-        _return_also(function, list(body.operations[len(body.operations) - 1].operands))
+        _return_also(function, _cheap(body.arguments, body.operations[len(body.operations) - 1].operands))
     return function
 
 
 def _call_stage(replaced, reference):
     """A call of the stage in the place of each of these operations."""
     for op in replaced:
-        results = [x.type for x in op.results]
+        (cheap,) = _cheap(op.operands, op.results)
         with op.location, ir.InsertionPoint(op):
-            call = func.CallOp([*results, _element(op.results[0])], reference, list(op.operands))
+            call = func.CallOp([op.results[0].type, _element(cheap)], reference, list(op.operands))
         _compute_once(call.operation)
         op.results[0].replace_all_uses_with(call.results[0])
         op.erase()
+
+
+def _cheap(operands, results):
+    return [next((x for x in operands if size(x)), results[0])]
 
 
 def _make_kernel(module, call):

@@ -119,6 +119,32 @@ def _reduction(name):
     return rule
 
 
+def _choice(name):
+    """The largest or the smallest, with JAX's derivative: equal ones share it, and what is not a number stays so."""
+
+    @jax.custom_jvp
+    def chosen(*x):
+        return reduce(LAX[name], x)
+
+    @chosen.defjvp
+    def _(x, dx):
+        found = chosen(*x)
+        here = [lax.convert_element_type(lax.eq(y, found), found.dtype) for y in x]
+        return found, lax.div(reduce(lax.add, map(lax.mul, dx, here)), reduce(lax.add, here))
+
+    fold = _reduction(name)
+
+    def rule(eqn, x):
+        out = eqn.outvars[0].aval
+        if not jnp.issubdtype(out.dtype, jnp.floating):
+            return fold(eqn, x)
+        axes = eqn.params["axes"]
+        rows = _rows(x, [i for i in range(x.ndim) if i not in axes], axes)
+        return [arranged([row[0] if len(row) == 1 else chosen(*map(unmarked, row)) for row in rows], out.shape)]
+
+    return rule
+
+
 def _rows(x, first, last):
     """x as a matrix, the axes `first` along its columns, `last` along its rows."""
     lengths = [math.prod(x.shape[i] for i in axes) for axes in (first, last)]
@@ -242,7 +268,8 @@ RULES = {
         "pad": _moved(0, 1),
         "scatter": _moved(0, 2),
     },
-    **{f"reduce_{kind}": _reduction(kind) for kind in ("max", "min", "and", "or")},
+    **{f"reduce_{kind}": _reduction(kind) for kind in ("and", "or")},
+    **{f"reduce_{kind}": _choice(kind) for kind in ("max", "min")},
     **{"reduce_sum": _reduction("add"), "reduce_prod": _reduction("mul")},
     "hhtjax_structural": _structural,
 }

@@ -1,6 +1,7 @@
 """A candidate for a kernel, compiled alone: XLA would fail on a whole program, of which the user knows no part."""
 
 from functools import lru_cache
+from typing import Any
 
 from jax.extend import backend
 from jaxlib.mlir import ir
@@ -8,7 +9,7 @@ from jaxlib.mlir.dialects import func
 
 from hhtjax.xla.inspection import callee
 
-OPTIONS = {"xla_backend_optimization_level": 0}  # less to do, the same refusals
+OPTIONS: Any = {"xla_backend_optimization_level": 0}  # less to do, the same refusals
 
 
 class Module:

@@ -1,0 +1,57 @@
+"""For every test and doctest: double precision, no silent promotion of ranks or dtypes, programs compiled quickly."""
+
+import ctypes
+import gc
+import importlib.util
+import mmap
+import os
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+# Most of the time goes into compiling small programs, which need not run fast. `XLA_FLAGS=` of one's own comes first.
+QUICK = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": "false"}
+LARGE = 1_000_000_000  # bytes of a test process, above which it forgets its compiled programs
+
+
+def is_known(flag):
+    """Whether this XLA knows a flag: it ends the process over one that it does not."""
+    libraries = Path(importlib.util.find_spec("jaxlib").origin).parent.glob("*.so")
+    for library in libraries:
+        with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            if content.find(flag.encode()) >= 0:
+                return True
+    return False
+
+
+def set_flags():
+    """Before JAX starts; processes that tests start inherit them."""
+    given = os.environ.get("XLA_FLAGS", "")
+    added = [f"--{name}={value}" for name, value in QUICK.items() if name not in given and is_known(name)]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+
+
+set_flags()
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def memory():
+    """Bytes that this process holds; 0 where the system does not tell."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Between two files, if need be, the programs compiled so far are forgotten."""
+    if (nextitem is None or nextitem.path != item.path) and memory() > LARGE:
+        jax.clear_caches()
+        gc.collect()
+        if sys.platform == "linux":  # what is free goes back to the system
+            getattr(ctypes.CDLL(None), "malloc_trim", int)(0)

@@ -1,0 +1,59 @@
+"""Any optax optimiser on the cost; like Levenberg-Marquardt, a `lax.while_loop` that ends with a code."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+
+from hhtjax.identification.progress import (
+    BAD_START,
+    COST,
+    GRADIENT,
+    LIMIT,
+    NO_INFLUENCE,
+    RUNNING,
+    STUCK,
+    History,
+    record,
+    show,
+)
+
+
+def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, patience=5):
+    """An optax optimiser on the cost; returns the best point it saw."""
+    optimizer = optax.with_extra_args_support(optimizer)
+    running = jnp.asarray(RUNNING, jnp.int32)
+
+    def cost(x):
+        return objective.cost(f(x))
+
+    def unfinished(carry):
+        return carry[-1] == RUNNING
+
+    def improve(carry):
+        x, state, best, before, step, quiet, iteration, history, _ = carry
+        value, gradient = jax.value_and_grad(cost)(x)
+        best = jax.tree.map(partial(jnp.where, value < best[1]), (x, value), best)
+        history = record(history, iteration, value, step, None)
+        quiet = jnp.where(jnp.abs(before - value) <= tolerance * value, quiet + 1, 0)
+        code = jnp.where(iteration == max_iterations, LIMIT, running)
+        code = jnp.where(quiet >= patience, COST, code)
+        level = jnp.where((iteration == 0) & (value > 0), NO_INFLUENCE, GRADIENT)
+        code = jnp.where(jnp.all(gradient == 0), level, code)
+        code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
+        if progress:
+            show(iteration, value, step)
+        updates, state = optimizer.update(gradient, state, x, value=value, grad=gradient, value_fn=cost)
+        updates = jnp.where(code == RUNNING, jnp.asarray(updates), 0)
+        iteration = jnp.where(code == RUNNING, iteration + 1, iteration)
+        return x + updates, state, best, value, jnp.max(jnp.abs(updates)), quiet, iteration, history, code
+
+    infinity = jnp.asarray(jnp.inf, x.dtype)
+    empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
+    begin = x, optimizer.init(x), (x, infinity), infinity, jnp.zeros((), x.dtype)
+    zero = jnp.zeros((), jnp.int32)
+    carry = (*begin, zero, zero, History(empty, empty, None), running)
+    _, _, (x, _), _, _, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
+    return x, history, iterations, code

@@ -1,0 +1,72 @@
+"""Robust losses, and the cost that a fit lowers: 1/2 sum rho((w r)^2)."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+def huber(z):
+    """z up to 1, then 2 sqrt(z) - 1: the square of a small residual, the size of a large one."""
+    return jnp.where(z <= 1, z, 2 * jnp.sqrt(jnp.maximum(z, 1)) - 1)
+
+
+def soft_l1(z):
+    """2 (sqrt(1 + z) - 1): Huber's loss made smooth."""
+    return 2 * z / (jnp.sqrt(1 + z) + 1)
+
+
+LOSSES = {"huber": huber, "soft_l1": soft_l1, "cauchy": jnp.log1p}
+LEAST_BEND = 0.1  # share of rho' that rho' + 2 rho'' z is taken to have at least, in a step
+
+
+class Objective(NamedTuple):
+    """1/2 sum rho(z) with z = (w r)^2 for the first `data` residuals, and rho(z) = z for the others, the priors."""
+
+    weights: Any  # (m,); 0: missing, whatever the residual
+    loss: Callable | None
+    data: int
+
+    def scaled(self, r):
+        """w r, with 0 in the place of what is missing; r may be a Jacobian."""
+        w = self.weights.reshape(-1, *(1,) * (r.ndim - 1))
+        return jnp.where(w == 0, 0, w * r)
+
+    def losses(self, r):
+        """rho of each residual, and its first two derivatives."""
+        z = self.scaled(r) ** 2
+        ones = jnp.ones_like(z)
+        loss = self.loss
+        if loss is None:
+            return z, ones, 0 * z
+
+        def rho(z):
+            return jnp.concatenate([loss(z[: self.data]), z[self.data :]])
+
+        (value, slope), (_, curvature) = jax.jvp(lambda z: jax.jvp(rho, (z,), (ones,)), (z,), (ones,))
+        return value, slope, curvature
+
+    def cost(self, r):
+        """1/2 sum rho."""
+        return jnp.sum(self.losses(r)[0]) / 2
+
+    def least_squares(self, r, J):
+        """(r, J) of an ordinary least-squares problem with the same gradient J^T r.
+
+        The rows of J are scaled by sqrt(rho' + 2 rho'' z) (Triggs et al. 2000, Sec. 4.3), but not far below the
+        sqrt(rho') of iterative reweighting: so the length of r stays that of the gradient's own residual.
+        """
+        if self.loss is None:
+            return self.scaled(r), self.scaled(J)
+        r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
+        row = jnp.sqrt(jnp.maximum(slope + 2 * curvature * r**2, LEAST_BEND * slope))
+        return slope * r / jnp.where(row == 0, 1, row), J * row[:, None]
+
+    def estimating(self, r, J):
+        """w J, and the first and second derivative of the loss of each weighted residual (None without a loss: 1).
+
+        With them J^T pull is the gradient of the cost, and J^T diag(bend) J its second derivative.
+        """
+        r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
+        return J, slope * r, None if self.loss is None else slope + 2 * curvature * r**2

@@ -1,0 +1,42 @@
+"""How a fit went: why it ended, its history, and what it shows on the way."""
+
+import sys
+from typing import Any, NamedTuple
+
+import jax
+
+RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE = range(8)
+REASONS = {
+    RUNNING: "still running",
+    COST: "converged: the cost changes by less than tolerance",
+    STEP: "converged: the step is smaller than tolerance",
+    GRADIENT: "converged: the gradient vanishes to within tolerance",
+    LIMIT: "stopped: max_iterations reached",
+    STUCK: "stopped: no step lowers the cost",
+    BAD_START: "failed: the residual is not finite at params0",
+    NO_INFLUENCE: "failed: no parameter changes the residual at params0",
+}
+
+
+class History(NamedTuple):
+    """Per iteration, the start first: cost; largest entry of the step in the scaled coordinates, 0 where it was
+    taken back; and the damping of Levenberg-Marquardt (None for optax)."""
+
+    cost: Any
+    step: Any
+    damping: Any
+
+
+def record(history, i, *values):
+    """The history with the values of iteration i; None where there are none."""
+    return History(*(None if x is None else x.at[i].set(value) for x, value in zip(history, values, strict=True)))
+
+
+def show(iteration, cost, step):
+    """A line on stderr."""
+
+    def tell(iteration, cost, step):
+        what = f"step {float(step):.3g}" if step else "no step" if iteration else "start"
+        print(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", file=sys.stderr, flush=True)
+
+    jax.debug.callback(tell, iteration, cost, step)

@@ -1,0 +1,65 @@
+"""Inputs that are held, `sampled(order=0)` in params: constant over a step, and a jump between two steps.
+
+A step that ends on a jump must not see the new value at its end, nor the next one the old value at its start. So a step
+gets the value in its middle, and where that differs from the step's before, the accelerations and multipliers that the
+state carries on take the jump along: M dw - B^T dL = Q(new) - Q(old), B dw = 0.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.numerics.linear_solve import solve
+from hhtjax.systems.constraints import factorize_constrained, saddle_point
+from hhtjax.systems.sampled import Sampled
+
+
+def holds(params):
+    """Whether there is a held input among the params."""
+    return any(map(_is_held, jax.tree.leaves(params, is_leaf=_is_held)))
+
+
+def held_at(params, t):
+    """The params with each held input constant, at its value at t."""
+    return jax.tree.map(lambda x: _constant(x, t) if _is_held(x) else x, params, is_leaf=_is_held)
+
+
+def before(params, t, dt):
+    """The params of a step that ends at t."""
+    return held_at(params, t - dt / 2) if holds(params) else params
+
+
+def bind(stepper, system, params, dt):
+    """`stepper.bind`, with held inputs constant over each step."""
+    if not holds(params):
+        return stepper.bind(system, params, dt)
+
+    def step(s):
+        now = held_at(params, s.t + dt / 2)
+        s = _jump(stepper, system, s, before(params, s.t, dt), now)
+        return stepper.bind(system, now, dt)(s)
+
+    return step
+
+
+def _jump(stepper, system, s, old, new):
+    """The state with the accelerations and multipliers that belong to the new params."""
+    dQ = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old)
+    if system.num_constraints:
+        rows = jnp.zeros(system.num_constraints, dQ.dtype)
+        ways = factorize_constrained(system.size, stepper.redundant)
+        dw, dL = saddle_point(system, s.q, s.t, new, dQ, rows, ways)
+        s = s._replace(L=s.L + dL)
+    else:
+        M = system.mass(s.q, new)
+        dw = dQ / M if M.ndim == 1 else solve(M, dQ)
+    return s._replace(w=s.w + dw, a=None if s.a is None else s.a + dw)
+
+
+def _is_held(x):
+    return isinstance(x, Sampled) and jnp.ndim(x.polynomials) > 1 and jnp.shape(x.polynomials)[1] == 1
+
+
+def _constant(x, t):
+    return replace(x, polynomials=x(t)[None, None])

@@ -1,0 +1,123 @@
+"""Held inputs: steps that end on the jumps keep the order of the method."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from hhtjax.scenes import pendulum
+
+VALUES = 3 * np.random.default_rng(0).normal(size=6)
+STEPPERS = {
+    "alpha = 0": hhtjax.hht(0.0),
+    "alpha = -.05": hhtjax.hht(-0.05),
+    "alpha = -.3": hhtjax.hht(-0.3),
+    "converged": hhtjax.hht(-0.3, iterations=None),
+    "newmark": hhtjax.newmark(),
+    "generalized_alpha": hhtjax.generalized_alpha(0.5),
+    "wilson": hhtjax.wilson(),
+    "conventional_hht": hhtjax.conventional_hht(),
+    "rowda": hhtjax.rowda(),
+    "rk4": hhtjax.rk4(),
+}
+
+
+def mass(q, params):
+    c = jnp.cos(q[0] - q[1])
+    return jnp.stack([jnp.stack([2.0 + 0 * c, c]), jnp.stack([c, 1.0 + 0 * c])])
+
+
+def force(q, v, t, params):
+    return jnp.stack([params["u"](t) - 9 * jnp.sin(q[0]) - 0.3 * v[0], -20 * q[1] - q[1] ** 3])
+
+
+SYSTEM = hhtjax.System(mass, force)
+
+
+def end(stepper, steps, values=VALUES, system=SYSTEM, q0=(0.4, -0.3), v0=(0.0, 1.0)):
+    """q and v after five samples, each of so many steps."""
+    params = {"u": hhtjax.sampled(jnp.asarray(values), 0.1, order=0)}
+    run = hhtjax.simulate(
+        system, stepper, jnp.array(q0), jnp.array(v0), params, dt=0.1 / steps, num_steps=5 * steps, save_every=steps
+    )
+    return jnp.concatenate([run.q[-1], run.v[-1]])
+
+
+@pytest.mark.parametrize("name", STEPPERS)
+def test_order_is_kept(name):
+    stepper, steps = STEPPERS[name], (4, 8) if name == "rk4" else (16, 32)
+    exact = end(hhtjax.rk4(), 128)
+    coarse, fine = (np.abs(end(stepper, k) - exact).max() for k in steps)
+    assert abs(np.log2(coarse / fine) - stepper.order) < 0.15
+
+
+def test_first_order_systems_too():
+    system = hhtjax.FirstOrderSystem(lambda y, t, params: params["u"](t) - y - y**3)
+    params = {"u": hhtjax.sampled(jnp.asarray(VALUES), 0.1, order=0)}
+
+    def end(stepper, steps):
+        return hhtjax.simulate(
+            system, stepper, jnp.array(0.3), params=params, dt=0.1 / steps, num_steps=5 * steps, save_every=steps
+        ).q[-1]
+
+    exact = end(hhtjax.rk4(), 64)
+    coarse, fine = (abs(end(hhtjax.hht(-0.3), k) - exact) for k in (16, 32))
+    assert abs(np.log2(coarse / fine) - 2) < 0.15
+
+
+def test_with_constraints_multipliers_jump_too():
+    """A pendulum pushed by a held force: the position after each sample, of second order."""
+    scene = pendulum.cartesian()
+
+    def pushed(q, v, t, params):
+        return scene.system.force(q, v, t, scene.params) + jnp.stack([params["u"](t), 0.0 * t])
+
+    system = hhtjax.System(
+        lambda q, p: scene.system.mass(q, scene.params),
+        pushed,
+        lambda q, t, p: scene.system.constraint(q, t, scene.params),
+    )
+    start = {"system": system, "q0": scene.q0, "v0": scene.v0}
+    exact = end(hhtjax.hht(0.0), 256, **start)
+    coarse, fine = (np.abs(end(hhtjax.hht(-0.05), k, **start) - exact).max() for k in (8, 16))
+    assert abs(np.log2(coarse / fine) - 2) < 0.15
+
+
+def test_step_by_step_a_sweep_and_a_batch_are_the_run():
+    stepper, start = STEPPERS["alpha = -.3"], (jnp.array([0.4, -0.3]), jnp.array([0.0, 1.0]))
+    params = {"u": hhtjax.sampled(jnp.asarray(VALUES), 0.1, order=0)}
+    run = hhtjax.simulate(SYSTEM, stepper, *start, params, dt=0.05, num_steps=10)
+    state = stepper.init(SYSTEM, *start, params, dt=0.05)
+    step = jax.jit(lambda state: stepper.step(SYSTEM, state, params, 0.05)[0])
+    for _ in range(10):
+        state = step(state)
+    np.testing.assert_allclose(state.q, run.q[-1], rtol=1e-12)
+    runs = hhtjax.sweep(SYSTEM, stepper, *start, params, dts=jnp.array([0.05, 0.1]), times=jnp.array([0.1, 0.3, 0.5]))
+    np.testing.assert_allclose(runs.q[0], run.q[np.array([0, 2, 6, 10])], rtol=1e-12)
+    batch = jax.vmap(lambda scale: end(stepper, 2, scale * VALUES))(jnp.array([1.0, 0.5]))
+    np.testing.assert_allclose(batch[0], jnp.concatenate([run.q[-1], run.v[-1]]), rtol=1e-12)
+    np.testing.assert_allclose(batch[1], end(stepper, 2, 0.5 * VALUES), rtol=1e-12)
+
+
+def test_derivatives_in_the_values():
+    def f(values):
+        return jnp.sum(end(STEPPERS["alpha = -.05"], 2, values))
+
+    gradient = jax.jit(jax.grad(f))(jnp.asarray(VALUES))
+    tangent = jax.jit(lambda d: jax.jvp(f, (jnp.asarray(VALUES),), (d,))[1])(jnp.ones(6))
+    np.testing.assert_allclose(gradient.sum(), tangent, rtol=1e-10)
+    shift = 1e-5
+    difference = (f(jnp.asarray(VALUES + shift)) - f(jnp.asarray(VALUES - shift))) / (2 * shift)
+    np.testing.assert_allclose(tangent, difference, rtol=1e-7)
+
+
+def test_energy_balance_sees_one_value_in_each_interval():
+    """A free mass: the work of a held force is exact, because v is linear in time between the samples."""
+    params = {"u": hhtjax.sampled(jnp.asarray(VALUES), 0.1, order=0)}
+    system = hhtjax.System(np.ones(1), lambda q, v, t, params: params["u"](t)[None])
+    run = hhtjax.simulate(system, hhtjax.hht(), jnp.zeros(1), jnp.ones(1), params, dt=0.1, num_steps=5)
+    v = 1 + 0.1 * np.concatenate([[0], np.cumsum(VALUES[:5])])
+    np.testing.assert_allclose(run.v[:, 0], v, rtol=1e-12)
+    found = hhtjax.analysis.energy_balance(system, run, params)
+    np.testing.assert_allclose(found.error, 0, atol=1e-14)

@@ -1,0 +1,58 @@
+"""Batched loops and empty arrays in what a user writes: as on plain JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+
+
+def counted(q, v, t, params):
+    """Each coordinate halved as often as it says."""
+    return -params * jax.vmap(lambda x: jax.lax.fori_loop(0, jnp.where(x > 0.5, 3, 2), lambda i, c: c / 2, x))(q)
+
+
+def until(q, v, t, params):
+    """Each coordinate halved until it is small."""
+    return -params * jax.vmap(lambda x: jax.lax.while_loop(lambda c: jnp.abs(c) > 0.3, lambda c: c / 2, x))(q)
+
+
+def nothing(q, v, t, params):
+    """Empty arrays made, taken apart, joined, summed and multiplied."""
+    empty = q[:0]
+    return -params * (q + jnp.sum(jnp.sin(empty)) + jnp.concatenate([empty, q]) + jnp.zeros((3, 0)) @ empty)
+
+
+@pytest.mark.parametrize("force", [counted, until, nothing])
+def test_they_give_what_plain_jax_gives(force):
+    system = hhtjax.System(jnp.ones(3), force)
+    q0 = jnp.array([0.1, 0.5, 1.0])
+
+    def end(params):
+        return hhtjax.simulate(system, hhtjax.rk4(), q0, 0 * q0, params, dt=0.01, num_steps=5).q[-1]
+
+    def all_of(params):
+        return end(params), jax.jvp(end, (params,), (params,)), jax.vmap(end)(jnp.stack([params, 2 * params]))
+
+    found = jax.jit(all_of)(1.5)
+    with hhtjax.plain():
+        expected = jax.jit(all_of)(1.5)
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert np.allclose(x, y, rtol=1e-12, atol=0)
+
+
+def test_a_leaf_of_no_coordinates():
+    """In a long run, in its gradient, and in a sweep; alone it would be no system."""
+    system = hhtjax.System(jnp.ones(2), lambda q, v, t, params: {"a": -params * q["a"], "none": q["none"]})
+    q0 = {"a": jnp.array([1.0, 2.0]), "none": jnp.zeros(0)}
+    v0 = jax.tree.map(jnp.zeros_like, q0)
+
+    def run(params):
+        return hhtjax.simulate(system, hhtjax.hht(), q0, v0, params, dt=0.01, num_steps=80)
+
+    assert run(1.0).q["none"].shape == (81, 0)
+    assert jnp.isfinite(jax.grad(lambda params: jnp.sum(run(params).q["a"]))(1.0))
+    sweep = hhtjax.sweep(system, hhtjax.hht(), q0, v0, 1.0, dts=jnp.array([0.01, 0.02]), duration=0.8, num_samples=40)
+    assert sweep.q["none"].shape == (2, 41, 0)
+    assert np.allclose(sweep.q["a"][0], run(1.0).q["a"][::2], rtol=1e-12)
