@@ -162,7 +162,9 @@ class Case:
         self.f = lambda *args: structure.unflatten(jaxpr_as_fun(closed)(*args))  # quicker than to trace f anew
         self.sizes = {k: sum(x.size for x in self.args if is_float(x) == k) for k in (True, False)}
         self.mode, self.plain = self._most()
-        single = any(getattr(v.aval, "dtype", None) == np.float32 for e in everywhere(self.plain.jaxpr) for v in e.outvars)
+        single = any(
+            getattr(v.aval, "dtype", None) == np.float32 for e in everywhere(self.plain.jaxpr) for v in e.outvars
+        )
         self.rtol = 5e-4 if single or any(x.dtype == np.float32 for x in self.args) else RTOL
 
     def _most(self):
@@ -188,7 +190,11 @@ class Case:
         return parts
 
     def derivatives(self, column):
-        return traced(self.mode(column(self.f)), self.args)[0], self.args, lambda numbers: numbers(self.plain, *self.args)
+        return (
+            traced(self.mode(column(self.f)), self.args)[0],
+            self.args,
+            lambda numbers: numbers(self.plain, *self.args),
+        )
 
     def batch(self, column):
         members = [member(self.args, i) for i in (0, 1)]
@@ -197,7 +203,7 @@ class Case:
         parts = 3 if mode is forward else 2 if self.mode is reverse else 1
 
         def expected(numbers):
-            each = [sum(self.parts(numbers(self.plain, *x))[:parts], []) for x in members]
+            each = [[y for part in self.parts(numbers(self.plain, *x))[:parts] for y in part] for x in members]
             return [np.stack(y) for y in zip(*each, strict=True)]
 
         return trace, [np.stack(x) for x in zip(*members, strict=True)], expected
@@ -239,7 +245,9 @@ def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
         if directions:
             with np.errstate(all="ignore"):
                 M = found[0].astype(float)
-                found = [np.where(np.isfinite(A).all(1), A @ d, np.nan) for A, d in zip((M, M.T), directions, strict=True)]
+                found = [
+                    np.where(np.isfinite(A).all(1), A @ d, np.nan) for A, d in zip((M, M.T), directions, strict=True)
+                ]
         verdict, expected = judge(found, reference, 0 if directions else max(1, sum(case.lengths[:2])), case.rtol)
         count[verdict] += 1
         if verdict.startswith("different"):

@@ -31,7 +31,13 @@ def _filling(fill, dtype):
         return fill
     if np.issubdtype(dtype, np.inexact):
         return np.nan
-    return True if dtype == bool else np.iinfo(dtype).min if np.issubdtype(dtype, np.signedinteger) else np.iinfo(dtype).max
+    return (
+        True
+        if dtype.kind == "b"
+        else np.iinfo(dtype).min
+        if np.issubdtype(dtype, np.signedinteger)
+        else np.iinfo(dtype).max
+    )
 
 
 def gather(eqn, x, indices):

@@ -5,6 +5,8 @@ Each is Python in variables of `ARGUMENTS`; those it names are arguments of the 
 
 import numpy as np
 
+# ruff: noqa: E501
+
 NAN, INF = np.nan, np.inf
 ARGUMENTS = {
     "s": np.array(0.7),

@@ -146,7 +146,11 @@ class Program:
             self.scope["refused"](lines, error)
             raise Refused from None
         value = local[name]
-        if isinstance(value, (tuple, list)) or not hasattr(value, "shape") or value.size > KEPT * self.choice([1] * 24 + [30]):
+        if (
+            isinstance(value, (tuple, list))
+            or not hasattr(value, "shape")
+            or value.size > KEPT * self.choice([1] * 24 + [30])
+        ):
             raise Refused
         self.lines += ["    " + x for x in lines]
         self.names[name] = value

@@ -67,8 +67,10 @@ def _kind(difference):
 
 def report(seed, text, args, difference):
     """A program that can be run, and what was found."""
-    numbers = [f"{name} = np.array({x.tolist()}, {str(x.dtype)!r})" + (f".reshape({x.shape})" if 0 in x.shape else "")
-               for name, x in zip("xyk", args, strict=True)]
+    numbers = [
+        f"{name} = np.array({x.tolist()}, {str(x.dtype)!r})" + (f".reshape({x.shape})" if 0 in x.shape else "")
+        for name, x in zip("xyk", args, strict=True)
+    ]
     print(f"# {'-' * 20} seed {seed}: {difference.column}, {difference.mode}", text, *numbers, sep="\n")
     print("# found", difference.found, "\n# expected", difference.expected, flush=True)
 

@@ -17,8 +17,12 @@ pytestmark = [
 
 @pytest.mark.slow
 @settings(
-    max_examples=100, derandomize=True, deadline=None, database=None,
-    phases=[Phase.generate], suppress_health_check=list(HealthCheck),
+    max_examples=100,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    phases=[Phase.generate],
+    suppress_health_check=list(HealthCheck),
 )  # without shrinking: programs.py does it by lines, in a moment
 @given(st.randoms(use_true_random=False), st.integers(3, 10))
 def test_same_numbers(rng, lines):

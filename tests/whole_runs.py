@@ -135,7 +135,10 @@ def main(number, seed):
         done += 1
         for way, mode, found, expected in compare(*run, modes=("value", MODES[1 + seed % 3]), count=count):
             different += 1
-            print(f"# {'-' * 20} run of seed {seed - 1}: {way}, {mode}\n{text}\n# found {found}\n# expected {expected}", flush=True)
+            print(
+                f"# {'-' * 20} run of seed {seed - 1}: {way}, {mode}\n{text}\n# found {found}\n# expected {expected}",
+                flush=True,
+            )
         if done % 20 == 0:
             jax.clear_caches()
     print(f"{number} whole runs, {different} differences;", dict(count))
