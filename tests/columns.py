@@ -1,0 +1,296 @@
+"""The same function with the machinery and without, differentiated and vectorised, evaluated operation by operation.
+
+Columns: on scalars, in stages, whole (stages on scalars, as a run has them), and the matrix of its derivative. Modes:
+values with forward and reverse derivatives, vmap of values with forward derivatives. Both sides are traced, so that
+arguments are tracers, and evaluated with NumPy (by_numpy.py). They shall agree to 1e-12 of the largest number in each
+array (single precision: to 5e-4); NaN, infinities and, in values, signs of zeros exactly. One licence: where a
+derivative is NaN, another number may stand, for what is known to be zero is not multiplied. And rounding may be
+magnified: a larger difference counts only if the plain program, disturbed by single roundings, stays far nearer.
+"""
+
+import traceback
+from collections import Counter
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from by_numpy import Numbers, is_close, signs
+from jax.extend.core import jaxpr_as_fun
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.xla.kernels import STAGED, staged
+from hhtjax.xla.linear_maps import linear_map
+from hhtjax.xla.scalars import by_scalars, join, split
+from hhtjax.xla.sharing import in_stages
+
+RTOL = 1e-12
+
+
+class Difference(NamedTuple):
+    """Where a function does not give the same: column, mode, what was found and expected (a traceback, and None)."""
+
+    column: str
+    mode: str
+    found: Any
+    expected: Any
+
+
+def on_scalars(f):
+    return lambda *args: join(by_scalars(f)(*split(args)))
+
+
+def stages(f):
+    def g(*args):
+        back = jax.tree.structure(jax.eval_shape(f, *args))
+        return back.unflatten(in_stages(STAGED, lambda *args: jax.tree.leaves(f(*args)), *args))
+
+    return g
+
+
+def whole(f):
+    return on_scalars(staged(f))
+
+
+COLUMNS = {"on scalars": on_scalars, "in stages": stages, "whole": whole}
+
+
+# Modes: functions of the same arguments, made of a function.
+
+
+def is_float(x):
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def _of_floats(f, args):
+    """(f of the floating-point arguments alone, to what is floating-point and the rest; those arguments)."""
+    at = [x for x in args if is_float(x)]
+
+    def g(*at):
+        floats = iter(at)
+        results = jax.tree.leaves(f(*(next(floats) if is_float(x) else x for x in args)))
+        return [y for y in results if is_float(y)], [y for y in results if not is_float(y)]
+
+    return g, at
+
+
+def direction(x):
+    """An array like this, of numbers without meaning."""
+    size = int(np.prod(x.shape))
+    return np.cos(1.0 + 2.0 * np.arange(size)).reshape(x.shape).astype(x.dtype)
+
+
+def forward(f):
+    def g(*args):
+        h, at = _of_floats(f, args)
+        values, along, others = jax.jvp(h, at, [*map(direction, at)], has_aux=True)
+        return others, values, along
+
+    return g
+
+
+def both(f):
+    """Forward, and back."""
+
+    def g(*args):
+        h, at = _of_floats(f, args)
+        values, tangent, others = jax.linearize(h, *at, has_aux=True)
+        back = jax.linear_transpose(tangent, *at)([*map(direction, values)])
+        return others, values, tangent(*map(direction, at)), back
+
+    return g
+
+
+def reverse(f):
+    """Where forward mode is not defined."""
+
+    def g(*args):
+        h, at = _of_floats(f, args)
+        values, pull, others = jax.vjp(h, *at, has_aux=True)
+        return others, values, [], pull([*map(direction, values)])
+
+    return g
+
+
+def value(f):
+    return lambda *args: (jax.tree.leaves(f(*args)),)
+
+
+def matrix(f):
+    """Of the derivative of all floating-point results, in all such arguments."""
+
+    def g(*args):
+        h, at = _of_floats(f, args)
+        z, back = ravel_pytree(at)
+        tangent = jax.linearize(lambda z: ravel_pytree(h(*back(z))[0])[0], z)[1]
+        return linear_map(tangent, z)
+
+    return g
+
+
+def member(args, i):
+    """Arguments of member 0, as given, or 1."""
+    if i == 0:
+        return list(args)
+    return [np.flip(x) if x.ndim else ~x if x.dtype == bool else x / 2 if is_float(x) else (x + 1) // 2 for x in args]
+
+
+# Comparison.
+
+
+def traced(f, args):
+    """The program of f, and its results without values."""
+    return jax.make_jaxpr(f, return_shape=True)(*args)
+
+
+def everywhere(jaxpr):
+    """Its operations, those of functions within it included."""
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in jax.tree.leaves(list(eqn.params.values())):
+            if hasattr(inner, "eqns"):
+                yield from everywhere(getattr(inner, "jaxpr", inner))
+
+
+class Case:
+    """A function and its arguments, and what plain JAX makes of them."""
+
+    def __init__(self, f, args):
+        self.args = [np.asarray(x) for x in args]
+        closed, shape = traced(f, self.args)
+        structure = jax.tree.structure(shape)
+        self.f = lambda *args: structure.unflatten(jaxpr_as_fun(closed)(*args))  # quicker than to trace f anew
+        self.sizes = {k: sum(x.size for x in self.args if is_float(x) == k) for k in (True, False)}
+        self.mode, self.plain = self._most()
+        single = any(
+            getattr(v.aval, "dtype", None) == np.float32 for e in everywhere(self.plain.jaxpr) for v in e.outvars
+        )
+        self.rtol = 5e-4 if single or any(x.dtype == np.float32 for x in self.args) else RTOL
+
+    def _most(self):
+        """The mode with most derivatives that plain JAX takes."""
+        modes = (both, forward, reverse) if self.sizes[True] else ()
+        for mode in (*modes, value):
+            try:
+                trace, shape = traced(mode(self.f), self.args)
+                Numbers()(trace, *self.args)
+            except Exception as error:  # no derivative, of a loop for one
+                reason = error
+                continue
+            self.lengths = [len(part) for part in shape]
+            return mode, trace
+        raise NotImplementedError(f"plain JAX does not run this: {reason}")
+
+    def parts(self, results):
+        """Results as lists: others, values, along, back; or values alone."""
+        parts, results = [], list(results)
+        for n in self.lengths:
+            parts.append(results[:n])
+            results = results[n:]
+        return parts
+
+    def derivatives(self, column):
+        return (
+            traced(self.mode(column(self.f)), self.args)[0],
+            self.args,
+            lambda numbers: numbers(self.plain, *self.args),
+        )
+
+    def batch(self, column):
+        members = [member(self.args, i) for i in (0, 1)]
+        mode = forward if self.mode in (both, forward) else value
+        trace = traced(jax.vmap(mode(column(self.f))), [np.stack(x) for x in zip(*members, strict=True)])[0]
+        parts = 3 if mode is forward else 2 if self.mode is reverse else 1
+
+        def expected(numbers):
+            each = [[y for part in self.parts(numbers(self.plain, *x))[:parts] for y in part] for x in members]
+            return [np.stack(y) for y in zip(*each, strict=True)]
+
+        return trace, [np.stack(x) for x in zip(*members, strict=True)], expected
+
+    def jacobian(self, column):
+        """Along the direction, and back, by the matrix."""
+        trace = traced(column(matrix(self.f)), self.args)[0]
+        ahead = np.concatenate([direction(x).ravel() for x in self.args if is_float(x)])
+
+        def expected(numbers):
+            _, _, along, back = self.parts(numbers(self.plain, *self.args))
+            along, back = ([np.ravel(y).astype(float) for y in part] for part in (along, back))
+            return [np.concatenate([*along, []]), np.concatenate([*back, []])]
+
+        _, values, *_ = self.parts(Numbers()(self.plain, *self.args))
+        behind = np.concatenate([*(direction(y).ravel() for y in values), []])
+        return trace, self.args, expected, ahead, behind
+
+
+def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
+    """The differences of a function.
+
+    rng: by which one column is taken for each mode, else all; count: of verdicts, updated; batched: columns under vmap.
+    """
+    count = Counter() if count is None else count
+    case = Case(f, args)
+    todo = {("derivatives", case.derivatives): tuple(COLUMNS), ("vmap", case.batch): batched}
+    if case.mode is both:
+        todo["matrix", case.jacobian] = "alone", "whole"
+    for (mode, make), name in [(key, x) for key, xs in todo.items() for x in (xs if rng is None else [rng.choice(xs)])]:
+        column = COLUMNS.get(name, lambda f: f)
+        try:
+            trace, at, reference, *directions = make(column)
+            found = Numbers()(trace, *at)
+        except Exception as error:
+            count["error"] += 1
+            yield Difference(name, mode, "".join(traceback.format_exception(error)[-6:]), None)
+            continue
+        if directions:
+            with np.errstate(all="ignore"):
+                M = found[0].astype(float)
+                found = [
+                    np.where(np.isfinite(A).all(1), A @ d, np.nan) for A, d in zip((M, M.T), directions, strict=True)
+                ]
+        verdict, expected = judge(found, reference, 0 if directions else max(1, sum(case.lengths[:2])), case.rtol)
+        count[verdict] += 1
+        if verdict.startswith("different"):
+            yield Difference(name, mode, found, expected)
+
+
+def judge(found, reference, values, rtol):
+    """In a word, and what is expected. reference: Numbers -> that; values: how many are no derivatives."""
+    expected = reference(Numbers())
+    if len(found) != len(expected):
+        return "different number of results", expected
+    spread, is_matrix = None, values == 0
+    worst = "same"
+    for i, (a, b) in enumerate(zip(found, expected, strict=True)):
+        if i >= values and a.shape == b.shape:
+            known = ~np.isnan(b) & ~(np.isnan(a) & is_matrix)
+            a, b = np.where(known, a, 0), np.where(known, b, 0)
+        near = is_close(a, b, rtol)
+        if near and (i >= values or np.array_equal(signs(a), signs(b))):
+            continue
+        if a.shape != b.shape or a.dtype != b.dtype:
+            return "different", expected
+        if spread is None:
+            spread = [reference(Numbers(np.random.default_rng(i))) for i in range(6)]
+        others = [x[i] for x in spread]
+        if near:
+            if not any((signs(x) != signs(b)).any() for x in others):
+                return "different signs of zero", expected
+            worst = "zero by rounding"
+        elif not _within(a, b, others, rtol):
+            return "different", expected
+        else:
+            worst = "badly conditioned"
+    return worst, expected
+
+
+def _within(a, b, others, rtol):
+    """Whether a is as near to b as other roundings bring it."""
+    if not np.issubdtype(b.dtype, np.inexact):
+        return any((x != b).any() for x in others)
+    with np.errstate(all="ignore"):
+        if any((np.isfinite(x) != np.isfinite(b)).any() for x in others):
+            return True
+        finite = np.isfinite(b)
+        reach = max(np.abs(x - b)[finite].max(initial=0.0) for x in others)
+        return is_close(a, b, max(rtol, 30 * reach / max(np.abs(b)[finite].max(initial=0.0), 1e-300)))

@@ -1,0 +1,82 @@
+"""Every operation with a rule, with its options: the same with the machinery as without, in every column and mode."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from by_numpy import Numbers, is_close, signs
+from columns import RTOL, Case, compare, everywhere, traced, value
+from jax import lax
+from operations_table import ARGUMENTS, TABLE
+from program_writer import HEADER, usual_promotion
+
+from hhtjax.xla import gate, linear_maps, parameters, scalar_calls, scalar_rules
+from hhtjax.xla.kernels import staged, structural
+
+pytestmark = [
+    pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX"),
+    pytest.mark.filterwarnings("ignore"),  # NumPy's, about NaN, overflow, and division by zero
+]
+NAMES = re.compile(r"(?<![\w.'])[a-zA-Z](?![\w('])")
+# XLA takes z + 0 for z in a compiled program, and JAX one fill value for the other, since they compare as equal
+SIGNS_OF_XLA = ("z + 0.0", "0.0 + z", "z - -0.0", "fill_value=-0.0")
+
+
+def scope():
+    known = {"lax": lax, "jnp": jnp, "np": np, "jax": jax, "staged": staged, "structural": structural}
+    exec(HEADER, known)
+    return known
+
+
+SCOPE = scope()
+
+
+def expression(text):
+    """The function of an expression, and its arguments: those of the table that it names."""
+    found = NAMES.findall(text)
+    names = [n for n in ARGUMENTS if n in found]
+    return eval(f"lambda {', '.join(names)}: {text}", SCOPE), [ARGUMENTS[n] for n in names]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", TABLE)
+def test_same_numbers(group):
+    with usual_promotion():
+        failures = [
+            f"{text}: {x.mode} {x.column}\n found {x.found}\n expected {x.expected}"
+            for text in TABLE[group]
+            for x in compare(*expression(text), batched=("whole",))
+        ]
+    assert not failures, f"{len(failures)}:\n" + "\n".join(failures)
+
+
+@pytest.fixture(scope="module")
+def cases():
+    """What plain JAX makes of the table: group -> list."""
+    with usual_promotion(), np.errstate(all="ignore"):
+        return {group: [Case(*expression(text)) for text in texts] for group, texts in TABLE.items()}
+
+
+@pytest.mark.slow
+def test_every_rule_has_its_rows(cases):
+    """Every operation that some rule is for occurs in the table or its derivatives, so a new rule comes with rows."""
+    rules = {*scalar_rules.RULES, *scalar_rules.NUMPY, *scalar_rules.SHORT, *scalar_calls.CALLS, *linear_maps.RULES}
+    programs = [case.plain.jaxpr for group in cases.values() for case in group]
+    assert rules | set(parameters.UNDERSTOOD) <= {eqn.primitive.name for x in programs for eqn in everywhere(x)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", TABLE)
+def test_the_witness_evaluates_as_xla_does(group, cases):
+    """Values by NumPy, on which the table rests, are those of plain JAX, compiled."""
+    known = cases[group]
+    results = jax.jit(lambda args: [jax.tree.leaves(case.f(*x)) for case, x in zip(known, args, strict=True)])
+    expected = results([case.args for case in known])
+    for text, case, ys in zip(TABLE[group], known, expected, strict=True):
+        xs = Numbers()(traced(value(case.f), case.args)[0], *case.args)
+        for x, y in zip(xs, map(np.asarray, ys), strict=True):
+            assert is_close(x, y, RTOL if case.rtol == RTOL else 1e-5), f"{text}: {x}, not {y}"
+            if not any(part in text for part in SIGNS_OF_XLA):
+                np.testing.assert_array_equal(signs(x), signs(y), text)

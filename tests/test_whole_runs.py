@@ -1,0 +1,65 @@
+"""Whole runs of the zoo: with the machinery, on plain JAX, and step by step, with forward derivatives and vmap."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import whole_runs
+import zoo
+from program_writer import usual_promotion
+
+import hhtjax
+from hhtjax.xla import gate
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")]
+STEPS = 8
+
+
+def step_by_step(problem, stepper, q0):
+    """Positions, by the two functions of a stepper."""
+    dt = problem.duration / 100
+    state = stepper.init(problem.system, q0, problem.v0, problem.params, dt)
+
+    def advance(state, _):
+        state, _ = stepper.step(problem.system, state, params=problem.params, dt=dt)
+        return state, state.q
+
+    return jnp.concatenate([q0[None], jax.lax.scan(advance, state, None, length=STEPS)[1]])
+
+
+def simulated(problem, stepper, q0):
+    dt = problem.duration / 100
+    system, params = problem.system, problem.params
+    return hhtjax.simulate(system, stepper, q0, problem.v0, params, dt=dt, num_steps=STEPS).q
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def everything(way, name, stepper):
+    """Positions, and their derivatives in q0, of a batch of two; steppers of one family are compiled once."""
+    problem = zoo.PROBLEMS[name]
+    q0 = jnp.stack([problem.q0, 0.7 * problem.q0])
+    return jax.vmap(lambda q0: jax.jvp(partial(way, problem, stepper), (q0,), (jnp.cos(q0),)))(q0)
+
+
+@pytest.mark.parametrize("name", ["forced double pendulum", "forced Duffing"])
+@pytest.mark.parametrize("stepper", zoo.STEPPERS)
+def test_same_three_ways(name, stepper):
+    stepper = zoo.as_data(zoo.STEPPERS[stepper])
+    fast = everything(simulated, name, stepper)
+    with hhtjax.plain():
+        plain = everything(simulated, name, stepper)
+    by_steps = everything(step_by_step, name, stepper)
+    for x, y, z in zip(fast, plain, by_steps, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(z, y, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_random_systems(seed):
+    """programs.py --whole-runs makes more of them."""
+    with usual_promotion():
+        _, *run = whole_runs.random_run(seed)
+        assert not list(whole_runs.compare(*run, modes=("value", "forward")))
