@@ -55,7 +55,7 @@ class Terms:
         shape, total = (self.n, *self.shape), self.full
         for (axis, offset), y in self.along.items():
             k, i = (lax.broadcasted_iota(jnp.int32, shape, j) for j in (0, axis + 1))
-            total = add_if_any(total, jnp.where(k == i + offset, y[None], zero_like(y)))
+            total = add_if_any(total, jnp.where(k == i + int(offset), y[None], zero_like(y)))
         return total
 
 
