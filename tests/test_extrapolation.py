@@ -9,7 +9,7 @@ from zoo import PROBLEMS, as_data, reference, run
 import hhtjax
 from hhtjax import rotation
 from hhtjax.runs.extrapolate import extrapolated
-from hhtjax.runs.simulate import Failure, Solution
+from hhtjax.runs.solution import Failure, Solution
 from hhtjax.steppers.stepper import Info
 
 DUFFING = PROBLEMS["forced Duffing"]
