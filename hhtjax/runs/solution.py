@@ -63,9 +63,8 @@ class Solution(NamedTuple):
         if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t)))):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         dt = np.asarray(self.dt)
-        if not np.all(np.isfinite(dt) & (dt > 0)):
-            bad = dt[~(np.isfinite(dt) & (dt > 0))].flat[0]
-            raise SimulationError(f"simulate: `dt` must be positive and finite; it was {bad:g}.")
+        if np.any(dt <= 0):  # what is not finite shows in the state
+            raise SimulationError(f"simulate: `dt` must be positive and finite; it was {dt[dt <= 0].flat[0]:g}.")
         steps = np.asarray(self.failure.step)
         strays = np.zeros_like(steps)
         if reach is not None:
