@@ -257,15 +257,17 @@ def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
         if verdict.startswith("different") and mode == "vmap":  # of members apart; vmap itself may bring NaN
             plain = case.batch(lambda f: f)[0]
             values = max(1, sum(case.lengths[:2]))
-            verdict, expected = judge(found, lambda numbers: numbers(plain, *at), values, case.rtol, case.has_sums)
+            verdict, expected = judge(
+                found, lambda numbers, at=at, plain=plain: numbers(plain, *at), values, case.rtol, case.has_sums
+            )
         count[verdict] += 1
         if verdict.startswith("different"):
             yield Difference(name, mode, found, expected)
 
 
 def judge(found, reference, values, rtol, has_sums):
-    """In a word, and what is expected. reference: Numbers -> that; values: how many are no derivatives; has_sums: the sign of a zero
-    is rounding."""
+    """In a word, and what is expected. reference: Numbers -> that; values: how many are no derivatives;
+    has_sums: the sign of a zero is rounding."""
     expected = reference(Numbers())
     if len(found) != len(expected):
         return "different number of results", expected
