@@ -1,12 +1,11 @@
 """The same function with the machinery and without, differentiated and vectorised, evaluated operation by operation.
 
-Columns: on scalars, in stages, whole (stages on scalars, as a run has them), and the matrix of its derivative. Modes:
-values with forward and reverse derivatives, vmap of values with forward derivatives. Both sides are traced, so that
-arguments are tracers, and evaluated with NumPy (by_numpy.py). They shall agree to 1e-12 of the largest number in each
-array (single precision: to 5e-4); NaN, infinities and, in values, signs of zeros exactly, but for the sign of a sum, which plain
-JAX leaves open (-0 - 0 is 0 by itself, -0 compiled). One licence: where a
-derivative is NaN, another number may stand, for what is known to be zero is not multiplied. And rounding may be
-magnified: a larger difference counts only if the plain program, disturbed by single roundings, stays far nearer.
+Columns: on scalars, in stages, whole (stages on scalars, as in a run), and the matrix of the derivative. Modes: values
+with forward and reverse derivatives; vmap of values with forward derivatives. Both sides are traced, so arguments are
+tracers, and evaluated with NumPy (by_numpy.py). They agree to 1e-12 of the largest number in an array (with single
+precision: 5e-4), in NaN and infinities, and values in signs of zeros, but for sums: -0 - 0 is 0 by itself, -0 compiled.
+One licence: where a derivative is NaN, another number may stand, for what is known to be zero is not multiplied. A
+larger difference counts only if the plain program, disturbed by single roundings, stays far nearer.
 """
 
 import traceback
@@ -54,9 +53,6 @@ def whole(f):
 
 
 COLUMNS = {"on scalars": on_scalars, "in stages": stages, "whole": whole}
-
-
-# Modes: functions of the same arguments, made of a function.
 
 
 def is_float(x):
@@ -134,9 +130,6 @@ def member(args, i):
     if i == 0:
         return list(args)
     return [np.flip(x) if x.ndim else ~x if x.dtype == bool else x / 2 if is_float(x) else (x + 1) // 2 for x in args]
-
-
-# Comparison.
 
 
 def traced(f, args):
