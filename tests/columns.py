@@ -264,8 +264,7 @@ def judge(found, reference, values, rtol, has_sums):
     expected = reference(Numbers())
     if len(found) != len(expected):
         return "different number of results", expected
-    spread, is_matrix = None, values == 0
-    worst = "same"
+    spread, is_matrix, worst = None, values == 0, "same"
     for i, (a, b) in enumerate(zip(found, expected, strict=True)):
         if i >= values and a.shape == b.shape:
             known = ~np.isnan(b) & ~(np.isnan(a) & is_matrix)
