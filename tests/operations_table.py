@@ -1,6 +1,7 @@
 """Expressions of every operation that hhtjax/xla has a rule for, with its options, for test_conformance.py.
 
 Each is Python in variables of `ARGUMENTS`; those it names are arguments of the traced function.
+Sums of negative zeros are not among them: plain JAX gives 0 by itself and -0 compiled.
 """
 
 import numpy as np
@@ -142,7 +143,7 @@ TABLE = {
         *(f"jnp.{f}(C, axis={a})" for f in ("sum", "prod", "max", "min") for a in ("0", "(0, 2)", "()", "-1")),
         *("jnp.sum(e)", "jnp.prod(e)", "jnp.sum(E, axis=1)", "jnp.sum(E, axis=0)", "jnp.all(E > 0)", "jnp.any(e > 0)"),
         *("jnp.max(E, axis=0)", "jnp.max(x, initial=9.0)", "jnp.min(X, axis=1, keepdims=True)", "jnp.sum(x, where=b)"),
-        *("jnp.sum(x, dtype=jnp.float32)", "jnp.sum(np.full(3, -0.0) * lax.abs(x))", "jnp.max(0.0 * w[:4])", "jnp.min(0 * w[:4])"),
+        *("jnp.sum(x, dtype=jnp.float32)", "jnp.max(0.0 * w[:4])", "jnp.min(0 * w[:4])"),
         *("jnp.max(s * np.ones(3))", "jnp.min(s * np.array([3.0, 1.0, 1.0, 1.0]))", "jnp.max(s * np.ones((2, 3)), axis=0)"),
         *("jnp.prod(0.0 * x)", "jnp.prod(x[:1] * np.array([1.0, 0.0, 2.0]))", "jnp.linalg.norm(0.0 * x + s)", "lax.max(x, x)"),
         *("lax.reduce_and(j, (0,))", "lax.reduce_or(j, (0,))", "lax.reduce_xor(j, (0,))", "lax.reduce_and(b, (0,))", "jnp.sum(l)"),
@@ -164,7 +165,7 @@ TABLE = {
         *("lax.dot_general(X, S, (((1,), (0,)), ((), ())), precision=lax.Precision.HIGHEST)", "lax.dot(x, i)", "b.astype(int) @ m"),
         *("lax.dot_general(x, y, (((0,), (0,)), ((), ())), precision=lax.DotAlgorithmPreset.F64_F64_F64)",),
         *("jnp.eye(3) @ x", "np.array([[0.0, 2.0, 0.0]]) @ z[:3]", "np.eye(9) @ z", "np.array([1.0, 0.0]) @ w[3:5]"),
-        *("np.full(2, -0.0) @ lax.abs(x[:2])", "np.array([[1.0, -0.0], [0.0, 1.0]]) @ z[3:5]", "jnp.zeros((3, 3)) @ x", "l @ l"),
+        *("np.array([[1.0, -0.0], [0.0, 1.0]]) @ z[3:5]", "jnp.zeros((3, 3)) @ x", "l @ l"),
     ],
     "functions": [
         *("lax.cond(d, lambda x: x * x, lambda x: -x, x)", "lax.cond(x[0] > 0, jnp.sin, jnp.cos, x)", "lax.cond(True, jnp.sin, jnp.cos, x)"),

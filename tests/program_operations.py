@@ -241,7 +241,7 @@ def gathered(p):
         at = p.choice([f":, {where(p, p.shape(x)[1])}", f"{at}, {p.indices(p.shape(x)[1], 1)[0]}", f"{at}, ::-1"])
     return p.choice([
         f"{x}[np.array({inside}, int)]",
-        f"{x}.at[{p.integer(0, n - 1) if n else ':'}].get(mode='promise_in_bounds')", 
+        f"{x}.at[{p.integer(0, n - 1) if n else ':'}].get(mode='promise_in_bounds')",
         *(f"{x}.at[{at}].get({mode(p)})" for _ in range(2)),
         f"jnp.take({x}, {where(p, n)}, axis=0, mode='{p.choice(['clip', 'fill', 'wrap'])}')",
         f"jnp.take_along_axis({x}, jnp.argsort({x}, axis=0), axis=0)",
