@@ -3,9 +3,7 @@
 import jax
 import numpy as np
 
-from hhtjax.numerics.linear_solve import (
-    solve,
-)
+from hhtjax.numerics.linear_solve import solve
 
 SIZES = range(1, 13)
 

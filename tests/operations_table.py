@@ -41,7 +41,17 @@ ROUNDINGS = ("AWAY_FROM_ZERO", "TO_NEAREST_EVEN")
 CONSTANTS = ("0.0", "-0.0", "1.0", "-1.0", "2.0", "jnp.inf", "-jnp.inf", "jnp.nan")
 # where the machinery may know what one operand is
 WITH_CONSTANTS = [f"{a} {o} {b}" for o in "+-*/" for k in CONSTANTS for a, b in (("z", k), (k, "z"))]
-AT = ("np.array([2, 0, 2])", "np.array([1, 5, -1])", "np.array([-4, 3, 9])", "i", "n", "p", "q", "1", "np.array([], int)")
+AT = (
+    "np.array([2, 0, 2])",
+    "np.array([1, 5, -1])",
+    "np.array([-4, 3, 9])",
+    "i",
+    "n",
+    "p",
+    "q",
+    "1",
+    "np.array([], int)",
+)
 HOW = ("mode='clip'", "mode='drop'", "mode='fill'")
 SURE = "mode='promise_in_bounds', indices_are_sorted=True, unique_indices=True"
 

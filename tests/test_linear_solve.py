@@ -18,14 +18,8 @@ from matrices import (
 )
 
 from hhtjax import explain
-from hhtjax.numerics.linear_solve import (
-    UNROLLED,
-    factorize,
-    factorize_with,
-    matvec,
-    solve,
-    solve_map,
-)
+from hhtjax.numerics.elimination import UNROLLED, factorize, matvec
+from hhtjax.numerics.linear_solve import factorize_with, solve, solve_map
 from hhtjax.xla import gate, kernels
 
 

@@ -8,11 +8,8 @@ from matrices import (
     random_matrix,
 )
 
-from hhtjax.numerics.linear_solve import (
-    UNROLLED,
-    factorize_least_squares,
-    matvec,
-)
+from hhtjax.numerics.elimination import UNROLLED, matvec
+from hhtjax.numerics.linear_solve import factorize_least_squares
 
 
 @jax.jit

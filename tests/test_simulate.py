@@ -133,20 +133,17 @@ def test_progress_changes_neither_result_nor_gradient(capfd):
         problem = DUFFING._replace(params={**DUFFING.params, "k": k})
         return jnp.sum(run(problem, hhtjax.hht(), 300, progress=progress).q ** 2)
 
-    @hhtjax.plain()  # a callback keeps a run plain
-    def silent(derivative, k):
-        return derivative(k, False)
-
-    assert float(loss(1.0, True)) == float(silent(loss, 1.0))
+    same = partial(np.testing.assert_allclose, rtol=1e-13)  # a callback keeps the run from being a kernel: rounding
+    same(loss(1.0, True), loss(1.0, False))
     jax.effects_barrier()
     shown = capfd.readouterr().err
     assert "step 300 of 300" in shown
     assert "step 3 of 300" in shown
     assert len(shown.split("\r")) == 101  # a hundred times, no oftener
     for derivative in (jax.grad(loss), jax.jacfwd(loss)):
-        assert float(derivative(1.0, True)) == float(silent(derivative, 1.0))
+        same(derivative(1.0, True), derivative(1.0, False))
     batch = jax.vmap(loss, in_axes=(0, None))
-    np.testing.assert_array_equal(batch(jnp.array([1.0, 2.0]), True), silent(batch, jnp.array([1.0, 2.0])))
+    same(batch(jnp.array([1.0, 2.0]), True), batch(jnp.array([1.0, 2.0]), False))
 
 
 def pendulum_lagrangian(q, v, t, params):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.numerics.linear_solve import matvec
+from hhtjax.numerics.elimination import matvec
 from hhtjax.rotation import cross
 from hhtjax.scenes.scene import Scene
 from hhtjax.systems.system import System

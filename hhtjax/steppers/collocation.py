@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from hhtjax.checks import require_number
-from hhtjax.numerics.linear_solve import factorize
+from hhtjax.numerics.elimination import factorize
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.options import Options, check_options
 from hhtjax.steppers.residual import residual

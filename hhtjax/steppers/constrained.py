@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.linear_solve import diagonal, matvec
+from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import State, join_info
 from hhtjax.systems.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation

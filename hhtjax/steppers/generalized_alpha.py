@@ -12,7 +12,8 @@ import jax.numpy as jnp
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
-from hhtjax.numerics.linear_solve import Structured, factorize, factorize_with, reuse
+from hhtjax.numerics.elimination import factorize
+from hhtjax.numerics.linear_solve import Structured, factorize_with, reuse
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.linearization import linearization_point
 from hhtjax.steppers.newton import left_by, linearized_solve, newton, told

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description import is_concrete
-from hhtjax.numerics.linear_solve import factorize, solve
+from hhtjax.numerics.elimination import factorize
+from hhtjax.numerics.linear_solve import solve
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.options import Options, check_options, require_alpha
 from hhtjax.steppers.residual import hht_coefficients

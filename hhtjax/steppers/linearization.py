@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.linear_solve import diagonal
+from hhtjax.numerics.elimination import diagonal
 from hhtjax.steppers.residual import residual
 from hhtjax.xla import staged
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.linear_solve import factorize
+from hhtjax.numerics.elimination import factorize
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.options import Options, check_options
 from hhtjax.steppers.residual import residual

@@ -20,7 +20,8 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_number
-from hhtjax.numerics.linear_solve import factorize, factorize_map
+from hhtjax.numerics.elimination import factorize
+from hhtjax.numerics.linear_solve import factorize_map
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.xla import staged

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description import is_concrete
-from hhtjax.numerics.linear_solve import matvec, solve
+from hhtjax.numerics.elimination import matvec
+from hhtjax.numerics.linear_solve import solve
 from hhtjax.steppers.options import require_alpha
 from hhtjax.steppers.residual import hht_coefficients
 from hhtjax.steppers.stepper import Info, State, Stepper

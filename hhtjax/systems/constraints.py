@@ -13,14 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.numerics.linear_solve import (
-    RANK_TOLERANCE,
-    UNROLLED,
-    factorize,
-    factorize_least_squares,
-    matvec,
-    solve_map,
-)
+from hhtjax.numerics.elimination import UNROLLED, factorize, matvec
+from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, solve_map
 from hhtjax.xla import linear_map, staged
 
 GRADIENT = 64  # roundings below which the gradient of a constraint is none

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe
-from hhtjax.numerics.linear_solve import factorize, matvec, solve
+from hhtjax.numerics.elimination import factorize, matvec
+from hhtjax.numerics.linear_solve import solve
 from hhtjax.systems import kinematics
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, as_matrix
 

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function
 from hhtjax.description import Description, is_array, is_concrete, is_real
-from hhtjax.numerics.linear_solve import matvec
+from hhtjax.numerics.elimination import matvec
 
 LARGEST_CHECKED = 256  # rows of a constant mass matrix whose eigenvalues are looked at
 SYMMETRIC = 1e-6  # relative size of M - M^T that passes

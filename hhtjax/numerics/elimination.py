@@ -1,0 +1,196 @@
+"""Elimination for one dense matrix that XLA can fuse; LAPACK above a size.
+
+A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
+up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones; up to
+`LOOPED` it is a loop in a kernel, and LAPACK's elsewhere.
+"""
+
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.linalg import lu_factor, lu_solve
+
+from hhtjax.xla import choose, structural
+
+UNROLLED = 8
+LOOPED = 16
+SCALAR = 4  # beyond, scalar operations are so many that compiling them takes long
+
+
+def matvec(A, x):
+    """A x for a full A (n, n), or a diagonal one (n,); elementwise for n <= 8, so that XLA can fuse it."""
+    if A.ndim == 1:
+        return A * x
+    if A.shape[-1] > UNROLLED:
+        return A @ x
+    return sum(A[:, j] * x[j] for j in range(1, A.shape[-1])) + A[:, 0] * x[0]
+
+
+def diagonal(A):
+    """Of a full A (n, n), or of a diagonal one (n,), which is its own. jnp.diagonal would ask for the platform."""
+    i = jnp.arange(len(A))
+    return A if A.ndim == 1 else A[i, i]
+
+
+def factorize(A):
+    """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff."""
+    A = lax.stop_gradient(A)
+    if A.shape[-1] == 2:
+        return partial(_cramer, A)
+    if A.shape[-1] <= SCALAR:
+        return partial(_substitute_scalars, *_lu_scalars(A))
+    if A.shape[-1] <= UNROLLED:
+        return partial(_substitute, _lu(A))
+    if A.shape[-1] <= LOOPED:
+        factors = choose(_lu, _lu_of_lapack, A)
+        ways = _substitute, _by_lapack
+        return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
+    return partial(lu_solve, lu_factor(A))
+
+
+def _lu(A):
+    """L below the diagonal and U on and above it, and the order of the rows: A[order] = L U."""
+    n = A.shape[0]
+    i = jnp.arange(n)
+    row, column = i[:, None], i[None, :]
+    nothing = structural(np.zeros((), A.dtype))
+    loop, find_pivot = (lax.fori_loop, _pivot) if n > UNROLLED else (_written_out, _pivot_by_scalars)
+
+    def eliminate(k, carry):
+        A, order = carry
+        pivot = find_pivot(A, k)
+        exchange = jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))
+        A, order = A[exchange], order[exchange]
+        factor = jnp.where(row > k, A[:, k][:, None] / A[k, k], nothing)
+        changed = A - factor * A[k][None, :]
+        return jnp.where(column > k, changed, jnp.where((column == k) & (row > k), factor, A)), order
+
+    return loop(0, n - 1, eliminate, (A, i))
+
+
+def _pivot(A, k):
+    """Row of the largest element of column k on or below the diagonal."""
+    return jnp.argmax(jnp.where(jnp.arange(len(A)) >= k, jnp.abs(A[:, k]), -1))
+
+
+def _pivot_by_scalars(A, k):
+    """The same without argmax: a reduction would end the fusion."""
+    largest, pivot = jnp.abs(A[k, k]), jnp.asarray(k, jnp.result_type(int))
+    for i in range(k + 1, len(A)):
+        candidate = jnp.abs(A[i, k])
+        larger = candidate > largest
+        largest, pivot = jnp.where(larger, candidate, largest), jnp.where(larger, i, pivot)
+    return pivot
+
+
+def _substitute(factors, b, trans=0):
+    """x with L U x = b[order]; for trans=1, x with x[order] = z and (L U)^T z = b."""
+    LU, order = factors
+    n = LU.shape[0]
+    i = jnp.arange(n)
+    loop = lax.fori_loop if n > UNROLLED else _written_out
+
+    def forward(k, x):
+        return x - jnp.where(i > k, LU[:, k] * x[k], 0)
+
+    def backward(j, x):
+        k = n - 1 - j
+        pivot = x[k] / LU[k, k]
+        return jnp.where(i == k, pivot, x - jnp.where(i < k, LU[:, k] * pivot, 0))
+
+    def forward_transposed(k, x):
+        pivot = x[k] / LU[k, k]
+        return jnp.where(i == k, pivot, x - jnp.where(i > k, LU[k] * pivot, 0))
+
+    def backward_transposed(j, x):
+        k = n - 1 - j
+        return x - jnp.where(i < k, LU[k] * x[k], 0)
+
+    if not trans:
+        return loop(0, n, backward, loop(0, n - 1, forward, b[order]))
+    x = loop(0, n - 1, backward_transposed, loop(0, n, forward_transposed, b))
+    return jnp.sum(jnp.where(order[:, None] == i[None, :], x[:, None], 0), axis=0)
+
+
+def _written_out(start, stop, body, x):
+    for k in range(start, stop):
+        x = body(k, x)
+    return x
+
+
+def _lu_of_lapack(A):
+    """The same as `_lu`."""
+    LU, _, order = lax.linalg.lu(A)
+    return LU, order.astype(jnp.result_type(int))
+
+
+def _by_lapack(factors, b, trans=0):
+    """The same as `_substitute`."""
+    LU, order = factors
+    substitute = partial(lax.linalg.triangular_solve, left_side=True, transpose_a=bool(trans))
+    lower, upper = {"lower": True, "unit_diagonal": True}, {"lower": False}
+    x = (b if trans else b[order])[:, None]
+    for triangle in (upper, lower) if trans else (lower, upper):
+        x = substitute(LU, x, **triangle)
+    return x[jnp.argsort(order), 0] if trans else x[:, 0]
+
+
+def _cramer(A, b, trans=0):
+    """Cramer's rule for two unknowns: forward stable (Higham 2002, Sec. 1.10.1), with one division."""
+    (p, q), (r, s) = [[A[i, j] for j in range(2)] for i in range(2)]
+    if trans:
+        q, r = r, q
+    inverse = 1 / (p * s - q * r)
+    return jnp.stack([(s * b[0] - q * b[1]) * inverse, (p * b[1] - r * b[0]) * inverse])
+
+
+def _lu_scalars(A):
+    """L and U in the place of A, the pivots as their reciprocals; the exchanges of rows before, [(k, i, whether)]."""
+    n = A.shape[0]
+    LU = [[A[i, j] for j in range(n)] for i in range(n)]
+    exchanges = []
+    for k in range(n):
+        for i in range(k + 1, n):
+            larger = jnp.abs(LU[i][k]) > jnp.abs(LU[k][k])
+            exchanges.append((k, i, larger))
+            for j in range(n):
+                LU[k][j], LU[i][j] = _exchange(larger, LU[k][j], LU[i][j])
+        LU[k][k] = 1 / LU[k][k]
+        for i in range(k + 1, n):
+            LU[i][k] = LU[i][k] * LU[k][k]
+            for j in range(k + 1, n):
+                LU[i][j] = LU[i][j] - LU[i][k] * LU[k][j]
+    return LU, exchanges
+
+
+def _substitute_scalars(LU, exchanges, b, trans=0):
+    """The same as `_substitute`."""
+    n = len(LU)
+    x = [b[i] for i in range(n)]
+    if not trans:
+        for k, i, whether in exchanges:
+            x[k], x[i] = _exchange(whether, x[k], x[i])
+        for k in range(n):
+            for i in range(k + 1, n):
+                x[i] = x[i] - LU[i][k] * x[k]
+        for k in reversed(range(n)):
+            x[k] = x[k] * LU[k][k]
+            for i in range(k):
+                x[i] = x[i] - LU[i][k] * x[k]
+        return jnp.stack(x)
+    for k in range(n):
+        x[k] = x[k] * LU[k][k]
+        for i in range(k + 1, n):
+            x[i] = x[i] - LU[k][i] * x[k]
+    for k in reversed(range(n)):
+        for i in range(k):
+            x[i] = x[i] - LU[k][i] * x[k]
+    for k, i, whether in reversed(exchanges):
+        x[k], x[i] = _exchange(whether, x[k], x[i])
+    return jnp.stack(x)
+
+
+def _exchange(whether, a, b):
+    return jnp.where(whether, b, a), jnp.where(whether, a, b)
