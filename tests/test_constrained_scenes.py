@@ -208,7 +208,12 @@ def test_params_are_no_part_of_the_program():
         (four_bars.four_bars, {"loops": 0}, ValueError, "four_bars: `loops` must be a positive integer; received 0."),
         (four_bars.four_bars, {"loops": 1.5}, ValueError, "four_bars: `loops` must be a positive integer; received"),
         (four_bars.four_bars, {"loops": np.inf}, ValueError, "four_bars: `loops` must be a positive integer; received"),
-        (four_bars.four_bars, {"loops": "2"}, TypeError, "four_bars: `loops` must be a real number; received '2'."),
+        (
+            four_bars.four_bars,
+            {"loops": "2"},
+            ValueError,
+            "four_bars: `loops` must be a positive integer; received '2'.",
+        ),
     ],
 )
 def test_bad_arguments(constructor, arguments, error, message):

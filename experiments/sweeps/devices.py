@@ -21,7 +21,9 @@ REPEATS = 5
 def main(arguments):
     """One case: prints what it found."""
     members, devices, *process = map(int, arguments)
-    os.environ["XLA_FLAGS"] = "" if process else f"--xla_force_host_platform_device_count={devices}"
+    if not process:
+        given = os.environ.get("XLA_FLAGS", "")  # the same as of one device: other ones round differently
+        os.environ["XLA_FLAGS"] = f"{given} --xla_force_host_platform_device_count={devices}".strip()
     import jax
 
     jax.config.update("jax_enable_x64", True)
