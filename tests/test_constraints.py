@@ -135,6 +135,7 @@ def test_squeezer_without_iterations():
         assert np.abs(state.q - np.array(exact["q"])).max() <= bar
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", ["index3", "ggl"])
 def test_multipliers_of_a_pendulum(formulation):
     """In the unit of force, for a Phi in units of length: minus the tension m (g cos + v^2/l)."""

@@ -107,6 +107,7 @@ def test_a_linear_equation_is_solved_by_one_linearisation(linearize):
 SOME = ("hht auto", "hht converged", "kim_hht", "conventional_hht", "implicit_euler", "rk4")  # a family each
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOME)
 def test_gradients(name):
     def loss(arguments):
@@ -117,6 +118,7 @@ def test_gradients(name):
     check_gradient(loss, (RATE, Y0, 0.03, 0.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOME)
 def test_own_loop_equals_simulate_and_vmap_equals_loop(name):
     stepper = STEPPERS[name]

@@ -130,6 +130,7 @@ def end_of_linear_and_general(n, **form):
 PARAMS = {"f": 2.0, "k": 1.3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 12])
 @pytest.mark.parametrize("form", [{}, {"iterations": None, "tolerance": 1e-11}], ids=str)
 def test_linear_system_equals_the_general_one(n, form):

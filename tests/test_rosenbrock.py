@@ -70,6 +70,7 @@ def test_radius_at_infinity_and_stability(name):
     assert radii[-1] == pytest.approx(RADIUS[name], abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "order"), [("rosenbrock(0)", 2), ("rowda", 3)])
 def test_order_of_position_and_acceleration_with_a_mass_that_changes(name, order):
     """The acceleration is compared with that of the state it belongs to."""

@@ -140,6 +140,7 @@ def test_rates_along_a_motion():
     assert_close(Omdot, np.einsum("pij,pj->pi", T, psiddot) + jax.vmap(tangent_rate)(VECTORS, psidot), 1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize(
     ("change", "corrected", "bound"), [(0.0, False, 1e6), (1.0, False, 1e4), (0.0, True, 4), (1.0, True, 4)]

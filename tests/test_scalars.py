@@ -181,6 +181,7 @@ def program(scene, stepper, loss, k):
     return jax.jit(jax.value_and_grad(run) if loss else run)(k)
 
 
+@pytest.mark.slow
 @old
 @pytest.mark.parametrize("stepper", [hhtjax.hht(), hhtjax.hht(iterations=None)], ids=["auto", "newton"])
 def test_runs_are_the_same(stepper, monkeypatch):
