@@ -1,10 +1,8 @@
 """How a run is cut into kernels changes the compiled program, and nothing else."""
 
 import os
-import re
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import jax
@@ -12,46 +10,15 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from linked_pendulums import N, end, loss, on_cpu, paths, run
 
 import hhtjax
-from hhtjax.xla import gate, inspection, kernels, lowering, trial
+from hhtjax.xla import inspection, kernels, trial
 
-on_cpu = pytest.mark.skipif(
-    jax.default_backend() != "cpu" or not gate.is_on(),
-    reason="kernels are cut on the CPU only, by JAX 0.10.2 or newer",
-)
-N = 5
 x = jnp.linspace(0.1, 1.0, 4)
 order = jnp.array([1, 0, 3, 2])
 BATCH = jnp.cos(jnp.arange(6.0 * 3 * 3)).reshape(6, 3, 3)
 EIGHTS = jnp.sin(jnp.arange(3.0 * 4 * 5 * 8)).reshape(3, 4, 5, 8)
-
-
-def links(q, v, t, params):
-    """Five pendulums, coupled."""
-    return -jnp.sin(q[:, None] - q[None, :]) @ v**2 - params * jnp.sin(q)
-
-
-def end(params, q0=None):
-    """Of a short run of the links; all of it new for JAX, which would take the program of the last call."""
-    system = hhtjax.System(jnp.arange(1.0, N + 1), lambda *args: links(*args))
-    q0 = jnp.linspace(0.1, 1.0, N) if q0 is None else q0
-    return hhtjax.simulate(system, hhtjax.hht(), q0, 0 * q0, params, dt=0.05, num_steps=20, save_every=20).q[-1]
-
-
-def loss(params):
-    return jnp.sum(end(params) ** 2)
-
-
-def paths(f, *args):
-    return hhtjax.explain(f, *args).paths
-
-
-def run(f, *args):
-    """f(*args), of which functions are taken as they are, and the verdicts; compiled once."""
-    arrays = [x for x in args if not callable(x)]
-    lowered = jax.jit(lambda *arrays: f(*(x for x in args if callable(x)), *arrays)).lower(*arrays)
-    return lowered.compile()(*arrays), tuple(re.findall(f'{lowering.VERDICT} = "([^"]*)"', lowered.as_text()))
 
 
 @on_cpu
@@ -315,76 +282,3 @@ def test_shared_values_are_computed_once():
 
     assert sines(partial(kernels.staged, size=N)) == 1
     assert sines(partial(kernels.staged, size=1)) == 2  # fused into both users
-
-
-GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged", "hhtjax_one_kernel", "hhtjax_inside", "hhtjax_kernels"
-
-
-def of_all_kinds(params):
-    """A run by a function that was jitted outside, with a choice, stages, scalars and a matrix of a linear map."""
-    return jax.value_and_grad(
-        jax.jit(lambda p: jax.jit(loss)(p * kernels.choose(jnp.sign, jnp.sign, jax.lax.stop_gradient(p))))
-    )(params)
-
-
-@on_cpu
-def test_plain_leaves_nothing_of_the_machinery():
-    fast = jax.jit(of_all_kinds)
-    first = fast(2.0)
-    assert "xla_cpu_small_call" in fast.lower(2.0).as_text()
-    with hhtjax.plain():
-        assert not [x for x in GIVEN_AWAY if x in fast.lower(2.0).as_text()]
-        assert paths(of_all_kinds, 2.0) == ("plain: inside hhtjax.plain()",) * 2
-        assert np.allclose(fast(2.0), first, rtol=1e-12, atol=0)
-    assert fast(2.0) == first
-    assert "xla_cpu_small_call" in fast.lower(2.0).as_text()
-
-
-@on_cpu
-def test_plain_holds_for_its_own_thread():
-    def is_on_in_plain():
-        with hhtjax.plain():
-            return gate.is_on(), paths(lambda params: end(params), 2.0)
-
-    with ThreadPoolExecutor(1) as other:
-        with hhtjax.plain():
-            assert other.submit(gate.is_on).result()
-            assert not gate.is_on()
-        assert other.submit(is_on_in_plain).result() == (False, ("plain: inside hhtjax.plain()",))
-        assert other.submit(gate.is_on).result()
-
-
-@on_cpu
-def test_a_sweep_gives_the_same_without_the_machinery():
-    system = hhtjax.System(jnp.arange(1.0, N + 1), links)
-    q0, dts = jnp.linspace(0.1, 1.0, N), jnp.array([0.01, 0.02, 0.05])
-
-    def sweep():
-        return hhtjax.sweep(system, hhtjax.hht(), q0, 0 * q0, 2.0, dts=dts, duration=1.0, num_samples=4).q
-
-    fast = sweep()
-    with hhtjax.plain():
-        assert np.allclose(sweep(), fast, rtol=1e-12, atol=1e-14)
-
-
-@on_cpu
-@pytest.mark.parametrize(
-    ("version", "wish", "why"),
-    [
-        ((99, 0, 0), "", "plain: JAX .* is newer than 0.10.2, the last one tested; HHTJAX_PLAIN=0 tries it"),
-        ((99, 0, 0), "0", "one kernel"),
-        (jax.__version_info__, "1", "plain: HHTJAX_PLAIN=1"),
-        (jax.__version_info__, "0", "one kernel"),
-    ],
-)
-def test_the_environment_and_the_version_of_jax(version, wish, why, monkeypatch):
-    monkeypatch.setattr(jax, "__version_info__", version)
-    monkeypatch.setenv(gate.VARIABLE, wish)
-    (path,) = paths(lambda params: end(params), 2.0)  # new for JAX
-    assert re.match(why, path)
-
-
-def test_a_wish_that_is_none(monkeypatch):
-    monkeypatch.setenv(gate.VARIABLE, "yes")
-    with pytest.raises(ValueError, match="HHTJAX_PLAIN must be 0 or 1; received 'yes'"):
-        end(2.0)

@@ -1,0 +1,43 @@
+"""Five coupled pendulums, whose runs are compiled anew with each call, and how they were compiled."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import hhtjax
+from hhtjax.xla import gate, lowering
+
+on_cpu = pytest.mark.skipif(
+    jax.default_backend() != "cpu" or not gate.is_on(),
+    reason="kernels are cut on the CPU only, by JAX 0.10.2 or newer",
+)
+N = 5
+
+
+def links(q, v, t, params):
+    """Five pendulums, coupled."""
+    return -jnp.sin(q[:, None] - q[None, :]) @ v**2 - params * jnp.sin(q)
+
+
+def end(params, q0=None):
+    """Of a short run of the links; all of it new for JAX, which would take the program of the last call."""
+    system = hhtjax.System(jnp.arange(1.0, N + 1), lambda *args: links(*args))
+    q0 = jnp.linspace(0.1, 1.0, N) if q0 is None else q0
+    return hhtjax.simulate(system, hhtjax.hht(), q0, 0 * q0, params, dt=0.05, num_steps=20, save_every=20).q[-1]
+
+
+def loss(params):
+    return jnp.sum(end(params) ** 2)
+
+
+def paths(f, *args):
+    return hhtjax.explain(f, *args).paths
+
+
+def run(f, *args):
+    """f(*args), of which functions are taken as they are, and the verdicts; compiled once."""
+    arrays = [x for x in args if not callable(x)]
+    lowered = jax.jit(lambda *arrays: f(*(x for x in args if callable(x)), *arrays)).lower(*arrays)
+    return lowered.compile()(*arrays), tuple(re.findall(f'{lowering.VERDICT} = "([^"]*)"', lowered.as_text()))

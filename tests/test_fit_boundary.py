@@ -1,0 +1,81 @@
+"""What `fit` is handed over, and what it says of it."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+
+GOOD = jnp.zeros(4)
+
+
+def rooted(p):
+    return {"a": GOOD, "b": jnp.sqrt(p) * jnp.ones(3)}
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: hhtjax.fit(3, 1.0), TypeError, r"`residuals` must be a function residuals\(params\); received 3"),
+        (lambda: hhtjax.fit(lambda p: GOOD, 1.0, "adam"), TypeError, "`optimizer` must be an optax .* received 'adam'"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {}), ValueError, "`params0` must hold at least one number; received {}"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": 1j}), TypeError, r"`params0\['k'\]` must be a real .* received 1j"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": "1"}), TypeError, r"`params0\['k'\]` must be a real .* received '1'"),
+        (
+            lambda: hhtjax.fit(lambda p: GOOD, np.array(["k"])),
+            TypeError,
+            r"`params0` must be a real .* received array",
+        ),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": len}), TypeError, r"`params0\['k'\]` must be a real .* function len"),
+        (lambda: hhtjax.fit(lambda p: {"r": "4"}, 1.0), TypeError, r"return real arrays; received '4' at \['r'\]"),
+        (
+            lambda: hhtjax.fit(lambda p: np.sin(p) + GOOD, 1.0),
+            TypeError,
+            "traceable by JAX, with jax.numpy in place of",
+        ),
+        (lambda: hhtjax.fit(lambda p: math.sin(p) + GOOD, 1.0), TypeError, "`residuals` must be traceable by JAX"),
+        (lambda: hhtjax.fit(lambda p: p if p > 0 else -p, 1.0), TypeError, "`residuals` must be traceable by JAX"),
+        (lambda: hhtjax.fit(lambda p: GOOD, jnp.ones(2, complex)), TypeError, "`params0` must be real; received compl"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": jnp.nan}), ValueError, r"`params0\['k'\]` must be finite; .* nan"),
+        (lambda: hhtjax.fit(lambda p: GOOD, 1.0, max_iterations=0), ValueError, "`max_iterations` .* received 0"),
+        (lambda: hhtjax.fit(lambda p: GOOD, 1.0, tolerance=-1.0), ValueError, "`tolerance` must be positive; .* -1.0"),
+        (lambda: hhtjax.fit(lambda p: GOOD, {"k": 1.0}, scale=2.0), ValueError, "`scale` must be a pytree structured"),
+        (
+            lambda: hhtjax.fit(lambda p: GOOD, {"k": 1.0}, scale={"k": 0.0}),
+            ValueError,
+            r"`scale\['k'\]` must be positive; received 0.0",
+        ),
+        (
+            lambda: hhtjax.fit(lambda p: GOOD, jnp.ones(2), scale=jnp.ones(3)),
+            ValueError,
+            r"`scale` must have the shape of its parameter, \(2,\); received \(3,\)",
+        ),
+        (
+            lambda: hhtjax.fit(lambda p: p[:2], jnp.ones(3)),
+            ValueError,
+            "`residuals` must return at least as many numbers as there are parameters, 3; received 2",
+        ),
+        (
+            lambda: hhtjax.fit(lambda p: jax.lax.complex(p, p) * jnp.ones(4, complex), 1.0),
+            TypeError,
+            "`residuals` must return real floats; .* complex",
+        ),
+        (
+            lambda: hhtjax.fit(rooted, -1.0, covariance=False),
+            ValueError,
+            r"`residuals` must be finite at params0; received nan at residuals\['b'\]\[0\] \(3 of 7 entries\); give "
+            "missing samples the weight False",
+        ),
+        (
+            lambda: hhtjax.fit(rooted, 0.0, covariance=False),
+            ValueError,
+            "received a finite residual with a derivative that is not finite",
+        ),
+    ],
+)
+def test_bad_input_is_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

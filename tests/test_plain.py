@@ -1,0 +1,85 @@
+"""The switch: plain JAX, by a context, by the environment, or for a JAX that is not known."""
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from linked_pendulums import N, end, links, loss, on_cpu, paths
+
+import hhtjax
+from hhtjax.xla import gate, kernels
+
+GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged", "hhtjax_one_kernel", "hhtjax_inside", "hhtjax_kernels"
+
+
+def of_all_kinds(params):
+    """A run by a function that was jitted outside, with a choice, stages, scalars and a matrix of a linear map."""
+    return jax.value_and_grad(
+        jax.jit(lambda p: jax.jit(loss)(p * kernels.choose(jnp.sign, jnp.sign, jax.lax.stop_gradient(p))))
+    )(params)
+
+
+@on_cpu
+def test_plain_leaves_nothing_of_the_machinery():
+    fast = jax.jit(of_all_kinds)
+    first = fast(2.0)
+    assert "xla_cpu_small_call" in fast.lower(2.0).as_text()
+    with hhtjax.plain():
+        assert not [x for x in GIVEN_AWAY if x in fast.lower(2.0).as_text()]
+        assert paths(of_all_kinds, 2.0) == ("plain: inside hhtjax.plain()",) * 2
+        assert np.allclose(fast(2.0), first, rtol=1e-12, atol=0)
+    assert fast(2.0) == first
+    assert "xla_cpu_small_call" in fast.lower(2.0).as_text()
+
+
+@on_cpu
+def test_plain_holds_for_its_own_thread():
+    def is_on_in_plain():
+        with hhtjax.plain():
+            return gate.is_on(), paths(lambda params: end(params), 2.0)
+
+    with ThreadPoolExecutor(1) as other:
+        with hhtjax.plain():
+            assert other.submit(gate.is_on).result()
+            assert not gate.is_on()
+        assert other.submit(is_on_in_plain).result() == (False, ("plain: inside hhtjax.plain()",))
+        assert other.submit(gate.is_on).result()
+
+
+@on_cpu
+def test_a_sweep_gives_the_same_without_the_machinery():
+    system = hhtjax.System(jnp.arange(1.0, N + 1), links)
+    q0, dts = jnp.linspace(0.1, 1.0, N), jnp.array([0.01, 0.02, 0.05])
+
+    def sweep():
+        return hhtjax.sweep(system, hhtjax.hht(), q0, 0 * q0, 2.0, dts=dts, duration=1.0, num_samples=4).q
+
+    fast = sweep()
+    with hhtjax.plain():
+        assert np.allclose(sweep(), fast, rtol=1e-12, atol=1e-14)
+
+
+@on_cpu
+@pytest.mark.parametrize(
+    ("version", "wish", "why"),
+    [
+        ((99, 0, 0), "", "plain: JAX .* is newer than 0.10.2, the last one tested; HHTJAX_PLAIN=0 tries it"),
+        ((99, 0, 0), "0", "one kernel"),
+        (jax.__version_info__, "1", "plain: HHTJAX_PLAIN=1"),
+        (jax.__version_info__, "0", "one kernel"),
+    ],
+)
+def test_the_environment_and_the_version_of_jax(version, wish, why, monkeypatch):
+    monkeypatch.setattr(jax, "__version_info__", version)
+    monkeypatch.setenv(gate.VARIABLE, wish)
+    (path,) = paths(lambda params: end(params), 2.0)  # new for JAX
+    assert re.match(why, path)
+
+
+def test_a_wish_that_is_none(monkeypatch):
+    monkeypatch.setenv(gate.VARIABLE, "yes")
+    with pytest.raises(ValueError, match="HHTJAX_PLAIN must be 0 or 1; received 'yes'"):
+        end(2.0)
