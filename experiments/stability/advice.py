@@ -129,4 +129,10 @@ def run(report, fast):
     totals = {key: sum(e[key] for e in entries) for key in ("silently_wrong", "flagged", "flagged_by_modes")}
     print(summary, totals, flush=True)
     methods = len({e["method"] for e in entries})
-    return {"methods": methods, "summary": summary, "totals": totals, "misses": misses(entries)}
+    unflagged = [
+        {**{key: e[key] for key in ("scene", "method", "alpha")}, "cells": e["silently_wrong"] - e["flagged"]}
+        for e in entries
+        if e["flagged"] < e["silently_wrong"]
+    ]
+    found = {"misses": misses(entries), "unflagged": unflagged}
+    return {"methods": methods, "summary": summary, "totals": totals, **found}

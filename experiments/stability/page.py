@@ -37,6 +37,12 @@ def misses(entries):
     return "\n".join(["Beyond that factor:\n", *found]) if found else "None is beyond that factor."
 
 
+def exceptions(entries):
+    """The silently wrong cells that no advice flags, in words."""
+    words = (f"{e['cells']} of {e['scene']} with {e['method']}, alpha = {e['alpha']}" for e in entries)
+    return f" (not flagged: {', '.join(words)})" if entries else ""
+
+
 def drift_table(entries):
     """One row per scene and method."""
     names = list(dict.fromkeys(key for e in entries for key in e["last"]))
@@ -89,6 +95,7 @@ def page(numbers):
             quantities=table(["what is named", "cells"], reported["named"].items()),
             wrong=advice["totals"]["silently_wrong"],
             flagged=advice["totals"]["flagged"],
+            unflagged=exceptions(advice["unflagged"]),
             flagged_by_modes=advice["totals"]["flagged_by_modes"],
             advised_methods=advice["methods"],
             advice=advice_table(advice["summary"]),
