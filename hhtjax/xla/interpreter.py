@@ -16,9 +16,19 @@ def evaluate(jaxpr, values, apply, of_literal=lambda x: x):
     def read(atom):
         return of_literal(atom.val) if isinstance(atom, Literal) else known[atom]
 
-    for eqn in jaxpr.eqns:
+    for eqn in _needed(jaxpr):
         known.update(zip(eqn.outvars, apply(eqn, [read(x) for x in eqn.invars]), strict=True))
     return [read(x) for x in jaxpr.outvars]
+
+
+def _needed(jaxpr):
+    """The operations that the results come from: what nobody asks for may have no derivative."""
+    wanted, found = set(x for x in jaxpr.outvars if not isinstance(x, Literal)), []
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or not wanted.isdisjoint(eqn.outvars):
+            found.append(eqn)
+            wanted.update(x for x in eqn.invars if not isinstance(x, Literal))
+    return found[::-1]
 
 
 def alone(eqn) -> Callable:
