@@ -23,7 +23,7 @@ def evaluate(jaxpr, values, apply, of_literal=lambda x: x):
 
 def _needed(jaxpr):
     """The operations that the results come from: what nobody asks for may have no derivative."""
-    wanted, found = set(x for x in jaxpr.outvars if not isinstance(x, Literal)), []
+    wanted, found = {x for x in jaxpr.outvars if not isinstance(x, Literal)}, []
     for eqn in reversed(jaxpr.eqns):
         if eqn.effects or not wanted.isdisjoint(eqn.outvars):
             found.append(eqn)
