@@ -43,7 +43,8 @@ def explain(f, *args) -> Explanation:
     >>> def height(c):
     ...     run = hhtjax.simulate(ball, hhtjax.hht(), jnp.array([9.0]), jnp.array([0.0]), c, dt=0.01, num_steps=50)
     ...     return run.q[-1, 0]
-    >>> set(hhtjax.explain(jax.grad(height), 0.1).paths) <= {"one kernel"}     # twice: forward, and back
+    >>> forward, back = hhtjax.explain(jax.grad(height), 0.1).paths
+    >>> forward == back == "one kernel" or forward.startswith("plain: JAX")     # too old, or too new
     True
     """
     start = time.perf_counter()
