@@ -213,6 +213,7 @@ def test_observed_order(stepper, order):
     np.testing.assert_allclose(alone.slope, order, atol=0.03)
     np.testing.assert_allclose(against.dt, [2 / 400, 2 / 600, 2 / 1600])
     assert alone.error.shape == (2,)
+    assert run(num_steps=(400, 600), reference=np.cos([2.0])).slope == pytest.approx([order], abs=0.03)
     assert alone.error[0] + alone.error[1] == pytest.approx(against.error[0] - against.error[2], rel=1e-6)
 
 
