@@ -58,6 +58,11 @@ def test_same_values_and_derivatives(name):
         np.testing.assert_allclose(jax.jacrev(g, (0, 1))(*point), expected, rtol=1e-13)
 
 
+def test_what_nobody_asks_for_is_left_out():
+    done = names(jax.make_jaxpr(in_stages(lambda x, y: [x * jnp.sin(y), jnp.cos(x)][:1]))(1.0, 2.0).jaxpr)
+    assert done.count("cos") == 0
+
+
 def test_what_is_the_same_is_done_once():
     def f(x, y):
         return [jnp.sin(x - y) + jnp.cos(x - y), jnp.sin(x - y), jnp.sin(y - x), x**2 + lax.integer_pow(x, 3)]

@@ -16,12 +16,12 @@ def evaluate(jaxpr, values, apply, of_literal=lambda x: x):
     def read(atom):
         return of_literal(atom.val) if isinstance(atom, Literal) else known[atom]
 
-    for eqn in _needed(jaxpr):
+    for eqn in needed(jaxpr):
         known.update(zip(eqn.outvars, apply(eqn, [read(x) for x in eqn.invars]), strict=True))
     return [read(x) for x in jaxpr.outvars]
 
 
-def _needed(jaxpr):
+def needed(jaxpr):
     """The operations that the results come from: what nobody asks for may have no derivative."""
     wanted, found = {x for x in jaxpr.outvars if not isinstance(x, Literal)}, []
     for eqn in reversed(jaxpr.eqns):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
-from hhtjax.xla.interpreter import alone, evaluate
+from hhtjax.xla.interpreter import alone, evaluate, needed
 from hhtjax.xla.kernels import named
 from hhtjax.xla.parameters import ELEMENTWISE, is_understood
 
@@ -50,7 +50,7 @@ def _each_once(jaxpr):
     def renamed(atoms):
         return [x if isinstance(x, Literal) else same.get(x, x) for x in atoms]
 
-    for eqn in jaxpr.eqns:
+    for eqn in needed(jaxpr):
         eqn = eqn.replace(invars=renamed(eqn.invars))
         key = eqn
         if eqn.primitive.name in ELEMENTWISE and is_understood(eqn):
