@@ -29,4 +29,5 @@ def _on_leaves(gain, coarse, fine):
 
 
 def take_out(gain, coarse, fine):
+    """The value without the leading error that both have."""
     return fine + gain * (fine - coarse)

@@ -65,4 +65,5 @@ def zero_like(like):
 
 
 def add_if_any(x, y):
+    """x + y, where None is nothing."""
     return y if x is None else x if y is None else x + y
