@@ -235,6 +235,9 @@ def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
             trace, at, reference, *directions = make(column)
             found = Numbers()(trace, *at)
         except Exception as error:
+            if _fails(make):  # of x**0, linearize knows that its derivative is zero, and jvp does not
+                count["plain fails too"] += 1
+                continue
             count["error"] += 1
             yield Difference(name, mode, "".join(traceback.format_exception(error)[-6:]), None)
             continue
@@ -258,6 +261,16 @@ def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
             yield Difference(name, mode, found, expected)
 
 
+def _fails(make):
+    """Whether the program without the machinery does, in this mode."""
+    try:
+        trace, at, *_ = make(lambda f: f)
+        Numbers()(trace, *at)
+    except Exception:
+        return True
+    return False
+
+
 def judge(found, reference, values, rtol, has_sums):
     """In a word, and what is expected. reference: Numbers -> that; values: how many are no derivatives;
     has_sums: the sign of a zero is rounding."""
@@ -269,7 +282,7 @@ def judge(found, reference, values, rtol, has_sums):
         if i >= values and a.shape == b.shape:
             known = ~np.isnan(b) & ~(np.isnan(a) & is_matrix)
             a, b = np.where(known, a, 0), np.where(known, b, 0)
-        near = is_close(a, b, rtol)
+        near = is_close(a, b, rtol) or (is_matrix and _is_zero(a, b, rtol))
         if near and (i >= values or has_sums or np.array_equal(signs(a), signs(b))):
             continue
         if a.shape != b.shape or a.dtype != b.dtype:
@@ -288,12 +301,22 @@ def judge(found, reference, values, rtol, has_sums):
     return worst, expected
 
 
+def _kinds(x):
+    """-inf, inf, NaN, or finite, in whole numbers."""
+    return np.select([np.isnan(x), np.isposinf(x), np.isneginf(x)], [1, 2, 3], 0)
+
+
+def _is_zero(a, b, rtol):
+    """Of derivatives along numbers of size one: what cancels leaves rounding."""
+    return a.shape == b.shape and bool(np.isfinite(a).all() and np.isfinite(b).all() and (np.abs(a - b) <= rtol).all())
+
+
 def _within(a, b, others, rtol):
     """Whether a is as near to b as other roundings bring it."""
     if not np.issubdtype(b.dtype, np.inexact):
         return any((x != b).any() for x in others)
     with np.errstate(all="ignore"):
-        if any((np.isfinite(x) != np.isfinite(b)).any() for x in others):
+        if any((_kinds(x) != _kinds(b)).any() for x in others):
             return True
         finite = np.isfinite(b)
         reach = max(np.abs(x - b)[finite].max(initial=0.0) for x in others)
