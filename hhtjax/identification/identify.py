@@ -7,6 +7,7 @@ optimiser on reverse-mode gradients for many.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +31,7 @@ from hhtjax.identification.problem import Data, solve
 from hhtjax.identification.progress import BAD_START, NO_INFLUENCE
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
+from hhtjax.xla import or_plain
 
 
 def fit(
@@ -118,7 +120,7 @@ def fit(
     data = _check_data("fit", params0, scale, weights, prior, tolerance)
     if records is not None or starts is not None:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
-    result = solve(residuals, options, params0, data)
+    result = or_plain(partial(solve, residuals, options, params0, data))
     return _finished("fit", result, weights) if is_concrete(result.code) else result
 
 
@@ -172,7 +174,7 @@ def multistart(
     )
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
-    every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
+    every = or_plain(lambda: jax.vmap(lambda start: solve(residuals, options, start, data))(starts))
     failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
     cost = jnp.where(failed, jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)

@@ -18,7 +18,7 @@ from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import on_scalars, one_kernel
+from hhtjax.xla import on_scalars, one_kernel, or_plain
 
 
 def simulate(
@@ -96,7 +96,7 @@ def simulate(
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every}
-        return _simulate(system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress)
+        return or_plain(partial(_simulate, system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 

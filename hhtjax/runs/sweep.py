@@ -16,7 +16,7 @@ from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems.flat_system import flatten
-from hhtjax.xla import on_scalars, one_kernel
+from hhtjax.xla import on_scalars, one_kernel, or_plain
 
 
 def sweep(
@@ -86,7 +86,7 @@ def sweep(
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, dts=dts, in_axes=in_axes, **grid)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
-    return run_sweep(*arguments, **keywords)
+    return or_plain(partial(run_sweep, *arguments, **keywords))
 
 
 @partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress"))
