@@ -56,7 +56,7 @@ def or_plain(run: Callable):
         result = run()  # where this fails too, the cause is another, and its error the one to see
     words = (str(refusal).splitlines() or [""])[0][:200]
     warnings.warn(
-        f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the attempt.",
+        f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the try.",
         RuntimeWarning,
         stacklevel=3,
     )
