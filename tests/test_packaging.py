@@ -32,7 +32,7 @@ def test_the_folder_of_a_clone_does_not_hide_an_editable_install(built, tmp_path
     site, parent = tmp_path / "site", tmp_path / "parent"
     (parent / "hhtjax" / "hhtjax").mkdir(parents=True)
     zipfile.ZipFile(built("editable")).extractall(site)
-    find = f"import importlib.util, site; site.addsitedir({str(site)!r}); print(importlib.util.find_spec('hhtjax').origin)"
+    find = f"import importlib.util as i, site; site.addsitedir({str(site)!r}); print(i.find_spec('hhtjax').origin)"
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     only_this = [sys.executable, "-S", "-c", find]  # -S: not what else is installed here
     found = subprocess.run(only_this, cwd=parent, env=environment, capture_output=True, text=True, check=True)

@@ -72,7 +72,7 @@ def test_arguments_of_one_meaning_have_one_name_and_order(name):
 def test_the_version_is_stated_once():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["project"]["dynamic"] == ["version"]
-    stated = project["tool"]["hatch"]["version"]["path"].removesuffix(".py").replace("/", ".")
+    stated = project["tool"]["hatch"]["version"]["path"].removesuffix("/__init__.py").replace("/", ".")
     assert importlib.import_module(stated).VERSION == hhtjax.__version__ == version("hhtjax")
 
 
