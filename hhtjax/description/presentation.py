@@ -87,10 +87,10 @@ def known(x) -> Any:
     return np.asarray(x)
 
 
-def all_known(tree) -> Any:
-    """`known` of each leaf; None where one of them is not."""
+def all_known(tree) -> list:
+    """`known` of each leaf; none of them where one is not."""
     numbers = [known(x) for x in jax.tree.leaves(tree)]
-    return None if any(x is None for x in numbers) else numbers
+    return [] if any(x is None for x in numbers) else numbers
 
 
 def leaf_rows(**trees):

@@ -50,7 +50,7 @@ class ModeBias(NamedTuple):
     def _verdict(self):
         """The frequencies, and the largest biases, in words."""
         numbers = all_known(self[:5])
-        if numbers is None or not numbers[0].size:
+        if len(numbers) < 5 or not numbers[0].size:
             return ""
         w, _, wh, stiffness, damping = numbers
         stiffness, damping = (between(100 * bias, "%", digits=3) for bias in (stiffness, damping))

@@ -38,10 +38,9 @@ def summary(result) -> str:
 def table(result) -> Table:
     """Verdict and estimates with their standard errors; of a batch, or of tracers, what is known without them."""
     numbers = all_known((result.code, result.iterations, result.cost, result.params))
-    partial = numbers is None or len(numbers) <= 3
-    if partial or numbers[0].ndim:
+    if len(numbers) <= 3 or numbers[0].ndim:
         title = f"cost {brief(result.cost)}"
-        if not partial:
+        if len(numbers) > 3:
             title = f"{np.isin(numbers[0], CONVERGED).sum()} of {numbers[0].size} fits converged"
         return Table(f"FitResult: {title}", [["parameter", "shape", "dtype"], *leaf_rows(params=result.params)])
     code, iterations, cost, *leaves = numbers

@@ -109,7 +109,7 @@ class Solution(NamedTuple):
 
     def _title(self):
         """Saved times, steps, and what `check` would say; of tracers, and of parts of a run, the times alone."""
-        numbers = all_known((self.t, self.dt, self.failure)) or []
+        numbers = all_known((self.t, self.dt, self.failure))
         if len(numbers) < 2 + 3:
             return f"t {brief(self.t)}"
         t, dt, *failed = numbers
