@@ -52,3 +52,7 @@ __all__ = [  # noqa: RUF022
     "FitResult", "Gaussian", "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
     "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip
+
+
+def __dir__():
+    return __all__

@@ -27,3 +27,7 @@ __all__ = [
     "suggest_step_size",
     "transient_growth",
 ]
+
+
+def __dir__():
+    return __all__

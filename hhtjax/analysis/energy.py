@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_function
+from hhtjax.description.presentation import shown
 from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import held
@@ -14,6 +15,7 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.system import LinearSystem, System
 
 
+@shown
 class EnergyBalance(NamedTuple):
     """By saved time, (K + 1,) each, in J. kinetic: v' M v/2; potential: V, 0 without; work: of all other forces since
     the start; error: kinetic + potential - their sum at the start - work, which the motion itself leaves at 0."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
+from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
     check_options,
     check_parameters,
@@ -84,7 +85,7 @@ def fit(
         covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
         segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
             residuals are cut for the cluster covariance (`hhtjax.identification.sandwich`).
-        progress: print cost and step after every iteration, to stderr.
+        progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
 
     A function is traced once, and then known by its identity: data that it reads from outside are part of the program,
     and that an array has changed in place or a name been bound anew goes unnoticed. For other data make another
@@ -124,6 +125,7 @@ def fit(
     return _finished("fit", result, weights) if is_concrete(result.code) else result
 
 
+@shown
 class Multistart(NamedTuple):
     """best: the `FitResult` of the lowest cost. all: a `FitResult` with a leading axis, one for each start."""
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, require_integer
+from hhtjax.description.presentation import shown
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.gauss_newton import with_jacobian
 from hhtjax.identification.identifiability import parameter_names
@@ -17,6 +18,7 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 
 
+@shown
 class Score(NamedTuple):
     """What `score_test` says of each candidate, arrays (candidates,).
 
@@ -83,6 +85,7 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     )
 
 
+@shown
 class Profile(NamedTuple):
     """values: of the parameter, and cost: the least one with it held there, (values,). deviance: 2 (cost - that of the
     fit)/variance, scaled so that its parabola is that of the standard error; 3.84 bounds the 95 % interval."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from hhtjax.analysis import damping_ratio
 from hhtjax.checks import require_function, require_integer, require_number
+from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
@@ -27,6 +28,7 @@ class StepSizeWarning(UserWarning):
     """The step size shifts an estimate by more than its standard error, or by what cannot be taken out."""
 
 
+@shown
 class Refined(NamedTuple):
     """What `refine` returns: an estimate together with the scheme and the step that it belongs to.
 

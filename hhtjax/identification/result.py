@@ -10,12 +10,14 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number
+from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.progress import COST, GRADIENT, REASONS, STEP, History
 from hhtjax.identification.sandwich import Uncertainty, correlation
 
 
+@shown
 class FitResult(NamedTuple):
     """An estimate, how it was reached, and how far to trust it.
 
@@ -113,6 +115,9 @@ class FitResult(NamedTuple):
         a          2  ...
         """
         return report.summary(self)
+
+    def _table(self):
+        return report.table(self)
 
     def plot(self, sampling_rate: float = 1.0) -> Any:
         """A figure: residual and its spectrum (of the first channel), intervals, correlations. Needs matplotlib."""

@@ -46,7 +46,7 @@ def simulate(
         dt: step size, positive. num_steps: number of steps.
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
-        progress: show a bar on stderr, also under jit.
+        progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
         extrapolate: number of runs, with steps of dt, dt/2, dt/4, ..., that Richardson's extrapolation joins at the
             same saved times, 1 to 4. For a stepper of order p, 2 takes the error dt^p out, for three times the work, 3
             dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already). For

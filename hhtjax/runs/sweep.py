@@ -56,7 +56,7 @@ def sweep(
             axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
         mesh: devices that share the work, `jax.make_mesh((jax.device_count(),), ("members",))`, also of several
             processes; each then holds all results, bitwise those of one device.
-        progress: show a bar on stderr, also under jit.
+        progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
 
     Returns:
         A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for

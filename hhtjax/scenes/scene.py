@@ -2,9 +2,11 @@
 
 from typing import Any, NamedTuple
 
+from hhtjax.description.presentation import shown
 from hhtjax.systems.system import LinearSystem, System
 
 
+@shown
 class Scene(NamedTuple):
     """system; params; q0, v0: initial position and velocity; duration in s."""
 

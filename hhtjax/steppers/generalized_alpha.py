@@ -5,7 +5,7 @@ The formulas are in residual.py; constraints are in constrained.py, and add rows
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from hhtjax.numerics.linear_solve import Structured, factorize_with, reuse
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.linearization import linearization_point
 from hhtjax.steppers.newton import left_by, linearized_solve, newton, told
-from hhtjax.steppers.options import Options, check_options, require_alpha, takes_options
+from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.stepper import State, Stepper, join_info
 from hhtjax.systems import kinematics
@@ -134,7 +134,7 @@ class GeneralizedAlpha(Stepper):
 
 
 @takes_options
-def hht(alpha: Any = -0.05, **options: Any) -> GeneralizedAlpha:
+def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """HHT-alpha, by default non-iterative: one Jacobian, one factorisation, one solve per step.
 
         alpha_m = 0,  alpha_f = -alpha,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -195,7 +195,7 @@ def hht(alpha: Any = -0.05, **options: Any) -> GeneralizedAlpha:
 
 
 @takes_options
-def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Any) -> GeneralizedAlpha:
+def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Newmark(beta, gamma): alpha_m = alpha_f = 0. The default is the trapezoidal rule.
 
     Order 2 for gamma = 1/2, else 1 (and gamma > 1/2 damps). A-stable for 2 beta >= gamma >= 1/2.
@@ -218,7 +218,7 @@ def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Any) -> GeneralizedAl
 
 
 @takes_options
-def bossak(alpha: Any = -0.1, **options: Any) -> GeneralizedAlpha:
+def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Bossak (Wood, Bossak, Zienkiewicz): HHT's weighting put on the inertia instead of the forces.
 
         alpha_m = alpha,  alpha_f = 0,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -241,7 +241,7 @@ def bossak(alpha: Any = -0.1, **options: Any) -> GeneralizedAlpha:
 
 
 @takes_options
-def generalized_alpha(rho_inf: Any = 0.8, **options: Any) -> GeneralizedAlpha:
+def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Chung and Hulbert's generalised-alpha: least low-frequency damping for a given one at infinity.
 
         alpha_m = (2 rho - 1)/(rho + 1),  alpha_f = rho/(rho + 1),

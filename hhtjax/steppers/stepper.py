@@ -4,15 +4,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import Description
+from hhtjax.description.presentation import known, shown
 from hhtjax.systems import held, kinematics
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 
 
+@shown
 class State(NamedTuple):
     """What the next step needs.
 
@@ -32,6 +35,7 @@ class State(NamedTuple):
     memory: Any = None
 
 
+@shown
 class Info(NamedTuple):
     """What a step tells about itself; None where a method has nothing to tell.
 
@@ -53,6 +57,13 @@ class Info(NamedTuple):
     dependent_row: Any = None
     solve_residual: Any = None
     solved: Any = None
+
+    def _verdict(self):
+        """Of several steps."""
+        met = known(self.converged)
+        if met is None or not met.ndim:
+            return ""
+        return f"{np.count_nonzero(~met)} of {met.size} not converged" if not met.all() else "all converged"
 
 
 def join_info(info, new):

@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import is_concrete
+from hhtjax.description.presentation import shown
 from hhtjax.numerics.linear_solve import solve_map
 from hhtjax.systems.constraints import (
     acceleration_and_multipliers,
@@ -27,6 +28,7 @@ MAX_ITERATIONS = 50
 CONSISTENT = 1e-6  # relative distance of initial values from consistent ones that passes
 
 
+@shown
 class ConsistentInitial(NamedTuple):
     """q, v, acceleration: pytrees like q0; multipliers: (m,); converged: whether Newton reached Phi(q) = 0."""
 

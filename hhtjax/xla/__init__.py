@@ -37,3 +37,7 @@ __all__ = [
     "staged",
     "structural",
 ]
+
+
+def __dir__():
+    return __all__
