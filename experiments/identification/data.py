@@ -120,12 +120,12 @@ SYSTEM = hhtjax.System(duffing.sampled_mass, force)
 
 @jax.jit
 def reconstruct(u):
-    """The input between its samples, band-limited. One program: its many small ones take three times as long to compile."""
+    """The input between its samples, band-limited; as one program, which compiles faster than its many small ones."""
     return hhtjax.band_limited(u, 1 / SAMPLING_RATE, factor=FINER)
 
 
 def beginning(u, samples):
-    """The same input over its first samples only, so that what needs no more compiles once for records of any length."""
+    """The same input over its first samples: what needs no more compiles once for records of all lengths."""
     return replace(u, polynomials=u.polynomials[: FINER * samples])
 
 
