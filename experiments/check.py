@@ -1,8 +1,8 @@
 """Compares the numbers of runs with the committed ones and names each accuracy that got worse.
 
 What a number is, its key says, or the nearest key above it that does: the words below, in this order; below a key that
-speaks of time, everything is time. Settings, counts of work, and whatever no word names are left alone. Rows of a list belong together by their names and
-settings, not by their place.
+speaks of time, everything is time. Settings, counts of work, and whatever no word names are left alone. Rows of a list
+belong together by their names and settings, not by their place.
 
 | kind | worse if | words |
 |---|---|---|
@@ -21,20 +21,22 @@ from experiments.results import baseline, read
 
 TOLERANCE = 0.05  # relative
 ROUNDING = 1e-11  # absolute, of errors: what is below is rounding, which machines and versions do differently
-SETTINGS = (
-    "h_s dt_in_s alpha alphas substeps N members num_steps steps steps_per_sample step_sizes_s tolerance setting unknowns "
-    "duration_s windows_s wh scales loops noise noise_rad iterations predicted"
-).split()
-TIMES = "time times second seconds compile compilation compiling slowest us ns mb bytes load flops calls".split()
-SUCCESSES = ("right", "converged", "covered", "accurate %")  # whole keys
-SUCCESS_WORDS = "order orders slope slopes share bitwise".split()
-SUCCESS_PHRASES = ("largest_bounded", "largest_h_below")
-ERRORS = (
-    "error errors rmse rms deviation difference differences residual violation cost mv mrad bias agreement wrong blown "
-    "failed minus tenth last fewest remainder"
-).split()
-ESTIMATES = ("over_truth", "parameters", "ours_rad", "standard_error")
-UNIT = re.compile(r"_in_[^_]+$")  # k3_in_1/V^2
+SETTINGS = re.compile(
+    "h_s|dt_in_s|alphas?|substeps|N|members|num_steps|steps|steps_per_sample|step_sizes_s|tolerance|setting|unknowns|"
+    "duration_s|windows_s|wh|scales|loops|noise|noise_rad|iterations|predicted"
+)
+SUCCESSES = re.compile("right|converged|covered|accurate %")
+# the rest is looked for among the words of a key
+TIME = re.compile("times?|seconds?|compile|compilation|compiling|slowest|us|ns|mb|bytes|load|flops|calls")
+SUCCESS = re.compile("orders?|slopes?|share|bitwise")
+ERROR = re.compile(
+    "errors?|rmse|rms|deviation|differences?|residual|violation|cost|mv|mrad|bias|agreement|wrong|blown|failed|minus|"
+    "tenth|last|fewest|remainder"
+)
+ESTIMATE = re.compile(
+    "over_truth|parameters|ours_rad|standard_error|_in_[^_]+$"
+)  # anywhere in a key, as in k3_in_1/V^2
+LARGEST = re.compile("largest_bounded|largest_h_below")
 
 
 class Worse(NamedTuple):
@@ -50,14 +52,14 @@ class Worse(NamedTuple):
         return f"{self.path}: {self.committed:.6g} -> {found} (limit {self.limit})"
 
 
-def words_of(key: str) -> list[str]:
-    """In small letters."""
-    return re.split(r"[^a-z]+", key.lower())
+def is_name(key: str) -> bool:
+    """Whether it is a row's label, or the name of a method or a scene: they say nothing about the number."""
+    return key.startswith("[") or (" " in key and not key.endswith("%"))
 
 
-def is_time(key: str) -> bool:
-    """Whether a key speaks of time taken, or of memory; labels of rows do not."""
-    return not key.startswith("[") and any(word in TIMES for word in words_of(key))
+def has(key: str, words: re.Pattern) -> bool:
+    """Whether one of its words is among these; names have none."""
+    return not is_name(key) and any(words.fullmatch(word) for word in re.split(r"[^a-z]+", key.lower()))
 
 
 def kind_of_key(key: str) -> str:
@@ -66,18 +68,17 @@ def kind_of_key(key: str) -> str:
     >>> [kind_of_key(key) for key in ("train_mV", "order", "k3_in_1/V^2", "fit_time_s", "h_s", "q")]
     ['error', 'success', 'estimate', 'ignored', 'ignored', '']
     """
-    if key.startswith("[") or (" " in key and not key.endswith("%")):  # a row, or the name of a method or scene
+    if is_name(key):
         return ""
-    words = words_of(key)
-    if key in SETTINGS or is_time(key):
+    if SETTINGS.fullmatch(key) or has(key, TIME):
         return "ignored"
-    if any(phrase in key for phrase in ESTIMATES):
+    if "standard_error" in key:
         return "estimate"
-    if key in SUCCESSES or any(x in words for x in SUCCESS_WORDS) or any(x in key for x in SUCCESS_PHRASES):
+    if SUCCESSES.fullmatch(key) or LARGEST.search(key) or has(key, SUCCESS):
         return "success"
-    if any(word in ERRORS for word in words):
+    if has(key, ERROR):
         return "error"
-    return "estimate" if UNIT.search(key) else ""
+    return "estimate" if ESTIMATE.search(key) else ""
 
 
 def kind(path: tuple[str, ...]) -> str:
@@ -87,12 +88,14 @@ def kind(path: tuple[str, ...]) -> str:
     ('error', 'ignored', 'estimate')
     """
     kinds = [known for key in reversed(path) if (known := kind_of_key(key))]
-    return kinds[0] if kinds and not any(is_time(key) for key in path) else "ignored"
+    return kinds[0] if kinds and not any(has(key, TIME) for key in path) else "ignored"
 
 
 def label(row: dict) -> str:
     """What a row of a list is called: its names and settings."""
-    own = [f"{k}={v}" for k, v in row.items() if isinstance(v, str) or (k in SETTINGS and not isinstance(v, list))]
+    own = [
+        f"{k}={v}" for k, v in row.items() if isinstance(v, str) or (SETTINGS.fullmatch(k) and not isinstance(v, list))
+    ]
     return f"[{', '.join(own)}]"
 
 
