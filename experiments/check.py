@@ -33,9 +33,7 @@ ERROR = re.compile(
     "errors?|rmse|rms|deviation|differences?|residual|violation|cost|mv|mrad|bias|agreement|wrong|blown|failed|minus|"
     "tenth|last|fewest|remainder"
 )
-ESTIMATE = re.compile(
-    "over_truth|parameters|ours_rad|standard_error|_in_[^_]+$"
-)  # anywhere in a key, as in k3_in_1/V^2
+ESTIMATE = re.compile("over_truth|parameters|ours_rad|standard_error|_in_[^_]+$")  # k3_in_1/V^2
 LARGEST = re.compile("largest_bounded|largest_h_below")
 
 
