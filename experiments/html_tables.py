@@ -5,6 +5,7 @@ from html import escape
 from typing import Any
 
 SHORT = 6  # numbers of a list that fit into a cell
+WORDS = 24  # letters up to which a cell is one line
 OPEN = 60  # numbers up to which a part is shown unfolded
 COLUMNS = 12  # beyond these, a table of few rows is turned on its side
 
@@ -57,7 +58,9 @@ def cell(value) -> str:
         return f'<td class="w">{folded(f"{count(value)} numbers", f"<code>{whole}</code>")}</td>'
     if isinstance(value, list):
         return f"<td>{escape(', '.join(map(text, value)))}</td>"
-    return f'<td class="{"w" if isinstance(value, str) else "n"}">{escape(text(value))}</td>'
+    if isinstance(value, str):
+        return f"<td{' class=w' if len(value) > WORDS else ''}>{escape(value)}</td>"
+    return f'<td class="n">{text(value)}</td>'
 
 
 def table(header: list[str], rows: list[list], sortable: bool = True) -> str:

@@ -36,7 +36,7 @@ def test_without_a_name_they_are_listed():
 
 def test_a_full_run_is_for_those_that_show_a_part_by_default():
     """The list says which."""
-    (line,) = (line for line in experiments().stdout.splitlines() if "--full)" in line)
+    (line,) = (line for line in experiments().stdout.splitlines() if "with --full" in line)
     assert line.split()[0] == "silverbox"
     for arguments in (["vehicle", "--full"], ["silverbox", "--full", "--fast"]):
         result = experiments(*arguments)
