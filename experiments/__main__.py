@@ -1,4 +1,8 @@
-"""The runner: `python -m experiments` lists the experiments, `python -m experiments NAME` runs one."""
+"""The runner: `python -m experiments` lists the experiments, `python -m experiments NAME` runs one.
+
+`all` runs every one and makes a page of what they wrote, `page` makes it of the committed results, and `check` compares
+what runs have written with those.
+"""
 
 import argparse
 import ast
@@ -102,7 +106,7 @@ def write_page(out: Path, committed: bool) -> None:
 
     path = out / "experiments.html"
     out.mkdir(parents=True, exist_ok=True)
-    path.write_text(page(of_experiments(EXPERIMENTS, None if committed else out)))
+    path.write_text(page(of_experiments(EXPERIMENTS, None if committed else out)), encoding="utf-8")
     print(f"Page: {path}", flush=True)
 
 

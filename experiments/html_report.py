@@ -90,7 +90,7 @@ def overview(results: list[Result]) -> str:
 def page(results: list[Result]) -> str:
     """The whole file."""
     links = "".join(f"<li>{link(r.name)}</li>" for r in results)
-    return Template((HERE / "report.html").read_text()).substitute(
+    return Template((HERE / "report.html").read_text(encoding="utf-8")).substitute(
         version=escape(hhtjax.__version__),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         links=links,

@@ -69,6 +69,8 @@ def test_rows_belong_together_by_name_and_setting():
     assert compare({"rows": rows}, {"rows": rows[::-1]}) == (4, [])
     (missing,) = compare({"rows": rows}, {"rows": rows[1:]})[1]
     assert missing.path == "rows/[method=a, h_s=0.1]/error_m"
+    alike = [{"method": "a", "error_m": x} for x in (1.0, 2.0)]
+    assert len(compare({"rows": alike}, {"rows": [{"method": "a", "error_m": 1.5}, alike[1]]})[1]) == 1
 
 
 def test_rounding_is_no_loss():
