@@ -92,7 +92,7 @@ def run(report: Report, fast: bool, full: bool = False):
     models, best = {}, names[-1]
     for name in names:
         report.progress(
-            f"fitting {name} and the initial state to {len(sets.train.y)} samples (the first time compiles)"
+            f"fitting {name} and the initial state to {len(sets.train.y)} samples, twice: the first compiles"
         )
         result, models[name] = fit_and_score(report, sets, MODELS[name], name == best, full)
         if name == best and (fast or full):
