@@ -59,8 +59,10 @@ def as_json(x, indent=0):
 class Report:
     """Collects what an experiment has to show."""
 
-    def __init__(self, name: str, out: Path):
+    def __init__(self, name: str, out: Path, mode: str = "full", command: str = ""):
+        """mode: full, fast (a smoke run) or part (less than the experiment has); command: what was typed."""
         self.name, self.out = name, out
+        self.mode, self.command = mode, command or f"python -m experiments {name}"
         self.start = time.perf_counter()
         self.written: list[Path] = []
         out.mkdir(parents=True, exist_ok=True)
@@ -83,11 +85,15 @@ class Report:
         figure.savefig(path)
         plt.close(figure)
         self.written.append(path)
+        self.progress(f"figure {path}")
 
     def numbers(self, values: dict):
-        """Saves numbers as JSON, named after the experiment."""
+        """Saves numbers as JSON, named after the experiment, with what they were made by."""
+        from experiments.provenance import provenance  # imports JAX, whose seconds belong to the run
+
+        made_by = provenance(self.command, self.mode, time.perf_counter() - self.start)
         path = self.out / f"{self.name}.json"
-        path.write_text(as_json(values) + "\n")
+        path.write_text(as_json({**values, "made_by": made_by}) + "\n")
         self.written.append(path)
 
     def close(self):

@@ -28,9 +28,9 @@ from experiments.identification.data import (
     Record,
     training_residuals,
 )
+from experiments.identification.scatter import over_scatter
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
-from hhtjax.identification.sandwich import SEGMENTS
 from hhtjax.numerics.richardson import richardson
 
 SUBSTEPS = 8
@@ -44,7 +44,7 @@ UNITS = {"m": "s^2", "c": "s", "k": "1", "k2": "1/V", "k3": "1/V^2", "offset": "
 UNITS |= {"c2": "s/V^2", "d": "s^2/V", "e": "s^2/V", "delay": "s"}
 
 
-def fit_training(record: Record, substeps: int, alpha: float, terms=LINEAR, progress=False):
+def fit_training(record: Record, substeps: int, alpha: float, terms=LINEAR):
     """Parameters and initial state from the whole record; returns the result, and seconds, warm and with compiling."""
     residuals = training_residuals(record, substeps, alpha)
     guess = {name: START.get(name, 0.0) for name in terms}
@@ -52,7 +52,7 @@ def fit_training(record: Record, substeps: int, alpha: float, terms=LINEAR, prog
     seconds = []
     for _ in range(2):  # the first time compiles
         start = time.perf_counter()
-        result = jax.block_until_ready(hhtjax.fit(residuals, unknown, scale=scale, progress=progress))
+        result = jax.block_until_ready(hhtjax.fit(residuals, unknown, scale=scale))
         seconds.append(time.perf_counter() - start)
     return result, min(seconds), seconds[0]
 
@@ -70,7 +70,8 @@ def initial_state(params, u, head, guess, substeps: int, alpha: float):
 def score(params, record: Record, substeps: int, alpha: float):
     """Simulated output with the initial state fitted to the first samples; RMSE and largest error in mV."""
     u = data.reconstruct(record.u)
-    start = initial_state(params, u, record.y[:WASHOUT], data.first_state(record), substeps, alpha)
+    head = data.beginning(u, WASHOUT)
+    start = initial_state(params, head, record.y[:WASHOUT], data.first_state(record), substeps, alpha)
     output = np.asarray(data.simulate(params, start, u, len(record.y), substeps, alpha))
     return output, rmse(output - record.y), 1e3 * float(np.max(np.abs(output - record.y)[WASHOUT:]))
 
@@ -80,24 +81,21 @@ def rmse(error):
     return 1e3 * float(np.sqrt(np.mean(np.asarray(error)[WASHOUT:] ** 2)))
 
 
-def run(report: Report, fast: bool):
-    """Fits the models, scores them on the official test sets, and charts error and bias against the step size."""
+def run(report: Report, fast: bool, full: bool = False):
+    """The best model's fit, scores on the official test sets, and chart; full: all models, and what the step size does.
+
+    fast: the whole of it with one model and a part of the data.
+    """
     sets = data.load(fast)
-    if sets.measured:
-        print("Silverbox, the measured record (Wigren and Schoukens 2013)." + " Parts of it only." * fast)
-    else:
-        print(f"GENERATED record, known parameters: the measured one was not found. To use it, {data.HOW_TO_GET_IT}.")
-    loss = hhtjax.spline_gain_error(RESONANCE, 1 / SAMPLING_RATE)
-    print(f"Input: band-limited. A cubic spline would lose {100 * loss:.2g} % of the gain at {RESONANCE:g} Hz.")
-    print("The gain of the input is fixed to 1: a common factor of all parameters cannot be identified.\n")
-    models, best = {}, BEST if not fast else "6 parameters"
-    for name, terms in MODELS.items():
-        if fast and name != best:
-            continue
-        report.progress(f"fitting {name} and the initial state to {len(sets.train.y)} samples")
-        result, scores, models[name] = fit_and_score(report, sets, terms, fast)
-        if name == best:
-            plot_fit(report, sets, scores)
+    tell(sets, fast)
+    names = ["6 parameters"] if fast else list(MODELS) if full else [BEST]
+    models, best = {}, names[-1]
+    for name in names:
+        report.progress(
+            f"fitting {name} and the initial state to {len(sets.train.y)} samples, twice: the first compiles"
+        )
+        result, models[name] = fit_and_score(report, sets, MODELS[name], name == best, full)
+        if name == best and (fast or full):
             plot_parameters(report, result)
     sizes = ("train", *sets.tests)
     report.table(
@@ -109,25 +107,44 @@ def run(report: Report, fast: bool):
     )
     numbers = {f"{part}_mV": models[best][f"{part}_mV"] for part in sizes}
     numbers |= {"data": "measured" if sets.measured else "generated", "fast": fast, "models": models}
-    report.numbers(rounded({**numbers, "by_step_size": step_size_study(report, sets, fast)}))
+    if fast or full:
+        numbers["by_step_size"] = step_size_study(report, sets, fast)
+    else:
+        print("All models, and the bias of the estimates by step size: python -m experiments silverbox --full\n")
+    report.numbers(rounded(numbers))
 
 
-def fit_and_score(report: Report, sets, terms, fast: bool):
-    """One model: its fit, its outputs and errors on all sets, and all of it as numbers."""
-    result, seconds, compiling = fit_training(sets.train, SUBSTEPS, 0.0, terms, progress=True)
-    params, errors = result.params[0], result.standard_errors[0]
-    naive = result.errors(result.uncertainty.naive)[0]
-    report.progress(f"{result.reason}, {int(result.iterations)} iterations, {seconds:.2f} s after compilation")
+def tell(sets, fast: bool):
+    """Where the data come from, and what is assumed of the input."""
+    if sets.measured:
+        print("Silverbox, the measured record (Wigren and Schoukens 2013)." + " Parts of it only." * fast)
+    else:
+        print(f"GENERATED record, known parameters: the measured one was not found. To use it, {data.HOW_TO_GET_IT}.")
+    loss = hhtjax.spline_gain_error(RESONANCE, 1 / SAMPLING_RATE)
+    print(f"Input: band-limited. A cubic spline would lose {100 * loss:.2g} % of the gain at {RESONANCE:g} Hz.")
+    print("The gain of the input is fixed to 1: a common factor of all parameters cannot be identified.\n", flush=True)
+
+
+def fit_and_score(report: Report, sets, terms, chart: bool, full: bool):
+    """One model: its fit, its errors on all sets, charted as soon as they are known, and all of it as numbers."""
+    result, seconds, compiling = fit_training(sets.train, SUBSTEPS, 0.0, terms)
+    params = result.params[0]
+    costs = ", ".join(f"{x:.4g}" for x in np.asarray(result.history.cost)[: int(result.iterations) + 1])
+    report.progress(f"{int(result.iterations)} iterations in {seconds:.2f} s after compilation; cost in V^2: {costs}")
+    report.progress(result.reason)
+    scores: dict[str, Any] = {"train": (np.asarray(result.residual + sets.train.y), rmse(result.residual), None)}
+    for name, record in sets.tests.items():
+        scores[name] = score(params, record, SUBSTEPS, 0.0)
+        report.progress(f"{name}: {scores[name][1]:.4f} mV")
+        if chart and name == "arrow_full":
+            plot_fit(report, sets, scores)
+    errors, naive = result.standard_errors[0], result.errors(result.uncertainty.naive)[0]
     header = ["parameter", "estimate", "standard error", "error / naive", "unit"]
     rows = [[n, float(params[n]), float(errors[n]), float(errors[n] / naive[n]), UNITS[n]] for n in params]
     if not sets.measured:
         header.insert(2, "true")
         rows = [[*row[:2], data.GENERATED.get(row[0], 0.0), *row[2:]] for row in rows]
     report.table(header, rows)
-    scores: dict[str, Any] = {"train": (np.asarray(result.residual + sets.train.y), rmse(result.residual), None)}
-    for name, record in sets.tests.items():
-        scores[name] = score(params, record, SUBSTEPS, 0.0)
-        report.progress(f"{name}: {scores[name][1]:.4f} mV")
     numbers = {
         **{f"{name}_mV": value for name, (_, value, _) in scores.items()},
         "largest_error_arrow_full_mV": scores["arrow_full"][2],
@@ -141,39 +158,9 @@ def fit_and_score(report: Report, sets, terms, fast: bool):
         **{f"{name}_in_{UNITS[name]}": float(params[name]) for name in params},
         **{f"standard_error_{name}_in_{UNITS[name]}": float(errors[name]) for name in params},
     }
-    if not fast:
-        numbers["standard_error_over_scatter"] = over_scatter(report, sets.train, result)
-    return result, scores, numbers
-
-
-def over_scatter(report: Report, record: Record, result):
-    """Standard errors, cluster and naive, over those seen: the scatter of fits to each of SEGMENTS parts of the record.
-
-    Each part has a free initial state. The mean of as many independent estimates scatters by their deviation over the
-    root of their number, which itself is known to 13 %.
-    """
-    params = result.params[0]
-    problem = data.windows_problem(record, len(record.y) // SEGMENTS - 1, SUBSTEPS, 0.0)
-    scale = {name: SCALE[name] for name in params}, STATE_SCALE
-
-    @jax.jit
-    @jax.vmap
-    def of_part(start, part):
-        fitted = hhtjax.fit(lambda x: problem["residuals"](*x, part), (params, start), scale=scale, covariance=False)
-        return fitted.params[0], fitted.converged
-
-    found, converged = of_part(problem["starts"], problem["records"])
-    count = len(converged)
-    seen = {name: float(np.std(found[name], ddof=1) / np.sqrt(count)) for name in params}
-    naive = result.errors(result.uncertainty.naive)[0]
-    ratios = {
-        n: {"cluster": float(result.standard_errors[0][n]) / e, "naive": float(naive[n]) / e} for n, e in seen.items()
-    }
-    report.progress(f"{int(np.sum(converged))} of {count} parts of the record converged")
-    report.table(
-        ["standard error over scatter", *ratios], [[k, *(r[k] for r in ratios.values())] for k in ("cluster", "naive")]
-    )
-    return ratios | {"parts": count, "converged": int(np.sum(converged))}
+    if full:
+        numbers["standard_error_over_scatter"] = over_scatter(report, sets.train, result, SUBSTEPS)
+    return result, numbers
 
 
 def step_size_study(report: Report, sets, fast: bool):
