@@ -25,6 +25,47 @@ def is_real(x):
     return isinstance(x, (int, float)) and not isinstance(x, bool)
 
 
+@jax.tree_util.register_pytree_node_class
+class Fixed:
+    """A function among data, as a pytree without leaves: part of the program."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def tree_flatten(self):
+        """No leaves."""
+        return (), self.function
+
+    @classmethod
+    def tree_unflatten(cls, function, _):
+        """Inverse of `tree_flatten`."""
+        return cls(function)
+
+
+def freeze(tree):
+    """The pytree with its leaves that are functions hidden, so that only data are left; the same where there are none.
+
+    Modules of neural networks have such leaves: their activations. Not hidden are callable arrays and tracers.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    hidden = [callable(x) and not is_array(x) and is_concrete(x) for x in leaves]
+    if not any(hidden):
+        return tree
+    return structure.unflatten([Fixed(x) if hide else x for x, hide in zip(leaves, hidden, strict=True)])
+
+
+def thaw(tree):
+    """What `freeze` was given; whatever holds nothing hidden is returned as it is."""
+    leaves, structure = jax.tree.flatten(tree, is_leaf=_is_fixed)
+    if not any(map(_is_fixed, leaves)):
+        return tree
+    return structure.unflatten([x.function if _is_fixed(x) else x for x in leaves])
+
+
+def _is_fixed(x):
+    return isinstance(x, Fixed)
+
+
 def _fingerprint(x):
     if not is_array(x):
         return x

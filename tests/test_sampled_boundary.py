@@ -41,7 +41,11 @@ TIMES = [
     (TypeError, "`times` must be real numbers; received an array of complex128.", {"times": 1j * UNEVEN}),
     (ValueError, "`times` must have shape (9,), one for each sample; received shape (8,).", {"times": UNEVEN[:-1]}),
     (ValueError, "`times` must have shape (9,), one for each sample; received shape ().", {"times": 0.1}),
-    (ValueError, "strictly increase; received 2.0 and 2.0 at samples 1 and 2.", {"times": [1.0, 2.0, 2.0, *range(3, 9)]}),
+    (
+        ValueError,
+        "strictly increase; received 2.0 and 2.0 at samples 1 and 2.",
+        {"times": [1.0, 2.0, 2.0, *range(3, 9)]},
+    ),
     (ValueError, "strictly increase; received 6.0 and nan at samples 7 and 8.", {"times": [*range(-1, 7), NAN]}),
     (ValueError, "strictly increase; received -inf and 0.0 at samples 0 and 1.", {"times": [-INF, *range(8)]}),
 ]

@@ -1,4 +1,4 @@
-"""Samples at any times: against SciPy and the uniform ones, as data, and held inputs whose jumps are not equally far."""
+"""Samples at any times: against SciPy and the uniform ones, as data, and held inputs with uneven jumps."""
 
 from functools import partial
 
@@ -48,7 +48,9 @@ def test_the_spline_of_few_and_of_many_samples(samples):
 def test_equal_distances_are_the_uniform_case(order):
     uniform = sampled(VALUES, 0.25, 0.7, order)
     t = 0.7 + np.linspace(-0.5, 3.3, 97)
-    np.testing.assert_allclose(evaluate(VALUES, 0.7 + 0.25 * np.arange(12), t, order), uniform(t), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(
+        evaluate(VALUES, 0.7 + 0.25 * np.arange(12), t, order), uniform(t), rtol=1e-11, atol=1e-12
+    )
 
 
 def test_derivatives_in_values_times_and_t():

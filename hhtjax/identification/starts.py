@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function
@@ -75,7 +76,7 @@ def _at_equal_distances(values, dt, t0, times):
     splines = jax.tree.map(lambda y: sampled(y, dt, t0, times=times), values)
     t0, end, count = float(times[0]), float(times[-1]), len(times)
     dt = (end - t0) / (count - 1)
-    return jax.tree.map(lambda u: u(t0 + dt * jnp.arange(count)), splines, is_leaf=_is_spline), dt, t0
+    return jax.tree.map(lambda u: u(t0 + dt * np.arange(count)), splines, is_leaf=_is_spline), dt, t0
 
 
 def _is_spline(x):

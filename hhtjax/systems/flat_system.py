@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe
+from hhtjax.description import freeze, thaw
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.linear_solve import solve
 from hhtjax.systems import kinematics
@@ -183,7 +184,7 @@ def _check_dtype(caller, name, value, dtype):
 def _evaluate(caller, name, function, *args):
     """Shape of function(*args); `name` is added to what the function raises."""
     try:
-        return jax.eval_shape(function, *args)
+        return jax.eval_shape(lambda *args: function(*thaw(args)), *freeze(args))
     except Exception as error:
         error.add_note(f"{caller}: raised while tracing `{name}` with " + ", ".join(describe(x) for x in args) + ".")
         raise
