@@ -140,7 +140,8 @@ def suggest_step_size(
         reach.append((_reach(error > tolerance), _reach(radius > STABLE_RADIUS) if rate.real <= 0 else np.inf))
     resolved, stable = np.reshape(reach, (-1, 2)).T / abs(rates)
     if duration is None:
-        dt, reason = _modal_step(rates, resolved, stable, tolerance, highest, isinstance(system, LinearSystem))
+        linear = isinstance(system, LinearSystem) and system.nonlinear is None
+        dt, reason = _modal_step(rates, resolved, stable, tolerance, highest, linear)
     else:
         dt, most = step_size_by_runs(system, stepper, q0, v0, params, float(t0), float(duration), tolerance)
         reason = f"keeps q within {tolerance:g} of its motion over {duration:g} s, by runs of up to {most} steps"
