@@ -92,21 +92,24 @@ class Description:
             places = tuple(map(is_array, leaves))
         data = [x for x, here in zip(leaves, places, strict=True) if here]
         static = tuple(None if here else x for x, here in zip(leaves, places, strict=True))
-        return data, (structure, static)
+        return data, (structure, places, static)
 
     @classmethod
     def tree_unflatten(cls, aux, data):
         """Inverse of `tree_flatten`; validates nothing, because JAX also calls it with placeholders."""
-        structure, static = aux
+        structure, places, static = aux
         data = iter(data)
-        fields = jax.tree.unflatten(structure, [next(data) if x is None else x for x in static])
+        fields = jax.tree.unflatten(
+            structure, [next(data) if here else x for x, here in zip(static, places, strict=True)]
+        )
         self = object.__new__(cls)
-        for name, value in (*fields.items(), ("_places", tuple(x is None for x in static))):
+        for name, value in (*fields.items(), ("_places", places)):
             object.__setattr__(self, name, value)
         return self
 
     def _flatten(self):
-        return jax.tree.flatten({name: value for name, value in vars(self).items() if name != "_places"})
+        fields = {name: value for name, value in vars(self).items() if name != "_places"}
+        return jax.tree.flatten(fields, is_leaf=lambda x: x is None)  # others put None in the place of an array
 
     def __eq__(self, other):
         return type(self) is type(other) and self._key() == other._key()

@@ -13,7 +13,7 @@ from hhtjax.description import Description
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass
 
-__all__ = ["FirstOrderSystem", "LinearSystem", "System"]
+__all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_system"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,3 +177,9 @@ class FirstOrderSystem(Description):
 
     def __post_init__(self):
         require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")
+
+
+def require_system(caller, system):
+    """An error for what is no system."""
+    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
+        raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
