@@ -29,6 +29,7 @@ from hhtjax.steppers.multistep import houbolt, park
 from hhtjax.steppers.rosenbrock import rosenbrock, rowda
 from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.systems import interop
 from hhtjax.systems.band_limited import band_limited, band_limited_motion, spline_gain_error
 from hhtjax.systems.consistent import ConsistentInitial, consistent_initial
 from hhtjax.systems.initial_values import PrecisionWarning
@@ -37,7 +38,7 @@ from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Explanation, explain, plain
 
 __all__ = [  # noqa: RUF022
-    "__version__", "analysis", "identification", "rotation", "scenes", "trigonometry",
+    "__version__", "analysis", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
     "FirstOrderSystem", "LinearSystem", "System", "PrecisionWarning", "ConsistentInitial", "consistent_initial",
     "Sampled", "band_limited", "band_limited_motion", "sampled", "spline_gain_error",

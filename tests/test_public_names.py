@@ -15,7 +15,7 @@ import pytest
 import hhtjax
 
 ROOT = Path(__file__).parents[1]
-ROOMS = [hhtjax, hhtjax.analysis, hhtjax.identification, hhtjax.rotation, hhtjax.trigonometry]
+ROOMS = [hhtjax, hhtjax.analysis, hhtjax.identification, hhtjax.interop, hhtjax.rotation, hhtjax.trigonometry]
 FUNCTIONS = {
     f"{room.__name__}.{name}": getattr(room, name)
     for room in ROOMS

@@ -73,16 +73,9 @@ def heights(q, params):
 
 def solve_reference(scene):
     """The motion as a function of the times, (times, 14), by scipy with tight tolerances."""
-
-    @jax.jit
-    def rate(t, y):
-        q, v = y[:7], y[7:]
-        w = scene.system.force(q, v, t, scene.params) / scene.system.mass(q, scene.params)
-        return jnp.concatenate([v, w])
-
-    y0 = np.concatenate([scene.q0, scene.v0])
+    rhs = hhtjax.interop.scipy_rhs(scene.system, scene.q0, scene.v0, scene.params)
     options = {"rtol": 1e-10, "atol": 1e-12, "dense_output": True}
-    run = solve_ivp(lambda t, y: np.asarray(rate(t, y)), (0, scene.duration), y0, "DOP853", **options)
+    run = solve_ivp(rhs.fun, (0, scene.duration), rhs.y0, "DOP853", **options)
     return lambda times: run.sol(times).T
 
 

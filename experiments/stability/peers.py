@@ -18,7 +18,6 @@ from scipy.integrate import solve_ivp
 
 import hhtjax
 from experiments import diffrax_run
-from experiments.cardona_geradin1989.index_1 import unconstrained
 from experiments.linearization.scenes import unit_mass
 from experiments.report import COLOURS, MARKERS
 from hhtjax.scenes import double_pendulum, pendulum
@@ -128,18 +127,11 @@ def dampers():
 def rods(duration):
     """By method: times, and the relative error of the rod's length."""
     system, params, q0, v0, _ = pendulum.cartesian()
-    ode = unconstrained(system, q0.size)
+    rhs = hhtjax.interop.scipy_rhs(system, q0, v0, params)
     times = np.linspace(0.0, duration, 101)
-
-    @jax.jit
-    def rate(t, y):
-        return jnp.concatenate([y[2:], ode.force(y[:2], y[2:], t, params)])
-
     found = {}
     for solver in ("RK45", "LSODA", "Radau"):
-        run = solve_ivp(
-            lambda t, y: np.asarray(rate(t, y)), times[[0, -1]], np.concatenate([q0, v0]), solver, times, rtol=1e-6
-        )
+        run = solve_ivp(rhs.fun, times[[0, -1]], rhs.y0, solver, times, rtol=1e-6)
         found[f"SciPy {solver}, rtol 1e-6"] = np.abs(np.linalg.norm(run.y[:2], axis=0) / params["l"] - 1)[1:].tolist()
     num_steps = 100 * round(duration / 0.5)
     path = hhtjax.simulate(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.description import is_concrete
+from hhtjax.description import is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
     check_options,
@@ -57,7 +57,8 @@ def fit(
 
     Args:
         residuals: params -> any pytree of real arrays; traceable by JAX, so that its derivatives are exact.
-        params0: where to start, any pytree of real numbers and arrays.
+        params0: where to start, any pytree of real numbers and arrays; functions in it, as in an `equinox.Module`, stay
+            as they are.
         optimizer: "levenberg_marquardt" with forward-mode Jacobians, a column for each parameter; or any optax
             optimiser, driven by reverse-mode gradients of the cost. None: the first for up to 64 free
             parameters, optax.lbfgs() for more.
@@ -122,6 +123,7 @@ def fit(
     if records is not None or starts is not None:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
     result = or_plain(partial(solve, residuals, options, params0, data))
+    result = result._replace(params=thaw(result.params))
     return _finished("fit", result, weights) if is_concrete(result.code) else result
 
 
@@ -180,6 +182,7 @@ def multistart(
     failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
     cost = jnp.where(failed, jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)
+    best, every = (result._replace(params=thaw(result.params)) for result in (best, every))
     return Multistart(_finished("multistart", best, weights) if is_concrete(best.code) else best, every)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from hhtjax.analysis import damping_ratio
 from hhtjax.checks import require_function, require_integer, require_number
+from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
@@ -106,12 +107,13 @@ def refine(
     fits = []
     for level in range(levels):
         fits.append(fit(residuals_at(stepper, dt / 2**level), fits[-1].params if fits else params0, **options))
-    params = richardson([result.params for result in fits], stepper.order)
+    params = richardson([freeze(result.params) for result in fits], stepper.order)
     shift = jax.tree.map(
-        lambda p, q, e: (p - q) / jnp.where(e > 0, e, jnp.inf), fits[0].params, params, fits[0].standard_errors
+        lambda p, q, e: (p - q) / jnp.where(e > 0, e, jnp.inf),
+        *map(freeze, (fits[0].params, params, fits[0].standard_errors)),
     )
     _warn_if_shifted(params, shift, dt)
-    return Refined(stepper, dt, tuple(fits), params, shift)
+    return Refined(stepper, dt, tuple(fits), thaw(params), thaw(shift))
 
 
 def needed_levels(stepper):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.description import freeze
 from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.identifiability import parameter_names, why_undetermined
@@ -111,7 +112,7 @@ def plot(result, sampling_rate=1.0):
 
 
 def _flat(tree):
-    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(freeze(tree))])
 
 
 TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}

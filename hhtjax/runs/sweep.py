@@ -8,6 +8,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import NamedSharding, PartitionSpec
 
+from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.loop import advance_from, as_solution, loop_of, show_progress
@@ -145,7 +146,7 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
 
     With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval.
     """
-    stepper, q0, v0, params = data
+    stepper, q0, v0, params = *data[:3], thaw(data[3])
     flat, q, v = flatten("sweep", system, q0, v0, t0, params)
     intervals = None if times is None else (times[:-1], dt, substeps, longest)
     loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])

@@ -12,7 +12,7 @@ from hhtjax.description.presentation import known, shown
 from hhtjax.systems import held, kinematics
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.systems.system import require_system as require_system
 
 
 @shown
@@ -127,12 +127,6 @@ def require_stepper(caller, stepper):
     """An error for what is no stepper."""
     if not isinstance(stepper, Stepper):
         raise TypeError(f"{caller}: `stepper` must be a stepper such as hht(); received {stepper!r}.")
-
-
-def require_system(caller, system):
-    """An error for what is no system."""
-    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
-        raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
 
 
 def require_capable(caller, system, stepper, q0, v0):
