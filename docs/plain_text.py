@@ -1,0 +1,141 @@
+"""Docstrings as they are written here, for Sphinx: plain text, indented formulas, sections of Google's style.
+
+    indented block after an empty line    a formula or a table, shown as it stands
+    Args:, Returns:, Raises: ...          a list of what is named before the colon
+    `name`                                a link if it is a public name or a page, else code
+    Title over ----, table between ====   as in reStructuredText
+"""
+
+import re
+import textwrap
+from pathlib import Path
+
+import hhtjax
+import hhtjax.scenes
+
+ROOT = Path(__file__).parents[1]
+SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Warns", "References")
+TITLES = {"Args": "Arguments"}
+ITEM = re.compile(r"(\*{0,2}[A-Za-z_][\w]*(?:, \*{0,2}[A-Za-z_]\w*)*|\"\w+\"): ?(.*)")
+
+
+def public_names():
+    """The short name, and the one with its room, of all that is public -> where it is documented."""
+    names = {}
+    rooms = [hhtjax.xla, hhtjax.trigonometry, hhtjax.rotation, hhtjax.analysis, hhtjax.identification, hhtjax]
+    for room in rooms:
+        short = room.__name__.removeprefix("hhtjax.")
+        for name in room.__all__:
+            target = f"{room.__name__}.{name}"
+            if room is not hhtjax and getattr(hhtjax, name, None) is getattr(room, name):
+                target = f"hhtjax.{name}"
+            names[f"{room.__name__}.{name}"] = names[f"{short}.{name}"] = target
+            if room not in (hhtjax.rotation, hhtjax.trigonometry, hhtjax.xla):
+                names[name] = target
+    return names
+
+
+NAMES = public_names()
+
+
+def inline(text):
+    """Text with its marks escaped, and what stands between backticks as link or code."""
+    parts = text.split("`")
+    for i, part in enumerate(parts):
+        if i % 2 == 0:
+            part = re.sub(r"([\\*|])", r"\\\1", part)
+            parts[i] = re.sub(r"_(?!\w)", r"\\_", part)
+        elif part in NAMES:
+            parts[i] = f":py:obj:`{part} <{NAMES[part]}>`"
+        elif re.fullmatch(r"\S+\.(md|ipynb)", part) and (ROOT / part).exists():
+            parts[i] = f":doc:`/{part.rpartition('.')[0]}`"
+        else:
+            parts[i] = f"``{part}``"
+    return re.sub(r"^(\w+\.)(?= )", r"\\\1", "".join(parts)) if re.match(r"\w\. ", text) else "".join(parts)
+
+
+def indented(lines):
+    return textwrap.indent("\n".join(lines), "    ").split("\n")
+
+
+def indentation(line):
+    return len(line) - len(line.lstrip())
+
+
+def blocks(lines):
+    """Runs of lines without an empty one between them."""
+    found, block = [], []
+    for line in [*lines, ""]:
+        if line.strip():
+            block.append(line)
+        elif block:
+            found.append(block)
+            block = []
+    return found
+
+
+def render(lines):
+    """reStructuredText of a docstring, or of a part of it, whose lines begin at the first column."""
+    result = []
+    remaining = blocks(lines)
+    while remaining:
+        block = remaining.pop(0)
+        first = block[0].rstrip()
+        if first.rstrip(":") in SECTIONS and first.endswith(":") and not indentation(first):
+            body = block[1:]
+            while remaining and indentation(remaining[0][0]) >= 4:
+                body += ["", *remaining.pop(0)]
+            result += section(first[:-1], body)
+        elif indentation(first):
+            while remaining and indentation(remaining[0][0]):
+                block += ["", *remaining.pop(0)]
+            result += ["::", "", *indented(textwrap.dedent("\n".join(block)).split("\n"))]
+        elif first.startswith((">>>", "===", ".. ")) or (len(block) > 1 and set(block[1]) <= set("-=~")):
+            title = not first.startswith((">>>", "===", ".. "))
+            result += [*block[:2], "", *render(block[2:])] if title else block
+        else:
+            result += paragraph(block)
+        result.append("")
+    return result
+
+
+def paragraph(block):
+    """Text, and what begins with a name in quotes as a list of definitions."""
+    text, items = [], []
+    for line in block:
+        named = re.match(r'("\w+"): ?(.*)', line)
+        if named:
+            items.append([named[1], [named[2]]])
+        else:
+            (items[-1][1] if items else text).append(line.strip())
+    result = inline("\n".join(text)).split("\n") if text else []
+    for name, about in items:
+        result += ["", f"``{name}``", *indented(render(about))]
+    return result
+
+
+def section(name, body):
+    """A field with a list of definitions; or with text, where nothing is named."""
+    body = textwrap.dedent("\n".join(body)).split("\n")
+    result, items = [f":{TITLES.get(name, name)}:"], []
+    for line in body:
+        named = ITEM.match(line) if name != "References" else None
+        if named:
+            items.append([named[1], [named[2]]])
+        elif items:
+            items[-1][1].append(line)
+        else:
+            items.append(["", [line]])
+    for title, (first, *rest) in items:
+        text = render([first, *textwrap.dedent("\n".join(rest)).split("\n")])
+        result += indented([f"**{inline(title)}**", *indented(text)] if title else text)
+    return result
+
+
+def process(app, what, name, obj, options, lines):
+    lines[:] = render(list(lines))
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", process)
+    return {"parallel_read_safe": True}
