@@ -1,1 +1,91 @@
-"""Steppers: one file per family."""
+"""Steppers: one step of size h, in as many ways as there are files here.
+
+====================================  ===========  ================  =================================================
+stepper                               order        solves per step   for
+====================================  ===========  ================  =================================================
+`hht(alpha=-0.05)`                    2            1                 stiff mechanics; the default. `linearize=` picks
+                                                                     the point of linearisation
+`hht(alpha, iterations=None)`         2            Newton's          the converged method, differentiated implicitly
+`newmark(beta, gamma)`,               2            1, or Newton's    the rest of the family, with the same options
+`bossak(alpha)`,
+`generalized_alpha(rho_inf)`
+`kim_hht(alpha)`                      1, but 2     1                 the paper of 2019, literally
+                                      for alpha=0
+`conventional_hht(alpha)`             1, but 2     Newton's          the method it is compared with there
+                                      for alpha=0
+`kim_implicit_euler()`                1            1                 the other one
+`rosenbrock(rho_inf=0)`               2            2                 one factorisation; L-stable for `rho_inf=0`
+`rowda()`                             3            4                 one factorisation, L-stable: for accuracy
+`houbolt()`, `park()`,                2            Newton's          classical baselines
+`wilson(theta)`,
+`collocation(beta, theta)`
+`operator_splitting(alpha)`           2 or 1       1, no Jacobian    a baseline; 2 where M and damping are constant
+`implicit_euler()`                    1            Newton's          robustness
+`rk4()`                               4            explicit          where nothing is stiff
+====================================  ===========  ================  =================================================
+
+All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
+Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it.
+
+Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
+of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
+takes the infinitely fast ones out at once. Its order is the power of h with which its error falls. Numerical damping is
+what a method takes out of a vibration that has none; its spectral radius, the factor that is left after one step.
+Non-iterative means that the nonlinear equations of an implicit step are solved by one step of Newton's iteration, about
+a point of linearisation that is cheap and good enough: which is best is measured by
+`python -m experiments linearization`.
+
+Which one
+---------
+
+Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker. If more than five digits are wanted
+of something stiff, take `rowda()`, or `simulate(..., extrapolate=2)`. For fitting by gradients take
+`hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are to be far longer than the
+fastest vibration and the run blows up, try `hht(linearize="held")`, more damping (`alpha=-0.3`), or
+`hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`, and what became of the
+tables and figures of the paper of 2019 on another, `experiments/kim2019/README.md`.
+
+How long a step
+---------------
+
+`hhtjax.analysis.suggest_step_size` reads the modes of the linearised system, or, with `duration=`, makes short runs
+until the motion itself is within the tolerance. Whatever is chosen, a sweep over step sizes shows what it does:
+
+>>> import jax.numpy as jnp, hhtjax
+>>> oscillator = hhtjax.LinearSystem(M=jnp.ones(1), K=jnp.full(1, 100.0))
+>>> start = jnp.ones(1), jnp.zeros(1)
+>>> print(hhtjax.analysis.suggest_step_size(oscillator, hhtjax.hht(), *start, tolerance=1e-3).reason)
+resolves the mode at 10 rad/s to 0.001
+>>> runs = hhtjax.sweep(oscillator, hhtjax.hht(), *start, dts=jnp.array([0.02, 0.01, 0.005]), duration=1.0, num_samples=1)
+>>> error = abs(runs.q[:, -1, 0] - jnp.cos(10.0))                        # a quarter for half the step: order 2
+>>> [round(float(ratio), 1) for ratio in error[:-1] / error[1:]]
+[3.8, 4.0]
+
+A stepper of your own
+---------------------
+
+A family is a frozen dataclass that derives from `Stepper` and has three things, on vectors q, v of a flat system: its
+`order`; `begin`, the `State` at the start; and `bind`, which does once what is constant and returns the function
+State -> (State, Info) of one step. Everything else (pytrees, runs, sweeps, gradients, analysis, fits) then works with it.
+
+>>> from dataclasses import dataclass
+>>> from hhtjax import Info, State, Stepper
+>>> @dataclass(frozen=True, eq=False)
+... class SemiImplicitEuler(Stepper):
+...     order: int = 1
+...     def begin(self, system, q, v, t, params, dt):
+...         return State(t, q, v, system.acceleration(q, v, t, params))
+...     def bind(self, system, params, dt):
+...         def step(s):
+...             v = s.v + dt * s.w
+...             q = s.q + dt * v
+...             return State(s.t + dt, q, v, system.acceleration(q, v, s.t + dt, params)), Info()
+...         return step
+>>> run = hhtjax.simulate(oscillator, SemiImplicitEuler(), *start, dt=1e-3, num_steps=1000)
+>>> abs(float(run.q[-1, 0] - jnp.cos(10.0))) < 5e-3
+True
+
+A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
+`implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
+refusals are tested on all problems there; what is its own gets a test with a closed form.
+"""
