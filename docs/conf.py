@@ -32,6 +32,7 @@ suppress_warnings = ["mystnb.unknown_mime_type"]  # of outputs that only a runni
 autodoc_typehints = "none"  # docstrings say what is what, in words
 autodoc_member_order = "bysource"
 autodoc_class_signature = "separated"
+default_role = "code"
 add_module_names = False
 highlight_language = "none"  # formulas; code says what it is
 toc_object_entries_show_parents = "hide"

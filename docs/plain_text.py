@@ -6,6 +6,7 @@
     Title over ----, table between ====   as in reStructuredText
 """
 
+import inspect
 import re
 import textwrap
 from pathlib import Path
@@ -16,6 +17,7 @@ import hhtjax.scenes
 ROOT = Path(__file__).parents[1]
 SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Warns", "References")
 TITLES = {"Args": "Arguments"}
+HEADER = re.compile(rf"({'|'.join(SECTIONS)}):(?: (.+))?$")
 ITEM = re.compile(r"(\*{0,2}[A-Za-z_][\w]*(?:, \*{0,2}[A-Za-z_]\w*)*|\"\w+\"): ?(.*)")
 
 
@@ -74,24 +76,27 @@ def blocks(lines):
     return found
 
 
-def render(lines):
+def render(lines, names=()):
     """reStructuredText of a docstring, or of a part of it, whose lines begin at the first column."""
     result = []
     remaining = blocks(lines)
     while remaining:
         block = remaining.pop(0)
         first = block[0].rstrip()
-        if first.rstrip(":") in SECTIONS and first.endswith(":") and not indentation(first):
-            body = block[1:]
-            while remaining and indentation(remaining[0][0]) >= 4:
+        if found := HEADER.match(first):
+            end = next((i for i, line in enumerate(block[1:], 1) if HEADER.match(line)), len(block))
+            if block[end:]:
+                remaining.insert(0, block[end:])
+            body = [*([f"    {found[2]}"] if found[2] else []), *block[1:end]]
+            while not block[end:] and remaining and indentation(remaining[0][0]) >= 4:
                 body += ["", *remaining.pop(0)]
-            result += section(first[:-1], body)
+            result += section(found[1], body, names)
         elif indentation(first):
             while remaining and indentation(remaining[0][0]):
                 block += ["", *remaining.pop(0)]
             result += ["::", "", *indented(textwrap.dedent("\n".join(block)).split("\n"))]
-        elif first.startswith((">>>", "===", ".. ")) or (len(block) > 1 and set(block[1]) <= set("-=~")):
-            title = not first.startswith((">>>", "===", ".. "))
+        elif first.startswith((">>>", "===")) or (len(block) > 1 and set(block[1]) <= set("-=~")):
+            title = not first.startswith((">>>", "==="))
             result += [*block[:2], "", *render(block[2:])] if title else block
         else:
             result += paragraph(block)
@@ -114,14 +119,13 @@ def paragraph(block):
     return result
 
 
-def section(name, body):
+def section(name, body, names):
     """A field with a list of definitions; or with text, where nothing is named."""
-    body = textwrap.dedent("\n".join(body)).split("\n")
     result, items = [f":{TITLES.get(name, name)}:"], []
-    for line in body:
+    for line in textwrap.dedent("\n".join(body)).split("\n"):
         named = ITEM.match(line) if name != "References" else None
         if named:
-            items.append([named[1], [named[2]]])
+            items += split(*named.groups(), names)
         elif items:
             items[-1][1].append(line)
         else:
@@ -132,8 +136,20 @@ def section(name, body):
     return result
 
 
+def split(title, text, names):
+    """An item as several, where its line goes on with the next argument: "dt: in s. times: in s."."""
+    for found in re.finditer(r"(?<=[.;] )(\w+): ", text):
+        if found[1] in names:
+            return [[title, [text[: found.start()].strip(" ;")]], *split(found[1], text[found.end() :], names)]
+    return [[title, [text]]]
+
+
 def process(app, what, name, obj, options, lines):
-    lines[:] = render(list(lines))
+    try:
+        names = set(inspect.signature(obj).parameters)
+    except (TypeError, ValueError):
+        names = set()
+    lines[:] = render(list(lines), names)
 
 
 def setup(app):

@@ -123,7 +123,12 @@ def fit(
 
 
 class Multistart(NamedTuple):
-    """best: the `FitResult` of the lowest cost. all: a `FitResult` with a leading axis, one for each start."""
+    """What `multistart` found.
+
+    Attributes:
+        best: the `FitResult` of the lowest cost.
+        all: a `FitResult` with a leading axis, one entry for each start.
+    """
 
     best: FitResult
     all: FitResult
@@ -149,7 +154,10 @@ def multistart(
     Args:
         starts: a pytree like params0, each leaf with a leading axis, one entry for each start.
         scale: a pytree like params0; by default that of the first start.
-        Everything else as in `fit`.
+        residuals, optimizer, transforms, weights, loss, prior, max_iterations, tolerance, covariance, segments: as in `fit`.
+
+    Returns:
+        A `Multistart`.
 
     Raises:
         TypeError, ValueError: as `fit`; starts of unequal numbers; residuals that are finite at none of them.

@@ -29,10 +29,11 @@ def equation_error(system: System, values: Any, dt: float, cutoff: float, t0: fl
         cutoff: Hz, between the frequencies of the motion and those of the noise.
         t0: time of the first sample.
 
+    Returns:
+        A function of params, whose result is (samples without both ends, n), in units of force.
+
     Raises:
         TypeError, ValueError: as `band_limited_motion`. NotImplementedError: a system with constraints.
-
-    Shape of the result: (samples without both ends, n), in units of force.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)

@@ -43,7 +43,9 @@ def simulate(
         q0, v0: position and velocity, pytrees of the same structure; float32 or float64, integers become
             the default float type. A `FirstOrderSystem` has y0 in the place of q0, and no v0.
         params: any pytree, handed to the functions of the system.
-        dt: step size, positive. num_steps: number of steps.
+        dt: step size, positive.
+        num_steps: number of steps.
+        t0: time of the start.
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
         progress: show a bar on stderr, also under jit.

@@ -68,6 +68,9 @@ def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Co
         beta: in (0, 1/4]; theta: 1 or more; numbers, or tracers to differentiate.
         tolerance, max_iterations: of Newton's iteration, as in `hht`.
 
+    Returns:
+        A `Stepper`.
+
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.
 
@@ -90,6 +93,9 @@ def wilson(theta: Any = 1.4, tolerance=1e-10, max_iterations=20) -> Collocation:
     Args:
         theta: 1 or more.
         tolerance, max_iterations: of Newton's iteration, as in `hht`.
+
+    Returns:
+        A `Stepper`.
 
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.

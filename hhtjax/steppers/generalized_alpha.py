@@ -177,6 +177,9 @@ def hht(alpha: Any = -0.05, **options: Any) -> GeneralizedAlpha:
             large systems `banded(p)` or `conjugate_gradients(iterations)`. A residual above 1e-6 of b (1e-3 in
             float32; or the `tolerance` of these two) is a failure that `solution.check()` names.
 
+    Returns:
+        A `Stepper`.
+
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.
 
@@ -204,6 +207,12 @@ def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Any) -> GeneralizedAl
         beta: in (0, 1]; gamma: in [1/2, 1].
         **options: those of `hht`.
 
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+
     References:
         Newmark (1959); Cardona, Geradin (1989), Eq. 36.
 
@@ -229,6 +238,12 @@ def bossak(alpha: Any = -0.1, **options: Any) -> GeneralizedAlpha:
         alpha: in [-1, 0].
         **options: those of `hht`.
 
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+
     References:
         Wood, Bossak, Zienkiewicz (1980); Cardona, Geradin (1989), Sec. 2.
 
@@ -252,6 +267,12 @@ def generalized_alpha(rho_inf: Any = 0.8, **options: Any) -> GeneralizedAlpha:
     Args:
         rho_inf: rho, the spectral radius at infinite frequency, in [0, 1].
         **options: those of `hht`.
+
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
 
     References:
         Chung, Hulbert (1993); Arnold, Bruls (2007).

@@ -45,7 +45,8 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
 
     Args:
         values: (samples,) or (samples, channels...), real; order + 1 samples at least.
-        dt: sampling period, positive; t0: time of the first sample.
+        dt: sampling period, positive.
+        t0: time of the first sample.
         order: 0, each value held until the next, as a D/A converter does; 1, linear; 3, cubic spline, twice
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
@@ -56,6 +57,9 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
     Outside [t0, t0 + (samples - 1) dt] the nearest end value is held. Differentiable in values and t.
     An input enters a simulation only through its values at the steps: with a step shorter than dt the
     reconstruction between the samples matters, and the cubic one is far better on smooth signals.
+
+    Returns:
+        A `Sampled`: t -> a number, or (channels...).
 
     Raises:
         ValueError, TypeError: too few samples, a non-positive dt, an unknown order, values that are not
