@@ -21,6 +21,9 @@ HEADER = re.compile(rf"({'|'.join(SECTIONS)}):(?: (.+))?$")
 ITEM = re.compile(r"(\*{0,2}[A-Za-z_][\w]*(?:, \*{0,2}[A-Za-z_]\w*)*|\"\w+\"): ?(.*)")
 
 
+MARK = r"\\|\||(?<![\w])\*(?!\w+\*(?!\w))(?!(?<=^\*) )"  # not *emphasis*, and no bullet
+
+
 def public_names():
     """The short name, and the one with its room, of all that is public -> where it is documented."""
     names = {}
@@ -45,7 +48,7 @@ def inline(text):
     parts = text.split("`")
     for i, part in enumerate(parts):
         if i % 2 == 0:
-            part = re.sub(r"([\\*|])", r"\\\1", part)
+            part = re.sub(MARK, lambda mark: "\\" + mark[0], part, flags=re.MULTILINE)
             parts[i] = re.sub(r"_(?!\w)", r"\\_", part)
         elif part in NAMES:
             parts[i] = f":py:obj:`{part} <{NAMES[part]}>`"
@@ -106,6 +109,8 @@ def render(lines, names=()):
 
 def paragraph(block):
     """Text, and what begins with a name in quotes as a list of definitions."""
+    if block[0].startswith("* "):
+        return inline("\n".join(block)).split("\n")
     text, items = [], []
     for line in block:
         named = re.match(r'("\w+"): ?(.*)', line)

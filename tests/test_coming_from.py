@@ -1,0 +1,28 @@
+"""The page for those who come from other packages runs, package by package; where one is missing, its part is skipped."""
+
+import re
+from pathlib import Path
+
+import jax
+import pytest
+
+PAGE = (Path(__file__).parents[1] / "experiments" / "notebooks" / "coming_from.md").read_text()
+BLOCKS = dict(
+    zip(("hhtjax", "scipy", "diffrax", "mujoco"), re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL), strict=True)
+)
+
+
+@pytest.fixture(scope="module")
+def namespace():
+    known = {}
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        exec(compile(BLOCKS["hhtjax"], "coming_from.md", "exec"), known)
+    return known
+
+
+@pytest.mark.parametrize("package", ["scipy", "diffrax", "mujoco"])
+@pytest.mark.filterwarnings("ignore")  # theirs
+def test_each_package_agrees(package, namespace):
+    pytest.importorskip(package)
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        exec(compile(BLOCKS[package], "coming_from.md", "exec"), dict(namespace))
