@@ -31,7 +31,6 @@ suppress_warnings = ["mystnb.unknown_mime_type"]  # of outputs that only a runni
 
 autodoc_typehints = "none"  # docstrings say what is what, in words
 autodoc_member_order = "bysource"
-autodoc_class_signature = "separated"
 default_role = "code"
 add_module_names = False
 highlight_language = "none"  # formulas; code says what it is
@@ -41,6 +40,7 @@ copybutton_prompt_is_regexp = True
 
 html_theme = "furo"
 html_title = f"hhtjax {version}"
+html_theme_options = {"source_repository": "", "top_of_page_buttons": []}
 html_additional_pages = {"index": "redirect.html"}  # the root document is docs/index
 templates_path = ["_templates"]
 html_static_path = ["_static"]

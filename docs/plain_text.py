@@ -1,9 +1,9 @@
 """Docstrings as they are written here, for Sphinx: plain text, indented formulas, sections of Google's style.
 
-    indented block after an empty line    a formula or a table, shown as it stands
-    Args:, Returns:, Raises: ...          a list of what is named before the colon
-    `name`                                a link if it is a public name or a page, else code
-    Title over ----, table between ====   as in reStructuredText
+indented block after an empty line    a formula or a table, shown as it stands
+Args:, Returns:, Raises: ...          a list of what is named before the colon
+`name`                                a link if it is a public name or a page, else code
+Title over ----, table between ====   as in reStructuredText
 """
 
 import inspect
@@ -100,7 +100,7 @@ def render(lines, names=()):
             result += ["::", "", *indented(textwrap.dedent("\n".join(block)).split("\n"))]
         elif first.startswith((">>>", "===")) or (len(block) > 1 and set(block[1]) <= set("-=~")):
             title = not first.startswith((">>>", "==="))
-            result += [*block[:2], "", *render(block[2:])] if title else block
+            result += [*block[:2], "", *render(block[2:])] if title else [re.sub(r" {3,}# ", "  # ", x) for x in block]
         else:
             result += paragraph(block)
         result.append("")
@@ -157,6 +157,12 @@ def process(app, what, name, obj, options, lines):
     lines[:] = render(list(lines), names)
 
 
+def is_field(app, what, name, obj, skip, options):
+    """Fields of named tuples are in the docstring of the tuple."""
+    return True if type(obj).__name__ == "_tuplegetter" else None
+
+
 def setup(app):
     app.connect("autodoc-process-docstring", process)
+    app.connect("autodoc-skip-member", is_field)
     return {"parallel_read_safe": True}

@@ -33,10 +33,10 @@ What holds everywhere:
 * What a scene does not have costs nothing: without a constraint there is no row for it, with a constant mass no
   derivative of it.
 
-How to add a stepper is in `hhtjax.steppers`, a scene in `hhtjax.scenes`, a rule for an operation in `hhtjax.xla`. How to
-test it: the table of problems and steppers in `tests/zoo.py` drives the tests of order, derivatives, dtypes, batches and
-memory, so that a new entry is tested like all others. Beyond that, a test belongs to a behaviour, compares with what was
-not computed by the same code, and has been seen to fail.
+How to add a stepper is in `hhtjax.steppers`, a scene in `hhtjax.scenes`, a rule for an operation in `hhtjax.xla`. How
+to test it: the table of problems and steppers in `tests/zoo.py` drives the tests of order, derivatives, dtypes, batches
+and memory, so that a new entry is tested like all others. Beyond that, a test belongs to a behaviour, compares with
+what was not computed by the same code, and has been seen to fail.
 """
 
 from hhtjax import analysis, identification, rotation, scenes, trigonometry

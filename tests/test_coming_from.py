@@ -1,4 +1,4 @@
-"""The page for those who come from other packages runs, package by package; where one is missing, its part is skipped."""
+"""The page for those who come from other packages runs; where a package is missing, its part is skipped."""
 
 import re
 from pathlib import Path
@@ -7,9 +7,8 @@ import jax
 import pytest
 
 PAGE = (Path(__file__).parents[1] / "experiments" / "notebooks" / "coming_from.md").read_text()
-BLOCKS = dict(
-    zip(("hhtjax", "scipy", "diffrax", "mujoco"), re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL), strict=True)
-)
+FOUND = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
+BLOCKS = dict(zip(("hhtjax", "scipy", "diffrax", "mujoco"), FOUND, strict=True))
 
 
 @pytest.fixture(scope="module")

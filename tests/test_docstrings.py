@@ -1,4 +1,4 @@
-"""Every public name says what it takes, returns and raises, and shows it by an example; and the documentation has it."""
+"""Every public name says what it takes, returns and raises, shows an example, and is in the documentation."""
 
 import importlib
 import inspect
@@ -39,7 +39,8 @@ CALLED = {
     for name, x in PUBLIC.items()
     if (callable(x) and not inspect.isclass(x)) or name.rpartition(".")[2] in CONSTRUCTED
 }
-TUPLES = {name: x for name, x in PUBLIC.items() if inspect.isclass(x) and issubclass(x, tuple)} | {"hhtjax.scenes.Scene": Scene}
+PUBLIC["hhtjax.scenes.Scene"] = Scene
+TUPLES = {name: x for name, x in PUBLIC.items() if inspect.isclass(x) and issubclass(x, tuple)}
 METHODS = {
     f"{name}.{inner}": getattr(x, inner)
     for name, x in PUBLIC.items()

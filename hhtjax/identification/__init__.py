@@ -32,12 +32,16 @@ than the textbook's.
 What a fit can be told
 ----------------------
 
-    transforms=     `positive`, `bounded(lower, upper)`, `fixed`: parameters kept positive, inside bounds, or as they are
-    weights=        one over the deviation of the noise; 0 marks missing samples
-    loss=           robust against outliers: "huber", "soft_l1", "cauchy"
-    prior=          `Gaussian(mean, deviation)`: what was known before
-    records=        many records, or `windows` of one, each with initial values of its own (`starts=`), which are fitted
-                    along and eliminated: each step of the fit is solved as if only the parameters were unknown
+==============  ==================================================================================================
+option          what it says
+==============  ==================================================================================================
+`transforms=`   `positive`, `bounded(lower, upper)`, `fixed`: kept positive, inside bounds, or as it is
+`weights=`      one over the deviation of the noise; 0 marks missing samples
+`loss=`         robust against outliers: `"huber"`, `"soft_l1"`, `"cauchy"`
+`prior=`        `Gaussian(mean, deviation)`: what was known before
+`records=`      many records, or `windows` of one, each with initial values of its own (`starts=`), which are fitted and
+                eliminated: each step of the fit is solved as if only the parameters were unknown
+==============  ==================================================================================================
 
 A start that is poor
 --------------------
@@ -54,8 +58,9 @@ it is. `step_size_bias` predicts by how much a parameter is off, and takes it ou
 damping where masses were fitted too or a single mode vibrates freely; `refine` fits with dt, dt/2, ... and extrapolates
 all parameters to zero.
 
-What comes of it in two measured systems, `silverbox` and `double_pendulum_measured`, and what can be found in principle,
-in stiff joints, a vehicle and a mechanism with six constraints, is on a page, `experiments/identification/README.md`.
+What comes of it in two measured systems, `silverbox` and `double_pendulum_measured`, and what can be found in
+principle, in stiff joints, a vehicle and a mechanism with six constraints, is on a page,
+`experiments/identification/README.md`.
 """
 
 from hhtjax.identification.arguments import Gaussian

@@ -156,7 +156,8 @@ def multistart(
     Args:
         starts: a pytree like params0, each leaf with a leading axis, one entry for each start.
         scale: a pytree like params0; by default that of the first start.
-        residuals, optimizer, transforms, weights, loss, prior, max_iterations, tolerance, covariance, segments: as in `fit`.
+        residuals, optimizer, transforms, weights, loss, prior, max_iterations, tolerance, covariance, segments: as in
+            `fit`.
 
     Returns:
         A `Multistart`.

@@ -22,8 +22,8 @@ class Score(NamedTuple):
 
     Attributes:
         names: of the candidates.
-        statistic: about chi-squared with one degree of freedom where the term is absent, so that 3.84 is the 95 % and 10.8
-            the 99.9 % point.
+        statistic: about chi-squared with one degree of freedom where the term is absent, so that 3.84 is the 95 % and
+            10.8 the 99.9 % point.
         cost_drop: share of the cost that it would take away.
         estimate: one Gauss-Newton step.
     """
@@ -96,8 +96,8 @@ class Profile(NamedTuple):
     Attributes:
         values: of the parameter, (values,).
         cost: the least one with the parameter held there, (values,).
-        deviance: 2 (cost - that of the fit)/variance, (values,), scaled so that its parabola is that of the standard error;
-            3.84 bounds the 95 % interval.
+        deviance: 2 (cost - that of the fit)/variance, (values,), scaled so that its parabola is that of the standard
+            error; 3.84 bounds the 95 % interval.
     """
 
     values: Any

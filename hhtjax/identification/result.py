@@ -31,10 +31,10 @@ class FitResult(NamedTuple):
         segments: how many parts of the record the covariance rests on.
         starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
 
-    `covariance` (p, p), whose rows follow ravel_pytree(params), and `standard_errors`, the root of its diagonal, structured
-    like params, come from how much segments of the record disagree (a cluster-robust covariance: `Uncertainty`), or from
-    the autocorrelation of the residuals where parameters outnumber segments. A fixed parameter has variance 0; one that the
-    residuals do not determine has inf, and covariances 0.
+    `covariance` (p, p), whose rows follow ravel_pytree(params), and `standard_errors`, the root of its diagonal,
+    structured like params, come from how much segments of the record disagree (a cluster-robust covariance:
+    `Uncertainty`), or from the autocorrelation of the residuals where parameters outnumber segments. A fixed parameter
+    has variance 0; one that the residuals do not determine has inf, and covariances 0.
     """
 
     params: Any

@@ -34,8 +34,8 @@ class Uncertainty(NamedTuple):
     """Covariances (p, p) of the free entries, in the order of `ravel_pytree(params)`, and what the residuals determine.
 
     Attributes:
-        cluster: from how much segments of the record disagree, the "cluster sandwich" (formulas and sources: at the top of
-            `hhtjax/identification/sandwich.py`); None where there are no more segments than parameters.
+        cluster: from how much segments of the record disagree, the "cluster sandwich" (`hhtjax.identification.sandwich`
+            has formulas and sources); None where there are no more segments than parameters.
         naive: the textbook's, as if every residual were independent noise.
         autocorrelated: the textbook's, with the correlation that the residuals have.
         singular_values: (p,), of the Jacobian with columns scaled to one, largest first: a small one belongs to a

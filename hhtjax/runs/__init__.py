@@ -46,8 +46,9 @@ False
 Sweeps
 ------
 
-Step sizes, parameters, initial states and coefficients are data: any list of step sizes is one compiled call, sampled at
-common times, at about the work of its members' own steps. A member that fails is flagged and leaves the others alone.
+Step sizes, parameters, initial states and coefficients are data: any list of step sizes is one compiled call, sampled
+at common times, at about the work of its members' own steps. A member that fails is flagged, and leaves the others
+alone.
 
 >>> dts = jnp.logspace(-3, -1, 9)                    # made smaller, if need be, to land on the samples: sweep.dt
 >>> sweep = hhtjax.sweep(pendulum, hhtjax.hht(), q0, v0, params, dts=dts, duration=2.0, num_samples=20)
@@ -55,9 +56,9 @@ common times, at about the work of its members' own steps. A member that fails i
 >>> sweep.q.shape
 (9, 21, 1)
 
-`times=`, in the place of `duration` and `num_samples`, are sample times at any distances, as of measured data; steps end
-at each. `in_axes=`, as for `jax.vmap`, says what else differs between members. `sweep_to_disk` writes chunks of members
-as `.npz`, continues where it was killed, and refuses other inputs. On a cluster, in every process:
+`times=`, in the place of `duration` and `num_samples`, are sample times at any distances, as of measured data; steps
+end at each. `in_axes=`, as for `jax.vmap`, says what else differs between members. `sweep_to_disk` writes chunks of
+members as `.npz`, continues where it was killed, and refuses other inputs. On a cluster, in every process:
 
     jax.distributed.initialize()
     mesh = jax.make_mesh((jax.device_count(),), ("members",))

@@ -23,8 +23,8 @@ class Failure(NamedTuple):
         quantity: number of the first quantity that is not finite.
         row: number, from 1, of the constraint that came to depend on those before it, 0 if none did; None without
             constraints.
-        solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is the
-            library's own.
+        solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is
+            the library's own.
     """
 
     step: Any

@@ -38,12 +38,12 @@ a point of linearisation that is cheap and good enough: which is best is measure
 Which one
 ---------
 
-Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker. If more than five digits are wanted
-of something stiff, take `rowda()`, or `simulate(..., extrapolate=2)`. For fitting by gradients take
+Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker. If more than five digits are
+wanted of something stiff, take `rowda()`, or `simulate(..., extrapolate=2)`. For fitting by gradients take
 `hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are to be far longer than the
 fastest vibration and the run blows up, try `hht(linearize="held")`, more damping (`alpha=-0.3`), or
-`hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`, and what became of the
-tables and figures of the paper of 2019 on another, `experiments/kim2019/README.md`.
+`hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`, and what became of
+the tables and figures of the paper of 2019 on another, `experiments/kim2019/README.md`.
 
 How long a step
 ---------------
@@ -56,7 +56,7 @@ until the motion itself is within the tolerance. Whatever is chosen, a sweep ove
 >>> start = jnp.ones(1), jnp.zeros(1)
 >>> print(hhtjax.analysis.suggest_step_size(oscillator, hhtjax.hht(), *start, tolerance=1e-3).reason)
 resolves the mode at 10 rad/s to 0.001
->>> runs = hhtjax.sweep(oscillator, hhtjax.hht(), *start, dts=jnp.array([0.02, 0.01, 0.005]), duration=1.0, num_samples=1)
+>>> runs = hhtjax.sweep(oscillator, hhtjax.hht(), *start, dts=jnp.array([0.02, 0.01, 0.005]), duration=1, num_samples=1)
 >>> error = abs(runs.q[:, -1, 0] - jnp.cos(10.0))                        # a quarter for half the step: order 2
 >>> [round(float(ratio), 1) for ratio in error[:-1] / error[1:]]
 [3.8, 4.0]
@@ -65,8 +65,8 @@ A stepper of your own
 ---------------------
 
 A family is a frozen dataclass that derives from `Stepper` and has three things, on vectors q, v of a flat system: its
-`order`; `begin`, the `State` at the start; and `bind`, which does once what is constant and returns the function
-State -> (State, Info) of one step. Everything else (pytrees, runs, sweeps, gradients, analysis, fits) then works with it.
+`order`; `begin`, the `State` at the start; and `bind`, which does once what is constant and returns the function State
+-> (State, Info) of one step. Everything else (pytrees, runs, sweeps, gradients, analysis, fits) then works with it.
 
 >>> from dataclasses import dataclass
 >>> from hhtjax import Info, State, Stepper

@@ -149,7 +149,8 @@ def hht(alpha: Any = -0.05, **options: Any) -> GeneralizedAlpha:
             "predictor": q, v for constant acceleration. Smooth in all arguments, so the one for fitting,
                 and for steps that resolve the motion. Fails first at large steps: on stiffening springs,
                 nonlinear dampers, chaotic links.
-            "held": q + h v, with the velocity v held as it is at t. Smooth, the most bounded, 1.5 to 1.7 times the error on average.
+            "held": q + h v, with the velocity v held as it is at t. Smooth, the most bounded, 1.5 to 1.7 times the
+                error on average.
             "state": (q, v, w) at t, the acceleration then refreshed by M w1 = Q1 (Kim's step made second
                 order). Best with nonlinear dampers; loses two digits on a stiff slow manifold, fails at
                 contacts, and costs a second factorisation, of M.
@@ -165,8 +166,8 @@ def hht(alpha: Any = -0.05, **options: Any) -> GeneralizedAlpha:
             value. q, v and w are of order 2 with both; only a needs the correction, which blows up when
             h exceeds the fastest time scale of the system. Default: simple; corrected with constraints.
         formulation: of constraints. "ggl": Phi = 0 and dPhi/dt = 0, by one more multiplier for each (Gear,
-            Gupta, Leimkuhler 1985); "index3": Phi = 0 alone, of index 3 as an equation. With constraints the one linearisation is at
-            the predictor.
+            Gupta, Leimkuhler 1985); "index3": Phi = 0 alone, of index 3 as an equation. With constraints the one
+            linearisation is at the predictor.
         redundant: "least_squares" for constraints that depend on each other, always or in singular positions: of
             their multipliers the smallest. One singular value decomposition per solve. By default they are
             an error at the start, and a failure named by `solution.check()` at the step where they become so.

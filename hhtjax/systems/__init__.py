@@ -70,10 +70,10 @@ Rotations
 ---------
 
 A leaf R (3, 3) of q, or several as (k, 3, 3), whose leaf of v has shape (3,) or (k, 3), is a rotation from material
-(body-fixed) to spatial components, and that leaf its material angular velocity, Rdot = R hat(Om). The `hht` family turns
-it by rotation vectors (`kinematics="chart"`) or directly (`"lie"`), both of second order for any inertia, and keeps it
-orthogonal to rounding. `hhtjax.rotation` has the exponential, the logarithm, the tangent maps and their derivatives,
-right at zero too.
+(body-fixed) to spatial components, and that leaf its material angular velocity, Rdot = R hat(Om). The `hht` family
+turns it by rotation vectors (`kinematics="chart"`) or directly (`"lie"`), both of second order for any inertia, and
+keeps it orthogonal to rounding. `hhtjax.rotation` has the exponential, the logarithm, the tangent maps and their
+derivatives, right at zero too.
 
 >>> def gyroscopic(R, Om, t, params):
 ...     return -jnp.cross(Om, params["J"] * Om)

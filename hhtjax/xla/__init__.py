@@ -16,7 +16,8 @@ as long as C with everything written by hand; with the sines of `hhtjax.trigonom
 long as C, and in a batch 13 ns for each member. The gradient of a run takes 2.7 to 3.8 times the run, in memory that
 grows with the square root of the number of steps. Systems of few operations are stepped number by number, not array by
 array, with every sine evaluated once. What is no single kernel runs as a list of them, several times slower, with all
-that the columns of a Jacobian share evaluated once: the squeezing mechanism with its 19 unknowns takes 19 microseconds a
+that the columns of a Jacobian share evaluated once: the squeezing mechanism with its 19 unknowns takes 19 microseconds
+    a
 step. Jacobians keep track of what depends on which unknown, so that for a chain of N links, or springs between
 neighbours, they take N^2 numbers and not N^3; a chain or a tree may give the product M(q) w without M:
 `System(..., inertia=)`. Measured, against C, by structure, batches and gradients, on a page,
@@ -64,8 +65,9 @@ the rule understands; `scalar_rules.py` has the rule itself, a function of the o
 returns the pieces of the results, or None for whole arrays; `linear_maps.py` has what is needed to know which result
 depends on which unknown. Then put expressions with all its options into `tests/operations_table.py`:
 `tests/test_conformance.py` compares values, forward and reverse derivatives and batches with those of plain JAX, with
-NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule without an entry. `python tests/programs.py`
-makes random programs of all operations and compares them too; `tests/test_kernels.py` looks at what XLA compiled.
+NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule without an entry. `python
+tests/programs.py` makes random programs of all operations and compares them too; `tests/test_kernels.py` looks at what
+XLA compiled.
 """
 
 from hhtjax.xla.explanation import Explanation, explain
