@@ -26,9 +26,10 @@ MARK = r"\\|\||(?<![\w])\*(?!\w+\*(?!\w))(?!(?<=^\*) )"  # not *emphasis*, and n
 
 def public_names():
     """The short name, and the one with its room, of all that is public -> where it is documented."""
-    names = {}
+    names = {name: name for name in ("hhtjax.systems", "hhtjax.steppers", "hhtjax.runs", "hhtjax.scenes")}
     rooms = [hhtjax.xla, hhtjax.trigonometry, hhtjax.rotation, hhtjax.analysis, hhtjax.identification, hhtjax]
     for room in rooms:
+        names[room.__name__] = room.__name__
         short = room.__name__.removeprefix("hhtjax.")
         for name in room.__all__:
             target = f"{room.__name__}.{name}"
@@ -162,7 +163,13 @@ def is_field(app, what, name, obj, skip, options):
     return True if type(obj).__name__ == "_tuplegetter" else None
 
 
+def signature(app, what, name, obj, options, arguments, result):
+    """A module as default value is shown by its name."""
+    return re.sub(r"<module '([\w.]+)' from [^>]*>", r"\1", arguments or "") or None, result
+
+
 def setup(app):
     app.connect("autodoc-process-docstring", process)
     app.connect("autodoc-skip-member", is_field)
+    app.connect("autodoc-process-signature", signature)
     return {"parallel_read_safe": True}

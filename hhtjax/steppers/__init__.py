@@ -1,28 +1,29 @@
 """Steppers: one step of size h, in as many ways as there are files here.
 
-====================================  ===========  ================  =================================================
-stepper                               order        solves per step   for
-====================================  ===========  ================  =================================================
-`hht(alpha=-0.05)`                    2            1                 stiff mechanics; the default. `linearize=` picks
-                                                                     the point of linearisation
-`hht(alpha, iterations=None)`         2            Newton's          the converged method, differentiated implicitly
-`newmark(beta, gamma)`,               2            1, or Newton's    the rest of the family, with the same options
-`bossak(alpha)`,
-`generalized_alpha(rho_inf)`
-`kim_hht(alpha)`                      1, but 2     1                 the paper of 2019, literally
-                                      for alpha=0
-`conventional_hht(alpha)`             1, but 2     Newton's          the method it is compared with there
-                                      for alpha=0
-`kim_implicit_euler()`                1            1                 the other one
-`rosenbrock(rho_inf=0)`               2            2                 one factorisation; L-stable for `rho_inf=0`
-`rowda()`                             3            4                 one factorisation, L-stable: for accuracy
-`houbolt()`, `park()`,                2            Newton's          classical baselines
-`wilson(theta)`,
-`collocation(beta, theta)`
-`operator_splitting(alpha)`           2 or 1       1, no Jacobian    a baseline; 2 where M and damping are constant
-`implicit_euler()`                    1            Newton's          robustness
-`rk4()`                               4            explicit          where nothing is stiff
-====================================  ===========  ================  =================================================
+=================================  ====================  ================  ==========================================
+stepper                            order                 solves per step   for
+=================================  ====================  ================  ==========================================
+`hht(alpha=-0.05)`                 2                     1                 stiff mechanics; the default. `linearize=`
+                                                                           picks the point of linearisation
+`hht(alpha, iterations=None)`      2                     Newton's          the converged method, differentiated
+                                                                           implicitly
+`newmark(beta, gamma)`             2                     1, or Newton's    the family's ancestor, same options
+`bossak(alpha)`                    2                     1, or Newton's    the rest of the family, same options
+`generalized_alpha(rho_inf)`       2                     1, or Newton's    the rest of the family, same options
+`kim_hht(alpha)`                   1; 2 for alpha = 0    1                 the paper of 2019, literally
+`conventional_hht(alpha)`          1; 2 for alpha = 0    Newton's          what it compares with, literally
+`kim_implicit_euler()`             1                     1                 what it compares with, literally
+`rosenbrock(rho_inf=0)`            2                     2                 one factorisation; L-stable
+`rowda()`                          3                     4                 one factorisation; L-stable: for accuracy
+`houbolt()`                        2                     Newton's          a classical baseline
+`park()`                           2                     Newton's          a classical baseline
+`wilson(theta)`                    2                     Newton's          a classical baseline
+`collocation(beta, theta)`         2                     Newton's          a classical baseline
+`operator_splitting(alpha)`        2 for constant M and  1, no Jacobian    a baseline
+                                   damping, else 1
+`implicit_euler()`                 1                     Newton's          robustness
+`rk4()`                            4                     explicit          where nothing is stiff
+=================================  ====================  ================  ==========================================
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
 Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it.

@@ -65,9 +65,8 @@ the rule understands; `scalar_rules.py` has the rule itself, a function of the o
 returns the pieces of the results, or None for whole arrays; `linear_maps.py` has what is needed to know which result
 depends on which unknown. Then put expressions with all its options into `tests/operations_table.py`:
 `tests/test_conformance.py` compares values, forward and reverse derivatives and batches with those of plain JAX, with
-NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule without an entry. `python
-tests/programs.py` makes random programs of all operations and compares them too; `tests/test_kernels.py` looks at what
-XLA compiled.
+NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule without an entry. Random programs of
+all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
 """
 
 from hhtjax.xla.explanation import Explanation, explain
