@@ -89,4 +89,23 @@ True
 A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
 `implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
 refusals are tested on all problems there; what is its own gets a test with a closed form.
+
+Sources
+-------
+
+* N. Newmark, J. Eng. Mech. Div. ASCE 85 (1959) 67-94: `newmark`.
+* H. Hilber, T. Hughes, R. Taylor, Earthquake Eng. Struct. Dyn. 5 (1977) 283-292: `hht`.
+* M. Kim et al., J. Mech. Sci. Tech. 33 (2019) 1087-1096: the non-iterative step; `kim_hht`, `conventional_hht`.
+* M. Arnold, O. Bruls, Multibody Syst. Dyn. 18 (2007) 185-202: second order with M(q) and constraints.
+* K. Jansen, C. Whiting, G. Hulbert, Comput. Methods Appl. Mech. Eng. 190 (2000) 305-319: first-order systems.
+* W. Wood, M. Bossak, O. Zienkiewicz, Int. J. Numer. Methods Eng. 15 (1980) 1562-1566: `bossak`.
+* J. Chung, G. Hulbert, J. Appl. Mech. 60 (1993) 371-375: `generalized_alpha`.
+* A. Cardona, M. Geradin, Computers & Structures 33 (1989) 801-820: constraints and rotations.
+* C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13 (1985) 77-90: `formulation="ggl"`.
+* O. Bruls, A. Cardona, J. Comput. Nonlinear Dyn. 5 (2010) 031002: `kinematics="lie"`.
+* E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, Sec. IV.7: `rosenbrock`.
+* C. Lubich, M. Roche, Computing 43 (1990) 325-342: `rowda`.
+* J. Houbolt, J. Aeronaut. Sci. 17 (1950) 540-550: `houbolt`. K. Park, J. Appl. Mech. 42 (1975) 464-470: `park`.
+* E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1 (1973) 241-252: `wilson`.
+* H. Hilber, T. Hughes, Earthquake Eng. Struct. Dyn. 6 (1978) 99-117: `collocation`.
 """
