@@ -99,7 +99,7 @@ def test_the_documentation_has_every_public_name(name):
     room, _, short = name.rpartition(".")
     if PUBLIC.get(f"hhtjax.{short}") is PUBLIC[name]:  # documented at the top
         room = "hhtjax"
-    if room.startswith("hhtjax.scenes"):
+    if room.startswith("hhtjax.scenes."):
         pattern = rf"automodule:: {re.escape(room)}\n   :members: .*\b{short}\b"
     else:
         pattern = rf"currentmodule:: {re.escape(room)}\n(?:(?!currentmodule)[\s\S])*?auto\w+:: {short}\n"
