@@ -43,11 +43,10 @@ def simulate(
         q0, v0: position and velocity, pytrees of the same structure; float32 or float64, integers become
             the default float type. A `FirstOrderSystem` has y0 in the place of q0, and no v0.
         params: any pytree, handed to the functions of the system.
-        dt: step size, positive.
-        num_steps: number of steps.
-        t0: time of the start.
+        dt: step size, positive. num_steps: number of steps.
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
+        t0: time of the start.
         progress: show a bar on stderr, also under jit.
         extrapolate: number of runs, with steps of dt, dt/2, dt/4, ..., that Richardson's extrapolation joins at the
             same saved times, 1 to 4. For a stepper of order p, 2 takes the error dt^p out, for three times the work, 3

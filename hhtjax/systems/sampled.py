@@ -45,8 +45,7 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
 
     Args:
         values: (samples,) or (samples, channels...), real; order + 1 samples at least.
-        dt: sampling period, positive.
-        t0: time of the first sample.
+        dt: sampling period, positive; t0: time of the first sample.
         order: 0, each value held until the next, as a D/A converter does; 1, linear; 3, cubic spline, twice
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
