@@ -46,13 +46,13 @@ def simulate(
         dt: step size, positive. num_steps: number of steps.
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
-        t0: time of the start.
         progress: show a bar on stderr, also under jit.
         extrapolate: number of runs, with steps of dt, dt/2, dt/4, ..., that Richardson's extrapolation joins at the
             same saved times, 1 to 4. For a stepper of order p, 2 takes the error dt^p out, for three times the work, 3
             dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already). For
             motions that dt resolves, elsewhere it makes errors larger; and for smooth steps, such as
             linearize="predictor": where "auto" changes its choice, dt^3 is left.
+        t0: time of the start.
 
     Returns:
         A `Solution`. Nothing raises while the steps run: call `solution.check()`.
