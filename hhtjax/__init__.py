@@ -2,6 +2,41 @@
 
 A system, a stepper, one run, and derivatives through all of it: `System`, `hht`, `simulate`, `fit`. What a step does to
 a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`.
+
+    params ---> System(mass, force, constraint) ---> Stepper(begin, bind) ---> simulate, one scan ---> Solution
+                                                                                      |
+                                                             sweep, fit, analysis, interpolate, your own loop
+
+The house
+---------
+
+One room for each question, one floor above the other. An upper floor imports from lower ones, never the reverse, and a
+test says so (`tests/test_floors.py` holds the floors as data).
+
+    scenes            examples: systems with parameters and initial values
+    identification    fits, and how far to trust them
+    analysis          what a step does to a motion
+    runs              simulate, sweep, interpolate: steps in a loop
+    steppers          one step; `residual.py` has the method in thirty lines, one file for each family
+    systems           what moves: pytrees outside, one flat vector inside; constraints, rotations, inputs
+    numerics          solves, scans, loops, extrapolation: mathematics that knows no mechanics; rotation, trigonometry
+    xla               how a run becomes one kernel, behind one door; it alone reads what JAX keeps to itself
+    description       frozen descriptions, known by identity; checks: every check of an argument, once
+
+What holds everywhere:
+
+* Functions, and no state: a system and a stepper are frozen descriptions, static to `jit`; state, info and solution are
+  named tuples of arrays; what may change is in `params`, which is passed and never read from outside.
+* `jit`, `vmap` and `grad` go through everything. float32 and float64 keep their type.
+* A wrong argument is refused where it comes in, by an error that names the argument, its value and what was expected.
+  Inside a run nothing raises: what failed travels along as data, and `solution.check()` makes an error of it.
+* What a scene does not have costs nothing: without a constraint there is no row for it, with a constant mass no
+  derivative of it.
+
+How to add a stepper is in `hhtjax.steppers`, a scene in `hhtjax.scenes`, a rule for an operation in `hhtjax.xla`. How
+to test it: the table of problems and steppers in `tests/zoo.py` drives the tests of order, derivatives, dtypes, batches
+and memory, so that a new entry is tested like all others. Beyond that, a test belongs to a behaviour, compares with
+what was not computed by the same code, and has been seen to fail.
 """
 
 from hhtjax import analysis, identification, rotation, scenes, trigonometry

@@ -58,6 +58,10 @@ ARCTANGENT = [1 / (2 * k + 1) for k in range(16)]  # arctan(z) / z in powers of 
 def hat(x) -> jax.Array:
     """The matrix (3, 3) of the cross product with x (3,): hat(x) y = x cross y.
 
+    Args: x: (3,).
+    Returns: (3, 3).
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+
     >>> print(hat(jnp.array([1.0, 2.0, 3.0])))
     [[ 0. -3.  2.]
      [ 3.  0. -1.]
@@ -70,6 +74,10 @@ def hat(x) -> jax.Array:
 def vee(X) -> jax.Array:
     """The inverse of `hat`: x (3,) with hat(x) = X; if X (3, 3) is not skew, that of (X - X^T)/2.
 
+    Args: X: (3, 3).
+    Returns: (3,).
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+
     >>> print(vee(hat(jnp.array([1.0, 2.0, 3.0]))))
     [1. 2. 3.]
     """
@@ -79,6 +87,10 @@ def vee(X) -> jax.Array:
 
 def exp(psi) -> jax.Array:
     """R (3, 3) = I + c1 P + c2 P^2, the rotation by psi (3,), in rad (Rodrigues); orthogonal to rounding.
+
+    Args: psi: (3,), in rad.
+    Returns: (3, 3).
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
 
     >>> print((exp(jnp.array([0.0, 0.0, jnp.pi / 2])) @ jnp.array([1.0, 0.0, 0.0])).round(6) + 0.0)
     [0. 1. 0.]
@@ -96,6 +108,10 @@ def log(R) -> jax.Array:
     d log(R exp(eps)) = T^-1(psi) d eps at eps = 0. At pi they are those of the result, towards smaller angles.
 
     From the quaternion q of R by the largest column of 4 q q^T (Bar-Itzhack, J. Guidance 23 (2000) 1085-1087).
+
+    Args: R: a rotation, (3, 3).
+    Returns: (3,), in rad.
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
 
     >>> print(log(exp(jnp.array([0.0, 0.0, 3.0]))))
     [0. 0. 3.]
@@ -121,6 +137,10 @@ def tangent(psi) -> jax.Array:
 
     T^T takes moments from material components to those that work on psi. det T = 2 c2, so T is singular at 2 pi.
 
+    Args: psi: (3,), in rad.
+    Returns: (3, 3).
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+
     >>> psi = jnp.array([0.0, 0.0, 2.0])
     >>> print(tangent(psi) @ psi)                              # about a fixed axis, Om = psidot
     [0. 0. 2.]
@@ -134,6 +154,10 @@ def inverse_tangent(psi) -> jax.Array:
     """T^-1 (3, 3) = I + P/2 + d P^2 for psi (3,), in rad: psidot = T^-1 Om.
 
     It grows without bound towards |psi| = 2 pi, where T is singular: there the result is inf, NaN or only rounding.
+
+    Args: psi: (3,), in rad.
+    Returns: (3, 3).
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
 
     >>> psi = jnp.array([0.3, -0.2, 0.1])
     >>> print((inverse_tangent(psi) @ tangent(psi)).round(6) + 0.0)
@@ -149,6 +173,10 @@ def tangent_rate(psi, psidot) -> jax.Array:
     """Tdot psidot (3,), in rad/s^2, while psi (3,) changes by psidot (3,), in rad/s: Omdot = T psiddot + Tdot psidot.
 
         Tdot psidot = xdot (-dc2/dx P + dc3/dx P^2) psidot + c3 psidot x (psi x psidot),    xdot = 2 psi.psidot
+
+    Args: psi: (3,), in rad. psidot: (3,), in rad/s.
+    Returns: (3,), in rad/s^2.
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
 
     >>> print(tangent_rate(jnp.zeros(3), jnp.array([1.0, 2.0, 3.0])))
     [0. 0. 0.]
@@ -166,6 +194,10 @@ def orthonormalize(R) -> jax.Array:
     For products of many rotations, whose rounding errors add up. At a rotation, its derivative takes dR to the part
     that is tangent to the rotations.
 
+    Args: R: nearly a rotation, (3, 3).
+    Returns: (3, 3).
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+
     >>> round(float(orthonormalize(1.01 * jnp.eye(3))[0, 0]), 4)
     0.9998
     """
@@ -175,6 +207,10 @@ def orthonormalize(R) -> jax.Array:
 
 def is_rotation(R, tolerance):
     """Whether R (3, 3) has no entry of R^T R - I beyond the tolerance, and det R > 0; a boolean array, traceable.
+
+    Args: R: (3, 3). tolerance: a number.
+    Returns: A boolean, as an array.
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
 
     >>> bool(is_rotation(exp(jnp.ones(3)), 1e-6)), bool(is_rotation(-jnp.eye(3), 1e-6))
     (True, False)
@@ -188,6 +224,10 @@ def is_rotation(R, tolerance):
 def product(A, B) -> jax.Array:
     """A B (3, 3) elementwise: XLA fuses it, and keeps float32 at full precision on every device.
 
+    Args: A, B: (3, 3).
+    Returns: (3, 3).
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+
     >>> print(product(hat(jnp.array([1.0, 0.0, 0.0])), jnp.eye(3))[2])
     [0. 1. 0.]
     """
@@ -195,7 +235,15 @@ def product(A, B) -> jax.Array:
 
 
 def cross(x, y) -> jax.Array:
-    """x cross y, for (3,) each; of scalars, which XLA fuses better than the gathers of jnp.cross."""
+    """x cross y, for (3,) each; of scalars, which XLA fuses better than the gathers of jnp.cross.
+
+    Args: x, y: (3,).
+    Returns: (3,).
+    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+
+    >>> print(cross(jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])))
+    [0. 0. 1.]
+    """
     (a, b, c), (d, e, f) = x, y
     return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d])
 

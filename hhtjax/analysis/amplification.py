@@ -70,6 +70,9 @@ def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Arra
 
     Differentiable; goes under jit and vmap.
 
+    Returns:
+        A, (k, k).
+
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
 
@@ -138,10 +141,14 @@ def oscillator_matrix(stepper, frequency, damping=0.0) -> jax.Array:
     """A of the test oscillator, on (q, h v, h^2 w, h^2 a, memory) as far as the stepper carries them: (k, k).
 
     Args:
+        stepper: any.
         frequency: W = (natural frequency) h, positive; jnp.inf for the limit.
         damping: zeta, the damping ratio.
 
     Differentiable; goes under jit and vmap.
+
+    Returns:
+        A, (k, k).
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
@@ -187,6 +194,12 @@ def constraint_matrix(stepper) -> jax.Array:
         ggl       alpha/(1 + alpha), and -(1 - gamma)/gamma = -(1/2 + alpha)/(1/2 - alpha) once
 
     and zeros.
+
+    Args:
+        stepper: one of the `hht` family, or `conventional_hht`.
+
+    Returns:
+        A, (5, 5).
 
     Raises:
         TypeError: no stepper. NotImplementedError: one that cannot solve constraints.

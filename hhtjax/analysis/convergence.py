@@ -15,7 +15,13 @@ from hhtjax.systems.initial_values import initial_values
 
 @shown
 class ObservedOrder(NamedTuple):
-    """dt: step sizes (k,); error: 2-norms of the error of q at the end, or of its change; slope between neighbours."""
+    """What `observed_order` found.
+
+    Attributes:
+        dt: step sizes (k,).
+        error: 2-norms of the error of q at the end, or of its change.
+        slope: between neighbours.
+    """
 
     dt: Any
     error: Any

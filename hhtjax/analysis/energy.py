@@ -18,8 +18,15 @@ from hhtjax.systems.system import LinearSystem, System
 
 @shown
 class EnergyBalance(NamedTuple):
-    """By saved time, (K + 1,) each, in J. kinetic: v' M v/2; potential: V, 0 without; work: of all other forces since
-    the start; error: kinetic + potential - their sum at the start - work, which the motion itself leaves at 0."""
+    """Energies by saved time, (K + 1,) each, in J.
+
+    Attributes:
+        t: s.
+        kinetic: v' M v/2.
+        potential: V, 0 without.
+        work: of all other forces since the start.
+        error: kinetic + potential - their sum at the start - work, which the motion itself leaves at 0.
+    """
 
     t: Any
     kinetic: Any
@@ -44,6 +51,9 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
         potential: V, `potential(q, t, params)`, a scalar in J, of forces that are part of the system's; None for 0.
 
     Differentiable; goes under jit.
+
+    Returns:
+        An `EnergyBalance`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind.

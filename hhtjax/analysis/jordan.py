@@ -9,7 +9,12 @@ from hhtjax.checks import require_integer, require_number
 
 
 class Eigenvalue(NamedTuple):
-    """value; blocks: the sizes of its Jordan blocks, the largest first. Only blocks of 1: as many eigenvectors."""
+    """An eigenvalue, and how many eigenvectors belong to it.
+
+    Attributes:
+        value: a complex number.
+        blocks: the sizes of its Jordan blocks, the largest first. Only blocks of 1: as many eigenvectors.
+    """
 
     value: complex
     blocks: tuple[int, ...]
@@ -21,6 +26,13 @@ def jordan_structure(matrix, tolerance=1e-3) -> tuple[Eigenvalue, ...]:
     Rounding scatters an eigenvalue with a block of size k by a k-th root of itself, but not the mean of what it
     becomes. Eigenvalues closer than `tolerance` count as one, their mean mu, and the ranks of (A - mu I)^j tell the
     blocks; a singular value counts as zero below tolerance^2 times the largest possible.
+
+    Args:
+        matrix: real, (n, n).
+        tolerance: relative to the largest entry of the scaled matrix, in (0, 1).
+
+    Returns:
+        A tuple of `Eigenvalue`.
 
     Raises:
         TypeError, ValueError: no real square matrix; a tolerance that is not in (0, 1); eigenvalues within the
@@ -68,9 +80,14 @@ def transient_growth(matrix, num_steps, near=None) -> np.ndarray:
     without a block it is zero.
 
     Args:
-        matrix, num_steps: A; n at the end. near: mu is the eigenvalue nearest to it, by default the largest.
+        matrix: A, real, (n, n). num_steps: the last n.
+        near: mu is the eigenvalue nearest to it, by default the largest.
 
-    Raises: as `jordan_structure`, and ValueError for a num_steps that is not a positive integer.
+    Returns:
+        (num_steps + 1,).
+
+    Raises:
+        TypeError, ValueError: as `jordan_structure`; a num_steps that is not a positive integer.
 
     >>> import hhtjax
     >>> A = hhtjax.analysis.constraint_matrix(hhtjax.hht(alpha=-0.1, formulation="index3"))

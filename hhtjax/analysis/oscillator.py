@@ -30,7 +30,10 @@ def spectral_radius(stepper, frequency, damping=0.0) -> jax.Array:
     At infinity, where roots meet (those of HHT in two), `jordan_structure` tells them to rounding.
 
     Args:
-        frequency, damping: as in `oscillator_matrix`, or arrays of them.
+        stepper, frequency, damping: as in `oscillator_matrix`, or arrays of the last two.
+
+    Returns:
+        Of the shape of frequency and damping, broadcast.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
@@ -48,7 +51,14 @@ def damping_ratio(stepper, frequency, damping=0.0) -> jax.Array:
     For damping = 0 all of it is the method's. The principal eigenvalue is the one that oscillates fastest; NaN where
     none oscillates, as with the strongly damping methods at large frequencies.
 
-    Args, raises: as in `spectral_radius`.
+    Args:
+        stepper, frequency, damping: as in `spectral_radius`.
+
+    Returns:
+        Of the shape of frequency and damping, broadcast; NaN where none oscillates.
+
+    Raises:
+        TypeError, ValueError: as `spectral_radius`.
 
     References:
         Hughes (1987), Sec. 9.1.3.
@@ -64,7 +74,14 @@ def damping_ratio(stepper, frequency, damping=0.0) -> jax.Array:
 def period_elongation(stepper, frequency, damping=0.0) -> jax.Array:
     """Relative error of the natural period, W/|r| - 1 with r = log(principal eigenvalue) as in `damping_ratio`.
 
-    Args, raises: as in `spectral_radius`.
+    Args:
+        stepper, frequency, damping: as in `spectral_radius`.
+
+    Returns:
+        Of the shape of frequency and damping, broadcast; NaN where none oscillates.
+
+    Raises:
+        TypeError, ValueError: as `spectral_radius`.
 
     >>> import hhtjax
     >>> round(float(hhtjax.analysis.period_elongation(hhtjax.hht(alpha=-0.05), 0.1)), 6)        # 0.000833 for alpha = 0
@@ -80,7 +97,14 @@ def overshoot(stepper, frequency, damping=0.0) -> jax.Array:
     At most 1 for the motion itself and for the trapezoidal rule. HHT overshoots in velocity, in proportion to W; such
     a peak decays with the next steps, unlike what a spectral radius above 1 raises.
 
-    Args, raises: as in `spectral_radius`.
+    Args:
+        stepper, frequency, damping: as in `spectral_radius`.
+
+    Returns:
+        Of the shape of frequency and damping, broadcast.
+
+    Raises:
+        TypeError, ValueError: as `spectral_radius`.
 
     References:
         Hilber, Hughes, Earthquake Eng. Struct. Dyn. 6 (1978) 99-117.
@@ -112,6 +136,13 @@ def stability_region(stepper, z) -> jax.Array:
     """Spectral radius of the step for y' = lambda y at z = h lambda, complex; stable where it is <= 1. Shaped like z.
 
     Of what y feels: not of the a of `kim_hht`, for example, whose recursion y never meets.
+
+    Args:
+        stepper: any.
+        z: complex numbers, an array of any shape.
+
+    Returns:
+        Shaped like z.
 
     Raises:
         TypeError, ValueError: no stepper; z not of finite numbers.

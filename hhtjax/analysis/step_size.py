@@ -27,11 +27,12 @@ RIGID = 1e-7  # |lambda| relative to the largest that counts as zero
 class Mode(NamedTuple):
     """A mode of the linearised system, and what the stepper makes of it at the suggested step.
 
-    frequency: |lambda|, natural frequency in rad/s, or rate of a motion that does not oscillate; damping_ratio: -1 for
-    pure growth, 1 for pure decay.
-    largest_dt: up to which the stepper keeps to the tolerance.
-    numerical_damping_ratio, period_elongation: of the discrete mode; NaN where one of the two does not oscillate.
-    resolved: whether the suggested step is below largest_dt.
+    Attributes:
+        frequency: |lambda|, natural frequency in rad/s, or rate of a motion that does not oscillate.
+        damping_ratio: -1 for pure growth, 1 for pure decay.
+        largest_dt: up to which the stepper keeps to the tolerance.
+        numerical_damping_ratio, period_elongation: of the discrete mode; NaN where one of the two does not oscillate.
+        resolved: whether the suggested step is below largest_dt.
     """
 
     frequency: float
@@ -43,7 +44,13 @@ class Mode(NamedTuple):
 
 
 class StepSize(NamedTuple):
-    """dt in s; reason: what limits it; modes: slowest first. As text, a table."""
+    """A suggestion; as text, a table.
+
+    Attributes:
+        dt: s.
+        reason: what limits it.
+        modes: a `Mode` for each, slowest first.
+    """
 
     dt: float
     reason: str
@@ -98,7 +105,11 @@ def suggest_step_size(
             take the stiffest state of the motion. They are those of the frozen state: where it moves fast, they also
             depend on the choice of coordinates.
         tolerance: in (0, 1).
+        highest: rad/s, of the modes that are to be resolved; None for all.
         duration: s; without `highest`.
+
+    Returns:
+        A `StepSize`, which prints as a table.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a system without a time scale of its own, or a

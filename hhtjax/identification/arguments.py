@@ -19,7 +19,19 @@ FOR_MANY = optax.lbfgs()  # one object, so that a second fit finds the first one
 
 
 class Gaussian(NamedTuple):
-    """A prior: mean and standard deviation, numbers or arrays like the parameter."""
+    """A prior, normally distributed, for `fit`.
+
+    Attributes:
+        mean, deviation: numbers, or arrays like the parameter.
+
+    Raises:
+        TypeError, ValueError: by `fit`: a mean or deviation that is not real, a deviation that is not positive.
+
+    >>> import jax, hhtjax
+    >>> result = hhtjax.fit(lambda p: p - jax.numpy.array([2.0, 4.0]), 0.0, prior=hhtjax.Gaussian(1.0, 0.5))
+    >>> round(float(result.params), 6)                # (2 + 4 + 4 * 1)/(1 + 1 + 4): the prior weighs as four samples
+    1.666667
+    """
 
     mean: Any
     deviation: Any

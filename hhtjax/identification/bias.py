@@ -32,12 +32,15 @@ DRIVEN = 64  # steps from t, in which a force that depends on the time has chang
 
 @shown
 class ModeBias(NamedTuple):
-    """Per mode with an oscillation, slowest first, arrays (modes,).
+    """What the step size did to a fit, for each mode with an oscillation, slowest first, arrays (modes,).
 
-    frequency: w = |s|, rad/s, and damping: -Re s/w, of the motion itself; both free of the bias. wh: w h.
-    stiffness_bias: |s'|^2/|s|^2 - 1. damping_bias: Re s'/Re s - 1, 0 for an undamped mode. s' belongs to the
-    parameters as fitted with steps h.
-    params: the fitted ones without the bias; None if not asked for.
+    Attributes:
+        frequency: w = |s|, rad/s, of the motion itself; free of the bias.
+        damping: -Re s/w, the damping ratio of the motion itself; free of the bias.
+        wh: w h.
+        stiffness_bias: |s'|^2/|s|^2 - 1; s' belongs to the parameters as fitted with steps h.
+        damping_bias: Re s'/Re s - 1, 0 for an undamped mode.
+        params: the fitted ones without the bias; None if not asked for.
     """
 
     frequency: Any
@@ -78,7 +81,8 @@ def step_size_bias(
     Args:
         system, stepper, dt: what the parameters were fitted through.
         params: the fitted ones.
-        q: an equilibrium, or another point about which the motion is small, on the constraint. v: 0 by default.
+        q: an equilibrium, or another point about which the motion is small, on the constraint.
+        v: velocity there, 0 by default. t0: time there.
         correct: True returns `params` with the smallest relative changes that give the equations the eigenvalues s
             and the steps' response to forces ("pre-warped"). That takes the bias out of all of them where they can
             follow: with masses fitted as well, entry by entry of M if there are several modes; or in the free
@@ -86,6 +90,9 @@ def step_size_bias(
             the motion: then the frequencies alone are given back, damping stays as fitted, and a warning says so.
             Parameters that the linear part does not depend on stay as they are. Or Booleans for the leaves of params,
             or for whole branches: False for what was not fitted, such as a known mass.
+
+    Returns:
+        A `ModeBias`.
 
     Warns:
         StepSizeWarning: params cannot follow. `refine` takes their bias out, from two fits or three.

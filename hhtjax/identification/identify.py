@@ -65,8 +65,9 @@ def fit(
         records: several experiments, or windows of one: any pytree whose leaves have a leading axis, one entry for
             each. Then `residuals(params, start, record)` is of one record.
         starts: guesses of what belongs to one record alone, such as its initial state: a pytree with the same leading
-            axis. It is fitted too, and eliminated from each step (a Schur complement), so that the Jacobian has
-            columns for one start only, however many records there are. Levenberg-Marquardt, without a prior.
+            axis. It is fitted too, and eliminated from each step, which is solved for the parameters alone (by a
+            Schur complement): so the Jacobian has columns for one start only, however many records there are.
+            Levenberg-Marquardt, without a prior.
         transforms: for each leaf of params0, or for whole branches: `positive`, `bounded(lower, upper)`, `fixed`,
             or None for neither.
         scale: typical size of each parameter: a pytree like params0, whose leaves are numbers or arrays of
@@ -85,7 +86,8 @@ def fit(
             the cost, five times running.
         covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
         segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
-            residuals are cut for the cluster covariance (`hhtjax.identification.sandwich`).
+            residuals are cut: how much these disagree gives the standard errors (the cluster covariance of
+            `Uncertainty`).
         progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
 
     A function is traced once, and then known by its identity: data that it reads from outside are part of the program,
@@ -129,7 +131,12 @@ def fit(
 
 @shown
 class Multistart(NamedTuple):
-    """best: the `FitResult` of the lowest cost. all: a `FitResult` with a leading axis, one for each start."""
+    """What `multistart` found.
+
+    Attributes:
+        best: the `FitResult` of the lowest cost.
+        all: a `FitResult` with a leading axis, one entry for each start.
+    """
 
     best: FitResult
     all: FitResult
@@ -155,7 +162,11 @@ def multistart(
     Args:
         starts: a pytree like params0, each leaf with a leading axis, one entry for each start.
         scale: a pytree like params0; by default that of the first start.
-        Everything else as in `fit`.
+        residuals, optimizer, transforms, weights, loss, prior, max_iterations, tolerance, covariance, segments: as in
+            `fit`.
+
+    Returns:
+        A `Multistart`.
 
     Raises:
         TypeError, ValueError: as `fit`; starts of unequal numbers; residuals that are finite at none of them.

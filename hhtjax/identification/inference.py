@@ -23,8 +23,12 @@ from hhtjax.identification.sandwich import SEGMENTS
 class Score(NamedTuple):
     """What `score_test` says of each candidate, arrays (candidates,).
 
-    names; statistic: about chi-squared with one degree of freedom where the term is absent, so that 3.84 is the 95 %
-    and 10.8 the 99.9 % point. cost_drop: share of the cost that it would take away. estimate: one Gauss-Newton step.
+    Attributes:
+        names: of the candidates.
+        statistic: about chi-squared with one degree of freedom where the term is absent, so that 3.84 is the 95 % and
+            10.8 the 99.9 % point.
+        cost_drop: share of the cost that it would take away.
+        estimate: one Gauss-Newton step.
     """
 
     names: list
@@ -46,6 +50,9 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
         residuals: (params, candidates) -> a pytree of arrays.
         params: as fitted without the candidates. candidates: the values at which they are absent, mostly zeros.
         segments: how many.
+
+    Returns:
+        A `Score`.
 
     Raises:
         TypeError, ValueError: residuals is no function; segments is no integer, 2 or more.
@@ -88,8 +95,14 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
 
 @shown
 class Profile(NamedTuple):
-    """values: of the parameter, and cost: the least one with it held there, (values,). deviance: 2 (cost - that of the
-    fit)/variance, scaled so that its parabola is that of the standard error; 3.84 bounds the 95 % interval."""
+    """What `profile` found.
+
+    Attributes:
+        values: of the parameter, (values,).
+        cost: the least one with the parameter held there, (values,).
+        deviance: 2 (cost - that of the fit)/variance, (values,), scaled so that its parabola is that of the standard
+            error; 3.84 bounds the 95 % interval.
+    """
 
     values: Any
     cost: Any
@@ -104,8 +117,20 @@ def profile(residuals: Callable[..., Any], result: FitResult, name: str, values:
         result: of that fit, with its covariance.
         name: of a scalar parameter, as in `result.summary()`. values: where to hold it.
 
+    Returns:
+        A `Profile`.
+
     Raises:
         ValueError: no parameter of that name, or one that is no scalar leaf or was fixed; a fit without covariance.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> x = jnp.linspace(0.0, 1.0, 200)
+    >>> def residuals(p):
+    ...     return p["a"] * x + p["b"] - 2.0 * x - 0.1 * jnp.sin(99.0 * x)
+    >>> result = hhtjax.fit(residuals, {"a": 1.0, "b": 0.0})
+    >>> found = hhtjax.identification.profile(residuals, result, "a", jnp.array([1.9, float(result.params["a"]), 2.1]))
+    >>> [bool(x > 3.84) for x in found.deviance]                                      # outside of the 95 % interval
+    [True, False, True]
     """
     believed = _uncertainty("profile", result)
     leaves, structure = jax.tree.flatten(freeze(result.params))
@@ -149,7 +174,11 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
 
     Args:
         predict: params -> any pytree of real arrays, such as the output at another input.
-        result: of `fit`, with its covariance C. noise: standard deviation of a new measurement's noise.
+        result: of `fit`, with its covariance C.
+        noise: standard deviation of a new measurement's noise.
+
+    Returns:
+        Numbers and arrays like what predict returns.
 
     Raises:
         ValueError: a fit without covariance.

@@ -16,8 +16,11 @@ from hhtjax.runs.solution import Solution
 class Windows(NamedTuple):
     """Windows of measurements, each with its own clock; the last entries of shorter ones repeat, and are not present.
 
-    t: (windows, samples), s since the first sample of the window. y: (windows, samples, ...). present: Booleans like
-    y, the weights of `fit`. begin: (windows,), time of the first samples on the clock of the record.
+    Attributes:
+        t: (windows, samples), s since the first sample of the window.
+        y: (windows, samples, ...), measured.
+        present: Booleans like y, the weights of `fit`.
+        begin: (windows,), time of the first samples on the clock of the record.
     """
 
     t: Any
@@ -34,6 +37,9 @@ def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
         y: (samples, ...), measured. present: Booleans like y; False where a sample is missing, and may be NaN.
         duration: of a window, s. The next window begins with the first sample at its end or after it; without a gap
             there, the two share that sample.
+
+    Returns:
+        A `Windows`.
 
     Raises:
         TypeError, ValueError: unequal lengths; times that do not increase; NaN not declared missing; a record shorter
@@ -75,6 +81,15 @@ def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
 def wrap_angle(angle: Any) -> Any:
     """The same angle in [-pi, pi): for the difference of two angles of which one has lost its whole turns.
 
+    Args:
+        angle: rad, an array of any shape.
+
+    Returns:
+        Shaped like angle.
+
+    Raises:
+        TypeError: angle is not real.
+
     >>> round(float(wrap_angle(6.0)), 4)                                          # 6 - 2 pi
     -0.2832
     """
@@ -90,9 +105,13 @@ def measure(solution: Solution, times: Any, gain: Any = 1.0, offset: Any = 0.0, 
     Args:
         solution: of one run. times: (samples,), s, not after its end.
         gain, offset: numbers, or pytrees like q.
+        delay: s, a number.
 
     Returns:
         A pytree like q, with a leading axis of samples.
+
+    Raises:
+        TypeError, ValueError: as `interpolate`; gain or offset unlike q.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q)

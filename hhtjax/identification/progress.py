@@ -22,8 +22,13 @@ REASONS = {
 
 @shown
 class History(NamedTuple):
-    """Per iteration, the start first: cost; largest entry of the step in the scaled coordinates, 0 where it was
-    taken back; and the damping of Levenberg-Marquardt (None for optax)."""
+    """The course of a fit, per iteration, the start first.
+
+    Attributes:
+        cost: after the iteration.
+        step: largest entry of the step in the scaled coordinates, 0 where it was taken back.
+        damping: of Levenberg-Marquardt (None for optax).
+    """
 
     cost: Any
     step: Any

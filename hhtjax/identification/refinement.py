@@ -33,8 +33,11 @@ class StepSizeWarning(UserWarning):
 class Refined(NamedTuple):
     """What `refine` returns: an estimate together with the scheme and the step that it belongs to.
 
-    stepper, dt: of the first fit. fits: `FitResult` with steps of dt, dt/2, ... params: Richardson's extrapolation to
-    dt = 0. shift: of the first fit from there, in its standard errors, a pytree like params.
+    Attributes:
+        stepper, dt: of the first fit.
+        fits: a `FitResult` for each of dt, dt/2, ...
+        params: Richardson's extrapolation to dt = 0.
+        shift: of the first fit from there, in its standard errors, a pytree like params.
     """
 
     stepper: Any
@@ -92,13 +95,34 @@ def refine(
     Args:
         residuals_at: (stepper, dt) -> the function residuals(params) of `fit`.
         params0, options: as in `fit`. Each fit starts where the one before ended.
+        stepper: whose order and damping decide about the extrapolation; handed to residuals_at.
+        dt: step size of the first fit, s.
         levels: number of fits, at least 2. None: 3 with numerical damping, else 2.
+
+    Returns:
+        A `Refined`.
 
     Warns:
         StepSizeWarning: some parameter is shifted by more than one standard error: names it.
 
     Raises:
         TypeError, ValueError: dt is no positive number, and whatever `fit` raises.
+
+    >>> import warnings, jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q)
+    >>> times = jnp.arange(1.0, 11.0)
+    >>> def residuals_at(stepper, dt):
+    ...     def residuals(params):
+    ...         start = jnp.ones(1), jnp.zeros(1)
+    ...         run = hhtjax.simulate(spring, stepper, *start, params, dt=dt, num_steps=round(10 / dt))
+    ...         return run.q[round(1 / dt) :: round(1 / dt), 0] - jnp.cos(3 * times)                  # so k is 9
+    ...     return residuals
+    >>> trapezoidal = hhtjax.hht(alpha=0.0, linearize="predictor")
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", hhtjax.identification.StepSizeWarning)      # there is no noise to hide it
+    ...     found = hhtjax.refine(residuals_at, {"k": 8.9}, trapezoidal, 0.05)
+    >>> f"{found.fits[0].params['k']:.2f} {found.params['k']:.4f}"
+    '9.03 9.0000'
     """
     require_function("refine", "residuals_at", residuals_at, "residuals_at(stepper, dt)")
     require_stepper("refine", stepper)

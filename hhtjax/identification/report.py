@@ -67,7 +67,8 @@ def _columns(free, error, lower, upper, naive):
 
 def _remarks(result, names):
     believed = result.uncertainty
-    kind = f"cluster sandwich over {result.segments} segments" if believed.cluster is not None else "autocorrelated"
+    segments = f"how much {result.segments} segments of the record disagree (cluster sandwich)"
+    kind = f"from {segments}" if believed.cluster is not None else "from the autocorrelation of the residuals"
     remarks = [f"standard errors: {kind}"]
     size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
     unknown, why = why_undetermined(result.params, result.free, believed, size)

@@ -22,15 +22,22 @@ from hhtjax.identification.sandwich import Uncertainty, correlation
 class FitResult(NamedTuple):
     """An estimate, how it was reached, and how far to trust it.
 
-    params: the estimate, structured like params0. residual: residuals(params), as the user's function gives it.
-    cost: 1/2 sum rho(weighted residual^2), and of priors. history: `History`, NaN after the last iteration when made
-    inside jit. iterations: how many. code: why it stopped, a key of `REASONS`. transforms: of each leaf.
-    uncertainty: `Uncertainty` of the free entries; None if not asked for. segments: how many the cluster
-    covariance rests on.
-    starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
-    covariance: (p, p); rows follow ravel_pytree(params). standard_errors: root of its diagonal, structured like params.
-    Both from the cluster sandwich over segments, or autocorrelated where parameters outnumber segments. A fixed
-    parameter has variance 0; one that the residuals do not determine has inf, and covariances 0.
+    Attributes:
+        params: the estimate, structured like params0.
+        residual: residuals(params), as the user's function gives it.
+        cost: 1/2 sum rho(weighted residual^2), and of priors.
+        history: `History`, NaN after the last iteration when made inside jit.
+        iterations: how many.
+        code: why it stopped, a number; `reason` says it in words.
+        transforms: of each leaf.
+        uncertainty: `Uncertainty` of the free entries; None if not asked for.
+        segments: how many parts of the record the covariance rests on.
+        starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
+
+    `covariance` (p, p), whose rows follow ravel_pytree(params), and `standard_errors`, the root of its diagonal,
+    structured like params, come from how much segments of the record disagree (a cluster-robust covariance:
+    `Uncertainty`), or from the autocorrelation of the residuals where parameters outnumber segments. A fixed parameter
+    has variance 0; one that the residuals do not determine has inf, and covariances 0.
     """
 
     params: Any

@@ -35,11 +35,17 @@ ALONE = 0.75  # share of the information on a combination of parameters, above w
 class Uncertainty(NamedTuple):
     """Covariances (p, p) of the free entries, in the order of `ravel_pytree(params)`, and what the residuals determine.
 
-    cluster: None where there are no more segments than parameters. singular_values: (p,), of the Jacobian with columns
-    scaled to one, largest first: a small one belongs to a combination of parameters that hardly matters. directions:
-    (p, p), a row for each: the change of the parameters, in their units. undetermined: (p,), parameters in a
-    combination that does not matter at all; their variance is inf, and their covariances are 0. inverse: of the second
-    derivative of the cost, J^T diag(psi') J.
+    Attributes:
+        cluster: from how much segments of the record disagree, the "cluster sandwich" (`hhtjax.identification.sandwich`
+            has formulas and sources); None where there are no more segments than parameters.
+        naive: the textbook's, as if every residual were independent noise.
+        autocorrelated: the textbook's, with the correlation that the residuals have.
+        singular_values: (p,), of the Jacobian with columns scaled to one, largest first: a small one belongs to a
+            combination of parameters that hardly matters.
+        directions: (p, p), a row for each of these: the change of the parameters, in their units.
+        undetermined: (p,), parameters in a combination that does not matter at all; their variance is inf, and their
+            covariances are 0.
+        inverse: of the second derivative of the cost, J^T diag(psi') J.
     """
 
     cluster: Any

@@ -36,10 +36,11 @@ def equation_error(
             cubic spline through them, `sampled(values, times=)`, as many as the samples, at equal distances: the cutoff
             has to stay well below half the sampling rate of the sparsest part.
 
+    Returns:
+        A function of params, whose result is (samples without both ends, n), in units of force.
+
     Raises:
         TypeError, ValueError: as `band_limited_motion` and `sampled`. NotImplementedError: a system with constraints.
-
-    Shape of the result: (samples without both ends, n), in units of force.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)

@@ -119,6 +119,12 @@ fixed = Fixed()
 def bounded(lower: float, upper: float) -> Bounded:
     """A transform that keeps a parameter strictly between two numbers.
 
+    Args:
+        lower, upper: numbers.
+
+    Returns:
+        What `fit(transforms=...)` takes.
+
     Raises:
         TypeError, ValueError: a bound is no finite number, or lower >= upper.
 

@@ -54,6 +54,9 @@ def banded(half_bandwidth=1, tolerance=None) -> Banded:
         tolerance: of this residual, relative to the right-hand side (2-norm); 1e-6 by default, 1e-3 in float32. A step
             above it is a failure that `solution.check()` names; `solution.info.solve_residual` has the largest.
 
+    Returns:
+        What `hht(solve=...)` takes.
+
     Raises:
         ValueError: half_bandwidth is no positive integer, or tolerance not positive.
 
@@ -84,8 +87,19 @@ def conjugate_gradients(iterations, tolerance=None) -> ConjugateGradients:
         tolerance: as in `banded`. Solves meant to be inexact need a larger one: with Newton's iteration 0.1 is enough
             for the motion, while derivatives are as exact as the solve.
 
+    Returns:
+        What `hht(solve=...)` takes.
+
     Raises:
         ValueError: iterations is no positive integer, or tolerance not positive.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> tower = hhtjax.System(jnp.ones(3), lambda q, v, t, params: -100.0 * q)
+    >>> stepper = hhtjax.hht(linearize="predictor", solve=hhtjax.conjugate_gradients(2))
+    >>> run = hhtjax.simulate(tower, stepper, jnp.ones(3), jnp.zeros(3), dt=0.01, num_steps=10)
+    >>> run.check()
+    >>> round(float(run.q[-1, 0]), 3)                                                                   # cos(1)
+    0.541
     """
     iterations = require_integer("conjugate_gradients", "iterations", iterations)
     return ConjugateGradients(iterations, _tolerance("conjugate_gradients", tolerance))

@@ -1,1 +1,86 @@
-"""Runs: one, many at once, over the disk, between their samples; and what they say about themselves."""
+"""Runs: one, many at once, over the disk, between their samples; and what they say about themselves.
+
+    simulate          one run: a `Solution`, whose `check()` names the first step that failed
+    sweep             many runs at once, with step sizes, parameters, starts and coefficients of their own
+    sweep_to_disk     the same in pieces, which survive being killed
+    interpolate       what lies between the saved times
+
+Everything composes with `jit`, `vmap` and `grad`: dt, alpha, q0, v0 and params can all be differentiated.
+
+>>> import jax, jax.numpy as jnp, hhtjax
+>>> pendulum = hhtjax.System(lambda q, params: jnp.array([params["l"]]), lambda q, v, t, params: -9.81 * jnp.sin(q))
+>>> q0, v0, params = jnp.array([1.0]), jnp.array([0.0]), {"l": 0.5}
+>>> def final_angle(dt, alpha, length):
+...     stepper = hhtjax.hht(alpha=alpha)
+...     return hhtjax.simulate(pendulum, stepper, q0, v0, {"l": length}, dt=dt, num_steps=100).q[-1, 0]
+>>> [bool(jnp.isfinite(x)) for x in jax.grad(final_angle, argnums=(0, 1, 2))(1e-2, -0.05, 0.5)]
+[True, True, True]
+>>> jax.vmap(final_angle, in_axes=(0, None, None))(jnp.logspace(-4, -1, 7), -0.05, 0.5).shape     # many steps at once
+(7,)
+
+Known by identity
+-----------------
+
+A system, or the residuals of a fit, is compiled at the first call and then known by the identity of its functions. So a
+function that reads a global variable, or an array around it, keeps what it has read at that first call, and a changed
+global gives the result of the old one without a word:
+
+>>> stiffness = 1.0
+>>> def force(q, v, t, params):
+...     return -stiffness * q
+>>> spring = hhtjax.System(jnp.ones(1), force)
+>>> def end():
+...     return float(hhtjax.simulate(spring, hhtjax.hht(), q0, v0, dt=1e-2, num_steps=10).q[-1, 0])
+>>> before = end()
+>>> stiffness = 100.0
+>>> end() == before                                                                                 # stale
+True
+
+What may change belongs into params (or, for the data of a fit, into `records`). Where that is not possible, make the
+function anew, or forget all that was compiled, by `jax.clear_caches()`:
+
+>>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: force(q, v, t, params))
+>>> end() == before
+False
+
+Sweeps
+------
+
+Step sizes, parameters, initial states and coefficients are data: any list of step sizes is one compiled call, sampled
+at common times, at about the work of its members' own steps. A member that fails is flagged, and leaves the others
+alone.
+
+>>> dts = jnp.logspace(-3, -1, 9)                    # made smaller, if need be, to land on the samples: sweep.dt
+>>> sweep = hhtjax.sweep(pendulum, hhtjax.hht(), q0, v0, params, dts=dts, duration=2.0, num_samples=20)
+>>> sweep.check()
+>>> sweep.q.shape
+(9, 21, 1)
+
+`times=`, in the place of `duration` and `num_samples`, are sample times at any distances, as of measured data; steps
+end at each. `in_axes=`, as for `jax.vmap`, says what else differs between members. `sweep_to_disk` writes chunks of
+members as `.npz`, continues where it was killed, and refuses other inputs. On a cluster, in every process:
+
+    jax.distributed.initialize()
+    mesh = jax.make_mesh((jax.device_count(),), ("members",))
+    sweep = hhtjax.sweep(pendulum, hhtjax.hht(), q0, v0, params, dts=dts, duration=2.0, num_samples=20, mesh=mesh)
+
+The results are bitwise those of one device. What this costs, with large systems (`hht(solve=hhtjax.banded(p))`, or
+`conjugate_gradients(k)`, whose steps grow with the number of unknowns) and a step at 1 kHz, is on a page,
+`experiments/sweeps/README.md`.
+
+Dense output
+------------
+
+`interpolate` gives q and v at any times inside a run. Derivatives pass through it, so that a fit may compare at the
+times of the measurements.
+
+>>> run = hhtjax.simulate(pendulum, hhtjax.hht(), q0, v0, params, dt=1e-2, num_steps=600)
+>>> hhtjax.interpolate(run, jnp.array([0.123, 4.56])).q.shape
+(2, 1)
+
+Extrapolation
+-------------
+
+`simulate(..., extrapolate=2)`, or 3, takes the leading errors in dt out of two, or three, runs with steps of dt, dt/2
+(and dt/4): order 3 and 4 where the motion is smooth and dt resolves it.
+"""

@@ -13,7 +13,11 @@ from hhtjax.systems import kinematics
 
 @shown
 class Interpolant(NamedTuple):
-    """Position and velocity at the times asked for, with these as leading axis; of a first-order system y and None."""
+    """Position and velocity between the saved times; made by `interpolate`.
+
+    Attributes:
+        q, v: with the times asked for as leading axes; of a first-order system y and None.
+    """
 
     q: Any
     v: Any
@@ -29,8 +33,12 @@ def interpolate(solution, times) -> Interpolant:
         solution: of one run (vmap this function for a batch).
         times: scalar or array, inside [solution.t[0], solution.t[-1]] up to rounding.
 
+    Returns:
+        An `Interpolant`.
+
     Raises:
-        ValueError: a time outside the run. For tracers the result is NaN there.
+        TypeError, ValueError: times that are not real; a solution of several runs; a time outside the run, where the
+            result is NaN for tracers.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: 0 * q - 9.81)

@@ -54,6 +54,7 @@ def simulate(
             dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already). For
             motions that dt resolves, elsewhere it makes errors larger; and for smooth steps, such as
             linearize="predictor": where "auto" changes its choice, dt^3 is left.
+        t0: time of the start.
 
     Returns:
         A `Solution`. Nothing raises while the steps run: call `solution.check()`.

@@ -17,11 +17,17 @@ class SimulationError(RuntimeError):
 
 @shown
 class Failure(NamedTuple):
-    """The first step that failed. step: its number, from 1, or 0 if none did; newton: True if Newton's
-    iteration failed while the state was still finite; quantity: index into QUANTITIES of the first that is not finite;
-    row: number, from 1, of the constraint that came to depend on those before it, 0 if none did, None without
-    constraints. solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the
-    solve is the library's own."""
+    """The first step that failed, as data.
+
+    Attributes:
+        step: its number, from 1, or 0 if none did.
+        newton: whether Newton's iteration failed while the state was still finite.
+        quantity: number of the first quantity that is not finite.
+        row: number, from 1, of the constraint that came to depend on those before it, 0 if none did; None without
+            constraints.
+        solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is
+            the library's own.
+    """
 
     step: Any
     newton: Any
@@ -46,13 +52,14 @@ QUANTITIES = "the position q", "the velocity v", "the acceleration", "the vector
 class Solution(NamedTuple):
     """A trajectory at its saved times, the start included.
 
-    t: (K + 1,). q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order
-    system y, y' and None.
-    multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L.
-    dt: the step size; (K,) of a sweep over `times`, one for each interval.
-    info: `Info` for each of the K intervals between saved times: largest residual, number of Newton
-    iterations, all converged; None where the method has nothing to tell.
-    failure: the first step that failed, as data; `check` turns it into an error.
+    Attributes:
+        t: (K + 1,).
+        q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order system y, y' and None.
+        multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L.
+        dt: the step size; (K,) of a sweep over `times`, one for each interval.
+        info: `Info` for each of the K intervals between saved times: largest residual, number of Newton iterations, all
+            converged; None where the method has nothing to tell.
+        failure: the first step that failed, a `Failure`; `check` turns it into an error.
     """
 
     t: Any

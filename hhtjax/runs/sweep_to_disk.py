@@ -46,8 +46,9 @@ def sweep_to_disk(
 
     Args:
         folder: made if it does not exist.
-        chunk: members in a file, which bounds the memory; progress: one line on stderr for each.
-        The others are those of `sweep`.
+        chunk: members in a file, which bounds the memory.
+        progress: one line on stderr for each file.
+        system, stepper, q0, v0, params, dts, duration, num_samples, times, t0, in_axes: those of `sweep`.
 
     Returns:
         The folder, to be read by `load_sweep`, or by `numpy.load` file by file.
@@ -56,6 +57,16 @@ def sweep_to_disk(
         ValueError: the folder holds a sweep of other inputs or versions.
         OSError: a file cannot be written, such as on a full disk; those before it stay, and the same call goes on.
         TypeError, ValueError: as `sweep`; also for tracers.
+
+    >>> import tempfile, jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: -4.0 * q)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     where = hhtjax.sweep_to_disk(
+    ...         folder, spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1),
+    ...         dts=jnp.array([0.1, 0.05, 0.01]), duration=1.0, num_samples=5, chunk=2)
+    ...     found = hhtjax.load_sweep(where)
+    >>> found["q"].shape                                                             # members, samples, coordinates
+    (3, 6, 1)
     """
     chunk = require_integer("sweep_to_disk", "chunk", chunk)
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
@@ -83,8 +94,19 @@ def sweep_to_disk(
 def load_sweep(folder) -> dict[str, np.ndarray]:
     """What `sweep_to_disk` wrote: the leaves of the `Solution` by name, members first.
 
+    Args:
+        folder: where `sweep_to_disk` wrote to.
+
+    Returns:
+        Arrays by name: "t", "q", "v", "dt", "failure.step", ...; their first axis is that of the members.
+
     Raises:
         FileNotFoundError: a chunk is missing, because the sweep is not finished.
+
+    >>> import hhtjax
+    >>> hhtjax.load_sweep("no such folder")  # doctest: +IGNORE_EXCEPTION_DETAIL
+    Traceback (most recent call last):
+    FileNotFoundError: ...
     """
     folder = Path(folder)
     chunks = json.loads((folder / "manifest.json").read_text())["chunks"]

@@ -1,4 +1,17 @@
-"""Scenes: one small file each."""
+"""Scenes: systems to start from, one small file each, which return a `Scene`.
+
+>>> import hhtjax
+>>> scene = hhtjax.scenes.double_pendulum.stiff()
+>>> run = hhtjax.simulate(
+...     scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params, dt=scene.duration / 1000, num_steps=1000)
+>>> run.check()
+>>> run.q.shape
+(1001, 2)
+
+A scene of your own is a file with plain functions, `mass(q, params)` and `force(q, v, t, params)`, and at its end a
+function that returns a `Scene` of them with numbers in SI units. The docstring gives the equations and their source;
+the test compares with something that was not computed by this library: a closed form, a table in print, or SciPy.
+"""
 
 from hhtjax.scenes import arm as arm
 from hhtjax.scenes import body_chain as body_chain

@@ -186,6 +186,12 @@ def swing(joints=6) -> Scene:
 
     Base yaw, shoulder and elbow pitch on soft springs, wrist roll, wrist pitch and tool roll on stiff
     ones with strong dampers: time scales from 1 ms to 2 s.
+
+    Args:
+        joints: how many, 1 to 6.
+
+    Raises:
+        TypeError, ValueError: joints is none of these.
     """
     joints = int(require_number("swing", "joints", joints, lambda n: n in range(1, 7), "be 1, 2, ... 6"))
     yaw, pitch, roll = np.eye(3)[::-1]

@@ -57,14 +57,23 @@ def _using(trigonometry, function):
 
 
 def free(trigonometry=jnp) -> Scene:
-    """No springs, no dampers: chaotic, conservative."""
+    """No springs, no dampers: chaotic, conservative.
+
+    Args:
+        trigonometry: the module whose sin and cos it uses, such as `hhtjax.trigonometry`.
+    """
     params = {"m": (1.0, 1.0), "l": (1.0, 1.5), "k": (0.0, 0.0), "c": (0.0, 0.0), "g": GRAVITY}
     system = System(_using(trigonometry, mass), _using(trigonometry, force))
     return Scene(system, params, jnp.zeros(2), jnp.zeros(2), 10.0)
 
 
 def stiff(as_printed=False, trigonometry=jnp) -> Scene:
-    """Stiff joints, the second one damped by 10000 N m s/rad; as_printed: the paper's torques."""
+    """Stiff joints, the second one damped by 10000 N m s/rad.
+
+    Args:
+        as_printed: True for the torques as the paper prints them.
+        trigonometry: the module whose sin and cos it uses, such as `hhtjax.trigonometry`.
+    """
     params = {"m": (10.0, 1.0), "l": (1.0, 1.5), "k": (400.0, 300.0), "c": (15.0, 10000.0), "g": GRAVITY}
     torques = force_as_printed if as_printed else force
     system = System(_using(trigonometry, mass), _using(trigonometry, torques))

@@ -45,7 +45,14 @@ def hardening_spring() -> Scene:
 
 
 def measured(params, u, q0, v0, duration) -> Scene:
-    """An oscillator under a sampled input u, from q0 (a number) and v0."""
+    """An oscillator under a sampled input.
+
+    Args:
+        params: of `driven`, with offset in the place of amplitude and frequency.
+        u: the input, made by `hhtjax.sampled`.
+        q0, v0: numbers.
+        duration: s.
+    """
     return Scene(
         System(sampled_mass, sampled_force), (params, u), jnp.reshape(q0, (1,)), jnp.reshape(v0, (1,)), duration
     )

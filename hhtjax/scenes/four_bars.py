@@ -56,6 +56,9 @@ def constraint(q, t, params):
 def four_bars(loops=2) -> Scene:
     """N = loops squares of 1 m bars of 1 kg, whose upper row starts at 1 m/s.
 
+    Args:
+        loops: N, their number.
+
     Raises:
         ValueError: loops is no positive integer.
 

@@ -51,10 +51,13 @@ def moment_of_weight(q, v, t, params):
 
 
 def cartesian(speed=2.505, length=0.5) -> Scene:
-    """The rod as a constraint. speed: at the lowest point, in m/s. length: of the rod, in m.
+    """The rod as a constraint.
+
+    Args:
+        speed: at the lowest point, in m/s. length: of the rod, in m.
 
     Raises:
-        TypeError, ValueError: speed is no finite number, length no positive one. So in `elastic` and `minimal`.
+        TypeError, ValueError: speed is no finite number, length no positive one.
     """
     params = _params("cartesian", speed, length)
     return Scene(System(point_mass, weight, rod), params, jnp.array([0.0, -length]), jnp.array([speed, 0.0]), DURATION)
@@ -66,8 +69,12 @@ def elastic(k=1e6, speed=2.505, length=0.5) -> Scene:
     It starts stretched by as much as carries the weight and turns the mass, k (r - l) = m (g + speed^2/r), so the
     spring hardly vibrates. The frequency of such a vibration is sqrt(k/m).
 
+    Args:
+        k: stiffness, N/m.
+        speed, length: as in `cartesian`.
+
     Raises:
-        TypeError, ValueError: as in `cartesian`, and where k is no positive number.
+        TypeError, ValueError: as `cartesian`, and where k is no positive number.
     """
     params = _params("elastic", speed, length)
     params["k"] = require_number("elastic", "k", k, lambda x: 0 < x < np.inf, "be positive and finite")
@@ -77,7 +84,14 @@ def elastic(k=1e6, speed=2.505, length=0.5) -> Scene:
 
 
 def minimal(speed=2.505, length=0.5) -> Scene:
-    """The same motion as `cartesian` in one angle: (x, y) = l (sin q, -cos q)."""
+    """The same motion as `cartesian` in one angle: (x, y) = l (sin q, -cos q).
+
+    Args:
+        speed, length: as in `cartesian`.
+
+    Raises:
+        TypeError, ValueError: as `cartesian`.
+    """
     params = _params("minimal", speed, length)
     return Scene(System(inertia, moment_of_weight), params, jnp.zeros(1), jnp.array([speed / length]), DURATION)
 

@@ -8,7 +8,13 @@ from hhtjax.systems.system import LinearSystem, System
 
 @shown
 class Scene(NamedTuple):
-    """system; params; q0, v0: initial position and velocity; duration in s."""
+    """A system, and what a run needs besides a stepper and a step size.
+
+    Attributes:
+        system, params: what moves.
+        q0, v0: initial position and velocity.
+        duration: s.
+    """
 
     system: System | LinearSystem
     params: Any

@@ -101,6 +101,9 @@ def squeezer(moment=0.033) -> Scene:
 
     q0 closes the loops for the lengths of the test set, and no others.
 
+    Args:
+        moment: on the crank, N m.
+
     Raises:
         TypeError, ValueError: moment is no finite number.
     """

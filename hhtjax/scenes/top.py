@@ -78,7 +78,14 @@ def minimal(spin=150.0, inclination=0.0) -> Scene:
 
 
 def constrained(spin=150.0, inclination=0.0) -> Scene:
-    """The same as a free disk, its centre held by the rod: 6 coordinates, 3 constraints. Arguments as in `minimal`."""
+    """The same as a free disk, its centre held by the rod: 6 coordinates, 3 constraints.
+
+    Args:
+        spin, inclination: as in `minimal`.
+
+    Raises:
+        TypeError, ValueError: as `minimal`.
+    """
     params, R, Om = _start("constrained", spin, inclination)
     arm = params["l"] * jnp.array([0.0, 1.0, 0.0])
     q0 = {"R": R, "x": matvec(R, arm)}

@@ -124,6 +124,14 @@ def ride(speed=10.0, duration=4.0, roughness=64e-6, bump=0.05, seed=0) -> Scene:
 
     params: body (3,), sprung mass and pitch and roll inertia; wheel, x, y, k, c, k_tyre (4,), in the order of the
     wheels; k3, v0, r; road, a `hhtjax.sampled` signal of the four heights.
+
+    Args:
+        speed: m/s. duration: s.
+        roughness: of the road, m^3. bump: its height half way, m.
+        seed: of the road.
+
+    Raises:
+        TypeError, ValueError: as `road`.
     """
     front, rear, half_track = 1.25, 1.45, 0.75
     params = {

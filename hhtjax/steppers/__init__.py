@@ -1,1 +1,111 @@
-"""Steppers: one file per family."""
+"""Steppers: one step of size h, in as many ways as there are files here.
+
+=================================  ====================  ================  ==========================================
+stepper                            order                 solves per step   for
+=================================  ====================  ================  ==========================================
+`hht(alpha=-0.05)`                 2                     1                 stiff mechanics; the default. `linearize=`
+                                                                           picks the point of linearisation
+`hht(alpha, iterations=None)`      2                     Newton's          the converged method, differentiated
+                                                                           implicitly
+`newmark(beta, gamma)`             2                     1, or Newton's    the family's ancestor, same options
+`bossak(alpha)`                    2                     1, or Newton's    the rest of the family, same options
+`generalized_alpha(rho_inf)`       2                     1, or Newton's    the rest of the family, same options
+`kim_hht(alpha)`                   1; 2 for alpha = 0    1                 the paper of 2019, literally
+`conventional_hht(alpha)`          1; 2 for alpha = 0    Newton's          what it compares with, literally
+`kim_implicit_euler()`             1                     1                 what it compares with, literally
+`rosenbrock(rho_inf=0)`            2                     2                 one factorisation; L-stable
+`rowda()`                          3                     4                 one factorisation; L-stable: for accuracy
+`houbolt()`                        2                     Newton's          a classical baseline
+`park()`                           2                     Newton's          a classical baseline
+`wilson(theta)`                    2                     Newton's          a classical baseline
+`collocation(beta, theta)`         2                     Newton's          a classical baseline
+`operator_splitting(alpha)`        2 for constant M and  1, no Jacobian    a baseline
+                                   damping, else 1
+`implicit_euler()`                 1                     Newton's          robustness
+`rk4()`                            4                     explicit          where nothing is stiff
+=================================  ====================  ================  ==========================================
+
+All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
+Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it.
+
+Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
+of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
+takes the infinitely fast ones out at once. Its order is the power of h with which its error falls. Numerical damping is
+what a method takes out of a vibration that has none; its spectral radius, the factor that is left after one step.
+Non-iterative means that the nonlinear equations of an implicit step are solved by one step of Newton's iteration, about
+a point of linearisation that is cheap and good enough: which is best is measured by
+`python -m experiments linearization`.
+
+Which one
+---------
+
+Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker. If more than five digits are
+wanted of something stiff, take `rowda()`, or `simulate(..., extrapolate=2)`. For fitting by gradients take
+`hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are to be far longer than the
+fastest vibration and the run blows up, try `hht(linearize="held")`, more damping (`alpha=-0.3`), or
+`hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`, and what became of
+the tables and figures of the paper of 2019 on another, `experiments/kim2019/README.md`.
+
+How long a step
+---------------
+
+`hhtjax.analysis.suggest_step_size` reads the modes of the linearised system, or, with `duration=`, makes short runs
+until the motion itself is within the tolerance. Whatever is chosen, a sweep over step sizes shows what it does:
+
+>>> import jax.numpy as jnp, hhtjax
+>>> oscillator = hhtjax.LinearSystem(M=jnp.ones(1), K=jnp.full(1, 100.0))
+>>> start = jnp.ones(1), jnp.zeros(1)
+>>> print(hhtjax.analysis.suggest_step_size(oscillator, hhtjax.hht(), *start, tolerance=1e-3).reason)
+resolves the mode at 10 rad/s to 0.001
+>>> runs = hhtjax.sweep(oscillator, hhtjax.hht(), *start, dts=jnp.array([0.02, 0.01, 0.005]), duration=1, num_samples=1)
+>>> error = abs(runs.q[:, -1, 0] - jnp.cos(10.0))                        # a quarter for half the step: order 2
+>>> [round(float(ratio), 1) for ratio in error[:-1] / error[1:]]
+[3.8, 4.0]
+
+A stepper of your own
+---------------------
+
+A family is a frozen dataclass that derives from `Stepper` and has three things, on vectors q, v of a flat system: its
+`order`; `begin`, the `State` at the start; and `bind`, which does once what is constant and returns the function State
+-> (State, Info) of one step. Everything else (pytrees, runs, sweeps, gradients, analysis, fits) then works with it.
+
+>>> from dataclasses import dataclass
+>>> from hhtjax import Info, State, Stepper
+>>> @dataclass(frozen=True, eq=False)
+... class SemiImplicitEuler(Stepper):
+...     order: int = 1
+...     def begin(self, system, q, v, t, params, dt):
+...         return State(t, q, v, system.acceleration(q, v, t, params))
+...     def bind(self, system, params, dt):
+...         def step(s):
+...             v = s.v + dt * s.w
+...             q = s.q + dt * v
+...             return State(s.t + dt, q, v, system.acceleration(q, v, s.t + dt, params)), Info()
+...         return step
+>>> run = hhtjax.simulate(oscillator, SemiImplicitEuler(), *start, dt=1e-3, num_steps=1000)
+>>> abs(float(run.q[-1, 0] - jnp.cos(10.0))) < 5e-3
+True
+
+A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
+`implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
+refusals are tested on all problems there; what is its own gets a test with a closed form.
+
+Sources
+-------
+
+* N. Newmark, J. Eng. Mech. Div. ASCE 85 (1959) 67-94: `newmark`.
+* H. Hilber, T. Hughes, R. Taylor, Earthquake Eng. Struct. Dyn. 5 (1977) 283-292: `hht`.
+* M. Kim et al., J. Mech. Sci. Tech. 33 (2019) 1087-1096: the non-iterative step; `kim_hht`, `conventional_hht`.
+* M. Arnold, O. Bruls, Multibody Syst. Dyn. 18 (2007) 185-202: second order with M(q) and constraints.
+* K. Jansen, C. Whiting, G. Hulbert, Comput. Methods Appl. Mech. Eng. 190 (2000) 305-319: first-order systems.
+* W. Wood, M. Bossak, O. Zienkiewicz, Int. J. Numer. Methods Eng. 15 (1980) 1562-1566: `bossak`.
+* J. Chung, G. Hulbert, J. Appl. Mech. 60 (1993) 371-375: `generalized_alpha`.
+* A. Cardona, M. Geradin, Computers & Structures 33 (1989) 801-820: constraints and rotations.
+* C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13 (1985) 77-90: `formulation="ggl"`.
+* O. Bruls, A. Cardona, J. Comput. Nonlinear Dyn. 5 (2010) 031002: `kinematics="lie"`.
+* E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, Sec. IV.7: `rosenbrock`.
+* C. Lubich, M. Roche, Computing 43 (1990) 325-342: `rowda`.
+* J. Houbolt, J. Aeronaut. Sci. 17 (1950) 540-550: `houbolt`. K. Park, J. Appl. Mech. 42 (1975) 464-470: `park`.
+* E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1 (1973) 241-252: `wilson`.
+* H. Hilber, T. Hughes, Earthquake Eng. Struct. Dyn. 6 (1978) 99-117: `collocation`.
+"""

@@ -1,10 +1,6 @@
 """Collocation methods: the equation of motion holds at t + theta h, beyond the end of the step. Baselines.
 
-    w_c = (1 - theta) w + theta w1                                              at t_c = t + theta h
-    q_c = q + theta h v + (theta h)^2 [(1/2 - beta) w + beta w_c],   v_c = v + theta h [(1 - gamma) w + gamma w_c]
-    M(q_c) w_c = Q(q_c, v_c, t_c)
-
-and q1, v1 are the same with theta = 1 and w1 for w_c. theta = 1 is Newmark's method.
+The formulas are those of `collocation`; theta = 1 is Newmark's method.
 
 E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1, 1973, 241-252; H. Hilber, T. Hughes, Earthquake Eng.
 Struct. Dyn. 6, 1978, 99-117.
@@ -56,7 +52,13 @@ class Collocation(Stepper):
 
 
 def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Collocation:
-    """The collocation method of Hilber and Hughes, with gamma = 1/2; formulas at the top of this file.
+    """The collocation method of Hilber and Hughes, with gamma = 1/2.
+
+        w_c = (1 - theta) w + theta w1                                              at t_c = t + theta h
+        q_c = q + theta h v + (theta h)^2 [(1/2 - beta) w + beta w_c],   v_c = v + theta h [(1 - gamma) w + gamma w_c]
+        M(q_c) w_c = Q(q_c, v_c, t_c)
+
+    and q1, v1 are the same with theta = 1 and w1 for w_c.
 
     Order 2. Unconditionally stable for theta >= 1 and
 
@@ -67,6 +69,9 @@ def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Co
     Args:
         beta: in (0, 1/4]; theta: 1 or more; numbers, or tracers to differentiate.
         tolerance, max_iterations: of Newton's iteration, as in `hht`.
+
+    Returns:
+        A `Stepper`.
 
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.
@@ -90,6 +95,9 @@ def wilson(theta: Any = 1.4, tolerance=1e-10, max_iterations=20) -> Collocation:
     Args:
         theta: 1 or more.
         tolerance, max_iterations: of Newton's iteration, as in `hht`.
+
+    Returns:
+        A `Stepper`.
 
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.

@@ -165,7 +165,8 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
             "predictor": q, v for constant acceleration. Smooth in all arguments, so the one for fitting,
                 and for steps that resolve the motion. Fails first at large steps: on stiffening springs,
                 nonlinear dampers, chaotic links.
-            "held": q + h v with v held. Smooth, the most bounded, 1.5 to 1.7 times the error on average.
+            "held": q + h v, with the velocity v held as it is at t. Smooth, the most bounded, 1.5 to 1.7 times the
+                error on average.
             "state": (q, v, w) at t, the acceleration then refreshed by M w1 = Q1 (Kim's step made second
                 order). Best with nonlinear dampers; loses two digits on a stiff slow manifold, fails at
                 contacts, and costs a second factorisation, of M.
@@ -181,8 +182,8 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
             value. q, v and w are of order 2 with both; only a needs the correction, which blows up when
             h exceeds the fastest time scale of the system. Default: simple; corrected with constraints.
         formulation: of constraints. "ggl": Phi = 0 and dPhi/dt = 0, by one more multiplier for each (Gear,
-            Gupta, Leimkuhler 1985); "index3": Phi = 0 alone. With constraints the one linearisation is at
-            the predictor.
+            Gupta, Leimkuhler 1985); "index3": Phi = 0 alone, of index 3 as an equation. With constraints the one
+            linearisation is at the predictor.
         redundant: "least_squares" for constraints that depend on each other, always or in singular positions: of
             their multipliers the smallest. One singular value decomposition per solve. By default they are
             an error at the start, and a failure named by `solution.check()` at the step where they become so.
@@ -192,6 +193,9 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU. Need not be differentiable. For
             large systems `banded(p)` or `conjugate_gradients(iterations)`. A residual above 1e-6 of b (1e-3 in
             float32; or the `tolerance` of these two) is a failure that `solution.check()` names.
+
+    Returns:
+        A `Stepper`.
 
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.
@@ -220,6 +224,12 @@ def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> 
         beta: in (0, 1]; gamma: in [1/2, 1].
         **options: those of `hht`.
 
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+
     References:
         Newmark (1959); Cardona, Geradin (1989), Eq. 36.
 
@@ -245,6 +255,12 @@ def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         alpha: in [-1, 0].
         **options: those of `hht`.
 
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+
     References:
         Wood, Bossak, Zienkiewicz (1980); Cardona, Geradin (1989), Sec. 2.
 
@@ -268,6 +284,12 @@ def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> Genera
     Args:
         rho_inf: rho, the spectral radius at infinite frequency, in [0, 1].
         **options: those of `hht`.
+
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
 
     References:
         Chung, Hulbert (1993); Arnold, Bruls (2007).

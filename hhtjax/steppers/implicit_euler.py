@@ -26,6 +26,12 @@ def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=No
         iterations: None, Newton until `tolerance`; k, that many Newton iterations.
         tolerance, max_iterations, solve: as in `hht`.
 
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+
     >>> import hhtjax
     >>> hhtjax.implicit_euler().order
     1

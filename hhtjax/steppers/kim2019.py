@@ -159,6 +159,12 @@ def kim_hht(alpha: Any = 0.0) -> KimHHT:
     Args:
         alpha: in [-1/3, 0].
 
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+
     >>> import hhtjax
     >>> hhtjax.kim_hht(alpha=0.0).order, hhtjax.kim_hht(alpha=-0.1).order
     (2, 1)
@@ -190,6 +196,12 @@ def conventional_hht(alpha: Any = 0.0, fictive_time=True, tolerance=1e-10, max_i
         tolerance, max_iterations: as in `hht`.
 
     `solution.acceleration` holds a, which belongs to the time t + alpha h.
+
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
 
     >>> import hhtjax
     >>> hhtjax.conventional_hht(alpha=0.0).order, hhtjax.conventional_hht(alpha=-0.1).order

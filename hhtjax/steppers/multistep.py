@@ -109,6 +109,9 @@ def houbolt(tolerance=1e-10, max_iterations=20) -> Houbolt:
     Args:
         tolerance, max_iterations: of Newton's iteration, as in `hht`.
 
+    Returns:
+        A `Stepper`.
+
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.
 
@@ -134,6 +137,9 @@ def park(tolerance=1e-10, max_iterations=20) -> Park:
 
     Args:
         tolerance, max_iterations: of Newton's iteration, as in `hht`.
+
+    Returns:
+        A `Stepper`.
 
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.

@@ -120,6 +120,9 @@ def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:
     Args:
         rho_inf: rho, the spectral radius at infinite frequency, in [0, 1]; a number, or a tracer to differentiate.
 
+    Returns:
+        A `Stepper`.
+
     Raises:
         ValueError, TypeError: rho_inf out of its range or not a real number.
 

@@ -99,6 +99,9 @@ def operator_splitting(alpha: Any = -0.05, modified=False) -> OperatorSplitting:
         alpha: in [-1/3, 0].
         modified: True for the form with numerical damping of the stiffness force alone.
 
+    Returns:
+        A `Stepper`.
+
     Raises:
         ValueError, TypeError: an argument out of its range or of the wrong kind.
 

@@ -19,11 +19,14 @@ from hhtjax.systems.system import require_system as require_system
 class State(NamedTuple):
     """What the next step needs.
 
-    t: time; q: position; v: velocity; w: acceleration, w = M^-1 Q on the trajectory;
-    a: algorithmic acceleration of the generalised-alpha recursion, None where a method has none.
-    L: multipliers (m,) of constraints, None without.
-    Of a first-order system: q: y; v: y'; w: None; a: algorithmic y'.
-    memory: whatever else a method carries on, on vectors; None where there is nothing.
+    Attributes:
+        t: time.
+        q, v: position and velocity. Of a first-order system y and y'.
+        w: acceleration, w = M^-1 Q on the trajectory; None of a first-order system.
+        a: algorithmic acceleration of the generalised-alpha recursion (algorithmic y' of a first-order system), None
+            where a method has none.
+        L: multipliers (m,) of constraints, None without.
+        memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
 
     t: Any
@@ -39,14 +42,17 @@ class State(NamedTuple):
 class Info(NamedTuple):
     """What a step tells about itself; None where a method has nothing to tell.
 
-    residual: max-norm of M w - Q at the accepted iterate, in units of force.
-    iterations: number of Newton iterations.
-    converged: whether they met the tolerance.
-    constraint: max-norm of Phi at the end of the step; constraint_rate: of dPhi/dt.
-    dependent_row: number, from 1, of the first constraint that depends on those before it at the start of the step;
-        0 while B has full rank.
-    solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
-        trust (`banded`, `conjugate_gradients`, a given function); solved: whether that is within its tolerance.
+    Attributes:
+        residual: max-norm of M w - Q at the accepted iterate, in units of force.
+        iterations: number of Newton iterations.
+        converged: whether they met the tolerance.
+        constraint: max-norm of Phi at the end of the step.
+        constraint_rate: that of dPhi/dt.
+        dependent_row: number, from 1, of the first constraint that depends on those before it at the start of the step;
+            0 while B has full rank.
+        solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
+            trust (`banded`, `conjugate_gradients`, a given function).
+        solved: whether that is within its tolerance.
     """
 
     residual: Any = None

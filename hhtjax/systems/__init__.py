@@ -1,1 +1,89 @@
-"""What is simulated, and what a stepper sees of it: systems, initial values, constraints, rotations, inputs."""
+"""Systems: what moves, and where it starts.
+
+    M(q) w = Q(q, v, t) + B^T L,    Phi(q, t) = 0,    B = dPhi/dq
+
+A system is two functions of position q, velocity v, time and parameters, or three with a constraint: M is the mass
+matrix, Q the force, w the acceleration; Phi are the constraints, and the multipliers L the forces that hold them. q and
+v are any pytrees, that is, nested dicts, lists and tuples of arrays, of one structure; the rows of M follow
+`jax.flatten_util.ravel_pytree(v)`, which takes the keys of a dict in sorted order. Whatever may change belongs into
+params: it can then be fitted, differentiated, and run in batches.
+
+>>> import jax, jax.numpy as jnp, hhtjax
+>>> def mass(q, params):                  # (n, n), or (n,) for a diagonal; or an array in place of the function
+...     return jnp.array([params["m"] * params["l"] ** 2])
+>>> def force(q, v, t, params):                                                                # structured like v
+...     return -params["m"] * 9.81 * params["l"] * jnp.sin(q) - params["k"] * q - params["c"] * v
+>>> pendulum = hhtjax.System(mass, force)
+>>> params = {"m": 1.0, "l": 0.5, "k": 2.0, "c": 0.05}
+>>> q0, v0 = jnp.array([1.0]), jnp.array([0.0])
+>>> run = hhtjax.simulate(pendulum, hhtjax.hht(alpha=-0.05), q0, v0, params, dt=1e-2, num_steps=500)
+>>> run.check()
+>>> run.t.shape, run.q.shape, run.acceleration.shape
+((501,), (501, 1), (501, 1))
+
+Functions are known by their identity: a system that reads a global variable keeps the value that it had at the first
+call. `hhtjax.runs` says more about it, and the way round.
+
+Energies
+--------
+
+Energies are enough: `System.from_lagrangian` makes M and Q of L = T - V by automatic differentiation. A linear system,
+`LinearSystem`, is factorised once for a whole run. A first-order system y' = f(y, t) is a `FirstOrderSystem`.
+
+>>> spring = hhtjax.System.from_lagrangian(
+...     lagrangian=lambda q, v, t, p: 0.5 * jnp.sum(v**2) - 0.5 * p["k"] * jnp.sum(q**2),
+...     force=lambda q, v, t, p: p["u"](t) - 0.1 * v)
+
+Inputs
+------
+
+A measured input is data: `sampled` makes a function of time of it, to be put into params. `band_limited` does so for
+samples hardly denser than their highest frequency, and `spline_gain_error` tells when that is needed.
+
+>>> u = hhtjax.sampled(jnp.sin(jnp.linspace(0.0, 6.0, 61)), dt=0.1)                # a cubic spline through the samples
+>>> run = hhtjax.simulate(spring, hhtjax.hht(), q0, v0, {"k": 9.0, "u": u}, dt=1e-2, num_steps=600)
+>>> run.check()
+
+Constraints
+-----------
+
+`System(mass, force, constraint)` with `constraint(q, t, params) -> (m,)` is a mechanism in more coordinates than it has
+freedoms. The `hht` family solves it, by default with one linear solve per step, and with both Phi = 0 and dPhi/dt = 0
+enforced, the second by one more multiplier for each constraint (in the formulation of Gear, Gupta and Leimkuhler, GGL
+for short). The multipliers come with the solution, and derivatives pass through, those by lengths in the constraint
+included. `consistent_initial` moves a start onto the constraint.
+
+>>> rod = hhtjax.System(
+...     mass=lambda q, params: params["m"] * jnp.ones(2),
+...     force=lambda q, v, t, params: jnp.array([0.0, -9.81 * params["m"]]),
+...     constraint=lambda q, t, params: jnp.array([jnp.sqrt(jnp.sum(q**2)) - params["l"]]))
+>>> params = {"m": 2.0, "l": 0.5}
+>>> start = hhtjax.consistent_initial(rod, jnp.array([0.3, -0.4]), jnp.array([1.0, 0.0]), params)
+>>> run = hhtjax.simulate(rod, hhtjax.hht(alpha=-0.1), start.q, start.v, params, dt=1e-3, num_steps=1000)
+>>> run.multipliers.shape, float(run.info.constraint.max()) < 1e-10      # minus the tension; how far the length drifts
+((1001, 1), True)
+
+Constraints that depend on each other, always or in a singular position, are named with an error;
+`hht(redundant="least_squares")` solves them all the same, with the smallest multipliers.
+
+Rotations
+---------
+
+A leaf R (3, 3) of q, or several as (k, 3, 3), whose leaf of v has shape (3,) or (k, 3), is a rotation from material
+(body-fixed) to spatial components, and that leaf its material angular velocity, Rdot = R hat(Om). The `hht` family
+turns it by rotation vectors (`kinematics="chart"`) or directly (`"lie"`), both of second order for any inertia, and
+keeps it orthogonal to rounding. `hhtjax.rotation` has the exponential, the logarithm, the tangent maps and their
+derivatives, right at zero too.
+
+>>> def gyroscopic(R, Om, t, params):
+...     return -jnp.cross(Om, params["J"] * Om)
+>>> body = hhtjax.System(mass=lambda R, params: params["J"], force=gyroscopic)
+>>> spin = jnp.array([0.01, 5.0, 0.01])                                  # about the axis of middle inertia: it tumbles
+>>> inertia = {"J": jnp.array([1.0, 2.0, 3.0])}
+>>> run = hhtjax.simulate(body, hhtjax.hht(), jnp.eye(3), spin, inertia, dt=1e-2, num_steps=400)
+>>> run.q.shape, hhtjax.rotation.log(run.q[-1]).shape
+((401, 3, 3), (3,))
+
+What became of the figures of Cardona and Geradin, and what a non-iterative step does to them, is on a page of its own,
+`experiments/cardona_geradin1989/README.md`.
+"""

@@ -30,7 +30,13 @@ CONSISTENT = 1e-6  # relative distance of initial values from consistent ones th
 
 @shown
 class ConsistentInitial(NamedTuple):
-    """q, v, acceleration: pytrees like q0; multipliers: (m,); converged: whether Newton reached Phi(q) = 0."""
+    """Initial values on the constraints; made by `consistent_initial`.
+
+    Attributes:
+        q, v, acceleration: pytrees like q0 and v0.
+        multipliers: L, (m,).
+        converged: whether Newton's iteration reached Phi(q) = 0.
+    """
 
     q: Any
     v: Any
@@ -52,6 +58,9 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None) -> C
 
     Differentiable, forward and reverse. Newton for q from q0: start near. Under jit nothing raises, and
     `converged` tells.
+
+    Returns:
+        A `ConsistentInitial`.
 
     Raises:
         ValueError: constraints that depend on each other (or on no coordinate) at q0, or no q found.

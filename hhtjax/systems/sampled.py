@@ -105,6 +105,9 @@ def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
     An input enters a simulation only through its values at the steps: with a step shorter than dt the
     reconstruction between the samples matters, and the cubic one is far better on smooth signals.
 
+    Returns:
+        A `Sampled`: t -> a number, or (channels...).
+
     Raises:
         ValueError, TypeError: too few samples, a non-positive dt, times that do not increase or are not as many as the
             samples, both dt and times, an unknown order, values that are not real or not finite.

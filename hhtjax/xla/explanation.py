@@ -12,8 +12,13 @@ from hhtjax.xla.lowering import VERDICT
 
 
 class Explanation(NamedTuple):
-    """What `explain` found. paths: for each loop over steps "one kernel", or "plain: " and what stood against it;
-    compile_seconds; temporary_bytes: memory beside arguments and results, None where XLA does not tell."""
+    """What `explain` found; as text, a line for each loop.
+
+    Attributes:
+        paths: for each loop over steps "one kernel", or "plain: " and what stood against it.
+        compile_seconds: time to compile, s.
+        temporary_bytes: memory beside arguments and results; None where XLA does not tell.
+    """
 
     paths: tuple[str, ...]
     compile_seconds: float
@@ -37,6 +42,12 @@ def explain(f, *args) -> Explanation:
     Args:
         f: any function; a gradient or a vmap has loops of its own.
         args: pytrees of arrays.
+
+    Returns:
+        An `Explanation`.
+
+    Raises:
+        whatever compiling f(*args) raises.
 
     >>> import jax, jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, c: -9.81 - c * v)

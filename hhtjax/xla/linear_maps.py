@@ -23,7 +23,22 @@ from hhtjax.xla.terms import Terms, zero_like
 
 
 def linear_map(f, like):
-    """The matrix of a linear map f of vectors like `like` to vectors."""
+    """The matrix of a linear map f of vectors like `like` to vectors.
+
+    Args:
+        f: a linear function of a vector (n,) that returns one, (m,).
+        like: a vector (n,) of the size and dtype of its argument; its values do not matter.
+
+    Returns:
+        (m, n).
+
+    Raises:
+        whatever f raises.
+
+    >>> print(linear_map(lambda x: jnp.stack([x[0] + x[1], 3 * x[1]]), jnp.zeros(2)))
+    [[1. 1.]
+     [0. 3.]]
+    """
     if like.size == 1 or not is_on():
         return jax.vmap(f, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
     trace = jax.make_jaxpr(f)(like)

@@ -1,0 +1,175 @@
+"""Docstrings as they are written here, for Sphinx: plain text, indented formulas, sections of Google's style.
+
+indented block after an empty line    a formula or a table, shown as it stands
+Args:, Returns:, Raises: ...          a list of what is named before the colon
+`name`                                a link if it is a public name or a page, else code
+Title over ----, table between ====   as in reStructuredText
+"""
+
+import inspect
+import re
+import textwrap
+from pathlib import Path
+
+import hhtjax
+import hhtjax.scenes
+
+ROOT = Path(__file__).parents[1]
+SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Warns", "References")
+TITLES = {"Args": "Arguments"}
+HEADER = re.compile(rf"({'|'.join(SECTIONS)}):(?: (.+))?$")
+ITEM = re.compile(r"(\*{0,2}[A-Za-z_][\w]*(?:, \*{0,2}[A-Za-z_]\w*)*|\"\w+\"): ?(.*)")
+
+
+MARK = r"\\|\||(?<![\w])\*(?!\w+\*(?!\w))(?!(?<=^\*) )"  # not *emphasis*, and no bullet
+
+
+def public_names():
+    """The short name, and the one with its room, of all that is public -> where it is documented."""
+    names = {name: name for name in ("hhtjax.systems", "hhtjax.steppers", "hhtjax.runs", "hhtjax.scenes")}
+    rooms = [hhtjax.xla, hhtjax.trigonometry, hhtjax.rotation, hhtjax.analysis, hhtjax.identification, hhtjax]
+    for room in rooms:
+        names[room.__name__] = room.__name__
+        short = room.__name__.removeprefix("hhtjax.")
+        for name in room.__all__:
+            target = f"{room.__name__}.{name}"
+            if room is not hhtjax and getattr(hhtjax, name, None) is getattr(room, name):
+                target = f"hhtjax.{name}"
+            names[f"{room.__name__}.{name}"] = names[f"{short}.{name}"] = target
+            if room not in (hhtjax.rotation, hhtjax.trigonometry, hhtjax.xla):
+                names[name] = target
+    return names
+
+
+NAMES = public_names()
+
+
+def inline(text):
+    """Text with its marks escaped, and what stands between backticks as link or code."""
+    parts = text.split("`")
+    for i, part in enumerate(parts):
+        if i % 2 == 0:
+            part = re.sub(MARK, lambda mark: "\\" + mark[0], part, flags=re.MULTILINE)
+            parts[i] = re.sub(r"_(?!\w)", r"\\_", part)
+        elif part in NAMES:
+            parts[i] = f":py:obj:`{part} <{NAMES[part]}>`"
+        elif re.fullmatch(r"\S+\.(md|ipynb)", part) and (ROOT / part).exists():
+            parts[i] = f":doc:`/{part.rpartition('.')[0]}`"
+        else:
+            parts[i] = f"``{part}``"
+    return re.sub(r"^(\w+\.)(?= )", r"\\\1", "".join(parts)) if re.match(r"\w\. ", text) else "".join(parts)
+
+
+def indented(lines):
+    return textwrap.indent("\n".join(lines), "    ").split("\n")
+
+
+def indentation(line):
+    return len(line) - len(line.lstrip())
+
+
+def blocks(lines):
+    """Runs of lines without an empty one between them."""
+    found, block = [], []
+    for line in [*lines, ""]:
+        if line.strip():
+            block.append(line)
+        elif block:
+            found.append(block)
+            block = []
+    return found
+
+
+def render(lines, names=()):
+    """reStructuredText of a docstring, or of a part of it, whose lines begin at the first column."""
+    result = []
+    remaining = blocks(lines)
+    while remaining:
+        block = remaining.pop(0)
+        first = block[0].rstrip()
+        if found := HEADER.match(first):
+            end = next((i for i, line in enumerate(block[1:], 1) if HEADER.match(line)), len(block))
+            if block[end:]:
+                remaining.insert(0, block[end:])
+            body = [*([f"    {found[2]}"] if found[2] else []), *block[1:end]]
+            while not block[end:] and remaining and indentation(remaining[0][0]) >= 4:
+                body += ["", *remaining.pop(0)]
+            result += section(found[1], body, names)
+        elif indentation(first):
+            while remaining and indentation(remaining[0][0]):
+                block += ["", *remaining.pop(0)]
+            result += ["::", "", *indented(textwrap.dedent("\n".join(block)).split("\n"))]
+        elif first.startswith((">>>", "===")) or (len(block) > 1 and set(block[1]) <= set("-=~")):
+            title = not first.startswith((">>>", "==="))
+            result += [*block[:2], "", *render(block[2:])] if title else [re.sub(r" {3,}# ", "  # ", x) for x in block]
+        else:
+            result += paragraph(block)
+        result.append("")
+    return result
+
+
+def paragraph(block):
+    """Text, and what begins with a name in quotes as a list of definitions."""
+    if block[0].startswith("* "):
+        return inline("\n".join(block)).split("\n")
+    text, items = [], []
+    for line in block:
+        named = re.match(r'("\w+"): ?(.*)', line)
+        if named:
+            items.append([named[1], [named[2]]])
+        else:
+            (items[-1][1] if items else text).append(line.strip())
+    result = inline("\n".join(text)).split("\n") if text else []
+    for name, about in items:
+        result += ["", f"``{name}``", *indented(render(about))]
+    return result
+
+
+def section(name, body, names):
+    """A field with a list of definitions; or with text, where nothing is named."""
+    result, items = [f":{TITLES.get(name, name)}:"], []
+    for line in textwrap.dedent("\n".join(body)).split("\n"):
+        named = ITEM.match(line) if name != "References" else None
+        if named:
+            items += split(*named.groups(), names)
+        elif items:
+            items[-1][1].append(line)
+        else:
+            items.append(["", [line]])
+    for title, (first, *rest) in items:
+        text = render([first, *textwrap.dedent("\n".join(rest)).split("\n")])
+        result += indented([f"**{inline(title)}**", *indented(text)] if title else text)
+    return result
+
+
+def split(title, text, names):
+    """An item as several, where its line goes on with the next argument: "dt: in s. times: in s."."""
+    for found in re.finditer(r"(?<=[.;] )(\w+): ", text):
+        if found[1] in names:
+            return [[title, [text[: found.start()].strip(" ;")]], *split(found[1], text[found.end() :], names)]
+    return [[title, [text]]]
+
+
+def process(app, what, name, obj, options, lines):
+    try:
+        names = set(inspect.signature(obj).parameters)
+    except (TypeError, ValueError):
+        names = set()
+    lines[:] = render(list(lines), names)
+
+
+def is_field(app, what, name, obj, skip, options):
+    """Fields of named tuples are in the docstring of the tuple."""
+    return True if type(obj).__name__ == "_tuplegetter" else None
+
+
+def signature(app, what, name, obj, options, arguments, result):
+    """A module as default value is shown by its name."""
+    return re.sub(r"<module '([\w.]+)' from [^>]*>", r"\1", arguments or "") or None, result
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", process)
+    app.connect("autodoc-skip-member", is_field)
+    app.connect("autodoc-process-signature", signature)
+    return {"parallel_read_safe": True}
