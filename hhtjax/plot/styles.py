@@ -22,7 +22,7 @@ LINES: tuple[Any, ...] = (
 )  # fmt: skip
 TEXT = 8.0  # pt
 COLUMN, PAGE = 85, 175  # mm
-PARAMETERS: dict[str, Any] = {
+PARAMETERS: Any = {
     "axes.formatter.use_mathtext": True,
     "axes.formatter.useoffset": False,
     "axes.grid": True,
