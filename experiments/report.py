@@ -12,6 +12,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from PIL import Image
 
 from hhtjax.plot import COLOURS, MARKERS, PARAMETERS, save
 
@@ -44,6 +45,14 @@ def as_json(x, indent=0):
     return f"{{{inner}{f',{inner}'.join(lines)}{outer}}}"
 
 
+def reduce_colours(path):
+    """A PNG of 128 colours, a third as large: it lies in the repository."""
+    with Image.open(path) as image:
+        small = image.convert("RGB").quantize(128, dither=Image.Dither.NONE)
+        dpi = image.info["dpi"]
+    small.save(path, optimize=True, dpi=dpi)
+
+
 class Report:
     """Collects what an experiment has to show."""
 
@@ -67,8 +76,12 @@ class Report:
 
     def figure(self, name: str, figure):
         """Saves a figure as NAME.png, and in other formats asked for."""
-        self.written += save(figure, self.out / name, self.formats)
+        paths = save(figure, self.out / name, self.formats)
         plt.close(figure)
+        for path in paths:
+            if path.suffix == ".png":
+                reduce_colours(path)
+        self.written += paths
 
     def numbers(self, values: dict):
         """Saves numbers as JSON, named after the experiment."""
