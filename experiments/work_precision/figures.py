@@ -91,7 +91,7 @@ def panels(lines, names, x, xlabel, ylabel, shown=None):
     for panel in grid[-1]:
         panel.set_xlabel(xlabel)
     key = keys[0] | keys[1]
-    drawn.legend(key.values(), key.keys(), loc="outside upper center", ncols=4)
+    drawn.legend(key.values(), key.keys(), loc="outside upper center", ncols=4 if shown else 3)
     return drawn
 
 

@@ -26,7 +26,8 @@ def error_against_h(
     """Error over step size, both logarithmic, with the observed order of each curve and triangles of whole orders.
 
     The order in the legend is the median of the slopes between neighbours, which rounding at one end, or steps too
-    coarse at the other, leave alone as long as most points are between them.
+    coarse at the other, leave alone as long as most points are between them. Of a curve that bends, whose slopes have
+    quartiles more than 0.5 apart, these are given.
 
     Args:
         dt: step sizes, with `error` as long; or an `ObservedOrder`; or a sweep, whose error is the RMS over samples and
@@ -50,7 +51,7 @@ def error_against_h(
         orders = {name: _order(*curve) for name, curve in curves.items()}
         start = len([line for line in panel.lines if not line.get_label().startswith("_")])
         for i, (name, (h, e)) in enumerate(curves.items()):
-            order = "" if np.isnan(orders[name]) else f"order {orders[name]:.2f}"
+            order = _in_words(h, e)
             shown = ": ".join(x for x in (name, order) if x)
             panel.loglog(h, e, label=shown, **look(start + i, marker=True))
         if slopes is None:
@@ -110,6 +111,14 @@ def _errors_of_sweep(sweep, reference):
 def _order(h, e):
     """Median of the slopes between neighbours; NaN of a single point."""
     return float(np.median(np.diff(np.log(e)) / np.diff(np.log(h)))) if len(h) > 1 else np.nan
+
+
+def _in_words(h, e):
+    """The order, or the quartiles of the slopes where they differ by more than 0.5; nothing of a single point."""
+    if len(h) < 2:
+        return ""
+    low, middle, high = np.percentile(np.diff(np.log(e)) / np.diff(np.log(h)), [25, 50, 75])
+    return f"order {low:.1f} to {high:.1f}" if high - low > 0.5 else f"order {middle:.2f}"
 
 
 def _triangle(ax, p, curve, curves, taken):
