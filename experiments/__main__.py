@@ -68,7 +68,7 @@ def run_side_by_side(options: list[str]) -> int:
         return int(any(list(pool.map(run, EXPERIMENTS))))
 
 
-USAGE = "python -m experiments NAME [--fast | --full] [--out DIR]"
+USAGE = "python -m experiments NAME [--fast | --full] [--out DIR] [--formats png,pdf,svg]"
 
 
 def parse(arguments: list[str]):
@@ -79,6 +79,7 @@ def parse(arguments: list[str]):
     size.add_argument("--fast", action="store_true", help="a smoke run: less data, fewer settings")
     size.add_argument("--full", action="store_true", help=f"everything, where less is shown by default: {IN_PART[0]}")
     parser.add_argument("--out", type=Path, default=HERE / "output", help="folder for figures, JSON and page")
+    parser.add_argument("--formats", default="png", help="of figures: png, pdf, svg, or several with commas")
     options = parser.parse_args(arguments)
     if options.full and options.name not in (*IN_PART, "all"):
         parser.error(f"--full is for {', '.join(IN_PART)}; the others show everything they have anyway")
@@ -93,7 +94,7 @@ def run(name: str, options) -> None:
     part = name in IN_PART and not full and not options.fast
     flag = " --fast" if options.fast else " --full" if name in IN_PART and full else ""
     mode = "fast" if options.fast else "part" if part else "full"
-    report = Report(name, options.out, mode, f"python -m experiments {name}{flag}")
+    report = Report(name, options.out, mode, f"python -m experiments {name}{flag}", options.formats.split(","))
     module = importlib.import_module(f"experiments.{EXPERIMENTS[name]}")
     module.run(report, options.fast, *([full] if name in IN_PART else []))
     report.close()
@@ -125,7 +126,7 @@ def main(arguments: list[str]) -> int:
         return check(EXPERIMENTS, options.out)
     failed = 0
     if options.name == "all" and options.fast:
-        failed = run_side_by_side(["--fast", "--out", str(options.out)])
+        failed = run_side_by_side(["--fast", "--out", str(options.out), "--formats", options.formats])
     elif options.name != "page":
         for name in EXPERIMENTS if options.name == "all" else [options.name]:
             run(name, options)

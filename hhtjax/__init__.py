@@ -1,7 +1,7 @@
 """hhtjax: differentiable, functional time integrators for multibody dynamics.
 
 A system, a stepper, one run, and derivatives through all of it: `System`, `hht`, `simulate`, `fit`. What a step does to
-a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`.
+a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`, charts in `hhtjax.plot`.
 
     params ---> System(mass, force, constraint) ---> Stepper(begin, bind) ---> simulate, one scan ---> Solution
                                                                                       |
@@ -13,6 +13,7 @@ The house
 One room for each question, one floor above the other. An upper floor imports from lower ones, never the reverse, and a
 test says so (`tests/test_floors.py` holds the floors as data).
 
+    plot              charts of what the other rooms give; with the extra `plot`
     scenes            examples: systems with parameters and initial values
     identification    fits, and how far to trust them
     analysis          what a step does to a motion
@@ -38,6 +39,8 @@ to test it: the table of problems and steppers in `tests/zoo.py` drives the test
 and memory, so that a new entry is tested like all others. Beyond that, a test belongs to a behaviour, compares with
 what was not computed by the same code, and has been seen to fail.
 """
+
+import importlib
 
 from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
@@ -92,3 +95,10 @@ __all__ = [  # noqa: RUF022
 
 def __dir__():
     return __all__
+
+
+def __getattr__(name):
+    """`hhtjax.plot`, imported when it is first asked for: it needs matplotlib, and nothing else does."""
+    if name == "plot":
+        return importlib.import_module("hhtjax.plot")
+    raise AttributeError(f"module 'hhtjax' has no attribute {name!r}")
