@@ -1,8 +1,10 @@
 """hhtjax: differentiable, functional time integrators for multibody dynamics.
 
 A system, a stepper, one run, and derivatives through all of it: `System`, `hht`, `simulate`, `fit`. What a step does to
-a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`.
+a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`, charts in `hhtjax.plot`.
 """
+
+import importlib
 
 from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
@@ -52,3 +54,10 @@ __all__ = [  # noqa: RUF022
     "FitResult", "Gaussian", "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
     "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip
+
+
+def __getattr__(name):
+    """`hhtjax.plot`, imported when it is first asked for: it needs matplotlib, and nothing else does."""
+    if name == "plot":
+        return importlib.import_module("hhtjax.plot")
+    raise AttributeError(f"module 'hhtjax' has no attribute {name!r}")

@@ -1,0 +1,171 @@
+"""Charts of error: against the step size, with observed orders, and against the time that it takes."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from hhtjax.analysis.convergence import ObservedOrder
+from hhtjax.plot.styles import LINES, MARKERS, canvas, legend, look, with_unit
+from hhtjax.runs.solution import Solution
+
+GREY = "#606060"
+
+
+def error_against_h(
+    dt: Any,
+    error: Any = None,
+    *,
+    reference: Any = None,
+    label: str | None = None,
+    slopes: Any = None,
+    unit: str | None = None,
+    time_unit: str = "s",
+    ax: Any = None,
+) -> Any:
+    """Error over step size, both logarithmic, with the observed order of each curve and triangles of whole orders.
+
+    The order in the legend is the median of the slopes between neighbours, which rounding at one end, or steps too
+    coarse at the other, leave alone as long as most points are between them.
+
+    Args:
+        dt: step sizes, with `error` as long; or an `ObservedOrder`; or a sweep, whose error is the RMS over samples and
+            entries of q less `reference` (q like a member's; by default the finest member is it, and not drawn);
+            or several of these by name, {label: sweep} or {label: (dt, error)}.
+        label: of a single curve. slopes: orders of the triangles; by default the whole numbers that are observed.
+        unit: of the error. time_unit: of dt.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind, shape or value.
+
+    >>> import numpy as np, hhtjax
+    >>> h = np.array([0.01, 0.02, 0.04])
+    >>> ax = hhtjax.plot.error_against_h(h, 3 * h**2, label="hht", unit="m")
+    >>> ax.get_legend().get_texts()[0].get_text(), ax.get_ylabel()
+    ('hht: order 2.00', 'error (m)')
+    """
+    given = dt if isinstance(dt, dict) else {label: dt if error is None else (dt, error)}
+    curves = {name: _curve(one, reference) for name, one in given.items()}
+    with canvas("error_against_h", ax) as (panel,):
+        orders = {name: _order(*curve) for name, curve in curves.items()}
+        start = len([line for line in panel.lines if not line.get_label().startswith("_")])
+        for i, (name, (h, e)) in enumerate(curves.items()):
+            order = "" if np.isnan(orders[name]) else f"order {orders[name]:.2f}"
+            shown = ": ".join(x for x in (name, order) if x)
+            panel.loglog(h, e, label=shown, **look(start + i, marker=True))
+        if slopes is None:
+            slopes = sorted({round(p) for p in orders.values() if abs(p - round(p)) < 0.3 and round(p) > 0})
+        for p in slopes:
+            nearest = min(curves, key=lambda name: abs(np.nan_to_num(orders[name], nan=np.inf) - p))
+            _triangle(panel, p, *curves[nearest])
+        panel.set(xlabel=with_unit("step size h", time_unit), ylabel=with_unit("error", unit))
+        legend(panel)
+    return panel
+
+
+def _curve(one, reference):
+    """(step sizes, errors) of what the user gave, sorted, without those that failed or are zero."""
+    if isinstance(one, ObservedOrder):
+        one = one.dt, one.error
+    elif isinstance(one, Solution):
+        one = _errors_of_sweep(one, reference)
+    elif not isinstance(one, tuple) or len(one) != 2:
+        raise TypeError(
+            "error_against_h: `dt` must be a sweep, an ObservedOrder, step sizes with `error`, or several of these by "
+            f"name; received {type(one).__name__}."
+        )
+    h, e = (np.asarray(x, float) for x in one)
+    if h.ndim != 1 or h.shape != e.shape:
+        raise ValueError(f"error_against_h: `dt` and `error` must be equally long; received {h.shape} and {e.shape}.")
+    if not np.all(h > 0):
+        raise ValueError(f"error_against_h: `dt` must be positive; received {h.min()}.")
+    order = np.argsort(h)
+    h, e = h[order], e[order]
+    kept = np.isfinite(e) & (e > 0)
+    return h[kept], e[kept]
+
+
+def _errors_of_sweep(sweep, reference):
+    """Step sizes, and RMS of q less the reference over samples and entries; NaN of members that failed."""
+    if np.ndim(sweep.t) != 2:
+        raise ValueError(f"error_against_h: `dt` must be a sweep; received a run, t of shape {np.shape(sweep.t)}.")
+    h = np.asarray(sweep.dt)
+    h = h.max(axis=1) if h.ndim == 2 else h
+    members = np.argsort(h)
+    if reference is None:
+        reference, members = jax.tree.map(lambda x: x[members[0]], sweep.q), members[1:]
+    ours, exact = jax.tree.leaves(sweep.q), jax.tree.leaves(reference)
+    if [np.shape(x)[1:] for x in ours] != [np.shape(x) for x in exact]:
+        shapes = ", ".join(str(np.shape(x)[1:]) for x in ours)
+        raise ValueError(
+            f"error_against_h: `reference` must be shaped like q of one member, {shapes}; "
+            f"received {', '.join(str(np.shape(x)) for x in exact)}."
+        )
+    squares = [np.square(np.asarray(x) - np.asarray(y)).reshape(len(h), -1) for x, y in zip(ours, exact, strict=True)]
+    error = np.sqrt(np.mean(np.concatenate(squares, axis=1), axis=1))
+    return h[members], np.where(np.asarray(sweep.failure.step) > 0, np.nan, error)[members]
+
+
+def _order(h, e):
+    """Median of the slopes between neighbours; NaN of a single point."""
+    return float(np.median(np.diff(np.log(e)) / np.diff(np.log(h)))) if len(h) > 1 else np.nan
+
+
+def _triangle(ax, p, h, e):
+    """A right triangle of slope p below a curve, its order beside it."""
+    x = np.exp(np.interp([0.5, 0.75], [0, 1], np.log(h[[0, -1]])))
+    below = np.exp(np.interp(np.log(x), np.log(h), np.log(e))) / 2.5
+    top = min(below[1], below[0] * (x[1] / x[0]) ** p)
+    y = top * (x[0] / x[1]) ** p
+    ax.plot([x[0], x[1], x[1], x[0]], [y, y, top, y], color=GREY, lw=0.8, label="_slope")
+    ax.annotate(f"{p:g}", (x[1], np.sqrt(y * top)), (3, 0), textcoords="offset points", color=GREY, va="center")
+
+
+def work_precision(
+    curves: Any,
+    *,
+    ours: Any = (),
+    xlabel: str = "time of a run (s)",
+    ylabel: str = "error",
+    ax: Any = None,
+) -> Any:
+    """Error over the time that it takes, both logarithmic: what lies further down and left is better.
+
+    Args:
+        curves: {label: (times, errors)}; what is not finite or not positive is left out.
+        ours: labels that are drawn with bold, full lines, the others with thin, broken ones.
+        xlabel, ylabel: with their units, of whatever work is counted in.
+
+    Raises:
+        TypeError, ValueError: curves is no dict, empty, or of arrays of different lengths; ours has other labels.
+
+    >>> import hhtjax
+    >>> curves = {"hht": ([1e-3, 2e-3], [1e-2, 2.5e-3]), "peer": ([1e-2, 2e-2], [1e-2, 6e-4])}
+    >>> ax = hhtjax.plot.work_precision(curves, ours=("hht",), ylabel="error (m)")
+    >>> [line.get_linewidth() for line in ax.lines]
+    [1.8, 0.9]
+    """
+    if not isinstance(curves, dict) or not curves:
+        raise TypeError(f"work_precision: `curves` must be {{label: (times, errors)}}; received {curves!r}.")
+    ours = (ours,) if isinstance(ours, str) else tuple(ours)
+    if unknown := [label for label in ours if label not in curves]:
+        raise ValueError(f"work_precision: `ours` must be among {', '.join(curves)}; received {unknown[0]!r}.")
+    points = {label: _points(label, *curve) for label, curve in curves.items()}
+    with canvas("work_precision", ax) as (panel,):
+        for i, (label, (times, errors)) in enumerate(points.items()):
+            mine = {"ls": "-", "lw": 1.8, "zorder": 3} if label in ours else {"ls": LINES[1 + i % 3], "lw": 0.9}
+            panel.loglog(times, errors, label=label, **(look(i) | {"marker": MARKERS[i % 8]} | mine))
+        panel.set(xlabel=xlabel, ylabel=ylabel)
+        legend(panel)
+    return panel
+
+
+def _points(label, times, errors):
+    times, errors = np.asarray(times, float), np.asarray(errors, float)
+    if times.ndim != 1 or times.shape != errors.shape:
+        raise ValueError(
+            f"work_precision: `curves` must hold times and errors of equal length; those of {label!r} have the shapes "
+            f"{times.shape} and {errors.shape}."
+        )
+    kept = np.isfinite(times) & np.isfinite(errors) & (times > 0) & (errors > 0)
+    return times[kept], errors[kept]
