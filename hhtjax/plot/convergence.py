@@ -55,9 +55,10 @@ def error_against_h(
             panel.loglog(h, e, label=shown, **look(start + i, marker=True))
         if slopes is None:
             slopes = sorted({round(p) for p in orders.values() if abs(p - round(p)) < 0.3 and round(p) > 0})
+        taken = []
         for p in slopes:
             nearest = min(curves, key=lambda name: abs(np.nan_to_num(orders[name], nan=np.inf) - p))
-            _triangle(panel, p, *curves[nearest])
+            taken.append(_triangle(panel, p, curves[nearest], list(curves.values()), taken))
         panel.set(xlabel=with_unit("step size h", time_unit), ylabel=with_unit("error", unit))
         legend(panel)
     return panel
@@ -111,14 +112,31 @@ def _order(h, e):
     return float(np.median(np.diff(np.log(e)) / np.diff(np.log(h)))) if len(h) > 1 else np.nan
 
 
-def _triangle(ax, p, h, e):
-    """A right triangle of slope p below a curve, its order beside it."""
-    x = np.exp(np.interp([0.5, 0.75], [0, 1], np.log(h[[0, -1]])))
-    below = np.exp(np.interp(np.log(x), np.log(h), np.log(e))) / 2.5
-    top = min(below[1], below[0] * (x[1] / x[0]) ** p)
-    y = top * (x[0] / x[1]) ** p
-    ax.plot([x[0], x[1], x[1], x[0]], [y, y, top, y], color=GREY, lw=0.8, label="_slope")
-    ax.annotate(f"{p:g}", (x[1], np.sqrt(y * top)), (3, 0), textcoords="offset points", color=GREY, va="center")
+def _triangle(ax, p, curve, curves, taken):
+    """A right triangle of slope p at a curve, its order beside it, where least is in its way; its corners."""
+    h, e = np.log(curve)
+    places = []
+    for start in (0.5, 0.25, 0.7, 0.05):
+        x = h[0] + (h[-1] - h[0]) * np.array([start, start + 0.2])
+        for gap in (-1.0, 1.0):  # below, with the right angle at the right; above, at the left
+            shift = min if gap < 0 else max
+            y = shift(np.interp(x, h, e) - p * x) + p * x + gap
+            places.append((x, y, gap))
+    x, y, gap = min(places, key=lambda place: _in_the_way(*place[:2], curves, taken))
+    corner = (x[1], y[0]) if gap < 0 else (x[0], y[1])
+    ax.plot(*np.exp([[x[0], y[0]], corner, [x[1], y[1]], [x[0], y[0]]]).T, color=GREY, lw=0.8, label="_slope")
+    side = {"xytext": (3 if gap < 0 else -3, 0), "ha": "left" if gap < 0 else "right"}
+    ax.annotate(f"{p:g}", np.exp([corner[0], y.mean()]), textcoords="offset points", color=GREY, va="center", **side)
+    return x, y
+
+
+def _in_the_way(x, y, curves, taken):
+    """How many curves cross the box from (x0, y0) to (x1, y1), and how many triangles share a part of it; logarithms."""
+    hits = 0
+    for h, e in curves:
+        over = np.interp(np.linspace(*x, 5), np.log(h), np.log(e), left=np.nan, right=np.nan)
+        hits += bool(np.any((over > y[0] - 0.2) & (over < y[1] + 0.2)))
+    return hits + sum(x[0] < a[1] and a[0] < x[1] and y[0] < b[1] and b[0] < y[1] for a, b in taken)
 
 
 def work_precision(

@@ -54,7 +54,7 @@ def energy_balance(
     >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
     >>> upper, lower = hhtjax.plot.energy_balance(spring, run)
     >>> [line.get_label() for line in upper.lines], lower.get_ylabel()
-    (['kinetic', 'potential', 'work of other forces', 'kinetic + potential'], 'made by the method (J)')
+    (['kinetic', 'potential', 'work of other forces', 'kinetic + potential'], 'made by the\nmethod (J)')
     """
     if energy is not None:
         t, curves, error, drift = _given_energy(solution, params, energy)
@@ -65,6 +65,7 @@ def energy_balance(
             axes[0].plot(t, values, label=name, **look(i))
         axes[0].set_ylabel(with_unit("energy", unit))
         legend(axes[0])
+        axes[0].figure.align_ylabels(axes)
         axes[1].plot(t, error, **look(1) | {"ls": "-"})
         axes[1].set_ylabel(with_unit(drift, unit))
         axes[1].set_xlabel(with_unit("t", time_unit))
@@ -89,7 +90,7 @@ def _balance(system, solution, params, potential):
     curves["work of other forces" if np.any(V) else "work of all forces"] = work
     if np.any(V):
         curves["kinetic + potential"] = kinetic + V
-    return t, curves, error, "made by the method"
+    return t, curves, error, "made by the\nmethod"
 
 
 def _given_energy(solution, params, energy):
@@ -100,4 +101,4 @@ def _given_energy(solution, params, energy):
     if np.shape(values) != np.shape(solution.t):
         raise ValueError(f"energy_balance: `energy` must return a scalar; received the shape {np.shape(values)[1:]}.")
     values = np.asarray(values)
-    return np.asarray(solution.t), {"energy": values}, values - values[0], "change since the start"
+    return np.asarray(solution.t), {"energy": values}, values - values[0], "change since\nthe start"

@@ -75,6 +75,7 @@ def fit_against_data(
         lower.set_xlabel(with_unit("frequency", frequency_unit))
         root = f"{unit or '1'}/$\\sqrt{{\\mathrm{{{frequency_unit}}}}}$"
         lower.set_ylabel(f"density\n({root})")
+        upper.figure.align_ylabels([upper, middle, lower])
         legend(upper)
         legend(lower)
     return np.array([upper, middle, lower], dtype=object)
@@ -188,7 +189,7 @@ def correlations(result: FitResult, *, ax: Any = None) -> Any:
     free = np.flatnonzero(result.free)
     names = np.asarray(parameter_names(result.params))[free]
     R = np.asarray(result.correlation)[np.ix_(free, free)]
-    with canvas("correlations", ax, height=72) as (panel,):
+    with canvas("correlations", ax, height=64) as (panel,):
         image = panel.imshow(R, vmin=-1, vmax=1, cmap="RdBu")
         panel.grid(False)
         at = np.arange(len(free))
@@ -197,7 +198,7 @@ def correlations(result: FitResult, *, ax: Any = None) -> Any:
         for i, j in np.ndindex(R.shape) if len(free) <= SHOWN_NUMBERS else ():
             colour = "white" if abs(R[i, j]) > 0.6 else "black"
             panel.text(j, i, f"{R[i, j]:.2f}", ha="center", va="center", color=colour)
-        bar = panel.figure.colorbar(image, ax=panel, label="correlation of the estimates")
+        bar = panel.figure.colorbar(image, ax=panel, shrink=0.8, label="correlation of the estimates")
         bar.ax.tick_params(labelsize=panel.yaxis.get_ticklabels()[0].get_size())
     return panel
 

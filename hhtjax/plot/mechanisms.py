@@ -6,10 +6,11 @@ from typing import Any
 import jax
 import numpy as np
 from matplotlib.animation import FuncAnimation
+from matplotlib.ticker import MaxNLocator
 
 from hhtjax.checks import require_function, require_number
 from hhtjax.plot.entries import require_run
-from hhtjax.plot.styles import COLOURS, canvas, look, with_unit
+from hhtjax.plot.styles import COLOURS, canvas, legend, look, with_unit
 from hhtjax.runs.interpolate import interpolate
 
 
@@ -92,6 +93,7 @@ def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = 
             for i, x in enumerate(frame):
                 shown = {"alpha": 1 - 0.75 * (len(frames) - 1 - k) / max(1, len(frames) - 1)}
                 panel.plot(*x.T, **_bar(i), **shown, label=f"t = {t:.3g}" if i == 0 else None)
+        legend(panel)
     return panel
 
 
@@ -119,14 +121,23 @@ def _scene(caller, ax, frames, unit):
     corners = np.concatenate([x for frame in frames for x in frame])
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.06 * max(np.max(high - low), 1e-12)
-    with canvas(caller, ax, height=80, **({"subplot_kw": {"projection": "3d"}} if spatial else {})) as (panel,):
+    size = high - low + 2 * margin
+    options = {"height": 75, "subplot_kw": {"projection": "3d"}} if spatial else {"height": _height(*size)}
+    with canvas(caller, ax, **options) as (panel,):
         for name, limits in zip("xyz", zip(low - margin, high + margin, strict=True), strict=False):
             panel.set(**{f"{name}lim": limits, f"{name}label": with_unit(name, unit)})
         if spatial:
-            panel.set_box_aspect(high - low + 2 * margin)
+            panel.set_box_aspect(size, zoom=0.8)
+            for axis, length in zip((panel.xaxis, panel.yaxis, panel.zaxis), size / max(size), strict=True):
+                axis.set_major_locator(MaxNLocator(1 + int(5 * length)))
         else:
             panel.set_aspect("equal")
         yield panel
+
+
+def _height(width, height):
+    """Of a figure, in mm, 85 wide, for a scene of this width and height; 25 for title and labels."""
+    return min(max(25 + 65 * height / width, 40), 150)
 
 
 def _bar(i):

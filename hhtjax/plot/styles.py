@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.textpath import TextPath
 
 from hhtjax.checks import require_integer, require_number
 
@@ -134,12 +135,20 @@ def legend(ax, handles=None, labels=None, **options: Any):
     if not labels:
         return None
     room = 72 * ax.get_figure(root=True).get_size_inches()[0] * ax.get_position().width
-    size = 30 + 0.62 * TEXT * max(map(len, labels))  # points of one entry
-    columns = int(min(max(1, room // size), len(labels)))
-    rows = -(-len(labels) // columns)
     place = {"loc": "lower left", "bbox_to_anchor": (0, 1.0), "borderaxespad": 0.3}
-    shape = {"ncols": -(-len(labels) // rows), "handlelength": 2.2, "columnspacing": 1.2, "borderpad": 0.2}
+    shape = {"ncols": _columns(labels, room), "handlelength": 2.2, "columnspacing": 1.2, "borderpad": 0.2}
     return ax.legend(handles, labels, **(place | shape | options))
+
+
+def _columns(labels, room):
+    """The most columns of a legend that fit into `room` points, by the width of the widest label of each."""
+    size = [TextPath((0, 0), label, size=TEXT).get_extents().width if label.strip() else 0 for label in labels]
+    for columns in range(len(labels), 1, -1):
+        rows = -(-len(labels) // columns)
+        widest = [max(size[i : i + rows]) for i in range(0, len(labels), rows)]
+        if sum(widest) + 33 * len(widest) <= room:
+            return columns
+    return 1
 
 
 def save(figure, path, formats: Sequence[str] = ("png",)) -> list[Path]:

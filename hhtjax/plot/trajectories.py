@@ -58,6 +58,7 @@ def trajectory(
             _draw(panel, solution.t, name, found, units.get(name) if by_quantity else units, label, line)
             legend(panel)
         axes[-1].set_xlabel(with_unit("t", time_unit))
+        axes[0].figure.align_ylabels(axes)
     return axes[0] if isinstance(quantities, str) else axes
 
 
