@@ -6,8 +6,6 @@
 # who notices, and what helps.
 
 # %%
-import warnings
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -22,19 +20,16 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## Blown up, wrong, or fine
 #
-# Three scenes, six methods, steps that are halved ten times. A run is **fine** if the RMS error of q stays below 5 % of the
+# Two scenes, six methods, steps that are halved ten times. A run is **fine** if the RMS error of q stays below 5 % of the
 # motion, **blown up** if it gets ten times as far from its start as the motion itself, and **wrong** in between.
 #
-# * a free double pendulum, chaotic, for 2 s,
 # * a mass on a spring that hardens strongly, $\ddot q = -100\,q - 10^4 q^3$, for 2 s,
 # * a damper that grows with the cube of the speed, $\ddot q = -q - 100\,\dot q^3$, for 20 s.
 
 # %%
-double = hhtjax.scenes.double_pendulum.free()
 hardening = hhtjax.System(jnp.ones(1), lambda q, v, t, p: -100.0 * q - 1e4 * q**3)
 cubic = hhtjax.System(jnp.ones(1), lambda q, v, t, p: -q - 100.0 * v**3)
 scenes = {
-    "double pendulum": (double.system, double.q0, double.v0, double.params, 2.0),
     "hardening spring": (hardening, jnp.ones(1), jnp.zeros(1), None, 2.0),
     "cubic damper": (cubic, jnp.ones(1), jnp.ones(1), None, 20.0),
 }
@@ -73,7 +68,7 @@ references: dict = {}
 grades = {scene: np.array([grade(scene, method) for method in methods.values()]) for scene in scenes}
 
 # %%
-figure, axes = hhtjax.plot.subplots(1, 3, width=175, height=65, sharey=True)
+figure, axes = hhtjax.plot.subplots(1, 2, width=175, height=65, sharey=True)
 colours = ListedColormap(["#009E73", "#E69F00", "#000000"])
 for axis, (name, cells) in zip(axes, grades.items(), strict=True):
     axis.imshow(cells, cmap=colours, vmin=0, vmax=2, aspect="auto")
@@ -89,12 +84,13 @@ print("· fine (green), × wrong (orange), ! blown up (black)")
 for name, method in methods.items():
     row = list(methods).index(name)
     cells = np.concatenate([grades[scene][row] for scene in scenes])
-    print(f"{name:<17} fine {np.sum(cells == 0):2d}, wrong {np.sum(cells == 1):2d}, blown up {np.sum(cells == 2):2d} of 30")
+    print(f"{name:<17} fine {np.sum(cells == 0):2d}, wrong {np.sum(cells == 1):2d}, blown up {np.sum(cells == 2):2d} of 20")
 
 # %% [markdown]
 # **Look at** the rows: the non-iterative step solves one linear system per step, and where it *linearises* decides what it
-# survives. `linearize="predictor"` is the smoothest and fails first, "held" stays bounded longest at the price of some
-# accuracy, and the default picks one of the two at each step by the residual. Newton's iteration is no cure either.
+# survives. `linearize="predictor"` is the smoothest and blows up first, "held" is bounded more often, and the default picks
+# one of the two at each step, by the residual. Newton's iteration, at several times the cost, turns runs that blow up into
+# runs that are wrong: compare the counts. Only smaller steps make runs fine.
 #
 # ## Who notices
 #
@@ -112,7 +108,8 @@ for title, method, n, reach in (
     run = hhtjax.simulate(system, method, q0, v0, params, dt=duration / n, num_steps=n)
     try:
         run.check(reach)
-        print(f"{title}: silent; |q| up to {jnp.abs(run.q).max():.3g}")
+        graded = ("fine", "wrong", "blown up")[grades["hardening spring"][list(methods.values()).index(method)][n.bit_length() - 4]]
+        print(f"{title}: silent; |q| up to {jnp.abs(run.q).max():.3g}, graded {graded}")
     except hhtjax.SimulationError as error:
         print(f"{title}: {error}")
 advice = analysis.suggest_step_size(system, methods["hht, the default"], q0, v0, params, duration=duration, tolerance=0.05)
@@ -183,18 +180,21 @@ plt.show()
 
 
 # %%
-def angle_at(duration_steps):
-    def end(q1):
-        run = hhtjax.simulate(
-            double.system, hhtjax.rowda(), double.q0.at[0].set(q1), double.v0, double.params,
-            dt=2e-3, num_steps=10000, save_every=50,
-        )  # fmt: skip
-        return run.q[:, 0], run.t
-
-    return jax.jvp(end, (0.0,), (1.0,))
+double = hhtjax.scenes.double_pendulum.free()
 
 
-(angle, t), (sensitivity, _) = jax.jit(lambda: angle_at(0))()
+@jax.jit
+def path(q1):
+    """The first angle over 20 s, let go from q1 above the horizontal."""
+    run = hhtjax.simulate(
+        double.system, hhtjax.rowda(), jnp.stack([q1, 1.0]), double.v0, double.params,
+        dt=2e-3, num_steps=10000, save_every=50,
+    )  # fmt: skip
+    return run.q[:, 0]
+
+
+t = np.arange(201) * 0.1
+_, sensitivity = jax.jvp(path, (1.0,), (1.0,))
 figure, axes = hhtjax.plot.subplots(width=130, height=60)
 axes.semilogy(t[1:], jnp.abs(sensitivity[1:]), lw=1)
 axes.set(xlabel="time (s)", ylabel="|d angle(t) / d angle(0)|")
@@ -205,20 +205,17 @@ print(f"grows on average by a factor {np.exp(growth):.1f} each second")
 # %% [markdown]
 # ## Singular positions
 #
-# Constraints may come to depend on each other on the way. Two squares of bars, hinged on the ground, fold flat twice a turn:
-# there the loop could go on in two ways. The run says so, and by which constraint; `redundant="least_squares"` passes.
+# Constraints may come to depend on each other. Squares of hinged bars that lie flat could go on folded or unfolded; their
+# constraints do not say which, and the forces in the bars are not unique. You are told so, with the rows concerned, before
+# the run, or by `check()` where it happens on the way. `hht(redundant="least_squares")` takes the smallest forces.
 
 # %%
 bars = hhtjax.scenes.four_bars.four_bars()
-for options in ({}, {"redundant": "least_squares"}):
-    run = hhtjax.simulate(
-        bars.system, hhtjax.hht(alpha=-0.1, **options), bars.q0, bars.v0, bars.params, dt=1e-2, num_steps=600
-    )
-    try:
-        run.check()
-        print(options, "passed; largest violation of a constraint", f"{run.info.constraint.max():.0e}")
-    except hhtjax.SimulationError as error:
-        print(options, error)
+flat = jnp.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
+try:
+    hhtjax.simulate(bars.system, hhtjax.hht(), flat, 0 * flat, bars.params, dt=1e-2, num_steps=10)
+except ValueError as error:
+    print("ValueError:", error)
 
 # %% [markdown]
 # ## What to try next
