@@ -22,8 +22,8 @@ jax.config.update("jax_enable_x64", True)  # double precision; JAX starts in sin
 # %% [markdown]
 # ## The record of the road
 #
-# Real records come with odd time stamps. This one has 300 heights at times that are not equally spaced. `sampled`
-# makes a smooth function of time out of equally spaced values, so we interpolate to these first.
+# Real records come with odd time stamps. This one has 300 heights at times that are not equally spaced. `sampled` makes
+# a smooth function of time out of equally spaced values, so we interpolate to these first.
 
 # %%
 rng = np.random.default_rng(1)
@@ -39,8 +39,8 @@ print(f"time steps of the record: {np.diff(t_road).min() * 1e3:.2f} to {np.diff(
 # ## The system
 #
 # Coordinates, both measured upwards from the rest position on a flat road: $q_0$, the body, and $q_1$, the wheel. The
-# spring between them is compressed by $d = q_1 - q_0$. Beyond a gap, a rubber stop pushes with $k_b\,(d - g)^2$. Between
-# tyre and road there is another, much stiffer spring.
+# spring between them is compressed by $d = q_1 - q_0$. Beyond a gap, a rubber stop pushes with $k_b\,(d - g)^2$.
+# Between tyre and road there is another, much stiffer spring.
 #
 # Everything that could change goes into `params`, a dictionary, the road too. Nothing is read from outside: so every
 # number can be changed, fitted or differentiated later.
@@ -63,7 +63,7 @@ def force(q, v, t, params):
 
 
 quarter_car = hhtjax.System(mass, force)
-params = {"body": 320.0, "wheel": 40.0, "k": 18e3, "c": 1200.0, "k_tyre": 200e3}  # kg, N/m, N s/m
+params: dict = {"body": 320.0, "wheel": 40.0, "k": 18e3, "c": 1200.0, "k_tyre": 200e3}  # kg, N/m, N s/m
 params |= {"k_stop": 30e6, "gap": 0.02, "road": road}  # N/m^2, m
 rest = jnp.zeros(2)
 
@@ -101,8 +101,8 @@ print(f"largest acceleration of the body {jnp.abs(run.acceleration[:, 0]).max():
 # ## Is the step small enough?
 #
 # The simplest check there is: halve the step. The difference should be about four times as small each time, since the
-# method is of second order. (A new `dt` compiles nothing; a new number of steps does, about a second each time. Notebook 5
-# runs many step sizes in one call.)
+# method is of second order. (A new `dt` compiles nothing; a new number of steps does, about a second each time.
+# Notebook 5 runs many step sizes in one call.)
 
 # %%
 ends = {n: hhtjax.simulate(quarter_car, hhtjax.hht(), rest, rest, params, dt=3.0 / n, num_steps=n, save_every=n // 300)
@@ -131,7 +131,9 @@ def ride(c):
 
 slope = jax.jacfwd(lambda c: ride(c)[0])(1200.0)
 around = (ride(1201.0)[0] - ride(1199.0)[0]) / 2
-print(f"d(acceleration)/dc: {slope:.6f} by differentiating the run, {around:.6f} by finite differences, m/s^2 per N s/m")
+print(
+    f"d(acceleration)/dc: {slope:.6f} by differentiating the run, {around:.6f} by finite differences, m/s^2 per N s/m"
+)
 assert abs(slope / around - 1) < 1e-3
 
 # %% [markdown]

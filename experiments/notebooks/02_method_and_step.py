@@ -2,7 +2,8 @@
 # # 2. Choosing a method and a step size
 #
 # Every step makes a small error. This notebook shows what that error does to a vibration, how it shrinks with the step,
-# which methods survive stiffness, and how to ask the library for a step size. At the end there is a short table of advice.
+# which methods survive stiffness, and how to ask the library for a step size. At the end there is a short table of
+# advice.
 
 # %%
 import time
@@ -21,8 +22,8 @@ jax.config.update("jax_enable_x64", True)
 # ## What a step does to one vibration
 #
 # Take one undamped oscillator of circular frequency $\omega$ and step it with $h$. All that matters is $\omega h$: at
-# $\omega h = 2\pi/20 \approx 0.31$ there are 20 steps per period. Two errors can be seen: the period comes out too long or
-# too short, and the amplitude decays (**numerical damping**, given as a damping ratio, or Lehr's measure) or grows.
+# $\omega h = 2\pi/20 \approx 0.31$ there are 20 steps per period. Two errors can be seen: the period comes out too long
+# or too short, and the amplitude decays (**numerical damping**, given as a damping ratio, or Lehr's measure) or grows.
 #
 # **Look at** the left of each figure: that is where you want to be for the vibrations that matter to you. The right is
 # where the vibrations live that your model has, but that you do not want to resolve: there damping is welcome.
@@ -49,8 +50,8 @@ for name, stepper in steppers.items():
     print(f"20 steps a period, {name:<24} period {100 * period:+.3f} %, damping ratio {100 * damping:+.4f} %")
 
 # %% [markdown]
-# A rule of thumb from these numbers: with `hht`, 20 steps per period lengthen the period by about one per cent, and since
-# the method is of **second order**, 40 steps by a quarter of that.
+# A rule of thumb from these numbers: with `hht`, 20 steps per period lengthen the period by about one per cent, and
+# since the method is of **second order**, 40 steps by a quarter of that.
 #
 # ## Error against step size
 #
@@ -58,7 +59,8 @@ for name, stepper in steppers.items():
 # mass on a hardening spring, $\ddot q + 0.2\,\dot q + q + q^3 = 0.8 \cos 1.3\,t$), against a run with very small steps.
 # `analysis.observed_order` does the runs.
 #
-# **Look at** the slopes, and at the horizontal distances: how many more steps one method needs than another for the same error.
+# **Look at** the slopes, and at the horizontal distances: how many more steps one method needs than another for the
+# same error.
 
 # %%
 scene = hhtjax.scenes.duffing.driven()
@@ -88,8 +90,8 @@ for name, result in found.items():
 # ## Stiffness: who survives
 #
 # A weight of 1 kg swings on a rod. Give the rod its true stiffness, 1 MN/m, and there is a vibration along the rod with
-# $\sqrt{k/m}$ = 1000 rad/s besides the swinging with some 4 rad/s. Nobody wants to see the fast one. An **explicit** method
-# such as RK4 has to resolve it all the same, or it blows up; an **implicit** one does not.
+# $\sqrt{k/m}$ = 1000 rad/s besides the swinging with some 4 rad/s. Nobody wants to see the fast one. An **explicit**
+# method such as RK4 has to resolve it all the same, or it blows up; an **implicit** one does not.
 
 # %%
 pendulum = hhtjax.scenes.pendulum.elastic(k=1e6)
@@ -119,9 +121,9 @@ plt.show()
 # %% [markdown]
 # ## Ask for a step size
 #
-# `analysis.suggest_step_size` answers in two ways. Without a duration it looks at the vibrations about the initial state,
-# and at what the stepper makes of each. With one, it runs the motion with halved steps until the error stays within the
-# tolerance: slower, but it sees everything that happens on the way.
+# `analysis.suggest_step_size` answers in two ways. Without a duration it looks at the vibrations about the initial
+# state, and at what the stepper makes of each. With one, it runs the motion with halved steps until the error stays
+# within the tolerance: slower, but it sees everything that happens on the way.
 
 # %%
 by_modes = analysis.suggest_step_size(scene.system, hhtjax.hht(), *start, tolerance=1e-2)
@@ -132,9 +134,9 @@ print("by runs:     ", by_runs)
 # %% [markdown]
 # ## What a step costs
 #
-# The methods differ in work per step. Timed below: 20000 steps of the same oscillator, after a first call that compiles.
-# (Absolute numbers depend on this machine; the ratios less so.) `iterations=None` repeats Newton's iteration until the
-# equations hold to rounding; the default does one solve a step, and has the same order.
+# The methods differ in work per step. Timed below: 20000 steps of the same oscillator, after a first call that
+# compiles. (Absolute numbers depend on this machine; the ratios less so.) `iterations=None` repeats Newton's iteration
+# until the equations hold to rounding; the default does one solve a step, and has the same order.
 
 
 # %%
@@ -176,7 +178,7 @@ for extrapolate in (1, 2):
 #
 # | your system | take | why |
 # |---|---|---|
-# | stiff springs, contacts, constraints; nothing known | `hht()` | one solve a step, order 2, damps what is not resolved |
+# | stiff springs, contacts, constraints; nothing known | `hht()` | one solve a step, damps what is not resolved |
 # | the same, and a fit through the run | `hht(linearize="predictor")` | smooth in its parameters |
 # | no energy may be lost, everything is resolved | `hht(alpha=0.0)` | no numerical damping at all, at any frequency |
 # | smooth and stiff, more than three digits | `rowda()`, or `extrapolate=2` | order 3 |

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 3. Parameters from measured data
 #
-# An electronic oscillator was driven by a known voltage $u$, and its output $y$ was recorded: the Silverbox benchmark of
-# Wigren and Schoukens (2013). We find mass, damping and stiffness from the record, with standard errors; ask which term
-# the model lacks; test it on data it has not seen; and see what the step size does to the result.
+# An electronic oscillator was driven by a known voltage $u$, and its output $y$ was recorded: the Silverbox benchmark
+# of Wigren and Schoukens (2013). We find mass, damping and stiffness from the record, with standard errors; ask which
+# term the model lacks; test it on data it has not seen; and see what the step size does to the result.
 #
 # The data are public (nonlinearbenchmark.org, file SNLS80mV.csv) but not ours to hand on. Put the file into a folder
 # `silverbox/` and let the environment variable `HHTJAX_DATA` name the folder that holds it. Without it this notebook
@@ -36,8 +36,8 @@ print("MEASURED record (Silverbox)" if measured else f"GENERATED record with kno
 #
 # $$m\ddot y + (c + c_2 y^2 + d\,|\dot y|)\,\dot y + k y + k_2 y^2 + k_3 y^3 = u(t) + u_0$$
 #
-# with $u$ and $y$ in V. Only ratios can be found from a voltage and a voltage, so the gain of the input is set to 1, and
-# $m$, $c$, $k$ have no SI units of mass, damping and stiffness but those of V per V s², and so on.
+# with $u$ and $y$ in V. Only ratios can be found from a voltage and a voltage, so the gain of the input is set to 1,
+# and $m$, $c$, $k$ have no SI units of mass, damping and stiffness but those of V per V s², and so on.
 #
 # The input between its samples matters as soon as there is more than one step per sample. These signals hold
 # frequencies well below half the sampling rate, and `band_limited` reconstructs them.
@@ -73,7 +73,7 @@ def output(params, start, u, samples, substeps):
 
 
 def generate(samples):
-    """A record from known parameters: noise up to 200 Hz as input, 16 steps per sample, 0.3 mV of noise in the output."""
+    """A record from known parameters: noise up to 200 Hz as input, 16 steps per sample, 0.3 mV of noise at the end."""
     rng = np.random.default_rng(0)
     spectrum = np.fft.rfft(rng.normal(size=samples))
     spectrum[np.fft.rfftfreq(samples, 1 / RATE) > 200.0] = 0
@@ -95,8 +95,8 @@ print(f"{TRAIN} samples to learn from, {TEST} others to be judged by; RMS of the
 # ## A fit
 #
 # `residuals` is any function of the unknowns; `fit` changes them until the sum of its squares is least, by
-# Levenberg-Marquardt on exact derivatives of the whole run. The initial position and velocity are unknown too, so they are
-# fitted along. The start is crude: a linear oscillator with the resonance that the spectrum shows, near 68 Hz.
+# Levenberg-Marquardt on exact derivatives of the whole run. The initial position and velocity are unknown too, so they
+# are fitted along. The start is crude: a linear oscillator with the resonance that the spectrum shows, near 68 Hz.
 
 # %%
 NAMES = ("m", "c", "k", "k2", "k3", "offset")
@@ -122,15 +122,16 @@ first = hhtjax.fit(problem(4, ABSENT), (guess, start_of(train)), scale=(scale, s
 print(first.summary())
 
 # %% [markdown]
-# Read the table from the right. **error / naive**: textbook standard errors suppose that one residual tells nothing about
-# the next. Residuals of a measured system are correlated, because the model is never exact; so the library estimates the
-# errors from segments of the record (a cluster sandwich), and the last column says how many times larger they are.
+# Read the table from the right. **error / naive**: textbook standard errors suppose that one residual tells nothing
+# about the next. Residuals of a measured system are correlated, because the model is never exact; so the library
+# estimates the errors from segments of the record (a cluster sandwich), and the last column says how many times larger
+# they are.
 #
 # ## Which term is missing?
 #
 # The score test needs no second fit: it asks of each candidate how much of the residual it would explain. Above 10.8 a
-# term is there with 99.9 % confidence. Candidates: damping that grows with the amplitude, and damping that grows with the
-# speed.
+# term is there with 99.9 % confidence. Candidates: damping that grows with the amplitude, and damping that grows with
+# the speed.
 
 
 # %%
@@ -162,8 +163,8 @@ if not measured:
 # %% [markdown]
 # ## The judge: data that the fit has not seen
 #
-# Both models predict the other part of the record from the input alone. Only the state at its beginning has to be found,
-# from the first 50 samples, which are not scored.
+# Both models predict the other part of the record from the input alone. Only the state at its beginning has to be
+# found, from the first 50 samples, which are not scored.
 
 
 # %%
@@ -202,11 +203,11 @@ plt.show()
 #
 # A parameter is fitted *through* the steps, and whatever the steps do to a vibration, the fit makes up for it. With $h$
 # equal to the sampling period, $\omega h$ is about 0.7 here: that is nine steps per period, and notebook 2 showed what
-# becomes of a period then. `step_size_bias` predicts the error of the stiffness (over the mass) and of the damping from the
-# steps alone, for small vibrations. Is it right? We fit with 1, 2 and 4 steps per sample and compare.
+# becomes of a period then. `step_size_bias` predicts the error of the stiffness (over the mass) and of the damping from
+# the steps alone, for small vibrations. Is it right? We fit with 1, 2 and 4 steps per sample and compare.
 
 # %%
-linear = {name: 0.0 for name in ("k2", "k3")}
+linear = dict.fromkeys(("k2", "k3"), 0.0)
 fits = {1: None, 2: None, 4: second}
 for substeps in (1, 2):
     fits[substeps] = hhtjax.fit(
@@ -233,12 +234,14 @@ error = second.standard_errors[0]["k"] / second.params[0]["k"]
 print(f"standard error of k with 4 steps per sample: {100 * error:.3f} %")
 if not measured:
     exact = TRUE["k"] / TRUE["m"], TRUE["c"] / TRUE["m"]
-    print("extrapolated, off from the truth:", *(f"{100 * (x / y - 1):.3f} %" for x, y in zip(limit, exact, strict=True)))
+    print(
+        "extrapolated, off from the truth:", *(f"{100 * (x / y - 1):.3f} %" for x, y in zip(limit, exact, strict=True))
+    )
 
 # %% [markdown]
-# Compare the bias of the stiffness with its standard error, which knows nothing of it: that is the danger. Two remedies:
-# `hhtjax.refine` fits with $h$ and $h/2$ and extrapolates, as done by hand above; `step_size_bias(..., correct=True)`
-# takes the bias out afterwards.
+# Compare the bias of the stiffness with its standard error, which knows nothing of it: that is the danger. Two
+# remedies: `hhtjax.refine` fits with $h$ and $h/2$ and extrapolates, as done by hand above; `step_size_bias(...,
+# correct=True)` takes the bias out afterwards.
 
 # %%
 figure, axes = hhtjax.plot.subplots(width=130, height=70)

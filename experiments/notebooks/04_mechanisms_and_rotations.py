@@ -6,8 +6,8 @@
 #
 # $$M(q)\,\ddot q = Q(q, \dot q, t) + B^T \lambda, \qquad \Phi(q, t) = 0, \qquad B = \partial\Phi/\partial q,$$
 #
-# and returns the **multipliers** $\lambda$, the forces that keep the constraints. First a Watt linkage in the plane, then a
-# body that turns freely in space.
+# and returns the **multipliers** $\lambda$, the forces that keep the constraints. First a Watt linkage in the plane,
+# then a body that turns freely in space.
 
 # %%
 import base64
@@ -17,7 +17,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
-import numpy as np
 from IPython.display import HTML, display
 
 import hhtjax
@@ -31,8 +30,8 @@ jax.config.update("jax_enable_x64", True)
 # straight line: that guided the piston rods of steam engines, and guides the rear axles of cars today.
 #
 # Coordinates: the two joints, (2, 2), in m. Three bars, so three constraints; one freedom is left. For a slender bar
-# whose ends move, the mass matrix is known: $m/6\,[2\ 1;\ 1\ 2]$ for each direction. An axle of 5 kg sits in P, held by a
-# spring.
+# whose ends move, the mass matrix is known: $m/6\,[2\ 1;\ 1\ 2]$ for each direction. An axle of 5 kg sits in P, held by
+# a spring.
 
 # %%
 PIVOTS = jnp.array([[0.0, 0.0], [0.8, 0.2]])
@@ -115,8 +114,8 @@ display(HTML(f'<img alt="Watt linkage swinging" src="data:image/gif;base64,{cont
 # %% [markdown]
 # ## Are the constraints kept, and the energy?
 #
-# By default both $\Phi = 0$ and $\dot\Phi = 0$ are enforced at every step, so there is no drift to watch for. The energy
-# balance compares the kinetic and potential energy with the work of all other forces, here none.
+# By default both $\Phi = 0$ and $\dot\Phi = 0$ are enforced at every step, so there is no drift to watch for. The
+# energy balance compares the kinetic and potential energy with the work of all other forces, here none.
 
 # %%
 balance = hhtjax.analysis.energy_balance(watt, run, params, potential=potential)
@@ -127,8 +126,8 @@ print(f"energy made or lost: at most {float(jnp.abs(balance.error).max()) / swin
 # %% [markdown]
 # ## Forces in the bars
 #
-# The constraint of a bar was written as half its squared length, so $B^T\lambda$ is $\lambda$ times the vector of the bar:
-# the force along it is $\lambda$ times its length, and a positive one pushes the ends apart.
+# The constraint of a bar was written as half its squared length, so $B^T\lambda$ is $\lambda$ times the vector of the
+# bar: the force along it is $\lambda$ times its length, and a positive one pushes the ends apart.
 
 # %%
 lengths = jnp.array([params["rocker"], params["rocker"], params["coupler"]])
@@ -145,8 +144,8 @@ plt.show()
 # ## A derivative through the mechanism
 #
 # Lengths in the constraint are parameters like all others. What if the coupler were a little longer? We ask for the
-# height of P after one second, differentiated in the coupler's length. The starting position
-# depends on that length too, and `consistent_initial` is differentiated along.
+# height of P after one second, differentiated in the coupler's length. The starting position depends on that length
+# too, and `consistent_initial` is differentiated along.
 
 
 # %%
@@ -165,12 +164,12 @@ print(f"{slope:.5f} by differentiation, {(around[0] - around[1]) / 2e-5:.5f} by 
 # %% [markdown]
 # ## Rotations
 #
-# A rotation is a matrix R (3, 3) in `q`, from the body's own axes to those of the room; its velocity is not the matrix's
-# derivative but the angular velocity $\Omega$ (3,) in the body's axes. Nothing else is needed: no angles that become
-# singular, no quaternions to normalise.
+# A rotation is a matrix R (3, 3) in `q`, from the body's own axes to those of the room; its velocity is not the
+# matrix's derivative but the angular velocity $\Omega$ (3,) in the body's axes. Nothing else is needed: no angles that
+# become singular, no quaternions to normalise.
 #
-# Throw a book in the air, spinning about its middle axis: it tumbles. Euler's equations say so,
-# $J\dot\Omega = -\Omega \times J\Omega$.
+# Throw a book in the air, spinning about its middle axis: it tumbles. Euler's equations say so, $J\dot\Omega = -\Omega
+# \times J\Omega$.
 
 
 # %%
@@ -203,9 +202,9 @@ for name, run in tumble.items():
     print(f"{name:<8} angular momentum kept to {drift:.0e}, R orthogonal to {off:.0e}")
 
 # %% [markdown]
-# **Look at** the solid lines: about the axes of least and largest inertia the body spins steadily, the cosine stays where
-# it was; about the middle one it turns over. The reason lies in the equations, not in the method: angular momentum, which
-# nothing enforces, is kept to the figures printed above, and R stays orthogonal to rounding.
+# **Look at** the solid lines: about the axes of least and largest inertia the body spins steadily, the cosine stays
+# where it was; about the middle one it turns over. The reason lies in the equations, not in the method: angular
+# momentum, which nothing enforces, is kept to the figures printed above, and R stays orthogonal to rounding.
 #
 # Both together, rotations and constraints, make mechanisms in space: see `hhtjax.scenes.body_chain`, rods on spherical
 # joints, and `hhtjax.scenes.top`.

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 5. Hundreds of runs in one call
 #
-# Step sizes, parameters, initial states and coefficients of the method are data: `hhtjax.sweep` runs any list of them in
-# one compiled call. Here: error against run time for three methods, a map of 600 members, the same on two devices, and the
-# same written to disk by parts.
+# Step sizes, parameters, initial states and coefficients of the method are data: `hhtjax.sweep` runs any list of them
+# in one compiled call. Here: error against run time for three methods, a map of 600 members, the same on two devices,
+# and the same written to disk by parts.
 
 # %%
 import json
@@ -24,8 +24,8 @@ jax.config.update("jax_num_cpu_devices", 2)  # before the first computation: spl
 # %% [markdown]
 # ## The scene
 #
-# A double pendulum with springs in both joints (`hhtjax.scenes.double_pendulum`, after Kim et al. 2019), let go from the
-# horizontal. The joints hold 20 N m/rad; later this becomes a parameter that differs between members.
+# A double pendulum with springs in both joints (`hhtjax.scenes.double_pendulum`, after Kim et al. 2019), let go from
+# the horizontal. The joints hold 20 N m/rad; later this becomes a parameter that differs between members.
 
 # %%
 scene = hhtjax.scenes.double_pendulum.free()
@@ -36,8 +36,8 @@ DURATION, SAMPLES = 1.0, 10
 # %% [markdown]
 # ## Error against time
 #
-# What counts for a user is not the error at a step size but the error that a second of computing buys. `sweep` gives the
-# errors of all step sizes at once; then each member is timed alone. (Only the values of `dts` change, so nothing is
+# What counts for a user is not the error at a step size but the error that a second of computing buys. `sweep` gives
+# the errors of all step sizes at once; then each member is timed alone. (Only the values of `dts` change, so nothing is
 # compiled again.)
 
 # %%
@@ -67,7 +67,7 @@ for name, stepper in methods.items():
     error = np.sqrt(np.mean((np.asarray(members.q) - reference) ** 2, axis=(1, 2)))
     alone = np.array([seconds(lambda dt=dt, stepper=stepper: run_all(stepper, dt[None]))[0] for dt in members.dt])
     errors[name], curves[name] = (np.asarray(members.dt), error), (alone, error)
-    print(f"{name:<11} first call {first:.1f} s, with compiling; then all {len(dts)} runs together {1e3 * together:.1f} ms")
+    print(f"{name:<11} first call {first:.1f} s, with compiling; then all {len(dts)} runs {1e3 * together:.1f} ms")
 
 # %%
 figure, (left, right) = hhtjax.plot.subplots(1, 2, width=175, height=75)
@@ -77,15 +77,15 @@ right.get_legend().remove()
 plt.show()
 
 # %% [markdown]
-# **Look at** the right figure, from above: at a given error the curve farthest to the left is the cheapest. Nothing is stiff
-# in this scene, so the explicit method wins wherever many digits are asked for. On the very left all curves end at the
-# cost of a call, which no step size avoids.
+# **Look at** the right figure, from above: at a given error the curve farthest to the left is the cheapest. Nothing is
+# stiff in this scene, so the explicit method wins wherever many digits are asked for. On the very left all curves end
+# at the cost of a call, which no step size avoids.
 #
 # ## A map of 600 members
 #
 # 20 step sizes times 30 stiffnesses of the second joint, from 1 to 10000 N m/rad. `in_axes` says what differs between
-# members, as for `jax.vmap`: the params have an axis of 600 in the leaf `k`, and nowhere else. The reference is a second
-# sweep with 30 members and a more accurate method.
+# members, as for `jax.vmap`: the params have an axis of 600 in the leaf `k`, and nowhere else. The reference is a
+# second sweep with 30 members and a more accurate method.
 
 # %%
 steps, stiffness = jnp.geomspace(2e-4, 5e-2, 20), jnp.geomspace(1.0, 1e4, 30)
@@ -126,8 +126,8 @@ figure.colorbar(image, label="log10 of the RMS error (rad)")
 plt.show()
 
 # %% [markdown]
-# **Look at** the white lines: along one, the error is the same. Towards soft joints they run level: there the swinging sets
-# the step size. Stiffer joints vibrate faster, at first with amplitudes worth resolving.
+# **Look at** the white lines: along one, the error is the same. Towards soft joints they run level: there the swinging
+# sets the step size. Stiffer joints vibrate faster, at first with amplitudes worth resolving.
 #
 # Is the map honest? A member of the sweep is the run that `simulate` does, up to rounding:
 
@@ -156,8 +156,8 @@ assert apart < 1e-12
 # %% [markdown]
 # ## To disk, and on after an interruption
 #
-# For sweeps that take hours: `sweep_to_disk` writes chunks of members, each a file of its own. Here 3 of 200 members. We
-# delete the second, as if the machine had stopped there, and repeat the call: only what is missing is computed.
+# For sweeps that take hours: `sweep_to_disk` writes chunks of members, each a file of its own. Here 3 of 200 members.
+# We delete the second, as if the machine had stopped there, and repeat the call: only what is missing is computed.
 
 
 # %%

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 6. Where methods fail
 #
-# No method with a fixed step is safe. This notebook makes them fail on purpose, so that you recognise it: runs that blow up,
-# runs that are wrong and look healthy, energy that disappears, ringing, and a motion that no method can follow. For each:
-# who notices, and what helps.
+# No method with a fixed step is safe. This notebook makes them fail on purpose, so that you recognise it: runs that
+# blow up, runs that are wrong and look healthy, energy that disappears, ringing, and a motion that no method can
+# follow. For each: who notices, and what helps.
 
 # %%
 import jax
@@ -20,8 +20,8 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## Blown up, wrong, or fine
 #
-# Two scenes, six methods, steps that are halved ten times. A run is **fine** if the RMS error of q stays below 5 % of the
-# motion, **blown up** if it gets ten times as far from its start as the motion itself, and **wrong** in between.
+# Two scenes, six methods, steps that are halved ten times. A run is **fine** if the RMS error of q stays below 5 % of
+# the motion, **blown up** if it gets ten times as far from its start as the motion itself, and **wrong** in between.
 #
 # * a mass on a spring that hardens strongly, $\ddot q = -100\,q - 10^4 q^3$, for 2 s,
 # * a damper that grows with the cube of the speed, $\ddot q = -q - 100\,\dot q^3$, for 20 s.
@@ -73,30 +73,30 @@ colours = ListedColormap(["#009E73", "#E69F00", "#000000"])
 for axis, (name, cells) in zip(axes, grades.items(), strict=True):
     axis.imshow(cells, cmap=colours, vmin=0, vmax=2, aspect="auto")
     for (i, j), value in np.ndenumerate(cells):
-        axis.text(j, i, "·×!"[value], ha="center", va="center", color="white", fontsize=7)
+        axis.text(j, i, ".x!"[value], ha="center", va="center", color="white", fontsize=7)
     axis.set_title(name)
     axis.set_xticks(range(0, 10, 3), counts[::3])
     axis.set_xlabel("number of steps")
     axis.grid(False)
 axes[0].set_yticks(range(len(methods)), methods)
 plt.show()
-print("· fine (green), × wrong (orange), ! blown up (black)")
-for name, method in methods.items():
-    row = list(methods).index(name)
+print("a dot: fine (green), x: wrong (orange), ! blown up (black)")
+for row, name in enumerate(methods):
     cells = np.concatenate([grades[scene][row] for scene in scenes])
-    print(f"{name:<17} fine {np.sum(cells == 0):2d}, wrong {np.sum(cells == 1):2d}, blown up {np.sum(cells == 2):2d} of 20")
+    fine, wrong, gone = (np.sum(cells == k) for k in range(3))
+    print(f"{name:<17} fine {fine:2d}, wrong {wrong:2d}, blown up {gone:2d} of {len(cells)}")
 
 # %% [markdown]
-# **Look at** the rows: the non-iterative step solves one linear system per step, and where it *linearises* decides what it
-# survives. `linearize="predictor"` is the smoothest and blows up first, "held" is bounded more often, and the default picks
-# one of the two at each step, by the residual. Newton's iteration, at several times the cost, turns runs that blow up into
-# runs that are wrong: compare the counts. Only smaller steps make runs fine.
+# **Look at** the rows: the non-iterative step solves one linear system per step, and where it *linearises* decides what
+# it survives. `linearize="predictor"` is the smoothest and blows up first, "held" is bounded more often, and the
+# default picks one of the two at each step, by the residual. Newton's iteration, at several times the cost, turns runs
+# that blow up into runs that are wrong: compare the counts. Only smaller steps make runs fine.
 #
 # ## Who notices
 #
-# `check()` finds what is not finite, and what Newton could not solve. A run that is finite but absurd needs your knowledge:
-# how far can q get? And a run that is wrong but of the right size shows nothing. There only a second run helps, and that is
-# what `suggest_step_size` with a duration does.
+# `check()` finds what is not finite, and what Newton could not solve. A run that is finite but absurd needs your
+# knowledge: how far can q get? And a run that is wrong but of the right size shows nothing. There only a second run
+# helps, and that is what `suggest_step_size` with a duration does.
 
 # %%
 system, q0, v0, params, duration = scenes["hardening spring"]
@@ -108,11 +108,15 @@ for title, method, n, reach in (
     run = hhtjax.simulate(system, method, q0, v0, params, dt=duration / n, num_steps=n)
     try:
         run.check(reach)
-        graded = ("fine", "wrong", "blown up")[grades["hardening spring"][list(methods.values()).index(method)][n.bit_length() - 4]]
+        graded = ("fine", "wrong", "blown up")[
+            grades["hardening spring"][list(methods.values()).index(method)][n.bit_length() - 4]
+        ]
         print(f"{title}: silent; |q| up to {jnp.abs(run.q).max():.3g}, graded {graded}")
     except hhtjax.SimulationError as error:
         print(f"{title}: {error}")
-advice = analysis.suggest_step_size(system, methods["hht, the default"], q0, v0, params, duration=duration, tolerance=0.05)
+advice = analysis.suggest_step_size(
+    system, methods["hht, the default"], q0, v0, params, duration=duration, tolerance=0.05
+)
 print(f"advice for 5 %: dt = {advice.dt:.2g} s, that is {duration / advice.dt:.0f} steps")
 
 # %% [markdown]
@@ -138,7 +142,12 @@ def energy_of(run):
 
 figure, axes = hhtjax.plot.subplots(width=130, height=65)
 for i, (name, method) in enumerate(
-    {"hht(0)": hhtjax.hht(0.0), "hht(-0.05)": hhtjax.hht(-0.05), "hht(-0.3)": hhtjax.hht(-0.3), "RK4": hhtjax.rk4()}.items()
+    {
+        "hht(0)": hhtjax.hht(0.0),
+        "hht(-0.05)": hhtjax.hht(-0.05),
+        "hht(-0.3)": hhtjax.hht(-0.3),
+        "RK4": hhtjax.rk4(),
+    }.items()
 ):
     run = hhtjax.simulate(dumbbell, method, *start, dt=6.6e-3, num_steps=30000, save_every=100)
     energy = energy_of(run)
@@ -151,22 +160,22 @@ plt.show()
 # %% [markdown]
 # ## Ringing
 #
-# `alpha=0` damps nothing at all, not even a stiff vibration that a poor start or a jump excites, and that its step cannot
-# resolve: the acceleration then alternates from step to step for ever. Here the elastic pendulum of notebook 2 starts with
-# its rod stretched too far by 0.1 mm.
+# `alpha=0` damps nothing at all, not even a stiff vibration that a poor start or a jump excites, and that its step
+# cannot resolve: the acceleration then alternates from step to step for ever. Here the elastic pendulum of notebook 2
+# starts with its rod stretched too far by 0.1 mm.
 
 # %%
 pendulum = hhtjax.scenes.pendulum.elastic(k=1e6)
 off = pendulum.q0 * (1 + 2e-4)
 figure, axes = hhtjax.plot.subplots(width=130, height=60)
 for alpha, line in ((0.0, "C1-"), (-0.05, "C0-"), (-0.3, "C2-")):
-    run = hhtjax.simulate(
-        pendulum.system, hhtjax.hht(alpha), off, pendulum.v0, pendulum.params, dt=1e-2, num_steps=100
-    )
+    run = hhtjax.simulate(pendulum.system, hhtjax.hht(alpha), off, pendulum.v0, pendulum.params, dt=1e-2, num_steps=100)
     stretch = 1e6 * (jnp.sqrt(jnp.sum(run.q**2, axis=1)) - 0.5)
     axes.plot(run.t, stretch, line, lw=1, label=f"alpha = {alpha}")
     rough = float(jnp.std(jnp.diff(stretch[50:])))
-    print(f"alpha = {alpha:<5} force in the rod = {float(stretch[-1]):7.1f} N at the end; jumps by {rough:6.1f} N a step")
+    print(
+        f"alpha = {alpha:<5} force in the rod = {float(stretch[-1]):7.1f} N at the end; jumps by {rough:6.1f} N a step"
+    )
 axes.set(xlabel="time (s)", ylabel="force in the rod (N)")
 axes.legend()
 plt.show()
@@ -175,8 +184,8 @@ plt.show()
 # ## What nobody can follow
 #
 # The free double pendulum is **chaotic**: neighbouring motions part exponentially. Then the error of any method grows
-# exponentially too, and so does the derivative of the end in the start. Both are right, and both are useless after a while:
-# fit such motions over short windows (`hhtjax.windows`).
+# exponentially too, and so does the derivative of the end in the start. Both are right, and both are useless after a
+# while: fit such motions over short windows (`hhtjax.windows`).
 
 
 # %%
@@ -205,9 +214,10 @@ print(f"grows on average by a factor {np.exp(growth):.1f} each second")
 # %% [markdown]
 # ## Singular positions
 #
-# Constraints may come to depend on each other. Squares of hinged bars that lie flat could go on folded or unfolded; their
-# constraints do not say which, and the forces in the bars are not unique. You are told so, with the rows concerned, before
-# the run, or by `check()` where it happens on the way. `hht(redundant="least_squares")` takes the smallest forces.
+# Constraints may come to depend on each other. Squares of hinged bars that lie flat could go on folded or unfolded;
+# their constraints do not say which, and the forces in the bars are not unique. You are told so, with the rows
+# concerned, before the run, or by `check()` where it happens on the way. `hht(redundant="least_squares")` takes the
+# smallest forces.
 
 # %%
 bars = hhtjax.scenes.four_bars.four_bars()
@@ -221,4 +231,5 @@ except ValueError as error:
 # ## What to try next
 #
 # * Repeat the gallery with `alpha=0.0` and with `alpha=-0.3`.
-# * All of this for 21 scenes and 14 methods: `python -m experiments stability`, and its page in `experiments/stability`.
+# * All of this for 21 scenes and 14 methods: `python -m experiments stability`, and its page in
+#   `experiments/stability`.

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 7. Real mechanisms: friction, hysteresis, impacts
 #
-# Joints stick, rubber remembers, parts collide. What can be done today, with smooth stand-ins, and what that costs; and what
-# the library does not have yet: set-valued Coulomb friction, internal states beside `q` and `v`, and events that are
-# located within a step. Where a stand-in is at its limit, this notebook shows the limit.
+# Joints stick, rubber remembers, parts collide. What can be done today, with smooth stand-ins, and what that costs; and
+# what the library does not have yet: set-valued Coulomb friction, internal states beside `q` and `v`, and events that
+# are located within a step. Where a stand-in is at its limit, this notebook shows the limit.
 
 # %%
 import jax
@@ -18,8 +18,9 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## Stick-slip: a mass on a moving belt
 #
-# A mass on a spring lies on a belt. It sticks and is carried along until the spring pulls harder than friction can hold,
-# slips back, and sticks again: so brakes squeal and violins sound. Friction falls with the sliding speed $s$ (Stribeck):
+# A mass on a spring lies on a belt. It sticks and is carried along until the spring pulls harder than friction can
+# hold, slips back, and sticks again: so brakes squeal and violins sound. Friction falls with the sliding speed $s$
+# (Stribeck):
 #
 # $$F(s) = \left[F_k + (F_s - F_k)\,e^{-(s/v_s)^2}\right] \tanh(s/v_t)$$
 #
@@ -55,15 +56,15 @@ sticking = float(jnp.mean(jnp.abs(run.v[1000:, 0] - params["belt"]) < 2 * params
 print(f"after the first second it sticks for {100 * sticking:.0f} % of the time")
 
 # %% [markdown]
-# **Look at** the dashed lines: above, the stretch at which the spring pulls with $F_s$; below, the speed of the belt. While the
-# mass sticks, its position is a straight line.
+# **Look at** the dashed lines: above, the stretch at which the spring pulls with $F_s$; below, the speed of the belt.
+# While the mass sticks, its position is a straight line.
 #
 # ## The price: creep, and small steps
 #
-# The stand-in never quite sticks. Load a block at rest with 90 % of what friction can hold, for ten seconds: it should not
-# move at all. It creeps, in proportion to $v_t$; and the smaller $v_t$, the smaller the step that follows it through a
-# reversal. The error below is that of a free vibration with dry friction, whose exact motion is known: between reversals it
-# is a cosine about $\pm F/k$.
+# The stand-in never quite sticks. Load a block at rest with 90 % of what friction can hold, for ten seconds: it should
+# not move at all. It creeps, in proportion to $v_t$; and the smaller $v_t$, the smaller the step that follows it
+# through a reversal. The error below is that of a free vibration with dry friction, whose exact motion is known:
+# between reversals it is a cosine about $\pm F/k$.
 
 # %%
 block = hhtjax.System(jnp.ones(1), lambda q, v, t, p: p["load"] - p["F"] * jnp.tanh(v / p["vt"]))
@@ -92,23 +93,23 @@ for vt in (1e-1, 1e-2, 1e-3):
 axes = hhtjax.plot.error_against_h(curves, slopes=(), unit="m")
 axes.figure.set_size_inches(5.6, 3.4)
 plt.show()
-for name, (dt, error) in curves.items():
+for name, (_, error) in curves.items():
     print(f"{name}: error {1e3 * error[0]:.2f} mm with {counts[0]} steps, {1e3 * error[-1]:.3f} mm with {counts[-1]}")
 
 # %% [markdown]
-# **Look at** the floors on the left: there the error is no longer the step's but the stand-in's, and only a smaller $v_t$ lowers
-# it. A set-valued friction law that sticks exactly and switches inside the step is being built; until then choose $v_t$
-# ten to a hundred times below the speeds that matter, and a step that follows.
+# **Look at** the floors on the left: there the error is no longer the step's but the stand-in's, and only a smaller
+# $v_t$ lowers it. A set-valued friction law that sticks exactly and switches inside the step is being built; until then
+# choose $v_t$ ten to a hundred times below the speeds that matter, and a step that follows.
 #
 # ## Hysteresis: a state that remembers
 #
-# Rubber mounts, wire ropes and bolted joints have a force that depends on the past. The Bouc-Wen model gives it a state $z$
-# of its own:
+# Rubber mounts, wire ropes and bolted joints have a force that depends on the past. The Bouc-Wen model gives it a state
+# $z$ of its own:
 #
 # $$m\ddot q + c\dot q + k q + z = u(t), \qquad \dot z = A\dot q - \beta\,(\gamma\,|\dot q|\,z + \delta\,\dot q\,|z|)$$
 #
-# A `System` has no place for $z$ yet. A `FirstOrderSystem` has: $y = (q, v, z)$, any pytree, and every method takes it. What
-# is lost: mass matrices, constraints and rotations; the solution's `q` is $y$.
+# A `System` has no place for $z$ yet. A `FirstOrderSystem` has: $y = (q, v, z)$, any pytree, and every method takes it.
+# What is lost: mass matrices, constraints and rotations; the solution's `q` is $y$.
 
 
 # %%
@@ -139,14 +140,14 @@ damped = float(jnp.sum(rubber["c"] * loops.q["v"][last] ** 2) * 2e-4)
 print(f"the hysteresis takes {1e3 * eaten:.0f} mJ out of the last cycle, the damper {1e3 * damped:.1f} mJ")
 
 # %% [markdown]
-# **Look at** the area inside a loop: the energy that a cycle loses. The loops grow with the amplitude, and the slope at their tips
-# is the stiffness $k + A$ at first, less later.
+# **Look at** the area inside a loop: the energy that a cycle loses. The loops grow with the amplitude, and the slope at
+# their tips is the stiffness $k + A$ at first, less later.
 #
 # ## A bouncing ball: a stiff contact
 #
-# A ball falls on a plate that pushes back with $k\,\delta\,(1 + c\,\dot\delta)$ at the depth $\delta$ (Hunt and Crossley): a
-# spring, and losses that vanish where the contact ends. The contact lasts some milliseconds, and the step has to
-# resolve it.
+# A ball falls on a plate that pushes back with $k\,\delta\,(1 + c\,\dot\delta)$ at the depth $\delta$ (Hunt and
+# Crossley): a spring, and losses that vanish where the contact ends. The contact lasts some milliseconds, and the step
+# has to resolve it.
 
 
 # %%
@@ -176,8 +177,8 @@ print(f"the first contact lasts {touching:.1f} ms; tops of the first jumps {', '
 print(f"restitution at the first impact, from the tops: {np.sqrt(tops[0]):.3f}")
 
 # %% [markdown]
-# How many steps does a contact need? All step sizes in one sweep, and the height 0.8 s after the start, well after the first
-# impact:
+# How many steps does a contact need? All step sizes in one sweep, and the height 0.8 s after the start, well after the
+# first impact:
 
 # %%
 dts = jnp.geomspace(2e-5, 5e-3, 25)

@@ -5,8 +5,9 @@
 # 0.2 s, no input, and a motion that is chaotic when it is large. We find inertia, weights and friction, from **short
 # windows** of the record, each with an initial state of its own.
 #
-# The file real_double_pend_h_1.txt belongs to the paper's supplementary data. Put it into a folder `double_pendulum/`, and let
-# `HHTJAX_DATA` name the folder that holds it. Without it, the notebook makes a record of the same kind, and says so.
+# The file real_double_pend_h_1.txt belongs to the paper's supplementary data. Put it into a folder `double_pendulum/`,
+# and let `HHTJAX_DATA` name the folder that holds it. Without it, the notebook makes a record of the same kind, and
+# says so.
 
 # %%
 import os
@@ -33,8 +34,8 @@ print("MEASURED (Schmidt and Lipson 2009)" if measured else f"GENERATED, known p
 #
 # $$M = \begin{pmatrix} 1 & B\cos(q_1 - q_2)\\ \cdot & A\end{pmatrix}$$
 #
-# and the forces are weights $g_1 \sin q_1$, $g_2 \sin q_2$, the terms that go with $M$, and viscous friction in both joints. Only
-# these ratios can be found from angles alone. A dictionary of parameters, two of them arrays:
+# and the forces are weights $g_1 \sin q_1$, $g_2 \sin q_2$, the terms that go with $M$, and viscous friction in both
+# joints. Only these ratios can be found from angles alone. A dictionary of parameters, two of them arrays:
 
 
 # %%
@@ -78,10 +79,10 @@ print(f"{len(t)} samples in {t[-1]:.1f} s, {1e3 * np.diff(t).min():.1f} to {1e3 
 # %% [markdown]
 # ## Windows
 #
-# Over a few seconds the derivative of a chaotic motion in its parameters explodes (notebook 6), and a fit over the whole
-# record gets lost. `windows` cuts it into pieces of equal duration; they follow the clock, so gaps do not matter. The
-# initial state of each piece is fitted along (`starts=`), and eliminated: the Jacobian stays small however many windows.
-# `interpolate` takes the run to the times of the samples.
+# Over a few seconds the derivative of a chaotic motion in its parameters explodes (notebook 6), and a fit over the
+# whole record gets lost. `windows` cuts it into pieces of equal duration; they follow the clock, so gaps do not matter.
+# The initial state of each piece is fitted along (`starts=`), and eliminated: the Jacobian stays small however many
+# windows. `interpolate` takes the run to the times of the samples.
 #
 # The tracker's zero may be off by a small angle: `offset`, two more unknowns.
 
@@ -114,14 +115,15 @@ rmse = float(np.sqrt(np.mean(np.asarray(result.residual)[np.asarray(records.pres
 print(f"\nRMS error {1e3 * rmse:.2f} mrad")
 if not measured:
     for name in ("A", "B", "g", "friction"):
-        print(name, "off by", np.round(np.asarray((result.params[name] - TRUE[name]) / result.standard_errors[name]), 1),
-              "standard errors")  # fmt: skip
+        off = np.asarray((result.params[name] - TRUE[name]) / result.standard_errors[name])
+        print(name, "off by", np.round(off, 1), "standard errors")
 
 # %% [markdown]
 # ## One window, and all residuals
 #
-# **Look at** the left for what is fitted, and at the right for what is left of it. Residuals that rise and fall together are the
-# model's own error (the joints' friction is hardly viscous, the arms are not rigid); scatter would be noise.
+# **Look at** the left for what is fitted, and at the right for what is left of it. Residuals that rise and fall
+# together are the model's own error (the joints' friction is hardly viscous, the arms are not rigid); scatter would be
+# noise.
 
 # %%
 k = int(np.argmax(np.ptp(records.y[:, :, 0], axis=1)))
@@ -129,7 +131,9 @@ here = records.present[k, :, 0]
 run = simulate(result.params, result.starts["q"][k], result.starts["v"][k], int(0.5 / DT))
 figure, (left, right) = hhtjax.plot.subplots(1, 2, width=175, height=70)
 for i in range(2):
-    left.plot(records.t[k][here], records.y[k][here, i], "os"[i], color=f"C{i}", ms=4, mfc="none", label=f"angle {i + 1}")
+    left.plot(
+        records.t[k][here], records.y[k][here, i], "os"[i], color=f"C{i}", ms=4, mfc="none", label=f"angle {i + 1}"
+    )
     left.plot(run.t, run.q[:, i] - result.params["offset"][i], color=f"C{i}", lw=1.2)
     right.plot((records.begin[:, None] + records.t)[records.present[:, :, i]],
                1e3 * np.asarray(result.residual)[:, :, i][records.present[:, :, i]],
@@ -143,8 +147,8 @@ plt.show()
 # %% [markdown]
 # ## How long can it predict?
 #
-# The same parameters over longer and longer windows, with the initial state as fitted at the beginning: the error grows as
-# neighbouring motions part.
+# The same parameters over longer and longer windows, with the initial state as fitted at the beginning: the error grows
+# as neighbouring motions part.
 
 # %%
 every = np.arange(0, len(records.begin), 2)

@@ -104,7 +104,8 @@ def main(arguments):
     options = parser.parse_args(arguments)
     environment()
     with ThreadPoolExecutor(2) as pool:
-        troubles = sum(pool.map(lambda path: process(path, options.check), scripts(options.names)), [])
+        found = pool.map(lambda path: process(path, options.check), scripts(options.names))
+        troubles = [trouble for troubles in found for trouble in troubles]
     for trouble in troubles:
         print(f"\n{trouble}", file=sys.stderr)
     return 1 if troubles else 0
