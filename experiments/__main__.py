@@ -56,7 +56,7 @@ def run_side_by_side(options: list[str]) -> int:
         return max(pool.map(run, EXPERIMENTS))
 
 
-USAGE = "python -m experiments NAME [--fast] [--out DIR]"
+USAGE = "python -m experiments NAME [--fast] [--out DIR] [--formats png,pdf,svg]"
 
 
 def main(arguments: list[str]) -> int:
@@ -65,6 +65,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("name", nargs="?", help="experiment to run; without it, they are listed")
     parser.add_argument("--fast", action="store_true", help="a smoke run: less data, fewer settings")
     parser.add_argument("--out", type=Path, default=HERE / "output", help="folder for figures and JSON")
+    parser.add_argument("--formats", default="png", help="of figures: png, pdf, svg, or several with commas")
     options = parser.parse_args(arguments)
     if options.name is None:
         print(listing())
@@ -74,13 +75,13 @@ def main(arguments: list[str]) -> int:
         return 2
 
     if options.name == "all" and options.fast:
-        return run_side_by_side(["--fast", "--out", str(options.out)])
+        return run_side_by_side(["--fast", "--out", str(options.out), "--formats", options.formats])
 
     from experiments.report import Report
 
     for name in EXPERIMENTS if options.name == "all" else [options.name]:
         module = importlib.import_module(f"experiments.{EXPERIMENTS[name]}")
-        report = Report(name, options.out)
+        report = Report(name, options.out, tuple(options.formats.split(",")))
         module.run(report, options.fast)
         report.close()
     return 0

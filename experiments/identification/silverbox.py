@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
@@ -32,6 +31,7 @@ from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
 from hhtjax.identification.sandwich import SEGMENTS
 from hhtjax.numerics.richardson import richardson
+from hhtjax.plot import legend, subplots
 
 SUBSTEPS = 8
 MODELS = {
@@ -226,16 +226,16 @@ def plot_fit(report: Report, sets, scores):
     residual = 1e3 * (record.y - output)
     width, peak = int(0.25 * SAMPLING_RATE), int(np.argmax(np.abs(record.y)))
     first = min(max(0, peak - width // 2), len(record.y) - width)
-    figure, axes = plt.subplots(2, 2, figsize=(9, 4.8), sharex="col", height_ratios=(2, 1))
+    figure, axes = subplots(2, 2, width=175, height=95, sharex="col", height_ratios=(2, 1))
     name = "measured" if sets.measured else "generated"
     parts = {
         f"arrow test set: RMSE {value:.3f} mV": slice(None),
         "a quarter of a second about its peak": slice(first, first + width),
     }
     for (upper, lower), (title, part) in zip(axes.T, parts.items(), strict=True):
-        upper.plot(seconds[part], record.y[part], color="black", lw=1.5, label=f"{name} output")
-        upper.plot(seconds[part], output[part], color=COLOURS[4], lw=1.0, ls="--", label="fitted model, simulated")
-        upper.set_title(title, loc="left", fontsize=9)
+        upper.plot(seconds[part], record.y[part], color="#808080", lw=1.6, label=f"{name} output")
+        upper.plot(seconds[part], output[part], color=COLOURS[1], lw=0.7, label="fitted model, simulated")
+        upper.set_title(title, loc="left")
         lower.plot(seconds[part], residual[part], color=COLOURS[0], lw=0.6)
         lower.set_xlabel("time (s)")
     axes[0, 0].set_ylabel("output y (V)")
@@ -247,7 +247,7 @@ def plot_fit(report: Report, sets, scores):
 def plot_parameters(report: Report, result):
     """Estimates with their standard errors, relative to the estimate, and the cost over the iterations."""
     params, errors = result.params[0], result.standard_errors[0]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), width_ratios=(3, 2))
+    figure, (left, right) = subplots(1, 2, width=175, height=70, width_ratios=(3, 2))
     relative = [100 * float(errors[name] / abs(params[name])) for name in params]
     units = {name: "" if unit == "1" else f" {unit.replace('^2', '²')}" for name, unit in UNITS.items()}
     left.plot(relative, [f"{name} = {float(params[name]):.4g}{units[name]}" for name in params], "o", color=COLOURS[0])
@@ -262,7 +262,7 @@ def plot_parameters(report: Report, result):
 
 def plot_step_sizes(report: Report, rows):
     """Test error, and the bias of stiffness and damping, measured and predicted, against the steps per sample."""
-    figure, axes = plt.subplots(1, 3, figsize=(10, 3.2))
+    figure, axes = subplots(1, 3, width=175, height=65)
     for i, alpha in enumerate(sorted({row["alpha"] for row in rows}, reverse=True)):
         mine = [row for row in rows if row["alpha"] == alpha]
         substeps = [row["substeps"] for row in mine]
@@ -282,6 +282,6 @@ def plot_step_sizes(report: Report, rows):
         axis.set_xlabel("steps per sample")
         axis.set_ylabel(label)
     axes[0].set_yticks([0.3, 0.5, 1.0, 2.0, 3.0])
-    axes[0].legend()
-    axes[1].set_title("marks measured, lines predicted", loc="left", fontsize=9)
+    legend(axes[0])
+    axes[1].set_title("marks measured, lines predicted", loc="left")
     report.figure("silverbox_step_size", figure)

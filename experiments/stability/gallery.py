@@ -177,12 +177,26 @@ def run(report, fast):
     for title, rows in ("Scenes on which the default was chosen.\n", tuned), ("Held-out scenes.\n", untouched):
         print(title)
         report.table(SUMMARY, rows)
-    report.figure("stability", page(outcomes, CAUSES))
+    scenes = cells(outcomes, sizes)
+    figures(report, scenes)
     return {
         "alphas": ALPHAS,
         "tuned_scenes": len(outcomes) - len(new),
         "summary_tuned_on": [dict(zip(SUMMARY, row, strict=True)) for row in tuned],
         "summary_held_out": [dict(zip(SUMMARY, row, strict=True)) for row in untouched],
         "boundaries": boundaries(outcomes, sizes, references),
-        "scenes": cells(outcomes, sizes),
+        "scenes": scenes,
     }
+
+
+def figures(report, scenes):
+    """All cells: of the methods with alpha, with a line on why they fail, and of the others."""
+    methods = next(iter(scenes.values()))["grades"]
+    with_alpha = [name for name, rows in methods.items() if len(rows) > 1]
+    for name, shown, causes in (
+        ("stability", with_alpha, CAUSES),
+        ("stability_without_alpha", [x for x in methods if x not in with_alpha], {}),
+    ):
+        if shown:
+            some = {key: {"grades": {x: scene["grades"][x] for x in shown}} for key, scene in scenes.items()}
+            report.figure(name, page(some, causes))

@@ -122,7 +122,7 @@ def _triangle(ax, p, curve, curves, taken):
             shift = min if gap < 0 else max
             y = shift(np.interp(x, h, e) - p * x) + p * x + gap
             places.append((x, y, gap))
-    x, y, gap = min(places, key=lambda place: _in_the_way(*place[:2], curves, taken))
+    x, y, gap = min(places, key=lambda place: _in_the_way(place[0], place[1], curves, taken))
     corner = (x[1], y[0]) if gap < 0 else (x[0], y[1])
     ax.plot(*np.exp([[x[0], y[0]], corner, [x[1], y[1]], [x[0], y[0]]]).T, color=GREY, lw=0.8, label="_slope")
     side = {"xytext": (3 if gap < 0 else -3, 0), "ha": "left" if gap < 0 else "right"}
@@ -130,11 +130,11 @@ def _triangle(ax, p, curve, curves, taken):
     return x, y
 
 
-def _in_the_way(x, y, curves, taken):
-    """How many curves cross the box from (x0, y0) to (x1, y1), and how many triangles share a part of it; logarithms."""
+def _in_the_way(x: Any, y: Any, curves: Any, taken: Any) -> int:
+    """How many curves cross the box between (x0, y0) and (x1, y1), and how many triangles; all of it in logarithms."""
     hits = 0
     for h, e in curves:
-        over = np.interp(np.linspace(*x, 5), np.log(h), np.log(e), left=np.nan, right=np.nan)
+        over = np.interp(np.linspace(x[0], x[1], 5), np.log(h), np.log(e), left=np.nan, right=np.nan)
         hits += bool(np.any((over > y[0] - 0.2) & (over < y[1] + 0.2)))
     return hits + sum(x[0] < a[1] and a[0] < x[1] and y[0] < b[1] and b[0] < y[1] for a, b in taken)
 

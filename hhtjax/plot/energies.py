@@ -53,8 +53,8 @@ def energy_balance(
     >>> spring = hhtjax.System.from_lagrangian(lambda q, v, t, params: 0.5 * jnp.sum(v**2) - 2.0 * jnp.sum(q**2))
     >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
     >>> upper, lower = hhtjax.plot.energy_balance(spring, run)
-    >>> [line.get_label() for line in upper.lines], lower.get_ylabel()
-    (['kinetic', 'potential', 'work of other forces', 'kinetic + potential'], 'made by the\nmethod (J)')
+    >>> [line.get_label() for line in upper.lines]
+    ['kinetic', 'potential', 'work of other forces', 'kinetic + potential']
     """
     if energy is not None:
         t, curves, error, drift = _given_energy(solution, params, energy)

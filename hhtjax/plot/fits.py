@@ -103,7 +103,7 @@ def _spectrum(values, rate):
     values = np.where(np.isfinite(values), values, 0.0)
     length = 2 ** int(np.log2(max(8, len(values) // 2)))
     power, frequency = mlab.psd(values, NFFT=length, Fs=rate, noverlap=length // 2, detrend="mean")
-    return frequency, np.sqrt(power)
+    return np.asarray(frequency), np.sqrt(power)
 
 
 def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: Any = None, ax: Any = None) -> Any:

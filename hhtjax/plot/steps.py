@@ -93,7 +93,7 @@ def stability_region(
     for name, ends in {"real": real, "imag": imag}.items():
         if np.shape(ends) != (2,) or not ends[0] < ends[1]:
             raise ValueError(f"stability_region: `{name}` must be two increasing numbers; received {ends!r}.")
-    x, y = np.linspace(*real, points), np.linspace(*imag, points)
+    x, y = np.linspace(real[0], real[1], points), np.linspace(imag[0], imag[1], points)
     z = x[None, :] + 1j * y[:, None]
     radii = {label: np.asarray(analysis.stability_region(one, z)) for label, one in named.items()}
     with canvas("stability_region", ax, height=80) as (panel,):

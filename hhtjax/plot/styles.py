@@ -11,6 +11,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.textpath import TextPath
+from matplotlib.ticker import Formatter, LogFormatterSciNotation
 
 from hhtjax.checks import require_integer, require_number
 
@@ -22,7 +23,7 @@ LINES: tuple[Any, ...] = (
 )  # fmt: skip
 TEXT = 8.0  # pt
 COLUMN, PAGE = 85, 175  # mm
-PARAMETERS: dict[str, Any] = {
+PARAMETERS: Any = {
     "axes.formatter.use_mathtext": True,
     "axes.formatter.useoffset": False,
     "axes.grid": True,
@@ -97,12 +98,35 @@ def pin(ax):
     ax.grid(True, color="#b0b0b0", alpha=0.3, linewidth=0.5)
 
 
+class _Between(Formatter):
+    """Labels between the decades of a logarithmic axis: 2 and 5, where fewer than two decades have one."""
+
+    def __call__(self, x, pos=None):
+        axis: Any = self.axis
+        ends = np.log10(np.sort(axis.get_view_interval()))
+        exponent = int(np.floor(np.log10(x) + 1e-9))
+        leading = round(x / 10.0**exponent)
+        if np.floor(ends[1]) - np.ceil(ends[0]) >= 1 or leading not in (2, 5):
+            return ""
+        return f"$\\mathdefault{{{leading}\\times10^{{{exponent}}}}}$"
+
+
+def thin_ticks(ax):
+    """Keeps the labels between the decades of logarithmic axes from running into each other."""
+    for axis in (ax.xaxis, ax.yaxis):
+        if axis.get_scale() == "log" and isinstance(axis.get_minor_formatter(), LogFormatterSciNotation):
+            axis.set_minor_formatter(_Between())
+
+
 @contextmanager
 def canvas(caller, ax, rows=1, width=COLUMN, height=None, **options):
     """The axes given, checked, or those of a new figure, and its style while they are drawn into: an array (rows,)."""
     if ax is None:
         with style():
-            yield subplots(rows, 1, width=width, height=height, squeeze=False, **options)[1][:, 0]
+            axes = subplots(rows, 1, width=width, height=height, squeeze=False, **options)[1][:, 0]
+            yield axes
+            for panel in axes:
+                thin_ticks(panel)
         return
     given = list(np.ravel(np.asarray(ax, dtype=object)))
     if len(given) != rows or not all(isinstance(x, Axes) for x in given):
@@ -136,7 +160,7 @@ def legend(ax, handles=None, labels=None, **options: Any):
         return None
     room = 72 * ax.get_figure(root=True).get_size_inches()[0] * ax.get_position().width
     place = {"loc": "lower left", "bbox_to_anchor": (0, 1.0), "borderaxespad": 0.3}
-    shape = {"ncols": _columns(labels, room), "handlelength": 2.2, "columnspacing": 1.2, "borderpad": 0.2}
+    shape = {"ncols": _columns(labels, room), "handlelength": 2.0, "columnspacing": 1.0, "borderpad": 0.2}
     return ax.legend(handles, labels, **(place | shape | options))
 
 
@@ -144,9 +168,8 @@ def _columns(labels, room):
     """The most columns of a legend that fit into `room` points, by the width of the widest label of each."""
     size = [TextPath((0, 0), label, size=TEXT).get_extents().width if label.strip() else 0 for label in labels]
     for columns in range(len(labels), 1, -1):
-        rows = -(-len(labels) // columns)
-        widest = [max(size[i : i + rows]) for i in range(0, len(labels), rows)]
-        if sum(widest) + 33 * len(widest) <= room:
+        widest = [max(part) for part in np.array_split(size, columns)]  # as matplotlib deals them out
+        if sum(widest) + 30 * columns <= room:
             return columns
     return 1
 
@@ -167,6 +190,8 @@ def save(figure, path, formats: Sequence[str] = ("png",)) -> list[Path]:
         raise TypeError(f"save: `figure` must be a matplotlib figure; received {figure!r}.")
     if isinstance(formats, str) or not set(formats) <= set(FORMATS):
         raise ValueError(f"save: `formats` must be a tuple of {', '.join(FORMATS)}; received {formats!r}.")
+    for ax in figure.axes:
+        thin_ticks(ax)
     paths = [Path(f"{path}.{ending}") for ending in formats]
     with style():
         for file in paths:
