@@ -18,6 +18,7 @@ import numpy as np
 import hhtjax
 
 jax.config.update("jax_enable_x64", True)  # double precision; JAX starts in single precision
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)  # the look of all figures
 
 # %% [markdown]
 # ## The record of the road
@@ -80,12 +81,12 @@ print("times", run.t.shape, " positions", run.q.shape, " accelerations", run.acc
 
 # %%
 compression = run.q[:, 1] - run.q[:, 0]
-figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.6), sharex=True, layout="constrained")
+figure, (above, below) = hhtjax.plot.subplots(2, 1, width=175, height=105, sharex=True)
 above.plot(t_road, 1e3 * z_road, ".", color="0.6", ms=3, label="road, as recorded")
 above.plot(run.t, 1e3 * run.q[:, 1], label="wheel", lw=1.2)
 above.plot(run.t, 1e3 * run.q[:, 0], label="body", lw=1.8)
 above.set_ylabel("height (mm)")
-above.legend(ncols=3)
+above.legend(ncols=3, loc="lower left")
 below.plot(run.t, 1e3 * compression, color="C2")
 below.axhline(1e3 * params["gap"], color="black", ls="--", lw=1)
 below.annotate("bump stop begins", (3.0, 1e3 * params["gap"]), ha="right", va="bottom")
@@ -146,12 +147,14 @@ c = jnp.linspace(300.0, 4000.0, 60)
 acceleration, load, worst = jax.jit(jax.vmap(ride))(c)
 best = int(jnp.argmin(acceleration))
 
-figure, left = plt.subplots(figsize=(7, 3.2), layout="constrained")
+figure, left = hhtjax.plot.subplots(width=140, height=75)
 left.plot(c, acceleration, label="body acceleration (left)")
 left.plot(c[:25], ride(1200.0)[0] + slope * (c[:25] - 1200.0), "k:", lw=1.2)
 left.plot(c[best], acceleration[best], "o", color="C0")
 left.set(xlabel="damper c (N s/m)", ylabel="largest body\nacceleration (m/s²)")
 right = left.twinx()
+right.grid(False)
+right.spines["right"].set_visible(True)
 right.plot(c, load / 1e3, color="C1", ls="--", label="least load of the tyre (right)")
 right.set_ylabel("least load of\nthe tyre (kN)")
 figure.legend(loc="outside upper center", ncols=2)

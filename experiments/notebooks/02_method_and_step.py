@@ -17,6 +17,7 @@ import hhtjax
 from hhtjax import analysis
 
 jax.config.update("jax_enable_x64", True)
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 # %% [markdown]
 # ## What a step does to one vibration
@@ -42,7 +43,9 @@ hhtjax.plot.period_elongation(steppers, frequency=wh, ax=left)
 hhtjax.plot.damping_ratio(steppers, frequency=wh, ax=right)
 left.set_ylim(-0.2, 1.0)
 right.set_ylim(-0.1, 0.6)
-right.get_legend().remove()
+for axes in (left, right):
+    axes.get_legend().remove()
+figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=3)
 plt.show()
 
 for name, stepper in steppers.items():

@@ -22,6 +22,7 @@ import hhtjax
 from hhtjax.identification import score_test
 
 jax.config.update("jax_enable_x64", True)
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 RATE = 1e7 / 2**14  # samples per second
 TRUE = {"m": 5.4e-6, "c": 2.2e-4, "k": 1.0, "k2": -0.03, "k3": 4.0, "offset": -5e-3, "c2": 1.5e-3, "d": 0.0}

@@ -22,6 +22,7 @@ from IPython.display import HTML, display
 import hhtjax
 
 jax.config.update("jax_enable_x64", True)
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 # %% [markdown]
 # ## Watt's linkage
@@ -103,9 +104,9 @@ print(f"P moves {1e3 * jnp.ptp(P[:, 1]):.0f} mm up and down, and {1e3 * jnp.ptp(
 # The same as a film:
 
 # %%
-film = hhtjax.plot.animation(run, points, fps=15, speed=0.7, trace=1)
+film = hhtjax.plot.animation(run, points, fps=12, speed=0.6, trace=1)
 with tempfile.TemporaryDirectory() as folder:
-    film.save(Path(folder) / "watt.gif", writer="pillow", dpi=60)
+    film.save(Path(folder) / "watt.gif", writer="pillow", dpi=50)
     plt.close(film._fig)
     content = base64.b64encode((Path(folder) / "watt.gif").read_bytes()).decode()
 print(f"{len(content) // 1000} kB")

@@ -16,6 +16,7 @@ import hhtjax
 from hhtjax import analysis
 
 jax.config.update("jax_enable_x64", True)
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 # %% [markdown]
 # ## Blown up, wrong, or fine
@@ -168,7 +169,7 @@ plt.show()
 pendulum = hhtjax.scenes.pendulum.elastic(k=1e6)
 off = pendulum.q0 * (1 + 2e-4)
 figure, axes = hhtjax.plot.subplots(width=130, height=60)
-for alpha, line in ((0.0, "C1-"), (-0.05, "C0-"), (-0.3, "C2-")):
+for alpha, line in ((0.0, "C1-"), (-0.05, "C0-"), (-0.3, "C2--")):
     run = hhtjax.simulate(pendulum.system, hhtjax.hht(alpha), off, pendulum.v0, pendulum.params, dt=1e-2, num_steps=100)
     stretch = 1e6 * (jnp.sqrt(jnp.sum(run.q**2, axis=1)) - 0.5)
     axes.plot(run.t, stretch, line, lw=1, label=f"alpha = {alpha}")
@@ -177,7 +178,7 @@ for alpha, line in ((0.0, "C1-"), (-0.05, "C0-"), (-0.3, "C2-")):
         f"alpha = {alpha:<5} force in the rod = {float(stretch[-1]):7.1f} N at the end; jumps by {rough:6.1f} N a step"
     )
 axes.set(xlabel="time (s)", ylabel="force in the rod (N)")
-axes.legend()
+figure.legend(loc="outside upper center", ncols=3)
 plt.show()
 
 # %% [markdown]

@@ -14,6 +14,7 @@ import numpy as np
 import hhtjax
 
 jax.config.update("jax_enable_x64", True)
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 # %% [markdown]
 # ## Stick-slip: a mass on a moving belt
@@ -90,8 +91,11 @@ for vt in (1e-1, 1e-2, 1e-3):
     sweep = hhtjax.sweep(sliding, stepper, *start, dts=1.5 / counts, duration=1.5, num_samples=75)
     error = np.abs(np.asarray(sweep.q[:, :, 0]) - exact(np.asarray(sweep.t))).max(axis=1)
     curves[f"vt = {vt:g} m/s"] = np.asarray(sweep.dt), error
-axes = hhtjax.plot.error_against_h(curves, slopes=(), unit="m")
-axes.figure.set_size_inches(5.6, 3.4)
+figure, axes = hhtjax.plot.subplots(width=130, height=75)
+for i, (name, (dt, error)) in enumerate(curves.items()):
+    axes.loglog(dt, error, marker=hhtjax.plot.MARKERS[i], ls=hhtjax.plot.LINES[i], label=name)
+axes.set(xlabel="step size (s)", ylabel="largest error of the position (m)")
+axes.legend()
 plt.show()
 for name, (_, error) in curves.items():
     print(f"{name}: error {1e3 * error[0]:.2f} mm with {counts[0]} steps, {1e3 * error[-1]:.3f} mm with {counts[-1]}")
@@ -122,17 +126,19 @@ def rate(y, t, p):
 
 mount = hhtjax.FirstOrderSystem(rate)
 rubber = {"m": 2.0, "c": 10.0, "k": 5e4, "A": 5e4, "beta": 1e3, "gamma": 0.8, "delta": -1.1}
-rubber |= {"amplitude": 40.0, "frequency": 15.0}  # N/s, Hz
+rubber |= {"amplitude": 120.0, "frequency": 5.0}  # N/s, Hz
 y0 = {"q": jnp.zeros(()), "v": jnp.zeros(()), "z": jnp.zeros(())}
 loops = hhtjax.simulate(mount, hhtjax.hht(), y0, params=rubber, dt=2e-4, num_steps=10000)
 loops.check()
 
 figure, axes = hhtjax.plot.subplots(width=100, height=75)
-points = axes.scatter(
-    1e3 * loops.q["q"][::5], rubber["k"] * loops.q["q"][::5] + loops.q["z"][::5], c=loops.t[::5], s=1, cmap="viridis"
-)
-axes.set(xlabel="displacement (mm)", ylabel="restoring force (N)")
-figure.colorbar(points, label="time (s)")
+for i, end in enumerate((0.6, 1.2, 2.0)):
+    cycle = (loops.t > end - 1 / rubber["frequency"]) & (loops.t <= end)
+    axes.plot(
+        1e3 * loops.q["q"][cycle], loops.q["z"][cycle], ls=hhtjax.plot.LINES[i], label=f"cycle that ends at {end} s"
+    )
+axes.set(xlabel="displacement (mm)", ylabel="hysteretic force z (N)")
+axes.legend()
 plt.show()
 last = loops.t > loops.t[-1] - 1 / rubber["frequency"]
 eaten = float(jnp.sum((loops.q["z"] * loops.q["v"])[last]) * 2e-4)
@@ -140,8 +146,8 @@ damped = float(jnp.sum(rubber["c"] * loops.q["v"][last] ** 2) * 2e-4)
 print(f"the hysteresis takes {1e3 * eaten:.0f} mJ out of the last cycle, the damper {1e3 * damped:.1f} mJ")
 
 # %% [markdown]
-# **Look at** the area inside a loop: the energy that a cycle loses. The loops grow with the amplitude, and the slope at
-# their tips is the stiffness $k + A$ at first, less later.
+# **Look at** the area inside a loop: the energy that a cycle loses. Small
+# motions hardly open a loop; large ones lose much.
 #
 # ## A bouncing ball: a stiff contact
 #
@@ -201,5 +207,5 @@ for wanted in (4, 20, 100):
 # ## What to try next
 #
 # * Fit `Fs`, `Fk` and `vs` of the belt from a noisy run, as in notebook 3; start with a large `vt` and make it smaller.
-# * Let the frequency of the mount be 30 Hz: what becomes of the loops?
+# * Let the frequency of the mount be 30 Hz, closer to its resonance: what becomes of the loops?
 # * Drop the ball with `hht(alpha=0.0)`: is the energy after an impact always less than before?

@@ -22,6 +22,7 @@ import hhtjax
 from hhtjax.identification import wrap_angle
 
 jax.config.update("jax_enable_x64", True)
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 file = Path(os.environ.get("HHTJAX_DATA", ".")) / "double_pendulum" / "real_double_pend_h_1.txt"
 measured = file.is_file()

@@ -14,6 +14,7 @@ import numpy as np
 import hhtjax
 
 jax.config.update("jax_enable_x64", True)
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 # %% [markdown]
 # ## The arm and its record
