@@ -164,9 +164,9 @@ v = jnp.linspace(-1.6 * seen, 1.6 * seen, 401)
 learned = jax.vmap(lambda v: friction(v, found.params))(v)
 inside = jnp.abs(v) <= seen
 off = learned - stribeck(v)
-print(f"speeds up to {seen:.2f} m/s in the record; there the friction found is off by {rms(off[inside]):.3f} N rms,")
-print(f"{jnp.abs(off[inside]).max():.3f} N at most, of {jnp.abs(stribeck(v[inside])).max():.2f} N;", end=" ")
-print(f"outside by up to {jnp.abs(off[~inside]).max():.2f} N")
+print(f"speeds up to {seen:.2f} m/s in the record, friction up to {jnp.abs(stribeck(v[inside])).max():.2f} N")
+print(f"friction found off by {rms(off[inside]):.3f} N rms, {jnp.abs(off[inside]).max():.3f} N at most;", end=" ")
+print(f"outside, out to {1.6 * seen:.2f} m/s, by up to {jnp.abs(off[~inside]).max():.3f} N")
 assert rms(off[inside]) < 0.05 * rms(stribeck(v[inside]))
 
 blue, orange = hhtjax.plot.COLOURS[:2]
@@ -181,7 +181,7 @@ count.hist(np.ravel(truth_train.v), bins=60, color="0.7", alpha=0.5)
 count.set(yticks=[], ylim=(0, 1500))
 count.spines[:].set_visible(False)
 ax.set(xlabel="velocity (m/s)", ylabel="friction (N)", xlim=(-1.6 * seen, 1.6 * seen), ylim=(-4, 4))
-ax.legend(loc="upper left")
+ax.legend(loc="lower right", fontsize=8, frameon=False)
 plt.show()
 
 # %% [markdown]
@@ -211,7 +211,7 @@ for (name, residual), colour, line in zip(residuals.items(), (orange, blue), ("-
     above.plot(t, 1e3 * (test + NOISE * residual), color=colour, ls=line, label=name)
     below.plot(t, 1e3 * NOISE * residual, color=colour, lw=0.8)
 above.set_ylabel("position (mm)")
-above.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+above.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=8, frameon=False)
 below.set(xlabel="time (s)", ylabel="simulated minus\nmeasured (mm)")
 plt.show()
 
