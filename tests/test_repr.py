@@ -1,5 +1,6 @@
 """What a result shows in a notebook: shapes, dtypes and verdicts, never arrays; of tracers too, without computing."""
 
+import pickle
 import re
 
 import jax
@@ -186,6 +187,7 @@ def test_completion_shows_our_names():
         assert not {"count", "index"} & names
         assert result.count(None) >= 0  # it is a tuple all the same
     assert isinstance(run(), tuple)
+    assert pickle.loads(pickle.dumps(State(1, 2, 3, 4))) == State(1, 2, 3, 4)
     assert run()._replace(t=1)[0] == 1
     assert State(1, 2, 3, 4) == (1, 2, 3, 4, None, None, None)
     assert jax.tree.leaves(State(1, 2, 3, 4)) == [1, 2, 3, 4]
