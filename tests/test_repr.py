@@ -1,5 +1,6 @@
 """What a result shows in a notebook: shapes, dtypes and verdicts, never arrays; of tracers too, without computing."""
 
+import pickle
 import re
 
 import jax
@@ -85,8 +86,10 @@ def test_a_batch_and_a_sweep_say_how_many():
         (Info(jnp.ones(9), converged=jnp.arange(9) > 1), "Info(2 of 9 not converged, residual=float64[9], converged="),
         (Info(jnp.ones(9), converged=jnp.ones(9, bool)), "Info(all converged, residual=float64[9], converged=bool[9])"),
         (Info(jnp.asarray(1e-12), converged=jnp.asarray(True)), "Info(residual=1e-12, converged=True)"),
-        (run(failed=3).failure, "Failure(the velocity v, step=3, newton=False, quantity=1)"),
+        (run(failed=3).failure, "Failure(the velocity v is not finite, step=3, newton=False, quantity=1)"),
         (run(failed=3, newton=True).failure, "Failure(Newton did not converge, step=3, newton=True, quantity=1)"),
+        (run(failed=3).failure._replace(row=jnp.asarray(2)), "Failure(a constraint depends on others, step=3, "),
+        (run(failed=3).failure._replace(solve=jnp.asarray(0.1)), "Failure(the linear solve left too much, step=3, "),
         (run().failure, "Failure(no step failed, step=0, newton=False, quantity=1)"),
         (Interpolant(jnp.ones((2, 1)), None), "Interpolant(q=float64[2,1])"),
         (
@@ -184,6 +187,7 @@ def test_completion_shows_our_names():
         assert not {"count", "index"} & names
         assert result.count(None) >= 0  # it is a tuple all the same
     assert isinstance(run(), tuple)
+    assert pickle.loads(pickle.dumps(State(1, 2, 3, 4))) == State(1, 2, 3, 4)
     assert run()._replace(t=1)[0] == 1
     assert State(1, 2, 3, 4) == (1, 2, 3, 4, None, None, None)
     assert jax.tree.leaves(State(1, 2, 3, 4)) == [1, 2, 3, 4]

@@ -42,7 +42,11 @@ class Failure(NamedTuple):
             return ""
         if step.ndim or not step:
             return f"{np.count_nonzero(step)} of {step.size} runs failed" if step.any() else "no step failed"
-        return "Newton did not converge" if known(self.newton) else f"{QUANTITIES[quantity]}"
+        if known(self.newton):
+            return "Newton did not converge"
+        if known(self.solve):
+            return "the linear solve left too much"
+        return "a constraint depends on others" if known(self.row) else f"{QUANTITIES[quantity]} is not finite"
 
 
 QUANTITIES = "the position q", "the velocity v", "the acceleration", "the vector of multipliers"
