@@ -1,10 +1,12 @@
 """The runner, and Silverbox as a user runs it: on the measured record where there is one, else on a generated one."""
 
+import importlib
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -42,6 +44,27 @@ def test_a_full_run_is_for_those_that_show_a_part_by_default():
         result = experiments(*arguments)
         assert result.returncode == 2
         assert "--full" in result.stderr
+
+
+def test_how_much_is_run_and_what_the_numbers_say_of_it(monkeypatch, tmp_path):
+    """Silverbox by default in part, `all` in full, with a page; experiments without --full take two arguments."""
+    runner = importlib.import_module("experiments.__main__")
+    monkeypatch.setattr(runner, "EXPERIMENTS", {name: EXPERIMENTS[name] for name in ("silverbox", "vehicle")})
+    for module in runner.EXPERIMENTS.values():
+        stub = SimpleNamespace(run=lambda report, *options: report.numbers({"options": options}))
+        monkeypatch.setitem(sys.modules, f"experiments.{module}", stub)
+
+    def told(name, *arguments):
+        assert runner.main([*arguments, "--out", str(tmp_path)]) == 0
+        numbers = json.loads((tmp_path / f"{name}.json").read_text())
+        return numbers["options"], numbers["made_by"]["mode"], numbers["made_by"]["command"].split()[3:]
+
+    assert told("silverbox", "silverbox") == ([False, False], "part", ["silverbox"])
+    assert told("silverbox", "silverbox", "--full") == ([False, True], "full", ["silverbox", "--full"])
+    assert told("silverbox", "silverbox", "--fast") == ([True, False], "fast", ["silverbox", "--fast"])
+    assert told("vehicle", "vehicle") == ([False], "full", ["vehicle"])
+    assert told("silverbox", "all") == ([False, True], "full", ["silverbox", "--full"])
+    assert "python -m experiments vehicle" in (tmp_path / "experiments.html").read_text(encoding="utf-8")
 
 
 def test_an_unknown_name_gives_the_list_and_fails():
