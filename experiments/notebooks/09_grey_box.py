@@ -116,9 +116,8 @@ def train_residuals(params):
 
 begin = time.process_time()
 found = hhtjax.fit(train_residuals, start, max_iterations=60, covariance=False)
-print(
-    f"{weights} weights, k and c: {found.iterations} iterations, {time.process_time() - begin:.0f} s of processor time, with compiling"
-)
+used = time.process_time() - begin
+print(f"{weights} weights, k and c: {found.iterations} iterations, {used:.0f} s of processor time with compiling")
 print(f"misfit {rms(found.residual):.3f} times the noise (start {rms(train_residuals(start)):.0f})")
 print(f"k = {found.params['k']:.2f} N/m, true 400; physics alone said {physics.params['k']:.1f}")
 assert rms(found.residual) < 1.1
