@@ -94,6 +94,9 @@ print(f"\nnoise: {1e3 * sigma:.2f} mm estimated, {1e3 * 0.05 * clean.std():.2f} 
 # same as coordinates $\log\theta$ with that covariance as inverse mass matrix.) Its gradient is $-J^T r$. With four
 # parameters, four forward derivatives along with the run cost less than one pass backwards through it. NUTS asks for
 # a gradient in reverse mode, so we hand it over by `jax.custom_vjp`.
+#
+# All times here are processor times of this process: what else the machine does counts little in them. On an idle
+# machine they are what a clock shows, since one core does nearly all of the work.
 
 # %%
 estimate, unravel = ravel_pytree(result.params)
@@ -129,12 +132,12 @@ def log_density(motion, mode="forward"):
 
 
 def seconds(f, *args, longest=0.3):
-    """The result of the compiled function, and its shortest time among those of 0.3 s."""
+    """The result of the compiled function, and the shortest processor time of calls for 0.3 s."""
     compiled, times, value = jax.jit(f).lower(*args).compile(), [], None
     while not times or sum(times) < longest:
-        begin = time.perf_counter()
+        begin = time.process_time()
         value = jax.block_until_ready(compiled(*args))
-        times.append(time.perf_counter() - begin)
+        times.append(time.process_time() - begin)
     return value, min(times)
 
 
@@ -212,7 +215,7 @@ def another(key):
 
 found, *believed = jax.jit(lambda keys: jax.lax.map(another, keys))(jax.random.split(jax.random.key(3), 50))
 scatter = found.std(axis=0, ddof=1)
-print("\n50 records, scatter of the estimates:", dict(zip(names, np.round(np.asarray(scatter), 4), strict=True)))
+print("\n50 records, scatter of the estimates:", *(f"{name} {x:.2g}" for name, x in zip(names, scatter, strict=True)))
 for kind, error in zip(errors, believed, strict=True):
     ratio, own = error.mean(axis=0) / scatter, jnp.max(error.std(axis=0) / error.mean(axis=0))
     print(f"errors of {kind:<9} over it, on average {np.round(ratio, 2)}; they scatter by {100 * own:.0f} % themselves")
@@ -353,13 +356,12 @@ print(f"{smooth_theirs[0] / forward_time:.0f} times")
 # %% [markdown]
 # ## Where the time goes
 #
-# The sampler calls the simulation in loops of its own, compiled with it. Each loop over steps is still one kernel:
+# The sampler calls the simulation in loops of its own, compiled with it. Each loop over steps stays what it is without:
 
 # %%
 explanation = hhtjax.explain(lambda *a: sample(log_density(ours), *a), keys, starts)
 print(explanation)
-if jax.default_backend() == "cpu" and not any("JAX" in path for path in explanation.paths):
-    assert set(explanation.paths) == {"one kernel"}
+assert set(explanation.paths) == set(hhtjax.explain(jax.value_and_grad(log_density(ours)), here).paths)
 print(f"a step with its four derivatives: {1e9 * forward_time / N:.0f} ns (the step alone {1e9 * run_time / N:.0f} ns)")
 inside = 1e3 * t_gradient["hhtjax"]
 print(f"a gradient: {1e3 * forward_time:.2f} ms by itself, {inside:.2f} ms with the sampler's own work")
