@@ -12,7 +12,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 @pytest.mark.slow
 def test_the_code_blocks_run(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    assert len(blocks) == 9
+    assert len(blocks) == 10
     namespace = {}
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         for block in blocks:
