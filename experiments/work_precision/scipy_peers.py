@@ -20,7 +20,8 @@ Makers = dict[str, Callable[[Any], Callable]]
 
 def by_jax(case):
     """Compiled from the same functions as ours; a call costs some microseconds of JAX's."""
-    return hhtjax.interop.scipy_rhs(*case.ode, case.scene.params).fun
+    system, q0, v0 = case.ode
+    return hhtjax.interop.scipy_rhs(system, q0, v0, case.scene.params).fun
 
 
 def by_c(case):

@@ -69,7 +69,7 @@ def modes(M, K, count=None) -> NormalModes:
     count = n if count is None else require_integer("modes", "count", count)
     if count > n:
         raise ValueError(f"modes: `count` must be at most {n}, the number of coordinates; received {count}.")
-    by_lanczos = (is_sparse(M) or is_sparse(K)) and n > DENSE
+    by_lanczos = (is_sparse(M) or is_sparse(K)) and DENSE < n != count
     squares, T, scale = (_by_lanczos if by_lanczos else _by_numpy)(M, K, count)
     if squares[0] < -1e-9 * scale:
         raise ValueError(f"modes: `K` must be positive semidefinite; received one with frequency^2 = {squares[0]:.4g}.")
@@ -123,8 +123,8 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
         )
     if K is None:
         raise ValueError("modal_reduction: `system` must have a stiffness K; received None.")
-    numbers = [A(params) if callable(A) else A for A in (M, K)]
-    frequencies, T = modes(*numbers, count)
+    mass, stiffness = (A(params) if callable(A) else A for A in (M, K))
+    frequencies, T = modes(mass, stiffness, count)
     reduced = LinearSystem(
         _Projected(T, M) if callable(M) else np.ones(count),
         C if C is None else _Projected(T, C) if callable(C) else _uncoupled(_project(T, C)),
@@ -132,7 +132,7 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
         None if load is None else _ProjectedLoad(T, load),
         None if nonlinear is None else _ProjectedForce(T if at is None else T[list(at)], nonlinear),
     )
-    return ModalReduction(reduced, frequencies, T, _times(numbers[0], T).T)
+    return ModalReduction(reduced, frequencies, T, _times(mass, T).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,11 +220,14 @@ def _by_lanczos(M, K, count):
     M, K = (sparse.csc_matrix(sparse.diags(np.asarray(A)) if np.ndim(A) == 1 and not is_sparse(A) else A, dtype=float)
             for A in (M, K))  # fmt: skip
     _require_symmetric(K, abs(K - K.T).max())
-    scale = np.max(K.diagonal() / M.diagonal())
+    diagonals: Any = [A.diagonal() for A in (K, M)]
+    if not np.min(diagonals[1]) > 0:
+        raise ValueError("modes: `M` must be positive definite; received one with a diagonal that is not positive.")
+    scale = np.max(diagonals[0] / diagonals[1])
     start = np.random.default_rng(0).standard_normal(M.shape[0])
     for shift in SHIFTS:
         try:
-            squares, T = eigsh(K, min(count, M.shape[0] - 1), M, sigma=-shift * scale, v0=start)
+            squares, T = eigsh(K, count, M, sigma=-shift * scale, v0=start)
         except (RuntimeError, ArpackError):  # a singular factor; no convergence
             continue
         order = np.argsort(squares)

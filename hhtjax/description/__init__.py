@@ -32,6 +32,9 @@ class Fixed:
     def __init__(self, function):
         self.function = function
 
+    def __repr__(self):
+        return repr(self.function)
+
     def tree_flatten(self):
         """No leaves."""
         return (), self.function

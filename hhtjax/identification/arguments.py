@@ -79,8 +79,8 @@ def check_options(
 
 def check_parameters(caller, params0, name="params0"):
     """params0 as a pytree of float arrays, functions among them hidden."""
-    params0 = freeze(params0)
-    leaves = jax.tree_util.tree_leaves_with_path(params0)
+    given, params0 = params0, freeze(params0)
+    leaves = jax.tree_util.tree_leaves_with_path(params0) or jax.tree_util.tree_leaves_with_path(given)
     if not leaves:
         raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
     for path, leaf in leaves:

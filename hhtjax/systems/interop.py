@@ -170,7 +170,8 @@ def _ode(system, t, y, params):
         return flat.unravel(flat.force(q, v, jnp.asarray(t).astype(v.dtype), params))
     if not isinstance(y, (tuple, list)) or len(y) != 2:
         raise TypeError(f"ode: `y` must be (q, v), two pytrees; received {y!r}.")
-    flat, q, v = flatten("ode", system, *y, t, params)
+    q, v = y
+    flat, q, v = flatten("ode", system, q, v, t, params)
     at = q, v, jnp.asarray(t).astype(q.dtype), params
     w = acceleration_and_multipliers(flat, *at)[0] if flat.num_constraints else flat.acceleration(*at)
     return flat.unravel(flat.rate(q, v)), flat.unravel_rates(w)
