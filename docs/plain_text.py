@@ -81,7 +81,7 @@ def blocks(lines):
     return found
 
 
-def render(lines, names=()):
+def render(lines, names=frozenset()):
     """reStructuredText of a docstring, or of a part of it, whose lines begin at the first column."""
     result = []
     remaining = blocks(lines)
@@ -145,8 +145,8 @@ def section(name, body, names):
 
 def split(title, text, names):
     """An item as several, where its line goes on with the next argument: "dt: in s. times: in s."."""
-    for found in re.finditer(r"(?<=[.;] )(\w+): ", text):
-        if found[1] in names:
+    for found in re.finditer(r"(?<=[.;] )(\w+(?:, \w+)*): ", text):
+        if names.issuperset(found[1].split(", ")):
             return [[title, [text[: found.start()].strip(" ;")]], *split(found[1], text[found.end() :], names)]
     return [[title, [text]]]
 
