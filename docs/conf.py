@@ -24,6 +24,7 @@ include_patterns = [
 exclude_patterns = [".*", "**/.*", "**/output", "build", "dist", "**/*.egg-info", "docs/_build"]
 
 nb_execution_mode = "off"  # notebooks are shown as they were committed
+nb_merge_streams = True
 nb_ipywidgets_js = {}  # nothing from the network
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
@@ -33,6 +34,7 @@ autodoc_typehints = "none"  # docstrings say what is what, in words
 autodoc_member_order = "bysource"
 default_role = "code"
 add_module_names = False
+smartquotes = False
 highlight_language = "none"  # formulas; code says what it is
 toc_object_entries_show_parents = "hide"
 copybutton_prompt_text = r">>> |\.\.\. |\$ "

@@ -6,13 +6,15 @@ Args:, Returns:, Raises: ...          a list of what is named before the colon
 Title over ----, table between ====   as in reStructuredText
 """
 
+import importlib
 import inspect
+import pkgutil
 import re
 import textwrap
 from pathlib import Path
+from types import ModuleType
 
 import hhtjax
-import hhtjax.scenes
 
 ROOT = Path(__file__).parents[1]
 SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Warns", "References")
@@ -26,19 +28,18 @@ MARK = r"\\|\||(?<![\w])\*(?!\w+\*(?!\w))(?!(?<=^\*) )"  # not *emphasis*, and n
 
 def public_names():
     """The short name, and the one with its room, of all that is public -> where it is documented."""
-    names = {name: name for name in ("hhtjax.systems", "hhtjax.steppers", "hhtjax.runs", "hhtjax.scenes")}
-    rooms = [hhtjax.xla, hhtjax.trigonometry, hhtjax.rotation, hhtjax.analysis, hhtjax.identification, hhtjax]
-    for room in rooms:
-        names[room.__name__] = room.__name__
-        short = room.__name__.removeprefix("hhtjax.")
-        for name in room.__all__:
-            target = f"{room.__name__}.{name}"
-            if room is not hhtjax and getattr(hhtjax, name, None) is getattr(room, name):
-                target = f"hhtjax.{name}"
-            names[f"{room.__name__}.{name}"] = names[f"{short}.{name}"] = target
-            if room not in (hhtjax.rotation, hhtjax.trigonometry, hhtjax.xla):
-                names[name] = target
-    return names
+    modules = {x.name: importlib.import_module(f"hhtjax.{x.name}") for x in pkgutil.iter_modules(hhtjax.__path__)}
+    modules |= {name: x for name in hhtjax.__all__ if isinstance(x := getattr(hhtjax, name), ModuleType)}
+    names = {f"hhtjax.{name}": x.__name__ for name, x in modules.items() if len(x.__doc__ or "") > 300}
+    for short, room in modules.items():
+        for name in getattr(room, "__all__", ()):
+            is_at_top = getattr(hhtjax, name, None) is getattr(room, name)
+            names[f"hhtjax.{short}.{name}"] = f"hhtjax.{name}" if is_at_top else f"hhtjax.{short}.{name}"
+            names[f"{short}.{name}"] = names[f"hhtjax.{short}.{name}"]
+            if short in ("analysis", "identification"):
+                names[name] = names[f"{short}.{name}"]
+    top = [name for name in hhtjax.__all__ if name not in modules and name != "__version__"]
+    return names | {f"hhtjax.{name}": f"hhtjax.{name}" for name in top} | {name: f"hhtjax.{name}" for name in top}
 
 
 NAMES = public_names()
@@ -80,7 +81,7 @@ def blocks(lines):
     return found
 
 
-def render(lines, names=()):
+def render(lines, names=frozenset()):
     """reStructuredText of a docstring, or of a part of it, whose lines begin at the first column."""
     result = []
     remaining = blocks(lines)
@@ -144,8 +145,8 @@ def section(name, body, names):
 
 def split(title, text, names):
     """An item as several, where its line goes on with the next argument: "dt: in s. times: in s."."""
-    for found in re.finditer(r"(?<=[.;] )(\w+): ", text):
-        if found[1] in names:
+    for found in re.finditer(r"(?<=[.;] )(\w+(?:, \w+)*): ", text):
+        if names.issuperset(found[1].split(", ")):
             return [[title, [text[: found.start()].strip(" ;")]], *split(found[1], text[found.end() :], names)]
     return [[title, [text]]]
 
