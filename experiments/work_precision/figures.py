@@ -36,24 +36,18 @@ def style(package, number):
 
 
 def curves(lines, case, x, shown):
-    """{label: (work, errors, style)} of the methods of each package, {package: these}; times in ms."""
+    """{package: {method: (work, errors, style)}}, in the order of their settings; times in ms."""
     found = {package: {} for package in PACKAGES}
+    scale = 1e3 if x == "time_s" else 1
     for package in PACKAGES:
         methods = list(dict.fromkeys(line["method"] for line in lines if line["package"] == package))
         methods = methods if shown is None else [m for m in shown[package] if m in methods]
-        for line in lines:
-            if line["case"] == case and line["method"] in methods and x in line:
-                points = np.array(
-                    [(a, e) for a, e in zip(line[x], line["rms_error"], strict=True) if a and e and e < WORST]
-                )
-                if points.size:
-                    work, error = points.T
-                    label = line["method"]
-                    found[package][label] = (
-                        1e3 * work if x == "time_s" else work,
-                        error,
-                        style(package, methods.index(label)),
-                    )
+        for number, method in enumerate(methods):
+            mine = [line for line in lines if (line["case"], line["method"]) == (case, method) and x in line]
+            pairs = [pair for line in mine for pair in zip(line[x], line["rms_error"], strict=True)]
+            points = [(scale * a, e) for a, e in pairs if a and e and e < WORST]
+            if points:
+                found[package][method] = (*np.array(points).T, style(package, number))
     return found
 
 

@@ -26,8 +26,8 @@ def error_against_h(
     """Error over step size, both logarithmic, with the observed order of each curve and triangles of whole orders.
 
     The order in the legend is the median of the slopes between neighbours, which rounding at one end, or steps too
-    coarse at the other, leave alone as long as most points are between them. Of a curve that bends, whose slopes have
-    quartiles more than 0.5 apart, these are given.
+    coarse at the other, leave alone as long as most points are between them. Of a curve that bends, whose slopes are
+    more than 1 apart, the least and the largest are given.
 
     Args:
         dt: step sizes, with `error` as long; or an `ObservedOrder`; or a sweep, whose error is the RMS over samples and
@@ -114,11 +114,13 @@ def _order(h, e):
 
 
 def _in_words(h, e):
-    """The order, or the quartiles of the slopes where they differ by more than 0.5; nothing of a single point."""
+    """The order, or the least and the largest slope where they are more than 1 apart; nothing of a single point."""
     if len(h) < 2:
         return ""
-    low, middle, high = np.percentile(np.diff(np.log(e)) / np.diff(np.log(h)), [25, 50, 75])
-    return f"order {low:.1f} to {high:.1f}" if high - low > 0.5 else f"order {middle:.2f}"
+    slopes = np.diff(np.log(e)) / np.diff(np.log(h))
+    if np.ptp(slopes) > 1:
+        return f"order {slopes.min():.1f} to {slopes.max():.1f}"
+    return f"order {np.median(slopes):.2f}"
 
 
 def _triangle(ax, p, curve, curves, taken):

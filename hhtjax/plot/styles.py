@@ -158,10 +158,20 @@ def legend(ax, handles=None, labels=None, **options: Any):
     labels = [handle.get_label() for handle in handles] if labels is None else list(labels)
     if not labels:
         return None
-    room = 72 * ax.get_figure(root=True).get_size_inches()[0] * ax.get_position().width
+    room = 72 * ax.get_figure(root=True).get_size_inches()[0] * _share(ax) - 36  # for the labels of the axis
     place = {"loc": "lower left", "bbox_to_anchor": (0, 1.0), "borderaxespad": 0.3}
-    shape = {"ncols": _columns(labels, room), "handlelength": 2.0, "columnspacing": 1.0, "borderpad": 0.2}
+    shape = {"ncols": _columns(labels, room), "handlelength": 1.8, "columnspacing": 1.0, "borderpad": 0.2}
     return ax.legend(handles, labels, **(place | shape | options))
+
+
+def _share(ax):
+    """Of the width of its figure, that axes have with their labels."""
+    cell = ax.get_subplotspec()
+    if cell is None:
+        return ax.get_position().width
+    grid = cell.get_gridspec()
+    widths = np.array(grid.get_width_ratios() or [1] * grid.ncols)
+    return widths[list(cell.colspan)].sum() / widths.sum()
 
 
 def _columns(labels, room):
@@ -169,7 +179,7 @@ def _columns(labels, room):
     size = [TextPath((0, 0), label, size=TEXT).get_extents().width if label.strip() else 0 for label in labels]
     for columns in range(len(labels), 1, -1):
         widest = [max(part) for part in np.array_split(size, columns)]  # as matplotlib deals them out
-        if sum(widest) + 30 * columns <= room:
+        if sum(widest) + 28 * columns <= room:
             return columns
     return 1
 
