@@ -76,7 +76,7 @@ watt = hhtjax.System(mass, force, constraint)
 guess = jnp.array([[0.39, 0.07], [0.41, 0.27]])
 start = hhtjax.consistent_initial(watt, guess, jnp.zeros((2, 2)), params)
 print("joints:", start.q.round(4).tolist())
-run = hhtjax.simulate(watt, hhtjax.hht(alpha=0.0), start.q, start.v, params, dt=1e-3, num_steps=2000)
+run = hhtjax.simulate(watt, hhtjax.hht(alpha=0.0), start.q, start.v, params, dt=1e-3, num_steps=1000)
 run.check()
 
 
@@ -102,10 +102,10 @@ print(f"P moves {1e3 * jnp.ptp(P[:, 1]):.0f} mm up and down, and {1e3 * jnp.ptp(
 # The same as a film:
 
 # %%
-film = hhtjax.plot.animation(run, points, fps=12, speed=0.6, trace=1)
+film = hhtjax.plot.animation(run, points, fps=12, speed=0.4, trace=1)
 with tempfile.TemporaryDirectory() as folder:
-    film.save(Path(folder) / "watt.gif", writer="pillow", dpi=50)
-    plt.close(film._fig)
+    film.save(Path(folder) / "watt.gif", writer="pillow", dpi=90)
+    plt.close()
     content = base64.b64encode((Path(folder) / "watt.gif").read_bytes()).decode()
 print(f"{len(content) // 1000} kB")
 display(HTML(f'<img alt="Watt linkage swinging" src="data:image/gif;base64,{content}">'))
@@ -200,9 +200,9 @@ for name, run in tumble.items():
     print(f"{name:<8} angular momentum kept to {drift:.0e}, R orthogonal to {off:.0e}")
 
 # %% [markdown]
-# **Look at** the lines: about the axes of least and largest inertia the body spins steadily, the cosine stays
-# where it was; about the middle one it turns over. The reason lies in the equations, not in the method: angular
-# momentum, which nothing enforces, is kept to the figures printed above, and R stays orthogonal to rounding.
+# **Look at** the lines: about the axes of least and largest inertia the body spins steadily, the cosine stays where it
+# was; about the middle one it turns over. The reason lies in the equations, not in the method: angular momentum, which
+# nothing enforces, is kept to the figures printed above, and R stays orthogonal to rounding.
 #
 # Both together, rotations and constraints, make mechanisms in space: see `hhtjax.scenes.body_chain`, rods on spherical
 # joints, and `hhtjax.scenes.top`.
