@@ -97,8 +97,18 @@ def plot(report, numbers, found):
     left.set_ylabel("estimate less truth, with its 95 % interval (%)")
     t = SAMPLING_PERIOD * np.arange(len(found["truth"]))
     part = (t > 1.0) & (t < 2.6)
-    for (kind, a), colour, width in zip(found.items(), (COLOURS[1], COLOURS[7], "black"), (1.2, 0.8, 0.8), strict=True):
-        right.plot(t[part], a[part, 3], color=colour, lw=width, ls="--" if kind == "estimate" else "-", label=kind)
+    for (kind, a), colour, width in zip(
+        found.items(), (COLOURS[1], COLOURS[0], "#808080"), (0.8, 0.8, 2.0), strict=True
+    ):
+        right.plot(
+            t[part],
+            a[part, 3],
+            color=colour,
+            lw=width,
+            ls=":" if kind == "guess" else "-",
+            label=kind,
+            zorder=4 - width,
+        )
     right.set(xlabel="time on the other road (s)", ylabel="acceleration of the front left wheel (m/s²)")
     legend(right)
     report.figure("vehicle", figure)

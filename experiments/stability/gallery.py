@@ -115,10 +115,8 @@ def boundaries(outcomes, sizes, references):
     }
 
 
-SLOW = "A Jacobian at the state misses how the stiff direction turns within the step: state, Kim, Rosenbrock, ROWDA."
-CONTACT = (
-    "Contact begins within the step: a Jacobian at the state still is that of free flight, and the push comes too hard."
-)
+SLOW = "A Jacobian at the state misses how the stiff direction turns: state, Kim, Rosenbrock, ROWDA."
+CONTACT = "Contact begins within the step: at the state it is free flight still, and the push too hard."
 CAUSES = {
     "Duffing, driven": "Nothing blows up; only steps of an eighth of a period and more are inaccurate.",
     "double pendulum, free": "Chaotic: steps of 0.3 s and more turn the links over and over, with Newton too.",

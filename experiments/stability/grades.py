@@ -1,5 +1,6 @@
 """How a run is graded, how far a method holds, and the page that shows all cells."""
 
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
@@ -79,9 +80,10 @@ def page(scenes, causes):
             x = (columns + 1) * column + np.arange(grades.shape[1] + 1)
             axes.pcolormesh(x, pitch * row + np.linspace(0, 3, len(grades) + 1), grades, **style)
         if causes:
-            axes.text(0, pitch * row + 4.1, causes.get(name, ""), va="center", style="italic", color="#444444")
+            line = axes.text(0, pitch * row + 4.1, causes.get(name, ""), va="center", style="italic", color="#444444")
+            line.set_in_layout(False)
     axes.set_xticks(
-        (columns + 1) * np.arange(len(methods)) + columns / 2, [name.replace(" ", "\n") for name in methods]
+        (columns + 1) * np.arange(len(methods)) + columns / 2, ["\n".join(wrap(name, 10)) for name in methods]
     )
     axes.set_yticks(pitch * np.arange(len(scenes)) + 1.5, [name.replace(", ", ",\n") for name in scenes])
     axes.set_xlim(-1, (columns + 1) * len(methods))
@@ -91,7 +93,7 @@ def page(scenes, causes):
     axes.grid(False)
     axes.spines[:].set_visible(False)
     alphas = f"rows: alpha = {', '.join(map(str, ALPHAS))}, or one without alpha"
-    axes.set_xlabel(f"In each block: step size halved from column to column; {alphas}")
+    axes.set_xlabel(f"In each block: step size halved from column to column\n{alphas}")
     handles = [Patch(color=colour, label=label) for label, colour in GRADES.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure

@@ -173,7 +173,7 @@ def figure(rows, left):
             times.loglog(n, y, line, color=COLOURS[i], marker=MARKERS[i], ms=4, label=f"{name}, {form}")
     times.loglog(n, 0.05 * np.array(n), color="black", lw=1, ls=":", label="slope 1")
     times.set(xlabel="number of unknowns", ylabel="time of a step (µs)")
-    legend(times)
+    drawn.legend(*times.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     for i, (n, found) in enumerate(left.items()):
         x = [row["iterations"] for row in found]
         errors.semilogy(x, [row["error"] for row in found], color=COLOURS[i], marker=MARKERS[i], label=f"n = {n}")

@@ -134,9 +134,8 @@ def run(report, fast):
 
 def figure(rows, coarse, biases):
     """Errors of the steppers, of alpha, and of the stiffness."""
-    drawn, grid = subplots(2, 2, width=175, height=200)
-    left, middle, right, empty = grid.flat
-    empty.remove()
+    drawn, grid = subplots(2, 2, width=175, height=165)
+    left, middle, right, key = grid.flat
     shown = [row for row in rows if row["alpha"] in (None, -0.1) and row["method"] != "hht predictor"]
     for i, row in enumerate(shown):
         style = {"color": COLOURS[i % 8], "marker": MARKERS[i % 8], "ms": 3, "ls": ("-", "--")[i // 8], "lw": 1}
@@ -154,5 +153,8 @@ def figure(rows, coarse, biases):
         axes.set_ylabel("error of the angles after 1 s (rad)")
     for axes in (left, middle, right):
         axes.set_xlabel("step size (s)")
-        legend(axes)
+    key.axis("off")
+    key.legend(*left.get_legend_handles_labels(), title="upper left", loc="center")
+    legend(middle)
+    legend(right)
     return drawn

@@ -5,8 +5,9 @@ import textwrap
 import numpy as np
 
 from experiments.report import COLOURS, MARKERS
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import subplots
 
+WORST = 10  # error beyond which a run is not drawn
 PACKAGES = "ours", "diffrax", "SciPy", "MuJoCo", "exudyn"
 SHOWN = {  # of a package: the methods that are drawn, where the page has all of them
     "ours": ("hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rk4"),
@@ -35,22 +36,18 @@ def style(package, number):
 
 
 def curves(lines, case, x, shown):
-    """{label: (work, errors, style)} of the methods of each package, {package: these}; times in ms."""
+    """{package: {method: (work, errors, style)}}, in the order of their settings; times in ms."""
     found = {package: {} for package in PACKAGES}
+    scale = 1e3 if x == "time_s" else 1
     for package in PACKAGES:
         methods = list(dict.fromkeys(line["method"] for line in lines if line["package"] == package))
         methods = methods if shown is None else [m for m in shown[package] if m in methods]
-        for line in lines:
-            if line["case"] == case and line["method"] in methods and x in line:
-                points = np.array([(a, e) for a, e in zip(line[x], line["rms_error"], strict=True) if a and e])
-                if points.size:
-                    work, error = points.T
-                    label = line["method"]
-                    found[package][label] = (
-                        1e3 * work if x == "time_s" else work,
-                        error,
-                        style(package, methods.index(label)),
-                    )
+        for number, method in enumerate(methods):
+            mine = [line for line in lines if (line["case"], line["method"]) == (case, method) and x in line]
+            pairs = [pair for line in mine for pair in zip(line[x], line["rms_error"], strict=True)]
+            points = [(scale * a, e) for a, e in pairs if a and e and e < WORST]
+            if points:
+                found[package][method] = (*np.array(points).T, style(package, number))
     return found
 
 
@@ -84,11 +81,11 @@ def panels(lines, names, x, xlabel, ylabel, shown=None):
             key |= dict(zip(labels, handles, strict=True))
         unit = next((line["unit"] for line in lines if line["case"] == name and "unit" in line), "1")
         row[0].set_ylabel("\n".join([*textwrap.wrap(name, 26), ylabel.format(unit=unit)]))
-        row[0].set_ylim(max(1e-10, row[0].get_ylim()[0]), min(10, row[0].get_ylim()[1]))
+        row[0].set_ylim(max(1e-10, row[0].get_ylim()[0]), row[0].get_ylim()[1])
     for panel in grid[-1]:
         panel.set_xlabel(xlabel)
-    for panel, key in zip(grid[0], keys, strict=True):
-        legend(panel, list(key.values()), list(key))
+    key = keys[0] | keys[1]
+    drawn.legend(key.values(), key.keys(), loc="outside upper center", ncols=4 if shown else 3)
     return drawn
 
 

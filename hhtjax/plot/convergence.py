@@ -26,7 +26,8 @@ def error_against_h(
     """Error over step size, both logarithmic, with the observed order of each curve and triangles of whole orders.
 
     The order in the legend is the median of the slopes between neighbours, which rounding at one end, or steps too
-    coarse at the other, leave alone as long as most points are between them.
+    coarse at the other, leave alone as long as most points are between them. Of a curve that bends, whose slopes are
+    more than 1 apart, the least and the largest are given.
 
     Args:
         dt: step sizes, with `error` as long; or an `ObservedOrder`; or a sweep, whose error is the RMS over samples and
@@ -50,7 +51,7 @@ def error_against_h(
         orders = {name: _order(*curve) for name, curve in curves.items()}
         start = len([line for line in panel.lines if not line.get_label().startswith("_")])
         for i, (name, (h, e)) in enumerate(curves.items()):
-            order = "" if np.isnan(orders[name]) else f"order {orders[name]:.2f}"
+            order = _in_words(h, e)
             shown = ": ".join(x for x in (name, order) if x)
             panel.loglog(h, e, label=shown, **look(start + i, marker=True))
         if slopes is None:
@@ -110,6 +111,16 @@ def _errors_of_sweep(sweep, reference):
 def _order(h, e):
     """Median of the slopes between neighbours; NaN of a single point."""
     return float(np.median(np.diff(np.log(e)) / np.diff(np.log(h)))) if len(h) > 1 else np.nan
+
+
+def _in_words(h, e):
+    """The order, or the least and the largest slope where they are more than 1 apart; nothing of a single point."""
+    if len(h) < 2:
+        return ""
+    slopes = np.diff(np.log(e)) / np.diff(np.log(h))
+    if np.ptp(slopes) > 1:
+        return f"order {slopes.min():.1f} to {slopes.max():.1f}"
+    return f"order {np.median(slopes):.2f}"
 
 
 def _triangle(ax, p, curve, curves, taken):
