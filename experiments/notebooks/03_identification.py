@@ -208,7 +208,6 @@ plt.show()
 # the steps alone, for small vibrations. Is it right? We fit with 1, 2 and 4 steps per sample and compare.
 
 # %%
-linear = dict.fromkeys(("k2", "k3"), 0.0)
 fits = {1: None, 2: None, 4: second}
 for substeps in (1, 2):
     fits[substeps] = hhtjax.fit(
@@ -218,8 +217,8 @@ for substeps in (1, 2):
 rows = []
 for substeps, result in fits.items():
     params = result.params[0]
-    small = {name: params[name] for name in ("m", "c", "k")} | linear | ABSENT | {"u": lambda t: 0.0 * t, "offset": 0.0}
-    bias = hhtjax.step_size_bias(oscillator, hhtjax.hht(0.0), small, 1 / RATE / substeps, q=jnp.zeros(1))
+    linear = hhtjax.LinearSystem(*(jnp.reshape(params[name], (1,)) for name in ("m", "c", "k")))
+    bias = hhtjax.step_size_bias(linear, hhtjax.hht(0.0), None, 1 / RATE / substeps, q=jnp.zeros(1))
     rows.append((substeps, params["k"] / params["m"], params["c"] / params["m"], bias))
 
 # the two finest, extrapolated to steps of no length: errors are of order h^2

@@ -51,9 +51,9 @@ def run_all(stepper, dts):
 
 
 def seconds(function):
-    """Least time of five calls, after one that may compile."""
+    """Least time of 20 calls, and the time of one before them, which may compile."""
     times = []
-    for _ in range(6):
+    for _ in range(21):
         begin = time.perf_counter()
         jax.block_until_ready(function())
         times.append(time.perf_counter() - begin)

@@ -146,8 +146,8 @@ damped = float(jnp.sum(rubber["c"] * loops.q["v"][last] ** 2) * 2e-4)
 print(f"the hysteresis takes {1e3 * eaten:.0f} mJ out of the last cycle, the damper {1e3 * damped:.1f} mJ")
 
 # %% [markdown]
-# **Look at** the area inside a loop: the energy that a cycle loses. Small
-# motions hardly open a loop; large ones lose much.
+# **Look at** the area inside a loop: the energy that a cycle loses. Small motions hardly open a loop; large ones lose
+# much.
 #
 # ## A bouncing ball: a stiff contact
 #

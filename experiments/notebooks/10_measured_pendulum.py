@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 10. A measured double pendulum
 #
-# A camera followed the two arms of a double pendulum (Schmidt and Lipson 2009): angles at about 100 Hz, with gaps up to
-# 0.2 s, no input, and a motion that is chaotic when it is large. We find inertia, weights and friction, from **short
-# windows** of the record, each with an initial state of its own.
+# A camera followed the two arms of a double pendulum (Schmidt and Lipson 2009): angles at about 100 Hz, with gaps, no
+# input, and a motion that is chaotic when it is large. We find inertia, weights and friction, from **short windows** of
+# the record, each with an initial state of its own.
 #
 # The file real_double_pend_h_1.txt belongs to the paper's supplementary data. Put it into a folder `double_pendulum/`,
 # and let `HHTJAX_DATA` name the folder that holds it. Without it, the notebook makes a record of the same kind, and

@@ -79,15 +79,15 @@ image = left.pcolormesh(free.t[:100] * 1e3, x, 1e3 * free.q[:100].T, cmap="RdBu"
 left.set(xlabel="time (ms)", ylabel="place along the beam (m)")
 left.grid(False)
 figure.colorbar(image, label="deflection (mm)")
-spectrum = np.abs(np.fft.rfft(free.q[:, N // 3]))
+spectrum = np.abs(np.fft.rfft(free.q[:, N // 6]))
 right.semilogy(np.fft.rfftfreq(len(free.t), 5 * DT), spectrum)
 for f in exact / 2 / np.pi:
     right.axvline(f, color="black", ls=":", lw=0.8)
-right.set(xlabel="frequency (Hz)", ylabel="amplitude at a third\nof the length", xlim=(0, 150))
+right.set(xlabel="frequency (Hz)", ylabel="amplitude at a sixth\nof the length", xlim=(0, 150))
 plt.show()
 
 # %% [markdown]
-# **Look at** the left for the wave that runs to the ends and back, and at the right for the peaks at the theoretical
+# **Look at** the left for the bulge that runs up and down the beam, and at the right for the peaks at the theoretical
 # frequencies (dotted).
 #
 # ## With a stop: nonlinear
