@@ -42,7 +42,7 @@ DURATION, SAMPLES = 1.0, 10
 # compiled again.)
 
 # %%
-dts = jnp.geomspace(2e-5, 5e-2, 10)
+dts = jnp.geomspace(1e-4, 5e-2, 10)
 methods = {"hht(-0.05)": hhtjax.hht(alpha=-0.05), "rowda": hhtjax.rowda(), "RK4": hhtjax.rk4()}
 
 
