@@ -75,7 +75,6 @@ figure, (left, right) = hhtjax.plot.subplots(1, 2, width=175, height=75)
 hhtjax.plot.error_against_h(errors, unit="rad", ax=left)
 hhtjax.plot.work_precision(curves, ylabel="RMS error (rad)", ax=right)
 right.get_legend().remove()
-right.xaxis.set_minor_formatter("")
 plt.show()
 
 # %% [markdown]
