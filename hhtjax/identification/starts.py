@@ -30,7 +30,8 @@ def equation_error(system: System, values: Any, dt: float, cutoff: float, t0: fl
         t0: time of the first sample.
 
     Raises:
-        TypeError, ValueError: as `band_limited_motion`. NotImplementedError: a system with constraints.
+        TypeError, ValueError: as `band_limited_motion`. NotImplementedError: a system with constraints
+            or internal states.
 
     Shape of the result: (samples without both ends, n), in units of force.
 
@@ -44,6 +45,8 @@ def equation_error(system: System, values: Any, dt: float, cutoff: float, t0: fl
     """
     if system.constraint is not None:
         raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
+    if system.internal is not None:
+        raise NotImplementedError("equation_error: `system` has internal states, which are not measured.")
     motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)
     q, v, a = jax.tree.transpose(jax.tree.structure(values), jax.tree.structure((0, 0, 0)), motion)
     samples = jax.tree.leaves(q)[0].shape[0]

@@ -11,17 +11,22 @@ from hhtjax.systems import kinematics
 
 
 class Interpolant(NamedTuple):
-    """Position and velocity at the times asked for, with these as leading axis; of a first-order system y and None."""
+    """Position, velocity and internal states at the times asked for, with these as leading axis.
+
+    z is None without; of a first-order system q is y, and v is None.
+    """
 
     q: Any
     v: Any
+    z: Any = None
 
 
 def interpolate(solution, times) -> Interpolant:
-    """Dense output: q and v at arbitrary times inside the run, differentiable in all.
+    """Dense output: q, v and z at arbitrary times inside the run, differentiable in all.
 
-    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration); for a rotation, of
-    the rotation vector from the saved one before. Their error is O(H^4), H the spacing of the saved times.
+    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
+    through (z, zdot); for a rotation, of the rotation vector from the saved one before. Their error is O(H^4), H the
+    spacing of the saved times.
 
     Args:
         solution: of one run (vmap this function for a batch).
@@ -72,4 +77,5 @@ def interpolate(solution, times) -> Interpolant:
 
     first_order = solution.acceleration is None
     v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)
-    return Interpolant(jax.tree.map(position, solution.q, solution.v), v)
+    z = None if solution.z is None else jax.tree.map(hermite, solution.z, solution.zdot)
+    return Interpolant(jax.tree.map(position, solution.q, solution.v), v, z)
