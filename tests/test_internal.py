@@ -1,0 +1,166 @@
+"""Internal states: orders, equivalences, derivatives, one factorisation, sweeps, dense output, analysis, bad input."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import check_gradient, check_message
+from internal_problems import CASES, LAG, arm, reference
+from jax.flatten_util import ravel_pytree
+from zoo import everywhere
+
+import hhtjax
+from hhtjax.scenes import bouc_wen, lugre, maxwell, motor_joint
+from hhtjax.steppers.residual import Coefficients
+
+FAMILY = {
+    **{f"hht({alpha})": hhtjax.hht(alpha) for alpha in (0.0, -0.05, -0.3)},
+    **{f"generalized_alpha({rho})": hhtjax.generalized_alpha(rho) for rho in (0.0, 0.5, 1.0)},
+}
+STEPS = 800, 1600
+
+
+def stacked(stepper):
+    """All of FAMILY, with the options of `stepper`, as data."""
+    columns = zip(*(s.coefficients for s in FAMILY.values()), strict=True)
+    return replace(stepper, coefficients=Coefficients(*map(jnp.array, columns)))
+
+
+def ends(case, stepper, num_steps):
+    """q, v, z and L at the end, for each number of steps."""
+
+    def end(num_steps):
+        dt = case.duration / num_steps.astype(float)
+        start = stepper.init(case.system, case.q0, case.v0, case.params, dt, z0=case.z0)
+
+        def advance(_, s):
+            return stepper.step(case.system, s, case.params, dt)[0]
+
+        s = jax.lax.fori_loop(0, num_steps, advance, start)
+        return [jnp.zeros(0) if x is None else ravel_pytree(x)[0] for x in (s.q, s.v, s.z, s.L)]
+
+    return jax.lax.map(end, num_steps)
+
+
+ends_of_family = jax.jit(jax.vmap(ends, (None, 0, None)))
+
+
+def orders(case, found, steps):
+    """Observed orders in q, v, z and L."""
+    slopes = []
+    for x, exact in zip(found, reference(case), strict=True):
+        if exact is not None:
+            error = np.linalg.norm(x - np.expand_dims(np.asarray(exact), tuple(range(x.ndim - 1))), axis=-1)
+            slopes.append(np.log(error[..., 0] / error[..., 1]) / np.log(steps[1] / steps[0]))
+    return np.array(slopes)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_order_two_in_all_of_the_state(name):
+    """For each of FAMILY, with internal states as slow as the motion, and with one of a thousandth of the step."""
+    for lag in (0.1, LAG):
+        case = CASES[name](lag)
+        found = orders(case, ends_of_family(case._replace(exact=None), stacked(hhtjax.hht()), jnp.array(STEPS)), STEPS)
+        assert np.all(np.abs(found - 2) < 0.15), (lag, found)
+
+
+@pytest.mark.parametrize("stepper", [hhtjax.rk4(), hhtjax.rowda()], ids=["rk4", "rowda"])
+def test_steppers_of_other_orders(stepper):
+    case, steps = arm(0.1), (50, 100)
+    found = orders(case, jax.jit(ends)(case, stepper, jnp.array(steps)), steps)
+    assert np.all(np.abs(found - stepper.order) < 0.35), found
+
+
+def decoupled_rate(y, t, params):
+    return {"x": jnp.cos(3 * t) - params["a"] * y["x"] ** 3, "y": y["x"][:1] - y["y"]}
+
+
+def test_system_and_first_order_system_are_the_two_ends():
+    """A system whose force leaves z alone moves as without it, and its z as a FirstOrderSystem, to rounding."""
+    q0, v0, z0 = jnp.array([0.3, -0.2]), jnp.array([0.5, -1.0]), {"x": jnp.array([1.0, 2.0]), "y": jnp.ones(1)}
+    pull = lambda q, v, t, params: -4.0 * q - 0.3 * v**3 + jnp.sin(t)  # noqa: E731
+    M = jnp.array([[2.0, 0.3], [0.3, 1.0]])
+    both = hhtjax.System(
+        M, lambda q, v, z, t, p: pull(q, v, t, p), internal=lambda q, v, z, t, p: decoupled_rate(z, t, p)
+    )
+    run = partial(hhtjax.simulate, params={"a": 2.0}, dt=0.05, num_steps=40)
+    stepper = hhtjax.hht(linearize="predictor")
+    joint = run(both, stepper, q0, v0, z0=z0)
+    mechanics = run(hhtjax.System(M, pull), stepper, q0, v0)
+    states = run(hhtjax.FirstOrderSystem(decoupled_rate), stepper, z0)
+    for x, y in ((joint.q, mechanics.q), (joint.v, mechanics.v), (joint.acceleration, mechanics.acceleration)):
+        np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-13)
+    for name in z0:
+        np.testing.assert_allclose(joint.z[name], states.q[name], rtol=1e-12)
+        np.testing.assert_allclose(joint.zdot[name], states.v[name], rtol=1e-12, atol=1e-12)
+    assert mechanics.z is None and mechanics.zdot is None and states.z is None
+
+
+SCENES = {
+    "motor": motor_joint.tracking(),
+    "Maxwell": maxwell.vibration(),
+    "Bouc-Wen": bouc_wen.benchmark(),
+    "LuGre": lugre.stick_slip(),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_are_the_same_three_ways_and_resolved(name):
+    """With the machinery, on plain JAX and step by step; with half the step not much else."""
+    system, params, q0, v0, duration, z0 = SCENES[name]
+    stepper, n = hhtjax.hht(), 2000 if name == "LuGre" else 400
+
+    @partial(jax.jit, static_argnums=0)
+    def simulated(plainly, dt):
+        run = hhtjax.simulate(system, stepper, q0, v0, params, z0=z0, dt=dt, num_steps=n, save_every=n // 4)
+        return ravel_pytree([run.q, run.v, run.z])[0], run.failure.step
+
+    @jax.jit
+    def by_steps(dt):
+        state = stepper.init(system, q0, v0, params, dt, z0=z0)
+        return jax.lax.scan(lambda s, _: (stepper.step(system, s, params, dt)[0], None), state, length=n)[0]
+
+    fast, failed = simulated(False, duration / n)
+    assert not failed
+    with hhtjax.plain():
+        slow, _ = simulated(True, duration / n)
+    size = np.max(np.abs(fast))
+    np.testing.assert_allclose(fast, slow, rtol=1e-8, atol=1e-11 * size)
+    state = by_steps(duration / n)
+    np.testing.assert_allclose(state.q, slow[4:5], rtol=1e-8)
+
+
+def test_gradients():
+    """In z0, in the parameters of g and of the force, in q0, v0 and dt."""
+    case = arm(0.1)
+
+    def loss(arguments):
+        z0, numbers, q0, v0, dt = arguments
+        params = {**case.params, **numbers}
+        stepper = hhtjax.hht(linearize="predictor")
+        run = hhtjax.simulate(case.system, stepper, q0, v0, params, z0=z0, dt=dt, num_steps=20, save_every=10)
+        return sum(jnp.sum(x**2) for x in jax.tree.leaves((run.q, run.v, run.z, run.zdot)))
+
+    found = check_gradient(loss, (case.z0, {"lag": 0.1}, case.q0, case.v0, 0.02), rtol=1e-12)
+    assert np.all(found != 0)
+
+
+def count(jaxpr, name):
+    return sum(eqn.primitive.name == name for eqn in everywhere(jaxpr))
+
+
+def test_one_factorisation_of_all_rates_in_a_step():
+    n, k = 20, 7
+    system = hhtjax.System(
+        jnp.ones(n),
+        lambda q, v, z, t, p: -q - v**3 - z["a"].sum() * q,
+        internal=lambda q, v, z, t, p: {"a": v[:k] - z["a"]},
+    )
+    stepper, x, z0 = hhtjax.hht(linearize="predictor"), jnp.ones(n), {"a": jnp.ones(k)}
+    state = stepper.init(system, x, x, None, 0.1, z0=z0)
+    jaxpr = jax.make_jaxpr(lambda s: stepper.step(system, s, None, 0.1))(state).jaxpr
+    sizes = [eqn.invars[0].aval.shape for eqn in everywhere(jaxpr) if eqn.primitive.name == "lu"]
+    assert sizes == [(n + k, n + k)]
