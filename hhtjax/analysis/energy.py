@@ -89,14 +89,9 @@ def _energy_balance(system, solution, params, potential):
 
     t, L = solution.t, solution.multipliers
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
-    between = interpolate(solution, middle)
     at_ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
-    v_middle = _vectors((between.v, between.z))
-    if held.holds(params) and not flat.blocks:  # accelerations jump: of the cubic through q and v the slope
-        q, v = _vectors(solution.q), _vectors(solution.v)
-        slope = 1.5 * jnp.diff(q, axis=0) / H[:, None] - (v[1:] + v[:-1]) / 4
-        v_middle = jnp.concatenate([slope, v_middle[:, flat.positions :]], axis=1)
-    at_middle = _vectors(between.q), v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
+    q_middle, v_middle = _between(solution, H, middle, held.holds(params) and not flat.blocks)
+    at_middle = q_middle, v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
     first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L)) for part in (slice(-1), slice(1, None)))
 
     def over_interval(first, between, last, H):
@@ -109,6 +104,17 @@ def _energy_balance(system, solution, params, potential):
     work = jnp.concatenate([jnp.zeros_like(t[:1]), work])
     T, V = jax.vmap(energies)(*at_ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
+
+
+def _between(solution, H, middle, jumps):
+    """Positions and rates in the middle of each interval, of length H; jumps: whether accelerations do at its ends."""
+    found = interpolate(solution, middle)
+    rates = _vectors(found[1:])
+    if jumps:  # of the cubic through q and v the slope
+        q, v = _vectors(solution.q), _vectors(solution.v)
+        slope = 1.5 * jnp.diff(q, axis=0) / H[:, None] - (v[1:] + v[:-1]) / 4
+        rates = jnp.concatenate([slope, rates[:, v.shape[1] :]], axis=1)
+    return _vectors(found.q), rates
 
 
 def _vectors(tree):

@@ -11,17 +11,21 @@ from hhtjax.systems import kinematics
 
 
 class Interpolant(NamedTuple):
-    """Position, velocity and internal states at the times asked for, with these as leading axis.
-
-    z is None without; of a first-order system q is y, and v is None.
-    """
+    """Position and velocity at the times asked for, with these as leading axis; of a first-order system y and None."""
 
     q: Any
     v: Any
-    z: Any = None
 
 
-def interpolate(solution, times) -> Interpolant:
+class InternalInterpolant(NamedTuple):
+    """The same with internal states z."""
+
+    q: Any
+    v: Any
+    z: Any
+
+
+def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     """Dense output: q, v and z at arbitrary times inside the run, differentiable in all.
 
     Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
@@ -77,5 +81,7 @@ def interpolate(solution, times) -> Interpolant:
 
     first_order = solution.acceleration is None
     v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)
-    z = None if solution.z is None else jax.tree.map(hermite, solution.z, solution.zdot)
-    return Interpolant(jax.tree.map(position, solution.q, solution.v), v, z)
+    q = jax.tree.map(position, solution.q, solution.v)
+    if solution.z is None:
+        return Interpolant(q, v)
+    return InternalInterpolant(q, v, jax.tree.map(hermite, solution.z, solution.zdot))
