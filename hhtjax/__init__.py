@@ -15,7 +15,7 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
 from hhtjax.numerics.structured_solve import banded, conjugate_gradients
-from hhtjax.runs.interpolate import Interpolant, InternalInterpolant, interpolate
+from hhtjax.runs.interpolate import InternalInterpolant, Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import Failure, SimulationError, Solution
 from hhtjax.runs.sweep import sweep

@@ -68,6 +68,16 @@ def test_order_two_in_all_of_the_state(name):
         assert np.all(np.abs(found - 2) < 0.15), (lag, found)
 
 
+def test_index_3_is_of_order_two_too():
+    """But for the multipliers of the undamped rule, which grow with or without internal states."""
+    case = CASES["a constraint"](LAG)
+    stepper = stacked(hhtjax.hht(formulation="index3"))
+    found = orders(case, ends_of_family(case._replace(exact=None), stepper, jnp.array(STEPS)), STEPS)
+    damped = [i for i, name in enumerate(FAMILY) if name not in ("hht(0.0)", "generalized_alpha(1.0)")]
+    assert np.all(np.abs(found[:3] - 2) < 0.15), found
+    assert np.all(np.abs(found[3, damped] - 2) < 0.15), found
+
+
 @pytest.mark.parametrize("stepper", [hhtjax.rk4(), hhtjax.rowda()], ids=["rk4", "rowda"])
 def test_steppers_of_other_orders(stepper):
     case, steps = arm(0.1), (50, 100)
