@@ -78,6 +78,15 @@ def test_index_3_is_of_order_two_too():
     assert np.all(np.abs(found[3, damped] - 2) < 0.15), found
 
 
+def test_the_start_is_corrected_for_positions_alone():
+    """What is faster than the step would start with an acceleration of 1/lag^2 else."""
+    case = CASES["a constraint"](LAG)
+    init = jax.jit(hhtjax.hht(-0.3).init)
+    state = init(case.system, case.q0, case.v0, case.params, 1e-3, z0=case.z0 + 0.1)
+    assert np.all(state.za == state.zdot)
+    assert np.all(state.a != state.w)
+
+
 @pytest.mark.parametrize("stepper", [hhtjax.rk4(), hhtjax.rowda()], ids=["rk4", "rowda"])
 def test_steppers_of_other_orders(stepper):
     case, steps = arm(0.1), (50, 100)
