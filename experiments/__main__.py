@@ -20,6 +20,7 @@ EXPERIMENTS = {
     "silverbox": "identification.silverbox",
     "silverbox_comparison": "identification.comparison",
     "double_pendulum_measured": "identification.double_pendulum_measured",
+    "bouc_wen": "identification.bouc_wen",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",
     "squeezer": "identification.squeezer",

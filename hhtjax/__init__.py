@@ -53,7 +53,7 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
 from hhtjax.numerics.structured_solve import banded, conjugate_gradients
-from hhtjax.runs.interpolate import Interpolant, interpolate
+from hhtjax.runs.interpolate import InternalInterpolant, Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import Failure, SimulationError, Solution
 from hhtjax.runs.sweep import sweep
@@ -85,7 +85,7 @@ __all__ = [  # noqa: RUF022
     "bossak", "collocation", "conventional_hht", "generalized_alpha", "hht", "houbolt", "implicit_euler", "kim_hht",
     "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
     # runs
-    "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
+    "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
     "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
     # identification
     "FitResult", "Gaussian", "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",

@@ -28,8 +28,11 @@ def require_integer(caller, name, value, least=1):
     return int(value)
 
 
-def require_function(caller, name, value, signature):
-    """An error unless `value` can be called, and is hashable, as a static argument of jit has to be."""
+def require_function(caller, name, value, signature, count=None):
+    """An error unless `value` can be called, and is hashable, as a static argument of jit has to be.
+
+    count: of its arguments, where another number is likely.
+    """
     if not callable(value):
         raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
     try:
@@ -40,7 +43,8 @@ def require_function(caller, name, value, signature):
             "Pass arrays through params."
         ) from None
     names = _argument_names(value)
-    if _in_other_order(names, signature[signature.index("(") + 1 : -1].split(", ")):
+    expected = signature[signature.index("(") + 1 : -1].split(", ")
+    if _in_other_order(names, expected) or (count is not None and not _takes(value, count)):
         raise TypeError(
             f"{caller}: `{name}` must be a function {signature}; received one with the arguments ({', '.join(names)})."
         )
@@ -51,6 +55,17 @@ def _argument_names(function):
         return list(inspect.signature(function).parameters)
     except (TypeError, ValueError):  # it does not tell
         return []
+
+
+def _takes(function, count):
+    """Whether a function can be called with so many arguments; True where it does not tell."""
+    try:
+        inspect.signature(function).bind(*range(count))
+    except ValueError:
+        return True
+    except TypeError:
+        return False
+    return True
 
 
 def _in_other_order(names, expected):

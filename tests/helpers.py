@@ -69,12 +69,12 @@ def tight(stepper):
     return with_tolerance(stepper, 1e-13)
 
 
-def check_gradient(loss, arguments):
+def check_gradient(loss, arguments, rtol=1e-10):
     """Compares the three derivatives of loss(arguments), a pytree of numbers; returns the forward one, a vector."""
-    return check_gradients(loss, [arguments])[0]
+    return check_gradients(loss, [arguments], rtol)[0]
 
 
-def check_gradients(loss, points):
+def check_gradients(loss, points, rtol=1e-10):
     """The same at several points, compiled once."""
     unravel = ravel_pytree(points[0])[1]
     points = [np.asarray(ravel_pytree(x)[0]) for x in points]
@@ -88,14 +88,14 @@ def check_gradients(loss, points):
         return jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 0))(eye)
 
     gradient = jax.jit(jax.grad(f))
-    return [_check_gradient(value_and_forward, gradient, x0) for x0 in points]
+    return [_check_gradient(value_and_forward, gradient, x0, rtol) for x0 in points]
 
 
-def _check_gradient(value_and_forward, gradient, x0):
+def _check_gradient(value_and_forward, gradient, x0, rtol):
     reverse, forward = gradient(x0), np.asarray(value_and_forward(x0)[1])
     size = np.maximum(np.abs(forward), 1e-3 * np.max(np.abs(forward)))
     assert np.all(np.isfinite(forward))
-    assert np.max(np.abs(reverse - forward) / size) < 1e-10
+    assert np.max(np.abs(reverse - forward) / size) < rtol
     for i, value in enumerate(x0):
         h = 1e-4 * (abs(value) or 1.0)
         e = h * np.eye(x0.size)[i]

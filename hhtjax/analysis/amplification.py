@@ -2,7 +2,7 @@
 
 The tangent of one step, in increments scaled by the step size h so that its entries stay of order one for every h,
 
-    x = (q, h v, h^2 w, h^2 a, h^2 L, memory),    x1 = A x,
+    x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za),    x1 = A x,
 
 has what a stepper carries: those fields of its `State` that are not None. On the test oscillator
 
@@ -57,7 +57,9 @@ TEST_EQUATION = FirstOrderSystem(_complex_product)
 
 
 def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Array:
-    """A, the derivative of one step at a state, with respect to x = (q, h v, h^2 w, h^2 a, h^2 L, memory): (k, k).
+    """A, the derivative of one step at a state, with respect to x: (k, k).
+
+        x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za)
 
     Constrained or not: of a nonlinear system it is the tangent of the flow of the step, which near an equilibrium, or
     for a small dt, tells how perturbations of the run grow. There each constraint adds the eigenvalues of infinite
@@ -111,7 +113,8 @@ def _amplification_matrix(system, stepper, state, params, dt):
 
     h = jnp.asarray(dt).astype(q.dtype)
     weights = (1, h, h, h, h, 1) if isinstance(system, FirstOrderSystem) else (1, h, h**2, h**2, h**2, 1)
-    sizes = [ravel_pytree(field)[0].size for field in unravel(x)[1:]]
+    weights = weights if state.z is None else (*weights, 1, h, h)
+    sizes = [ravel_pytree(field)[0].size for field in unravel(x)[1 : len(weights) + 1]]
     scale = jnp.concatenate([jnp.full(n, w, q.dtype) for n, w in zip(sizes, weights, strict=True)])
     A = scale[:, None] * jax.jacfwd(increments)(x) / scale[None, :]
     if state.memory is None:

@@ -29,12 +29,12 @@ class ObservedOrder(NamedTuple):
 
 
 def observed_order(
-    system, stepper, q0, v0=None, params=None, *, duration, num_steps, reference=None, t0=0.0
+    system, stepper, q0, v0=None, params=None, *, z0=None, duration, num_steps, reference=None, t0=0.0
 ) -> ObservedOrder:
     """Order of convergence of q at t0 + duration, from runs with each of `num_steps` steps.
 
     Args:
-        system, stepper, q0, v0, params, t0: as in `simulate`.
+        system, stepper, q0, v0, params, z0, t0: as in `simulate`.
         duration: s. num_steps: increasing integers, such as (100, 200, 400).
         reference: q at the end, like q0. Without it, what counts is the change from each run to the next, one number
             less, with the same slope; num_steps must then be a geometric sequence.
@@ -72,9 +72,10 @@ def observed_order(
             "observed_order: `num_steps` must be a geometric sequence where there is no `reference`; "
             f"received {num_steps!r}."
         )
-    q0, v0 = initial_values("observed_order", system, q0, v0)
+    q0, v0, z0 = initial_values("observed_order", system, q0, v0, z0)
     ends = [
-        np.asarray(_end(system, stepper, q0, v0, params, float(t0), float(duration) / n, n)) for n in counts.tolist()
+        np.asarray(_end(system, stepper, q0, v0, params, z0, float(t0), float(duration) / n, n))
+        for n in counts.tolist()
     ]
     if reference is None:
         error = np.array([np.linalg.norm(x - y) for x, y in pairwise(ends)])
@@ -90,8 +91,8 @@ def observed_order(
 
 
 @jax.jit
-def _end(system, stepper, q0, v0, params, t0, dt, num_steps):
+def _end(system, stepper, q0, v0, params, z0, t0, dt, num_steps):
     """q at the end as a vector; one compilation for all numbers of steps."""
-    state = stepper.init(system, q0, v0, params, dt, t0)
+    state = stepper.init(system, q0, v0, params, dt, t0, z0)
     state = jax.lax.fori_loop(0, num_steps, lambda _, s: stepper.step(system, s, params, dt)[0], state)
     return ravel_pytree(state.q)[0]

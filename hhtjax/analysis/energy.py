@@ -79,33 +79,33 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
 
 @partial(jax.jit, static_argnames="potential")
 def _energy_balance(system, solution, params, potential):
-    q0, v0, t0 = (jax.tree.map(lambda x: x[0], y) for y in (solution.q, solution.v, solution.t))
+    q0, v0, t0, z0 = (jax.tree.map(lambda x: x[0], y) for y in (solution.q, solution.v, solution.t, solution.z))
     params = thaw(params)
-    flat, _, _ = flatten("energy_balance", system, q0, v0, t0, params)
+    flat, _, _ = flatten("energy_balance", system, q0, v0, t0, params, z0)
+
+    def along(v, forces):
+        """What forces do with the velocities, internal states left out: v' Q."""
+        return jnp.dot(flat.located(v), flat.located(forces))
 
     def energies(q, v, t):
         V = jnp.zeros_like(t) if potential is None else potential(flat.unravel(q), t, params)
-        return jnp.dot(v, flat.inertia(q, v, params)) / 2, jnp.asarray(V).astype(t.dtype)
+        return along(v, flat.inertia(q, v, params)) / 2, jnp.asarray(V).astype(t.dtype)
 
     def power(q, v, t, L, params):
         """P; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
-        along = flat.rate(q, v), jnp.ones_like(t)
-        _, (T_q, V_dot) = jax.jvp(lambda q, t: energies(q, v, t), (q, t), along)
-        P = jnp.dot(v, flat.force(q, v, t, params)) + T_q + V_dot
+        motion = flat.rate(q, v), jnp.ones_like(t)
+        _, (T_q, V_dot) = jax.jvp(lambda q, t: energies(q, v, t), (q, t), motion)
+        P = along(v, flat.force(q, v, t, params)) + T_q + V_dot
         if not flat.num_constraints:
             return P
-        _, stretching = jax.jvp(lambda q: flat.constraint(q, t, params), (q,), along[:1])
+        _, stretching = jax.jvp(lambda q: flat.constraint(q, t, params), (q,), motion[:1])
         return P + jnp.dot(L, stretching)
 
     t, L = solution.t, solution.multipliers
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
-    between = interpolate(solution, middle)
-    at_ends = _vectors(solution.q), _vectors(solution.v), t
-    v_middle = _vectors(between.v)
-    if held.holds(params) and not flat.blocks:  # accelerations jump: of the cubic through q and v the slope
-        q, v = _vectors(solution.q), _vectors(solution.v)
-        v_middle = 1.5 * jnp.diff(q, axis=0) / H[:, None] - (v[1:] + v[:-1]) / 4
-    at_middle = _vectors(between.q), v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
+    at_ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
+    q_middle, v_middle = _between(solution, H, middle, held.holds(params) and not flat.blocks)
+    at_middle = q_middle, v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
     first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L)) for part in (slice(-1), slice(1, None)))
 
     def over_interval(first, between, last, H):
@@ -118,6 +118,17 @@ def _energy_balance(system, solution, params, potential):
     work = jnp.concatenate([jnp.zeros_like(t[:1]), work])
     T, V = jax.vmap(energies)(*at_ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
+
+
+def _between(solution, H, middle, jumps):
+    """Positions and rates in the middle of each interval, of length H; jumps: whether accelerations do at its ends."""
+    found = interpolate(solution, middle)
+    rates = _vectors(found[1:])
+    if jumps:  # of the cubic through q and v the slope
+        q, v = _vectors(solution.q), _vectors(solution.v)
+        slope = 1.5 * jnp.diff(q, axis=0) / H[:, None] - (v[1:] + v[:-1]) / 4
+        rates = jnp.concatenate([slope, rates[:, v.shape[1] :]], axis=1)
+    return _vectors(found.q), rates
 
 
 def _vectors(tree):

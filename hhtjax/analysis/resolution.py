@@ -13,7 +13,7 @@ SAMPLES = 64  # times at which runs are compared; a power of two, so that the co
 FEWEST, ENOUGH, MOST = 8, 1024, 2**20  # steps of the first run, and at least and at most of the last
 
 
-def step_size_by_runs(system, stepper, q0, v0, params, t0, duration, tolerance):
+def step_size_by_runs(system, stepper, q0, v0, params, z0, t0, duration, tolerance):
     """The largest step from which on the error of q stays within the tolerance, and the steps of the finest run.
 
     The error is the RMS of q less that of the finest run, relative to the motion about its mean. Halving ends when two
@@ -23,7 +23,7 @@ def step_size_by_runs(system, stepper, q0, v0, params, t0, duration, tolerance):
     Raises:
         ValueError: more than MOST steps would be needed.
     """
-    run = partial(_samples, system, stepper, q0, v0, params, t0, duration)
+    run = partial(_samples, system, stepper, q0, v0, params, z0, t0, duration)
     counts, paths = [FEWEST], [np.asarray(run(FEWEST))]
     while counts[-1] < MOST:
         counts.append(2 * counts[-1])
@@ -63,7 +63,7 @@ def _rms(x):
 
 
 @jax.jit
-def _samples(system, stepper, q0, v0, params, t0, duration, num_steps):
+def _samples(system, stepper, q0, v0, params, z0, t0, duration, num_steps):
     """q at SAMPLES times, or, of fewer steps, after each; compiled once for all numbers of steps."""
     params, dt = thaw(params), duration / num_steps
     between = jnp.maximum(1, num_steps // SAMPLES)
@@ -74,5 +74,5 @@ def _samples(system, stepper, q0, v0, params, t0, duration, num_steps):
         return state, path.at[i // between].set(ravel_pytree(state.q)[0])  # the last to write is the one on time
 
     q, _ = ravel_pytree(q0)
-    start = stepper.init(system, q0, v0, params, dt, t0), jnp.zeros((SAMPLES, q.size), q.dtype)
+    start = stepper.init(system, q0, v0, params, dt, t0, z0), jnp.zeros((SAMPLES, q.size), q.dtype)
     return jax.lax.fori_loop(0, num_steps, step, start)[1]

@@ -77,7 +77,7 @@ class StepSize(NamedTuple):
 
 
 def suggest_step_size(
-    system, stepper, q0, v0, params=None, *, tolerance=1e-2, highest=None, duration=None, t0=0.0
+    system, stepper, q0, v0, params=None, *, z0=None, tolerance=1e-2, highest=None, duration=None, t0=0.0
 ) -> StepSize:
     """A step size that resolves the modes of the system linearised at a state, with what each mode then suffers.
 
@@ -101,7 +101,7 @@ def suggest_step_size(
     method may damp a fast vibration out of all of them.
 
     Args:
-        system, stepper, q0, v0, params, t0: as in `simulate`; no `FirstOrderSystem`. Modes change along the way, so
+        system, stepper, q0, v0, params, z0, t0: as in `simulate`; no `FirstOrderSystem`. Modes change along the way, so
             take the stiffest state of the motion. They are those of the frozen state: where it moves fast, they also
             depend on the choice of coordinates.
         tolerance: in (0, 1).
@@ -142,9 +142,9 @@ def suggest_step_size(
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
     params = freeze(params)
-    q0, v0 = initial_values(caller, system, q0, v0)
+    q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
     require_capable(caller, system, stepper, q0, v0)
-    rates = _rates(*map(np.asarray, _linearize(system, q0, v0, params, t0)))
+    rates = _rates(*map(np.asarray, _linearize(system, q0, v0, params, t0, z0)))
     reach = []
     for rate in rates:
         error, radius = _errors(stepper, rate / abs(rate))
@@ -154,7 +154,7 @@ def suggest_step_size(
         linear = isinstance(system, LinearSystem) and system.nonlinear is None
         dt, reason = _modal_step(rates, resolved, stable, tolerance, highest, linear)
     else:
-        dt, most = step_size_by_runs(system, stepper, q0, v0, params, float(t0), float(duration), tolerance)
+        dt, most = step_size_by_runs(system, stepper, q0, v0, params, z0, float(t0), float(duration), tolerance)
         reason = f"keeps q within {tolerance:g} of its motion over {duration:g} s, by runs of up to {most} steps"
 
     modes = []
@@ -190,10 +190,10 @@ def _modal_step(rates, resolved, stable, tolerance, highest, linear):
 
 
 @jax.jit
-def _linearize(system, q0, v0, params, t0):
-    """Derivatives of w in displacement and velocity, (n, n), and B, (m, n)."""
+def _linearize(system, q0, v0, params, t0, z0):
+    """Derivatives of w in displacement and velocity, (N, N), and B, (m, N), internal states among the velocities."""
     params = thaw(params)
-    flat, q, v = flatten("suggest_step_size", system, q0, v0, t0, params)
+    flat, q, v = flatten("suggest_step_size", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
 
     def acceleration(x, v):

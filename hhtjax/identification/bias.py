@@ -99,6 +99,7 @@ def step_size_bias(
 
     Raises:
         TypeError, ValueError: dt is no positive number; q does not meet the constraint.
+        NotImplementedError: a system with internal states.
 
     References:
         Cook, Malkus, Plesha, Witt (2002), Sec. 11.13, for the period error of Newmark's method.
@@ -113,6 +114,10 @@ def step_size_bias(
     """
     require_number("step_size_bias", "dt", dt, lambda x: x > 0, "be positive")
     require_stepper("step_size_bias", stepper)
+    if system.internal is not None:
+        raise NotImplementedError(
+            "step_size_bias: `system` has internal states, which M, C and K cannot hold; `refine` takes the bias out."
+        )
     _require_on_constraint(system, params, q, t0)
     matrices = _linear_part(system, params, q, v, t0)
     fitted = _rates_of_equations(*matrices)

@@ -40,7 +40,8 @@ def equation_error(
         A function of params, whose result is (samples without both ends, n), in units of force.
 
     Raises:
-        TypeError, ValueError: as `band_limited_motion` and `sampled`. NotImplementedError: a system with constraints.
+        TypeError, ValueError: as `band_limited_motion` and `sampled`. NotImplementedError: a system with constraints
+            or internal states.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -52,6 +53,8 @@ def equation_error(
     """
     if system.constraint is not None:
         raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
+    if system.internal is not None:
+        raise NotImplementedError("equation_error: `system` has internal states, which are not measured.")
     if times is not None:
         values, dt, t0 = _at_equal_distances(values, dt, t0, times)
     motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)

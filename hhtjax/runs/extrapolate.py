@@ -30,12 +30,10 @@ def _combine(solutions, order, join):
 
     turns = first.acceleration is not None  # a first-order system has no rotations
     q = value("q", partial(_positions, first.v) if turns else None)
-    v, acceleration, multipliers = (value(name) for name in ("v", "acceleration", "multipliers"))
+    rest = {name: value(name) for name in ("v", "acceleration", "multipliers", "z", "zdot")}
     return first._replace(
         q=q,
-        v=v,
-        acceleration=acceleration,
-        multipliers=multipliers,
+        **rest,
         info=reduce(join, [solution.info for solution in solutions]),
         failure=_first([solution.failure for solution in solutions]),
     )

@@ -23,11 +23,20 @@ class Interpolant(NamedTuple):
     v: Any
 
 
-def interpolate(solution, times) -> Interpolant:
-    """Dense output: q and v at arbitrary times inside the run, differentiable in all.
+class InternalInterpolant(NamedTuple):
+    """The same with internal states z."""
 
-    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration); for a rotation, of
-    the rotation vector from the saved one before. Their error is O(H^4), H the spacing of the saved times.
+    q: Any
+    v: Any
+    z: Any
+
+
+def interpolate(solution, times) -> Interpolant | InternalInterpolant:
+    """Dense output: q, v and z at arbitrary times inside the run, differentiable in all.
+
+    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
+    through (z, zdot); for a rotation, of the rotation vector from the saved one before. Their error is O(H^4), H the
+    spacing of the saved times.
 
     Args:
         solution: of one run (vmap this function for a batch).
@@ -82,4 +91,7 @@ def interpolate(solution, times) -> Interpolant:
 
     first_order = solution.acceleration is None
     v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)
-    return Interpolant(jax.tree.map(position, solution.q, solution.v), v)
+    q = jax.tree.map(position, solution.q, solution.v)
+    if solution.z is None:
+        return Interpolant(q, v)
+    return InternalInterpolant(q, v, jax.tree.map(hermite, solution.z, solution.zdot))

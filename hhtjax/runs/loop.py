@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description.presentation import overwrite
-from hhtjax.runs.solution import Failure, Solution
+from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.stepper import Info, public
 from hhtjax.systems import held
 from hhtjax.xla import staged
@@ -31,16 +31,16 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     start = stepper.begin(flat, q, v, t0, held.before(params, t0, dt), dt)
     no_info = neutral_info(jax.eval_shape(take_step, start)[1])
     carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    return Loop(carry, counted(take_step, flat, q, t0, dt), partial(saved, flat), no_info)
+    return Loop(carry, counted(take_step, flat, t0, dt), partial(saved, flat), no_info)
 
 
-def advance_from(flat, stepper, q0, params, t, dt, count):
+def advance_from(flat, stepper, dtype, params, t, dt, count):
     """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken."""
-    take_step = held.bind(stepper.astype(q0.dtype), flat, params, dt)
-    return counted(take_step, flat, q0, t, dt, count)
+    take_step = held.bind(stepper.astype(dtype), flat, params, dt)
+    return counted(take_step, flat, t, dt, count)
 
 
-def counted(take_step, flat, q0, t0, dt, before=None):
+def counted(take_step, flat, t0, dt, before=None):
     """The step of a run, on (state, number of steps, first failure); also its `Info`. before: steps taken at t0."""
 
     def step(carry):
@@ -49,9 +49,7 @@ def counted(take_step, flat, q0, t0, dt, before=None):
         count = count + 1
         taken = count if before is None else count - before
         state = state._replace(t=t0 + taken.astype(dt.dtype) * dt)  # no rounding piles up
-        if flat.first_order:
-            state = state._replace(q=q0)  # stays zero
-        return (state, count, _first_failure(failure, count, state, info)), info
+        return (state, count, _first_failure(flat, failure, count, state, info)), info
 
     return step
 
@@ -59,15 +57,16 @@ def counted(take_step, flat, q0, t0, dt, before=None):
 def saved(flat, state):
     """What a run saves of a state."""
     state = public(flat, state)
-    return state.t, state.q, state.v, state.w, state.L
+    return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot
 
 
 def as_solution(flat, start, path, dt, info, failure):
     """The start and the path after it as a `Solution`."""
-    t, q, *rates, L = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
+    t, q, v, w, L, *z = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
     q = jax.vmap(flat.unravel)(q)
-    v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in rates)
-    return Solution(t, q, v, w, L, dt, info, failure)
+    v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in (v, w))
+    z, zdot = (None if x is None else jax.vmap(flat.unravel_internal)(x) for x in z)
+    return Solution(t, q, v, w, L, dt, info, failure, z, zdot)
 
 
 def no_failure(info):
@@ -76,9 +75,11 @@ def no_failure(info):
     return Failure(none, jnp.array(False), none, info.dependent_row, info.solve_residual)
 
 
-def _first_failure(failure, count, state, info):
-    """The failure so far, or this step's."""
-    known = [(i, x) for i, x in enumerate((state.q, state.v, state.w, state.L)) if x is not None]
+def _first_failure(flat, failure, count, state, info):
+    """The failure so far, or this step's. Of several quantities an internal state is named, then the first."""
+    _, *values = saved(flat, state)
+    known = [(i, x) for i, x in enumerate(values) if x is not None]
+    known.sort(key=lambda x: x[0] < INTERNAL_STATE)
     checks = staged(lambda values: [jnp.all(jnp.isfinite(x)) for x in values])([x for _, x in known])
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
     for (i, _), fine in reversed(list(zip(known, checks, strict=True))):

@@ -28,6 +28,7 @@ def simulate(
     v0: Any = None,
     params: Any = None,
     *,
+    z0: Any = None,
     dt: Any,
     num_steps: int,
     t0: Any = 0.0,
@@ -35,7 +36,7 @@ def simulate(
     progress: bool = False,
     extrapolate: int = 1,
 ) -> Solution:
-    """Steps `system` from (q0, v0) at t0, num_steps times by dt.
+    """Steps `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), num_steps times by dt.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`.
@@ -45,6 +46,7 @@ def simulate(
         params: any pytree, handed to the functions of the system. Its arrays and numbers are data. Functions in it,
             such as the activations of a neural network in an `equinox.Module`, are part of the program, and told apart
             by identity: a new module of the same structure costs no compilation, a new lambda does.
+        z0: internal states of a `System(..., internal=)`, any pytree of arrays.
         dt: step size, positive. num_steps: number of steps.
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
@@ -59,7 +61,7 @@ def simulate(
     Returns:
         A `Solution`. Nothing raises while the steps run: call `solution.check()`.
 
-    Differentiable, forward and reverse, in dt, t0, params, q0, v0 and the numbers of the stepper; reverse
+    Differentiable, forward and reverse, in dt, t0, params, q0, v0, z0 and the numbers of the stepper; reverse
     mode computes the steps again, in blocks, and its memory grows with the square root of num_steps.
     Compiled once for each system, stepper, structure, num_steps and save_every; a new dt, q0 or params
     costs no compilation. Functions are told apart by identity, here as in `fit`: one that reads a global variable, or
@@ -69,7 +71,7 @@ def simulate(
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate
             a constraint. Values are checked unless they are tracers.
-        NotImplementedError: the system has a constraint, and the stepper cannot solve one.
+        NotImplementedError: the system has a constraint, or internal states, and the stepper cannot solve them.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: -params["k"] * q)
@@ -91,23 +93,24 @@ def simulate(
     params = require_params("simulate", params)
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
-    q0, v0 = initial_values("simulate", system, q0, v0)
+    q0, v0, z0 = initial_values("simulate", system, q0, v0, z0)
     require_capable("simulate", system, stepper, q0, v0)
     if system.constraint is not None:
-        require_consistent("simulate", system, q0, v0, t0, params, stepper.redundant)
+        require_consistent("simulate", system, q0, v0, t0, params, stepper.redundant, z0)
     dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every}
-        return or_plain(partial(_simulate, system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress))
+        arguments = system, stepper, q0, v0, params, dt / k, t0, z0
+        return or_plain(partial(_simulate, *arguments, **sizes, progress=progress))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "save_every", "progress"))
-def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every, progress):
+def _simulate(system, stepper, q0, v0, params, dt, t0, z0, *, num_steps, save_every, progress):
     params = thaw(params)
-    flat, q, v = flatten("simulate", system, q0, v0, t0, params)
+    flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
     loop = loop_of(flat, stepper, q, v, t0, params, dt)
 

@@ -49,7 +49,11 @@ class Failure(NamedTuple):
         return "a constraint depends on others" if known(self.row) else f"{QUANTITIES[quantity]} is not finite"
 
 
-QUANTITIES = "the position q", "the velocity v", "the acceleration", "the vector of multipliers"
+QUANTITIES = (
+    "the position q", "the velocity v", "the acceleration", "the vector of multipliers",
+    "the internal state z", "the rate of the internal state z",
+)  # fmt: skip
+INTERNAL_STATE = 4  # among them
 
 
 @shown
@@ -64,6 +68,7 @@ class Solution(NamedTuple):
         info: `Info` for each of the K intervals between saved times: largest residual, number of Newton iterations, all
             converged; None where the method has nothing to tell.
         failure: the first step that failed, a `Failure`; `check` turns it into an error.
+        z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without.
     """
 
     t: Any
@@ -74,6 +79,8 @@ class Solution(NamedTuple):
     dt: Any
     info: Info
     failure: Failure
+    z: Any = None
+    zdot: Any = None
 
     def check(self, reach=None):
         """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
@@ -160,7 +167,7 @@ class Solution(NamedTuple):
                 "the acceleration is not finite at the start already: there the mass is singular, or a function of the "
                 "system not finite"
             )
-        names = ("the position", "y", "y'") if self.acceleration is None else QUANTITIES
+        names = ("y", "y'") if self.acceleration is None else QUANTITIES
         return f"{names[quantity]} is not finite. Take a smaller dt, or another linearize=, or a method that damps"
 
     def _first_beyond(self, reach):

@@ -27,6 +27,7 @@ def sweep(
     v0=None,
     params=None,
     *,
+    z0=None,
     dts,
     duration=None,
     num_samples=None,
@@ -45,16 +46,16 @@ def sweep(
     `check()` and leaves the others as they are.
 
     Args:
-        system, stepper, q0, v0, params, t0: as for `simulate`.
+        system, stepper, q0, v0, params, z0, t0: as for `simulate`.
         dts: (B,) step sizes, positive, at most H. Their number B is part of the program, their values are data.
         duration: positive. num_samples: K, the number of samples after the start.
         times: (K,), in the place of both: strictly increasing, after t0; data too. Steps end at each: unlike SciPy's
             `t_eval` they shorten steps, and dts are upper bounds, like its `max_step`. A dt larger than H, or infinite,
             takes the one step H. The `hht` family is of order 2 as dts shrink between given times; where there is one
             step from sample to sample, unequal ones add an error of first order unless alpha = 0.
-        in_axes: what else differs between members: (stepper, q0, v0, params), each 0 where all its arrays have a
-            leading axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A stepper with an
-            axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
+        in_axes: what else differs between members: (stepper, q0, v0, params), or one more for z0, each 0 where all its
+            arrays have a leading axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A
+            stepper with an axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
         mesh: devices that share the work, `jax.make_mesh((jax.device_count(),), ("members",))`, also of several
             processes; each then holds all results, bitwise those of one device.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
@@ -85,7 +86,7 @@ def sweep(
     [-0.4101, -0.4157, -0.4161]
     """
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
-    inputs = Inputs.checked(system, stepper, q0, v0, params, dts=dts, in_axes=in_axes, **grid)
+    inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
     return or_plain(partial(run_sweep, *arguments, **keywords))
 
@@ -146,8 +147,8 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
 
     With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval.
     """
-    stepper, q0, v0, params = *data[:3], thaw(data[3])
-    flat, q, v = flatten("sweep", system, q0, v0, t0, params)
+    stepper, q0, v0, params, z0 = *data[:3], thaw(data[3]), data[4]
+    flat, q, v = flatten("sweep", system, q0, v0, t0, params, z0)
     intervals = None if times is None else (times[:-1], dt, substeps, longest)
     loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
     form = on_scalars(loop.advance, loop.carry)
@@ -158,7 +159,7 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
         if interval is None:
             return form.of(loop.advance), substeps, longest
         t, h, mine, most = interval
-        return form.of(advance_from(flat, stepper, q, params, t, h, run[1])), mine, most
+        return form.of(advance_from(flat, stepper, q.dtype, params, t, h, run[1])), mine, most
 
     @checkpoint
     def interval(run, here):

@@ -18,7 +18,7 @@ LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are f
 
 
 class Inputs(NamedTuple):
-    """What a sweep is made from, checked: `data` is (stepper, q0, v0, params), `mapped` which of its leaves differ."""
+    """What a sweep is made from, checked: `data` is (stepper, q0, v0, params, z0), `mapped` which leaves differ."""
 
     system: Any
     data: Any
@@ -30,7 +30,7 @@ class Inputs(NamedTuple):
     times: Any = None
 
     @classmethod
-    def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes, times=None):
+    def checked(cls, system, stepper, q0, v0, params, *, z0, dts, duration, num_samples, t0, in_axes, times=None):
         """An error that names what is wrong, or the inputs."""
         require_system("sweep", system)
         require_stepper("sweep", stepper)
@@ -38,14 +38,14 @@ class Inputs(NamedTuple):
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
         dts = require_step_sizes(dts)
-        (q0, v0), mapped = _initial_values(system, q0, v0, params, stepper, in_axes, dts.size)
+        (q0, v0, z0), mapped = _initial_values(system, q0, v0, params, z0, stepper, in_axes, dts.size)
         if times is None:
             require_steps_within(dts, 0.0, duration, num_samples)
         else:
             times = require_times(times, t0, jax.tree.leaves(q0)[0].dtype)
             num_samples = times.size
             require_steps_within(dts, t0, times[-1])
-        data = stepper, q0, v0, params
+        data = stepper, q0, v0, params, z0
         require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
         if system.constraint is not None:
             _require_consistent(system, data, mapped, t0)
@@ -78,14 +78,18 @@ def _lanes(size):
     return min(LANES, 1 << (size // BLOCKS).bit_length())
 
 
-def _initial_values(system, q0, v0, params, stepper, in_axes, size):
-    """q0 and v0, checked, and for each leaf of (stepper, q0, v0, params) whether it has the axis of members."""
+def _initial_values(system, q0, v0, params, z0, stepper, in_axes, size):
+    """q0, v0, z0, checked, and for each leaf of (stepper, q0, v0, params, z0) whether it has the axis of members."""
     if in_axes is None:
         in_axes = (None,) * 4
-    if not isinstance(in_axes, tuple) or len(in_axes) != 4:
-        raise ValueError(f"sweep: `in_axes` must be a tuple of four, (stepper, q0, v0, params); received {in_axes!r}.")
-    names = "stepper", "q0", "v0", "params"
-    trees = dict(zip(names, (stepper, q0, v0, params), strict=True))
+    if not isinstance(in_axes, tuple) or len(in_axes) not in (4, 5):
+        raise ValueError(
+            "sweep: `in_axes` must be a tuple of four, (stepper, q0, v0, params), or of five, with z0; "
+            f"received {in_axes!r}."
+        )
+    names = "stepper", "q0", "v0", "params", "z0"
+    trees = dict(zip(names, (stepper, q0, v0, params, z0), strict=True))
+    in_axes = (*in_axes, None)[:5]
     flags = {name: _flags(name, trees[name], axes, size) for name, axes in zip(names, in_axes, strict=True)}
     if v0 is not None and any(flags["q0"] + flags["v0"]) and not all(flags["q0"] + flags["v0"]):
         for name in ("q0", "v0"):
@@ -95,7 +99,7 @@ def _initial_values(system, q0, v0, params, stepper, in_axes, size):
                 for x, flag in zip(leaves, flags[name], strict=True)
             ]
             trees[name], flags[name] = jax.tree.unflatten(structure, leaves), [True] * len(leaves)
-    values = initial_values("sweep", system, trees["q0"], trees["v0"])
+    values = initial_values("sweep", system, trees["q0"], trees["v0"], z0)
     return values, tuple(flag for name in names for flag in flags[name])
 
 
@@ -136,13 +140,13 @@ def _require_consistent(system, data, mapped, t0):
     if any(mapped):
 
         def distances(leaves):
-            stepper, q0, v0, params = jax.tree.unflatten(structure, leaves)
-            _, found = examine(system, q0, v0, t0, params, stepper.redundant)
+            stepper, q0, v0, params, z0 = jax.tree.unflatten(structure, leaves)
+            _, found = examine(system, q0, v0, t0, params, z0, stepper.redundant)
             return [distance for _, distance in found]
 
         with jax.ensure_compile_time_eval():  # under jit too
             found = jax.vmap(distances, ([0 if flag else None for flag in mapped],))(leaves)
         worst |= {int(np.argmax(distance)) for distance in found}
     for i in sorted(worst):
-        stepper, q0, v0, params = _member(data, mapped, i)
-        require_consistent(f"sweep: member {i}", system, q0, v0, t0, params, stepper.redundant)
+        stepper, q0, v0, params, z0 = _member(data, mapped, i)
+        require_consistent(f"sweep: member {i}", system, q0, v0, t0, params, stepper.redundant, z0)

@@ -27,6 +27,7 @@ def sweep_to_disk(
     v0=None,
     params=None,
     *,
+    z0=None,
     dts,
     duration=None,
     num_samples=None,
@@ -70,7 +71,7 @@ def sweep_to_disk(
     """
     chunk = require_integer("sweep_to_disk", "chunk", chunk)
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
-    inputs = Inputs.checked(system, stepper, q0, v0, params, dts=dts, in_axes=in_axes, **grid)
+    inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
     if not all(map(is_concrete, jax.tree.leaves(inputs))):
         raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
     folder, size = Path(folder), inputs.dts.size

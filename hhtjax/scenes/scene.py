@@ -21,3 +21,14 @@ class Scene(NamedTuple):
     q0: Any
     v0: Any
     duration: float
+
+
+class InternalScene(NamedTuple):
+    """The same with z0: initial internal states."""
+
+    system: System
+    params: Any
+    q0: Any
+    v0: Any
+    duration: float
+    z0: Any

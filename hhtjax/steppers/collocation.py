@@ -18,9 +18,10 @@ from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import State, Stepper
 
 
-def newmark_step(s, h, w, beta):
+def newmark_step(system, s, h, w, beta):
     """State at t + h by Newmark's formulas with gamma = 1/2, given the acceleration there."""
-    return State(s.t + h, s.q + h * s.v + h**2 * ((0.5 - beta) * s.w + beta * w), s.v + h / 2 * (s.w + w), w)
+    t, q = s.t + h, s.q + system.located(h * s.v) + system.located(h**2 * ((0.5 - beta) * s.w + beta * w))
+    return State(t, q, s.v + h / 2 * (s.w + w), w)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +44,10 @@ class Collocation(Stepper):
 
         def step(s):
             def path(w):
-                return newmark_step(s, theta * dt, w, beta)
+                return newmark_step(system, s, theta * dt, w, beta)
 
             w, info = newton(system, r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
-            return newmark_step(s, dt, s.w + (w - s.w) / theta, beta), info
+            return newmark_step(system, s, dt, s.w + (w - s.w) / theta, beta), info
 
         return step
 

@@ -47,9 +47,9 @@ def report(system, params, s, info, row):
     return info._replace(constraint=constraint, constraint_rate=constraint_rate, dependent_row=row)
 
 
-def directions(M, B):
+def directions(system, M, B):
     """D: (n, m)."""
-    d = diagonal(M)
+    d = system.with_ones(diagonal(M))
     return B.T / jnp.where(d == 0, 1, d)[:, None]
 
 
@@ -67,7 +67,7 @@ def bind_constrained(method, system, params, dt):
 
     def step(s):
         B = jacobian(system, s.q, s.t, params)
-        D = directions(system.mass(s.q, params), B) if ggl else None
+        D = directions(system, system.mass(s.q, params), B) if ggl else None
 
         def path(z):
             w, L, eta = z[:n], z[n : n + m], z[n + m :]

@@ -12,6 +12,8 @@ class RK4(Stepper):
 
     order: int = 4
 
+    solves_internal = True
+
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, the first stage of the first step."""
         return State(t, q, v, system.acceleration(q, v, t, params))
@@ -23,13 +25,13 @@ class RK4(Stepper):
         def step(s):
             def stage(t, dq, dv):
                 v = s.v + dv
-                return v, acceleration(s.q + dq, v, t, params)
+                return v, acceleration(s.q + system.located(dq), v, t, params)
 
             v1, w1 = s.v, s.w
             v2, w2 = stage(s.t + dt / 2, dt / 2 * v1, dt / 2 * w1)
             v3, w3 = stage(s.t + dt / 2, dt / 2 * v2, dt / 2 * w2)
             v4, w4 = stage(s.t + dt, dt * v3, dt * w3)
-            q = s.q + dt / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
+            q = s.q + system.located(dt / 6 * (v1 + 2 * v2 + 2 * v3 + v4))
             v = s.v + dt / 6 * (w1 + 2 * w2 + 2 * w3 + w4)
             return State(s.t + dt, q, v, acceleration(q, v, s.t + dt, params)), Info()
 

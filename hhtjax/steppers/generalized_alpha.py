@@ -65,6 +65,7 @@ class GeneralizedAlpha(Stepper):
 
     solves_constraints = True
     solves_rotations = True
+    solves_internal = True
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""
@@ -83,10 +84,13 @@ class GeneralizedAlpha(Stepper):
         return State(t, q, v, w, self.corrected(system, v, w, tangent(system.rate(q, v), w, jnp.ones_like(t)), dt))
 
     def corrected(self, system, v, w, wdot, dt):
-        """a0 of second order: w0 + (alpha_m - alpha_f) h times the rate of psiddot, or of v."""
-        if self.options.kinematics == "chart":
-            wdot = kinematics.chart_jerk(system.blocks, v, w, wdot)
-        return w + (self.coefficients.alpha_m - self.coefficients.alpha_f) * dt * wdot
+        """a0 of second order: w0 + (alpha_m - alpha_f) h times the rate of psiddot, or of v.
+
+        Internal states may be far faster than h, and keep their w0.
+        """
+        if self.options.kinematics == "chart" and system.blocks:
+            wdot = system.with_internal(kinematics.chart_jerk(system.blocks, *map(system.located, (v, w, wdot))), wdot)
+        return system.with_internal(w + (self.coefficients.alpha_m - self.coefficients.alpha_f) * dt * wdot, w)
 
     @property
     def factorize(self):
@@ -113,7 +117,7 @@ class GeneralizedAlpha(Stepper):
         x, *rates = self.advance(s, dt, w)
         x = x if shift is None else x - shift
         if self.options.kinematics == "chart":
-            rates = kinematics.end_of_chart(system.blocks, x, *rates)
+            rates = system.end_of_chart(x, *rates)
         return State(s.t + dt, system.move(s.q, x), *rates)
 
     def bind(self, system, params, dt):

@@ -28,13 +28,13 @@ def linearize_at_state(system, params, s):
     def forces(q, v):
         return system.force(q, v, s.t, params)
 
-    zero = jnp.zeros_like(s.q)
+    zero = jnp.zeros_like(s.v)
     Q, tangent = jax.linearize(forces, s.q, s.v)
-    Q_q = linear_map(lambda x: tangent(x, zero), zero)
-    Q_v = linear_map(lambda x: tangent(zero, x), zero)
-    Ma_q = jax.jacfwd(lambda q: system.inertia(q, s.w, params))(s.q)
+    Q_q = linear_map(lambda x: tangent(system.located(x), zero), zero)
+    Q_v = linear_map(lambda x: tangent(system.located(zero), x), zero)
+    Ma_q = system.widened(jax.jacfwd(lambda q: system.inertia(q, s.w, params))(s.q))
     M = system.mass(s.q, params)
-    return jnp.diag(M) if M.ndim == 1 else M, Q, Q_q, Q_v, Ma_q
+    return jnp.diag(system.with_ones(M)) if M.ndim == 1 else M, Q, Q_q, Q_v, Ma_q
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class KimHHT(Stepper):
             dv = solve(M - dt * gamma * Jv - dt**2 * beta * Jq, dt * (Q + gamma * dt * Jq @ drift))
             dq = dt * (drift + beta / gamma * dv)
             a = dv / (dt * gamma) + (1 - 1 / gamma) * s.w
-            return State(s.t + dt, s.q + dq, s.v + dv, a), Info()
+            return State(s.t + dt, s.q + system.located(dq), s.v + dv, a), Info()
 
         return step
 
@@ -138,7 +138,7 @@ class KimImplicitEuler(Stepper):
             M, Q, Q_q, Q_v, Ma_q = linearize_at_state(system, params, s)
             Jq = Q_q - Ma_q
             v = s.v + solve(M - dt * Q_v - dt**2 * Jq, dt * (Q + dt * Jq @ s.v))
-            q, t = s.q + dt * v, s.t + dt
+            q, t = s.q + system.located(dt * v), s.t + dt
             return State(t, q, v, system.acceleration(q, v, t, params)), Info()
 
         return step

@@ -22,7 +22,7 @@ def linearization_point(system, params, s, predicted, where):
     held = s._replace(t=predicted.t, q=system.move(s.q, (predicted.t - s.t) * s.v))
     if where == "held":
         return held
-    D = diagonal(system.mass(s.q, params))
+    D = system.with_ones(diagonal(system.mass(s.q, params)))
 
     @staged
     def size(s):

@@ -43,8 +43,8 @@ class Multistep(Stepper):
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, and no past."""
-        unknown = jnp.zeros((2, q.size), q.dtype)
-        memory = Memory(unknown, unknown, jnp.zeros((), jnp.int32))
+        unknown = jnp.zeros((2, v.size), v.dtype)
+        memory = Memory(unknown[:, : q.size], unknown, jnp.zeros((), jnp.int32))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
     def bind(self, system, params, dt):
@@ -78,7 +78,7 @@ class Houbolt(Multistep):
 
     def advance(self, system, s, past, dt, w):
         """By differences, which lose less to rounding than the q themselves."""
-        if system.first_order:
+        if not system.positions:
             return s.q, s.v + (6 * dt * w + 7 * past.v[0] - 2 * past.v[1]) / 11
         dq = (dt**2 * w + 3 * past.q[0] - past.q[1]) / 2
         return s.q + dq, (11 * dq - 7 * past.q[0] + 2 * past.q[1]) / (6 * dt)
@@ -90,7 +90,7 @@ class Park(Multistep):
     def advance(self, system, s, past, dt, w):
         """One formula, for v from w and for q from v."""
         v = s.v + (6 * dt * w + 5 * past.v[0] - past.v[1]) / 10
-        return s.q + (6 * dt * v + 5 * past.q[0] - past.q[1]) / 10, v
+        return s.q + (system.located(6 * dt * v) + 5 * past.q[0] - past.q[1]) / 10, v
 
 
 def houbolt(tolerance=1e-10, max_iterations=20) -> Houbolt:

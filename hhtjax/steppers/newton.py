@@ -121,7 +121,7 @@ def term_sizes(system, s0, s1):
     h = s1.t - s0.t
     w = jnp.abs(s0.w) + jnp.abs(s1.w)
     v = jnp.abs(s0.v) + jnp.abs(s1.v) + h * w
-    sizes = {"q": kinematics.terms(system.blocks, s0.q, s1.q, h * v), "v": v, "w": w}
+    sizes = {"q": kinematics.terms(system.blocks, s0.q, s1.q, system.located(h * v)), "v": v, "w": w}
     return sizes if s1.L is None else sizes | {"L": jnp.abs(s0.L) + jnp.abs(s1.L)}
 
 

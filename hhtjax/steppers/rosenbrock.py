@@ -43,6 +43,8 @@ class Rosenbrock(Stepper):
     tableau: Tableau
     order: int
 
+    solves_internal = True
+
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
@@ -54,7 +56,7 @@ class Rosenbrock(Stepper):
 
         def factorized(tangent):
             def implicit(x):
-                return tangent(State(instant, (g * dt) ** 2 * x, g * dt * x, x))
+                return tangent(State(instant, system.located((g * dt) ** 2 * x), g * dt * x, x))
 
             return factorize_map(implicit, zero, factorize)
 
@@ -64,15 +66,15 @@ class Rosenbrock(Stepper):
         def step(s):
             value, tangent = staged(partial(jax.linearize, r), system.size)(s)
             solve = once if system.linear else factorized(tangent)
-            return stages(self.tableau, s, dt, r, value, tangent, solve), Info()
+            return stages(system, self.tableau, s, dt, r, value, tangent, solve), Info()
 
         return step
 
 
-def stages(tableau, s, dt, r, value, tangent, solve):
+def stages(system, tableau, s, dt, r, value, tangent, solve):
     """The state at t + dt, by the formulas at the top of this file; value, tangent: of r at s."""
     g, A, G, b = tableau
-    zero = jnp.zeros(s.q.size, s.q.dtype)
+    zero = jnp.zeros(system.size, s.q.dtype)
 
     def increment(weights, rates):
         """dt times the weighted sum of the rates of q, of v and of w."""
@@ -80,8 +82,8 @@ def stages(tableau, s, dt, r, value, tangent, solve):
 
     def moved(h, weights, rates):
         """The state after the rates so weighted, at the time t + h."""
-        y = zip((s.q, s.v, s.w), increment(weights, rates), strict=True)
-        return State(s.t + h, *(x + dx for x, dx in y))
+        dq, dv, dw = increment(weights, rates)
+        return State(s.t + h, s.q + system.located(dq), s.v + dv, s.w + dw)
 
     def start(row, rates):
         """Where a stage starts, and r there."""
@@ -92,7 +94,7 @@ def stages(tableau, s, dt, r, value, tangent, solve):
         """Its rates."""
         zq, zv, zw = increment(coupling, rates)
         kq = at.v + zv
-        shift = State((g + sum(coupling)) * dt, zq + g * dt * kq, zv, -at.w)
+        shift = State((g + sum(coupling)) * dt, system.located(zq + g * dt * kq), zv, -at.w)
         kv = -solve(value + tangent(shift))
         return kq + g * dt * kv, kv, (kv - at.w - zw) / (g * dt)
 

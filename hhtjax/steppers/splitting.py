@@ -38,7 +38,7 @@ class OperatorSplitting(Stepper):
     def begin(self, system, q, v, t, params, dt):
         """a_0 = M^-1 Q, and the tangent that the whole run keeps."""
         K, C = (-jax.jacfwd(system.force, argnums=i)(q, v, t, params) for i in (0, 1))
-        memory = Memory(K, C, self.weighted_force(system, q, v, t, params))
+        memory = Memory(system.widened(K), C, self.weighted_force(system, q, v, t, params))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
     def weighted_force(self, system, q, v, t, params):
@@ -57,15 +57,15 @@ class OperatorSplitting(Stepper):
             weighted = stiffness if self.modified else implicit
 
             t = s.t + dt
-            q = s.q + dt * s.v + dt**2 * (0.5 - beta) * s.w
+            q = s.q + system.located(dt * s.v) + system.located(dt**2 * (0.5 - beta) * s.w)
             v = s.v + dt * (1 - gamma) * s.w
             Q = system.force(q, v, t, params)
             P = self.weighted_force(system, q, v, t, params)
             M = system.mass(q, params)
-            M = jnp.diag(M) if M.ndim == 1 else M
+            M = jnp.diag(system.with_ones(M)) if M.ndim == 1 else M
             a = solve(M + implicit + alpha * weighted, Q + alpha * (P - P0))
             memory = Memory(K, C, P - matvec(weighted, a))
-            return State(t, q + dt**2 * beta * a, v + dt * gamma * a, a, memory=memory), Info()
+            return State(t, q + system.located(dt**2 * beta * a), v + dt * gamma * a, a, memory=memory), Info()
 
         return step
 

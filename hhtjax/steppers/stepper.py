@@ -25,6 +25,7 @@ class State(NamedTuple):
         w: acceleration, w = M^-1 Q on the trajectory; None of a first-order system.
         a: algorithmic acceleration of the generalised-alpha recursion (algorithmic y' of a first-order system), None
             where a method has none.
+        z, zdot, za: internal states, their rates and their algorithmic rates, None without.
         L: multipliers (m,) of constraints, None without.
         memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
@@ -36,6 +37,12 @@ class State(NamedTuple):
     a: Any = None
     L: Any = None
     memory: Any = None
+    z: Any = None
+    zdot: Any = None
+    za: Any = None
+
+
+INTERNAL = {"v": "z", "w": "zdot", "a": "za"}  # where a state has what is no rate of a position
 
 
 @shown
@@ -96,6 +103,7 @@ class Stepper(Description):
     order: int  # of convergence of q and v in dt
     solves_constraints = False
     solves_rotations = False
+    solves_internal = False
     needs_equal_steps = False  # what it remembers belongs to steps of one size
     redundant: str | None = None  # how constraints that depend on each other are solved
 
@@ -111,19 +119,19 @@ class Stepper(Description):
         """The same with its arrays, such as a traced alpha, in the dtype of the state."""
         return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), self)
 
-    def init(self, system, q0, v0, params, dt, t0=0.0) -> State:
-        """State at t0, from position q0 and velocity v0 (None for a `FirstOrderSystem`)."""
-        q0, v0 = initial_values("init", system, q0, v0)
+    def init(self, system, q0, v0, params, dt, t0=0.0, z0=None) -> State:
+        """State at t0, from position q0, velocity v0 (None for a `FirstOrderSystem`) and internal states z0."""
+        q0, v0, z0 = initial_values("init", system, q0, v0, z0)
         require_capable("init", system, self, q0, v0)
-        flat, q, v = flatten("init", system, q0, v0, t0, params)
+        flat, q, v = flatten("init", system, q0, v0, t0, params, z0)
         dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
         return _unravel(flat, self.astype(q.dtype).begin(flat, q, v, t0, held.before(params, t0, dt), dt))
 
     def step(self, system, state, params, dt) -> tuple[State, Info]:
         """State one step dt after `state`, and what the step tells about itself."""
-        flat, q, v = flatten("step", system, state.q, state.v, state.t, params)
-        w = ravel_pytree(state.v if flat.first_order else state.w)[0]
-        a = None if state.a is None else ravel_pytree(state.a)[0]
+        flat, q, v = flatten("step", system, state.q, state.v, state.t, params, state.z)
+        w = ravel_pytree((state.w if flat.positions else state.v, state.zdot))[0]
+        a = None if state.a is None else ravel_pytree((state.a, state.za))[0]
         step = held.bind(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
         state, info = step(State(state.t, q, v, w, a, state.L, state.memory))
         return _unravel(flat, state), info
@@ -136,7 +144,7 @@ def require_stepper(caller, stepper):
 
 
 def require_capable(caller, system, stepper, q0, v0):
-    """An error for a constraint or a rotation that the stepper does not know."""
+    """An error for a constraint, a rotation or internal states that the stepper does not know."""
     name = type(stepper).__name__
     if system.constraint is not None and not stepper.solves_constraints:
         raise NotImplementedError(
@@ -146,15 +154,32 @@ def require_capable(caller, system, stepper, q0, v0):
         raise NotImplementedError(
             f"{caller}: {name} cannot move the rotations in `q0`; use hht() or another of its family."
         )
+    if system.internal is not None and not stepper.solves_internal:
+        raise NotImplementedError(
+            f"{caller}: {name} cannot solve the `internal` states; use hht() or another of its family, rk4(), "
+            "rosenbrock() or rowda()."
+        )
 
 
 def public(flat, state):
-    """The state as its user sees it: y and y' of a first-order system are q and v, and it has no w."""
-    return state._replace(q=state.v, v=state.w, w=None) if flat.first_order else state
+    """The state as its user sees it, internal states by themselves.
+
+    A first-order system has nothing else, and they are its q; their rates are its v, and it has no w.
+    """
+    n = flat.positions
+    if n == 0:
+        return state._replace(q=state.v, v=state.w, w=None)
+    if n == flat.size:
+        return state
+    split = {name: (x[:n], x[n:]) for name in ("v", "w", "a") if (x := getattr(state, name)) is not None}
+    rates = {name: x for name, (x, _) in split.items()}
+    return state._replace(**rates, **{INTERNAL[name]: z for name, (_, z) in split.items()})
 
 
 def _unravel(flat, state):
     state = public(flat, state)
-    rates = {name: getattr(state, name) for name in ("v", "w", "a")}
+    rates = {name: getattr(state, name) for name in INTERNAL}
     rates = {name: flat.unravel_rates(x) for name, x in rates.items() if x is not None}
-    return state._replace(q=flat.unravel(state.q), **rates)
+    internal = {name: getattr(state, name) for name in INTERNAL.values()}
+    internal = {name: flat.unravel_internal(x) for name, x in internal.items() if x is not None}
+    return state._replace(q=flat.unravel(state.q), **rates, **internal)

@@ -45,7 +45,7 @@ class ConsistentInitial(NamedTuple):
     converged: Any
 
 
-def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None) -> ConsistentInitial:
+def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=None) -> ConsistentInitial:
     """The values nearest to q0 and v0 that satisfy the constraints, with the acceleration and multipliers there.
 
         min |q - q0|_M with Phi(q, t0) = 0,     min |v - v0|_M with B v + Phi_t = 0,     |x|_M^2 = x^T M x
@@ -55,6 +55,7 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None) -> C
     Args:
         system: a `System` with a constraint. q0, v0, params, t0: as in `simulate`.
         redundant: "least_squares" for constraints that may depend on each other, as in `hht`.
+        z0: internal states, where the system has some; they enter the forces, and stay as they are.
 
     Differentiable, forward and reverse. Newton for q from q0: start near. Under jit nothing raises, and
     `converged` tells.
@@ -77,8 +78,8 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None) -> C
     if getattr(system, "constraint", None) is None:
         raise ValueError("consistent_initial: `system` must have a constraint.")
     check_redundant("consistent_initial", redundant)
-    q0, v0 = initial_values("consistent_initial", system, q0, v0)
-    start, B, left = _consistent_initial(system, q0, v0, freeze(params), t0, redundant)
+    q0, v0, z0 = initial_values("consistent_initial", system, q0, v0, z0)
+    start, B, left = _consistent_initial(system, q0, v0, freeze(params), t0, z0, redundant)
     if all(map(is_concrete, jax.tree.leaves((start, B)))):
         if redundant is None:
             require_independent("consistent_initial", np.asarray(B))
@@ -90,10 +91,10 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None) -> C
 
 
 @partial(jax.jit, static_argnames="redundant")
-def _consistent_initial(system, q0, v0, params, t0, redundant):
+def _consistent_initial(system, q0, v0, params, t0, z0, redundant):
     """The result, B at q0, and max|Phi| at the end."""
     params = thaw(params)
-    flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params)
+    flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params, z0)
     factorize = factorize_constrained(flat.size, redundant)
     t = jnp.asarray(t0).astype(q.dtype)
     B = jacobian(flat, q, t, params)
@@ -101,7 +102,7 @@ def _consistent_initial(system, q0, v0, params, t0, redundant):
     left = jnp.max(jnp.abs(flat.constraint(q, t, params)))
     v = v + correction(flat, q, t, params, -violation(flat, q, v, t, params)[1], factorize)
     w, L = acceleration_and_multipliers(flat, q, v, t, params, factorize)
-    v, w = (flat.unravel_rates(x) for x in (v, w))
+    v, w = (flat.unravel_rates(flat.located(x)) for x in (v, w))
     return ConsistentInitial(flat.unravel(q), v, w, L, converged), B, left
 
 
@@ -140,10 +141,10 @@ def nearest_position(system, q0, t, params, factorize):
 
 
 @partial(jax.jit, static_argnames="redundant")
-def examine(system, q0, v0, t0, params, redundant):
+def examine(system, q0, v0, t0, params, z0, redundant):
     """B, and for Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not."""
     params = thaw(params)
-    flat, q, v = flatten("simulate", system, q0, v0, t0, params)
+    flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     B = jacobian(flat, q, t, params)
     both = violation(flat, q, v, t, params)
@@ -151,13 +152,13 @@ def examine(system, q0, v0, t0, params, redundant):
     return B, [(jnp.max(jnp.abs(x)), jnp.max(jnp.abs(away(x)))) for x in both]
 
 
-def require_consistent(caller, system, q0, v0, t0, params, redundant=None):
+def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None):
     """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
     params = freeze(params)
-    if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params)))):
+    if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
     with jax.ensure_compile_time_eval():  # under jit too
-        B, found = examine(system, q0, v0, t0, params, redundant)
+        B, found = examine(system, q0, v0, t0, params, z0, redundant)
         found = jax.tree.map(float, found)
     if redundant is None:
         require_independent(caller, np.asarray(B))

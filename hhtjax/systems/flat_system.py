@@ -18,19 +18,21 @@ from hhtjax.systems.system import FirstOrderSystem, LinearSystem
 
 
 class FlatSystem(NamedTuple):
-    """A system on vectors q and v (n,), as the steppers see it; made by `flatten`.
+    """A system on vectors, as the steppers see it; made by `flatten`.
 
-    q is (n,) too, but for rotations, of which it holds the matrices. A first-order system is one whose force
-    depends on its velocity y alone. Its position is nobody's business, and stays zero.
+    An internal state is a rate that has no position: v = (velocity, z) and w = (acceleration, zdot) hold N rates, of
+    which the first n have positions. Their force is (Q, g), and the mass of z is 1. A first-order system is the case
+    n = 0. q is (n,) too, but for rotations, of which it holds the matrices.
     """
 
-    mass: Callable  # q, params -> (n, n), or (n,) for a diagonal
-    force: Callable  # q, v, t, params -> (n,)
-    size: int  # n
+    mass: Callable  # q, params -> (n, n), or (n,) for a diagonal: of the rates that have positions
+    force: Callable  # q, v, t, params -> (N,)
+    size: int  # N, the number of rates
+    positions: int  # n, how many of them have positions
     linear: bool  # the residual is affine in (q, v, w), with constant coefficients
-    first_order: bool
     unravel: Callable  # vector -> pytree structured like q
     unravel_rates: Callable  # (n,) -> pytree structured like v
+    unravel_internal: Callable | None = None  # (N - n,) -> pytree structured like z
     constraint: Any = None  # q, t, params -> (m,); None without
     num_constraints: int = 0  # m
     blocks: tuple = ()  # where the rotations are; empty without
@@ -38,25 +40,64 @@ class FlatSystem(NamedTuple):
     local: Any = None  # the `Local` force beside a linear system
 
     def inertia(self, q, w, params):
-        """M(q) w."""
-        return matvec(self.mass(q, params), w) if self.product is None else self.product(q, w, params)
+        """M(q) w, and zdot."""
+
+        def product(w):
+            return matvec(self.mass(q, params), w) if self.product is None else self.product(q, w, params)
+
+        return self._of_positions(product, w)
 
     def acceleration(self, q, v, t, params, factorize=factorize):
-        """w = M(q)^-1 Q(q, v, t)."""
+        """w = M(q)^-1 Q(q, v, t), and zdot."""
         M, Q = self.mass(q, params), self.force(q, v, t, params)
-        return Q / M if M.ndim == 1 else solve(M, Q, factorize)
+        return self.solve_mass(M, Q, factorize)
+
+    def solve_mass(self, M, Q, factorize=factorize):
+        """M^-1 Q, and what works on z as it is."""
+        return self._of_positions(lambda Q: Q / M if M.ndim == 1 else solve(M, Q, factorize), Q)
+
+    def with_ones(self, d):
+        """d (n,), of M, and ones for z: (N,)."""
+        return d if self.positions == self.size else jnp.concatenate([d, jnp.ones(self.size - self.positions, d.dtype)])
+
+    def located(self, x):
+        """Those entries of a vector (N,) of rates that have positions."""
+        return x if self.positions == self.size else x[: self.positions]
+
+    def with_internal(self, x, z):
+        """x, but beside positions the entries of internal states as in z: (N,)."""
+        n = self.positions
+        return x if n in (0, self.size) else jnp.concatenate([x[:n], z[n:]])
+
+    def widened(self, D):
+        """A derivative (N, n) in q as one in displacements (N,), of which those of z move nothing."""
+        return D if self.positions == self.size else jnp.pad(D, ((0, 0), (0, self.size - self.positions)))
 
     def move(self, q, x):
-        """q displaced by x (n,): q + x, and R exp(x) for rotations."""
-        return kinematics.move(self.blocks, q, x)
+        """q displaced by x (N,): q + x, and R exp(x) for rotations."""
+        return kinematics.move(self.blocks, q, self.located(x))
 
     def rate(self, q, v):
         """qdot: v, and R hat(v) for rotations."""
-        return kinematics.rate(self.blocks, q, v)
+        return kinematics.rate(self.blocks, q, self.located(v))
+
+    def end_of_chart(self, x, *rates):
+        """Velocity, acceleration, algorithmic acceleration, from first and second rates of the displacement x."""
+        if not self.blocks:
+            return rates
+        ends = kinematics.end_of_chart(self.blocks, *map(self.located, (x, *rates)))
+        return tuple(map(self.with_internal, ends, rates))
 
     def tidy(self, state):
         """The state at the end of a step, its rotations orthogonal to rounding."""
         return state._replace(q=kinematics.orthonormalize(self.blocks, state.q))
+
+    def _of_positions(self, f, x):
+        """f of the entries that have positions, the others as they are."""
+        n = self.positions
+        if n == self.size:
+            return f(x)
+        return jnp.concatenate([f(x[:n]), x[n:]]) if n else x
 
 
 class Local(NamedTuple):
@@ -68,8 +109,8 @@ class Local(NamedTuple):
     size: int | None  # k; None where it acts on all coordinates
 
 
-def flatten(caller, system, q0, v0, t0, params):
-    """The system on vectors, and q0, v0 as vectors: the one place where pytrees are ravelled.
+def flatten(caller, system, q0, v0, t0, params, z0=None):
+    """The system on vectors, and q0 and (v0, z0) as vectors: the one place where pytrees are ravelled.
 
     Runs while tracing, so it checks shapes and structures and costs nothing at run time.
     """
@@ -90,7 +131,7 @@ def flatten(caller, system, q0, v0, t0, params):
         constraint = partial(_flat_constraint, system.constraint, unravel, dtype)
 
     linear = isinstance(system, LinearSystem)
-    _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params)
+    _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0)
 
     def mass(q, params):
         M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
@@ -103,8 +144,10 @@ def flatten(caller, system, q0, v0, t0, params):
     if not linear and system.inertia is not None:
         _check_like(caller, "inertia", _evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
         product = partial(_flat_product, system.inertia, unravel, unravel_rates, dtype)
-    flat = FlatSystem(mass, force, n, linear, False, unravel, unravel_rates, constraint, m, blocks, product)
-    return (_with_local(system, flat, dtype) if linear and system.nonlinear is not None else flat), q, v
+    flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks, product)
+    if linear and system.nonlinear is not None:
+        flat = _with_local(system, flat, dtype)
+    return (flat, q, v) if system.internal is None else _with_internal(system, flat, q, v0, z0)
 
 
 def _with_local(system, flat, dtype):
@@ -122,8 +165,20 @@ def _with_local(system, flat, dtype):
     return flat._replace(linear=False, local=local)
 
 
+def _with_internal(system, flat, q, v0, z0):
+    """The same with internal states, behind the velocities and their rates."""
+    V, unravel = ravel_pytree((v0, z0))
+    unravel_internal = ravel_pytree(z0)[1]
+
+    def force(q, V, t, params):
+        at = flat.unravel(q), *unravel(V), t, params
+        return ravel_pytree((system.force(*at), system.internal(*at)))[0].astype(V.dtype)
+
+    return flat._replace(force=force, size=V.size, unravel_internal=unravel_internal), q, V
+
+
 def _flatten_first_order(caller, system, y0, t0, params):
-    """y' = rate is a system of unit mass whose velocity is y, and whose position is nothing."""
+    """y' = rate: internal states alone, without a position."""
     y, unravel = ravel_pytree(y0)
     n, dtype = y.size, y.dtype
     _check_like(caller, "rate", _evaluate(caller, "rate", system.rate, y0, t0, params), "q0", y0, dtype)
@@ -132,12 +187,12 @@ def _flatten_first_order(caller, system, y0, t0, params):
         return ravel_pytree(system.rate(unravel(v), t, params))[0].astype(dtype)
 
     def mass(q, params):
-        return jnp.ones(n, dtype)
+        return jnp.ones(0, dtype)
 
-    return FlatSystem(mass, rate, n, False, True, unravel, unravel), jnp.zeros_like(y), y
+    return FlatSystem(mass, rate, n, 0, False, unravel, unravel), jnp.zeros(0, dtype), y
 
 
-def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params):
+def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):
     """Shapes of what the functions of a system return."""
     if linear:
         for name in ("M", "C", "K"):
@@ -148,9 +203,13 @@ def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params):
         _check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
     if linear and system.load is not None:
         Q = _evaluate(caller, "force", system.load, t0, params)
-    else:
+    elif system.internal is None:
         function = system.linear_force if linear else system.force
         Q = _evaluate(caller, "force", function, q0, v0, t0, params)
+    else:
+        Q = _evaluate(caller, "force", system.force, q0, v0, z0, t0, params)
+        zdot = _evaluate(caller, "internal", system.internal, q0, v0, z0, t0, params)
+        _check_like(caller, "internal", zdot, "z0", z0, dtype)
     _check_like(caller, "force", Q, "v0", v0, dtype)
     if linear and system.nonlinear is not None:
         _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params)

@@ -9,7 +9,6 @@ one ends on a sample of uneven times: the old value there is the one held until 
 import jax
 import jax.numpy as jnp
 
-from hhtjax.numerics.linear_solve import solve
 from hhtjax.systems.constraints import factorize_constrained, saddle_point
 from hhtjax.systems.sampled import Sampled
 
@@ -51,8 +50,7 @@ def _jump(stepper, system, s, old, new):
         dw, dL = saddle_point(system, s.q, s.t, new, dQ, rows, ways)
         s = s._replace(L=s.L + dL)
     else:
-        M = system.mass(s.q, new)
-        dw = dQ / M if M.ndim == 1 else solve(M, dQ)
+        dw = system.solve_mass(system.mass(s.q, new), dQ)
     return s._replace(w=s.w + dw, a=None if s.a is None else s.a + dw)
 
 

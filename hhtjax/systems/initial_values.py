@@ -18,13 +18,14 @@ class PrecisionWarning(UserWarning):
     """The state is in single precision."""
 
 
-def initial_values(caller, system, q0, v0):
-    """q0 and v0 as arrays of one float dtype, checked; v0 is None for a first-order system."""
+def initial_values(caller, system, q0, v0, z0=None):
+    """q0, v0 and z0 as arrays of one float dtype, checked; those that the system does not have are None."""
     first_order = isinstance(system, FirstOrderSystem)
     if first_order:
         if v0 is not None:
             raise ValueError(f"{caller}: `v0` must be left out for a FirstOrderSystem; received {v0!r}.")
         v0 = q0
+    _require_internal(caller, system, z0)
     if not sum(np.size(x) for x in jax.tree.leaves(q0)):
         raise ValueError(f"{caller}: `q0` must hold at least one number; received {q0!r}.")
     structure = jax.tree.structure(q0)
@@ -33,7 +34,7 @@ def initial_values(caller, system, q0, v0):
             f"{caller}: `v0` must be a pytree structured like q0, {structure}; received {jax.tree.structure(v0)}."
         )
     dtypes = set()
-    for name, values in (("q0", q0), ("v0", v0)):
+    for name, values in (("q0", q0), ("v0", v0), ("z0", z0)):
         for path, leaf in jax.tree_util.tree_leaves_with_path(values):
             dtype = _require_finite(f"{caller}: `{name}{jax.tree_util.keystr(path)}`", leaf)
             if is_array(leaf) and jnp.issubdtype(dtype, jnp.floating):
@@ -46,9 +47,7 @@ def initial_values(caller, system, q0, v0):
             raise ValueError(
                 f"{caller}: `v0` must have the shapes of q0, {describe(q0)}{rotation}; received {describe(v0)}."
             )
-    if len(dtypes) > 1:
-        raise TypeError(f"{caller}: `q0` and `v0` must share one dtype; received {describe(q0)} and {describe(v0)}.")
-    dtype = dtypes.pop() if dtypes else jnp.result_type(float)
+    dtype = _the_one(caller, dtypes, q0, v0, z0) if dtypes else jnp.result_type(float)
     if dtype == jnp.float32:
         warnings.warn(
             f"{caller}: in float32 expect about 4 correct digits at best, fewer on stiff systems and small steps: "
@@ -56,8 +55,28 @@ def initial_values(caller, system, q0, v0):
             PrecisionWarning,
             stacklevel=3,
         )
-    q0, v0 = (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0))
-    return q0, None if first_order else v0
+    q0, v0, z0 = (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0, z0))
+    return q0, None if first_order else v0, z0
+
+
+def _the_one(caller, dtypes, q0, v0, z0):
+    """The dtype that all share, or an error."""
+    if len(dtypes) > 1:
+        names = "`q0` and `v0`" if z0 is None else "`q0`, `v0` and `z0`"
+        received = " and ".join(describe(x) for x in (q0, v0, z0) if x is not None)
+        raise TypeError(f"{caller}: {names} must share one dtype; received {received}.")
+    return dtypes.pop()
+
+
+def _require_internal(caller, system, z0):
+    """An error for a z0 that is missing, or that the system has no use for."""
+    if system.internal is None:
+        if z0 is not None:
+            raise ValueError(f"{caller}: leave `z0` out: the system has no internal states; received {z0!r}.")
+    elif z0 is None:
+        raise ValueError(f"{caller}: `z0` must be given: the system has internal states.")
+    elif not sum(np.size(x) for x in jax.tree.leaves(z0)):
+        raise ValueError(f"{caller}: `z0` must hold at least one number; received {z0!r}.")
 
 
 def _require_finite(where, leaf):

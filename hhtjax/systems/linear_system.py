@@ -92,6 +92,7 @@ class LinearSystem(Description):
         object.__setattr__(self, "at", None if at is None else _numbers_of_coordinates(at, nonlinear, size))
 
     constraint = None
+    internal = None
 
     def mass(self, q, params):
         """M, whatever q."""

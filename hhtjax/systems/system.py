@@ -1,15 +1,12 @@
-"""What is simulated: M(q) w = Q(q, v, t), or y' = f(y, t), described by plain functions of pytrees."""
+"""What is simulated: M(q) w = Q(q, v, t), with or without internal states, or y' = f(y, t): functions of pytrees."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-
 from hhtjax.checks import require_function
 from hhtjax.description import Description
+from hhtjax.systems.lagrangian import InternalLagrangianForce, LagrangianForce, LagrangianInertia, LagrangianMass
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass
 
@@ -30,6 +27,17 @@ class System(Description):
         inertia: M(q) w without M, `inertia(q, w, params)`, a pytree structured like v: for chains and trees, whose
             inverse dynamics take fewer operations than their matrix. It replaces the product of `mass` and w, in the
             steps and in their Jacobians, and is trusted to be equal to it; `mass` is still asked for M itself.
+        internal: g, the rate of internal states z of first order, such as the current of a motor, the integral of a
+            controller, hysteresis, or a Maxwell branch: `internal(q, v, z, t, params)`, a pytree structured like z,
+            of any shapes. The force is then `force(q, v, z, t, params)`, and runs take a `z0`:
+
+                M(q) w = Q(q, v, z, t) + B^T L,    zdot = g(q, v, z, t)
+
+            Both are solved at once, in one factorisation of their common size, to the order of the stepper, however
+            fast z is. (With alpha = 0, or rho_inf = 1, a fast z that starts off the values it is drawn to swings
+            about them for ever, as the trapezoidal rule does: damp, or start it there.) For the `hht` family, `rk4`,
+            `rosenbrock` and `rowda`. g should have bounded slopes: no relays, and |z|^nu at z = 0 has derivatives in
+            nu that are not finite, unless written exp(nu log(|z| + 1e-12)).
 
     q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
     leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
@@ -37,7 +45,7 @@ class System(Description):
     units do. A System is frozen and hashable; constant arrays in it are leaves of a pytree.
 
     Raises:
-        TypeError: `mass`, `force`, `constraint` or `inertia` is not callable (or an array, for `mass`).
+        TypeError: a function is not callable (or an array, for `mass`), or has other arguments.
         ValueError: a constant `mass` of a wrong shape, not finite, not symmetric or not positive definite.
 
     Example: a pendulum of length 2 m, with q the angle from the downward vertical in rad.
@@ -52,15 +60,33 @@ class System(Description):
     ...     dt=1e-2, num_steps=100)
     >>> solution.q.shape
     (101, 1)
+
+    Example: an arm of 0.1 kg m^2 on a motor with the torque constant 0.5 N m/A; z is the current in A, at 2 V.
+
+    >>> arm = hhtjax.System(
+    ...     mass=jnp.array([0.1]),
+    ...     force=lambda q, v, z, t, params: params["kt"] * z - 0.01 * v,
+    ...     internal=lambda q, v, z, t, params: (2.0 - params["R"] * z - params["kt"] * v) / params["L"],
+    ... )
+    >>> zero = jnp.zeros(1)
+    >>> solution = hhtjax.simulate(
+    ...     arm, hhtjax.hht(), zero, zero, {"kt": 0.5, "R": 1.0, "L": 1e-3}, z0=zero, dt=1e-2, num_steps=500)
+    >>> [round(float(x[-1, 0]), 3) for x in (solution.v, solution.z)]         # 2 kt/(kt^2 + 0.01 R), 0.01 v/kt
+    [3.846, 0.077]
     """
 
     mass: Any
     force: Callable
     constraint: Callable | None = None
     inertia: Callable | None = None
+    internal: Callable | None = None
 
     def __post_init__(self):
-        require_function("System", "force", self.force, "force(q, v, t, params)")
+        if self.internal is None:
+            require_function("System", "force", self.force, "force(q, v, t, params)")
+        else:
+            for name in ("force", "internal"):
+                require_function("System", name, getattr(self, name), f"{name}(q, v, z, t, params)", count=5)
         if self.inertia is not None:
             require_function("System", "inertia", self.inertia, "inertia(q, w, params)")
         if self.constraint is not None:
@@ -73,7 +99,7 @@ class System(Description):
             object.__setattr__(self, "mass", mass)
 
     @classmethod
-    def from_lagrangian(cls, lagrangian, force=None):
+    def from_lagrangian(cls, lagrangian, force=None, internal=None):
         """The system of Lagrange's equations  d/dt (dL/dv) - dL/dq = F, with M and Q by autodiff.
 
             M = d2L/dv2,    Q = F + dL/dq - (d2L/dv dq) v - d2L/dv dt
@@ -82,6 +108,7 @@ class System(Description):
             lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v, with
                 a mass matrix that depends on q and params only: M is evaluated at v = 0, t = 0.
             force: F, the forces that no potential holds (damping, inputs): `force(q, v, t, params)`.
+            internal: as for `System`; then `force(q, v, z, t, params)`.
 
         Example: a mass on a spring, L = m v^2/2 - k q^2/2.
 
@@ -92,59 +119,16 @@ class System(Description):
         """
         require_function("System.from_lagrangian", "lagrangian", lagrangian, "lagrangian(q, v, t, params)")
         if force is not None:
-            require_function("System.from_lagrangian", "force", force, "force(q, v, t, params)")
-        return cls(
-            _LagrangianMass(lagrangian), _LagrangianForce(lagrangian, force), inertia=_LagrangianInertia(lagrangian)
-        )
-
-
-@dataclass(frozen=True)
-class _LagrangianMass:
-    """M(q) = d2L/dv2. A class and not a closure, so that equal Lagrangians give equal systems."""
-
-    lagrangian: Callable
-    is_lagrangian = True  # knows no rotations
-
-    def __call__(self, q, params):
-        zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))
-        return jax.hessian(lambda v: self.lagrangian(q, unravel(v), 0.0, params))(zero)
-
-
-@dataclass(frozen=True)
-class _LagrangianInertia:
-    """M(q) w, the derivative of the momentum dL/dv in the direction w: one column of the Hessian, not all."""
-
-    lagrangian: Callable
-
-    def __call__(self, q, w, params):
-        q, w = (jax.tree.map(jnp.asarray, x) for x in (q, w))
-        zero = jax.tree.map(jnp.zeros_like, w)
-        momentum = jax.grad(lambda v: self.lagrangian(q, v, 0.0, params))
-        return jax.jvp(momentum, (zero,), (w,))[1]
-
-
-@dataclass(frozen=True)
-class _LagrangianForce:
-    """Q(q, v, t) = F + dL/dq - d/ds (dL/dv)(q + s v, t + s)."""
-
-    lagrangian: Callable
-    force: Callable | None
-
-    def __call__(self, q, v, t, params):
-        q, v = (jax.tree.map(jnp.asarray, x) for x in (q, v))
-        t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(q)))
-
-        def momentum(q, t):
-            return jax.grad(self.lagrangian, argnums=1)(q, v, t, params)
-
-        _, convective = jax.jvp(momentum, (q, t), (v, jnp.ones_like(t)))
-        Q = jax.tree.map(jnp.subtract, jax.grad(self.lagrangian)(q, v, t, params), convective)
-        return Q if self.force is None else jax.tree.map(jnp.add, Q, self.force(q, v, t, params))
+            arguments, count = ("q, v, t, params", None) if internal is None else ("q, v, z, t, params", 5)
+            require_function("System.from_lagrangian", "force", force, f"force({arguments})", count)
+        own_force = (LagrangianForce if internal is None else InternalLagrangianForce)(lagrangian, force)
+        inertia = LagrangianInertia(lagrangian)
+        return cls(LagrangianMass(lagrangian), own_force, inertia=inertia, internal=internal)
 
 
 @dataclass(frozen=True, eq=False)
 class FirstOrderSystem(Description):
-    """The first-order system  y' = f(y, t), for every stepper: y takes the place of the velocity, with M = 1.
+    """The first-order system  y' = f(y, t), for every stepper: internal states without a position.
 
     `simulate` takes y0 as q0, no v0, and returns y as `solution.q`, y' as `solution.v`, no acceleration. On it
 
@@ -174,6 +158,7 @@ class FirstOrderSystem(Description):
 
     rate: Callable
     constraint = None
+    internal = None
 
     def __post_init__(self):
         require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")

@@ -1,0 +1,66 @@
+"""Bouc-Wen hysteresis: one degree of freedom whose restoring force z remembers.
+
+    m w + c v + k q + z = u(t),    zdot = alpha v - beta (gamma |v| |z|^(nu - 1) z + delta v |z|^nu)
+
+The parameters of `benchmark` are those of J.-P. Noel, M. Schoukens, "Hysteretic benchmark with a dynamic nonlinearity",
+Workshop on Nonlinear System Identification Benchmarks, Brussels 2016, with nu = 1. There, beta, gamma and delta enter
+as beta gamma and beta delta only.
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import InternalScene
+from hhtjax.systems.system import System
+
+
+def mass(q, params):
+    """M = [m]."""
+    return params["m"] * jnp.ones(1, q.dtype)
+
+
+def restoring(q, v, z, params):
+    """-(c v + k q + z)."""
+    return -(params["c"] * v + params["k"] * q + z)
+
+
+def force(q, v, z, t, params):
+    """Q with a harmonic input, u = amplitude sin(frequency t)."""
+    return restoring(q, v, z, params) + params["amplitude"] * jnp.sin(params["frequency"] * t)
+
+
+def internal(q, v, z, t, params):
+    """zdot, for nu = 1."""
+    return params["alpha"] * v - params["beta_gamma"] * jnp.abs(v) * z - params["beta_delta"] * v * jnp.abs(z)
+
+
+def sampled_mass(q, params):
+    """M for `sampled_force`."""
+    return mass(q, params[0])
+
+
+def sampled_force(q, v, z, t, params):
+    """Q with a measured input: params is a pair (parameters, u), u made by `hhtjax.sampled` or the like."""
+    params, u = params
+    return restoring(q, v, z, params) + u(t)
+
+
+def sampled_internal(q, v, z, t, params):
+    """zdot for `sampled_force`."""
+    return internal(q, v, z, t, params[0])
+
+
+BENCHMARK = {"m": 2.0, "c": 10.0, "k": 5e4, "alpha": 5e4, "beta_gamma": 0.8e3, "beta_delta": -1.1e3}
+SAMPLED = System(sampled_mass, sampled_force, internal=sampled_internal)
+
+
+def benchmark() -> InternalScene:
+    """The benchmark's oscillator, driven at 30 Hz below its resonance (SI units)."""
+    params = {**BENCHMARK, "amplitude": 100.0, "frequency": 2 * jnp.pi * 30.0}
+    zero = jnp.zeros(1)
+    return InternalScene(System(mass, force, internal=internal), params, zero, zero, 0.1, zero)
+
+
+def measured(params, u, duration) -> InternalScene:
+    """The oscillator at rest, under a given input u."""
+    zero = jnp.zeros(1)
+    return InternalScene(SAMPLED, (params, u), zero, zero, duration, zero)

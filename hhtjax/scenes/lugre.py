@@ -1,0 +1,38 @@
+"""LuGre friction: a mass that a spring drags over a surface, whose bristles bend by z before they slip.
+
+    F = sigma0 z + sigma1 zdot + sigma2 v,    zdot = v - sigma0 |v| z/s(v),    s(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)
+
+C. Canudas de Wit, H. Olsson, K. Astrom, P. Lischinsky, IEEE Trans. Automatic Control 40, 1995, 419-425.
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import InternalScene
+from hhtjax.systems.system import System
+
+
+def mass(q, params):
+    """M = [m]."""
+    return params["m"] * jnp.ones(1, q.dtype)
+
+
+def internal(q, v, z, t, params):
+    """zdot."""
+    steady = params["coulomb"] + (params["static"] - params["coulomb"]) * jnp.exp(-((v / params["stribeck"]) ** 2))
+    return v - params["sigma0"] * jnp.abs(v) * z / steady
+
+
+def force(q, v, z, t, params):
+    """Q: the spring, whose far end moves at a constant speed, and friction."""
+    friction = params["sigma0"] * z + params["sigma1"] * internal(q, v, z, t, params) + params["sigma2"] * v
+    return params["k"] * (params["speed"] * t - q) - friction
+
+
+def stick_slip() -> InternalScene:
+    """The experiment of the source, Sec. III-C: 1 kg dragged at 0.1 m/s sticks and slips (SI units)."""
+    params = {
+        "m": 1.0, "k": 2.0, "speed": 0.1, "sigma0": 1e5, "sigma1": 1e5**0.5, "sigma2": 0.4,
+        "coulomb": 1.0, "static": 1.5, "stribeck": 1e-3,
+    }  # fmt: skip
+    zero = jnp.zeros(1)
+    return InternalScene(System(mass, force, internal=internal), params, zero, zero, 10.0, zero)

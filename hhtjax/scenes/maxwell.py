@@ -1,0 +1,31 @@
+"""A mass on a spring with Maxwell branches, spring and damper in series, of time constants far apart."""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import InternalScene
+from hhtjax.systems.system import System
+
+
+def mass(q, params):
+    """M = [m]."""
+    return params["m"] * jnp.ones(1, q.dtype)
+
+
+def force(q, v, z, t, params):
+    """Q: spring, the forces z of the branches, and an input."""
+    return params["amplitude"] * jnp.cos(params["frequency"] * t) - params["k"] * q - jnp.sum(z)
+
+
+def internal(q, v, z, t, params):
+    """zdot = k v - z/tau of each branch."""
+    return params["stiffness"] * v - z / params["tau"]
+
+
+def vibration() -> InternalScene:
+    """A rubber mount, driven near its resonance; the branches relax in 1 s, 30 ms and 0.1 ms (SI units)."""
+    params = {
+        "m": 2.0, "k": 800.0, "amplitude": 5.0, "frequency": 22.0,
+        "stiffness": jnp.array([100.0, 200.0, 1e4]), "tau": jnp.array([1.0, 3e-2, 1e-4]),
+    }  # fmt: skip
+    system = System(mass, force, internal=internal)
+    return InternalScene(system, params, jnp.array([0.01]), jnp.zeros(1), 2.0, jnp.array([0.5, 0.0, 0.0]))

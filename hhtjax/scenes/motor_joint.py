@@ -1,0 +1,41 @@
+"""A joint on a geared motor, under a PI controller with velocity feedback: its current and the integral are states."""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import InternalScene
+from hhtjax.systems.system import System
+
+GRAVITY = 9.80665
+
+
+def mass(q, params):
+    """M = [inertia of the link, and of the rotor seen through the gear]."""
+    return (params["link_inertia"] + params["gear"] ** 2 * params["rotor_inertia"]) * jnp.ones(1, q.dtype)
+
+
+def force(q, v, z, t, params):
+    """Q: torque of the motor, friction of the bearing, and weight; q = 0 hangs down."""
+    torque = params["gear"] * params["torque_constant"] * z["current"]
+    return torque - params["friction"] * v - params["weight"] * jnp.sin(q)
+
+
+def internal(q, v, z, t, params):
+    """L di/dt = U - R i - (back EMF), and the rate of the integral: the error of the angle."""
+    error = params["amplitude"] * jnp.sin(params["frequency"] * t) - q
+    voltage = params["kp"] * error + params["ki"] * z["integral"] - params["kd"] * v
+    back_emf = params["gear"] * params["torque_constant"] * v
+    current = (voltage - params["resistance"] * z["current"] - back_emf) / params["inductance"]
+    return {"current": current, "integral": error}
+
+
+def tracking() -> InternalScene:
+    """A link of 1 kg and 0.5 m follows a sine; the current, L/R = 1 ms, is far faster than the motion (SI units)."""
+    params = {
+        "link_inertia": 1.0 * 0.5**2 / 3, "rotor_inertia": 2e-5, "gear": 50.0, "friction": 0.05,
+        "weight": 1.0 * GRAVITY * 0.25, "torque_constant": 0.05, "resistance": 1.0, "inductance": 1e-3,
+        "kp": 60.0, "ki": 40.0, "kd": 2.0, "amplitude": 1.0, "frequency": 3.0,
+    }  # fmt: skip
+    zero = jnp.zeros(1)
+    return InternalScene(
+        System(mass, force, internal=internal), params, zero, zero, 2.0, {"current": zero, "integral": zero}
+    )

@@ -1,0 +1,64 @@
+"""Mass, inertia and force of Lagrange's equations by autodiff. Classes: equal Lagrangians give equal systems."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+
+@dataclass(frozen=True)
+class LagrangianMass:
+    """M(q) = d2L/dv2."""
+
+    lagrangian: Callable
+    is_lagrangian = True  # knows no rotations
+
+    def __call__(self, q, params):
+        zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))
+        return jax.hessian(lambda v: self.lagrangian(q, unravel(v), 0.0, params))(zero)
+
+
+@dataclass(frozen=True)
+class LagrangianInertia:
+    """M(q) w, the derivative of the momentum dL/dv in the direction w: one column of the Hessian, not all."""
+
+    lagrangian: Callable
+
+    def __call__(self, q, w, params):
+        q, w = (jax.tree.map(jnp.asarray, x) for x in (q, w))
+        zero = jax.tree.map(jnp.zeros_like, w)
+        momentum = jax.grad(lambda v: self.lagrangian(q, v, 0.0, params))
+        return jax.jvp(momentum, (zero,), (w,))[1]
+
+
+@dataclass(frozen=True)
+class LagrangianForce:
+    """Q(q, v, t) = F + dL/dq - d/ds (dL/dv)(q + s v, t + s)."""
+
+    lagrangian: Callable
+    force: Callable | None
+
+    def __call__(self, q, v, t, params):
+        q, v = (jax.tree.map(jnp.asarray, x) for x in (q, v))
+        t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(q)))
+
+        def momentum(q, t):
+            return jax.grad(self.lagrangian, argnums=1)(q, v, t, params)
+
+        _, convective = jax.jvp(momentum, (q, t), (v, jnp.ones_like(t)))
+        Q = jax.tree.map(jnp.subtract, jax.grad(self.lagrangian)(q, v, t, params), convective)
+        return Q if self.force is None else jax.tree.map(jnp.add, Q, self.force(q, v, t, params))
+
+
+@dataclass(frozen=True)
+class InternalLagrangianForce:
+    """The same where F depends on internal states z too."""
+
+    lagrangian: Callable
+    force: Callable | None
+
+    def __call__(self, q, v, z, t, params):
+        Q = LagrangianForce(self.lagrangian, None)(q, v, t, params)
+        return Q if self.force is None else jax.tree.map(jnp.add, Q, self.force(q, v, z, t, params))
