@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 
 import hhtjax
-from hhtjax.scenes import Scene
+from hhtjax.scenes import InternalScene, Scene
 
 ROOT = Path(__file__).parents[1]
 TOP = {name: x for name in hhtjax.__all__ if isinstance(x := getattr(hhtjax, name), ModuleType)}
@@ -24,10 +24,10 @@ ELSEWHERE = re.compile(r"(?:those of|as in|as for|as) `([\w.]+)`")
 
 
 def scenes():
-    """Functions that return a Scene."""
+    """Functions that return a scene."""
     for name, module in vars(hhtjax.scenes).items():
         for inner, x in vars(module).items() if isinstance(module, ModuleType) else ():
-            if inspect.isfunction(x) and inspect.signature(x).return_annotation is Scene:
+            if inspect.isfunction(x) and inspect.signature(x).return_annotation in (Scene, InternalScene):
                 yield f"hhtjax.scenes.{name}.{inner}", x
 
 
@@ -42,7 +42,7 @@ CALLED = {
     for name, x in PUBLIC.items()
     if (callable(x) and not inspect.isclass(x)) or name.rpartition(".")[2] in CONSTRUCTED
 }
-PUBLIC["hhtjax.scenes.Scene"] = Scene
+PUBLIC |= {"hhtjax.scenes.Scene": Scene, "hhtjax.scenes.InternalScene": InternalScene}
 TUPLES = {name: x for name, x in PUBLIC.items() if inspect.isclass(x) and issubclass(x, tuple)}
 METHODS = {
     f"{name}.{inner}": getattr(x, inner)

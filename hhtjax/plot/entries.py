@@ -6,7 +6,7 @@ import numpy as np
 from hhtjax.description import is_concrete
 from hhtjax.runs.solution import Solution
 
-SYMBOLS = {"q": "q", "v": "v", "acceleration": "w", "multipliers": "L"}
+SYMBOLS = {"q": "q", "v": "v", "acceleration": "w", "multipliers": "L", "z": "z"}
 
 
 def require_run(caller, solution):

@@ -22,11 +22,11 @@ def trajectory(
     ax: Any = None,
     **line: Any,
 ) -> Any:
-    """q, v, acceleration or multipliers over time, a curve for each entry.
+    """q, v, acceleration, multipliers or internal states over time, a curve for each entry.
 
     Args:
         solution: of one run.
-        quantities: "q", "v", "acceleration" or "multipliers"; several as a tuple, one panel above the other.
+        quantities: "q", "v", "acceleration", "multipliers" or "z"; several as a tuple, one panel above the other.
         entries: which to draw, by name: "[0]" of an array, "phi" or "x[1]" of a dict, "x" for all of a leaf.
         units: a word; or words by entry or leaf, {"x": "m"}; or one of these by quantity, {"q": "rad", "v": "rad/s"}.
         label: put before the names of the curves, to tell runs in one chart.

@@ -23,8 +23,13 @@ class Interpolant(NamedTuple):
     v: Any
 
 
+@shown
 class InternalInterpolant(NamedTuple):
-    """The same with internal states z."""
+    """The same of a run with internal states.
+
+    Attributes:
+        q, v, z: with the times asked for as leading axes.
+    """
 
     q: Any
     v: Any

@@ -123,6 +123,7 @@ class Solution(NamedTuple):
     def _table(self):
         """The run in a line, and its arrays."""
         rows = leaf_rows(q=self.q, v=self.v, acceleration=self.acceleration, multipliers=self.multipliers)
+        rows += leaf_rows(z=self.z, zdot=self.zdot)
         return Table(f"Solution: {self._title()}", [["", "shape", "dtype"], *rows, *leaf_rows(info=self.info)])
 
     def _title(self):

@@ -61,6 +61,11 @@ def benchmark() -> InternalScene:
 
 
 def measured(params, u, duration) -> InternalScene:
-    """The oscillator at rest, under a given input u."""
+    """The oscillator at rest, under a given input u.
+
+    Args:
+        params: as `BENCHMARK` has them. u: force, N, a function of time that is a pytree, as `hhtjax.sampled` makes.
+        duration: s.
+    """
     zero = jnp.zeros(1)
     return InternalScene(SAMPLED, (params, u), zero, zero, duration, zero)

@@ -23,8 +23,15 @@ class Scene(NamedTuple):
     duration: float
 
 
+@shown
 class InternalScene(NamedTuple):
-    """The same with z0: initial internal states."""
+    """A system with internal states, and what a run needs besides a stepper and a step size.
+
+    Attributes:
+        system, params: what moves.
+        q0, v0, z0: initial position, velocity and internal states.
+        duration: s.
+    """
 
     system: System
     params: Any

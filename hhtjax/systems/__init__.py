@@ -92,6 +92,31 @@ included. `consistent_initial` moves a start onto the constraint.
 Constraints that depend on each other, always or in a singular position, are named with an error;
 `hht(redundant="least_squares")` solves them all the same, with the smallest multipliers.
 
+Internal states
+---------------
+
+Hysteresis, the bristles of friction, the current of a motor, the integral of a controller, a Maxwell branch: what has a
+rate, and no position, is a z behind q and v, any pytree, zdot = g(q, v, z, t). It is solved along with the motion, in
+the same factorisation and to the same order, however fast it is, by the `hht` family, `rosenbrock`, `rowda` and (unless
+it is fast) `rk4`, with constraints, rotations, sweeps and gradients. Forces take z too.
+
+>>> def torque(q, v, z, t, params):
+...     return params["kt"] * z["current"] - 0.01 * v
+>>> def rate(q, v, z, t, params):                                                                      # L di/dt = ...
+...     return {"current": (2.0 - z["current"] - params["kt"] * v) / params["L"]}
+>>> arm = hhtjax.System(jnp.array([0.1]), torque, internal=rate)
+>>> zero = jnp.zeros(1)
+>>> run = hhtjax.simulate(
+...     arm, hhtjax.hht(), zero, zero, {"kt": 0.5, "L": 1e-4}, z0={"current": zero}, dt=1e-2, num_steps=500)
+>>> run.check()
+>>> run.z["current"].shape, run.zdot["current"].shape
+((501, 1), (501, 1))
+>>> hhtjax.interpolate(run, jnp.array([0.123])).z["current"].shape
+(1, 1)
+
+`hhtjax.scenes` has motors, Bouc-Wen hysteresis, LuGre friction and a rubber mount. Relays and dry friction without
+bristles, whose g jumps, are none of these.
+
 Rotations
 ---------
 

@@ -5,7 +5,7 @@ The second-order system becomes the first-order one of y = (q, v),
     q' = v,    v' = w with M(q) w = Q(q, v, t);    with constraints  [M -B^T; B 0] [w; L] = [Q; -(rest of d2Phi/dt2)]
 
 that is, of index 1: solutions leave Phi = 0 by what the solver's errors add up to. A rotation R has R' = R hat(Om),
-and stays orthogonal to the accuracy of the solver.
+and stays orthogonal to the accuracy of the solver. With internal states, y = (q, v, z).
 """
 
 import importlib
@@ -31,10 +31,10 @@ __all__ = ["FlatODE", "ScipyRHS", "diffrax_term", "flat_ode", "ode", "scipy_rhs"
 def ode(system):
     """The system as an ODE on pytrees: the function (t, y, params) -> y' of y = (q, v); of y itself for y' = f(y, t).
 
-    Traceable and differentiable; of equal systems equal, also as a pytree.
+    With internal states y = (q, v, z). Traceable and differentiable; of equal systems equal, also as a pytree.
 
     Raises:
-        TypeError: what is no system; when called, a y that is no (q, v).
+        TypeError: what is no system; when called, a y that is no (q, v), or (q, v, z).
 
     >>> import jax.numpy as jnp, hhtjax
     >>> pendulum = hhtjax.System(jnp.ones(1), lambda q, v, t, params: {"angle": -params["g"] * jnp.sin(q["angle"])})
@@ -48,19 +48,19 @@ def ode(system):
 
 
 class FlatODE(NamedTuple):
-    """rate: (t, y, params) -> y' on vectors (N,), traceable; y0: (N,); unravel: y -> (q, v), or of a first-order system
-    the pytree y."""
+    """rate: (t, y, params) -> y' on vectors (N,), traceable; y0: (N,); unravel: y -> (q, v), or (q, v, z), or of a
+    first-order system the pytree y."""
 
     rate: Any
     y0: Any
     unravel: Any
 
 
-def flat_ode(system, q0, v0=None) -> FlatODE:
-    """The same on vectors: y holds the numbers of q, then those of v, both in the order of `ravel_pytree`.
+def flat_ode(system, q0, v0=None, z0=None) -> FlatODE:
+    """The same on vectors: y holds the numbers of q, then those of v, then z, each in the order of `ravel_pytree`.
 
     Args:
-        system, q0, v0: as in `simulate`.
+        system, q0, v0, z0: as in `simulate`.
 
     Raises:
         TypeError, ValueError: as `simulate`, for these.
@@ -72,19 +72,16 @@ def flat_ode(system, q0, v0=None) -> FlatODE:
     ((12,), [0.0, -2.0, 0.0])
     """
     require_system("flat_ode", system)
-    q0, v0 = initial_values("flat_ode", system, q0, v0)
-    q, unravel_q = ravel_pytree(q0)
-    if v0 is None:
-        return FlatODE(_FlatRate(system, q.size, unravel_q, None), q, unravel_q)
-    v, unravel_v = ravel_pytree(v0)
-    rate = _FlatRate(system, q.size, unravel_q, unravel_v)
-    return FlatODE(rate, jnp.concatenate([q, v]), rate.unravel)
+    q0, v0, z0 = initial_values("flat_ode", system, q0, v0, z0)
+    parts = [ravel_pytree(x) for x in (q0, v0, z0) if x is not None]
+    rate = _FlatRate(system, tuple(x.size for x, _ in parts), tuple(unravel for _, unravel in parts))
+    return FlatODE(rate, jnp.concatenate([x for x, _ in parts]), rate.unravel)
 
 
 def diffrax_term(system):
     """The system as a `diffrax.ODETerm`, for `diffeqsolve(term, solver, t0, t1, dt0, y0=(q0, v0), args=params)`.
 
-    y0 is (q0, v0), pytrees, or y0 of a `FirstOrderSystem`; args are the params, modules of equinox among them. All
+    y0 is (q0, v0), pytrees, or (q0, v0, z0), or y0 of a `FirstOrderSystem`; args are the params, modules of equinox among them. All
     that diffrax does with an ODE is there: step-size control, events, adjoints. Inputs that are held,
     `sampled(order=0)`, jump: tell the step-size controller, `diffrax.ClipStepSizeController(..., jump_ts=)`.
 
@@ -108,7 +105,7 @@ class ScipyRHS(NamedTuple):
     """For `scipy.integrate.solve_ivp(fun, (t0, t1), y0, jac=jac)`.
 
     fun: (t, y) -> y', (N,), and jac: (t, y) -> (N, N), compiled, of NumPy arrays. y0: (N,). unravel: y (N,), or
-    (N, times) as the result has it, -> (q, v), with a leading axis of times.
+    (N, times) as the result has it, -> (q, v), or as `FlatODE` has it, with a leading axis of times.
     """
 
     fun: Any
@@ -117,14 +114,14 @@ class ScipyRHS(NamedTuple):
     jac: Any
 
 
-def scipy_rhs(system, q0, v0=None, params=None, t0=0.0) -> ScipyRHS:
+def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
     """The system as SciPy takes it: right-hand side, start and Jacobian, for Radau, BDF and LSODA too.
 
     Compiled once for each system and structure; new params, and a new start, cost no compilation. A call takes some
     microseconds, most of them on the way into JAX and out again.
 
     Args:
-        system, q0, v0, params, t0: as in `simulate`, in double precision.
+        system, q0, v0, params, t0, z0: as in `simulate`, in double precision.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; initial values that violate a constraint; single
@@ -143,12 +140,12 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0) -> ScipyRHS:
     require_system(caller, system)
     params = require_params(caller, params)
     require_number(caller, "t0", t0, np.isfinite, "be finite")
-    q0, v0 = initial_values(caller, system, q0, v0)
+    q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
     if jax.tree.leaves(q0)[0].dtype != np.float64:
         raise ValueError(f"{caller}: SciPy computes in double precision: `q0` and `v0` must be float64 (with x64 on).")
     if system.constraint is not None:
-        require_consistent(caller, system, q0, v0, t0, params)
-    flat = flat_ode(system, q0, v0)
+        require_consistent(caller, system, q0, v0, t0, params, z0=z0)
+    flat = flat_ode(system, q0, v0, z0)
     packed, unpack = _packed(params)
     rate, jacobian = _compiled(flat.rate, unpack)
     jax.eval_shape(rate, t0, flat.y0, packed)  # raises here and not inside SciPy
@@ -168,26 +165,29 @@ def _ode(system, t, y, params):
     if isinstance(system, FirstOrderSystem):
         flat, q, v = flatten("ode", system, y, None, t, params)
         return flat.unravel(flat.force(q, v, jnp.asarray(t).astype(v.dtype), params))
-    if not isinstance(y, (tuple, list)) or len(y) != 2:
-        raise TypeError(f"ode: `y` must be (q, v), two pytrees; received {y!r}.")
-    q, v = y
-    flat, q, v = flatten("ode", system, q, v, t, params)
+    internal = system.internal is not None
+    if not isinstance(y, (tuple, list)) or len(y) != 2 + internal:
+        expected = "(q, v, z), three pytrees" if internal else "(q, v), two pytrees"
+        raise TypeError(f"ode: `y` must be {expected}; received {y!r}.")
+    q, v, z = (*y, None)[:3]
+    flat, q, v = flatten("ode", system, q, v, t, params, z)
     at = q, v, jnp.asarray(t).astype(q.dtype), params
     w = acceleration_and_multipliers(flat, *at)[0] if flat.num_constraints else flat.acceleration(*at)
-    return flat.unravel(flat.rate(q, v)), flat.unravel_rates(w)
+    rates = flat.unravel(flat.rate(q, v)), flat.unravel_rates(flat.located(w))
+    return rates if flat.unravel_internal is None else (*rates, flat.unravel_internal(w[flat.positions :]))
 
 
 class _FlatRate(Description):
     """`ode` on vectors; frozen and hashable, so that equal ones share a program."""
 
-    def __init__(self, system, size, unravel_q, unravel_v):
-        self.system, self.size, self.unravel_q, self.unravel_v = system, size, unravel_q, unravel_v
+    def __init__(self, system, sizes, unravels):
+        self.system, self.sizes, self.unravels = system, sizes, unravels
 
     def unravel(self, y):
-        """(q, v), or y."""
-        return self.unravel_q(y) if self.unravel_v is None else (
-            self.unravel_q(y[: self.size]), self.unravel_v(y[self.size :])
-        )  # fmt: skip
+        """(q, v), or (q, v, z), or y."""
+        parts = jnp.split(y, np.cumsum(self.sizes)[:-1])
+        found = tuple(unravel(part) for unravel, part in zip(self.unravels, parts, strict=True))
+        return found if len(found) > 1 else found[0]
 
     def __call__(self, t, y, params):
         return ravel_pytree(_ode(self.system, t, self.unravel(y), params))[0]
