@@ -6,7 +6,13 @@ from pathlib import Path
 
 project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 extras = project["optional-dependencies"]
-for requirement in [*project["dependencies"], *extras["plot"], *extras["experiments"], *extras["test"]]:
+for requirement in [
+    *project["dependencies"],
+    *extras["plot"],
+    *extras["experiments"],
+    *extras["interop"],
+    *extras["test"],
+]:
     match = re.fullmatch(r"([a-z-]+)>=([\d.]+)", requirement)
     if match:
         print(f"{match[1]}=={match[2]}")

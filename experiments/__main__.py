@@ -1,4 +1,8 @@
-"""The runner: `python -m experiments` lists the experiments, `python -m experiments NAME` runs one."""
+"""The runner: `python -m experiments` lists the experiments, `python -m experiments NAME` runs one.
+
+`all` runs every one and makes a page of what they wrote, `page` makes it of the committed results, and `check` compares
+what runs have written with those.
+"""
 
 import argparse
 import ast
@@ -28,6 +32,13 @@ EXPERIMENTS = {
     "benchmarks": "benchmarks.benchmarks",
     "work_precision": "work_precision.work_precision",
 }
+IN_PART = ("silverbox",)  # without --full these show a part; their run takes a third argument
+MORE = " (A first look; all of it with --full.)"
+COMMANDS = {
+    "all": "Every one of them, in full, and a page of what they wrote, experiments.html.",
+    "page": "That page from the committed results instead, without running anything.",
+    "check": "Compares what runs have written with the committed numbers; fails where one got worse.",
+}
 HERE = Path(__file__).parent
 
 
@@ -39,8 +50,9 @@ def summary(module: str) -> str:
 
 def listing() -> str:
     """The experiments, a line each."""
-    lines = [f"  {name:<26}{summary(module)}" for name, module in EXPERIMENTS.items()]
-    return "\n".join(["Experiments:", *lines, f"  {'all':<26}Every one of them.", "", USAGE])
+    lines = [(name, summary(module) + MORE * (name in IN_PART)) for name, module in EXPERIMENTS.items()]
+    lines = [f"  {name:<26}{text}" for name, text in [*lines, *COMMANDS.items()]]
+    return "\n".join(["Experiments:", *lines, "", USAGE])
 
 
 def run_side_by_side(options: list[str]) -> int:
@@ -53,37 +65,74 @@ def run_side_by_side(options: list[str]) -> int:
         return result.returncode
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return max(pool.map(run, EXPERIMENTS))
+        return int(any(list(pool.map(run, EXPERIMENTS))))
 
 
-USAGE = "python -m experiments NAME [--fast] [--out DIR]"
+USAGE = "python -m experiments NAME [--fast | --full] [--out DIR] [--formats png,pdf,svg]"
+
+
+def parse(arguments: list[str]):
+    """Name and options."""
+    parser = argparse.ArgumentParser(prog="python -m experiments", usage=USAGE)
+    parser.add_argument("name", nargs="?", help="experiment to run; without it, they are listed")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--fast", action="store_true", help="a smoke run: less data, fewer settings")
+    size.add_argument("--full", action="store_true", help=f"everything, where less is shown by default: {IN_PART[0]}")
+    parser.add_argument("--out", type=Path, default=HERE / "output", help="folder for figures, JSON and page")
+    parser.add_argument("--formats", default="png", help="of figures: png, pdf, svg, or several with commas")
+    options = parser.parse_args(arguments)
+    if options.full and options.name not in (*IN_PART, "all"):
+        parser.error(f"--full is for {', '.join(IN_PART)}; the others show everything they have anyway")
+    return options
+
+
+def run(name: str, options) -> None:
+    """One experiment, in this process."""
+    from experiments.report import Report
+
+    full = options.full or options.name == "all"
+    part = name in IN_PART and not full and not options.fast
+    flag = " --fast" if options.fast else " --full" if name in IN_PART and full else ""
+    mode = "fast" if options.fast else "part" if part else "full"
+    report = Report(name, options.out, mode, f"python -m experiments {name}{flag}", options.formats.split(","))
+    module = importlib.import_module(f"experiments.{EXPERIMENTS[name]}")
+    module.run(report, options.fast, *([full] if name in IN_PART else []))
+    report.close()
+
+
+def write_page(out: Path, committed: bool) -> None:
+    """The page of results."""
+    from experiments.html_report import page
+    from experiments.results import of_experiments
+
+    path = out / "experiments.html"
+    out.mkdir(parents=True, exist_ok=True)
+    path.write_text(page(of_experiments(EXPERIMENTS, None if committed else out)), encoding="utf-8")
+    print(f"Page: {path}", flush=True)
 
 
 def main(arguments: list[str]) -> int:
-    """Runs the experiment named, or lists them all."""
-    parser = argparse.ArgumentParser(prog="python -m experiments", usage=USAGE)
-    parser.add_argument("name", nargs="?", help="experiment to run; without it, they are listed")
-    parser.add_argument("--fast", action="store_true", help="a smoke run: less data, fewer settings")
-    parser.add_argument("--out", type=Path, default=HERE / "output", help="folder for figures and JSON")
-    options = parser.parse_args(arguments)
+    """Runs the experiment or command named, or lists them all."""
+    options = parse(arguments)
     if options.name is None:
         print(listing())
         return 0
-    if options.name != "all" and options.name not in EXPERIMENTS:
+    if options.name not in EXPERIMENTS and options.name not in COMMANDS:
         print(f"Unknown experiment {options.name!r}.\n{listing()}", file=sys.stderr)
         return 2
+    if options.name == "check":
+        from experiments.check import check
 
+        return check(EXPERIMENTS, options.out)
+    failed = 0
     if options.name == "all" and options.fast:
-        return run_side_by_side(["--fast", "--out", str(options.out)])
-
-    from experiments.report import Report
-
-    for name in EXPERIMENTS if options.name == "all" else [options.name]:
-        module = importlib.import_module(f"experiments.{EXPERIMENTS[name]}")
-        report = Report(name, options.out)
-        module.run(report, options.fast)
-        report.close()
-    return 0
+        failed = run_side_by_side(["--fast", "--out", str(options.out), "--formats", options.formats])
+    elif options.name != "page":
+        for name in EXPERIMENTS if options.name == "all" else [options.name]:
+            run(name, options)
+    if options.name in ("all", "page"):
+        write_page(options.out, committed=options.name == "page")
+    return failed
 
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
 
+import hhtjax
+
 SAMPLES = 64  # times at which q is compared; the coarsest runs hit a part of them
 ACCURATE = 0.05  # error of q below which a run is accurate
 FARTHEST = 10.0  # distance from q0, in that of the reference, beyond which it is unbounded
@@ -51,25 +53,10 @@ def solve_reference(case) -> Reference:
     system, params, q0, v0, duration = case.scene
     n = q0.size
 
-    @jax.jit
-    def rate(t, y):
-        q, v = y[:n], y[n:]
-        M = jnp.asarray(system.mass(q, params) if callable(system.mass) else system.mass)
-        Q = system.force(q, v, t, params)
-        return jnp.concatenate([v, Q / M if M.ndim == 1 else jnp.linalg.solve(M, Q)])
-
-    jacobian: dict[str, Any] = {"jac": jax.jit(jax.jacfwd(rate, 1))} if case.solver == "Radau" else {}
+    rhs = hhtjax.interop.scipy_rhs(system, q0, v0, params)
+    jacobian: dict[str, Any] = {"jac": rhs.jac} if case.solver == "Radau" else {}
     times = np.linspace(0, duration, SAMPLES + 1)
-    run = solve_ivp(
-        lambda t, y: np.asarray(rate(t, y)),
-        (0, duration),
-        np.concatenate([q0, v0]),
-        case.solver,
-        times,
-        rtol=1e-10,
-        atol=1e-12,
-        **jacobian,
-    )
+    run = solve_ivp(rhs.fun, (0, duration), rhs.y0, case.solver, times, rtol=1e-10, atol=1e-12, **jacobian)
     q = run.y[:n].T
     return Reference(q[1:], rms(q - q.mean(axis=0), (0, 1)), np.abs(q - q0).max())
 

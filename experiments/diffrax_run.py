@@ -1,20 +1,15 @@
-"""diffrax on the scenes of this library, imported only where it is asked for: it belongs to the extra `peers`."""
+"""diffrax on the scenes of this library, imported only where it is asked for: it belongs to the extra `interop`."""
 
 import importlib
 
-import jax.numpy as jnp
+import hhtjax
 
 
 def solve(scene, solver, params, duration, **options):
     """The solution of q' = v, v' = M^-1 Q by the solver of that name, with step-size control."""
     diffrax = importlib.import_module("diffrax")
-
-    def rate(t, y, params):
-        q, v = y
-        return v, jnp.linalg.solve(scene.system.mass(q, params), scene.system.force(q, v, t, params))
-
     return diffrax.diffeqsolve(
-        diffrax.ODETerm(rate),
+        hhtjax.interop.diffrax_term(scene.system),
         getattr(diffrax, solver)(),
         0.0,
         duration,

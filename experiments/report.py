@@ -4,6 +4,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,25 +12,13 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from cycler import cycler
+from PIL import Image
 
-# Okabe and Ito's colours, told apart by colour-blind readers
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+from hhtjax.plot import COLOURS, MARKERS, PARAMETERS, save
 
-plt.rcParams.update(
-    {
-        "figure.constrained_layout.use": True,
-        "figure.dpi": 130,
-        "axes.prop_cycle": cycler(color=COLOURS),
-        "axes.grid": True,
-        "grid.alpha": 0.3,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "legend.frameon": False,
-        "font.size": 9,
-    }
-)
+__all__ = ["COLOURS", "MARKERS", "Report", "side_by_side"]  # charts of experiments look like those of the library
+
+plt.rcParams.update(PARAMETERS)
 
 
 def side_by_side(functions):
@@ -56,11 +45,21 @@ def as_json(x, indent=0):
     return f"{{{inner}{f',{inner}'.join(lines)}{outer}}}"
 
 
+def reduce_colours(path):
+    """A PNG of 128 colours, a third as large: it lies in the repository."""
+    with Image.open(path) as image:
+        small = image.convert("RGB").quantize(128, dither=Image.Dither.NONE)
+        dpi = image.info["dpi"]
+    small.save(path, optimize=True, dpi=dpi)
+
+
 class Report:
     """Collects what an experiment has to show."""
 
-    def __init__(self, name: str, out: Path):
-        self.name, self.out = name, out
+    def __init__(self, name: str, out: Path, mode: str = "full", command: str = "", formats: Sequence[str] = ("png",)):
+        """mode: full, fast (a smoke run) or part (less than the experiment has); command: what was typed."""
+        self.name, self.out, self.formats = name, out, formats
+        self.mode, self.command = mode, command or f"python -m experiments {name}"
         self.start = time.perf_counter()
         self.written: list[Path] = []
         out.mkdir(parents=True, exist_ok=True)
@@ -78,16 +77,22 @@ class Report:
         print(flush=True)
 
     def figure(self, name: str, figure):
-        """Saves a figure as NAME.png."""
-        path = self.out / f"{name}.png"
-        figure.savefig(path)
+        """Saves a figure as NAME.png, and in other formats asked for."""
+        paths = save(figure, self.out / name, self.formats)
         plt.close(figure)
-        self.written.append(path)
+        for path in paths:
+            if path.suffix == ".png":
+                reduce_colours(path)
+            self.progress(f"figure {path}")
+        self.written += paths
 
     def numbers(self, values: dict):
-        """Saves numbers as JSON, named after the experiment."""
+        """Saves numbers as JSON, named after the experiment, with what they were made by."""
+        from experiments.provenance import provenance  # imports JAX, whose seconds belong to the run
+
+        made_by = provenance(self.command, self.mode, time.perf_counter() - self.start)
         path = self.out / f"{self.name}.json"
-        path.write_text(as_json(values) + "\n")
+        path.write_text(as_json({**values, "made_by": made_by}) + "\n")
         self.written.append(path)
 
     def close(self):

@@ -1,7 +1,7 @@
 """hhtjax: differentiable, functional time integrators for multibody dynamics.
 
 A system, a stepper, one run, and derivatives through all of it: `System`, `hht`, `simulate`, `fit`. What a step does to
-a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`.
+a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`, charts in `hhtjax.plot`.
 
     params ---> System(mass, force, constraint) ---> Stepper(begin, bind) ---> simulate, one scan ---> Solution
                                                                                       |
@@ -13,6 +13,7 @@ The house
 One room for each question, one floor above the other. An upper floor imports from lower ones, never the reverse, and a
 test says so (`tests/test_floors.py` holds the floors as data).
 
+    plot              charts of what the other rooms give; with the extra `plot`
     scenes            examples: systems with parameters and initial values
     identification    fits, and how far to trust them
     analysis          what a step does to a motion
@@ -39,6 +40,8 @@ and memory, so that a new entry is tested like all others. Beyond that, a test b
 what was not computed by the same code, and has been seen to fail.
 """
 
+import importlib
+
 from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
 from hhtjax.identification.arguments import Gaussian
@@ -64,6 +67,7 @@ from hhtjax.steppers.multistep import houbolt, park
 from hhtjax.steppers.rosenbrock import rosenbrock, rowda
 from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.systems import interop
 from hhtjax.systems.band_limited import band_limited, band_limited_motion, spline_gain_error
 from hhtjax.systems.consistent import ConsistentInitial, consistent_initial
 from hhtjax.systems.initial_values import PrecisionWarning
@@ -72,7 +76,7 @@ from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Explanation, explain, plain
 
 __all__ = [  # noqa: RUF022
-    "__version__", "analysis", "identification", "rotation", "scenes", "trigonometry",
+    "__version__", "analysis", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
     "FirstOrderSystem", "LinearSystem", "System", "PrecisionWarning", "ConsistentInitial", "consistent_initial",
     "Sampled", "band_limited", "band_limited_motion", "sampled", "spline_gain_error",
@@ -87,3 +91,14 @@ __all__ = [  # noqa: RUF022
     "FitResult", "Gaussian", "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
     "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip
+
+
+def __dir__():
+    return __all__
+
+
+def __getattr__(name):
+    """`hhtjax.plot`, imported when it is first asked for: it needs matplotlib, and nothing else does."""
+    if name == "plot":
+        return importlib.import_module("hhtjax.plot")
+    raise AttributeError(f"module 'hhtjax' has no attribute {name!r}")

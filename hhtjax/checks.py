@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import freeze, is_array, is_concrete, is_real
 
 
 def require_number(caller, name, value, valid, expectation):
@@ -63,15 +63,29 @@ def _in_other_order(names, expected):
 
 
 def require_params(caller, params):
-    """An error that names what is no number among the params: text, functions, objects."""
+    """The params as data, functions among them hidden; an error that names what is neither: text, objects."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         data = is_array(leaf) or hasattr(leaf, "__jax_array__") or isinstance(leaf, (bool, int, float, complex))
-        if not data or (isinstance(leaf, np.ndarray) and leaf.dtype.kind in "OUSMm"):
+        where = f"{caller}: `params{jax.tree_util.keystr(path)}`"
+        if callable(leaf) and not data:
+            _require_hashable(where, leaf)
+        elif not data or (isinstance(leaf, np.ndarray) and leaf.dtype.kind in "OUSMm"):
             shown = f"an array of {leaf.dtype}" if isinstance(leaf, np.ndarray) else repr(leaf)
             raise TypeError(
-                f"{caller}: `params{jax.tree_util.keystr(path)}` must be an array or a number; received {shown}. What "
-                "is none of them belongs into the functions of the system."
+                f"{where} must be an array, a number or a function; received {shown}. What is none of them belongs "
+                "into the functions of the system."
             )
+    return freeze(params)
+
+
+def _require_hashable(where, function):
+    try:
+        hash(function)
+    except TypeError:
+        raise TypeError(
+            f"{where} must be hashable, because a function is static under jit; received {function!r}. Make it a "
+            "pytree (an equinox.Module, a jax.tree_util.Partial), whose arrays are data."
+        ) from None
 
 
 def describe(x):

@@ -17,6 +17,11 @@ from hhtjax.xla import staged
 
 __all__ = ["cos", "sin", "sincos"]
 
+
+def __dir__():
+    return __all__
+
+
 RANGE = 1e5  # largest |x|, rad
 
 # pi/2 in three parts. Whole numbers up to 2^17 times one of the first two, of 36 bits, are exact.

@@ -9,7 +9,7 @@ from functools import reduce
 import jax
 import numpy as np
 from jax.extend.core import Literal
-from numpy_arithmetic import ARITHMETIC, INEXACT, QUIET, SUMS, sum_over
+from numpy_arithmetic import ARITHMETIC, INEXACT, QUIET, SIGNLESS, SUMS, sum_over
 from numpy_places import PLACES
 
 
@@ -54,7 +54,11 @@ class Numbers:
             results = [_dot_general(eqn, *values)]
         else:
             results = by_jax(eqn, values)
-        return [self.disturbed(y) for y in results] if self.noise is not None and name not in QUIET else results
+        if self.noise is None or name in QUIET:
+            return results
+        if name in SIGNLESS:
+            results = [np.where(y == 0, np.copysign(y, self.noise.uniform(-1, 1)), y) for y in results]
+        return [self.disturbed(y) for y in results]
 
     def disturbed(self, x):
         if not np.issubdtype(x.dtype, np.inexact):
@@ -125,7 +129,7 @@ def _scan(self, params, *values):
         results = self(params["jaxpr"], *consts, *carry, *(x[i] for x in xs))
         carry, rows[i] = results[: second - first], results[second - first :]
     if not rows:
-        return [*carry, *(np.zeros(v.shape, v.dtype) for v in params["jaxpr"].out_avals[second - first :])]
+        return [*carry, *(np.zeros((0, *v.shape), v.dtype) for v in params["jaxpr"].out_avals[second - first :])]
     return [*carry, *map(np.stack, zip(*rows, strict=True))]
 
 
@@ -179,6 +183,8 @@ def _iota(eqn):
 
 def _convert(eqn, x):
     to = eqn.outvars[0].aval.dtype
+    if x.dtype == jax.dtypes.float0:  # the derivative of a truth
+        return [np.zeros(x.shape, to)]
     if np.issubdtype(to, np.integer) and np.issubdtype(x.dtype, np.floating):  # NaN, and numbers too large
         low, high = np.iinfo(to).min, np.iinfo(to).max
         inside = (x > low) & (x < high)

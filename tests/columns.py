@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from by_numpy import Numbers, is_close, signs
+from by_numpy import Numbers
 from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
+from verdicts import judge
 
 from hhtjax.xla.kernels import STAGED, staged
 from hhtjax.xla.linear_maps import linear_map
@@ -235,6 +236,9 @@ def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
             trace, at, reference, *directions = make(column)
             found = Numbers()(trace, *at)
         except Exception as error:
+            if _fails(make):  # of x**0, linearize knows that its derivative is zero, and jvp does not
+                count["plain fails too"] += 1
+                continue
             count["error"] += 1
             yield Difference(name, mode, "".join(traceback.format_exception(error)[-6:]), None)
             continue
@@ -258,43 +262,11 @@ def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
             yield Difference(name, mode, found, expected)
 
 
-def judge(found, reference, values, rtol, has_sums):
-    """In a word, and what is expected. reference: Numbers -> that; values: how many are no derivatives;
-    has_sums: the sign of a zero is rounding."""
-    expected = reference(Numbers())
-    if len(found) != len(expected):
-        return "different number of results", expected
-    spread, is_matrix, worst = None, values == 0, "same"
-    for i, (a, b) in enumerate(zip(found, expected, strict=True)):
-        if i >= values and a.shape == b.shape:
-            known = ~np.isnan(b) & ~(np.isnan(a) & is_matrix)
-            a, b = np.where(known, a, 0), np.where(known, b, 0)
-        near = is_close(a, b, rtol)
-        if near and (i >= values or has_sums or np.array_equal(signs(a), signs(b))):
-            continue
-        if a.shape != b.shape or a.dtype != b.dtype:
-            return "different", expected
-        if spread is None:
-            spread = [reference(Numbers(np.random.default_rng(i))) for i in range(6)]
-        others = [x[i] for x in spread]
-        if near:
-            if not any((signs(x) != signs(b)).any() for x in others):
-                return "different signs of zero", expected
-            worst = "zero by rounding"
-        elif not _within(a, b, others, rtol):
-            return "different", expected
-        else:
-            worst = "badly conditioned"
-    return worst, expected
-
-
-def _within(a, b, others, rtol):
-    """Whether a is as near to b as other roundings bring it."""
-    if not np.issubdtype(b.dtype, np.inexact):
-        return any((x != b).any() for x in others)
-    with np.errstate(all="ignore"):
-        if any((np.isfinite(x) != np.isfinite(b)).any() for x in others):
-            return True
-        finite = np.isfinite(b)
-        reach = max(np.abs(x - b)[finite].max(initial=0.0) for x in others)
-        return is_close(a, b, max(rtol, 30 * reach / max(np.abs(b)[finite].max(initial=0.0), 1e-300)))
+def _fails(make):
+    """Whether the program without the machinery does, in this mode."""
+    try:
+        trace, at, *_ = make(lambda f: f)
+        Numbers()(trace, *at)
+    except Exception:
+        return True
+    return False

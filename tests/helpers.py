@@ -61,7 +61,7 @@ def with_tolerance(stepper, tolerance):
     """The same, Newton's tolerance changed, where there is one."""
     if getattr(stepper, "options", None) is None:
         return stepper
-    return replace(stepper, options=stepper.options._replace(tolerance=tolerance))
+    return replace(stepper, options=replace(stepper.options, tolerance=tolerance))
 
 
 def tight(stepper):

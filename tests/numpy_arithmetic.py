@@ -107,6 +107,7 @@ ARITHMETIC = {
     **{"reduce_or": _over_axes(np.bitwise_or.reduce), "reduce_and": _over_axes(np.bitwise_and.reduce)},
 }
 SUMS = ("reduce_sum", "dot_general", "cumsum", "reduce_prod", "cumprod", "cumlogsumexp", "reduce_window_sum")
+SIGNLESS = ("reduce_sum", "dot_general", "cumsum", "reduce_window_sum")  # where they give zero, its sign is rounding
 INEXACT = ("div", "rem", "pow", "integer_pow", "round")  # NumPy does otherwise with integers
 QUIET = {
     *("select_n", "copy", "stop_gradient", "neg", "abs", "sign", "floor", "ceil", "gather", "dynamic_slice", "round"),

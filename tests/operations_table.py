@@ -196,6 +196,7 @@ TABLE = {
         *("lax.custom_linear_solve(lambda v: S @ v, x, lambda _, b: jnp.linalg.solve(S, b), lambda _, b: jnp.linalg.solve(S.T, b))",),
         *("lax.custom_linear_solve(lambda v: 2 * v, x, lambda f, b: b / 2)", "lax.custom_linear_solve(lambda v: s * v, x,"
           " lambda f, b: b / s, symmetric=True)", "jnp.linalg.solve(S, x)", "jnp.linalg.inv(S)", "jnp.linalg.det(S)"),
+        *("jnp.linalg.solve(jnp.diag(jnp.stack([2 + x[0], 4.0])), jnp.stack([x[0], 0.5]))",),
         *("jax.scipy.sparse.linalg.cg(lambda v: (S + S.T) @ v, x)[0]", "jnp.linalg.cholesky(S + S.T)", "lax.stop_gradient(x) * x"),
         *("staged(lambda x, y: (x, jnp.sin(x - y), y))(x, y)", "staged(lambda x: structural(np.eye(3)) @ x)(x)", "lax.optimization_barrier(x)"),
         *("structural(np.array([0.0, 1.0, 0.0])) * x + y", "jax.pure_callback(np.sin, x, x, vmap_method='sequential')"),

@@ -79,9 +79,27 @@ def test_so_are_those_of_other_functions_and_any_other_names_pass():
 NO_DATA = [("steel", "'steel'"), (np.array(["a"]), "an array of <U1"), (np.array([None]), "an array of object")]
 
 
-@pytest.mark.parametrize(("value", "received"), [*NO_DATA, (len, "<built-in function len>")])
-def test_params_are_numbers(value, received):
-    message = f"`params['k'][1]` must be an array or a number; received {received}. What is none of them"
+class Unhashable:
+    """A function that cannot be part of a program."""
+
+    __hash__ = None
+    __call__ = __repr__ = lambda *_: "Unhashable()"
+
+
+WORDS = "an array, a number or a function"
+ENDS = {"Unhashable()": "Make it a pytree"}
+
+
+@pytest.mark.parametrize(
+    ("value", "received", "what"),
+    [
+        *((*x, WORDS) for x in NO_DATA),
+        (Unhashable(), "Unhashable()", "hashable, because a function is static under jit"),
+    ],
+)
+def test_params_are_numbers_or_functions(value, received, what):
+    end = ENDS.get(received, "What is none of them")
+    message = f"`params['k'][1]` must be {what}; received {received}. {end}"
     for call in (
         lambda params: run(System(np.ones(2), pull), params=params),
         lambda params: hhtjax.sweep(

@@ -1,12 +1,16 @@
 """The runner, and Silverbox as a user runs it: on the measured record where there is one, else on a generated one."""
 
+import importlib
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from experiments.__main__ import EXPERIMENTS
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("HHTJAX_DATA") or ROOT.parent / "shared" / "data")
@@ -28,8 +32,39 @@ def experiments(*arguments, **environment):
 def test_without_a_name_they_are_listed():
     result = experiments()
     assert result.returncode == 0
-    for name in ("silverbox", "double_pendulum_measured", "stiff_joint", "vehicle", "squeezer", "kim2019", "all"):
+    for name in (*EXPERIMENTS, "all", "page", "check"):
         assert any(line.split()[:1] == [name] and len(line) > 30 for line in result.stdout.splitlines())
+
+
+def test_a_full_run_is_for_those_that_show_a_part_by_default():
+    """The list says which."""
+    (line,) = (line for line in experiments().stdout.splitlines() if "with --full" in line)
+    assert line.split()[0] == "silverbox"
+    for arguments in (["vehicle", "--full"], ["silverbox", "--full", "--fast"]):
+        result = experiments(*arguments)
+        assert result.returncode == 2
+        assert "--full" in result.stderr
+
+
+def test_how_much_is_run_and_what_the_numbers_say_of_it(monkeypatch, tmp_path):
+    """Silverbox by default in part, `all` in full, with a page; experiments without --full take two arguments."""
+    runner = importlib.import_module("experiments.__main__")
+    monkeypatch.setattr(runner, "EXPERIMENTS", {name: EXPERIMENTS[name] for name in ("silverbox", "vehicle")})
+    for module in runner.EXPERIMENTS.values():
+        stub = SimpleNamespace(run=lambda report, *options: report.numbers({"options": options}))
+        monkeypatch.setitem(sys.modules, f"experiments.{module}", stub)
+
+    def told(name, *arguments):
+        assert runner.main([*arguments, "--out", str(tmp_path)]) == 0
+        numbers = json.loads((tmp_path / f"{name}.json").read_text())
+        return numbers["options"], numbers["made_by"]["mode"], numbers["made_by"]["command"].split()[3:]
+
+    assert told("silverbox", "silverbox") == ([False, False], "part", ["silverbox"])
+    assert told("silverbox", "silverbox", "--full") == ([False, True], "full", ["silverbox", "--full"])
+    assert told("silverbox", "silverbox", "--fast") == ([True, False], "fast", ["silverbox", "--fast"])
+    assert told("vehicle", "vehicle") == ([False], "full", ["vehicle"])
+    assert told("silverbox", "all") == ([False, True], "full", ["silverbox", "--full"])
+    assert "python -m experiments vehicle" in (tmp_path / "experiments.html").read_text(encoding="utf-8")
 
 
 def test_an_unknown_name_gives_the_list_and_fails():
@@ -52,21 +87,26 @@ def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path):
     assert model["c_in_s"] == pytest.approx(2.2e-4, rel=1e-2)
     assert numbers["multisine_mV"] < 0.5
     assert len(list(tmp_path.glob("*.png"))) == 3
+    assert numbers["made_by"]["command"] == "python -m experiments silverbox --fast"
+    checked = experiments("check", "--out", str(tmp_path))
+    assert checked.returncode == 2
+    assert "silverbox: a smoke run (--fast) has less data" in checked.stdout
 
 
 @pytest.mark.slow
-def test_silverbox_on_the_measured_record():
-    """Full training record, 8 steps per sample, 6 parameters: the errors that this model reaches."""
+def test_silverbox_on_the_measured_record(tmp_path):
+    """As README's first command runs it: the best model on the whole record, one figure; the errors that it reaches."""
     if not (DATA / "silverbox").is_dir():
         pytest.skip("the measured Silverbox record is not here: set HHTJAX_DATA to the folder that holds silverbox/")
-    from experiments.identification import data, silverbox
-
-    sets = data.load(fast=False)
-    assert sets.measured
-    result, *_ = silverbox.fit_training(sets.train, silverbox.SUBSTEPS, 0.0)
-    assert result.converged
-    assert silverbox.rmse(result.residual) == pytest.approx(0.2987, abs=5e-4)
-    expected = {"arrow_full": 0.3894, "multisine": 0.3043}
+    result = experiments("silverbox", "--out", str(tmp_path), HHTJAX_DATA=str(DATA))
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("Silverbox, the measured record")
+    numbers = json.loads((tmp_path / "silverbox.json").read_text())
+    expected = {"train": 0.2237, "arrow_full": 0.2778, "arrow_no_extrapolation": 0.2285, "multisine": 0.2325}
     for name, value in expected.items():
-        _, error, _ = silverbox.score(result.params[0], sets.tests[name], silverbox.SUBSTEPS, 0.0)
-        assert error == pytest.approx(value, abs=5e-4)
+        assert numbers[f"{name}_mV"] == numbers["models"]["10 parameters"][f"{name}_mV"]
+        assert numbers[f"{name}_mV"] == pytest.approx(value, abs=5e-4)
+    assert [path.name for path in tmp_path.glob("*.png")] == ["silverbox_fit.png"]
+    checked = experiments("check", "--out", str(tmp_path))
+    assert checked.returncode == 0, checked.stdout
+    assert checked.stdout.startswith("silverbox: 30 numbers compared that it has, 0 worse.")

@@ -1,11 +1,14 @@
-"""The options of the generalised-alpha family: listed once, and found by help() and completion."""
+"""The options of the generalised-alpha family: listed once, and found by help(), completion and type checkers."""
 
 import inspect
+from pathlib import Path
+from typing import get_type_hints
 
+import jedi
 import pytest
 
 import hhtjax
-from hhtjax.steppers.options import Options
+from hhtjax.steppers.options import OPTIONS, Keywords, Options
 from hhtjax.steppers.residual import hht_coefficients
 
 FAMILY = [hhtjax.hht, hhtjax.newmark, hhtjax.bossak, hhtjax.generalized_alpha]
@@ -14,14 +17,27 @@ FAMILY = [hhtjax.hht, hhtjax.newmark, hhtjax.bossak, hhtjax.generalized_alpha]
 @pytest.mark.parametrize("make", FAMILY)
 def test_each_constructor_shows_the_options_by_name(make):
     shown = inspect.signature(make).parameters
-    assert set(Options._fields) < set(shown)
+    assert set(OPTIONS) < set(shown)
     assert shown["linearize"].default is None
     assert "held" in str(shown["linearize"].annotation)
     assert all(x.kind is not inspect.Parameter.VAR_KEYWORD for x in shown.values())
 
 
+@pytest.mark.parametrize("make", FAMILY)
+def test_an_editor_that_runs_nothing_finds_them(make):
+    """jedi, as in editors; a kernel's completion asks `inspect.signature`, which is tested above."""
+    line = f"hhtjax.{make.__name__}(li"
+    script = jedi.Script(f"import hhtjax\n{line}", project=jedi.Project(Path(hhtjax.__file__).parents[1]))
+    assert "linearize=" in {found.name_with_symbols for found in script.complete(2, len(line))}
+
+
+def test_type_checkers_are_told_the_same():
+    assert get_type_hints(Keywords) == get_type_hints(Options)
+    assert list(get_type_hints(Keywords)) == OPTIONS
+
+
 def test_each_option_is_explained():
-    for name in Options._fields:
+    for name in OPTIONS:
         assert f"\n        {name}: " in inspect.cleandoc(hhtjax.hht.__doc__).replace("\n    ", "\n        ")
 
 

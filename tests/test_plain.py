@@ -10,7 +10,7 @@ import pytest
 from linked_pendulums import N, end, links, loss, on_cpu, paths
 
 import hhtjax
-from hhtjax.xla import gate, kernels
+from hhtjax.xla import gate, inspection, kernels, trial
 
 GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged", "hhtjax_one_kernel", "hhtjax_inside", "hhtjax_kernels"
 
@@ -83,3 +83,34 @@ def test_a_wish_that_is_none(monkeypatch):
     monkeypatch.setenv(gate.VARIABLE, "yes")
     with pytest.raises(ValueError, match="HHTJAX_PLAIN must be 0 or 1; received 'yes'"):
         end(2.0)
+
+
+@on_cpu
+def test_a_program_that_xla_refuses_runs_on_plain_jax(monkeypatch):
+    """As when a new XLA refuses a kernel of which all operations were known to compile."""
+    monkeypatch.setattr(inspection, "KNOWN", inspection.KNOWN | {"sort"})
+    monkeypatch.setattr(trial, "_refusal", lambda text: None)
+    system = hhtjax.System(mass=jnp.ones(3), force=lambda q, v, t, k: -k * jnp.sort(q) * q)
+
+    def final(q0):
+        return hhtjax.simulate(system, hhtjax.rk4(), q0, jnp.zeros(3), 2.0, dt=0.1, num_steps=3).q[-1]
+
+    q0 = jnp.array([0.3, 0.1, 0.2])
+    with pytest.warns(RuntimeWarning, match="XLA refused the fast program"):
+        found = final(q0)
+    with hhtjax.plain():
+        assert np.allclose(found, final(q0), rtol=1e-14)
+    with pytest.raises(jax.errors.JaxRuntimeError):  # XLA sees the user's program after he has left it
+        jax.jit(final)(q0)
+
+
+def test_an_error_of_the_users_own_stays():
+    def fails(x):
+        raise ValueError("mine")
+
+    system = hhtjax.System(
+        mass=jnp.ones(1),
+        force=lambda q, v, t, k: jax.pure_callback(fails, q, q),
+    )
+    with pytest.raises(jax.errors.JaxRuntimeError, match="mine"):
+        hhtjax.simulate(system, hhtjax.rk4(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=3)

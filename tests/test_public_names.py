@@ -15,7 +15,7 @@ import pytest
 import hhtjax
 
 ROOT = Path(__file__).parents[1]
-ROOMS = [hhtjax, hhtjax.analysis, hhtjax.identification, hhtjax.rotation, hhtjax.trigonometry]
+ROOMS = [hhtjax, hhtjax.analysis, hhtjax.identification, hhtjax.interop, hhtjax.rotation, hhtjax.trigonometry]
 FUNCTIONS = {
     f"{room.__name__}.{name}": getattr(room, name)
     for room in ROOMS
@@ -72,8 +72,8 @@ def test_arguments_of_one_meaning_have_one_name_and_order(name):
 def test_the_version_is_stated_once():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["project"]["dynamic"] == ["version"]
-    module, _, name = project["tool"]["setuptools"]["dynamic"]["version"]["attr"].rpartition(".")
-    assert getattr(importlib.import_module(module), name) == hhtjax.__version__ == version("hhtjax")
+    stated = project["tool"]["hatch"]["version"]["path"].removesuffix("/__init__.py").replace("/", ".")
+    assert importlib.import_module(stated).VERSION == hhtjax.__version__ == version("hhtjax")
 
 
 def test_every_name_in_the_readme_exists():

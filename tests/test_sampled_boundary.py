@@ -34,6 +34,21 @@ ERRORS = [
     *((ValueError, f"`t0` must be finite; received {x}.", {"t0": x}) for x in (NAN, INF, -INF)),
     *((TypeError, f"`t0` {REAL} {x!r}.", {"t0": x}) for x in ("now", None, True, 1j, np.array([0.1]))),
 ]
+UNEVEN = np.arange(9.0) ** 1.5
+TIMES = [
+    (ValueError, "in the place of dt and t0; received dt=0.25, t0=0.0 too.", {"dt": DT}),
+    (ValueError, "in the place of dt and t0; received dt=None, t0=1.0 too.", {"t0": 1.0}),
+    (TypeError, "`times` must be real numbers; received an array of complex128.", {"times": 1j * UNEVEN}),
+    (ValueError, "`times` must have shape (9,), one for each sample; received shape (8,).", {"times": UNEVEN[:-1]}),
+    (ValueError, "`times` must have shape (9,), one for each sample; received shape ().", {"times": 0.1}),
+    (
+        ValueError,
+        "strictly increase; received 2.0 and 2.0 at samples 1 and 2.",
+        {"times": [1.0, 2.0, 2.0, *range(3, 9)]},
+    ),
+    (ValueError, "strictly increase; received 6.0 and nan at samples 7 and 8.", {"times": [*range(-1, 7), NAN]}),
+    (ValueError, "strictly increase; received -inf and 0.0 at samples 0 and 1.", {"times": [-INF, *range(8)]}),
+]
 
 
 @pytest.mark.parametrize(("error", "message", "arguments"), ERRORS)
@@ -41,6 +56,13 @@ def test_arguments_are_checked(error, message, arguments):
     with pytest.raises(error, match=re.escape(message)) as caught:
         sampled(**{"values": VALUES, "dt": DT, **arguments})
     assert str(caught.value).startswith("sampled: ")
+
+
+@pytest.mark.parametrize(("error", "message", "arguments"), TIMES)
+def test_times_are_checked(error, message, arguments):
+    with pytest.raises(error, match=re.escape(message)) as caught:
+        sampled(VALUES, **{"times": UNEVEN, **arguments})
+    assert str(caught.value).startswith("sampled: `times` must ")
 
 
 def test_the_sample_that_is_not_finite_is_named():

@@ -140,6 +140,7 @@ def test_progress_changes_neither_result_nor_gradient(capfd):
     assert "step 300 of 300" in shown
     assert "step 3 of 300" in shown
     assert len(shown.split("\r")) == 101  # a hundred times, no oftener
+    assert shown.count("\n") == 1  # and one line stays
     for derivative in (jax.grad(loss), jax.jacfwd(loss)):
         same(derivative(1.0, True), derivative(1.0, False))
     batch = jax.vmap(loss, in_axes=(0, None))

@@ -35,6 +35,25 @@ def test_the_equation_of_motion_gives_stiffness_and_damping_without_a_guess():
     np.testing.assert_allclose(found.params["c"], joints["c"], rtol=0.1)
 
 
+def test_the_equation_of_motion_from_samples_at_any_times():
+    """A decaying oscillation, its samples 2 to 18 ms apart: as good as from equal distances."""
+    spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
+    rng = np.random.default_rng(0)
+    times = 0.3 + 0.01 * np.arange(1000) + np.append(0.0, rng.uniform(-0.004, 0.004, 999))
+
+    def estimate(t, **grid):
+        q = np.exp(-0.1 * t) * np.cos(3.0 * t)  # k = 9.01, c = 0.2
+        residuals = hhtjax.equation_error(spring, q[:, None], cutoff=5.0, **grid)
+        return hhtjax.fit(residuals, {"k": 1.0, "c": 1.0}, covariance=False).params
+
+    for found in (estimate(times, times=times), estimate(0.3 + 0.01 * np.arange(1000), dt=0.01, t0=0.3)):
+        np.testing.assert_allclose([found["k"], found["c"]], [9.01, 0.2], rtol=0.01)
+    with pytest.raises(ValueError, match=r"sampled: `times` must stand in the place of dt and t0; received dt=0.1"):
+        hhtjax.equation_error(spring, times[:, None], 0.1, 5.0, times=times)
+    with pytest.raises(TypeError, match="`cutoff` must be a real number; received None"):
+        hhtjax.equation_error(spring, times[:, None], times=times)
+
+
 def test_sensors_show_a_delayed_signal():
     ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: {"x": 0 * q["x"] + 2.0})
     zero = {"x": 0.0}

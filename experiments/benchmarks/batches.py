@@ -6,13 +6,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.benchmarks.against_c import ALPHA, DT, c_runs
 from experiments.benchmarks.measure import least_seconds, one_core
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import double_pendulum
 
 BLOCK = 256
@@ -108,11 +108,11 @@ def run(report, fast):
 
 def figure(rows, columns):
     """Time per step and member against the size of the batch."""
-    drawn, axes = plt.subplots(figsize=(6, 3.6))
+    drawn, axes = subplots(width=85, height=75)
     for i, name in enumerate(columns):
         mine = [row for row in rows if name in row]
         style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 4, "lw": 1}
         axes.loglog([row["members"] for row in mine], [row[name] for row in mine], **style, label=name)
     axes.set(xlabel="members of the batch", ylabel="time per step and member (ns)")
-    drawn.legend(loc="outside lower center", ncols=3, fontsize=8)
+    legend(axes)
     return drawn

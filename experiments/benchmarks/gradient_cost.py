@@ -10,11 +10,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.report import COLOURS, MARKERS, Report
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import double_pendulum
 
 DT = 1e-4
@@ -101,7 +101,7 @@ def slope(rows):
 
 def plot(report: Report, rows):
     """Time ratio and temporary memory."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2))
+    figure, (left, right) = subplots(1, 2, width=175, height=80)
     for i, saved in enumerate(("path", "end")):
         mine = [row for row in rows if row["saved"] == saved]
         steps = np.array([row["steps"] for row in mine])
@@ -114,5 +114,5 @@ def plot(report: Report, rows):
     right.set_ylabel("temporary memory of the gradient (MB)")
     for axis in (left, right):
         axis.set_xlabel("number of steps")
-        axis.legend()
+        legend(axis)
     report.figure("gradient_cost", figure)

@@ -1,12 +1,12 @@
 """Constraint drift over long runs: of the steps none, of the index-1 ODE without end."""
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.cardona_geradin1989.index_1 import unconstrained, violation
 from experiments.report import COLOURS, MARKERS
 from hhtjax import hht, rk4, simulate
+from hhtjax.plot import subplots
 from hhtjax.scenes import pendulum, slider_crank
 
 ALPHA = -0.05
@@ -71,7 +71,7 @@ def run(report, fast):
 
 def figure(entries):
     """Largest violations by window."""
-    drawn, panels = plt.subplots(2, len(SCENES), figsize=(8.6, 5.2), sharex=True)
+    drawn, panels = subplots(2, len(SCENES), width=175, height=120, sharex=True)
     units = {"pendulum": "m$^2$", "slider-crank": "m"}
     for column, scene in zip(panels.T, SCENES, strict=True):
         for i, e in enumerate(e for e in entries if e["scene"] == scene):
@@ -80,7 +80,6 @@ def figure(entries):
             for axes, key in zip(column, ("position", "rate"), strict=True):
                 axes.semilogy(steps, e[key], **style)
         column[0].set(title=f"{scene}, h = {1e3 * SCENES[scene][1]:g} ms", ylabel=f"max |$\\Phi$| ({units[scene]})")
-        column[0].title.set_fontsize(9)
         column[1].set(xlabel="number of steps", ylabel=f"max |d$\\Phi$/dt| ({units[scene]}/s)")
-    drawn.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    drawn.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return drawn

@@ -5,7 +5,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.report import COLOURS, MARKERS
@@ -17,6 +16,7 @@ from hhtjax.analysis import (
     oscillator_matrix,
     transient_growth,
 )
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import pendulum, squeezer
 
 ALPHAS = (0.0, -0.05, -0.1, -0.3)
@@ -166,7 +166,7 @@ def run(report, fast):
 
 def figure(curves, roots, growth):
     """Fig. 1; the roots of the oscillator on their way to infinity; the tension of the pendulum."""
-    drawn, (left, middle, right) = plt.subplots(1, 3, figsize=(10.4, 3.7))
+    drawn, (left, middle, right) = subplots(1, 3, width=175, height=85)
     style = {alpha: {"color": COLOURS[i], "marker": MARKERS[i]} for i, alpha in enumerate(FIG1_ALPHAS)}
     n = np.linspace(0, NUM_STEPS, 1001)
     for alpha, curve in sorted(curves.items(), reverse=True):
@@ -174,8 +174,7 @@ def figure(curves, roots, growth):
         shown = np.arange(0, NUM_STEPS + 1, 4) if abs(alpha) < 0.05 else np.arange(0, 41, 2)
         left.plot(shown, curve[shown], **style[alpha], ls="", ms=3.5, label=f"$\\alpha$ = {alpha:g}")
     left.set(xlim=(0, NUM_STEPS), ylim=(0, 24), xlabel="step n", ylabel=r"$|D_{23}|$: what $A^n$ adds to $\mu^n$")
-    left.set_title("Fig. 1: lines closed form, markers the step", fontsize=9)
-    left.legend(fontsize=7, loc="upper right")
+    legend(left, title="Fig. 1 (lines: closed form)")
 
     angle = np.linspace(0, 2 * np.pi, 300)
     middle.plot(np.cos(angle), np.sin(angle), color="0.7", lw=0.8)
@@ -187,8 +186,7 @@ def figure(curves, roots, growth):
     middle.plot([], [], "ko", fillstyle="none", label="index 3, double")
     middle.plot([], [], "k|", ms=9, mew=1.5, label="GGL, simple")
     middle.set(xlabel=r"Re $\mu$", ylabel=r"Im $\mu$", aspect="equal", xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
-    middle.set_title("eigenvalues of the step", fontsize=9)
-    middle.legend(fontsize=7, loc=(0.36, 0.57))
+    legend(middle, title="eigenvalues of the step")
 
     steps = np.arange(1, RUN_STEPS + 1)
     for (formulation, alpha), tension in growth.items():
@@ -198,6 +196,5 @@ def figure(curves, roots, growth):
     right.plot([], [], "k-", label="index 3")
     right.plot([], [], "k--", lw=1, label="GGL")
     right.set(xlabel="step n", ylabel="tension per radial velocity, N s/m", xlim=(1, RUN_STEPS), ylim=(1, 1e7))
-    right.set_title("pendulum, h = 1 ms", fontsize=9)
-    right.legend(fontsize=7, loc="upper left")
+    legend(right, title="pendulum, h = 1 ms")
     return drawn

@@ -7,12 +7,12 @@ damped runs oscillate at first.
 
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from experiments.cardona_geradin1989.runs import STARTS, constrained_hht, trace
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import pendulum
 
 SPEED, STEP_SIZE = 2.505, 5e-3  # m/s, s
@@ -105,13 +105,14 @@ def run(report, fast):
 
 def paper_figure(times, true, paths):
     """The paper's Figs. 4 to 7."""
-    drawn, axes = plt.subplots(2, 2, figsize=(8.6, 5.4), sharex=True)
+    drawn, axes = subplots(2, 2, width=175, height=140, sharex=True)
     shown = times <= DURATION + 1e-9
     t = times[shown]
     q = paths["HHT, alpha = -0.05", "zero"][0][shown]
     axes[0, 0].plot(t, q[:, 0], label="horizontal, x")
     axes[0, 0].plot(t, q[:, 1] - q[0, 1], ls="--", label="vertical, y - y(0)")
-    axes[0, 0].set(title="Fig. 4: positions", ylabel="displacement (m)")
+    axes[0, 0].set_ylabel("displacement (m)")
+    legend(axes[0, 0], title="Fig. 4: positions")
     panels = {
         axes[0, 1]: ("Fig. 5: trapezoidal rule", ["trapezoidal rule"]),
         axes[1, 0]: ("Fig. 6: HHT", ["HHT, alpha = -0.05", "HHT, alpha = -0.1"]),
@@ -123,11 +124,9 @@ def paper_figure(times, true, paths):
             style = {"color": COLOURS[i], "lw": 0.7 if i == 0 else 1.3, "label": name.replace("alpha", "$\\alpha$")}
             panel.plot(t[1:], paths[name, "zero"][1][shown][1:, 0], **style)
         panel.plot(t, true[1][shown][:, 0], color="black", ls=":", lw=1, label="exact")
-        panel.set(title=title, ylabel="horizontal acceleration (m/s$^2$)")
+        panel.set_ylabel("horizontal acceleration (m/s$^2$)")
+        legend(panel, title=title)
     axes[1, 0].set_ylim(-12.5, 12.5)
-    for panel in axes.flat:
-        panel.legend(fontsize=7)
-        panel.title.set_fontsize(9)
     for panel in axes[1]:
         panel.set_xlabel("time (s)")
     return drawn
@@ -135,7 +134,7 @@ def paper_figure(times, true, paths):
 
 def tension_figure(times, true, paths):
     """Error of the tension against the number of steps, from both starts."""
-    drawn, panels = plt.subplots(1, 2, figsize=(8.6, 3.6), sharey=True)
+    drawn, panels = subplots(1, 2, width=175, height=85, sharey=True)
     for panel, start in zip(panels, STARTS, strict=True):
         for i, name in enumerate(METHODS):
             error = np.abs(paths[name, start][2] - true[2])[1:]
@@ -143,7 +142,6 @@ def tension_figure(times, true, paths):
             style = {"marker": MARKERS[i], "ms": 4, "lw": 1, "mfc": "none" if i > 2 else None, "markevery": (i, 5)}
             panel.semilogy(np.arange(1, 41) * 10, worst, color=COLOURS[i], label=name, **style)
         panel.set(title=f"from {start} initial accelerations", xlabel="number of steps")
-        panel.title.set_fontsize(9)
     panels[0].set_ylabel("error of the tension (N), largest of 10 steps")
-    drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return drawn

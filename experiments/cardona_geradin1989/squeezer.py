@@ -10,6 +10,7 @@ from experiments.cardona_geradin1989.index_1 import reference
 from experiments.cardona_geradin1989.runs import constrained_hht
 from experiments.report import COLOURS, MARKERS, side_by_side
 from hhtjax import newmark, simulate
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import squeezer
 
 DURATION, NUM_STEPS = 0.02, 400  # s; the paper's
@@ -109,15 +110,15 @@ def draw_mechanism(axes, q, strength=1.0):
 
 def configurations(times, q):
     """Fig. 17: four times, the start faint behind."""
-    drawn, panels = plt.subplots(1, len(SHOWN), figsize=(9.6, 3.6), sharey=True)
+    drawn, panels = subplots(1, len(SHOWN), width=175, height=75, sharey=True)
     for axes, t in zip(panels, SHOWN, strict=True):
         if t:
             draw_mechanism(axes, q[0], 0.2)
         draw_mechanism(axes, q[np.searchsorted(times, t - 1e-9)])
-        axes.set_title(f"t = {1e3 * t:g} ms", fontsize=9)
+        axes.set_title(f"t = {1e3 * t:g} ms")
         axes.label_outer()
     handles, names = panels[0].get_legend_handles_labels()
-    drawn.legend(handles, names, loc="outside lower center", ncols=len(NAMES), fontsize=8)
+    drawn.legend(handles, names, loc="outside lower center", ncols=len(NAMES))
     return drawn
 
 
@@ -136,38 +137,34 @@ def node_figure(times, exact, paths):
     labels = "x (mm)", "acceleration in x (km/s$^2$)", "angle (rad)"
     true = node_5(*exact[:3])
     moved = {name: node_5(*paths[name][:3]) for name in names}
-    drawn, axes = plt.subplots(3, 2, figsize=(8.2, 6.9))
+    drawn, axes = subplots(3, 2, width=175, height=205)
     for panel, (title, (what, shown, until)) in zip(axes.flat, panels.items(), strict=False):
         few = slice(0, until * NUM_STEPS + 1)
         for name in shown:
             style = {"color": colours[name], "ls": lines[name], "lw": 1, "label": name.replace("alpha", "$\\alpha$")}
             panel.plot(1e3 * times[few], moved[name][what][few], **style)
         panel.plot(1e3 * times[few], true[what][few], color="black", ls=":", lw=1, label="exact")
-        panel.set(title=title, ylabel=labels[what], xlabel="time (ms)")
-        panel.legend(fontsize=7)
+        panel.set(ylabel=labels[what], xlabel="time (ms)")
+        legend(panel, title=title)
     axes[2, 0].set_ylim(-40, 60)
     for i, name in enumerate(names):
         error = np.abs(paths[name][2] - exact[2])[1:].max(axis=1).reshape(-1, 20).max(axis=1)
         style = {"color": colours[name], "marker": MARKERS[i], "ms": 4, "lw": 1, "markevery": (i, 6), "label": name}
         axes[2, 1].semilogy(1e3 * times[20::20], error, **style)
-    axes[2, 1].set(
-        title="all angles", xlabel="time (ms)", ylabel="error of acceleration (rad/s$^2$)", ylim=(None, 1e13)
-    )
-    axes[2, 1].legend(fontsize=7)
-    for panel in axes.flat:
-        panel.title.set_fontsize(9)
+    axes[2, 1].set(xlabel="time (ms)", ylabel="error of acceleration (rad/s$^2$)")
+    legend(axes[2, 1], title="all angles")
     return drawn
 
 
 def animate(report, times, q, frames):
     """The squeezer in motion until t = 0.03 s."""
-    figure, axes = plt.subplots(figsize=(2.9, 3.4), dpi=100)
+    figure, axes = subplots(width=74, height=86)
     shown = np.searchsorted(times, np.linspace(0, squeezer.squeezer().duration, frames, endpoint=False) - 1e-9)
 
     def draw(i):
         axes.clear()
         draw_mechanism(axes, q[shown[i]])
-        axes.set_title(f"t = {1e3 * times[shown[i]]:4.1f} ms", fontsize=9)
+        axes.set_title(f"t = {1e3 * times[shown[i]]:4.1f} ms")
 
     animation.save(report, "cardona_geradin1989_squeezer", figure, draw, frames)
     plt.close(figure)

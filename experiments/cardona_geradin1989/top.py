@@ -12,6 +12,7 @@ from experiments.cardona_geradin1989 import animation
 from experiments.cardona_geradin1989.runs import constrained_hht, end, trace
 from experiments.report import COLOURS, MARKERS, side_by_side
 from hhtjax import conventional_hht, hht, newmark
+from hhtjax.plot import error_against_h, legend, subplots
 from hhtjax.rotation import log
 from hhtjax.scenes import top
 
@@ -101,7 +102,8 @@ def run(report, fast):
 
 def motion_figure(times, path, true):
     """Figs. 9-12: the path of the disk, and the exact rotation it belongs to."""
-    drawn = plt.figure(figsize=(7.6, 5.2))
+    drawn, axes = subplots(2, 2, width=175, height=140)
+    axes[0, 0].remove()
     fine = np.linspace(0, DURATION, 2001)
     x, _, R, Om = exact(fine)
     space = drawn.add_subplot(2, 2, 1, projection="3d")
@@ -109,9 +111,11 @@ def motion_figure(times, path, true):
     space.plot(*path[0].T, MARKERS[0], color=COLOURS[1], ms=2.5, label="non-iterative, 100 steps")
     space.plot(*zip((0, 0, 0), x[0], strict=True), color="black", lw=1)
     space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="Fig. 9: path of the disk")
+    space.tick_params(pad=-1)
+    space.set_box_aspect(None, zoom=0.85)
     space.set(xticks=(-0.5, 0, 0.5), yticks=(0, 0.5, 1), zticks=(-1, -0.5, 0))
-    space.legend(fontsize=7, loc="upper left")
-    panels = [drawn.add_subplot(2, 2, i) for i in (2, 3, 4)]
+    space.legend(loc="upper left")
+    panels = axes.flat[1:]
     psi = np.array(jax.vmap(log)(jnp.asarray(R)))
     jumps = np.abs(np.diff(psi, axis=0)).max(axis=1) > 1
     psi[1:][jumps] = np.nan  # at pi, where psi and -psi are the same rotation
@@ -121,21 +125,19 @@ def motion_figure(times, path, true):
         panels[0].plot(fine, psi[:, i], **style)
         panels[1].plot(fine, spatial[:, i], **style)
     panels[2].plot(fine, Om[:, 0], color=COLOURS[0], lw=1)
-    panels[0].set(title="Fig. 10: rotation vector", ylabel="component (rad)")
-    panels[1].set(title="Fig. 11: angular velocity in space", ylabel="component (rad/s)")
+    panels[0].set_ylabel("component (rad)")
+    panels[1].set_ylabel("component (rad/s)")
     panels[2].set(title="Fig. 12: material angular velocity across the rod", ylabel="$\\Omega_1$ (rad/s)")
-    for panel in panels[:2]:
-        panel.legend(ncols=3, fontsize=7, loc="lower left")
+    legend(panels[0], title="Fig. 10: rotation vector")
+    legend(panels[1], title="Fig. 11: angular velocity in space")
     for panel in panels:
         panel.set_xlabel("time (s)")
-    for panel in (space, *panels):
-        panel.title.set_fontsize(9)
     return drawn
 
 
 def methods_figure(times, paths, true):
     """Figs. 13-15: accelerations of the paper's three methods, and where each takes the disk."""
-    drawn, panels = plt.subplots(1, 3, figsize=(10.5, 3.6))
+    drawn, panels = subplots(1, 3, width=175, height=85)
     hilber, trapezoidal, damped, ours = FIGURED
     for panel, title, names in (
         (panels[0], "Fig. 13", (trapezoidal, hilber)),
@@ -145,29 +147,22 @@ def methods_figure(times, paths, true):
             i = list(METHODS).index(name)
             panel.plot(times, paths[name][1][:, 0], color=COLOURS[i], lw=1, label=name.replace("alpha", "$\\alpha$"))
         panel.plot(times, true[1][:, 0], color="black", ls=":", lw=1, label="exact")
-        panel.set(title=f"{title}: acceleration of the disk", xlabel="time (s)", ylabel="$\\ddot x$ (m/s$^2$)")
+        panel.set(xlabel="time (s)", ylabel="$\\ddot x$ (m/s$^2$)")
+        legend(panel, title=f"{title}: acceleration of the disk")
     for i, name in enumerate(FIGURED):
         distance = np.linalg.norm(paths[name][0] - true[0], axis=1)
         panels[2].semilogy(times[2:], distance[2:], color=COLOURS[i], lw=1.2, label=name.replace("alpha", "$\\alpha$"))
-    panels[2].set(title="Fig. 15: distance from the exact path", xlabel="time (s)", ylabel="distance (m)")
-    for panel in panels:
-        panel.legend(fontsize=6.5)
-        panel.title.set_fontsize(9)
+    panels[2].set(xlabel="time (s)", ylabel="distance (m)")
+    legend(panels[2], title="Fig. 15: distance from the exact path")
     return drawn
 
 
 def orders_figure(errors):
     """Error of the place of the disk against the step."""
-    drawn, panel = plt.subplots(figsize=(5.4, 4))
+    drawn, panel = subplots(width=85, height=90)
     h = DURATION / np.array(LADDER)
-    for i, (name, values) in enumerate(errors.items()):
-        panel.loglog(h, values, MARKERS[i] + "-", color=COLOURS[i], ms=4, lw=1.2, label=name)
-    for order, scale, style in ((1, 30, ":"), (2, 3e4, "--")):
-        panel.loglog(h, scale * h**order / 10, style, color="grey", lw=1, label=f"order {order}")
-    panel.set(
-        xlabel="step h (s)", ylabel="error of the disk's place at 0.5 s (m)", title="Spinning top, $\\alpha$ = -0.05"
-    )
-    panel.legend(fontsize=7)
+    error_against_h({name: (h, np.array(values)) for name, values in errors.items()}, slopes=(1, 2), unit="m", ax=panel)
+    panel.set_ylabel("error of the disk's place at 0.5 s (m)")
     return drawn
 
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -26,6 +25,7 @@ from experiments.cardona_geradin1989.index_1 import (
 from experiments.cardona_geradin1989.runs import constrained_hht, end, least_seconds
 from experiments.report import COLOURS, MARKERS, side_by_side
 from hhtjax import rk4
+from hhtjax.plot import subplots
 from hhtjax.scenes import squeezer
 
 ALPHA = -0.1
@@ -223,7 +223,7 @@ def show(report, entries, by_stop):
 def figure(entries, work, label):
     """Errors against time or solves."""
     methods = list(dict.fromkeys(e["method"] for e in entries))
-    drawn, panels = plt.subplots(1, len(UNITS), figsize=(9.6, 3.9))
+    drawn, panels = subplots(1, len(UNITS), width=175, height=95)
     markers = (*MARKERS, "<", "h")
     for axes, (x, unit) in zip(panels, UNITS.items(), strict=True):
         for i, method in enumerate(methods):
@@ -232,5 +232,5 @@ def figure(entries, work, label):
             style |= {"ms": 4, "lw": 1, "ls": "-" if i < 4 else "--", "label": f"HHT, {method}" if i < 4 else method}
             axes.loglog([e[work] for e in mine], [e[f"{x}_error_{unit}"] for e in mine], **style)
         axes.set(xlabel=label, ylabel=f"error of {x} ({unit.replace('_', '/')})")
-    drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7.5)
+    drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return drawn

@@ -15,12 +15,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.identification import pendulum_data
 from experiments.report import COLOURS, MARKERS, Report
+from hhtjax.plot import legend, subplots
 
 DT = 1e-3  # s; the unseen trial turns at up to 35 rad/s
 HORIZONS = (0.125, 0.25, 0.5, 1.0, 2.0)  # s, of the windows of one fit after the other
@@ -248,7 +248,7 @@ def long_windows(report: Report, train):
 
 def plot(report: Report, numbers):
     """Errors of predictions by the length of their windows, and the friction of each model."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), width_ratios=(2, 3))
+    figure, (left, right) = subplots(1, 2, width=175, height=80, width_ratios=(2, 3))
     scored = numbers["windows_s"]
     for i, (name, values) in enumerate({
         "the unseen trial": list(numbers["test_mrad"].values()),
@@ -258,7 +258,7 @@ def plot(report: Report, numbers):
     left.set_xticks(scored, [f"{x:g}" for x in scored])
     ticks = (1, 1.5, 2, 3, 4, 5, 6, 7)
     left.set_yticks(ticks, [f"{x:g}" for x in ticks])
-    left.legend()
+    legend(left)
     left.minorticks_off()
     left.set_xlabel("window predicted (s)")
     left.set_ylabel("RMSE of the angles (mrad)")
@@ -274,5 +274,5 @@ def plot(report: Report, numbers):
     right.axhline(0, color="black", lw=0.8)
     right.set_xticks(range(len(terms)), [f"{name[:-1]}\njoint {name[-1]}" for name in terms])
     right.set_ylabel("coefficient, with its 95 % interval\n(per inertia of link 1, SI)")
-    right.legend()
+    legend(right)
     report.figure("double_pendulum_measured", figure)

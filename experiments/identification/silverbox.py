@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
@@ -28,10 +27,11 @@ from experiments.identification.data import (
     Record,
     training_residuals,
 )
+from experiments.identification.scatter import over_scatter
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
-from hhtjax.identification.sandwich import SEGMENTS
 from hhtjax.numerics.richardson import richardson
+from hhtjax.plot import legend, subplots
 
 SUBSTEPS = 8
 MODELS = {
@@ -44,7 +44,7 @@ UNITS = {"m": "s^2", "c": "s", "k": "1", "k2": "1/V", "k3": "1/V^2", "offset": "
 UNITS |= {"c2": "s/V^2", "d": "s^2/V", "e": "s^2/V", "delay": "s"}
 
 
-def fit_training(record: Record, substeps: int, alpha: float, terms=LINEAR, progress=False):
+def fit_training(record: Record, substeps: int, alpha: float, terms=LINEAR):
     """Parameters and initial state from the whole record; returns the result, and seconds, warm and with compiling."""
     residuals = training_residuals(record, substeps, alpha)
     guess = {name: START.get(name, 0.0) for name in terms}
@@ -52,7 +52,7 @@ def fit_training(record: Record, substeps: int, alpha: float, terms=LINEAR, prog
     seconds = []
     for _ in range(2):  # the first time compiles
         start = time.perf_counter()
-        result = jax.block_until_ready(hhtjax.fit(residuals, unknown, scale=scale, progress=progress))
+        result = jax.block_until_ready(hhtjax.fit(residuals, unknown, scale=scale))
         seconds.append(time.perf_counter() - start)
     return result, min(seconds), seconds[0]
 
@@ -70,7 +70,8 @@ def initial_state(params, u, head, guess, substeps: int, alpha: float):
 def score(params, record: Record, substeps: int, alpha: float):
     """Simulated output with the initial state fitted to the first samples; RMSE and largest error in mV."""
     u = data.reconstruct(record.u)
-    start = initial_state(params, u, record.y[:WASHOUT], data.first_state(record), substeps, alpha)
+    head = data.beginning(u, WASHOUT)
+    start = initial_state(params, head, record.y[:WASHOUT], data.first_state(record), substeps, alpha)
     output = np.asarray(data.simulate(params, start, u, len(record.y), substeps, alpha))
     return output, rmse(output - record.y), 1e3 * float(np.max(np.abs(output - record.y)[WASHOUT:]))
 
@@ -80,24 +81,21 @@ def rmse(error):
     return 1e3 * float(np.sqrt(np.mean(np.asarray(error)[WASHOUT:] ** 2)))
 
 
-def run(report: Report, fast: bool):
-    """Fits the models, scores them on the official test sets, and charts error and bias against the step size."""
+def run(report: Report, fast: bool, full: bool = False):
+    """The best model's fit, scores on the official test sets, and chart; full: all models, and what the step size does.
+
+    fast: the whole of it with one model and a part of the data.
+    """
     sets = data.load(fast)
-    if sets.measured:
-        print("Silverbox, the measured record (Wigren and Schoukens 2013)." + " Parts of it only." * fast)
-    else:
-        print(f"GENERATED record, known parameters: the measured one was not found. To use it, {data.HOW_TO_GET_IT}.")
-    loss = hhtjax.spline_gain_error(RESONANCE, 1 / SAMPLING_RATE)
-    print(f"Input: band-limited. A cubic spline would lose {100 * loss:.2g} % of the gain at {RESONANCE:g} Hz.")
-    print("The gain of the input is fixed to 1: a common factor of all parameters cannot be identified.\n")
-    models, best = {}, BEST if not fast else "6 parameters"
-    for name, terms in MODELS.items():
-        if fast and name != best:
-            continue
-        report.progress(f"fitting {name} and the initial state to {len(sets.train.y)} samples")
-        result, scores, models[name] = fit_and_score(report, sets, terms, fast)
-        if name == best:
-            plot_fit(report, sets, scores)
+    tell(sets, fast)
+    names = ["6 parameters"] if fast else list(MODELS) if full else [BEST]
+    models, best = {}, names[-1]
+    for name in names:
+        report.progress(
+            f"fitting {name} and the initial state to {len(sets.train.y)} samples, twice: the first compiles"
+        )
+        result, models[name] = fit_and_score(report, sets, MODELS[name], name == best, full)
+        if name == best and (fast or full):
             plot_parameters(report, result)
     sizes = ("train", *sets.tests)
     report.table(
@@ -109,25 +107,44 @@ def run(report: Report, fast: bool):
     )
     numbers = {f"{part}_mV": models[best][f"{part}_mV"] for part in sizes}
     numbers |= {"data": "measured" if sets.measured else "generated", "fast": fast, "models": models}
-    report.numbers(rounded({**numbers, "by_step_size": step_size_study(report, sets, fast)}))
+    if fast or full:
+        numbers["by_step_size"] = step_size_study(report, sets, fast)
+    else:
+        print("All models, and the bias of the estimates by step size: python -m experiments silverbox --full\n")
+    report.numbers(rounded(numbers))
 
 
-def fit_and_score(report: Report, sets, terms, fast: bool):
-    """One model: its fit, its outputs and errors on all sets, and all of it as numbers."""
-    result, seconds, compiling = fit_training(sets.train, SUBSTEPS, 0.0, terms, progress=True)
-    params, errors = result.params[0], result.standard_errors[0]
-    naive = result.errors(result.uncertainty.naive)[0]
-    report.progress(f"{result.reason}, {int(result.iterations)} iterations, {seconds:.2f} s after compilation")
+def tell(sets, fast: bool):
+    """Where the data come from, and what is assumed of the input."""
+    if sets.measured:
+        print("Silverbox, the measured record (Wigren and Schoukens 2013)." + " Parts of it only." * fast)
+    else:
+        print(f"GENERATED record, known parameters: the measured one was not found. To use it, {data.HOW_TO_GET_IT}.")
+    loss = hhtjax.spline_gain_error(RESONANCE, 1 / SAMPLING_RATE)
+    print(f"Input: band-limited. A cubic spline would lose {100 * loss:.2g} % of the gain at {RESONANCE:g} Hz.")
+    print("The gain of the input is fixed to 1: a common factor of all parameters cannot be identified.\n", flush=True)
+
+
+def fit_and_score(report: Report, sets, terms, chart: bool, full: bool):
+    """One model: its fit, its errors on all sets, charted as soon as they are known, and all of it as numbers."""
+    result, seconds, compiling = fit_training(sets.train, SUBSTEPS, 0.0, terms)
+    params = result.params[0]
+    costs = ", ".join(f"{x:.4g}" for x in np.asarray(result.history.cost)[: int(result.iterations) + 1])
+    report.progress(f"{int(result.iterations)} iterations in {seconds:.2f} s after compilation; cost in V^2: {costs}")
+    report.progress(result.reason)
+    scores: dict[str, Any] = {"train": (np.asarray(result.residual + sets.train.y), rmse(result.residual), None)}
+    for name, record in sets.tests.items():
+        scores[name] = score(params, record, SUBSTEPS, 0.0)
+        report.progress(f"{name}: {scores[name][1]:.4f} mV")
+        if chart and name == "arrow_full":
+            plot_fit(report, sets, scores)
+    errors, naive = result.standard_errors[0], result.errors(result.uncertainty.naive)[0]
     header = ["parameter", "estimate", "standard error", "error / naive", "unit"]
     rows = [[n, float(params[n]), float(errors[n]), float(errors[n] / naive[n]), UNITS[n]] for n in params]
     if not sets.measured:
         header.insert(2, "true")
         rows = [[*row[:2], data.GENERATED.get(row[0], 0.0), *row[2:]] for row in rows]
     report.table(header, rows)
-    scores: dict[str, Any] = {"train": (np.asarray(result.residual + sets.train.y), rmse(result.residual), None)}
-    for name, record in sets.tests.items():
-        scores[name] = score(params, record, SUBSTEPS, 0.0)
-        report.progress(f"{name}: {scores[name][1]:.4f} mV")
     numbers = {
         **{f"{name}_mV": value for name, (_, value, _) in scores.items()},
         "largest_error_arrow_full_mV": scores["arrow_full"][2],
@@ -141,39 +158,9 @@ def fit_and_score(report: Report, sets, terms, fast: bool):
         **{f"{name}_in_{UNITS[name]}": float(params[name]) for name in params},
         **{f"standard_error_{name}_in_{UNITS[name]}": float(errors[name]) for name in params},
     }
-    if not fast:
-        numbers["standard_error_over_scatter"] = over_scatter(report, sets.train, result)
-    return result, scores, numbers
-
-
-def over_scatter(report: Report, record: Record, result):
-    """Standard errors, cluster and naive, over those seen: the scatter of fits to each of SEGMENTS parts of the record.
-
-    Each part has a free initial state. The mean of as many independent estimates scatters by their deviation over the
-    root of their number, which itself is known to 13 %.
-    """
-    params = result.params[0]
-    problem = data.windows_problem(record, len(record.y) // SEGMENTS - 1, SUBSTEPS, 0.0)
-    scale = {name: SCALE[name] for name in params}, STATE_SCALE
-
-    @jax.jit
-    @jax.vmap
-    def of_part(start, part):
-        fitted = hhtjax.fit(lambda x: problem["residuals"](*x, part), (params, start), scale=scale, covariance=False)
-        return fitted.params[0], fitted.converged
-
-    found, converged = of_part(problem["starts"], problem["records"])
-    count = len(converged)
-    seen = {name: float(np.std(found[name], ddof=1) / np.sqrt(count)) for name in params}
-    naive = result.errors(result.uncertainty.naive)[0]
-    ratios = {
-        n: {"cluster": float(result.standard_errors[0][n]) / e, "naive": float(naive[n]) / e} for n, e in seen.items()
-    }
-    report.progress(f"{int(np.sum(converged))} of {count} parts of the record converged")
-    report.table(
-        ["standard error over scatter", *ratios], [[k, *(r[k] for r in ratios.values())] for k in ("cluster", "naive")]
-    )
-    return ratios | {"parts": count, "converged": int(np.sum(converged))}
+    if full:
+        numbers["standard_error_over_scatter"] = over_scatter(report, sets.train, result, SUBSTEPS)
+    return result, numbers
 
 
 def step_size_study(report: Report, sets, fast: bool):
@@ -226,16 +213,16 @@ def plot_fit(report: Report, sets, scores):
     residual = 1e3 * (record.y - output)
     width, peak = int(0.25 * SAMPLING_RATE), int(np.argmax(np.abs(record.y)))
     first = min(max(0, peak - width // 2), len(record.y) - width)
-    figure, axes = plt.subplots(2, 2, figsize=(9, 4.8), sharex="col", height_ratios=(2, 1))
+    figure, axes = subplots(2, 2, width=175, height=95, sharex="col", height_ratios=(2, 1))
     name = "measured" if sets.measured else "generated"
     parts = {
         f"arrow test set: RMSE {value:.3f} mV": slice(None),
         "a quarter of a second about its peak": slice(first, first + width),
     }
     for (upper, lower), (title, part) in zip(axes.T, parts.items(), strict=True):
-        upper.plot(seconds[part], record.y[part], color="black", lw=1.5, label=f"{name} output")
-        upper.plot(seconds[part], output[part], color=COLOURS[4], lw=1.0, ls="--", label="fitted model, simulated")
-        upper.set_title(title, loc="left", fontsize=9)
+        upper.plot(seconds[part], record.y[part], color="#808080", lw=1.6, label=f"{name} output")
+        upper.plot(seconds[part], output[part], color=COLOURS[1], lw=0.7, label="fitted model, simulated")
+        upper.set_title(title, loc="left")
         lower.plot(seconds[part], residual[part], color=COLOURS[0], lw=0.6)
         lower.set_xlabel("time (s)")
     axes[0, 0].set_ylabel("output y (V)")
@@ -247,7 +234,7 @@ def plot_fit(report: Report, sets, scores):
 def plot_parameters(report: Report, result):
     """Estimates with their standard errors, relative to the estimate, and the cost over the iterations."""
     params, errors = result.params[0], result.standard_errors[0]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), width_ratios=(3, 2))
+    figure, (left, right) = subplots(1, 2, width=175, height=70, width_ratios=(3, 2))
     relative = [100 * float(errors[name] / abs(params[name])) for name in params]
     units = {name: "" if unit == "1" else f" {unit.replace('^2', '²')}" for name, unit in UNITS.items()}
     left.plot(relative, [f"{name} = {float(params[name]):.4g}{units[name]}" for name in params], "o", color=COLOURS[0])
@@ -262,7 +249,7 @@ def plot_parameters(report: Report, result):
 
 def plot_step_sizes(report: Report, rows):
     """Test error, and the bias of stiffness and damping, measured and predicted, against the steps per sample."""
-    figure, axes = plt.subplots(1, 3, figsize=(10, 3.2))
+    figure, axes = subplots(1, 3, width=175, height=65)
     for i, alpha in enumerate(sorted({row["alpha"] for row in rows}, reverse=True)):
         mine = [row for row in rows if row["alpha"] == alpha]
         substeps = [row["substeps"] for row in mine]
@@ -282,6 +269,6 @@ def plot_step_sizes(report: Report, rows):
         axis.set_xlabel("steps per sample")
         axis.set_ylabel(label)
     axes[0].set_yticks([0.3, 0.5, 1.0, 2.0, 3.0])
-    axes[0].legend()
-    axes[1].set_title("marks measured, lines predicted", loc="left", fontsize=9)
+    legend(axes[0])
+    axes[1].set_title("marks measured, lines predicted", loc="left")
     report.figure("silverbox_step_size", figure)

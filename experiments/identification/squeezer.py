@@ -10,13 +10,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.identification.coverage import fit_logarithms, judge, tell
 from experiments.parts import rounded
 from experiments.report import COLOURS, Report
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import squeezer
 
 SCENE = squeezer.squeezer()
@@ -78,13 +78,13 @@ def run(report: Report, fast: bool):
 
 def plot(report, numbers, measured, guessed, exact):
     """The crank angle, and the estimates of all records."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
+    figure, (left, right) = subplots(1, 2, width=175, height=75)
     t = 1e3 * SCENE.duration * np.arange(1, SAMPLES + 1) / SAMPLES
     left.plot(t, exact, color=COLOURS[0], lw=1, label="truth (and fits, to line width)")
     left.plot(t[::6], measured[::6], ".", color="black", ms=3, label="measured")
     left.plot(t, guessed, color=COLOURS[7], lw=1, ls="--", label="guess")
     left.set(xlabel="time (ms)", ylabel="crank angle (rad)")
-    left.legend()
+    legend(left)
     (c0, c0_low, c0_high), (l0, l0_low, l0_high) = (
         100 * (np.array(x) - 1) for x in numbers["over_truth_with_interval"].values()
     )

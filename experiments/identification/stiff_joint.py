@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
@@ -21,6 +20,7 @@ from experiments.identification import stiff_joint_gradients
 from experiments.identification.coverage import fit_logarithms, judge, tell
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import double_pendulum
 
 SCENE = double_pendulum.stiff()
@@ -114,7 +114,7 @@ def run(report: Report, fast: bool):
 
 def plot_recovery(report, found):
     """What the records determine, errors in units of the intervals, and how many intervals hold the truth."""
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10, 3.6))
+    figure, (left, middle, right) = subplots(1, 3, width=175, height=85)
     k = np.array(found["k1_true_N_m_rad"])
     for i, (name, values) in enumerate(found["over_truth_with_interval"].items()):
         value, lower, upper = np.log(values)
@@ -123,7 +123,7 @@ def plot_recovery(report, found):
         middle.semilogx(k, 2 * value / (upper - lower), **style)
     half = 1.96 * float(PRIOR.deviation)
     left.axhline(half, color="black", lw=0.8)
-    left.text(k.max(), 1.15 * half, "prior alone", ha="right", fontsize=8)
+    left.text(k.max(), 1.15 * half, "prior alone", ha="right")
     left.set_ylim(top=4 * half)
     middle.axhspan(-1, 1, color="black", alpha=0.08)
     left.set_ylabel("half-width of the 95 % interval\n(of the logarithm of the parameter)")
@@ -136,15 +136,15 @@ def plot_recovery(report, found):
     right.axhline(93, color="black", lw=0.8)
     right.set_xticks(range(len(KIM)), list(KIM))
     right.set_ylabel("truth inside the 95 % interval (%)")
-    right.set_ylim(0, 125)
-    right.legend(ncols=2, fontsize=8)
-    left.legend(ncols=2, fontsize=8)
+    right.set_ylim(0, 100)
+    legend(right)
+    legend(left)
     report.figure("stiff_joint", figure)
 
 
 def plot_gradients(report, rows):
     """Error of the gradient over h^2 against the step, and the error against time."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6))
+    figure, (left, right) = subplots(1, 2, width=175, height=80)
     for i, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
         mine = [row for row in rows if row["method"] == method]
         error = np.array([row["relative_error"] for row in mine])

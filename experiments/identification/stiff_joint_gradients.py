@@ -55,17 +55,14 @@ def gradient(x, measured, alpha, make, options, steps_per_sample):
 def diffrax_gradient(diffrax, tolerance):
     """The same by an adaptive, L-stable Runge-Kutta method of order 5 with diffrax's default adjoint."""
 
-    def rate(t, y, params):
-        q, v = y[:2], y[2:]
-        return jnp.concatenate([v, jnp.linalg.solve(SCENE.system.mass(q, params), SCENE.system.force(q, v, t, params))])
-
     def loss(x, measured):
         found = diffrax.diffeqsolve(
-            diffrax.ODETerm(rate), diffrax.Kvaerno5(), 0.0, DURATION, None, jnp.zeros(4), own(x),
+            hhtjax.interop.diffrax_term(SCENE.system), diffrax.Kvaerno5(), 0.0, DURATION, None,
+            (jnp.zeros(2), jnp.zeros(2)), own(x),
             saveat=diffrax.SaveAt(ts=DURATION * jnp.arange(1, SAMPLES + 1) / SAMPLES),
             stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance), max_steps=16384,
         )  # fmt: skip
-        return jnp.mean((found.ys[:, :2] - measured) ** 2)
+        return jnp.mean((found.ys[0] - measured) ** 2)
 
     return jax.jit(jax.grad(loss))
 

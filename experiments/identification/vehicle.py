@@ -11,13 +11,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.identification.coverage import fit_logarithms, judge, tell
 from experiments.parts import rounded
 from experiments.report import COLOURS, Report
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import vehicle
 
 SCENE, OTHER_ROAD = vehicle.ride(), vehicle.ride(speed=15.0, seed=1)
@@ -87,18 +87,28 @@ def run(report: Report, fast: bool):
 
 def plot(report, numbers, found):
     """Intervals of all records, and a wheel on the other road."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.6), width_ratios=(2, 3))
+    figure, (left, right) = subplots(1, 2, width=175, height=75, width_ratios=(2, 3))
     for i, values in enumerate(numbers["over_truth_with_interval"].values()):
         value, lower, upper = 100 * (np.array(values) - 1)
         at = i + np.linspace(-0.3, 0.3, len(value))
         left.errorbar(at, value, [value - lower, upper - value], fmt="o", ms=2, lw=0.7, color=COLOURS[i])
     left.axhline(0, color="black", lw=0.8)
-    left.set_xticks(range(len(TRUTH)), [name.replace(" ", "\n") for name in TRUTH], fontsize=8)
+    left.set_xticks(range(len(TRUTH)), [name.replace(" ", "\n") for name in TRUTH])
     left.set_ylabel("estimate less truth, with its 95 % interval (%)")
     t = SAMPLING_PERIOD * np.arange(len(found["truth"]))
     part = (t > 1.0) & (t < 2.6)
-    for (kind, a), colour, width in zip(found.items(), (COLOURS[4], COLOURS[7], "black"), (1.2, 0.8, 0.8), strict=True):
-        right.plot(t[part], a[part, 3], color=colour, lw=width, ls="--" if kind == "estimate" else "-", label=kind)
+    for (kind, a), colour, width in zip(
+        found.items(), (COLOURS[1], COLOURS[0], "#808080"), (0.8, 0.8, 2.0), strict=True
+    ):
+        right.plot(
+            t[part],
+            a[part, 3],
+            color=colour,
+            lw=width,
+            ls=":" if kind == "guess" else "-",
+            label=kind,
+            zorder=4 - width,
+        )
     right.set(xlabel="time on the other road (s)", ylabel="acceleration of the front left wheel (m/s²)")
-    right.legend(ncols=3)
+    legend(right)
     report.figure("vehicle", figure)

@@ -1,10 +1,10 @@
 """What the paper does not say (1): its tables were computed with alpha = 0."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.kim2019 import pendulum, printed
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import subplots
 
 ALPHAS = pendulum.ALPHAS
 COLUMNS = {"conventional HHT": 1, "non-iterative HHT": 2}
@@ -31,7 +31,7 @@ def run(report, fast):
 
 def figure(numbers):
     """One line for each entry of the tables; alpha = 0 at the left edge."""
-    drawn, axes = plt.subplots(figsize=(7.6, 3.4))
+    drawn, axes = subplots(width=175, height=110)
     x = np.array([1e-4, *(-alpha for alpha in ALPHAS[1:])])
     for k, entry in enumerate(numbers):
         label = f"{entry['scene']}, {entry['method']}, h = {entry['h_s']:g} s"
@@ -40,8 +40,8 @@ def figure(numbers):
     axes.set_xticks(x, [f"{alpha:g}" for alpha in ALPHAS])
     axes.minorticks_off()
     axes.axhline(2e-3, color="k", lw=0.8, ls=":")
-    axes.annotate("within 0.2 %", (x[-1], 1.8e-3), fontsize=8, ha="right", va="top")
+    axes.annotate("within 0.2 %", (x[-1], 1.8e-3), ha="right", va="top")
     axes.set_xlabel(r"$\alpha$ of our run")
     axes.set_ylabel("|RMS error, ours / printed - 1|")
-    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    drawn.legend(loc="outside lower center", ncols=2)
     return drawn

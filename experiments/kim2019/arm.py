@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from experiments.report import COLOURS, MARKERS, side_by_side
 from hhtjax import hht, kim_hht, kim_implicit_euler
+from hhtjax.plot import subplots
 from hhtjax.scenes import arm
 
 ALPHA = -0.05
@@ -174,10 +175,9 @@ def print_tables(report, numbers):
 
 def figure(scene, exact, numbers):
     """The motion from above and from the side; error against step size and against time."""
-    drawn = plt.figure(figsize=(10, 3.6))
-    grid = drawn.add_gridspec(2, 3, width_ratios=(0.45, 1, 1))
-    draw_motion([drawn.add_subplot(grid[i, 0]) for i in range(2)], scene, exact)
-    by_step, by_time = drawn.add_subplot(grid[:, 1]), drawn.add_subplot(grid[:, 2])
+    drawn, axes = subplots(2, 2, width=175, height=140, height_ratios=(1, 2))
+    draw_motion(axes[0], scene, exact)
+    by_step, by_time = axes[1]
     h = np.array(numbers["step_sizes_s"])
     fastest = min(e["time_per_step_s"] for e in numbers["entries"])
     for i, entry in enumerate(numbers["entries"]):
@@ -187,12 +187,12 @@ def figure(scene, exact, numbers):
         by_time.loglog(np.array(entry["time_per_run_s"]) / fastest, entry["rms_error_rad"], **style)
     for order, end in ((1, 6e-4), (2, 4e-6)):
         by_step.loglog(h, end * (h / h[-1]) ** order, color="black", lw=0.8, ls="--")
-        by_step.text(h[-1], end * 0.9, f"slope {order}", ha="left", va="top", fontsize=8)
+        by_step.text(h[-1], end * 0.9, f"slope {order}", ha="left", va="top")
     by_step.set_xlabel("step size h (s)")
     by_time.set_xlabel("time of the run / least time of a step")
     for axes in (by_step, by_time):
         axes.set_ylabel("RMS error of q (rad)")
-    by_step.legend(fontsize=7, loc="lower right")
+    drawn.legend(*by_step.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return drawn
 
 
@@ -210,7 +210,5 @@ def draw_motion(panels, scene, q):
         for chain, shade in zip(places[::2], np.linspace(0.25, 1.0, SAMPLES // 2 + 1), strict=True):
             axes.plot(chain[:, 0], chain[:, down], color=plt.get_cmap("Blues")(shade), marker="o", ms=1.5, lw=1)
         axes.plot(places[:, -1, 0], places[:, -1, down], color=COLOURS[1], lw=0.8)
-        axes.set_title(f"from {place}, every {2 * scene.duration / SAMPLES:g} s", fontsize=7)
-        axes.set_ylabel(f"{label} (m)")
-        axes.set_aspect("equal")
-    panels[-1].set_xlabel("x (m)")
+        axes.set_title(f"from {place}, every {2 * scene.duration / SAMPLES:g} s")
+        axes.set(xlabel="x (m)", ylabel=f"{label} (m)", aspect="equal")

@@ -4,11 +4,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.report import COLOURS, MARKERS
 from hhtjax import FirstOrderSystem, LinearSystem, hht, kim_hht, simulate
+from hhtjax.plot import legend, subplots
 
 RATE = 1000.0  # 1/s, of y' = -RATE y
 STIFFNESS = 1000.0  # 1/s^2, of q'' + STIFFNESS q = 0
@@ -31,7 +31,7 @@ def run(report, fast):
 
 def damped(report):
     """Fig. 3, and the amplification per step, measured and mu = 1 + z/(1 - theta z), z = -RATE h."""
-    figure, panels = plt.subplots(1, 4, figsize=(11, 2.7))
+    figure, panels = subplots(1, 4, width=175, height=60)
     rows, numbers = [], []
     for axes, h in zip(panels, STEP_SIZES, strict=True):
         num_steps = 40
@@ -47,10 +47,10 @@ def damped(report):
             measured, theory = float(path.q[1, 0]), 1 + z / (1 - theta * z)
             rows.append([f"{h:g}", f"{alpha:g}", measured, theory, float(np.exp(z))])
             numbers.append({"h_s": h, "alpha": alpha, "factor_per_step": measured, "closed_form": theory})
-        axes.set_title(f"h = {h:g} s", fontsize=9)
+        axes.set_title(f"h = {h:g} s")
         axes.set_xlabel("time (s)")
     panels[0].set_ylabel("y")
-    panels[0].legend(fontsize=7)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     report.figure("kim2019_damped", figure)
     print("Fig. 3: y' = -1000 y with Kim's step, factor per step")
     report.table(["h (s)", "alpha", "of the run", "closed form", "exp(-1000 h)"], rows)
@@ -161,7 +161,7 @@ def errors_at(method, alpha, x):
 
 def oscillation_figure(duration, step_sizes):
     """Solutions over two periods, envelopes over a long time: of Kim's step and of the repaired one."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2))
+    figure, (left, right) = subplots(1, 2, width=175, height=95)
     alpha = -0.05
     time = np.linspace(0, 0.4, 500)
     left.plot(time, 1e3 * np.sin(OMEGA * time) / OMEGA, "k", lw=1, label="exact")
@@ -186,21 +186,18 @@ def oscillation_figure(duration, step_sizes):
                 shown = path.t <= 0.4
                 style = {"color": COLOURS[i], "marker": MARKERS[i] if h > 2e-3 else "", "ms": 3, "lw": 0.9}
                 left.plot(path.t[shown], 1e3 * path.q[shown, 0], label=f"Kim's step, h = {h:g} s", **style)
-    left.set_title(f"solution, $\\alpha$ = {alpha:g}", fontsize=9)
-    right.set_title(f"envelope, $\\alpha$ = {alpha:g}", fontsize=9)
     for axes in (left, right):
         axes.set_xlabel("time (s)")
         axes.set_ylabel("q (mm)")
     right.set_ylabel("amplitude (mm)")
-    left.set_ylim(bottom=-60)
-    left.legend(fontsize=7, loc="lower left", ncols=2)
-    right.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    legend(left, title=f"solution, $\\alpha$ = {alpha:g}")
+    legend(right, title=f"envelope, $\\alpha$ = {alpha:g}")
     return figure
 
 
 def error_figure(sizes, curves):
     """Damping ratio and period error of the methods themselves: lines by theory, markers of runs."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
+    figure, (left, right) = subplots(1, 2, width=175, height=95)
     fine = np.logspace(-2.5, 0.5, 200)
     for j, method in enumerate(METHODS):
         for i, alpha in enumerate(ALPHAS):
@@ -218,6 +215,6 @@ def error_figure(sizes, curves):
     right.set_ylabel("relative period error")
     for axes in (left, right):
         axes.set_xlabel(r"$\omega h$ (rad)")
-        axes.legend(fontsize=7)
-    left.set_title(r"lines: theory, markers: runs; $\alpha$ = 0 has none", fontsize=9)
+        legend(axes)
+    left.text(0.02, 0.98, "lines: theory, markers: runs", transform=left.transAxes, va="top")
     return figure

@@ -4,13 +4,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from jax import jvp
 
 from experiments.report import COLOURS, side_by_side
 from hhtjax import System, conventional_hht, hht, kim_hht, rk4
 from hhtjax.numerics.linear_solve import solve
+from hhtjax.plot import subplots
 from hhtjax.scenes import double_pendulum
 
 DURATION = 1.0  # s
@@ -169,7 +169,7 @@ def run(report, fast):
 def figure(steps, curves):
     """Errors, predicted errors and remainders of the first case, for three methods."""
     case = next(iter(CASES))
-    drawn, panels = plt.subplots(1, 3, figsize=(10, 3.5), sharey=True)
+    drawn, panels = subplots(1, 3, width=175, height=80, sharey=True)
     h = DURATION / steps
     for axes, method in zip(panels, SHOWN, strict=True):
         error, predicted, rest = curves[case, method].T
@@ -179,9 +179,9 @@ def figure(steps, curves):
             axes.loglog(h, rest, "s", color=COLOURS[1], ms=5, label="error - prediction")
             axes.loglog(h, predicted[-1] * (h / h[-1]) / 2, "k:", lw=0.8, label="slopes 1 and 2")
         axes.loglog(h, rest[-1] * (h / h[-1]) ** 2 / 2, "k:", lw=0.8)
-        axes.set_title(f"{method}", fontsize=9)
+        axes.set_title(f"{method}")
         axes.set_xlabel("step size h (s)")
     panels[0].set_ylabel("norm of the error of (q, v) at t = 1 s")
-    panels[0].legend(fontsize=7)
-    drawn.suptitle(f"forced double pendulum, $\\alpha$ = {CASES[case][0]:g}", fontsize=9)
+    drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    drawn.suptitle(f"forced double pendulum, $\\alpha$ = {CASES[case][0]:g}")
     return drawn

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from experiments.report import side_by_side
-from hhtjax import conventional_hht, hht, kim_hht, kim_implicit_euler, rk4, simulate
+from hhtjax import conventional_hht, hht, interop, kim_hht, kim_implicit_euler, rk4, simulate
 from hhtjax.scenes import double_pendulum
 
 SCENES = {
@@ -44,16 +44,10 @@ def reference(scene):
 def check_reference(scene):
     """RMS difference of the reference, in rad, to SciPy's Radau or DOP853 over the first second."""
     system, params, q0, v0, _ = SCENES[scene]
-
-    @jax.jit
-    def rate(t, y):
-        q, v = y[:2], y[2:]
-        return jnp.concatenate([v, jnp.linalg.solve(system.mass(q, params), system.force(q, v, t, params))])
-
+    rhs = interop.scipy_rhs(system, q0, v0, params)
     times = np.arange(101) / 100
-    y0 = np.concatenate([q0, v0])
     method = "DOP853" if scene == "free" else "Radau"
-    run = solve_ivp(lambda t, y: np.asarray(rate(t, y)), (0, 1), y0, method, times, rtol=1e-11, atol=1e-13)
+    run = solve_ivp(rhs.fun, (0, 1), rhs.y0, method, times, rtol=1e-11, atol=1e-13)
     ours = np.asarray(reference(scene))[: round(1 / FINEST) + 1 : round(0.01 / FINEST)]
     return float(np.sqrt(np.mean((run.y[:2].T - ours) ** 2)))
 

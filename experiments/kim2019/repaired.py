@@ -1,10 +1,10 @@
 """What the paper does not say (3): the repaired non-iterative forms are of order two, one better than converged."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.kim2019 import pendulum
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import subplots
 
 METHODS = ("conventional HHT", "non-iterative HHT", "converged", "refreshed", "predictor", "auto")
 SHOWN = (0.0, -0.05, -0.1, -0.3)
@@ -47,9 +47,8 @@ def run(report, fast):
 def figure(sizes, numbers):
     """Error against step size: rows scenes, columns alpha."""
     scenes, alphas = sorted({n["scene"] for n in numbers}), (0.0, -0.05, -0.3)
-    drawn, panels = plt.subplots(
-        len(scenes), 3, figsize=(10, 3.1 * len(scenes)), sharex=True, sharey="row", squeeze=False
-    )
+    shape = {"sharex": True, "sharey": "row", "squeeze": False}
+    drawn, panels = subplots(len(scenes), 3, width=175, height=25 + 55 * len(scenes), **shape)
     for axes, (scene, alpha) in zip(panels.flat, ((s, a) for s in scenes for a in alphas), strict=True):
         for entry in numbers:
             if (entry["scene"], entry["alpha"]) == (scene, alpha):
@@ -58,11 +57,11 @@ def figure(sizes, numbers):
                 label = f"{entry['method']}, as printed" if old else f"hht, {entry['method']}"
                 style = {"color": COLOURS[j], "marker": MARKERS[j], "ms": 4, "lw": 1, "ls": ":" if old else "-"}
                 axes.loglog(sizes, entry["rms_error_q1_rad"], label=label, **style)
-        axes.set_title(f"{scene} double pendulum, $\\alpha$ = {alpha:g}", fontsize=9)
+        axes.set_title(f"{scene}, $\\alpha$ = {alpha:g}")
         axes.set_ylim(top=10)
     for axes in panels[-1]:
         axes.set_xlabel("step size h (s)")
     for axes in panels[:, 0]:
         axes.set_ylabel("RMS error of $q_1$ (rad)")
-    panels[0, 0].legend(fontsize=7)
+    drawn.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawn

@@ -15,13 +15,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.cells import FARTHEST, SAMPLES, relative_error, solve_reference
 from experiments.linearization.scenes import Case
 from experiments.report import COLOURS, MARKERS
 from hhtjax import System, hht, operator_splitting, simulate
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import double_pendulum, duffing
 
 ALPHAS = (0.0, -0.05, -0.3)
@@ -160,7 +160,7 @@ def error_panel(axes, case, errors):
         axes.plot(lost, np.full(len(lost), 50 / 3**i), "x", color=COLOURS[i])
     for order in (1, 2):
         axes.plot(dts[:4], 2e-7 * (dts[:4] / dts[0]) ** order, color="0.5", linewidth=0.8)
-        axes.annotate(f" {order}", (dts[3], 2e-7 * 8**order), color="0.4", va="center", fontsize=8)
+        axes.annotate(f" {order}", (dts[3], 2e-7 * 8**order), color="0.4", va="center")
     axes.set(title=case.name, xlabel="h in s", ylabel="relative RMS error of q", ylim=(1e-7, 100))
 
 
@@ -173,11 +173,11 @@ def limit_panel(axes, limits):
         axes.plot(RATIOS, measured, MARKERS[i], color=COLOURS[i], markersize=4, label=f"alpha = {alpha:g}")
         if alpha:
             axes.axvline((1 - alpha) ** 2 / (-4 * alpha), color=COLOURS[i], linestyle="--", linewidth=1)
-    axes.set(title="oscillator, stiffened", xlabel="stiffness k / initial stiffness k0", xlim=(0.9, 21))
+    axes.set(xlabel="stiffness / initial stiffness", xlim=(0.9, 21))
     axes.set(ylabel="largest stable h sqrt(k0/m)", ylim=(0.4, 30))
     axes.set_xticks([1, 2, 5, 10, 20], ["1", "2", "5", "10", "20"])
     axes.minorticks_off()
-    axes.legend(fontsize=8, title="none stable right of dashes", title_fontsize=8, frameon=True, edgecolor="none")
+    legend(axes, title="oscillator: none stable right of dashes")
 
 
 def spring_panel(axes, reach):
@@ -187,14 +187,14 @@ def spring_panel(axes, reach):
         axes.plot(1e3 * SPRING_DTS[bounded], q[bounded], color=COLOURS[i], label=f"alpha = {alpha:g}")
         axes.plot(1e3 * SPRING_DTS[bounded][-1], q[bounded][-1], "x", color=COLOURS[i])
     axes.axvline(1e3 * predicted_limit(0.0, HIGHEST, INITIAL["from q = 0"]), color="0.3", linestyle=":")
-    axes.set(title="hardening spring from q = 0", xlabel="h in ms (dots: bound for alpha = 0)")
+    axes.set(xlabel="h in ms")
     axes.set(ylabel=f"largest |q| in {SPRING_STEPS} steps, m", xlim=(0, 13), ylim=(0, 2))
-    axes.legend(fontsize=8, loc="lower left")
+    legend(axes, title="hardening spring from q = 0")
 
 
 def draw(errors, limits, reach):
     """The scenes; the limit of the oscillator; the hardening spring against h."""
-    figure, grid = plt.subplots(2, 3, figsize=(9, 5.9))
+    figure, grid = subplots(2, 3, width=175, height=150)
     for axes, case in zip(grid[:, :2].flat, cases(), strict=True):
         if case.name in errors:
             error_panel(axes, case, errors[case.name])

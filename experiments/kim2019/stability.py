@@ -5,11 +5,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.report import COLOURS, side_by_side
 from hhtjax import FirstOrderSystem, conventional_hht, hht, kim_hht, kim_implicit_euler
+from hhtjax.plot import legend, subplots
 
 ALPHAS = (0.0, -0.05, -0.1, -0.3)
 
@@ -139,31 +139,30 @@ def locus(method, alpha):
 
 def figure(x, y, radii, ends):
     """Fig. 1, Fig. 2, and the length of the unstable interval for every alpha."""
-    drawn, (left, middle, right) = plt.subplots(1, 3, figsize=(10.4, 3.5), width_ratios=(1, 1, 0.85))
+    drawn, (left, middle, right) = subplots(1, 3, width=175, height=95, width_ratios=(1, 1, 0.85))
     alphas = [alpha for method, alpha in radii if method == "non-iterative HHT" and alpha]
     for i, alpha in enumerate(alphas):
         left.contour(x, y, radii["non-iterative HHT", alpha], [1.0], colors=COLOURS[i])
         edge = locus("non-iterative HHT", alpha)
         left.plot(edge.real, edge.imag, "k:", lw=1.2)
         left.plot([], [], color=COLOURS[i], label=f"$\\alpha$ = {alpha:g}")
-    left.plot([], [], "k:", label="closed form (Eq. 19-22)")
-    left.axvline(0, color=COLOURS[5], lw=2, label=r"$\alpha$ = 0: the imaginary axis")
-    left.set_title("Fig. 1: non-iterative, unstable inside", fontsize=9)
+    left.plot([], [], "k:", label="closed form")
+    left.axvline(0, color=COLOURS[5], lw=2, label=r"$\alpha$ = 0: the axis")
     shown = (("non-iterative HHT", -0.3), ("conventional HHT", -0.3), ("implicit Euler", 0.0))
     for i, (method, alpha) in enumerate(shown):
         middle.contourf(x, y, radii[method, alpha], [1, np.inf], colors=COLOURS[i], alpha=0.35)
         edge = locus(method, alpha)
         middle.plot(edge.real, edge.imag, color=COLOURS[i], label=method)
-    middle.set_title(r"Fig. 2: $\alpha$ = -0.3, unstable inside", fontsize=9)
     for axes in (left, middle):
         axes.set_xlabel(r"Re $h\lambda$")
         axes.set_ylabel(r"Im $h\lambda$")
         axes.set_aspect("equal")
-        axes.legend(fontsize=7, loc="lower right", borderaxespad=0.1)
         axes.set_xlim(x[0], x[-1])
         axes.set_ylim(y[0], y[-1])
     middle.set_xlim(-4, 21)
     middle.set_ylim(-12, 12)
+    legend(left, title="Fig. 1, unstable inside")
+    legend(middle, title=r"Fig. 2: $\alpha$ = -0.3")
     a = -np.linspace(1e-3, 1 / 3, 300)
     right.semilogy(a, -2 / (a * (1 + 2 * a)), color=COLOURS[0], label="non-iterative HHT")
     right.semilogy(a, -1 / (a * (1 + 2 * a)), color=COLOURS[1], label="conventional HHT")
@@ -172,6 +171,5 @@ def figure(x, y, radii, ends):
         right.plot(alphas, [ends[method, alpha] for alpha in alphas], "o", color=COLOURS[i], ms=4)
     right.set_xlabel(r"$\alpha$")
     right.set_ylabel(r"unstable for 0 < $h\lambda$ < ...")
-    right.set_title("lines: closed form, dots: the step", fontsize=9)
-    right.legend(fontsize=7)
+    legend(right, title="dots: the step")
     return drawn

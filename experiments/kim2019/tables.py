@@ -4,12 +4,12 @@ import json
 from functools import partial
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.kim2019 import pendulum, printed
 from experiments.report import COLOURS, MARKERS, side_by_side
 from hhtjax import simulate
+from hhtjax.plot import subplots
 
 REPRODUCED = Path(__file__).parents[2] / "tests" / "data" / "kim2019.json"  # by an independent program
 KEYS = ("implicit_euler", "conventional_hht", "non_iterative_hht")
@@ -86,7 +86,7 @@ def slope_line(axes, x, y, order, **style):
     """A line of slope `order` from (x, y) over a decade and a half, labelled with it."""
     ends = np.array([x, 30 * x])
     axes.loglog(ends, y * (ends / x) ** order, color="black", lw=0.8, ls=":", **style)
-    axes.annotate(f"slope {order}", (ends[0], y), fontsize=8, ha="left", va="top")
+    axes.annotate(f"slope {order}", (ends[0], y), ha="left", va="top")
 
 
 def error_figure(sizes, errors):
@@ -97,7 +97,7 @@ def error_figure(sizes, errors):
         "free": "free",
     }
     scenes = [scene for scene in titles if (scene, printed.COLUMNS[0]) in errors]
-    figure, panels = plt.subplots(1, len(scenes), figsize=(3.5 * len(scenes), 3.5), sharey=True, squeeze=False)
+    figure, panels = subplots(1, len(scenes), width=175, height=80, sharey=True, squeeze=False)
     panels = panels[0]
     for axes, scene in zip(panels, scenes, strict=True):
         for j, method in enumerate(printed.COLUMNS):
@@ -108,11 +108,11 @@ def error_figure(sizes, errors):
                 axes.loglog(printed.STEP_SIZES, points, "x", color=COLOURS[j], ms=7)
         slope_line(axes, 2e-4, 3e-4 if scene != "free" else 2e-2, 1)
         slope_line(axes, 6e-4, 1e-7 if scene != "free" else 4e-7, 2)
-        axes.set_title(titles[scene], fontsize=9)
+        axes.set_title(titles[scene])
         axes.set_xlabel("step size h (s)")
     panels[0].set_ylabel("RMS error of $q_1$ (rad)")
     panels[0].plot([], [], "kx", label="printed, misprints mended")
-    panels[0].legend(loc="lower right", fontsize=7.5)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
 
@@ -126,7 +126,7 @@ def trajectories(scene, methods, dt, every):
 
 def trajectory_figure(scenes, methods, dt=1e-4):
     """Figs. 6 and 8: both angles with the three methods and the reference."""
-    figure, panels = plt.subplots(2, len(scenes), figsize=(3.7 * len(scenes), 4.4), sharex="col", squeeze=False)
+    figure, panels = subplots(2, len(scenes), width=175, height=115, sharex="col", squeeze=False)
     styles = ({"ls": "-.", "lw": 2.2}, {"ls": "--", "lw": 1.8}, {"ls": ":", "lw": 1.8})
     for column, scene in enumerate(scenes):
         duration = pendulum.SCENES[scene].duration
@@ -139,9 +139,9 @@ def trajectory_figure(scenes, methods, dt=1e-4):
             path.check()
             for angle in (0, 1):
                 panels[angle, column].plot(path.t, path.q[:, angle], color=COLOURS[j], label=method, **styles[j])
-        panels[0, column].set_title(f"{scene}, h = {dt:g} s", fontsize=9)
+        panels[0, column].set_title(f"{scene}, h = {dt:g} s")
         panels[1, column].set_xlabel("time (s)")
     for angle in (0, 1):
         panels[angle, 0].set_ylabel(f"$q_{angle + 1}$ (rad)")
-    panels[0, 0].legend(fontsize=7.5)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure

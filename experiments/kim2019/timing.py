@@ -4,11 +4,11 @@ import time
 from functools import partial
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.kim2019 import pendulum
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import subplots
 
 METHODS = ("implicit Euler", "conventional HHT", "non-iterative HHT", "refreshed", "predictor", "auto")
 ALPHA = 0.0  # as in the paper
@@ -110,7 +110,7 @@ def summary(numbers):
 def figure(numbers):
     """RMS error of q1 against the time of one run."""
     scenes = list(dict.fromkeys(n["scene"] for n in numbers))
-    drawn, panels = plt.subplots(1, len(scenes), figsize=(4.4 * len(scenes), 3.6), squeeze=False)
+    drawn, panels = subplots(1, len(scenes), width=175, height=90, squeeze=False)
     for axes, scene in zip(panels[0], scenes, strict=True):
         for j, method in enumerate(METHODS):
             mine = [n for n in numbers if (n["scene"], n["method"]) == (scene, method)]
@@ -118,9 +118,9 @@ def figure(numbers):
                 x, y = ([n[key] for n in mine] for key in ("time_per_run_s", "rms_error_q1_rad"))
                 label = method if j < 3 else f"hht, {method}"
                 axes.loglog(1e3 * np.array(x), y, color=COLOURS[j], marker=MARKERS[j], ms=4, lw=1, label=label)
-        axes.set_title(f"{scene} double pendulum, $\\alpha$ = 0", fontsize=9)
+        axes.set_title(f"{scene} double pendulum, $\\alpha$ = 0")
         axes.set_xlabel("time of one run (ms)")
         axes.set_ylabel("RMS error of $q_1$ (rad)")
         axes.set_ylim(top=10)
-    panels[0, 0].legend(fontsize=7)
+    drawn.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawn

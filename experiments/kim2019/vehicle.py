@@ -15,12 +15,12 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
 
 import hhtjax
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import vehicle
 
 ALPHA = -0.05
@@ -73,16 +73,9 @@ def heights(q, params):
 
 def solve_reference(scene):
     """The motion as a function of the times, (times, 14), by scipy with tight tolerances."""
-
-    @jax.jit
-    def rate(t, y):
-        q, v = y[:7], y[7:]
-        w = scene.system.force(q, v, t, scene.params) / scene.system.mass(q, scene.params)
-        return jnp.concatenate([v, w])
-
-    y0 = np.concatenate([scene.q0, scene.v0])
+    rhs = hhtjax.interop.scipy_rhs(scene.system, scene.q0, scene.v0, scene.params)
     options = {"rtol": 1e-10, "atol": 1e-12, "dense_output": True}
-    run = solve_ivp(lambda t, y: np.asarray(rate(t, y)), (0, scene.duration), y0, "DOP853", **options)
+    run = solve_ivp(rhs.fun, (0, scene.duration), rhs.y0, "DOP853", **options)
     return lambda times: run.sol(times).T
 
 
@@ -179,14 +172,17 @@ def lowest_load(scene, times, q):
 
 def draw(scene, times, q, errors, factors):
     """The ride, error against step size, and real-time factor against error."""
-    figure, axes = plt.subplot_mosaic([["ride", "ride"], ["error", "factor"]], figsize=(7.4, 6.2), height_ratios=(2, 3))
-    ride, by_step, by_error = axes["ride"], axes["error"], axes["factor"]
+    figure, axes = subplots(2, 2, width=175, height=150, height_ratios=(2, 3))
+    by_step, by_error = axes[1]
+    ride = figure.add_subplot(axes[0, 0].get_gridspec()[0, :])
+    for panel in axes[0]:
+        panel.remove()
     height = heights(q, jax.tree.map(np.asarray, scene.params))
     ride.plot(times, 1e3 * scene.params["road"](times)[:, 0], color="0.6", lw=1, label="road")
     ride.plot(times, height[:, 4], color=COLOURS[1], lw=1, ls="--", label="wheel")
     ride.plot(times, height[:, 0], color=COLOURS[0], label="body")
     ride.set(xlabel="time (s)", ylabel="height, front left (mm)", xlim=(0, scene.duration))
-    ride.legend(ncols=3, loc="upper left")
+    legend(ride)
 
     h = 1e3 * np.array(STEP_SIZES)
     for i, (name, error) in enumerate(errors.items()):

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.patches import Patch
@@ -30,6 +29,7 @@ from experiments.cells import (
 )
 from experiments.linearization.scenes import cases
 from hhtjax import hht
+from hhtjax.plot import subplots
 
 ALPHAS = (0.0, -0.05, -0.3)
 STARTS = ("corrected", "simple")
@@ -136,7 +136,7 @@ def cell_figure(outcomes):
     """Every cell: scenes down, methods across; in each block the step shrinks to the right."""
     colours = ("#000000", "#F2CF8D", "#0072B2")  # also apart in grey: black, light, middle
     labels = ("unbounded", "bounded, error above 5 %", "error below 5 %")
-    figure, axes = plt.subplots(figsize=(7.4, 0.9 + 0.42 * len(outcomes)))
+    figure, axes = subplots(width=175, height=23 + 10 * len(outcomes))
     columns = len(next(iter(outcomes.values()))["converged"].error)
     for row, by_method in enumerate(outcomes.values()):
         for column, outcome in enumerate(by_method.values()):
@@ -163,12 +163,12 @@ def ratio_figure(outcomes):
     """Error over that of the converged method, for each scene."""
     methods = list(METHODS)[1:]
     table = np.array([[geometric_mean(error_ratios(x[m], x["converged"])) for m in methods] for x in outcomes.values()])
-    figure, axes = plt.subplots(figsize=(5.6, 0.9 + 0.3 * len(outcomes)))
+    figure, axes = subplots(width=175, height=23 + 7.5 * len(outcomes))
     image = axes.imshow(table, aspect="auto", cmap="PuOr_r", norm=LogNorm(1 / 30, 30))
     for (row, column), value in np.ndenumerate(table):
         strong = abs(np.log10(value)) > 1 if np.isfinite(value) else False
         text = f"{value:.2f}" if np.isfinite(value) else "-"
-        axes.text(column, row, text, ha="center", va="center", color="white" if strong else "black", fontsize=8)
+        axes.text(column, row, text, ha="center", va="center", color="white" if strong else "black")
     axes.set_xticks(range(len(methods)), methods)
     axes.set_yticks(range(len(outcomes)), outcomes)
     axes.xaxis.tick_top()

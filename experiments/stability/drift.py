@@ -7,7 +7,6 @@
 Errors are relative to the value at the start (of momentum and angular momentum: to its length), at the ends of windows.
 """
 
-import matplotlib.pyplot as plt
 import numpy as np
 from jax import numpy as jnp
 
@@ -16,6 +15,7 @@ from experiments.linearization.scenes import unit_mass
 from experiments.report import COLOURS, MARKERS
 from experiments.stability.gallery import METHODS
 from experiments.stability.grades import plain
+from hhtjax.plot import legend, subplots
 from hhtjax.rotation import cross
 from hhtjax.scenes import Scene, pendulum
 
@@ -132,17 +132,17 @@ def run(report, fast):
 def figure(entries, num_steps):
     """Energy of each scene, and what else each keeps or loses."""
     panels = ("dumbbell", "energy"), ("dumbbell", "angular momentum"), ("free body", "energy"), ("pendulum", "energy")
-    drawn, grid = plt.subplots(2, 2, figsize=(9.4, 7.2), sharex=True, dpi=100)
+    drawn, grid = subplots(2, 2, width=175, height=210, sharex=True)
     steps = num_steps / WINDOWS * np.arange(1, WINDOWS + 1)
     for axes, (scene, quantity) in zip(grid.ravel(), panels, strict=True):
         for i, e in enumerate(e for e in entries if e["scene"] == scene):
             marker = {"marker": MARKERS[(i + i // 8) % 8], "ms": 4, "markevery": (i, 9)}
             x = np.maximum(e["path"][quantity], 1e-16)
             axes.loglog(steps, x, color=COLOURS[i % 8], lw=1, ls=("-", "--")[i // 8], label=e["method"], **marker)
-        axes.set_title(f"{scene}, h = {1e3 * next(e['h_s'] for e in entries if e['scene'] == scene):g} ms", fontsize=9)
+        axes.set_title(f"{scene}, h = {1e3 * next(e['h_s'] for e in entries if e['scene'] == scene):g} ms")
         axes.set_ylabel(f"relative error of {quantity}")
         if (scene, quantity) != panels[1]:
-            axes.legend(fontsize=6, ncols=2 if scene == "dumbbell" else 1)
+            legend(axes)
     for axes in grid[1]:
         axes.set_xlabel("number of steps")
     return drawn

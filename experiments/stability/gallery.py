@@ -115,10 +115,8 @@ def boundaries(outcomes, sizes, references):
     }
 
 
-SLOW = "A Jacobian at the state misses how the stiff direction turns within the step: state, Kim, Rosenbrock, ROWDA."
-CONTACT = (
-    "Contact begins within the step: a Jacobian at the state still is that of free flight, and the push comes too hard."
-)
+SLOW = "A Jacobian at the state misses how the stiff direction turns: state, Kim, Rosenbrock, ROWDA."
+CONTACT = "Contact begins within the step: at the state it is free flight still, and the push too hard."
 CAUSES = {
     "Duffing, driven": "Nothing blows up; only steps of an eighth of a period and more are inaccurate.",
     "double pendulum, free": "Chaotic: steps of 0.3 s and more turn the links over and over, with Newton too.",
@@ -177,12 +175,26 @@ def run(report, fast):
     for title, rows in ("Scenes on which the default was chosen.\n", tuned), ("Held-out scenes.\n", untouched):
         print(title)
         report.table(SUMMARY, rows)
-    report.figure("stability", page(outcomes, CAUSES))
+    scenes = cells(outcomes, sizes)
+    figures(report, scenes)
     return {
         "alphas": ALPHAS,
         "tuned_scenes": len(outcomes) - len(new),
         "summary_tuned_on": [dict(zip(SUMMARY, row, strict=True)) for row in tuned],
         "summary_held_out": [dict(zip(SUMMARY, row, strict=True)) for row in untouched],
         "boundaries": boundaries(outcomes, sizes, references),
-        "scenes": cells(outcomes, sizes),
+        "scenes": scenes,
     }
+
+
+def figures(report, scenes):
+    """All cells: of the methods with alpha, with a line on why they fail, and of the others."""
+    methods = next(iter(scenes.values()))["grades"]
+    with_alpha = [name for name, rows in methods.items() if len(rows) > 1]
+    for name, shown, causes in (
+        ("stability", with_alpha, CAUSES),
+        ("stability_without_alpha", [x for x in methods if x not in with_alpha], {}),
+    ):
+        if shown:
+            some = {key: {"grades": {x: scene["grades"][x] for x in shown}} for key, scene in scenes.items()}
+            report.figure(name, page(some, causes))

@@ -1,13 +1,14 @@
 """How a run is graded, how far a method holds, and the page that shows all cells."""
 
+from textwrap import wrap
 from typing import NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.patches import Patch
 
 from experiments.cells import ACCURATE
+from hhtjax.plot import subplots
 
 ALPHAS = (0.0, -0.05, -0.3)
 BLOWN_UP, WRONG, BOUNDED, GOOD = range(4)
@@ -60,38 +61,39 @@ def cells(outcomes, sizes):
     }
 
 
-def page(outcomes, causes):
-    """Every cell: scenes down, with a line on why methods fail; methods across; the step shrinks to the right."""
-    first = next(iter(outcomes.values()))
-    methods, columns = list(first), len(next(iter(first.values())).error)
-    size = max(7.4, 0.9 + 0.72 * len(methods)), 1.3 + 0.52 * len(outcomes)
-    figure, axes = plt.subplots(figsize=size, dpi=115)
+def page(scenes, causes):
+    """Cells as of `cells`: scenes down, with why methods fail; methods across; the step shrinks to the right."""
+    methods = list(next(iter(scenes.values()))["grades"])
+    columns = max(len(row) for by_method in scenes.values() for rows in by_method["grades"].values() for row in rows)
+    pitch = 5.5 if causes else 4
+    figure, axes = subplots(width=175, height=30 + 2 * pitch * len(scenes))
     style = {
         "cmap": ListedColormap(list(GRADES.values())),
         "vmin": 0,
         "vmax": 3,
         "edgecolor": "white",
-        "linewidth": 0.25,
+        "linewidth": 0.3,
     }
-    for row, (name, by_method) in enumerate(outcomes.items()):
-        for column, outcome in enumerate(by_method.values()):
-            x = (columns + 1) * column + np.arange(columns + 1)
-            y = 5.5 * row + np.linspace(0, 3, 1 + outcome.error.shape[1])
-            axes.pcolormesh(x, y, outcome.grade.T, **style)
-        axes.text(0, 5.5 * row + 4.1, causes.get(name, ""), fontsize=6.5, va="center", style="italic", color="#444444")
-    axes.set_xticks((columns + 1) * np.arange(len(methods)) + columns / 2, methods, fontsize=8)
-    axes.set_yticks(5.5 * np.arange(len(outcomes)) + 1.5, outcomes, fontsize=8)
+    for row, (name, scene) in enumerate(scenes.items()):
+        for column, method in enumerate(methods):
+            grades = np.array([[LETTERS.index(letter) for letter in line] for line in scene["grades"][method]])
+            x = (columns + 1) * column + np.arange(grades.shape[1] + 1)
+            axes.pcolormesh(x, pitch * row + np.linspace(0, 3, len(grades) + 1), grades, **style)
+        if causes:
+            line = axes.text(0, pitch * row + 4.1, causes.get(name, ""), va="center", style="italic", color="#444444")
+            line.set_in_layout(False)
+    axes.set_xticks(
+        (columns + 1) * np.arange(len(methods)) + columns / 2, ["\n".join(wrap(name, 10)) for name in methods]
+    )
+    axes.set_yticks(pitch * np.arange(len(scenes)) + 1.5, [name.replace(", ", ",\n") for name in scenes])
     axes.set_xlim(-1, (columns + 1) * len(methods))
-    axes.set_ylim(5.5 * len(outcomes), -0.5)
+    axes.set_ylim(pitch * len(scenes), -0.5)
     axes.xaxis.tick_top()
     axes.tick_params(length=0)
     axes.grid(False)
     axes.spines[:].set_visible(False)
-    axes.set_xlabel(
-        f"In each block: step size halved from column to column\n"
-        f"rows: alpha = {', '.join(map(str, ALPHAS))}, or one without alpha",
-        fontsize=8,
-    )
+    alphas = f"rows: alpha = {', '.join(map(str, ALPHAS))}, or one without alpha"
+    axes.set_xlabel(f"In each block: step size halved from column to column\n{alphas}")
     handles = [Patch(color=colour, label=label) for label, colour in GRADES.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure

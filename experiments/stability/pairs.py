@@ -72,5 +72,6 @@ def run_study(report, study, name, fast):
         outcomes[case.name] = {method: assess(study, case, steps, references, method) for method in methods}
         sizes[case.name] = steps
         report.progress(f"{name}: {case.name}")
-    report.figure(name, page(outcomes, study.causes or {}))
-    return cells(outcomes, sizes)
+    found = cells(outcomes, sizes)
+    report.figure(name, page(found, study.causes or {}))
+    return found

@@ -12,15 +12,14 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
 
 import hhtjax
 from experiments import diffrax_run
-from experiments.cardona_geradin1989.index_1 import unconstrained
 from experiments.linearization.scenes import unit_mass
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import double_pendulum, pendulum
 
 FREQUENCY = 100.0  # rad/s, of the mass on a spring
@@ -128,18 +127,11 @@ def dampers():
 def rods(duration):
     """By method: times, and the relative error of the rod's length."""
     system, params, q0, v0, _ = pendulum.cartesian()
-    ode = unconstrained(system, q0.size)
+    rhs = hhtjax.interop.scipy_rhs(system, q0, v0, params)
     times = np.linspace(0.0, duration, 101)
-
-    @jax.jit
-    def rate(t, y):
-        return jnp.concatenate([y[2:], ode.force(y[:2], y[2:], t, params)])
-
     found = {}
     for solver in ("RK45", "LSODA", "Radau"):
-        run = solve_ivp(
-            lambda t, y: np.asarray(rate(t, y)), times[[0, -1]], np.concatenate([q0, v0]), solver, times, rtol=1e-6
-        )
+        run = solve_ivp(rhs.fun, times[[0, -1]], rhs.y0, solver, times, rtol=1e-6)
         found[f"SciPy {solver}, rtol 1e-6"] = np.abs(np.linalg.norm(run.y[:2], axis=0) / params["l"] - 1)[1:].tolist()
     num_steps = 100 * round(duration / 0.5)
     path = hhtjax.simulate(
@@ -178,23 +170,23 @@ def run(report, fast):
 
 def figure(amplitudes, damped, lengths):
     """Three panels."""
-    drawn, (springs_axes, dampers_axes, rods_axes) = plt.subplots(1, 3, figsize=(11, 3.6))
+    drawn, (springs_axes, dampers_axes, rods_axes) = subplots(1, 3, width=175, height=95)
     styles = [{"color": c, "marker": m, "ms": 4, "lw": 1} for c, m in zip(COLOURS, MARKERS, strict=True)]
     for style, (name, x) in zip(styles, amplitudes.items(), strict=False):
         springs_axes.loglog(OMEGA_H, np.clip(x, 1e-3, 1e6), **style, label=name)
     springs_axes.axvline(2.0, color="#999999", lw=0.8, ls=":")
-    springs_axes.set(xlabel="$\\omega h$", ylabel="largest |q|/q(0), steps 101 to 200; cut at 10$^6$")
+    springs_axes.set(xlabel="$\\omega h$", ylabel="largest |q|/q(0), steps 101 to 200")
     c = [row["c_N_m_s"] for row in damped]
     dampers_axes.loglog(c, [row["hht_steps"] for row in damped], **styles[0], label="hht")
     if "tsit5_steps" in damped[0]:
         steps = [row["tsit5_steps"] or MAX_STEPS for row in damped]
         dampers_axes.loglog(c, steps, **styles[1], label="diffrax Tsit5, rtol 1e-6")
         dampers_axes.axhline(MAX_STEPS, color="#999999", lw=0.8, ls=":")
-    dampers_axes.set(xlabel="damping of the second joint (N m s/rad)", ylabel="steps for 1 s")
+    dampers_axes.set(xlabel="damping, joint 2 (N m s/rad)", ylabel="steps for 1 s")
     for i, (name, x) in enumerate(lengths["errors"].items()):
         style = styles[(i + 1) % len(lengths["errors"])]
         rods_axes.loglog(lengths["times_s"], np.maximum(x, 1e-16), **style | {"marker": None}, label=name)
     rods_axes.set(xlabel="time (s)", ylabel="relative error of the rod's length")
     for axes in (springs_axes, dampers_axes, rods_axes):
-        axes.legend(fontsize=7)
+        legend(axes)
     return drawn

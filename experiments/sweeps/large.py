@@ -10,12 +10,12 @@ cost of a step must grow with n, not with n^2 or n^3.
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.benchmarks.measure import least_seconds, temporary_bytes
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import legend, subplots
 
 SIZES, FAST_SIZES = (100, 1000, 10_000, 100_000), (40,)
 STEPS = 20
@@ -164,7 +164,7 @@ def run(report, fast):
 
 def figure(rows, left):
     """Time against size; error against iterations."""
-    drawn, (times, errors) = plt.subplots(1, 2, figsize=(9, 3.6))
+    drawn, (times, errors) = subplots(1, 2, width=175, height=95)
     for i, name in enumerate(CASES):
         mine = [row for row in rows if row["case"] == name]
         n = [row["unknowns"] for row in mine]
@@ -173,7 +173,7 @@ def figure(rows, left):
             times.loglog(n, y, line, color=COLOURS[i], marker=MARKERS[i], ms=4, label=f"{name}, {form}")
     times.loglog(n, 0.05 * np.array(n), color="black", lw=1, ls=":", label="slope 1")
     times.set(xlabel="number of unknowns", ylabel="time of a step (µs)")
-    times.legend(fontsize=6)
+    drawn.legend(*times.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     for i, (n, found) in enumerate(left.items()):
         x = [row["iterations"] for row in found]
         errors.semilogy(x, [row["error"] for row in found], color=COLOURS[i], marker=MARKERS[i], label=f"n = {n}")
@@ -182,5 +182,5 @@ def figure(rows, left):
         ylabel="relative error of q after 200 steps",
         ylim=(1e-16, 10),
     )
-    errors.legend()
+    legend(errors)
     return drawn

@@ -10,13 +10,13 @@ import sys
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.benchmarks import native
 from experiments.benchmarks.measure import least_seconds, temporary_bytes
 from hhtjax import trigonometry
+from hhtjax.plot import subplots
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.scenes import double_pendulum
@@ -120,7 +120,7 @@ def run(report, fast):
 def figure(axes, error):
     """Error over (h, stiffness) for two alphas, and over (h, alpha) for two stiffnesses."""
     scales, alphas, steps = axes
-    drawn, grid = plt.subplots(2, 2, figsize=(9, 6.4), sharex=True)
+    drawn, grid = subplots(2, 2, width=175, height=145, sharex=True)
     panels = [
         (f"alpha = {alphas[-1]:.3g}", scales, error[:, -1], "stiffness / that of the paper"),
         (f"alpha = {alphas[0]:.3g}", scales, error[:, 0], "stiffness / that of the paper"),

@@ -7,12 +7,12 @@ Gauss-Newton on exact derivatives, all step sizes at once, each with its own est
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.report import COLOURS, MARKERS
 from hhtjax import trigonometry
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import double_pendulum
 
 DURATION = 1.0
@@ -134,25 +134,27 @@ def run(report, fast):
 
 def figure(rows, coarse, biases):
     """Errors of the steppers, of alpha, and of the stiffness."""
-    drawn, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 5), dpi=100)
+    drawn, grid = subplots(2, 2, width=175, height=165)
+    left, middle, right, key = grid.flat
     shown = [row for row in rows if row["alpha"] in (None, -0.1) and row["method"] != "hht predictor"]
     for i, row in enumerate(shown):
         style = {"color": COLOURS[i % 8], "marker": MARKERS[i % 8], "ms": 3, "ls": ("-", "--")[i // 8], "lw": 1}
         left.loglog(row["h_s"], row["error_rad"], label=f"{row['method']} ({row['order']:.2f})", **style)
-    left.set(title="alpha = -0.1, fitted order in brackets", ylim=(1e-13, 10))
+    left.set_ylim(1e-13, 10)
     for i, alpha in enumerate(ALPHAS):
         for name, line in (("hht predictor", "-"), ("kim_hht", "--")):
             row = next(r for r in rows if r["method"] == name and r["alpha"] == alpha)
             label = f"{name}, {alpha:g} ({row['order']:.2f})"
             middle.loglog(row["h_s"], row["error_rad"], line, color=COLOURS[i], marker=MARKERS[i], ms=3, label=label)
-    middle.set_title("alpha, fitted order in brackets")
     for i, (name, bias) in enumerate(biases.items()):
         right.loglog(coarse, np.abs(bias), color=COLOURS[i], marker=MARKERS[i], ms=3, label=name)
-    right.set_title("stiffness identified with this step")
     right.set_ylabel("relative error of the stiffness")
     for axes in (left, middle):
         axes.set_ylabel("error of the angles after 1 s (rad)")
     for axes in (left, middle, right):
         axes.set_xlabel("step size (s)")
-        axes.legend(fontsize=6.5, ncols=2, handlelength=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
+    key.axis("off")
+    key.legend(*left.get_legend_handles_labels(), title="upper left", loc="center")
+    legend(middle)
+    legend(right)
     return drawn

@@ -14,13 +14,13 @@ from collections import Counter
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from jax import export
 from jax.flatten_util import ravel_pytree
 
 import hhtjax
 from experiments.report import COLOURS
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import double_pendulum, squeezer, vehicle
 from hhtjax.xla import one_kernel
 
@@ -191,7 +191,7 @@ def run(report, fast):
 
 def figure(samples, path):
     """How many calls took longer than that; the controlled angle."""
-    drawn, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
+    drawn, (left, right) = subplots(1, 2, width=175, height=90)
     shown = [key for key in samples if key[1] in ("empty call", "compiled", "at 1 kHz", "empty call at 1 kHz")]
     shown = [key for key in shown if key[0] == "double pendulum" or key[1] == "compiled"]
     for i, key in enumerate(shown):
@@ -200,9 +200,9 @@ def figure(samples, path):
         left.loglog(1e6 * x, share, color=COLOURS[i], ls=("-", "--", ":")[i % 3], label=", ".join(key))
     left.axvline(1e6 * PERIOD, color="black", lw=1)
     left.set(xlabel="latency (µs)", ylabel="share of calls that took longer", ylim=(0.5 / x.size, 1.2))
-    left.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.18), ncol=2)
+    legend(left)
     right.plot(PERIOD * np.arange(len(path)), path, label="first link")
     right.axhline(0.5, color="black", ls=":", label="target")
-    right.set(xlabel="time (s)", ylabel="angle (rad)", title="controller and plant in two threads")
-    right.legend()
+    right.set(xlabel="time (s)", ylabel="angle (rad)")
+    legend(right)
     return drawn

@@ -12,8 +12,6 @@ from scipy.integrate import solve_ivp
 import hhtjax
 from experiments.benchmarks.chain import chain
 from experiments.cardona_geradin1989.index_1 import unconstrained
-from hhtjax.numerics.linear_solve import solve
-from hhtjax.rotation import hat
 from hhtjax.scenes import Scene, double_pendulum, duffing, squeezer, top
 from hhtjax.xla import on_scalars, one_kernel
 
@@ -41,30 +39,16 @@ class Case(NamedTuple):
 def second_order(scene, unit="rad", system=None):
     """The case of a scene in vectors q and v; system: one without constraints, if it has some."""
     plain = system or scene.system
-    n = scene.q0.size
-
-    def rate(t, y, params):
-        q, v = y[:n], y[n:]
-        M = jnp.asarray(plain.mass(q, params) if callable(plain.mass) else plain.mass)
-        Q = plain.force(q, v, t, params)
-        return jnp.concatenate([v, Q / M if M.ndim == 1 else solve(M, Q)])
-
-    y0 = np.concatenate([scene.q0, scene.v0])
-    return Case(scene, rate, y0, n, (plain, scene.q0, scene.v0), unit)
+    flat = hhtjax.interop.flat_ode(plain, scene.q0, scene.v0)
+    return Case(scene, flat.rate, np.asarray(flat.y0), scene.q0.size, (plain, scene.q0, scene.v0), unit)
 
 
 def spinning_top():
     """The top as a rotation: for the others as 9 numbers and 3 angular velocities."""
     scene = top.minimal()
-
-    def rate(t, y, params):
-        R, Om = y[:9].reshape(3, 3), y[9:]
-        moment = scene.system.force(R, Om, t, params)
-        return jnp.concatenate([(R @ hat(Om)).ravel(), moment / scene.system.mass(R, params)])
-
-    system = hhtjax.FirstOrderSystem(lambda y, t, params: rate(t, y, params))
-    y0 = np.concatenate([np.ravel(scene.q0), scene.v0])
-    return Case(scene, rate, y0, 9, (system, jnp.asarray(y0), None), "1")
+    flat = hhtjax.interop.flat_ode(scene.system, scene.q0, scene.v0)
+    system = hhtjax.FirstOrderSystem(lambda y, t, params: flat.rate(t, y, params))
+    return Case(scene, flat.rate, np.asarray(flat.y0), 9, (system, flat.y0, None), "1")
 
 
 def at(scene, duration):
@@ -94,16 +78,9 @@ def cases():
 def reference(name):
     """Positions at the sample times, (SAMPLES, size), by SciPy's DOP853 at a tolerance of 1e-13."""
     case = cases()[name]
-    rate = jax.jit(case.rate)
-    run = solve_ivp(
-        lambda t, y: np.asarray(rate(t, y, case.scene.params)),
-        (0.0, case.scene.duration),
-        case.y0,
-        "DOP853",
-        case.times,
-        rtol=1e-13,
-        atol=1e-14,
-    )
+    system, q0, v0 = case.ode
+    rhs = hhtjax.interop.scipy_rhs(system, q0, v0, case.scene.params)
+    run = solve_ivp(rhs.fun, (0.0, case.scene.duration), rhs.y0, "DOP853", case.times, rtol=1e-13, atol=1e-14)
     return run.y[: case.size].T
 
 

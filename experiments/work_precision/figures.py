@@ -1,9 +1,13 @@
 """The charts: error against time, against factorised matrices, and the gradient's error against time."""
 
-import matplotlib.pyplot as plt
+import textwrap
+
+import numpy as np
 
 from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import subplots
 
+WORST = 10  # error beyond which a run is not drawn
 PACKAGES = "ours", "diffrax", "SciPy", "MuJoCo", "exudyn"
 SHOWN = {  # of a package: the methods that are drawn, where the page has all of them
     "ours": ("hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rk4"),
@@ -31,46 +35,69 @@ def style(package, number):
     return line | {"color": colour, "marker": MARKERS[number % len(MARKERS)], "ms": 3.5}
 
 
+def curves(lines, case, x, shown):
+    """{package: {method: (work, errors, style)}}, in the order of their settings; times in ms."""
+    found = {package: {} for package in PACKAGES}
+    scale = 1e3 if x == "time_s" else 1
+    for package in PACKAGES:
+        methods = list(dict.fromkeys(line["method"] for line in lines if line["package"] == package))
+        methods = methods if shown is None else [m for m in shown[package] if m in methods]
+        for number, method in enumerate(methods):
+            mine = [line for line in lines if (line["case"], line["method"]) == (case, method) and x in line]
+            pairs = [pair for line in mine for pair in zip(line[x], line["rms_error"], strict=True)]
+            points = [(scale * a, e) for a, e in pairs if a and e and e < WORST]
+            if points:
+                found[package][method] = (*np.array(points).T, style(package, number))
+    return found
+
+
+def front(panel, packages, label):
+    """The least error that any of these methods reaches with that much work, in grey behind the curves."""
+    points = [
+        (a, e) for methods in packages for work, error, _ in methods.values() for a, e in zip(work, error, strict=True)
+    ]
+    if points:
+        work, error = np.array(sorted(points)).T
+        panel.step(work, np.minimum.accumulate(error), where="post", color="#bbbbbb", lw=3, zorder=1, label=label)
+
+
 def panels(lines, names, x, xlabel, ylabel, shown=None):
-    """A panel for each case; x: the key of the horizontal axis; shown: {package: methods}, by default all."""
-    columns = min(2, len(names))
-    height = -(-len(names) // columns)
-    drawn, axes = plt.subplots(height, columns, figsize=(4.6 * columns, 0.9 + 2.9 * height), squeeze=False, dpi=88)
-    legend = {}
-    for name, panel in zip(names, axes.ravel(), strict=True):
-        for package in PACKAGES:
-            methods = list(dict.fromkeys(line["method"] for line in lines if line["package"] == package))
-            methods = methods if shown is None else [m for m in shown[package] if m in methods]
-            for line in lines:
-                if line["case"] != name or line["method"] not in methods or x not in line:
-                    continue
-                points = [(a, e) for a, e in zip(line[x], line["rms_error"], strict=True) if a and e]
-                if points:
-                    scale = 1e3 if x == "time_s" else 1
-                    (drawn_line,) = panel.loglog(
-                        [scale * a for a, _ in points],
-                        [e for _, e in points],
-                        **style(package, methods.index(line["method"])),
-                    )
-                    label = line["method"] if package != "ours" else f"ours: {line['method']}"
-                    legend.setdefault(label, drawn_line)
-            unit = next((line["unit"] for line in lines if line["case"] == name and "unit" in line), "1")
-        panel.set(xlabel=xlabel, ylabel=ylabel.format(unit=unit))
-        panel.set_title(name, fontsize=9)
-        panel.set_ylim(max(1e-10, panel.get_ylim()[0]), min(10, panel.get_ylim()[1]))
-    drawn.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, fontsize=7.5)
+    """A row for each case: our methods, then those of others, each with the best of the other side in grey.
+
+    x: the key of the horizontal axis; shown: {package: methods}, by default all.
+    """
+    drawn, grid = subplots(len(names), 2, width=175, height=25 + 50 * len(names), squeeze=False, sharey="row")
+    keys = {}, {}
+    for row, name in zip(grid, names, strict=True):
+        found = curves(lines, name, x, shown)
+        ours, others = [found["ours"]], [found[package] for package in PACKAGES[1:]]
+        for panel, mine, rest, label, key in zip(
+            row, (ours, others), (others, ours), ("best of others", "best of ours"), keys, strict=True
+        ):
+            front(panel, rest, label)
+            for method, (work, error, look) in (item for methods in mine for item in methods.items()):
+                panel.loglog(work, error, label=method, **look)
+            handles, labels = panel.get_legend_handles_labels()
+            key |= dict(zip(labels, handles, strict=True))
+        unit = next((line["unit"] for line in lines if line["case"] == name and "unit" in line), "1")
+        row[0].set_ylabel("\n".join([*textwrap.wrap(name, 26), ylabel.format(unit=unit)]))
+        row[0].set_ylim(max(1e-10, row[0].get_ylim()[0]), row[0].get_ylim()[1])
+    for panel in grid[-1]:
+        panel.set_xlabel(xlabel)
+    key = keys[0] | keys[1]
+    drawn.legend(key.values(), key.keys(), loc="outside upper center", ncols=4 if shown else 3)
     return drawn
 
 
 def draw(report, lines, names, gradient_lines, gradient_names):
     """All figures."""
     counted = {package: [m for m in methods if "Kvaerno" not in m] for package, methods in SHOWN.items()}
-    error = "RMS error of the positions ({unit})"
+    error = "RMS error ({unit})"
     for i, some in enumerate((names[:4], names[4:]), 1):
         report.figure(f"work_precision_time_{i}", panels(lines, some, "time_s", "time of a run (ms)", error, SHOWN))
         report.figure(
             f"work_precision_solves_{i}", panels(lines, some, "solves", "factorised matrices", error, counted)
         )
     label = "time of value and gradient (ms)"
-    figure = panels(gradient_lines, gradient_names, "time_s", label, "relative error of the gradient")
+    figure = panels(gradient_lines, gradient_names, "time_s", label, "relative error")
     report.figure("work_precision_gradients", figure)

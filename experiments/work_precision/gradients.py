@@ -138,6 +138,7 @@ def diffrax_rows(name, tolerances):
             throw=False,
         )
         fine = found.result == diffrax.RESULTS.successful
+        assert found.ys is not None
         return jnp.where(fine, jnp.mean(found.ys[:, : case.size] ** 2), jnp.nan)
 
     for solver, mode in (

@@ -5,28 +5,23 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
 
+import hhtjax
 from experiments.benchmarks import native
 from experiments.work_precision.cases import cases
 from experiments.work_precision.timing import sweep
 
 SOLVERS = "LSODA", "Radau", "BDF", "DOP853"
 TOLERANCES = tuple(10.0**-n for n in range(3, 12))
-PROGRAMS: dict = {}
 Makers = dict[str, Callable[[Any], Callable]]
 
 
 def by_jax(case):
     """Compiled from the same functions as ours; a call costs some microseconds of JAX's."""
-    values, unravel = ravel_pytree(case.scene.params)
-    if case.rate not in PROGRAMS:  # the parameters as one vector: the fewer arguments, the quicker the call
-        PROGRAMS[case.rate] = jax.jit(lambda t, y, p: case.rate(t, y, unravel(p)))
-    rate, values = PROGRAMS[case.rate], np.asarray(values)
-    return lambda t, y: np.asarray(rate(t, y, values))
+    system, q0, v0 = case.ode
+    return hhtjax.interop.scipy_rhs(system, q0, v0, case.scene.params).fun
 
 
 def by_c(case):

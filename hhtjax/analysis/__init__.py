@@ -19,13 +19,16 @@ from hhtjax.analysis.amplification import amplification_matrix, constraint_matri
 from hhtjax.analysis.convergence import ObservedOrder, observed_order
 from hhtjax.analysis.energy import EnergyBalance, energy_balance
 from hhtjax.analysis.jordan import Eigenvalue, jordan_structure, transient_growth
+from hhtjax.analysis.modal import ModalReduction, NormalModes, modal_reduction, modes
 from hhtjax.analysis.oscillator import damping_ratio, overshoot, period_elongation, spectral_radius, stability_region
 from hhtjax.analysis.step_size import Mode, StepSize, suggest_step_size
 
 __all__ = [
     "Eigenvalue",
     "EnergyBalance",
+    "ModalReduction",
     "Mode",
+    "NormalModes",
     "ObservedOrder",
     "StepSize",
     "amplification_matrix",
@@ -33,6 +36,8 @@ __all__ = [
     "damping_ratio",
     "energy_balance",
     "jordan_structure",
+    "modal_reduction",
+    "modes",
     "observed_order",
     "oscillator_matrix",
     "overshoot",
@@ -42,3 +47,7 @@ __all__ = [
     "suggest_step_size",
     "transient_growth",
 ]
+
+
+def __dir__():
+    return __all__

@@ -8,10 +8,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number
+from hhtjax.description.presentation import shown
 from hhtjax.steppers.stepper import require_stepper
 from hhtjax.systems.initial_values import initial_values
 
 
+@shown
 class ObservedOrder(NamedTuple):
     """What `observed_order` found.
 

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_function
+from hhtjax.description import freeze, thaw
+from hhtjax.description.presentation import shown
 from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import held
@@ -14,6 +16,7 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.system import LinearSystem, System
 
 
+@shown
 class EnergyBalance(NamedTuple):
     """Energies by saved time, (K + 1,) each, in J.
 
@@ -71,12 +74,13 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
     if potential is not None:
         require_function(caller, "potential", potential, "potential(q, t, params)")
-    return _energy_balance(system, solution, params, potential)
+    return _energy_balance(system, solution, freeze(params), potential)
 
 
 @partial(jax.jit, static_argnames="potential")
 def _energy_balance(system, solution, params, potential):
     q0, v0, t0 = (jax.tree.map(lambda x: x[0], y) for y in (solution.q, solution.v, solution.t))
+    params = thaw(params)
     flat, _, _ = flatten("energy_balance", system, q0, v0, t0, params)
 
     def energies(q, v, t):

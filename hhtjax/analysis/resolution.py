@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from hhtjax.description import thaw
+
 SAMPLES = 64  # times at which runs are compared; a power of two, so that the coarsest hit a part of them
 FEWEST, ENOUGH, MOST = 8, 1024, 2**20  # steps of the first run, and at least and at most of the last
 
@@ -63,7 +65,7 @@ def _rms(x):
 @jax.jit
 def _samples(system, stepper, q0, v0, params, t0, duration, num_steps):
     """q at SAMPLES times, or, of fewer steps, after each; compiled once for all numbers of steps."""
-    dt = duration / num_steps
+    params, dt = thaw(params), duration / num_steps
     between = jnp.maximum(1, num_steps // SAMPLES)
 
     def step(i, carry):

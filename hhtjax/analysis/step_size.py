@@ -10,6 +10,7 @@ from hhtjax.analysis.amplification import eigenvalues
 from hhtjax.analysis.oscillator import damping_ratio, period_elongation
 from hhtjax.analysis.resolution import step_size_by_runs
 from hhtjax.checks import require_number
+from hhtjax.description import freeze, thaw
 from hhtjax.steppers.stepper import require_capable, require_stepper
 from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.systems.flat_system import flatten
@@ -140,6 +141,7 @@ def suggest_step_size(
             raise ValueError(f"{caller}: `highest` must be left out where there is a `duration`; received {highest}.")
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
+    params = freeze(params)
     q0, v0 = initial_values(caller, system, q0, v0)
     require_capable(caller, system, stepper, q0, v0)
     rates = _rates(*map(np.asarray, _linearize(system, q0, v0, params, t0)))
@@ -149,7 +151,8 @@ def suggest_step_size(
         reach.append((_reach(error > tolerance), _reach(radius > STABLE_RADIUS) if rate.real <= 0 else np.inf))
     resolved, stable = np.reshape(reach, (-1, 2)).T / abs(rates)
     if duration is None:
-        dt, reason = _modal_step(rates, resolved, stable, tolerance, highest, isinstance(system, LinearSystem))
+        linear = isinstance(system, LinearSystem) and system.nonlinear is None
+        dt, reason = _modal_step(rates, resolved, stable, tolerance, highest, linear)
     else:
         dt, most = step_size_by_runs(system, stepper, q0, v0, params, float(t0), float(duration), tolerance)
         reason = f"keeps q within {tolerance:g} of its motion over {duration:g} s, by runs of up to {most} steps"
@@ -189,6 +192,7 @@ def _modal_step(rates, resolved, stable, tolerance, highest, linear):
 @jax.jit
 def _linearize(system, q0, v0, params, t0):
     """Derivatives of w in displacement and velocity, (n, n), and B, (m, n)."""
+    params = thaw(params)
     flat, q, v = flatten("suggest_step_size", system, q0, v0, t0, params)
     t = jnp.asarray(t0).astype(q.dtype)
 

@@ -105,3 +105,7 @@ __all__ = [
     "windows",
     "wrap_angle",
 ]
+
+
+def __dir__():
+    return __all__

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 
 from hhtjax.checks import require_function, require_integer
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
 
@@ -78,8 +78,9 @@ def check_options(
 
 
 def check_parameters(caller, params0, name="params0"):
-    """params0 as a pytree of float arrays."""
-    leaves = jax.tree_util.tree_leaves_with_path(params0)
+    """params0 as a pytree of float arrays, functions among them hidden."""
+    given, params0 = params0, freeze(params0)
+    leaves = jax.tree_util.tree_leaves_with_path(params0) or jax.tree_util.tree_leaves_with_path(given)
     if not leaves:
         raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
     for path, leaf in leaves:
@@ -96,6 +97,7 @@ def check_scale(caller, scale, params0):
     """The scale of each entry of params0, by default its size, or 1 where that is 0."""
     if scale is None:
         return jax.tree.map(lambda x: jnp.where(x == 0, 1, jnp.abs(x)), params0)
+    scale = freeze(scale)
     if jax.tree.structure(scale) != jax.tree.structure(params0):
         raise ValueError(
             f"{caller}: `scale` must be a pytree structured like params0, {jax.tree.structure(params0)}; "
@@ -159,7 +161,7 @@ def check_residuals(caller, residuals, p, *args):
         return result
 
     try:
-        shapes = jax.eval_shape(real, *args)
+        shapes = jax.eval_shape(lambda *args: real(*thaw(args)), *freeze(args))
     except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
         raise TypeError(
             f"{caller}: `residuals` must be traceable by JAX, with jax.numpy in place of NumPy, float() and `if` "

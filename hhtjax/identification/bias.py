@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis import amplification_matrix
 from hhtjax.checks import require_number
+from hhtjax.description.presentation import all_known, between, shown
 from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import Stepper, require_stepper
 from hhtjax.systems.system import LinearSystem, System
@@ -29,6 +30,7 @@ ON_CONSTRAINT = 1e-6  # largest residual of it
 DRIVEN = 64  # steps from t, in which a force that depends on the time has changed
 
 
+@shown
 class ModeBias(NamedTuple):
     """What the step size did to a fit, for each mode with an oscillation, slowest first, arrays (modes,).
 
@@ -47,6 +49,16 @@ class ModeBias(NamedTuple):
     stiffness_bias: Any
     damping_bias: Any
     params: Any = None
+
+    def _verdict(self):
+        """The frequencies, and the largest biases, in words."""
+        numbers = all_known(self[:5])
+        if len(numbers) < 5 or not numbers[0].size:
+            return ""
+        w, _, wh, stiffness, damping = numbers
+        stiffness, damping = (between(100 * bias, "%", digits=3) for bias in (stiffness, damping))
+        frequencies = f"{w.size} mode{'s' * (w.size > 1)}, {between(w, 'rad/s')}, w h = {between(wh, digits=3)}"
+        return f"{frequencies}: stiffness off by {stiffness}, damping by {damping}"
 
 
 def step_size_bias(

@@ -44,7 +44,7 @@ def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, pat
         code = jnp.where(jnp.all(gradient == 0), level, code)
         code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
         if progress:
-            show(iteration, value, step)
+            show(iteration, value, step, code)
         updates, state = optimizer.update(gradient, state, x, value=value, grad=gradient, value_fn=cost)
         updates = jnp.where(code == RUNNING, jnp.asarray(updates), 0)
         iteration = jnp.where(code == RUNNING, iteration + 1, iteration)

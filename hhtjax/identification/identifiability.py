@@ -5,6 +5,8 @@ import warnings
 import jax
 import numpy as np
 
+from hhtjax.description import freeze
+
 BEYOND = "the loss is flat there, with residuals beyond its bend (`weights` is one over the noise)"
 
 
@@ -15,7 +17,7 @@ class IdentifiabilityWarning(UserWarning):
 def parameter_names(params):
     """A name for each entry, in the order of `ravel_pytree(params)`: a, decay[0], decay[1]."""
     names = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(freeze(params)):
         name = jax.tree_util.keystr(path, simple=True, separator=".") or "params"
         names += [f"{name}{list(map(int, i)) or ''}" for i in np.ndindex(np.shape(leaf))]
     return names
@@ -79,7 +81,7 @@ def why_undetermined(params, free, uncertainty, num_residuals):
     if num_residuals == len(names):
         why = "there are as many residuals as parameters, so their variance cannot be estimated"
     else:
-        values = np.concatenate([np.ravel(x) for x in jax.tree.leaves(params)])[free]
+        values = np.concatenate([np.ravel(x) for x in jax.tree.leaves(freeze(params))])[free]
         s, directions = uncertainty.singular_values, uncertainty.directions
         combinations = undetermined_combinations(names, values, s, directions, num_residuals)
         why = f"the residuals determine {'; '.join(combinations)}" if combinations else BEYOND

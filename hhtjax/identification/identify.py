@@ -7,6 +7,7 @@ optimiser on reverse-mode gradients for many.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.description import is_concrete
+from hhtjax.description import is_concrete, thaw
+from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
     check_options,
     check_parameters,
@@ -30,6 +32,7 @@ from hhtjax.identification.problem import Data, solve
 from hhtjax.identification.progress import BAD_START, NO_INFLUENCE
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
+from hhtjax.xla import or_plain
 
 
 def fit(
@@ -54,7 +57,8 @@ def fit(
 
     Args:
         residuals: params -> any pytree of real arrays; traceable by JAX, so that its derivatives are exact.
-        params0: where to start, any pytree of real numbers and arrays.
+        params0: where to start, any pytree of real numbers and arrays; functions in it, as in an `equinox.Module`, stay
+            as they are.
         optimizer: "levenberg_marquardt" with forward-mode Jacobians, a column for each parameter; or any optax
             optimiser, driven by reverse-mode gradients of the cost. None: the first for up to 64 free
             parameters, optax.lbfgs() for more.
@@ -84,7 +88,7 @@ def fit(
         segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
             residuals are cut: how much these disagree gives the standard errors (the cluster covariance of
             `Uncertainty`).
-        progress: print cost and step after every iteration, to stderr.
+        progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
 
     A function is traced once, and then known by its identity: data that it reads from outside are part of the program,
     and that an array has changed in place or a name been bound anew goes unnoticed. For other data make another
@@ -120,10 +124,12 @@ def fit(
     data = _check_data("fit", params0, scale, weights, prior, tolerance)
     if records is not None or starts is not None:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
-    result = solve(residuals, options, params0, data)
+    result = or_plain(partial(solve, residuals, options, params0, data))
+    result = result._replace(params=thaw(result.params))
     return _finished("fit", result, weights) if is_concrete(result.code) else result
 
 
+@shown
 class Multistart(NamedTuple):
     """What `multistart` found.
 
@@ -183,10 +189,11 @@ def multistart(
     )
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
-    every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
+    every = or_plain(lambda: jax.vmap(lambda start: solve(residuals, options, start, data))(starts))
     failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
     cost = jnp.where(failed, jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)
+    best, every = (result._replace(params=thaw(result.params)) for result in (best, every))
     return Multistart(_finished("multistart", best, weights) if is_concrete(best.code) else best, every)
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, require_integer
+from hhtjax.description import freeze, thaw
+from hhtjax.description.presentation import shown
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.gauss_newton import with_jacobian
 from hhtjax.identification.identifiability import parameter_names
@@ -17,6 +19,7 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 
 
+@shown
 class Score(NamedTuple):
     """What `score_test` says of each candidate, arrays (candidates,).
 
@@ -69,11 +72,11 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     require_function("score_test", "residuals", residuals, "residuals(params, candidates)")
     segments = require_integer("score_test", "segments", segments, 2)
     params, candidates = (
-        jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), y) for y in (params, candidates)
+        jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), freeze(y)) for y in (params, candidates)
     )
     both, unravel = ravel_pytree((params, candidates))
     p = ravel_pytree(params)[0].size
-    r, J = with_jacobian(lambda x: ravel_pytree(residuals(*unravel(x)))[0], both)
+    r, J = with_jacobian(lambda x: ravel_pytree(residuals(*thaw(unravel(x))))[0], both)
     Q, _ = jnp.linalg.qr(J[:, :p])
     X = J[:, p:] - Q @ (Q.T @ J[:, p:])
     length = -(-r.size // segments)
@@ -90,6 +93,7 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     )
 
 
+@shown
 class Profile(NamedTuple):
     """What `profile` found.
 
@@ -129,7 +133,7 @@ def profile(residuals: Callable[..., Any], result: FitResult, name: str, values:
     [True, False, True]
     """
     believed = _uncertainty("profile", result)
-    leaves, structure = jax.tree.flatten(result.params)
+    leaves, structure = jax.tree.flatten(freeze(result.params))
     names = [parameter_names(jax.tree.unflatten(structure, [x if i == k else None for k, x in enumerate(leaves)]))
              for i in range(len(leaves))]  # fmt: skip
     if [name] not in names or result.transforms[names.index([name])] is tf.fixed:
@@ -149,7 +153,7 @@ def profile(residuals: Callable[..., Any], result: FitResult, name: str, values:
             **options,
         )
         costs.append(float(held.cost))
-        params = jax.tree.leaves(held.params)
+        params = jax.tree.leaves(freeze(held.params))
     row = int(np.flatnonzero(_flags(leaves, at))[0])
     variance = float(result.covariance[row, row] / result.embed(believed.inverse)[row, row])
     return Profile(np.asarray(values), np.asarray(costs), 2 * (np.asarray(costs) - float(result.cost)) / variance)
@@ -186,8 +190,8 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
     True
     """
     _uncertainty("prediction_errors", result)
-    x, unravel = ravel_pytree(result.params)
-    shapes = jax.eval_shape(predict, result.params)
+    x, unravel = ravel_pytree(freeze(result.params))
+    shapes = jax.eval_shape(lambda x: predict(thaw(unravel(x))), x)
     _, unravel_output = ravel_pytree(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
-    J = jax.jacfwd(lambda x: ravel_pytree(predict(unravel(x)))[0])(x)
+    J = jax.jacfwd(lambda x: ravel_pytree(predict(thaw(unravel(x))))[0])(x)
     return unravel_output(jnp.sqrt(jnp.einsum("ip,pq,iq->i", J, result.covariance, J) + noise**2))

@@ -56,7 +56,7 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
         taken = jnp.where(lower & ~first, jnp.max(jnp.abs(step)), 0)
         history = record(history, iteration, best.cost, taken, lam)
         if progress:
-            show(iteration, best.cost, taken)
+            show(iteration, best.cost, taken, code)
         return best, lam, iteration, history, code
 
     # nothing is known before the first evaluation, which is that of the loop: f is compiled once

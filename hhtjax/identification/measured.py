@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
+from hhtjax.description.presentation import shown
 from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.solution import Solution
 
 
+@shown
 class Windows(NamedTuple):
     """Windows of measurements, each with its own clock; the last entries of shorter ones repeat, and are not present.
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from hhtjax.description import freeze, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options, check_residuals, spread_weights
 from hhtjax.identification.descent import descend
@@ -70,7 +71,7 @@ class Coordinates:
     def params(self, x):
         """All leaves, as params0 has them."""
         changed = dict(zip(self.free, self.free_leaves(x), strict=True))
-        return self.structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(self.leaves)])
+        return thaw(self.structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(self.leaves)]))
 
     def slope(self, x):
         """dp/dx of the fitted entries."""
@@ -98,7 +99,7 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
         tau = variance_inflation(found.leaves)
         believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau)
     ended = found.residual, found.cost, found.history, found.iterations, found.code
-    return FitResult(coordinates.params(found.x), *ended, options.transforms, believed, segments, found.starts)
+    return FitResult(freeze(coordinates.params(found.x)), *ended, options.transforms, believed, segments, found.starts)
 
 
 def _solve_dense(residuals, options, coordinates, data, limits):
@@ -140,7 +141,10 @@ def _solve_records(residuals, options, coordinates, data, limits):
     one = jax.tree.map(lambda x: x[0], data.starts)
     _, unravel_start = ravel_pytree(one)
     own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
-    every = jax.vmap(residuals, in_axes=(None, 0, 0))
+
+    def every(params, starts, records):
+        return jax.vmap(partial(residuals, params))(starts, records)
+
     unknowns, params0 = coordinates.x0.size + own0.size, coordinates.params(coordinates.x0)
     shapes = check_residuals("fit", every, unknowns, params0, data.starts, data.records)
     weights = jax.tree.unflatten(jax.tree.structure(shapes), spread_weights("fit", data.weights, shapes))

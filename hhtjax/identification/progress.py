@@ -1,11 +1,13 @@
 """How a fit went: why it ended, its history, and what it shows on the way."""
 
-import sys
 from typing import Any, NamedTuple
 
 import jax
 
+from hhtjax.description.presentation import overwrite, shown
+
 RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE = range(8)
+CONVERGED = COST, STEP, GRADIENT
 REASONS = {
     RUNNING: "still running",
     COST: "converged: the cost changes by less than tolerance",
@@ -18,6 +20,7 @@ REASONS = {
 }
 
 
+@shown
 class History(NamedTuple):
     """The course of a fit, per iteration, the start first.
 
@@ -37,11 +40,12 @@ def record(history, i, *values):
     return History(*(None if x is None else x.at[i].set(value) for x, value in zip(history, values, strict=True)))
 
 
-def show(iteration, cost, step):
-    """A line on stderr."""
+def show(iteration, cost, step, code):
+    """A line on stderr, the same one at every iteration; at the end with the reason."""
 
-    def tell(iteration, cost, step):
+    def tell(iteration, cost, step, code):
         what = f"step {float(step):.3g}" if step else "no step" if iteration else "start"
-        print(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", file=sys.stderr, flush=True)
+        what = what if code == RUNNING else REASONS[int(code)]
+        overwrite(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", last=code != RUNNING)
 
-    jax.debug.callback(tell, iteration, cost, step)
+    jax.debug.callback(tell, iteration, cost, step, code)

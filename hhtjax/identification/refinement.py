@@ -11,6 +11,8 @@ import numpy as np
 
 from hhtjax.analysis import damping_ratio
 from hhtjax.checks import require_function, require_integer, require_number
+from hhtjax.description import freeze, thaw
+from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
@@ -27,6 +29,7 @@ class StepSizeWarning(UserWarning):
     """The step size shifts an estimate by more than its standard error, or by what cannot be taken out."""
 
 
+@shown
 class Refined(NamedTuple):
     """What `refine` returns: an estimate together with the scheme and the step that it belongs to.
 
@@ -128,12 +131,13 @@ def refine(
     fits = []
     for level in range(levels):
         fits.append(fit(residuals_at(stepper, dt / 2**level), fits[-1].params if fits else params0, **options))
-    params = richardson([result.params for result in fits], stepper.order)
+    params = richardson([freeze(result.params) for result in fits], stepper.order)
     shift = jax.tree.map(
-        lambda p, q, e: (p - q) / jnp.where(e > 0, e, jnp.inf), fits[0].params, params, fits[0].standard_errors
+        lambda p, q, e: (p - q) / jnp.where(e > 0, e, jnp.inf),
+        *map(freeze, (fits[0].params, params, fits[0].standard_errors)),
     )
     _warn_if_shifted(params, shift, dt)
-    return Refined(stepper, dt, tuple(fits), params, shift)
+    return Refined(stepper, dt, tuple(fits), thaw(params), thaw(shift))
 
 
 def needed_levels(stepper):

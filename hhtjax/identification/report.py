@@ -7,8 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.description import freeze
+from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.identifiability import parameter_names, why_undetermined
+from hhtjax.identification.progress import CONVERGED, REASONS
 
 
 def summary(result) -> str:
@@ -31,6 +34,26 @@ def summary(result) -> str:
     if result.uncertainty is not None:
         lines += _remarks(result, np.asarray(names))
     return "\n".join(lines)
+
+
+def table(result) -> Table:
+    """Verdict and estimates with their standard errors; of a batch, or of tracers, what is known without them."""
+    numbers = all_known((result.code, result.iterations, result.cost, result.params))
+    if len(numbers) <= 3 or numbers[0].ndim:
+        title = f"cost {brief(result.cost)}"
+        if len(numbers) > 3:
+            title = f"{np.isin(numbers[0], CONVERGED).sum()} of {numbers[0].size} fits converged"
+        return Table(f"FitResult: {title}", [["parameter", "shape", "dtype"], *leaf_rows(params=result.params)])
+    code, iterations, cost, *leaves = numbers
+    rows = [["parameter", "estimate"]]
+    rows += [[name, f"{x:.6g}"] for name, x in zip(parameter_names(result.params), _flat(leaves), strict=True)]
+    covariance = None if result.uncertainty is None else known(result.uncertainty.covariance)
+    if covariance is not None and covariance.shape == (np.sum(result.free),) * 2:
+        errors = np.zeros(len(rows) - 1)
+        errors[result.free] = np.sqrt(np.maximum(np.diagonal(covariance), 0))
+        words = (_columns(free, error, 0, 0, 0)[0] for free, error in zip(result.free, errors, strict=True))
+        rows = [[*row, word] for row, word in zip(rows, ["standard error", *words], strict=True)]
+    return Table(f"FitResult: {REASONS.get(code.item())}; {iterations} iterations, cost {cost:.6g}", rows)
 
 
 def _columns(free, error, lower, upper, naive):
@@ -90,7 +113,7 @@ def plot(result, sampling_rate=1.0):
 
 
 def _flat(tree):
-    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(freeze(tree))])
 
 
 TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}

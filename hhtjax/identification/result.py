@@ -10,12 +10,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number
+from hhtjax.description import freeze, thaw
+from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.progress import COST, GRADIENT, REASONS, STEP, History
 from hhtjax.identification.sandwich import Uncertainty, correlation
 
 
+@shown
 class FitResult(NamedTuple):
     """An estimate, how it was reached, and how far to trust it.
 
@@ -61,7 +64,7 @@ class FitResult(NamedTuple):
     @property
     def free(self) -> np.ndarray:
         """Whether each entry of ravel_pytree(params) was fitted, (p,)."""
-        leaves = zip(self.transforms, jax.tree.leaves(self.params), strict=True)
+        leaves = zip(self.transforms, jax.tree.leaves(freeze(self.params)), strict=True)
         return np.concatenate([np.full(np.size(x), T is not tf.fixed) for T, x in leaves])
 
     @property
@@ -87,8 +90,8 @@ class FitResult(NamedTuple):
 
     def errors(self, covariance):
         """Standard errors from a covariance of the free entries, structured like params."""
-        _, unravel = ravel_pytree(self.params)
-        return unravel(jnp.sqrt(jnp.diagonal(self.embed(covariance))))
+        _, unravel = ravel_pytree(freeze(self.params))
+        return thaw(unravel(jnp.sqrt(jnp.diagonal(self.embed(covariance)))))
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Lower and upper ends of each parameter's confidence interval, two pytrees like params.
@@ -103,10 +106,11 @@ class FitResult(NamedTuple):
         if self.uncertainty is None:
             raise ValueError("interval: the fit was made with covariance=False.")
         t = _student(level, self.segments - 1 if self.uncertainty.cluster is not None else None)
-        leaves, structure = jax.tree.flatten(self.params)
-        errors = jax.tree.leaves(self.standard_errors)
+        leaves, structure = jax.tree.flatten(freeze(self.params))
+        errors = jax.tree.leaves(freeze(self.standard_errors))
         ends = [_ends(T, p, t * e) for T, p, e in zip(self.transforms, leaves, errors, strict=True)]
-        return structure.unflatten([lower for lower, _ in ends]), structure.unflatten([upper for _, upper in ends])
+        lower, upper = (thaw(structure.unflatten(x)) for x in zip(*ends, strict=True))
+        return lower, upper
 
     def summary(self) -> str:
         """A table of estimates, standard errors and intervals, and what limits them.
@@ -120,6 +124,9 @@ class FitResult(NamedTuple):
         a          2  ...
         """
         return report.summary(self)
+
+    def _table(self):
+        return report.table(self)
 
     def plot(self, sampling_rate: float = 1.0) -> Any:
         """A figure: residual and its spectrum (of the first channel), intervals, correlations. Needs matplotlib."""

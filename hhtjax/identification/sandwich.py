@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import triangle
 
 SEGMENTS = 32
@@ -30,6 +31,7 @@ FLAT = 1e-6  # curvature of the cost beside that of the sum of squares, at which
 ALONE = 0.75  # share of the information on a combination of parameters, above which its segment has taken it all
 
 
+@shown
 class Uncertainty(NamedTuple):
     """Covariances (p, p) of the free entries, in the order of `ravel_pytree(params)`, and what the residuals determine.
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function
@@ -12,12 +13,15 @@ from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.band_limited import band_limited_motion
 from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.sampled import Sampled, sampled
 from hhtjax.systems.system import System
 
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
 
-def equation_error(system: System, values: Any, dt: float, cutoff: float, t0: float = 0.0) -> Callable[[Any], Any]:
+def equation_error(
+    system: System, values: Any, dt: Any = None, cutoff: Any = None, t0: float = 0.0, *, times: Any = None
+) -> Callable[[Any], Any]:
     """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
 
     Nothing is simulated, and most parameters enter linearly: so the fit converges from anywhere, and its estimate is a
@@ -28,12 +32,15 @@ def equation_error(system: System, values: Any, dt: float, cutoff: float, t0: fl
         values: positions, a pytree like q with a leading axis of samples. dt: sampling period, s.
         cutoff: Hz, between the frequencies of the motion and those of the noise.
         t0: time of the first sample.
+        times: (samples,), in the place of dt and t0: sample times at any distances. The values are then those of the
+            cubic spline through them, `sampled(values, times=)`, as many as the samples, at equal distances: the cutoff
+            has to stay well below half the sampling rate of the sparsest part.
 
     Returns:
         A function of params, whose result is (samples without both ends, n), in units of force.
 
     Raises:
-        TypeError, ValueError: as `band_limited_motion`. NotImplementedError: a system with constraints.
+        TypeError, ValueError: as `band_limited_motion` and `sampled`. NotImplementedError: a system with constraints.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -45,6 +52,8 @@ def equation_error(system: System, values: Any, dt: float, cutoff: float, t0: fl
     """
     if system.constraint is not None:
         raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
+    if times is not None:
+        values, dt, t0 = _at_equal_distances(values, dt, t0, times)
     motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)
     q, v, a = jax.tree.transpose(jax.tree.structure(values), jax.tree.structure((0, 0, 0)), motion)
     samples = jax.tree.leaves(q)[0].shape[0]
@@ -61,6 +70,18 @@ def equation_error(system: System, values: Any, dt: float, cutoff: float, t0: fl
         return jax.vmap(one)(*inside)
 
     return residuals
+
+
+def _at_equal_distances(values, dt, t0, times):
+    """The values at as many times at equal distances, their sampling period, and the time of the first."""
+    splines = jax.tree.map(lambda y: sampled(y, dt, t0, times=times), values)
+    t0, end, count = float(times[0]), float(times[-1]), len(times)
+    dt = (end - t0) / (count - 1)
+    return jax.tree.map(lambda u: u(t0 + dt * np.arange(count)), splines, is_leaf=_is_spline), dt, t0
+
+
+def _is_spline(x):
+    return isinstance(x, Sampled)
 
 
 def fit_progressively(

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description.presentation import shown
 from hhtjax.systems import kinematics
 
 
+@shown
 class Interpolant(NamedTuple):
     """Position and velocity between the saved times; made by `interpolate`.
 

@@ -1,6 +1,5 @@
 """What a run is made of: the step that counts, watches and saves, for one run as for a sweep."""
 
-import sys
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.description.presentation import overwrite
 from hhtjax.runs.solution import Failure, Solution
 from hhtjax.steppers.stepper import Info, public
 from hhtjax.systems import held
@@ -110,8 +110,7 @@ def show_progress(count, total, what):
 
     def show(count):
         done = int(count) * 40 // total
-        end = "\n" if int(count) == total else ""
-        print(f"\r[{'#' * done:<40}] {what} {int(count)} of {total}", end=end, file=sys.stderr, flush=True)
+        overwrite(f"[{'#' * done:<40}] {what} {int(count)} of {total}", last=int(count) == total)
 
     due = (count % every == 0) | (count == total)
     lax.cond(due, lambda: jax.debug.callback(show, count), lambda: None)

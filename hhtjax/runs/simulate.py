@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_integer, require_number, require_params
-from hhtjax.description import is_concrete
+from hhtjax.description import is_concrete, thaw
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.extrapolate import MOST, extrapolated
 from hhtjax.runs.loop import as_solution, loop_of, show_progress
@@ -18,7 +18,7 @@ from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import on_scalars, one_kernel
+from hhtjax.xla import on_scalars, one_kernel, or_plain
 
 
 def simulate(
@@ -42,11 +42,13 @@ def simulate(
         stepper: `hht()`, `rk4()`, ...
         q0, v0: position and velocity, pytrees of the same structure; float32 or float64, integers become
             the default float type. A `FirstOrderSystem` has y0 in the place of q0, and no v0.
-        params: any pytree, handed to the functions of the system.
+        params: any pytree, handed to the functions of the system. Its arrays and numbers are data. Functions in it,
+            such as the activations of a neural network in an `equinox.Module`, are part of the program, and told apart
+            by identity: a new module of the same structure costs no compilation, a new lambda does.
         dt: step size, positive. num_steps: number of steps.
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
-        progress: show a bar on stderr, also under jit.
+        progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
         extrapolate: number of runs, with steps of dt, dt/2, dt/4, ..., that Richardson's extrapolation joins at the
             same saved times, 1 to 4. For a stepper of order p, 2 takes the error dt^p out, for three times the work, 3
             dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already). For
@@ -86,7 +88,7 @@ def simulate(
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
-    require_params("simulate", params)
+    params = require_params("simulate", params)
     require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
     q0, v0 = initial_values("simulate", system, q0, v0)
@@ -97,13 +99,14 @@ def simulate(
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every}
-        return _simulate(system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress)
+        return or_plain(partial(_simulate, system, stepper, q0, v0, params, dt / k, t0, **sizes, progress=progress))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "save_every", "progress"))
 def _simulate(system, stepper, q0, v0, params, dt, t0, *, num_steps, save_every, progress):
+    params = thaw(params)
     flat, q, v = flatten("simulate", system, q0, v0, t0, params)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
     loop = loop_of(flat, stepper, q, v, t0, params, dt)

@@ -7,6 +7,7 @@ import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
+from hhtjax.description.presentation import Table, all_known, between, brief, known, leaf_rows, shown
 from hhtjax.steppers.stepper import Info
 
 
@@ -14,6 +15,7 @@ class SimulationError(RuntimeError):
     """A run in which a step failed; raised by `Solution.check`."""
 
 
+@shown
 class Failure(NamedTuple):
     """The first step that failed, as data.
 
@@ -33,10 +35,24 @@ class Failure(NamedTuple):
     row: Any = None
     solve: Any = None
 
+    def _verdict(self):
+        """How many failed, or what did."""
+        step, quantity = known(self.step), known(self.quantity)
+        if step is None or quantity is None:
+            return ""
+        if step.ndim or not step:
+            return f"{np.count_nonzero(step)} of {step.size} runs failed" if step.any() else "no step failed"
+        if known(self.newton):
+            return "Newton did not converge"
+        if known(self.solve):
+            return "the linear solve left too much"
+        return "a constraint depends on others" if known(self.row) else f"{QUANTITIES[quantity]} is not finite"
+
 
 QUANTITIES = "the position q", "the velocity v", "the acceleration", "the vector of multipliers"
 
 
+@shown
 class Solution(NamedTuple):
     """A trajectory at its saved times, the start included.
 
@@ -69,9 +85,14 @@ class Solution(NamedTuple):
         """
         if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t)))):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
+        if fault := self._fault(reach):
+            raise SimulationError(f"simulate: {fault}")
+
+    def _fault(self, reach=None):
+        """What is wrong with the run, in words; None where nothing is."""
         dt = np.asarray(self.dt)
         if np.any(dt <= 0):  # what is not finite shows in the state
-            raise SimulationError(f"simulate: `dt` must be positive and finite; it was {dt[dt <= 0].flat[0]:g}.")
+            return f"`dt` must be positive and finite; it was {dt[dt <= 0].flat[0]:g}."
         steps = np.asarray(self.failure.step)
         strays = np.zeros_like(steps)
         if reach is not None:
@@ -80,7 +101,7 @@ class Solution(NamedTuple):
             strays = np.where((steps > 0) & (steps <= strays), 0, strays)
         bad = np.where(strays > 0, strays, steps)
         if not bad.any():
-            return
+            return None
         member = tuple(int(i) for i in np.argwhere(bad)[0])
         step, time = bad[member], self._time_of(bad[member], member)
         failed = f"({np.count_nonzero(bad)} of {bad.size} failed)"
@@ -90,7 +111,29 @@ class Solution(NamedTuple):
             if strays[member]
             else self._why(member)
         )
-        raise SimulationError(f"simulate: {which}step {step} (to t = {time:.6g}) failed: {why}.")
+        return f"{which}step {step} (to t = {time:.6g}) failed: {why}."
+
+    def _table(self):
+        """The run in a line, and its arrays."""
+        rows = leaf_rows(q=self.q, v=self.v, acceleration=self.acceleration, multipliers=self.multipliers)
+        return Table(f"Solution: {self._title()}", [["", "shape", "dtype"], *rows, *leaf_rows(info=self.info)])
+
+    def _title(self):
+        """Saved times, steps, and what `check` would say; of tracers, and of parts of a run, the times alone."""
+        numbers = all_known((self.t, self.dt, self.failure))
+        if len(numbers) < 2 + 3:
+            return f"t {brief(self.t)}"
+        t, dt, *failed = numbers
+        runs = failed[0].shape
+        fitting = t.ndim == len(runs) + 1 and t.shape[:-1] == runs and all(x.shape == runs for x in failed)
+        if not fitting or not t.size or dt.shape not in (runs, (*runs, t.shape[-1] - 1)):
+            return f"t {brief(self.t)}"
+        batch = f"{failed[0].size} runs {runs}, each of " if runs else ""
+        fault = self._fault()
+        verdict = "every step finite" if fault is None else fault.partition(". ")[0].removesuffix(".")
+        if fault is None and self.info.converged is not None:
+            verdict += ", and converged"
+        return f"{batch}{t.shape[-1]} saved times, t = {between(t, 's')}, dt = {between(dt, 's')}; {verdict}"
 
     def _why(self, member):
         """What `failure` says of one member of a batch."""

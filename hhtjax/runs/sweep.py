@@ -8,6 +8,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import NamedSharding, PartitionSpec
 
+from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.loop import advance_from, as_solution, loop_of, show_progress
@@ -16,7 +17,7 @@ from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems.flat_system import flatten
-from hhtjax.xla import on_scalars, one_kernel
+from hhtjax.xla import on_scalars, one_kernel, or_plain
 
 
 def sweep(
@@ -56,7 +57,7 @@ def sweep(
             axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
         mesh: devices that share the work, `jax.make_mesh((jax.device_count(),), ("members",))`, also of several
             processes; each then holds all results, bitwise those of one device.
-        progress: show a bar on stderr, also under jit.
+        progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
 
     Returns:
         A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for
@@ -86,7 +87,7 @@ def sweep(
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, dts=dts, in_axes=in_axes, **grid)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
-    return run_sweep(*arguments, **keywords)
+    return or_plain(partial(run_sweep, *arguments, **keywords))
 
 
 @partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress"))
@@ -145,7 +146,7 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
 
     With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval.
     """
-    stepper, q0, v0, params = data
+    stepper, q0, v0, params = *data[:3], thaw(data[3])
     flat, q, v = flatten("sweep", system, q0, v0, t0, params)
     intervals = None if times is None else (times[:-1], dt, substeps, longest)
     loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])

@@ -34,7 +34,7 @@ class Inputs(NamedTuple):
         """An error that names what is wrong, or the inputs."""
         require_system("sweep", system)
         require_stepper("sweep", stepper)
-        require_params("sweep", params)
+        params = require_params("sweep", params)
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
         dts = require_step_sizes(dts)

@@ -16,6 +16,7 @@ from hhtjax.checks import require_integer
 from hhtjax.description import VERSION, is_concrete
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
+from hhtjax.xla import or_plain
 
 
 def sweep_to_disk(
@@ -81,7 +82,7 @@ def sweep_to_disk(
     for number, members in enumerate(places):
         path = folder / f"chunk-{number:05d}.npz"
         if not _is_whole(path):
-            compiled = compiled or lowered.compile()
+            compiled = compiled or or_plain(lambda: run_sweep.lower(*arguments, **keywords).compile())
             runs = compiled(*inputs.chunk(members).call()[0])
             kept = min(chunk, size - number * chunk)
             _write(path, lambda file, runs=runs, kept=kept: np.savez(file, **_named(runs, kept)))

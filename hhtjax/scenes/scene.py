@@ -2,9 +2,11 @@
 
 from typing import Any, NamedTuple
 
+from hhtjax.description.presentation import shown
 from hhtjax.systems.system import LinearSystem, System
 
 
+@shown
 class Scene(NamedTuple):
     """A system, and what a run needs besides a stepper and a step size.
 

@@ -5,7 +5,7 @@ The formulas are in residual.py; constraints are in constrained.py, and add rows
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +14,11 @@ from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
 from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with, reuse
+from hhtjax.numerics.low_rank import Changing
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.linearization import linearization_point
 from hhtjax.steppers.newton import left_by, linearized_solve, newton, told
-from hhtjax.steppers.options import Options, check_options, require_alpha, takes_options
+from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.stepper import State, Stepper, join_info
 from hhtjax.systems import kinematics
@@ -119,6 +120,9 @@ class GeneralizedAlpha(Stepper):
         """The step; for a linear system its matrix is factorised here, once."""
         if system.num_constraints:
             return bind_constrained(self, system, params, dt)
+        if system.local is not None and self.options.solve is None:
+            changing = self.factorize_linear_part(system, params, dt)
+            return partial(step, self, system, params, changing, self.options.linearize, dt)
         if not system.linear:
             return partial(step, self, system, params, self.factorize, self.options.linearize, dt)
         # all points of linearisation are one
@@ -126,15 +130,27 @@ class GeneralizedAlpha(Stepper):
 
     def factorize_once(self, system, params, dt):
         """The factorised matrix of a linear system, in the place of `factorize`."""
+        return reuse(self.factorize, self.factorize(self.step_matrix(system, params, dt)))
+
+    def factorize_linear_part(self, system, params, dt):
+        """The same of a linear system with a nonlinear force beside it, whose Jacobian it adds at each state."""
+        local = system.local
+
+        def slope(s):
+            return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
+
+        return Changing(self.step_matrix(local.linear, params, dt), slope, local.spread, local.size)
+
+    def step_matrix(self, system, params, dt):
+        """The matrix of the step of a linear system."""
         zero = jnp.zeros(system.size, dt.dtype)
         rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
         path = partial(self.arrive, system, rest, dt)
-        inverse = self.factorize(jax.jacfwd(lambda w: residual(system, params, path(w)))(zero))
-        return reuse(self.factorize, inverse)
+        return jax.jacfwd(lambda w: residual(system, params, path(w)))(zero)
 
 
 @takes_options
-def hht(alpha: Any = -0.05, **options: Any) -> GeneralizedAlpha:
+def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """HHT-alpha, by default non-iterative: one Jacobian, one factorisation, one solve per step.
 
         alpha_m = 0,  alpha_f = -alpha,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -199,7 +215,7 @@ def hht(alpha: Any = -0.05, **options: Any) -> GeneralizedAlpha:
 
 
 @takes_options
-def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Any) -> GeneralizedAlpha:
+def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Newmark(beta, gamma): alpha_m = alpha_f = 0. The default is the trapezoidal rule.
 
     Order 2 for gamma = 1/2, else 1 (and gamma > 1/2 damps). A-stable for 2 beta >= gamma >= 1/2.
@@ -228,7 +244,7 @@ def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Any) -> GeneralizedAl
 
 
 @takes_options
-def bossak(alpha: Any = -0.1, **options: Any) -> GeneralizedAlpha:
+def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Bossak (Wood, Bossak, Zienkiewicz): HHT's weighting put on the inertia instead of the forces.
 
         alpha_m = alpha,  alpha_f = 0,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -257,7 +273,7 @@ def bossak(alpha: Any = -0.1, **options: Any) -> GeneralizedAlpha:
 
 
 @takes_options
-def generalized_alpha(rho_inf: Any = 0.8, **options: Any) -> GeneralizedAlpha:
+def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Chung and Hulbert's generalised-alpha: least low-frequency damping for a given one at infinity.
 
         alpha_m = (2 rho - 1)/(rho + 1),  alpha_f = rho/(rho + 1),

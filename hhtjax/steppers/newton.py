@@ -8,6 +8,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.numerics.linear_solve import Trusted, invert_and_bound, solve_map
+from hhtjax.numerics.low_rank import around
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems import kinematics
 from hhtjax.xla import staged
@@ -35,6 +36,7 @@ def linearized_solve(r, path, w, factorize, at=None):
     def f(dw):
         return tangent(along(dw))
 
+    factorize = around(factorize, lambda: (path(w) if at is None else at, along))
     dw = solve_map(f, value, factorize)
     return w - dw, told(factorize, left_by(factorize, f, value, dw))
 
@@ -67,7 +69,8 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
         def improve(carry):
             w0, _, iterations, _, left = carry
             before, tangent = staged(partial(jax.linearize, f), w.size)(w0)
-            inverse, terms = invert_and_bound(tangent, w, factorize)
+            here = around(factorize, lambda: jax.linearize(path, w0))
+            inverse, terms = invert_and_bound(tangent, w, here)
             dw = inverse(before, trans=0)
             w1 = w0 - dw
             value = f(w1)

@@ -2,8 +2,11 @@
 
 import inspect
 from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import wraps
-from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_type_hints
+from typing import Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
+
+import jax
 
 from hhtjax.checks import require_function, require_integer, require_number
 from hhtjax.systems.constraints import check_redundant
@@ -11,8 +14,9 @@ from hhtjax.systems.constraints import check_redundant
 Constructor = TypeVar("Constructor", bound=Callable)
 
 
-class Options(NamedTuple):
-    """How the residual is solved; `hht` documents the fields."""
+@dataclass(frozen=True)
+class Options:
+    """How the residual is solved; `hht` documents the fields. Editors find them because constructors pass them on."""
 
     iterations: int | None = 1
     linearize: Literal["predictor", "held", "state", "auto"] | None = None
@@ -25,6 +29,24 @@ class Options(NamedTuple):
     solve: Callable | None = None
 
 
+OPTIONS = [field.name for field in fields(Options)]
+jax.tree_util.register_dataclass(Options, OPTIONS, [])
+
+
+class Keywords(TypedDict, total=False):
+    """The same for type checkers, which cannot read them off `Options` (a test compares them)."""
+
+    iterations: int | None
+    linearize: Literal["predictor", "held", "state", "auto"] | None
+    tolerance: float
+    max_iterations: int
+    start: Literal["corrected", "simple"] | None
+    formulation: Literal["ggl", "index3"]
+    redundant: Literal["least_squares"] | None
+    kinematics: Literal["chart", "lie"]
+    solve: Callable | None
+
+
 def takes_options(constructor: Constructor) -> Constructor:
     """A constructor whose `**options` are these: help() and completion list them, an unknown name is an error."""
     name, own = constructor.__name__, inspect.signature(constructor)
@@ -33,13 +55,13 @@ def takes_options(constructor: Constructor) -> Constructor:
     @wraps(constructor)
     def checked(*arguments, **keywords):
         for given in keywords:
-            if given not in own.parameters and given not in Options._fields:
-                raise TypeError(f"{name}: unknown option {given!r}; the options are {', '.join(Options._fields)}.")
+            if given not in own.parameters and given not in OPTIONS:
+                raise TypeError(f"{name}: unknown option {given!r}; the options are {', '.join(OPTIONS)}.")
         return constructor(*arguments, **keywords)
 
     listed = (
-        inspect.Parameter(field, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kinds[field])
-        for field, default in Options._field_defaults.items()
+        inspect.Parameter(x.name, inspect.Parameter.KEYWORD_ONLY, default=x.default, annotation=kinds[x.name])
+        for x in fields(Options)
     )
     first = [x for x in own.parameters.values() if x.kind is not inspect.Parameter.VAR_KEYWORD]
     checked.__signature__ = own.replace(parameters=[*first, *listed])  # pyright: ignore[reportAttributeAccessIssue]
@@ -50,9 +72,9 @@ def check_options(caller, **keywords: Any) -> Options:
     """`Options` with the default of `linearize` filled in, or an error that names what is wrong."""
     options = Options(**keywords)
     if options.iterations is not None:
-        options = options._replace(iterations=require_integer(caller, "iterations", options.iterations))
+        options = replace(options, iterations=require_integer(caller, "iterations", options.iterations))
     if options.linearize is None:
-        options = options._replace(linearize="auto" if options.iterations == 1 else "predictor")
+        options = replace(options, linearize="auto" if options.iterations == 1 else "predictor")
     _require_one_of(caller, "linearize", options)
     if options.iterations is None and options.linearize != "predictor":
         raise ValueError(
@@ -60,7 +82,7 @@ def check_options(caller, **keywords: Any) -> Options:
             f"received {options.linearize!r}."
         )
     require_number(caller, "tolerance", options.tolerance, lambda x: x > 0, "be positive")
-    options = options._replace(max_iterations=require_integer(caller, "max_iterations", options.max_iterations))
+    options = replace(options, max_iterations=require_integer(caller, "max_iterations", options.max_iterations))
     for name in ("start", "formulation", "kinematics"):
         _require_one_of(caller, name, options)
     check_redundant(caller, options.redundant)

@@ -4,15 +4,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import Description
+from hhtjax.description.presentation import known, shown
 from hhtjax.systems import held, kinematics
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.systems.system import require_system as require_system
 
 
+@shown
 class State(NamedTuple):
     """What the next step needs.
 
@@ -35,6 +38,7 @@ class State(NamedTuple):
     memory: Any = None
 
 
+@shown
 class Info(NamedTuple):
     """What a step tells about itself; None where a method has nothing to tell.
 
@@ -59,6 +63,13 @@ class Info(NamedTuple):
     dependent_row: Any = None
     solve_residual: Any = None
     solved: Any = None
+
+    def _verdict(self):
+        """Of several steps."""
+        met = known(self.converged)
+        if met is None or not met.ndim:
+            return ""
+        return f"{np.count_nonzero(~met)} of {met.size} not converged" if not met.all() else "all converged"
 
 
 def join_info(info, new):
@@ -122,12 +133,6 @@ def require_stepper(caller, stepper):
     """An error for what is no stepper."""
     if not isinstance(stepper, Stepper):
         raise TypeError(f"{caller}: `stepper` must be a stepper such as hht(); received {stepper!r}.")
-
-
-def require_system(caller, system):
-    """An error for what is no system."""
-    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
-        raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
 
 
 def require_capable(caller, system, stepper, q0, v0):

@@ -34,10 +34,36 @@ Energies are enough: `System.from_lagrangian` makes M and Q of L = T - V by auto
 ...     lagrangian=lambda q, v, t, p: 0.5 * jnp.sum(v**2) - 0.5 * p["k"] * jnp.sum(q**2),
 ...     force=lambda q, v, t, p: p["u"](t) - 0.1 * v)
 
+Linear systems, and others with few nonlinear forces
+----------------------------------------------------
+
+`LinearSystem(M, C, K, force)` is factorised once for the whole run, also with a nonlinear force at a few coordinates
+beside it: an end stop, a joint, a damper. Matrices may be SciPy's sparse ones, as `scipy.io.mmread` reads them;
+`hhtjax.analysis.modal_reduction` reduces large ones to their lowest modes, and knows their frequencies.
+
+>>> n = 100
+>>> K = 1e4 * (2 * jnp.eye(n) - jnp.eye(n, k=1) - jnp.eye(n, k=-1))
+>>> def stop(q, v, t, p):                                                             # of the coordinates `at` alone
+...     return -p["stop"] * jnp.maximum(q - 0.01, 0.0)
+>>> bar = hhtjax.LinearSystem(jnp.ones(n), 1e-3 * K, K, nonlinear=stop, at=[n - 1])
+>>> run = hhtjax.simulate(bar, hhtjax.hht(), jnp.zeros(n), jnp.ones(n), {"stop": 1e5}, dt=1e-3, num_steps=200)
+>>> reduced = hhtjax.analysis.modal_reduction(bar, 20)              # reduced.system, .project(q0), .expand(run.q)
+>>> [round(float(w), 2) for w in reduced.frequencies[:3]]
+[3.11, 6.22, 9.33]
+
+Other packages
+--------------
+
+`hhtjax.interop.diffrax_term` is a system as a diffrax term, with (q, v) for its state, and `hhtjax.interop.scipy_rhs`
+what SciPy's `solve_ivp` takes, Jacobian included; constraints are reduced to index 1. params may hold modules of
+equinox, a force that is a neural network among them: `simulate`, `sweep` and `fit` take them as they are, and
+`equinox.filter_grad` gives derivatives.
+
 Inputs
 ------
 
-A measured input is data: `sampled` makes a function of time of it, to be put into params. `band_limited` does so for
+A measured input is data: `sampled` makes a function of time of it, to be put into params, of samples at equal steps or
+at any `times`. `band_limited` does so for
 samples hardly denser than their highest frequency, and `spline_gain_error` tells when that is needed.
 
 >>> u = hhtjax.sampled(jnp.sin(jnp.linspace(0.0, 6.0, 61)), dt=0.1)                # a cubic spline through the samples

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import is_concrete
+from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.description.presentation import shown
 from hhtjax.numerics.linear_solve import solve_map
 from hhtjax.systems.constraints import (
     acceleration_and_multipliers,
@@ -27,6 +28,7 @@ MAX_ITERATIONS = 50
 CONSISTENT = 1e-6  # relative distance of initial values from consistent ones that passes
 
 
+@shown
 class ConsistentInitial(NamedTuple):
     """Initial values on the constraints; made by `consistent_initial`.
 
@@ -76,7 +78,7 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None) -> C
         raise ValueError("consistent_initial: `system` must have a constraint.")
     check_redundant("consistent_initial", redundant)
     q0, v0 = initial_values("consistent_initial", system, q0, v0)
-    start, B, left = _consistent_initial(system, q0, v0, params, t0, redundant)
+    start, B, left = _consistent_initial(system, q0, v0, freeze(params), t0, redundant)
     if all(map(is_concrete, jax.tree.leaves((start, B)))):
         if redundant is None:
             require_independent("consistent_initial", np.asarray(B))
@@ -90,6 +92,7 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None) -> C
 @partial(jax.jit, static_argnames="redundant")
 def _consistent_initial(system, q0, v0, params, t0, redundant):
     """The result, B at q0, and max|Phi| at the end."""
+    params = thaw(params)
     flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params)
     factorize = factorize_constrained(flat.size, redundant)
     t = jnp.asarray(t0).astype(q.dtype)
@@ -139,6 +142,7 @@ def nearest_position(system, q0, t, params, factorize):
 @partial(jax.jit, static_argnames="redundant")
 def examine(system, q0, v0, t0, params, redundant):
     """B, and for Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not."""
+    params = thaw(params)
     flat, q, v = flatten("simulate", system, q0, v0, t0, params)
     t = jnp.asarray(t0).astype(q.dtype)
     B = jacobian(flat, q, t, params)
@@ -149,6 +153,7 @@ def examine(system, q0, v0, t0, params, redundant):
 
 def require_consistent(caller, system, q0, v0, t0, params, redundant=None):
     """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
+    params = freeze(params)
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params)))):
         return
     with jax.ensure_compile_time_eval():  # under jit too

@@ -9,10 +9,12 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe
+from hhtjax.description import freeze, thaw
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.linear_solve import solve
 from hhtjax.systems import kinematics
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, as_matrix
+from hhtjax.systems.matrices import as_matrix
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem
 
 
 class FlatSystem(NamedTuple):
@@ -33,6 +35,7 @@ class FlatSystem(NamedTuple):
     num_constraints: int = 0  # m
     blocks: tuple = ()  # where the rotations are; empty without
     product: Callable | None = None  # q, w, params -> M(q) w, where the system has its own
+    local: Any = None  # the `Local` force beside a linear system
 
     def inertia(self, q, w, params):
         """M(q) w."""
@@ -54,6 +57,15 @@ class FlatSystem(NamedTuple):
     def tidy(self, state):
         """The state at the end of a step, its rotations orthogonal to rounding."""
         return state._replace(q=kinematics.orthonormalize(self.blocks, state.q))
+
+
+class Local(NamedTuple):
+    """A nonlinear force beside a linear system."""
+
+    linear: FlatSystem  # without it
+    force: Callable  # q, v, t, params -> (k,), or (n,)
+    spread: Callable  # (k,) -> (n,)
+    size: int | None  # k; None where it acts on all coordinates
 
 
 def flatten(caller, system, q0, v0, t0, params):
@@ -91,7 +103,23 @@ def flatten(caller, system, q0, v0, t0, params):
     if not linear and system.inertia is not None:
         _check_like(caller, "inertia", _evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
         product = partial(_flat_product, system.inertia, unravel, unravel_rates, dtype)
-    return FlatSystem(mass, force, n, linear, False, unravel, unravel_rates, constraint, m, blocks, product), q, v
+    flat = FlatSystem(mass, force, n, linear, False, unravel, unravel_rates, constraint, m, blocks, product)
+    return (_with_local(system, flat, dtype) if linear and system.nonlinear is not None else flat), q, v
+
+
+def _with_local(system, flat, dtype):
+    """The system with its nonlinear force kept apart, too."""
+
+    def linear_force(q, v, t, params):
+        Q = system.linear_force(flat.unravel(q), flat.unravel_rates(v), t, params)
+        return ravel_pytree(Q)[0].astype(dtype)
+
+    def local_force(q, v, t, params):
+        return system.local_force(flat.unravel(q), flat.unravel_rates(v), t, params).astype(dtype)
+
+    spread, size = partial(system.spread, n=flat.size), None if system.at is None else len(system.at)
+    local = Local(flat._replace(force=linear_force), local_force, spread, size)
+    return flat._replace(linear=False, local=local)
 
 
 def _flatten_first_order(caller, system, y0, t0, params):
@@ -121,8 +149,23 @@ def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params):
     if linear and system.load is not None:
         Q = _evaluate(caller, "force", system.load, t0, params)
     else:
-        Q = _evaluate(caller, "force", system.force, q0, v0, t0, params)
+        function = system.linear_force if linear else system.force
+        Q = _evaluate(caller, "force", function, q0, v0, t0, params)
     _check_like(caller, "force", Q, "v0", v0, dtype)
+    if linear and system.nonlinear is not None:
+        _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params)
+
+
+def _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params):
+    """The force beside a linear system."""
+    if system.at is None:
+        like = "v0", v0
+    elif max(system.at) >= n:
+        raise ValueError(f"{caller}: `at` must hold numbers of coordinates below {n}; received {list(system.at)}.")
+    else:
+        some = jnp.zeros(len(system.at), dtype)
+        q0, v0, like = some, some, ("v0[at]", some)
+    _check_like(caller, "nonlinear", _evaluate(caller, "nonlinear", system.nonlinear, q0, v0, t0, params), *like, dtype)
 
 
 def _flat_constraint(constraint, unravel, dtype, q, t, params):
@@ -183,7 +226,7 @@ def _check_dtype(caller, name, value, dtype):
 def _evaluate(caller, name, function, *args):
     """Shape of function(*args); `name` is added to what the function raises."""
     try:
-        return jax.eval_shape(function, *args)
+        return jax.eval_shape(lambda *args: function(*thaw(args)), *freeze(args))
     except Exception as error:
         error.add_note(f"{caller}: raised while tracing `{name}` with " + ", ".join(describe(x) for x in args) + ".")
         raise

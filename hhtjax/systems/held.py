@@ -2,10 +2,9 @@
 
 A step that ends on a jump must not see the new value at its end, nor the next one the old value at its start. So a step
 gets the value in its middle, and where that differs from the step's before, the accelerations and multipliers that the
-state carries on take the jump along: M dw - B^T dL = Q(new) - Q(old), B dw = 0.
+state carries on take the jump along: M dw - B^T dL = Q(new) - Q(old), B dw = 0. Steps are taken to be equal, but where
+one ends on a sample of uneven times: the old value there is the one held until then.
 """
-
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +21,12 @@ def holds(params):
 
 def held_at(params, t):
     """The params with each held input constant, at its value at t."""
-    return jax.tree.map(lambda x: _constant(x, t) if _is_held(x) else x, params, is_leaf=_is_held)
+    return _with_held(params, lambda x: x(t))
 
 
 def before(params, t, dt):
     """The params of a step that ends at t."""
-    return held_at(params, t - dt / 2) if holds(params) else params
+    return _with_held(params, lambda x: x.held_before(t, dt)) if holds(params) else params
 
 
 def bind(stepper, system, params, dt):
@@ -61,5 +60,5 @@ def _is_held(x):
     return isinstance(x, Sampled) and jnp.ndim(x.polynomials) > 1 and jnp.shape(x.polynomials)[1] == 1
 
 
-def _constant(x, t):
-    return replace(x, polynomials=x(t)[None, None])
+def _with_held(params, value):
+    return jax.tree.map(lambda x: x.constant(value(x)) if _is_held(x) else x, params, is_leaf=_is_held)

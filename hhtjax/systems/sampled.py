@@ -1,6 +1,6 @@
-"""A uniformly sampled input as a function of time, and as data."""
+"""A sampled input as a function of time, and as data: samples at equal distances, or at any increasing times."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,26 +12,23 @@ from jax import lax
 from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_concrete, is_real
 
+SLOP = 8  # roundings that a time may lie before a sample, and still be the sample's
 
-@partial(jax.tree_util.register_dataclass, data_fields=("polynomials", "dt", "t0"), meta_fields=())
+
+@partial(jax.tree_util.register_dataclass, data_fields=("polynomials", "dt", "t0", "times"), meta_fields=())
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """Piecewise polynomial through uniform samples, called with t; made by `sampled`."""
+    """Piecewise polynomial through samples, called with t; made by `sampled`."""
 
     polynomials: Any  # (intervals, order + 1, ...), of x in [0, 1]; lowest power first
-    dt: Any
+    dt: Any  # of uniform samples, else None, as t0
     t0: Any
+    times: Any = None  # of the samples, where they are not uniform
 
     def __call__(self, t):
         """Value at time t, a scalar or an array; outside the samples, the nearest end value."""
         intervals, terms = self.polynomials.shape[:2]
-        x = (jnp.asarray(t).astype(self.dt.dtype) - self.t0) / self.dt
-        if terms == 1:  # a jump: at a sample, up to rounding, the new value
-            x = x + 8 * float(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + jnp.abs(self.t0 / self.dt))
-        i = jnp.clip(jnp.floor(x), 0, intervals - 1)
-        x = x - i
-        x = jnp.where(x < 0, 0, jnp.where(x > 1, 1, x))  # at the ends the slope is the one inside
-        i = i.astype(jnp.int32)
+        i, x = self._uniform(t, intervals, terms) if self.times is None else self._find(t, intervals, terms)
         x = x.reshape(x.shape + (1,) * (self.polynomials.ndim - 2))
         coefficients = jnp.moveaxis(self.polynomials[i], jnp.ndim(t), 0)
         value = coefficients[-1]
@@ -39,21 +36,72 @@ class Sampled:
             value = value * x + coefficients[k]
         return value
 
+    def _uniform(self, t, intervals, terms):
+        """Number of the interval of t, and the place in it, from 0 to 1."""
+        x = (jnp.asarray(t).astype(self.dt.dtype) - self.t0) / self.dt
+        if terms == 1:  # a jump: at a sample, up to rounding, the new value
+            x = x + SLOP * float(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + jnp.abs(self.t0 / self.dt))
+        i = jnp.clip(jnp.floor(x), 0, intervals - 1)
+        x = _inside(x - i)
+        return i.astype(jnp.int32), x
 
-def sampled(values, dt, t0=0.0, order=3) -> Sampled:
-    """The function of time through `values[k]` at t0 + k dt: a pytree to put in params and call with t.
+    def _find(self, t, intervals, terms):
+        """The same by bisection, as many halvings as the number of samples asks for, whatever t."""
+        t = jnp.asarray(t).astype(self.times.dtype)
+        if terms == 1:
+            i = self._last_before(t + self._rounding(t), intervals)
+            return i, t
+        i = self._last_before(t, intervals)
+        return i, _inside((t - self.times[i]) / (self.times[i + 1] - self.times[i]))
+
+    def _last_before(self, t, intervals):
+        """Number of the last of the first `intervals` samples that is not after t; 0 where all are."""
+        i = jnp.zeros(t.shape, jnp.int32)
+        for half in reversed(range((intervals - 1).bit_length())):
+            further = i + (1 << half)
+            good = (further < intervals) & (self.times[jnp.minimum(further, intervals - 1)] <= t)
+            i = jnp.where(good, further, i)
+        return i
+
+    def _rounding(self, t):
+        return SLOP * float(jnp.finfo(self.times.dtype).eps) * (jnp.abs(t) + jnp.abs(self.times[0]))
+
+    def held_before(self, t, dt):
+        """Of a held input the value that a step dt, or shorter, had which ended at t."""
+        if self.times is None:
+            return self(t - dt / 2)
+        t = jnp.asarray(t).astype(self.times.dtype)
+        now, before = (self._last_before(x, len(self.times)) for x in (t + self._rounding(t), t - self._rounding(t)))
+        return jnp.where(now > before, self.polynomials[before, 0], self(t - dt / 2))  # steps may differ at a sample
+
+    def constant(self, value):
+        """The held input that always has this value."""
+        one = jnp.ones((), self.polynomials.dtype)
+        scale = {"dt": one, "t0": one - 1, "times": None} if self.times is not None else {}
+        return replace(self, polynomials=value[None, None], **scale)
+
+
+def _inside(x):
+    return jnp.where(x < 0, 0, jnp.where(x > 1, 1, x))  # at the ends the slope is the one inside
+
+
+def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
+    """The function of time through `values[k]` at t0 + k dt, or at times[k]: a pytree for params, called with t.
 
     Args:
         values: (samples,) or (samples, channels...), real; order + 1 samples at least.
         dt: sampling period, positive; t0: time of the first sample.
+        times: (samples,), in the place of dt and t0: strictly increasing, at any distances. A call then costs a
+            bisection besides, some nanoseconds in a compiled run.
         order: 0, each value held until the next, as a D/A converter does; 1, linear; 3, cubic spline, twice
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
     A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order
-    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). What is saved at a jump is the
-    acceleration before it; `interpolate` uses it for v after it too.
+    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). For jumps at any distances,
+    `sweep(..., times=)` ends steps there. What is saved at a jump is the acceleration before it; `interpolate` uses it
+    for v after it too.
 
-    Outside [t0, t0 + (samples - 1) dt] the nearest end value is held. Differentiable in values and t.
+    Outside the samples the nearest end value is held. Differentiable in values, times and t.
     An input enters a simulation only through its values at the steps: with a step shorter than dt the
     reconstruction between the samples matters, and the cubic one is far better on smooth signals.
 
@@ -61,13 +109,16 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
         A `Sampled`: t -> a number, or (channels...).
 
     Raises:
-        ValueError, TypeError: too few samples, a non-positive dt, an unknown order, values that are not
-            real or not finite.
+        ValueError, TypeError: too few samples, a non-positive dt, times that do not increase or are not as many as the
+            samples, both dt and times, an unknown order, values that are not real or not finite.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> u = hhtjax.sampled(jnp.array([0.0, 1.0, 4.0, 9.0, 16.0]), dt=0.5)     # u(t) = 4 t^2
     >>> float(u(0.75)), float(u(100.0))
     (2.25, 16.0)
+    >>> times = jnp.array([0.0, 0.4, 1.1, 1.5, 2.0])
+    >>> round(float(hhtjax.sampled(4 * times**2, times=times)(0.75)), 12)
+    2.25
     """
     if order not in (0, 1, 3) or isinstance(order, bool):
         raise ValueError(f"sampled: `order` must be 0 (held), 1 (linear) or 3 (cubic); received {order!r}.")
@@ -85,19 +136,48 @@ def sampled(values, dt, t0=0.0, order=3) -> Sampled:
     if is_concrete(values) and not np.all(np.isfinite(values)):
         bad = int(np.argmin(np.isfinite(values).reshape(values.shape[0], -1).all(axis=1)))
         raise ValueError(f"sampled: `values` must be finite; received {values[bad]} at sample {bad}.")
-    require_number("sampled", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    require_number("sampled", "t0", t0, np.isfinite, "be finite")
+    times, dt, t0 = _grid(values, dt, t0, times)
 
+    widths = None if times is None else (times[1:] - times[:-1]).reshape(-1, *(1,) * (values.ndim - 1))
     rise = values[1:] - values[:-1]
     if order == 0:
         polynomials = values[:, None]
     elif order == 1:
         polynomials = jnp.stack([values[:-1], rise], axis=1)
     else:
-        slope = _spline_slopes(rise)
+        slope = _spline_slopes(rise) if widths is None else _uneven_spline_slopes(rise, widths)
         left, right = slope[:-1], slope[1:]
+        if widths is not None:
+            left, right = left * widths, right * widths
         polynomials = jnp.stack([values[:-1], left, 3 * rise - 2 * left - right, left + right - 2 * rise], axis=1)
-    return Sampled(polynomials, *(jnp.asarray(x).astype(values.dtype) for x in (dt, t0)))
+    return Sampled(polynomials, dt, t0, times)
+
+
+def _grid(values, dt, t0, times):
+    """times, dt and t0, checked, in the dtype of the values: either times, or the other two."""
+    if times is None:
+        require_number("sampled", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+        require_number("sampled", "t0", t0, np.isfinite, "be finite")
+        return None, *(jnp.asarray(x).astype(values.dtype) for x in (dt, t0))
+    if dt is not None or not (is_real(t0) and is_concrete(t0) and np.ndim(t0) == 0 and t0 == 0):
+        raise ValueError(f"sampled: `times` must stand in the place of dt and t0; received dt={dt!r}, t0={t0!r} too.")
+    times = times if is_array(times) else np.asarray(times)
+    if not is_real(times):
+        raise TypeError(f"sampled: `times` must be real numbers; received an array of {times.dtype}.")
+    if times.shape != values.shape[:1]:
+        raise ValueError(
+            f"sampled: `times` must have shape {values.shape[:1]}, one for each sample; received shape {times.shape}."
+        )
+    if is_concrete(times):
+        before, after = np.asarray(times)[:-1], np.asarray(times)[1:]
+        wrong = np.flatnonzero(~((before < after) & np.isfinite(before) & np.isfinite(after)))
+        if wrong.size:
+            k = int(wrong[0])
+            raise ValueError(
+                f"sampled: `times` must be finite and strictly increase; received {before[k]} and {after[k]} at "
+                f"samples {k} and {k + 1}."
+            )
+    return jnp.asarray(times).astype(values.dtype), None, None
 
 
 def _spline_slopes(rise):
@@ -113,3 +193,24 @@ def _spline_slopes(rise):
     inner = lax.linalg.tridiagonal_solve(beside.at[0].set(0), diagonal, beside.at[-1].set(0), rhs)
     slopes = jnp.concatenate([(first - 2 * inner[0])[None], inner, (last - 2 * inner[-1])[None]])
     return slopes.reshape(-1, *rise.shape[1:])
+
+
+def _uneven_spline_slopes(rise, widths):
+    """Slopes s_k, per time, of the spline through samples h_k apart, d_k = rise_k/h_k:
+
+    h_k s_(k-1) + 2 (h_(k-1) + h_k) s_k + h_(k-1) s_(k+1) = 3 (h_k d_(k-1) + h_(k-1) d_k)
+    """
+    h = widths.reshape(-1, 1)
+    d = rise.reshape(rise.shape[0], -1) / h
+    rhs = 3 * (h[1:] * d[:-1] + h[:-1] * d[1:])
+    both = (h[1:] + h[:-1])[:, 0]
+    # not-a-knot: h_1 s_0 + (h_0 + h_1) s_1 = first, to eliminate s_0 from the first row; likewise at the end
+    first = ((3 * h[0] + 2 * h[1]) * h[1] * d[0] + h[0] ** 2 * d[1]) / both[0]
+    last = ((3 * h[-1] + 2 * h[-2]) * h[-2] * d[-1] + h[-1] ** 2 * d[-2]) / both[-1]
+    rhs = jnp.concatenate([(rhs[0] - first)[None], rhs[1:-1], (rhs[-1] - last)[None]])
+    diagonal = 2 * both
+    diagonal = diagonal.at[0].set(both[0]).at[-1].set(both[-1])
+    lower, upper = h[1:, 0].at[0].set(0), h[:-1, 0].at[-1].set(0)
+    inner = lax.linalg.tridiagonal_solve(lower, diagonal, upper, rhs)
+    start, end = (first - both[0] * inner[0]) / h[1], (last - both[-1] * inner[-1]) / h[-2]
+    return jnp.concatenate([start[None], inner, end[None]]).reshape(-1, *rise.shape[1:])

@@ -6,15 +6,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function
-from hhtjax.description import Description, is_array, is_concrete, is_real
-from hhtjax.numerics.elimination import matvec
+from hhtjax.description import Description
+from hhtjax.systems.linear_system import LinearSystem
+from hhtjax.systems.matrices import constant_matrix, require_mass
 
-LARGEST_CHECKED = 256  # rows of a constant mass matrix whose eigenvalues are looked at
-SYMMETRIC = 1e-6  # relative size of M - M^T that passes
+__all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_system"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +68,8 @@ class System(Description):
         if callable(self.mass):
             require_function("System", "mass", self.mass, "mass(q, params)")
         else:
-            mass = _constant_matrix("System", "mass", self.mass)
-            _require_mass("System", "mass", mass, self.constraint is not None)
+            mass = constant_matrix("System", "mass", self.mass)
+            require_mass("System", "mass", mass, self.constraint is not None)
             object.__setattr__(self, "mass", mass)
 
     @classmethod
@@ -143,74 +142,6 @@ class _LagrangianForce:
         return Q if self.force is None else jax.tree.map(jnp.add, Q, self.force(q, v, t, params))
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class LinearSystem(Description):
-    """The linear system  M w + C v + K q = f(t), whose step matrix is factorised once for a whole run.
-
-    Args:
-        M, C, K: mass, damping and stiffness: arrays (n, n), or (n,) for a diagonal, or functions of
-            params that return them. C and K may be None. Rows follow `jax.flatten_util.ravel_pytree(v)`.
-        force: f, `force(t, params)`, a pytree structured like v; None for free vibration.
-
-    Raises:
-        TypeError, ValueError: an argument that is neither, or an array of a wrong shape or not finite.
-
-    Example: a mass of 2 kg on a spring of 200 N/m, started from 0.1 m. One period is 0.628 s.
-
-    >>> import jax.numpy as jnp, hhtjax
-    >>> oscillator = hhtjax.LinearSystem(M=jnp.array([2.0]), C=None, K=lambda params: jnp.array([params["k"]]))
-    >>> solution = hhtjax.simulate(
-    ...     oscillator, hhtjax.hht(alpha=0.0), jnp.array([0.1]), jnp.array([0.0]), {"k": 200.0},
-    ...     dt=6.2831853e-4, num_steps=1000)
-    >>> round(float(solution.q[-1, 0]), 6)
-    0.1
-    """
-
-    M: Any
-    C: Any
-    K: Any
-    load: Callable | None
-
-    def __init__(self, M, C=None, K=None, force=None):
-        for name, matrix in (("M", M), ("C", C), ("K", K)):
-            if matrix is None and name != "M":
-                pass
-            elif callable(matrix):
-                require_function("LinearSystem", name, matrix, f"{name}(params)")
-            else:
-                matrix = _constant_matrix("LinearSystem", name, matrix)
-            object.__setattr__(self, name, matrix)
-        known = [name for name in "MCK" if is_array(getattr(self, name))]
-        for name in known[1:]:
-            n, shape = len(getattr(self, known[0])), getattr(self, name).shape
-            if shape[0] != n:
-                raise ValueError(
-                    f"LinearSystem: `{name}` must have shape ({n}, {n}), or ({n},) for a diagonal, to fit "
-                    f"`{known[0]}`; received shape {shape}."
-                )
-        if is_array(self.M):
-            _require_mass("LinearSystem", "M", self.M)
-        if force is not None:
-            require_function("LinearSystem", "force", force, "force(t, params)")
-        object.__setattr__(self, "load", force)
-
-    constraint = None
-
-    def mass(self, q, params):
-        """M, whatever q."""
-        return self.M(params) if callable(self.M) else self.M
-
-    def force(self, q, v, t, params):
-        """f(t) - C v - K q, a pytree structured like v."""
-        v, unravel = ravel_pytree(v)
-        q, _ = ravel_pytree(q)
-        Q = jnp.zeros_like(v) if self.load is None else ravel_pytree(self.load(t, params))[0]
-        for matrix, x in ((self.C, v), (self.K, q)):
-            if matrix is not None:
-                Q = Q - matvec(as_matrix(matrix(params) if callable(matrix) else matrix, x.dtype), x)
-        return unravel(Q)
-
-
 @dataclass(frozen=True, eq=False)
 class FirstOrderSystem(Description):
     """The first-order system  y' = f(y, t), for every stepper: y takes the place of the velocity, with M = 1.
@@ -248,49 +179,7 @@ class FirstOrderSystem(Description):
         require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")
 
 
-def as_matrix(value, dtype):
-    """(n, n) or (n,), of the dtype of the state; a scalar is the matrix of one degree of freedom."""
-    return jnp.atleast_1d(jnp.asarray(value)).astype(dtype)
-
-
-def _constant_matrix(caller, name, received):
-    try:
-        value = received if is_array(received) else np.asarray(received)
-    except ValueError:  # a ragged list
-        value = np.asarray(None)
-    if not is_real(value):
-        if is_array(received) or (isinstance(received, (list, tuple)) and value.ndim):
-            raise TypeError(f"{caller}: `{name}` must be real; received an array of {value.dtype}.")
-        raise TypeError(f"{caller}: `{name}` must be a function or an array; received {received!r}.")
-    if not is_array(received):
-        value = value.astype(float)
-    if value.ndim == 0:
-        value = value.reshape(1)
-    if value.ndim not in (1, 2) or value.shape[0] != value.shape[-1]:
-        raise ValueError(
-            f"{caller}: `{name}` must have shape (n, n), or (n,) for a diagonal; received shape {value.shape}."
-        )
-    if is_concrete(value) and not np.all(np.isfinite(value)):
-        raise ValueError(f"{caller}: `{name}` must be finite; received {value!r}.")
-    return value
-
-
-def _require_mass(caller, name, M, massless=False):
-    """An error for a constant M that is not symmetric, or not positive definite; with constraints it may be singular.
-
-    In units in which its diagonal is 1. Tracers pass, and what is too large for a look at each run.
-    """
-    if not is_concrete(M) or len(M) > LARGEST_CHECKED:
-        return
-    M = np.asarray(M)
-    d = M if M.ndim == 1 else np.diagonal(M)
-    smallest, rounding = np.min(d), 0.0
-    if M.ndim == 2 and smallest > 0:
-        scaled = M / np.sqrt(np.outer(d, d))
-        if np.max(np.abs(scaled - scaled.T)) > SYMMETRIC:
-            raise ValueError(f"{caller}: `{name}` must be symmetric; received one that differs from its transpose.")
-        smallest = np.linalg.eigvalsh(scaled)[0]
-        rounding = 4 * len(M) * float(np.finfo(np.result_type(M, np.float32)).eps)
-    if smallest < -rounding or (not massless and smallest <= rounding):
-        what = "singular" if smallest >= -rounding else "not"
-        raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is {what}.")
+def require_system(caller, system):
+    """An error for what is no system."""
+    if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
+        raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")

@@ -17,8 +17,7 @@ long as C, and in a batch 13 ns for each member. The gradient of a run takes 2.7
 grows with the square root of the number of steps. Systems of few operations are stepped number by number, not array by
 array, with every sine evaluated once. What is no single kernel runs as a list of them, several times slower, with all
 that the columns of a Jacobian share evaluated once: the squeezing mechanism with its 19 unknowns takes 19 microseconds
-    a
-step. Jacobians keep track of what depends on which unknown, so that for a chain of N links, or springs between
+a step. Jacobians keep track of what depends on which unknown, so that for a chain of N links, or springs between
 neighbours, they take N^2 numbers and not N^3; a chain or a tree may give the product M(q) w without M:
 `System(..., inertia=)`. Measured, against C, by structure, batches and gradients, on a page,
 `experiments/benchmarks/README.md`; error against time beside diffrax, SciPy, MuJoCo and exudyn, losses included, on
@@ -36,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows eight names of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows nine functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -46,6 +45,7 @@ The rest of the library knows eight names of this room, and works as well on pla
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     explain(f, *args)         what became of the loops of a program
     plain()                   a context without all that
+    or_plain(run)             run(), or the same without all that where XLA refuses it
 
 The contract
 ------------
@@ -70,7 +70,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 """
 
 from hhtjax.xla.explanation import Explanation, explain
-from hhtjax.xla.gate import plain
+from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.kernels import choose, one_kernel, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.scalars import on_scalars
@@ -82,7 +82,12 @@ __all__ = [
     "linear_map",
     "on_scalars",
     "one_kernel",
+    "or_plain",
     "plain",
     "staged",
     "structural",
 ]
+
+
+def __dir__():
+    return __all__

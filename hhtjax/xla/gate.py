@@ -1,6 +1,8 @@
 """Whether the machinery is on: with the versions of JAX that it is tested with, and unless a user says no."""
 
 import os
+import warnings
+from collections.abc import Callable
 from contextlib import contextmanager
 
 import jax
@@ -37,6 +39,28 @@ def plain():
     else:
         with _plain(True):
             yield
+
+
+def or_plain(run: Callable):
+    """run(), or the same on plain JAX where XLA refuses what the machinery has made of it; a warning says so.
+
+    The last resort of programs that start here: inside a jit of the user's, XLA is not asked before he has left it.
+    """
+    try:
+        return run()
+    except jax.errors.JaxRuntimeError as error:
+        if not is_on():
+            raise
+        refusal = error
+    with plain():
+        result = run()  # where this fails too, the cause is another, and its error the one to see
+    words = (str(refusal).splitlines() or [""])[0][:200]
+    warnings.warn(
+        f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the try.",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+    return result
 
 
 def why_off():

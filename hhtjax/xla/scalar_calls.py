@@ -119,17 +119,18 @@ def _custom_linear_solve(run, eqn, *values):
     *constants, b = [values[start:stop] for start, stop in zip([0, *ends], [*ends, None], strict=True)]
     if closed.transpose_solve is None or len(b) != len(eqn.outvars):  # no reverse mode, or results beside x
         return None
+    scalars = flat(b)
+    if not scalars or len({x.dtype for x in scalars}) > 1:
+        return None
 
-    def scalar(name, constants):
+    def vector(name, constants):
         function = getattr(closed, name)
-        return lambda x: flat(run(function, [*constants, *back(x)]))
+        return lambda x: jnp.stack(flat(run(function, [*constants, *back(list(x))])))
 
-    matvec, _, solve, transpose_solve = map(scalar, lengths._fields, constants)
-    return back(
-        lax.custom_linear_solve(
-            matvec, flat(b), solve=lambda _, b: solve(b), transpose_solve=lambda _, b: transpose_solve(b)
-        )
-    )
+    matvec, _, solve, transpose_solve = map(vector, lengths._fields, constants)
+    # as one vector: JAX does not transpose a solve of which some numbers on the right are constant, and some are not
+    x = lax.custom_linear_solve(matvec, jnp.stack(scalars), lambda _, b: solve(b), lambda _, b: transpose_solve(b))
+    return back(list(x))
 
 
 def _custom_jvp_call(run, eqn, *values):

@@ -25,6 +25,50 @@ def is_real(x):
     return isinstance(x, (int, float)) and not isinstance(x, bool)
 
 
+@jax.tree_util.register_pytree_node_class
+class Fixed:
+    """A function among data, as a pytree without leaves: part of the program."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def __repr__(self):
+        return repr(self.function)
+
+    def tree_flatten(self):
+        """No leaves."""
+        return (), self.function
+
+    @classmethod
+    def tree_unflatten(cls, function, _):
+        """Inverse of `tree_flatten`."""
+        return cls(function)
+
+
+def freeze(tree):
+    """The pytree with its leaves that are functions hidden, so that only data are left; the same where there are none.
+
+    Modules of neural networks have such leaves: their activations. Not hidden are callable arrays and tracers.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    hidden = [callable(x) and not is_array(x) and is_concrete(x) for x in leaves]
+    if not any(hidden):
+        return tree
+    return structure.unflatten([Fixed(x) if hide else x for x, hide in zip(leaves, hidden, strict=True)])
+
+
+def thaw(tree):
+    """What `freeze` was given; whatever holds nothing hidden is returned as it is."""
+    leaves, structure = jax.tree.flatten(tree, is_leaf=_is_fixed)
+    if not any(map(_is_fixed, leaves)):
+        return tree
+    return structure.unflatten([x.function if _is_fixed(x) else x for x in leaves])
+
+
+def _is_fixed(x):
+    return isinstance(x, Fixed)
+
+
 def _fingerprint(x):
     if not is_array(x):
         return x
@@ -51,21 +95,24 @@ class Description:
             places = tuple(map(is_array, leaves))
         data = [x for x, here in zip(leaves, places, strict=True) if here]
         static = tuple(None if here else x for x, here in zip(leaves, places, strict=True))
-        return data, (structure, static)
+        return data, (structure, places, static)
 
     @classmethod
     def tree_unflatten(cls, aux, data):
         """Inverse of `tree_flatten`; validates nothing, because JAX also calls it with placeholders."""
-        structure, static = aux
+        structure, places, static = aux
         data = iter(data)
-        fields = jax.tree.unflatten(structure, [next(data) if x is None else x for x in static])
+        fields = jax.tree.unflatten(
+            structure, [next(data) if here else x for x, here in zip(static, places, strict=True)]
+        )
         self = object.__new__(cls)
-        for name, value in (*fields.items(), ("_places", tuple(x is None for x in static))):
+        for name, value in (*fields.items(), ("_places", places)):
             object.__setattr__(self, name, value)
         return self
 
     def _flatten(self):
-        return jax.tree.flatten({name: value for name, value in vars(self).items() if name != "_places"})
+        fields = {name: value for name, value in vars(self).items() if name != "_places"}
+        return jax.tree.flatten(fields, is_leaf=lambda x: x is None)  # others put None in the place of an array
 
     def __eq__(self, other):
         return type(self) is type(other) and self._key() == other._key()

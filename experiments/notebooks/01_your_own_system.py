@@ -1,0 +1,187 @@
+# %% [markdown]
+# # 1. Your own system in twenty lines
+#
+# hhtjax steps mechanical systems
+#
+# $$M(q)\,\ddot q = Q(q, \dot q, t)$$
+#
+# through time. You write two plain functions, the mass matrix $M$ and the force $Q$; the library differentiates them,
+# solves for the accelerations and marches on. Here: a quarter car, that is, one wheel of a car with its share of the
+# body, over a recorded bump, with a bump stop that is hit.
+
+# %%
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import hhtjax
+
+jax.config.update("jax_enable_x64", True)  # double precision; JAX starts in single precision
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)  # the look of all figures
+
+# %% [markdown]
+# ## The record of the road
+#
+# Real records come with odd time stamps. This one has 300 heights at times that are not equally spaced. `sampled` makes
+# a smooth function of time out of equally spaced values, so we interpolate to these first.
+
+# %%
+rng = np.random.default_rng(1)
+t_road = np.sort(np.append(rng.uniform(0.0, 3.0, 298), [0.0, 3.0]))  # s
+z_road = 0.05 * np.exp(-(((t_road - 1.0) / 0.08) ** 2)) - 0.03 * np.exp(-(((t_road - 1.9) / 0.15) ** 2))  # m
+
+dt_road = 5e-3
+equal = np.arange(0.0, 3.0 + dt_road / 2, dt_road)
+road = hhtjax.sampled(np.interp(equal, t_road, z_road), dt=dt_road, order=1)
+print(f"time steps of the record: {np.diff(t_road).min() * 1e3:.2f} to {np.diff(t_road).max() * 1e3:.0f} ms")
+
+# %% [markdown]
+# ## The system
+#
+# Coordinates, both measured upwards from the rest position on a flat road: $q_0$, the body, and $q_1$, the wheel. The
+# spring between them is compressed by $d = q_1 - q_0$. Beyond a gap, a rubber stop pushes with $k_b\,(d - g)^2$.
+# Between tyre and road there is another, much stiffer spring.
+#
+# Everything that could change goes into `params`, a dictionary, the road too. Nothing is read from outside: so every
+# number can be changed, fitted or differentiated later.
+
+
+# %%
+def mass(q, params):  # a diagonal: one number for each coordinate
+    return jnp.stack([params["body"], params["wheel"]])
+
+
+def stop_force(d, params):
+    return params["k_stop"] * jnp.maximum(d - params["gap"], 0.0) ** 2
+
+
+def force(q, v, t, params):
+    d, rate = q[1] - q[0], v[1] - v[0]
+    strut = params["k"] * d + params["c"] * rate + stop_force(d, params)
+    tyre = params["k_tyre"] * (params["road"](t) - q[1])
+    return jnp.stack([strut, tyre - strut])
+
+
+quarter_car = hhtjax.System(mass, force)
+params: dict = {"body": 320.0, "wheel": 40.0, "k": 18e3, "c": 1200.0, "k_tyre": 200e3}  # kg, N/m, N s/m
+params |= {"k_stop": 30e6, "gap": 0.02, "road": road}  # N/m^2, m
+rest = jnp.zeros(2)
+
+run = hhtjax.simulate(quarter_car, hhtjax.hht(alpha=-0.05), rest, rest, params, dt=1e-3, num_steps=3000)
+run.check()  # an error that names the first bad step, if there is one
+print("times", run.t.shape, " positions", run.q.shape, " accelerations", run.acceleration.shape)
+
+# %% [markdown]
+# `hht(alpha=-0.05)` is the method: the HHT-alpha step of structural dynamics, second order, stable for stiff springs.
+# `alpha` is a little damping of the fastest vibrations; notebook 2 is about this choice. `run` holds the whole motion,
+# the start included.
+#
+# **Look at** the lower figure: where the compression passes the dashed line, the stop is at work.
+
+# %%
+compression = run.q[:, 1] - run.q[:, 0]
+figure, (above, below) = hhtjax.plot.subplots(2, 1, width=175, height=105, sharex=True)
+above.plot(t_road, 1e3 * z_road, ".", color="0.6", ms=3, label="road, as recorded")
+above.plot(run.t, 1e3 * run.q[:, 1], label="wheel", lw=1.2)
+above.plot(run.t, 1e3 * run.q[:, 0], label="body", lw=1.8)
+above.set_ylabel("height (mm)")
+above.legend(ncols=3, loc="lower left")
+below.plot(run.t, 1e3 * compression, color="C2")
+below.axhline(1e3 * params["gap"], color="black", ls="--", lw=1)
+below.annotate("bump stop begins", (3.0, 1e3 * params["gap"]), ha="right", va="bottom")
+below.set(xlabel="time (s)", ylabel="compression\nof the strut (mm)")
+plt.show()
+
+touching = float(jnp.mean(compression > params["gap"]) * 3.0)
+print(f"largest compression {1e3 * compression.max():.1f} mm; the stop is touched for {1e3 * touching:.0f} ms")
+print(f"largest force of the stop {stop_force(compression, params).max():.0f} N")
+print(f"largest acceleration of the body {jnp.abs(run.acceleration[:, 0]).max():.1f} m/s^2")
+
+# %% [markdown]
+# ## Is the step small enough?
+#
+# The simplest check there is: halve the step. The difference should be about four times as small each time, since the
+# method is of second order. (A new `dt` compiles nothing; a new number of steps does, about a second each time.
+# Notebook 5 runs many step sizes in one call.)
+
+# %%
+ends = {n: hhtjax.simulate(quarter_car, hhtjax.hht(), rest, rest, params, dt=3.0 / n, num_steps=n, save_every=n // 300)
+        for n in (1200, 2400, 4800)}  # fmt: skip
+coarse, middle, fine = (1e3 * run.q[:, 0] for run in ends.values())
+print(f"body, steps of 2.5 against 1.25 ms:   {jnp.abs(coarse - middle).max():.4f} mm")
+print(f"body, steps of 1.25 against 0.625 ms: {jnp.abs(middle - fine).max():.4f} mm")
+
+# %% [markdown]
+# ## A derivative, and a design
+#
+# The run is a function of its parameters, so JAX differentiates it, exactly and through all steps. How does the largest
+# acceleration of the body depend on the damper?
+
+
+# %%
+def ride(c):
+    """Largest acceleration of the body, least load of the tyre, and when the first of them occurs, for a damper c."""
+    stepper = hhtjax.hht(alpha=-0.05)
+    run = hhtjax.simulate(quarter_car, stepper, rest, rest, params | {"c": c}, dt=1e-3, num_steps=3000)
+    tyre = params["k_tyre"] * (jax.vmap(road)(run.t) - run.q[:, 1])
+    weight = 9.81 * (params["body"] + params["wheel"])
+    a = jnp.abs(run.acceleration[:, 0])
+    return a.max(), jnp.min(weight + tyre), run.t[jnp.argmax(a)]
+
+
+slope = jax.jacfwd(lambda c: ride(c)[0])(1200.0)
+around = (ride(1201.0)[0] - ride(1199.0)[0]) / 2
+print(
+    f"d(acceleration)/dc: {slope:.6f} by differentiating the run, {around:.6f} by finite differences, m/s^2 per N s/m"
+)
+assert abs(slope / around - 1) < 1e-3
+
+# %% [markdown]
+# And `jax.vmap` runs 60 dampers at once. **Look at** the corners of the comfort curve: there another moment of the ride
+# becomes the worst one (the times are printed below), and the derivative jumps. The derivative computed above is the
+# slope of the dotted line.
+
+# %%
+c = jnp.linspace(300.0, 4000.0, 60)
+acceleration, load, worst = jax.jit(jax.vmap(ride))(c)
+best = int(jnp.argmin(acceleration))
+
+figure, left = hhtjax.plot.subplots(width=140, height=75)
+left.plot(c, acceleration, label="body acceleration (left)")
+left.plot(c[:25], ride(1200.0)[0] + slope * (c[:25] - 1200.0), "k:", lw=1.2)
+left.plot(c[best], acceleration[best], "o", color="C0")
+left.set(xlabel="damper c (N s/m)", ylabel="largest body\nacceleration (m/s²)")
+right = left.twinx()
+right.grid(False)
+right.spines["right"].set_visible(True)
+right.plot(c, load / 1e3, color="C1", ls="--", label="least load of the tyre (right)")
+right.set_ylabel("least load of\nthe tyre (kN)")
+figure.legend(loc="outside upper center", ncols=2)
+plt.show()
+print(f"smoothest ride: c = {c[best]:.0f} N s/m, {acceleration[best]:.1f} m/s^2 (with c = 1200: {ride(1200.0)[0]:.1f})")
+for i in (0, best - 5, best + 5):
+    print(f"with c = {c[i]:4.0f} N s/m the body is accelerated most at t = {worst[i]:.2f} s")
+
+# %% [markdown]
+# ## When something is wrong
+#
+# Mistakes are named at the boundary, before anything is compiled. Two common ones:
+
+# %%
+for wrong in (
+    lambda: hhtjax.simulate(quarter_car, hhtjax.hht(), rest, jnp.zeros(3), params, dt=1e-3, num_steps=10),
+    lambda: hhtjax.simulate(quarter_car, hhtjax.hht(alpha=0.2), rest, rest, params, dt=1e-3, num_steps=10),
+):
+    try:
+        wrong()
+    except ValueError as error:
+        print("ValueError:", error, "\n")
+
+# %% [markdown]
+# ## What to try next
+#
+# * Replace the stop's square by a linear spring of 1 MN/m: how small must the step become?
+# * Add a second wheel, and the pitch of the body: four coordinates, nothing else changes.
+# * Put the wheel's mass into `jax.jacfwd` as well: which of the parameters matters most for the ride?
+# * Notebook 2: which method, which step. Notebook 3: parameters from measured data.

@@ -1,0 +1,196 @@
+# %% [markdown]
+# # 2. Choosing a method and a step size
+#
+# Every step makes a small error. This notebook shows what that error does to a vibration, how it shrinks with the step,
+# which methods survive stiffness, and how to ask the library for a step size. At the end there is a short table of
+# advice.
+
+# %%
+import time
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import hhtjax
+from hhtjax import analysis
+
+jax.config.update("jax_enable_x64", True)
+plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
+
+# %% [markdown]
+# ## What a step does to one vibration
+#
+# Take one undamped oscillator of circular frequency $\omega$ and step it with $h$. All that matters is $\omega h$: at
+# $\omega h = 2\pi/20 \approx 0.31$ there are 20 steps per period. Two errors can be seen: the period comes out too long
+# or too short, and the amplitude decays (**numerical damping**, given as a damping ratio, or Lehr's measure) or grows.
+#
+# **Look at** the left of each figure: that is where you want to be for the vibrations that matter to you. The right is
+# where the vibrations live that your model has, but that you do not want to resolve: there damping is welcome.
+
+# %%
+steppers = {
+    "hht(0), trapezoidal": hhtjax.hht(alpha=0.0),
+    "hht(-0.05), the default": hhtjax.hht(alpha=-0.05),
+    "hht(-0.3)": hhtjax.hht(alpha=-0.3),
+    "implicit Euler": hhtjax.implicit_euler(),
+    "RK4": hhtjax.rk4(),
+}
+wh = np.geomspace(0.1, 20.0, 80)
+figure, (left, right) = hhtjax.plot.subplots(1, 2, width=175, height=75)
+hhtjax.plot.period_elongation(steppers, frequency=wh, ax=left)
+hhtjax.plot.damping_ratio(steppers, frequency=wh, ax=right)
+left.set_ylim(-0.2, 1.0)
+right.set_ylim(-0.1, 0.6)
+for axes in (left, right):
+    axes.get_legend().remove()
+figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+plt.show()
+
+for name, stepper in steppers.items():
+    period, damping = (float(f(stepper, 2 * np.pi / 20)) for f in (analysis.period_elongation, analysis.damping_ratio))
+    print(f"20 steps a period, {name:<24} period {100 * period:+.3f} %, damping ratio {100 * damping:+.4f} %")
+
+# %% [markdown]
+# A rule of thumb from these numbers: with `hht`, 20 steps per period lengthen the period by about one per cent, and
+# since the method is of **second order**, 40 steps by a quarter of that.
+#
+# ## Error against step size
+#
+# Order $p$ means that the error of a smooth motion shrinks like $h^p$. Measured here on a driven Duffing oscillator (a
+# mass on a hardening spring, $\ddot q + 0.2\,\dot q + q + q^3 = 0.8 \cos 1.3\,t$), against a run with very small steps.
+# `analysis.observed_order` does the runs.
+#
+# **Look at** the slopes, and at the horizontal distances: how many more steps one method needs than another for the
+# same error.
+
+# %%
+scene = hhtjax.scenes.duffing.driven()
+start = scene.q0, scene.v0, scene.params
+candidates = {
+    "hht(-0.05)": hhtjax.hht(alpha=-0.05),
+    "newmark": hhtjax.newmark(),
+    "rowda": hhtjax.rowda(),
+    "RK4": hhtjax.rk4(),
+    "implicit Euler": hhtjax.implicit_euler(),
+}
+
+
+def order_of(stepper, num_steps, **options):
+    return analysis.observed_order(scene.system, stepper, *start, duration=10.0, num_steps=num_steps, **options)
+
+
+fine = hhtjax.simulate(scene.system, hhtjax.rk4(), *start, dt=10.0 / 20000, num_steps=20000, save_every=20000)
+found = {name: order_of(s, (50, 100, 200, 400, 800, 1600), reference=fine.q[-1]) for name, s in candidates.items()}
+axes = hhtjax.plot.error_against_h(found, unit="m")
+axes.figure.set_size_inches(5.6, 3.6)
+plt.show()
+for name, result in found.items():
+    print(f"{name:<15} slopes {np.round(result.slope, 2)}")
+
+# %% [markdown]
+# ## Stiffness: who survives
+#
+# A weight of 1 kg swings on a rod. Give the rod its true stiffness, 1 MN/m, and there is a vibration along the rod with
+# $\sqrt{k/m}$ = 1000 rad/s besides the swinging with some 4 rad/s. Nobody wants to see the fast one. An **explicit**
+# method such as RK4 has to resolve it all the same, or it blows up; an **implicit** one does not.
+
+# %%
+pendulum = hhtjax.scenes.pendulum.elastic(k=1e6)
+angle = {}
+for name, stepper, dt in [
+    ("RK4, 2 ms", hhtjax.rk4(), 2e-3),
+    ("RK4, 4 ms", hhtjax.rk4(), 4e-3),
+    ("hht, 4 ms", hhtjax.hht(), 4e-3),
+    ("hht, 20 ms", hhtjax.hht(), 2e-2),
+]:
+    n = round(1.0 / dt)
+    run = hhtjax.simulate(pendulum.system, stepper, pendulum.q0, pendulum.v0, pendulum.params, dt=dt, num_steps=n)
+    try:
+        run.check(reach=2.0)  # a run that gets farther than 2 m from its start counts as failed too
+        angle[name] = run.t, jnp.degrees(jnp.arctan2(run.q[:, 0], -run.q[:, 1]))
+        print(f"{name}: fine, with {n} steps")
+    except hhtjax.SimulationError as error:
+        print(f"{name}: {error}")
+
+figure, axes = hhtjax.plot.subplots(width=175, height=60)
+for (name, (t, value)), line in zip(angle.items(), ("-", "--", "o"), strict=True):
+    axes.plot(t, value, line, label=name, ms=4)
+axes.set(xlabel="time (s)", ylabel="angle of the rod (degrees)")
+axes.legend()
+plt.show()
+
+# %% [markdown]
+# ## Ask for a step size
+#
+# `analysis.suggest_step_size` answers in two ways. Without a duration it looks at the vibrations about the initial
+# state, and at what the stepper makes of each. With one, it runs the motion with halved steps until the error stays
+# within the tolerance: slower, but it sees everything that happens on the way.
+
+# %%
+by_modes = analysis.suggest_step_size(scene.system, hhtjax.hht(), *start, tolerance=1e-2)
+by_runs = analysis.suggest_step_size(scene.system, hhtjax.hht(), *start, tolerance=1e-2, duration=10.0)
+print("by the modes:", by_modes, "\n")
+print("by runs:     ", by_runs)
+
+# %% [markdown]
+# ## What a step costs
+#
+# The methods differ in work per step. Timed below: 20000 steps of the same oscillator, after a first call that
+# compiles. (Absolute numbers depend on this machine; the ratios less so.) `iterations=None` repeats Newton's iteration
+# until the equations hold to rounding; the default does one solve a step, and has the same order.
+
+
+# %%
+def nanoseconds(stepper, **options):
+    def run():
+        begin = time.perf_counter()
+        jax.block_until_ready(
+            hhtjax.simulate(scene.system, stepper, *start, dt=1e-3, num_steps=20000, save_every=2000, **options)
+        )
+        return 1e9 * (time.perf_counter() - begin) / 20000
+
+    return run(), min(run() for _ in range(5))
+
+
+for name, stepper in {**candidates, "hht, Newton": hhtjax.hht(alpha=-0.05, iterations=None)}.items():
+    first, later = nanoseconds(stepper)
+    print(f"{name:<15} {later:6.0f} ns a step;  first call, with compiling: {first * 20000 / 1e9:.1f} s")
+
+# %% [markdown]
+# ## More order from the same method
+#
+# Where the motion is smooth, `extrapolate=2` runs with $h$ and $h/2$ and takes the leading error out of both
+# (Richardson's extrapolation): one order more, for three times the work; two orders for `alpha=0`, as here.
+
+# %%
+sharp = hhtjax.hht(alpha=0.0, linearize="predictor")  # smooth in everything, which extrapolation needs
+for extrapolate in (1, 2):
+    error = []
+    for n in (200, 400):
+        run = hhtjax.simulate(
+            scene.system, sharp, *start, dt=10 / n, num_steps=n, save_every=n, extrapolate=extrapolate
+        )
+        error.append(float(jnp.abs(run.q[-1] - fine.q[-1])[0]))
+    print(f"extrapolate={extrapolate}: error {error[0]:.1e} with 200 steps, {error[1]:.1e} with 400: order "
+          f"{np.log2(error[0] / error[1]):.1f}")  # fmt: skip
+
+# %% [markdown]
+# ## Advice
+#
+# | your system | take | why |
+# |---|---|---|
+# | stiff springs, contacts, constraints; nothing known | `hht()` | one solve a step, damps what is not resolved |
+# | the same, and a fit through the run | `hht(linearize="predictor")` | smooth in its parameters |
+# | no energy may be lost, everything is resolved | `hht(alpha=0.0)` | no numerical damping at all, at any frequency |
+# | smooth and stiff, more than three digits | `rowda()`, or `extrapolate=2` | order 3 |
+# | smooth, nothing stiff | `rk4()` | order 4, no Jacobian |
+#
+# Then ask `suggest_step_size`, or halve the step and compare, as in notebook 1.
+#
+# ## What to try next
+#
+# * Where does `hht(-0.3)` cross `hht(-0.05)` in the error figure? Add it to `candidates`.
+# * Let the rod of the pendulum be 100 times softer: which step does RK4 need now?
+# * Notebook 6 shows what goes wrong beyond all this advice.

@@ -1,0 +1,1 @@
+"""Teaching notebooks: percent scripts, rendered beside them."""

@@ -1,0 +1,241 @@
+"""Normal modes of M w + K q = 0, and linear systems reduced to some of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.checks import require_integer
+from hhtjax.description import Description, is_concrete
+from hhtjax.systems.linear_system import LinearSystem
+from hhtjax.systems.matrices import SYMMETRIC, constant_matrix, is_sparse, require_mass
+
+DENSE = 1000  # rows up to which a sparse problem is solved as a dense one
+UNCOUPLED = 1e-9  # size of what couples modes, relative to their damping, that is rounding
+SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first that is no eigenvalue
+
+
+class NormalModes(NamedTuple):
+    """frequencies: (count,), rad/s, lowest first, 0 for rigid motions. shapes: T, (n, count), with T^T M T = 1."""
+
+    frequencies: Any
+    shapes: Any
+
+
+class ModalReduction(NamedTuple):
+    """What `modal_reduction` returns: the reduced system, and the way to it and back."""
+
+    system: LinearSystem
+    frequencies: Any
+    shapes: Any  # T, (n, count)
+    inverse: Any  # T^T M, (count, n)
+
+    def expand(self, q):
+        """Coordinates (..., n) of modal ones (..., count), T q: positions, velocities, accelerations."""
+        return jnp.asarray(q) @ jnp.asarray(self.shapes).T
+
+    def project(self, q):
+        """Modal coordinates (..., count) of given ones (..., n), T^T M q: of what the modes span, exactly."""
+        return jnp.asarray(q) @ jnp.asarray(self.inverse).T
+
+
+def modes(M, K, count=None) -> NormalModes:
+    """The lowest modes of free vibration: K T = M T diag(frequencies^2).
+
+    Args:
+        M, K: mass and stiffness, symmetric, M positive definite and K positive semidefinite: arrays (n, n), (n,) for
+            diagonals, or matrices of scipy.sparse of any size. With more than 1000 rows these are solved by Lanczos's
+            iteration on the shifted inverse (`scipy.sparse.linalg.eigsh`), the others by NumPy.
+        count: how many; None for all.
+
+    Raises:
+        TypeError, ValueError: matrices of a wrong kind or shape, not symmetric, or indefinite; a count out of range.
+
+    References:
+        Meirovitch, Computational Methods in Structural Dynamics, 1980; Lehoucq, Sorensen, Yang, ARPACK, 1998.
+
+    >>> import numpy as np, hhtjax
+    >>> K = 100.0 * (2 * np.eye(3) - np.eye(3, k=1) - np.eye(3, k=-1))          # three masses between two walls
+    >>> found = hhtjax.analysis.modes(np.ones(3), K, count=2)
+    >>> [round(float(w), 6) for w in found.frequencies], [round(20 * float(np.sin(j * np.pi / 8)), 6) for j in (1, 2)]
+    ([7.653669, 14.142136], [7.653669, 14.142136])
+    """
+    n = _rows("M", M)
+    if n != _rows("K", K):
+        raise ValueError(f"modes: `K` must have the shape of M, {n} rows; received {_rows('K', K)}.")
+    count = n if count is None else require_integer("modes", "count", count)
+    if count > n:
+        raise ValueError(f"modes: `count` must be at most {n}, the number of coordinates; received {count}.")
+    by_lanczos = (is_sparse(M) or is_sparse(K)) and DENSE < n != count
+    squares, T, scale = (_by_lanczos if by_lanczos else _by_numpy)(M, K, count)
+    if squares[0] < -1e-9 * scale:
+        raise ValueError(f"modes: `K` must be positive semidefinite; received one with frequency^2 = {squares[0]:.4g}.")
+    largest = np.take_along_axis(T, np.argmax(np.abs(T), axis=0)[None], axis=0)
+    return NormalModes(np.sqrt(np.maximum(squares, 0)), T * np.where(largest < 0, -1, 1))
+
+
+def modal_reduction(system, count, params=None) -> ModalReduction:
+    """The linear system in its lowest `count` modes, q = T x:
+
+        x'' + T^T C T x' + diag(frequencies^2) x = T^T f(t) + T^T g(T x, T v, t)
+
+    Modes that proportional damping leaves uncoupled stay so (a diagonal); other damping couples them. What f does to
+    the modes left out is missing, its static deflection too.
+
+    Args:
+        system: a `LinearSystem`, or (M, C, K), or (M, C, K, force), as it takes them, C may be None; matrices of
+            scipy.sparse may have any size. Matrices that are functions of params stay such, with T from the given
+            params: so parameters can be fitted through the reduced system. Its q and v are vectors x; a `nonlinear`
+            force without `at` gets vectors too.
+        count: number of modes.
+        params: for functions of params.
+
+    Returns:
+        A `ModalReduction`: its `system` for `simulate`, started from `project(q0)`, `project(v0)`; `expand(run.q)` are
+        the coordinates, and `suggest_step_size(reduced.system, stepper, ...)` says which modes a step resolves.
+
+    Raises:
+        TypeError, ValueError: as `modes`.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> K = 100.0 * (2 * jnp.eye(50) - jnp.eye(50, k=1) - jnp.eye(50, k=-1))
+    >>> chain = hhtjax.LinearSystem(jnp.ones(50), 1e-3 * K, K, lambda t, params: jnp.sin(t) * jnp.ones(50))
+    >>> reduced = hhtjax.analysis.modal_reduction(chain, 6)
+    >>> rest = jnp.zeros(6)
+    >>> run = hhtjax.simulate(reduced.system, hhtjax.hht(), rest, rest, dt=0.05, num_steps=100)
+    >>> reduced.expand(run.q).shape, reduced.system.C.shape
+    ((101, 50), (6,))
+    >>> print(hhtjax.analysis.suggest_step_size(reduced.system, hhtjax.hht(), rest, rest, highest=1.0).reason)
+    resolves the mode at 0.6159 rad/s to 0.01
+    """
+    nonlinear, at = None, None
+    if isinstance(system, LinearSystem):
+        M, C, K, load = system.M, system.C, system.K, system.load
+        nonlinear, at = system.nonlinear, system.at
+    elif isinstance(system, tuple) and len(system) in (3, 4):
+        M, C, K, load = (*system, None)[:4]
+    else:
+        raise TypeError(
+            f"modal_reduction: `system` must be a LinearSystem, (M, C, K) or (M, C, K, force); received {system!r}."
+        )
+    if K is None:
+        raise ValueError("modal_reduction: `system` must have a stiffness K; received None.")
+    mass, stiffness = (A(params) if callable(A) else A for A in (M, K))
+    frequencies, T = modes(mass, stiffness, count)
+    reduced = LinearSystem(
+        _Projected(T, M) if callable(M) else np.ones(count),
+        C if C is None else _Projected(T, C) if callable(C) else _uncoupled(_project(T, C)),
+        _Projected(T, K) if callable(K) else frequencies**2,
+        None if load is None else _ProjectedLoad(T, load),
+        None if nonlinear is None else _ProjectedForce(T if at is None else T[list(at)], nonlinear),
+    )
+    return ModalReduction(reduced, frequencies, T, _times(mass, T).T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Projected(Description):
+    """T^T A(params) T."""
+
+    T: Any
+    matrix: Callable
+
+    def __call__(self, params):
+        return _project(self.T, jnp.asarray(self.matrix(params)))
+
+
+@dataclass(frozen=True, eq=False)
+class _ProjectedLoad(Description):
+    """T^T f(t)."""
+
+    T: Any
+    load: Callable
+
+    def __call__(self, t, params):
+        f, _ = ravel_pytree(self.load(t, params))
+        return jnp.asarray(self.T, f.dtype).T @ f
+
+
+@dataclass(frozen=True, eq=False)
+class _ProjectedForce(Description):
+    """T^T g(T x, T v, t), with the rows of T where g acts."""
+
+    T: Any
+    force: Callable
+
+    def __call__(self, q, v, t, params):
+        T = jnp.asarray(self.T, q.dtype)
+        return T.T @ ravel_pytree(self.force(T @ q, T @ v, t, params))[0]
+
+
+def _times(A, T):
+    return A[:, None] * T if np.ndim(A) == 1 and not is_sparse(A) else A @ T
+
+
+def _project(T, A):
+    return T.T @ _times(A, T)
+
+
+def _uncoupled(D):
+    """The diagonal, if all the rest is rounding."""
+    d = np.diagonal(D)
+    rest = np.abs(D - np.diag(d))
+    return np.array(d) if np.all(rest <= UNCOUPLED * np.max(np.abs(d), initial=0)) else D
+
+
+def _rows(name, A):
+    """Number of rows of a matrix that is known, and square."""
+    if not is_concrete(A):
+        raise TypeError(f"modes: `{name}` must be known: call it outside jit, vmap and grad.")
+    if not is_sparse(A):
+        return len(constant_matrix("modes", name, A))
+    if len(A.shape) != 2 or A.shape[0] != A.shape[1]:
+        raise ValueError(f"modes: `{name}` must have shape (n, n), or (n,) for a diagonal; received shape {A.shape}.")
+    return A.shape[0]
+
+
+def _require_symmetric(K, difference):
+    if difference > SYMMETRIC * abs(K).max():
+        raise ValueError("modes: `K` must be symmetric; received one that differs from its transpose.")
+
+
+def _by_numpy(M, K, count):
+    """Squares of the frequencies, shapes, and the size of the largest square, by Cholesky's factor of M."""
+    M, K = (np.asarray(constant_matrix("modes", name, A)) for name, A in (("M", M), ("K", K)))
+    require_mass("modes", "M", M)
+    K = np.diag(K) if K.ndim == 1 else K
+    _require_symmetric(K, np.max(np.abs(K - K.T)))
+    to_unit = np.diag(1 / np.sqrt(M)) if M.ndim == 1 else np.linalg.inv(np.linalg.cholesky(M)).T
+    squares, Y = np.linalg.eigh(to_unit.T @ ((K + K.T) / 2) @ to_unit)
+    return squares[:count], to_unit @ Y[:, :count], np.max(np.abs(squares))
+
+
+def _by_lanczos(M, K, count):
+    """The same by SciPy, for sparse matrices."""
+    from scipy import sparse
+    from scipy.sparse.linalg import ArpackError, eigsh
+
+    M, K = (sparse.csc_matrix(sparse.diags(np.asarray(A)) if np.ndim(A) == 1 and not is_sparse(A) else A, dtype=float)
+            for A in (M, K))  # fmt: skip
+    _require_symmetric(K, abs(K - K.T).max())
+    diagonals: Any = [A.diagonal() for A in (K, M)]
+    if not np.min(diagonals[1]) > 0:
+        raise ValueError("modes: `M` must be positive definite; received one with a diagonal that is not positive.")
+    scale = np.max(diagonals[0] / diagonals[1])
+    start = np.random.default_rng(0).standard_normal(M.shape[0])
+    for shift in SHIFTS:
+        try:
+            squares, T = eigsh(K, count, M, sigma=-shift * scale, v0=start)
+        except (RuntimeError, ArpackError):  # a singular factor; no convergence
+            continue
+        order = np.argsort(squares)
+        squares, T = squares[order], T[:, order]
+        T = T / np.sqrt(np.sum(T * (M @ T), axis=0))
+        left, rounding = np.abs(K @ T - (M @ T) * squares), np.finfo(float).eps * (abs(K) @ np.abs(T))
+        if np.all(left <= 1e-6 * np.abs(squares[-1]) * np.max(np.abs(M @ T), axis=0) + 1e3 * rounding):
+            return squares, T, scale
+    raise ValueError(
+        f"modes: {count} modes of the sparse `M` and `K` were not found: M may be singular, or K indefinite."
+    )

@@ -1,0 +1,140 @@
+"""How results show themselves in a notebook, a terminal, a log: shapes, dtypes and verdicts, never arrays.
+
+Nothing here computes with JAX: a result may hold tracers, or be shown while something else is being traced.
+"""
+
+import html
+import sys
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+
+from hhtjax.description import is_array, is_concrete, is_real
+
+Kind = TypeVar("Kind", bound=type)
+MOST = 16  # rows of a table, or entries of a container
+LINE = "text-align: left; border-bottom: 1px solid rgba(128, 128, 128, 0.35)"  # seen on light and on dark
+
+
+class Table(NamedTuple):
+    """What a result shows: a title, with the verdict, and rows, the first of which is the header."""
+
+    title: str
+    rows: list[list[str]]
+
+
+def shown(cls: Kind) -> Kind:
+    """A named tuple that shows itself in one line, or by its method `_table`, and completes to its own names only.
+
+    A method `_verdict` adds words to the line. Tuples they remain, for `isinstance`, comparison and `jax.tree`.
+
+    >>> @shown
+    ... class Point(NamedTuple):
+    ...     x: Any
+    ...     name: Any = None
+    >>> Point(np.zeros((3, 2)), "start"), "count" in dir(Point(1.0))
+    (Point(x=float64[3,2], name='start'), False)
+    """
+    named: Any = cls
+    named.__repr__ = line
+    named.__dir__ = lambda self: [name for name in object.__dir__(self) if name not in ("count", "index")]
+    if hasattr(cls, "_table"):
+        named.__repr__ = lambda self: as_text(self._table())
+        named._repr_html_ = lambda self: as_html(self._table())
+    return cls
+
+
+def line(x):
+    """A named tuple in one line."""
+    told = [x._verdict()] if hasattr(x, "_verdict") else []
+    told += [f"{name}={brief(y)}" for name, y in zip(x._fields, x, strict=True) if y is not None]
+    return f"{type(x).__name__}({_some(filter(None, told))})"
+
+
+def brief(x):
+    """A few characters: a number as it is, an array as float64[3,2], a container by what it holds."""
+    value = known(x)
+    if value is not None and not value.ndim:
+        return f"{value:.6g}" if value.dtype.kind == "f" else str(value)
+    if hasattr(x, "shape") and hasattr(x, "dtype"):
+        return f"{x.dtype}{str(list(x.shape)).replace(' ', '')}"
+    if hasattr(x, "_table"):
+        return f"<{x._table().title}>"
+    if hasattr(x, "_fields"):
+        return line(x)
+    if isinstance(x, dict):
+        return f"{{{_some(f'{name}: {brief(y)}' for name, y in x.items())}}}"
+    if isinstance(x, list | tuple):
+        first, last = "[]" if isinstance(x, list) else "()"
+        return f"{first}{_some(map(brief, x))}{last}"
+    return repr(x) if x is None or isinstance(x, str | bool) else f"<{getattr(x, '__name__', type(x).__name__)}>"
+
+
+def _some(entries):
+    entries = list(entries)
+    return ", ".join([*entries[:MOST], *([f"and {len(entries) - MOST} more"] if len(entries) > MOST else [])])
+
+
+def known(x) -> Any:
+    """The numbers of an array, or a number, as NumPy's; None where they cannot be had: of a tracer, or elsewhere."""
+    if isinstance(x, bool):
+        return np.asarray(x)
+    if (not (is_array(x) and x.dtype == bool) and not is_real(x)) or not is_concrete(x):
+        return None
+    if isinstance(x, jax.Array) and (x.is_deleted() or not x.is_fully_addressable):
+        return None
+    return np.asarray(x)
+
+
+def all_known(tree) -> list:
+    """`known` of each leaf; none of them where one is not."""
+    numbers = [known(x) for x in jax.tree.leaves(tree)]
+    return [] if any(x is None for x in numbers) else numbers
+
+
+def leaf_rows(**trees):
+    """Name, shape and dtype of each array in pytrees, as rows of a table; trees that are None do not occur."""
+    rows = []
+    for name, tree in trees.items():
+        for path, x in jax.tree_util.tree_leaves_with_path(tree):
+            where = jax.tree_util.keystr(path, simple=True, separator=".")
+            size = [str(tuple(x.shape)), str(x.dtype)] if hasattr(x, "shape") else [brief(x), ""]
+            rows.append([f"{name}.{where}" if where else name, *size])
+    return rows
+
+
+def between(x, unit="", digits=6):
+    """The range of known numbers, in words."""
+    least, most = (f"{end:.{digits}g}" for end in (np.min(x), np.max(x)))
+    return (least if least == most else f"{least} ... {most}") + (f" {unit}" if unit else "")
+
+
+def _shortened(table):
+    """At most `MOST` rows, and what is left out."""
+    left = len(table.rows) - 1 - MOST
+    return table.rows[: MOST + 1], f"and {left} more" if left > 0 else ""
+
+
+def as_text(table):
+    """Title and columns."""
+    rows, more = _shortened(table)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["    " + "  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join([table.title, *lines, *(["    " + more] if more else [])])
+
+
+def as_html(table):
+    """The same as HTML, in the colours around it."""
+    rows, more = _shortened(table)
+
+    def line(kind, cells):
+        return "<tr>" + "".join(f'<{kind} style="{LINE}">{html.escape(x)}</{kind}>' for x in cells) + "</tr>"
+
+    body = "".join([line("th", rows[0]), *(line("td", row) for row in rows[1:])])
+    return f"<div>{html.escape(table.title)}</div><table>{body}</table><div>{more}</div>"
+
+
+def overwrite(line, last):
+    """A line on stderr that takes the place of the one before, in a terminal as in a notebook; the last one stays."""
+    print(f"\r{line:<79}", end="\n" if last else "", file=sys.stderr, flush=True)

@@ -1,0 +1,53 @@
+"""Charts of runs, steps and fits, by matplotlib: `pip install 'hhtjax[plot]'`.
+
+Every function draws into the axes given as `ax`, or makes a figure, 85 mm wide with 8 pt text, and returns the axes:
+
+>>> import jax.numpy as jnp, hhtjax
+>>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
+>>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
+>>> ax = hhtjax.plot.trajectory(run, units="m")
+>>> ax.get_xlabel(), ax.get_ylabel()
+('t (s)', 'q[0] (m)')
+
+Nothing is shown, no global setting changed; `hhtjax.plot.save(ax.figure, "run", ("png", "pdf"))` writes files.
+"""
+
+try:
+    import matplotlib  # noqa: F401
+except ModuleNotFoundError as error:
+    raise ImportError("hhtjax.plot needs matplotlib: pip install 'hhtjax[plot]'") from error
+
+from hhtjax.plot.convergence import error_against_h, work_precision
+from hhtjax.plot.energies import energy_balance
+from hhtjax.plot.fits import correlations, estimates, fit_against_data, profile
+from hhtjax.plot.mechanisms import animation, configuration
+from hhtjax.plot.steps import damping_ratio, period_elongation, spectral_radius, stability_region
+from hhtjax.plot.styles import COLOURS, LINES, MARKERS, PARAMETERS, legend, save, style, subplots
+from hhtjax.plot.trajectories import constraint_drift, phase_plane, trajectory
+
+__all__ = [
+    "COLOURS",
+    "LINES",
+    "MARKERS",
+    "PARAMETERS",
+    "animation",
+    "configuration",
+    "constraint_drift",
+    "correlations",
+    "damping_ratio",
+    "energy_balance",
+    "error_against_h",
+    "estimates",
+    "fit_against_data",
+    "legend",
+    "period_elongation",
+    "phase_plane",
+    "profile",
+    "save",
+    "spectral_radius",
+    "stability_region",
+    "style",
+    "subplots",
+    "trajectory",
+    "work_precision",
+]

@@ -1,0 +1,200 @@
+"""Charts of error: against the step size, with observed orders, and against the time that it takes."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from hhtjax.analysis.convergence import ObservedOrder
+from hhtjax.plot.styles import LINES, MARKERS, canvas, legend, look, with_unit
+from hhtjax.runs.solution import Solution
+
+GREY = "#606060"
+
+
+def error_against_h(
+    dt: Any,
+    error: Any = None,
+    *,
+    reference: Any = None,
+    label: str | None = None,
+    slopes: Any = None,
+    unit: str | None = None,
+    time_unit: str = "s",
+    ax: Any = None,
+) -> Any:
+    """Error over step size, both logarithmic, with the observed order of each curve and triangles of whole orders.
+
+    The order in the legend is the median of the slopes between neighbours, which rounding at one end, or steps too
+    coarse at the other, leave alone as long as most points are between them. Of a curve that bends, whose slopes are
+    more than 1 apart, the least and the largest are given.
+
+    Args:
+        dt: step sizes, with `error` as long; or an `ObservedOrder`; or a sweep, whose error is the RMS over samples and
+            entries of q less `reference` (q like a member's; by default the finest member is it, and not drawn);
+            or several of these by name, {label: sweep} or {label: (dt, error)}.
+        label: of a single curve. slopes: orders of the triangles; by default the whole numbers that are observed.
+        unit: of the error. time_unit: of dt.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind, shape or value.
+
+    >>> import numpy as np, hhtjax
+    >>> h = np.array([0.01, 0.02, 0.04])
+    >>> ax = hhtjax.plot.error_against_h(h, 3 * h**2, label="hht", unit="m")
+    >>> ax.get_legend().get_texts()[0].get_text(), ax.get_ylabel()
+    ('hht: order 2.00', 'error (m)')
+    """
+    given = dt if isinstance(dt, dict) else {label: dt if error is None else (dt, error)}
+    curves = {name: _curve(one, reference) for name, one in given.items()}
+    with canvas("error_against_h", ax) as (panel,):
+        orders = {name: _order(*curve) for name, curve in curves.items()}
+        start = len([line for line in panel.lines if not line.get_label().startswith("_")])
+        for i, (name, (h, e)) in enumerate(curves.items()):
+            order = _in_words(h, e)
+            shown = ": ".join(x for x in (name, order) if x)
+            panel.loglog(h, e, label=shown, **look(start + i, marker=True))
+        if slopes is None:
+            slopes = sorted({round(p) for p in orders.values() if abs(p - round(p)) < 0.3 and round(p) > 0})
+        taken = []
+        for p in slopes:
+            nearest = min(curves, key=lambda name: abs(np.nan_to_num(orders[name], nan=np.inf) - p))
+            taken.append(_triangle(panel, p, curves[nearest], list(curves.values()), taken))
+        panel.set(xlabel=with_unit("step size h", time_unit), ylabel=with_unit("error", unit))
+        legend(panel)
+    return panel
+
+
+def _curve(one, reference):
+    """(step sizes, errors) of what the user gave, sorted, without those that failed or are zero."""
+    if isinstance(one, ObservedOrder):
+        one = one.dt, one.error
+    elif isinstance(one, Solution):
+        one = _errors_of_sweep(one, reference)
+    elif not isinstance(one, tuple) or len(one) != 2:
+        raise TypeError(
+            "error_against_h: `dt` must be a sweep, an ObservedOrder, step sizes with `error`, or several of these by "
+            f"name; received {type(one).__name__}."
+        )
+    h, e = (np.asarray(x, float) for x in one)
+    if h.ndim != 1 or h.shape != e.shape:
+        raise ValueError(f"error_against_h: `dt` and `error` must be equally long; received {h.shape} and {e.shape}.")
+    if not np.all(h > 0):
+        raise ValueError(f"error_against_h: `dt` must be positive; received {h.min()}.")
+    order = np.argsort(h)
+    h, e = h[order], e[order]
+    kept = np.isfinite(e) & (e > 0)
+    return h[kept], e[kept]
+
+
+def _errors_of_sweep(sweep, reference):
+    """Step sizes, and RMS of q less the reference over samples and entries; NaN of members that failed."""
+    if np.ndim(sweep.t) != 2:
+        raise ValueError(f"error_against_h: `dt` must be a sweep; received a run, t of shape {np.shape(sweep.t)}.")
+    h = np.asarray(sweep.dt)
+    h = h.max(axis=1) if h.ndim == 2 else h
+    members = np.argsort(h)
+    if reference is None:
+        reference, members = jax.tree.map(lambda x: x[members[0]], sweep.q), members[1:]
+    ours, exact = jax.tree.leaves(sweep.q), jax.tree.leaves(reference)
+    if [np.shape(x)[1:] for x in ours] != [np.shape(x) for x in exact]:
+        shapes = ", ".join(str(np.shape(x)[1:]) for x in ours)
+        raise ValueError(
+            f"error_against_h: `reference` must be shaped like q of one member, {shapes}; "
+            f"received {', '.join(str(np.shape(x)) for x in exact)}."
+        )
+    squares = [np.square(np.asarray(x) - np.asarray(y)).reshape(len(h), -1) for x, y in zip(ours, exact, strict=True)]
+    error = np.sqrt(np.mean(np.concatenate(squares, axis=1), axis=1))
+    return h[members], np.where(np.asarray(sweep.failure.step) > 0, np.nan, error)[members]
+
+
+def _order(h, e):
+    """Median of the slopes between neighbours; NaN of a single point."""
+    return float(np.median(np.diff(np.log(e)) / np.diff(np.log(h)))) if len(h) > 1 else np.nan
+
+
+def _in_words(h, e):
+    """The order, or the least and the largest slope where they are more than 1 apart; nothing of a single point."""
+    if len(h) < 2:
+        return ""
+    slopes = np.diff(np.log(e)) / np.diff(np.log(h))
+    if np.ptp(slopes) > 1:
+        return f"order {slopes.min():.1f} to {slopes.max():.1f}"
+    return f"order {np.median(slopes):.2f}"
+
+
+def _triangle(ax, p, curve, curves, taken):
+    """A right triangle of slope p at a curve, its order beside it, where least is in its way; its corners."""
+    h, e = np.log(curve)
+    places = []
+    for start in (0.5, 0.25, 0.7, 0.05):
+        x = h[0] + (h[-1] - h[0]) * np.array([start, start + 0.2])
+        for gap in (-1.0, 1.0):  # below, with the right angle at the right; above, at the left
+            shift = min if gap < 0 else max
+            y = shift(np.interp(x, h, e) - p * x) + p * x + gap
+            places.append((x, y, gap))
+    x, y, gap = min(places, key=lambda place: _in_the_way(place[0], place[1], curves, taken))
+    corner = (x[1], y[0]) if gap < 0 else (x[0], y[1])
+    ax.plot(*np.exp([[x[0], y[0]], corner, [x[1], y[1]], [x[0], y[0]]]).T, color=GREY, lw=0.8, label="_slope")
+    side = {"xytext": (3 if gap < 0 else -3, 0), "ha": "left" if gap < 0 else "right"}
+    ax.annotate(f"{p:g}", np.exp([corner[0], y.mean()]), textcoords="offset points", color=GREY, va="center", **side)
+    return x, y
+
+
+def _in_the_way(x: Any, y: Any, curves: Any, taken: Any) -> int:
+    """How many curves cross the box between (x0, y0) and (x1, y1), and how many triangles; all of it in logarithms."""
+    hits = 0
+    for h, e in curves:
+        over = np.interp(np.linspace(x[0], x[1], 5), np.log(h), np.log(e), left=np.nan, right=np.nan)
+        hits += bool(np.any((over > y[0] - 0.2) & (over < y[1] + 0.2)))
+    return hits + sum(x[0] < a[1] and a[0] < x[1] and y[0] < b[1] and b[0] < y[1] for a, b in taken)
+
+
+def work_precision(
+    curves: Any,
+    *,
+    ours: Any = (),
+    xlabel: str = "time of a run (s)",
+    ylabel: str = "error",
+    ax: Any = None,
+) -> Any:
+    """Error over the time that it takes, both logarithmic: what lies further down and left is better.
+
+    Args:
+        curves: {label: (times, errors)}; what is not finite or not positive is left out.
+        ours: labels that are drawn with bold, full lines, the others with thin, broken ones.
+        xlabel, ylabel: with their units, of whatever work is counted in.
+
+    Raises:
+        TypeError, ValueError: curves is no dict, empty, or of arrays of different lengths; ours has other labels.
+
+    >>> import hhtjax
+    >>> curves = {"hht": ([1e-3, 2e-3], [1e-2, 2.5e-3]), "peer": ([1e-2, 2e-2], [1e-2, 6e-4])}
+    >>> ax = hhtjax.plot.work_precision(curves, ours=("hht",), ylabel="error (m)")
+    >>> [line.get_linewidth() for line in ax.lines]
+    [1.8, 0.9]
+    """
+    if not isinstance(curves, dict) or not curves:
+        raise TypeError(f"work_precision: `curves` must be {{label: (times, errors)}}; received {curves!r}.")
+    ours = (ours,) if isinstance(ours, str) else tuple(ours)
+    if unknown := [label for label in ours if label not in curves]:
+        raise ValueError(f"work_precision: `ours` must be among {', '.join(curves)}; received {unknown[0]!r}.")
+    points = {label: _points(label, *curve) for label, curve in curves.items()}
+    with canvas("work_precision", ax) as (panel,):
+        for i, (label, (times, errors)) in enumerate(points.items()):
+            mine = {"ls": "-", "lw": 1.8, "zorder": 3} if label in ours else {"ls": LINES[1 + i % 3], "lw": 0.9}
+            panel.loglog(times, errors, label=label, **(look(i) | {"marker": MARKERS[i % 8]} | mine))
+        panel.set(xlabel=xlabel, ylabel=ylabel)
+        legend(panel)
+    return panel
+
+
+def _points(label, times, errors):
+    times, errors = np.asarray(times, float), np.asarray(errors, float)
+    if times.ndim != 1 or times.shape != errors.shape:
+        raise ValueError(
+            f"work_precision: `curves` must hold times and errors of equal length; those of {label!r} have the shapes "
+            f"{times.shape} and {errors.shape}."
+        )
+    kept = np.isfinite(times) & np.isfinite(errors) & (times > 0) & (errors > 0)
+    return times[kept], errors[kept]

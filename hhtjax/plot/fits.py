@@ -1,0 +1,257 @@
+"""Charts of an identification: measured and simulated, estimates with their intervals, correlations, a profile."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib import mlab
+
+from hhtjax.checks import require_number
+from hhtjax.identification.identifiability import parameter_names
+from hhtjax.identification.inference import Profile
+from hhtjax.identification.result import FitResult
+from hhtjax.plot.styles import COLOURS, MARKERS, canvas, legend, look, with_unit
+
+MEASURED = "#808080"
+SHOWN_NUMBERS = 8  # parameters up to which the correlations are written into the matrix
+
+
+def fit_against_data(
+    times: Any,
+    measured: Any,
+    simulated: Any,
+    *,
+    unit: str | None = None,
+    ylabel: str = "output",
+    time_unit: str = "s",
+    frequency_unit: str = "Hz",
+    show: Any = None,
+    ax: Any = None,
+) -> Any:
+    """Measured and simulated output, below them the residual, measured - simulated, and the spectra of both.
+
+    Spectra are roots of one-sided power spectral densities, means over windows of about a quarter of the record.
+
+    Args:
+        times: (N,), at equal distances. measured, simulated: (N,); NaN where nothing was measured, which counts as a
+            residual of 0 in the spectrum.
+        unit, ylabel: of the output. frequency_unit: one over that of times.
+        show: (first, last), the part of the time that is drawn; spectra are of all.
+        ax: three axes.
+
+    Returns:
+        Three axes: output, residual, spectrum.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind, shape or value.
+
+    >>> import numpy as np, hhtjax
+    >>> t = np.arange(256) / 100.0
+    >>> upper, middle, lower = hhtjax.plot.fit_against_data(t, np.sin(t), np.sin(t) - 0.1, unit="mV")
+    >>> middle.get_ylabel(), round(float(middle.lines[0].get_ydata()[7]), 3), lower.get_xlabel()
+    ('residual (mV)', 0.1, 'frequency (Hz)')
+    """
+    times, measured, simulated = _record(times, measured, simulated)
+    inside = slice(None)
+    if show is not None:
+        if np.shape(show) != (2,) or not show[0] < show[1]:
+            raise ValueError(f"fit_against_data: `show` must be two increasing times; received {show!r}.")
+        inside = (times >= show[0]) & (times <= show[1])
+    residual = measured - simulated
+    rate = (len(times) - 1) / (times[-1] - times[0])
+    options = {"height": 115, "gridspec_kw": {"height_ratios": [3, 2, 3]}}
+    with canvas("fit_against_data", ax, 3, **options) as (upper, middle, lower):
+        data, model = {"color": MEASURED, "lw": 1.6}, {"color": COLOURS[1], "lw": 0.8}
+        upper.plot(times[inside], measured[inside], label="measured", **data)
+        upper.plot(times[inside], simulated[inside], label="simulated", **model)
+        middle.plot(times[inside], residual[inside], color=COLOURS[0], lw=0.7)
+        for values, name, line in ((measured, "measured", data), (residual, "residual", {"color": COLOURS[0]})):
+            frequency, density = _spectrum(values, rate)
+            lower.semilogy(frequency[1:], density[1:], label=name, **(line | {"lw": 0.9}))
+        upper.set_ylabel(with_unit(ylabel, unit))
+        middle.set(ylabel=with_unit("residual", unit), xlabel=with_unit("t", time_unit))
+        upper.sharex(middle)
+        upper.tick_params(labelbottom=False)
+        lower.set_xlabel(with_unit("frequency", frequency_unit))
+        root = f"{unit or '1'}/$\\sqrt{{\\mathrm{{{frequency_unit}}}}}$"
+        lower.set_ylabel(f"density\n({root})")
+        upper.figure.align_ylabels([upper, middle, lower])
+        legend(upper)
+        legend(lower)
+    return np.array([upper, middle, lower], dtype=object)
+
+
+def _record(times, measured, simulated):
+    times, measured, simulated = (np.asarray(x, float) for x in (times, measured, simulated))
+    for name, x in {"measured": measured, "simulated": simulated}.items():
+        if times.ndim != 1 or x.shape != times.shape or len(times) < 8:
+            raise ValueError(
+                f"fit_against_data: `{name}` must be as long as `times`, 8 samples or more; "
+                f"received the shapes {x.shape} and {times.shape}."
+            )
+    distances = np.diff(times)
+    if not np.all(distances > 0) or np.ptp(distances) > 1e-3 * distances.mean():
+        raise ValueError(
+            "fit_against_data: `times` must increase by equal distances; received distances from "
+            f"{distances.min():.6g} to {distances.max():.6g}."
+        )
+    return times, measured, simulated
+
+
+def _spectrum(values, rate):
+    """Frequencies, and roots of the power spectral density, by Welch's method."""
+    values = np.where(np.isfinite(values), values, 0.0)
+    length = 2 ** int(np.log2(max(8, len(values) // 2)))
+    power, frequency = mlab.psd(values, NFFT=length, Fs=rate, noverlap=length // 2, detrend="mean")
+    return np.asarray(frequency), np.sqrt(power)
+
+
+def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: Any = None, ax: Any = None) -> Any:
+    """Estimates with their confidence intervals, in per cent of the estimate, or of the truth.
+
+    Args:
+        results: a FitResult, or several of one model by name, {label: result}. level: of the intervals.
+        truth: params, where they are known: what intervals are relative to, instead of the first estimate.
+        entries: which parameters, by name as in `result.summary()`; by default all that were fitted.
+
+    What the residuals do not determine has a cross and no interval.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value; a fit without covariance; a parameter that is 0,
+        of which there are no per cent (leave it out by `entries`).
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> t = jnp.arange(100.0)
+    >>> result = hhtjax.fit(lambda p: p["a"] - 2.0 - jnp.sin(t), {"a": 1.0})
+    >>> ax = hhtjax.plot.estimates(result)
+    >>> [x.get_text() for x in ax.get_yticklabels()], ax.get_xlabel()
+    (['a = 2.004'], '95 % interval (% of the estimate)')
+    """
+    require_number("estimates", "level", level, lambda x: 0 < x < 1, "lie between 0 and 1")
+    named = results if isinstance(results, dict) else {None: results}
+    for result in named.values():
+        _require_fit("estimates", "results", result)
+    first = next(iter(named.values()))
+    names = parameter_names(first.params)
+    kept = _kept(names, first, entries)
+    against = first.params if truth is None else truth
+    if jax.tree.structure(against) != jax.tree.structure(first.params):
+        raise ValueError("estimates: `truth` must be structured like the params of the fit.")
+    size = _flat(against)
+    if zero := [names[i] for i in kept if size[i] == 0]:
+        raise ValueError(f"estimates: `{zero[0]}` is 0, of which there are no per cent; leave it out by `entries`.")
+    with canvas("estimates", ax, height=22 + 8 * len(kept)) as (panel,):
+        panel.axvline(0, color="black", lw=0.6)
+        for i, (label, result) in enumerate(named.items()):
+            at = np.arange(len(kept)) + 0.5 * ((i + 0.5) / len(named) - 0.5)
+            _intervals(panel, result, level, kept, size, at, label, i)
+        of = "estimate" if truth is None else "truth"
+        panel.set_xlabel(f"{100 * level:g} % interval (% of the {of})")
+        value = (lambda i: f" = {_flat(first.params)[i]:.4g}") if len(named) == 1 else (lambda i: "")
+        panel.set_yticks(np.arange(len(kept)), [f"{names[i]}{value(i)}" for i in kept])
+        panel.set_ylim(len(kept) - 0.5, -0.5)
+        legend(panel)
+    return panel
+
+
+def _kept(names, result, entries):
+    """Which numbers of params are drawn."""
+    if entries is None:
+        return np.flatnonzero(result.free)
+    entries = (entries,) if isinstance(entries, str) else tuple(entries)
+    if unknown := [name for name in entries if name not in names]:
+        raise ValueError(f"estimates: `entries` must be among {', '.join(names)}; received {unknown[0]!r}.")
+    return np.array([names.index(name) for name in entries])
+
+
+def _intervals(ax, result, level, kept, size, at, label, number):
+    """The markers and bars of one fit."""
+    value = _flat(result.params)
+    lower, upper = map(_flat, result.interval(level))
+    middle, reach = 100 * (value - size) / abs(size), 100 * np.stack([value - lower, upper - value]) / abs(size)
+    known = np.isfinite(reach).all(axis=0)[kept]
+    colour, marker = COLOURS[number % 8], MARKERS[number % 8]
+    shown = kept[known]
+    ax.errorbar(
+        middle[shown], at[known], xerr=reach[:, shown], fmt=marker, color=colour, capsize=2.5, lw=1.2, label=label
+    )
+    if not known.all():
+        ax.plot(middle[kept[~known]], at[~known], "x", color=colour, ms=6, label="undetermined")
+
+
+def correlations(result: FitResult, *, ax: Any = None) -> Any:
+    """The correlation matrix of the estimates that were fitted; of up to 8 its numbers too.
+
+    Raises:
+        TypeError, ValueError: no fit, or one without covariance.
+    """
+    _require_fit("correlations", "result", result)
+    free = np.flatnonzero(result.free)
+    names = np.asarray(parameter_names(result.params))[free]
+    R = np.asarray(result.correlation)[np.ix_(free, free)]
+    with canvas("correlations", ax, height=64) as (panel,):
+        image = panel.imshow(R, vmin=-1, vmax=1, cmap="RdBu")
+        panel.grid(False)
+        at = np.arange(len(free))
+        panel.set_xticks(at, names, rotation=0 if max(map(len, names)) < 4 else 90)
+        panel.set_yticks(at, names)
+        for i, j in np.ndindex(R.shape) if len(free) <= SHOWN_NUMBERS else ():
+            colour = "white" if abs(R[i, j]) > 0.6 else "black"
+            panel.text(j, i, f"{R[i, j]:.2f}", ha="center", va="center", color=colour)
+        bar = panel.figure.colorbar(image, ax=panel, shrink=0.8, label="correlation of the estimates")
+        bar.ax.tick_params(labelsize=panel.yaxis.get_ticklabels()[0].get_size())
+    return panel
+
+
+def profile(
+    found: Profile, *, name: str = "parameter", unit: str | None = None, result: FitResult | None = None, ax: Any = None
+) -> Any:
+    """The deviance over one parameter, with the 95 % bound, 3.84, and the parabola of the standard error.
+
+    Args:
+        found: of `hhtjax.identification.profile`. name, unit: of the parameter.
+        result: of the fit, for the parabola, in which `name` then is a parameter's.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind; a name that the fit does not have.
+
+    >>> import numpy as np, hhtjax
+    >>> values = np.linspace(1.0, 3.0, 5)
+    >>> found = hhtjax.identification.Profile(values, (values - 2) ** 2, 8 * (values - 2) ** 2)
+    >>> hhtjax.plot.profile(found, name="k", unit="N/m").get_xlabel()
+    'k (N/m)'
+    """
+    if not isinstance(found, Profile):
+        raise TypeError(f"profile: `found` must be a Profile, of identification.profile; received {found!r}.")
+    values, deviance = np.asarray(found.values), np.asarray(found.deviance)
+    order = np.argsort(values)
+    with canvas("profile", ax) as (panel,):
+        panel.plot(values[order], deviance[order], label="profile", **look(0, marker=True))
+        if result is not None:
+            estimate, error = _estimate_of(result, name)
+            x = np.linspace(values.min(), values.max(), 101)
+            panel.plot(x, ((x - estimate) / error) ** 2, label="parabola of the standard error", **look(1))
+        panel.axhline(3.84, label="95 %", color=MEASURED, ls=":")
+        panel.set(xlabel=with_unit(name, unit), ylabel="deviance")
+        legend(panel)
+    return panel
+
+
+def _estimate_of(result, name):
+    _require_fit("profile", "result", result)
+    names = parameter_names(result.params)
+    if name not in names:
+        raise ValueError(f"profile: `name` must be one of {', '.join(names)}; received {name!r}.")
+    at = names.index(name)
+    return _flat(result.params)[at], _flat(result.standard_errors)[at]
+
+
+def _require_fit(caller, name, result):
+    if not isinstance(result, FitResult):
+        raise TypeError(f"{caller}: `{name}` must be a FitResult, as of fit; received {type(result).__name__}.")
+    if result.uncertainty is None:
+        raise ValueError(f"{caller}: `{name}` must have a covariance; received a fit made with covariance=False.")
+
+
+def _flat(tree):
+    return np.concatenate([np.ravel(np.asarray(x)) for x in jax.tree.leaves(tree)])

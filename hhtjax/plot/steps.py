@@ -1,0 +1,110 @@
+"""Charts of what a step does to a linear motion, over w h or in the complex plane."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from hhtjax import analysis
+from hhtjax.checks import require_integer
+from hhtjax.plot.styles import canvas, legend, look
+from hhtjax.steppers.stepper import Stepper, require_stepper
+
+WIDE = np.logspace(-2, 3, 251)  # w h of the spectral radius
+NEAR = np.linspace(0.02, 3.0, 150)  # w h that still turn
+
+
+def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
+    """The factor by which a step changes an oscillation at most, over w h: below 1 it damps, above 1 it is unstable.
+
+    Args:
+        steppers: a Stepper, or several by name, {label: stepper}. frequency: w h, an array; by default 0.01 to 1000.
+        damping: the damping ratio of the oscillator.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import hhtjax, numpy as np
+    >>> ax = hhtjax.plot.spectral_radius({"hht": hhtjax.hht(alpha=-0.1)}, frequency=np.array([0.1, 10.0]))
+    >>> ax.lines[0].get_ydata().round(3).tolist()
+    [1.0, 0.838]
+    """
+    return _over_frequency("spectral_radius", "spectral radius", steppers, frequency, damping, ax, WIDE)
+
+
+def damping_ratio(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
+    """The damping ratio that the discrete oscillator has, over w h; of an undamped one all of it is the method's.
+
+    Args, raises: as in `spectral_radius`; by default w h goes to 3.
+    """
+    return _over_frequency("damping_ratio", "damping ratio", steppers, frequency, damping, ax, NEAR)
+
+
+def period_elongation(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
+    """The relative error of the period, over w h.
+
+    Args, raises: as in `spectral_radius`; by default w h goes to 3.
+    """
+    return _over_frequency("period_elongation", "relative period error", steppers, frequency, damping, ax, NEAR)
+
+
+def _over_frequency(caller, ylabel, steppers, frequency, damping, ax, default):
+    """One of the functions of `hhtjax.analysis` with this name, for each stepper."""
+    named = _named(caller, steppers)
+    frequency = default if frequency is None else np.asarray(frequency)
+    if frequency.ndim != 1 or not np.all(frequency > 0):
+        raise ValueError(f"{caller}: `frequency` must be a vector of positive numbers w h; received {frequency!r}.")
+    curves = {label: np.asarray(getattr(analysis, caller)(one, frequency, damping)) for label, one in named.items()}
+    with canvas(caller, ax) as (panel,):
+        for i, (label, values) in enumerate(curves.items()):
+            panel.plot(frequency, values, label=label, **look(i))
+        if default is WIDE:
+            panel.set_xscale("log")
+        panel.set(xlabel="w h (rad)", ylabel=ylabel)
+        legend(panel)
+    return panel
+
+
+def _named(caller, steppers):
+    """{label: stepper}; one alone has no label."""
+    if isinstance(steppers, Stepper):
+        return {None: steppers}
+    if not isinstance(steppers, dict) or not steppers:
+        raise TypeError(f"{caller}: `steppers` must be a stepper or {{label: stepper}}; received {steppers!r}.")
+    for stepper in steppers.values():
+        require_stepper(caller, stepper)
+    return steppers
+
+
+def stability_region(
+    steppers: Any, *, real: Any = (-8.0, 8.0), imag: Any = (-8.0, 8.0), points: int = 121, ax: Any = None
+) -> Any:
+    """Where y' = lambda y is stable, in the plane of z = h lambda: shaded, with its edge.
+
+    Args:
+        steppers: a Stepper, or several by name, {label: stepper}. real, imag: the part of the plane.
+        points: in each direction.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value.
+    """
+    named = _named("stability_region", steppers)
+    points = require_integer("stability_region", "points", points, 2)
+    for name, ends in {"real": real, "imag": imag}.items():
+        if np.shape(ends) != (2,) or not ends[0] < ends[1]:
+            raise ValueError(f"stability_region: `{name}` must be two increasing numbers; received {ends!r}.")
+    x, y = np.linspace(real[0], real[1], points), np.linspace(imag[0], imag[1], points)
+    z = x[None, :] + 1j * y[:, None]
+    radii = {label: np.asarray(analysis.stability_region(one, z)) for label, one in named.items()}
+    with canvas("stability_region", ax, height=80) as (panel,):
+        for i, radius in enumerate(radii.values()):
+            chosen = look(i)
+            panel.contourf(x, y, radius, levels=[0, 1 + 1e-9], colors=[chosen["color"]], alpha=0.15)
+            panel.contour(x, y, radius, levels=[1 + 1e-9], colors=[chosen["color"]], linestyles=[chosen["ls"]])
+        panel.axhline(0, color="black", lw=0.5)
+        panel.axvline(0, color="black", lw=0.5)
+        panel.set_aspect("equal")
+        panel.set(xlabel="Re h lambda", ylabel="Im h lambda")
+        shown = [Line2D([], [], label=label, **look(i)) for i, label in enumerate(radii) if label is not None]
+        legend(panel, shown, [label for label in radii if label is not None])
+    return panel

@@ -1,0 +1,215 @@
+"""How charts look: colours that colour-blind readers tell apart, 8 pt text at the width of a column, vector text."""
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.textpath import TextPath
+from matplotlib.ticker import Formatter, LogFormatterSciNotation
+
+from hhtjax.checks import require_integer, require_number
+
+# Okabe and Ito's colours, jfly.uni-koeln.de/color; each goes with a marker and a line style
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+LINES: tuple[Any, ...] = (
+    "-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (8, 2)), (0, (1, 2)),
+)  # fmt: skip
+TEXT = 8.0  # pt
+COLUMN, PAGE = 85, 175  # mm
+PARAMETERS: Any = {
+    "axes.formatter.use_mathtext": True,
+    "axes.formatter.useoffset": False,
+    "axes.grid": True,
+    "axes.labelsize": TEXT,
+    "axes.linewidth": 0.6,
+    "axes.prop_cycle": cycler(color=COLOURS),
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": TEXT,
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 130,
+    "figure.titlesize": TEXT,
+    "font.size": TEXT,
+    "grid.alpha": 0.3,
+    "grid.linewidth": 0.5,
+    "legend.fontsize": TEXT,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4,
+    "pdf.fonttype": 42,
+    "savefig.dpi": 200,
+    "svg.fonttype": "none",
+    "xtick.labelsize": TEXT,
+    "ytick.labelsize": TEXT,
+}
+FORMATS = ("png", "pdf", "svg")
+MM = 1 / 25.4  # inches
+
+
+def style():
+    """A context in which matplotlib draws like this module: 8 pt text, Okabe and Ito's colours, constrained layout.
+
+    >>> import matplotlib, hhtjax
+    >>> with hhtjax.plot.style():
+    ...     inside = matplotlib.rcParams["font.size"]
+    >>> inside, matplotlib.rcParams["font.size"]
+    (8.0, 10.0)
+    """
+    return mpl.rc_context(PARAMETERS)
+
+
+def subplots(rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float | None = None, **options: Any):
+    """A figure and its axes as of `plt.subplots`, in this style, with sizes in mm.
+
+    Args:
+        rows, columns: of panels. width: of the figure, 85 for a column of text, 175 for a page.
+        height: of the figure; by default panels of four to three. options: as for `plt.subplots`.
+
+    Raises:
+        TypeError, ValueError: rows, columns, width or height is no positive number.
+
+    >>> import hhtjax
+    >>> figure, axes = hhtjax.plot.subplots(1, 2, width=175)
+    >>> axes.shape, [round(25.4 * float(x)) for x in figure.get_size_inches()]
+    ((2,), [175, 66])
+    """
+    rows, columns = require_integer("subplots", "rows", rows), require_integer("subplots", "columns", columns)
+    require_number("subplots", "width", width, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    if height is None:
+        height = 0.75 * width / columns * rows
+    require_number("subplots", "height", height, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    with style():
+        figure, axes = plt.subplots(rows, columns, figsize=(width * MM, height * MM), **options)
+        for ax in np.ravel(axes):
+            pin(ax)
+    return figure, axes
+
+
+def pin(ax):
+    """Fixes what matplotlib would read from the settings that hold when a figure is drawn, not when it is made."""
+    ax.tick_params(which="both", labelsize=TEXT, width=0.6)
+    ax.grid(True, color="#b0b0b0", alpha=0.3, linewidth=0.5)
+
+
+class _Between(Formatter):
+    """Labels between the decades of a logarithmic axis: 2 and 5, where fewer than two decades have one."""
+
+    def __call__(self, x, pos=None):
+        axis: Any = self.axis
+        ends = np.log10(np.sort(axis.get_view_interval()))
+        exponent = int(np.floor(np.log10(x) + 1e-9))
+        leading = round(x / 10.0**exponent)
+        if np.floor(ends[1]) - np.ceil(ends[0]) >= 1 or leading not in (2, 5):
+            return ""
+        return f"$\\mathdefault{{{leading}\\times10^{{{exponent}}}}}$"
+
+
+def thin_ticks(ax):
+    """Keeps the labels between the decades of logarithmic axes from running into each other."""
+    for axis in (ax.xaxis, ax.yaxis):
+        if axis.get_scale() == "log" and isinstance(axis.get_minor_formatter(), LogFormatterSciNotation):
+            axis.set_minor_formatter(_Between())
+
+
+@contextmanager
+def canvas(caller, ax, rows=1, width=COLUMN, height=None, **options):
+    """The axes given, checked, or those of a new figure, and its style while they are drawn into: an array (rows,)."""
+    if ax is None:
+        with style():
+            axes = subplots(rows, 1, width=width, height=height, squeeze=False, **options)[1][:, 0]
+            yield axes
+            for panel in axes:
+                thin_ticks(panel)
+        return
+    given = list(np.ravel(np.asarray(ax, dtype=object)))
+    if len(given) != rows or not all(isinstance(x, Axes) for x in given):
+        wanted = "matplotlib axes" if rows == 1 else f"{rows} matplotlib axes"
+        raise TypeError(f"{caller}: `ax` must be {wanted}; received {ax!r}.")
+    yield np.array(given, dtype=object)
+
+
+def look(i: int, marker: bool = False) -> dict[str, Any]:
+    """Colour, line style and, if asked for, marker of the curve with number i."""
+    chosen = {"color": COLOURS[i % len(COLOURS)], "ls": LINES[i % len(LINES)]}
+    return chosen | ({"marker": MARKERS[i % len(MARKERS)]} if marker else {})
+
+
+def legend(ax, handles=None, labels=None, **options: Any):
+    """A legend above the axes, where it covers no curve, in as many columns as fit; None where nothing has a label.
+
+    Args:
+        ax: axes. handles, labels, options: as for `ax.legend`.
+
+    >>> import hhtjax
+    >>> figure, ax = hhtjax.plot.subplots()
+    >>> line = ax.plot([0, 1], label="a line")
+    >>> hhtjax.plot.legend(ax).get_texts()[0].get_text()
+    'a line'
+    """
+    if handles is None:
+        handles, labels = ax.get_legend_handles_labels()
+    labels = [handle.get_label() for handle in handles] if labels is None else list(labels)
+    if not labels:
+        return None
+    room = 72 * ax.get_figure(root=True).get_size_inches()[0] * _share(ax) - 36  # for the labels of the axis
+    place = {"loc": "lower left", "bbox_to_anchor": (0, 1.0), "borderaxespad": 0.3}
+    shape = {"ncols": _columns(labels, room), "handlelength": 1.8, "columnspacing": 1.0, "borderpad": 0.2}
+    return ax.legend(handles, labels, **(place | shape | options))
+
+
+def _share(ax):
+    """Of the width of its figure, that axes have with their labels."""
+    cell = ax.get_subplotspec()
+    if cell is None:
+        return ax.get_position().width
+    grid = cell.get_gridspec()
+    widths = np.array(grid.get_width_ratios() or [1] * grid.ncols)
+    return widths[list(cell.colspan)].sum() / widths.sum()
+
+
+def _columns(labels, room):
+    """The most columns of a legend that fit into `room` points, by the width of the widest label of each."""
+    size = [TextPath((0, 0), label, size=TEXT).get_extents().width if label.strip() else 0 for label in labels]
+    for columns in range(len(labels), 1, -1):
+        widest = [max(part) for part in np.array_split(size, columns)]  # as matplotlib deals them out
+        if sum(widest) + 28 * columns <= room:
+            return columns
+    return 1
+
+
+def save(figure, path, formats: Sequence[str] = ("png",)) -> list[Path]:
+    """Writes a figure as path.png (200 dpi), path.pdf, path.svg, with text as text; returns what it wrote.
+
+    Raises:
+        TypeError, ValueError: figure is none; formats has others than png, pdf and svg.
+
+    >>> import hhtjax, pathlib, tempfile
+    >>> figure, ax = hhtjax.plot.subplots()
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in hhtjax.plot.save(figure, pathlib.Path(folder) / "empty", ("png", "svg"))]
+    ['empty.png', 'empty.svg']
+    """
+    if not hasattr(figure, "savefig"):
+        raise TypeError(f"save: `figure` must be a matplotlib figure; received {figure!r}.")
+    if isinstance(formats, str) or not set(formats) <= set(FORMATS):
+        raise ValueError(f"save: `formats` must be a tuple of {', '.join(FORMATS)}; received {formats!r}.")
+    for ax in figure.axes:
+        thin_ticks(ax)
+    paths = [Path(f"{path}.{ending}") for ending in formats]
+    with style():
+        for file in paths:
+            dated = {"metadata": {"Date": None}} if file.suffix == ".svg" else {}
+            figure.savefig(file, **dated)
+    return paths
+
+
+def with_unit(name: str, unit: str | None) -> str:
+    """`name (unit)`."""
+    return f"{name} ({unit})" if unit else name

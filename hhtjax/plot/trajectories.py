@@ -1,0 +1,161 @@
+"""Charts of one run: over time, in the phase plane, and how far its constraints drift."""
+
+from typing import Any
+
+import numpy as np
+
+from hhtjax.plot.entries import SYMBOLS, chosen_entries, prefixed, require_run, shown_name, unit_of
+from hhtjax.plot.styles import canvas, legend, look, with_unit
+from hhtjax.runs.solution import Solution
+
+HEIGHT = 45  # mm of a panel over time
+
+
+def trajectory(
+    solution: Solution,
+    quantities: Any = "q",
+    *,
+    entries: Any = None,
+    units: Any = None,
+    time_unit: str = "s",
+    label: str | None = None,
+    ax: Any = None,
+    **line: Any,
+) -> Any:
+    """q, v, acceleration or multipliers over time, a curve for each entry.
+
+    Args:
+        solution: of one run.
+        quantities: "q", "v", "acceleration" or "multipliers"; several as a tuple, one panel above the other.
+        entries: which to draw, by name: "[0]" of an array, "phi" or "x[1]" of a dict, "x" for all of a leaf.
+        units: a word; or words by entry or leaf, {"x": "m"}; or one of these by quantity, {"q": "rad", "v": "rad/s"}.
+        label: put before the names of the curves, to tell runs in one chart.
+        ax: axes to draw into, as many as quantities. line: further options of `ax.plot`.
+
+    Returns:
+        The axes; of several quantities an array.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
+    >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
+    >>> upper, lower = hhtjax.plot.trajectory(run, ("q", "v"), units={"q": "m", "v": "m/s"})
+    >>> upper.get_ylabel(), lower.get_ylabel(), lower.get_xlabel()
+    ('q[0] (m)', 'v[0] (m/s)', 't (s)')
+    """
+    require_run("trajectory", solution)
+    names = (quantities,) if isinstance(quantities, str) else tuple(quantities)
+    unknown = [name for name in names if name not in SYMBOLS]
+    if unknown or not names:
+        raise ValueError(f"trajectory: `quantities` must be among {', '.join(SYMBOLS)}; received {quantities!r}.")
+    curves = [chosen_entries("trajectory", solution, name, entries) for name in names]
+    options = {"height": HEIGHT * len(names) + 15, "sharex": True}
+    with canvas("trajectory", ax, len(names), **options) as axes:
+        for panel, name, found in zip(axes, names, curves, strict=True):
+            by_quantity = isinstance(units, dict) and set(units) <= set(SYMBOLS)
+            _draw(panel, solution.t, name, found, units.get(name) if by_quantity else units, label, line)
+            legend(panel)
+        axes[-1].set_xlabel(with_unit("t", time_unit))
+        axes[0].figure.align_ylabels(axes)
+    return axes[0] if isinstance(quantities, str) else axes
+
+
+def _draw(ax, t, quantity, found, units, label, line):
+    """The entries of one quantity; the unit goes to the axis if they share it, else to each name."""
+    each = [unit_of(units, name, leaf) for name, (leaf, _) in found.items()]
+    shared = each[0] if len(set(each)) == 1 else None
+    start = len(ax.lines)
+    for i, ((name, (_, values)), unit) in enumerate(zip(found.items(), each, strict=True)):
+        shown = with_unit(shown_name(quantity, name), None if shared else unit)
+        alone = len(found) == 1 and label is not None
+        ax.plot(np.asarray(t), values, label=label if alone else prefixed(label, shown), **(look(start + i) | line))
+    name = shown_name(quantity, next(iter(found))) if len(found) == 1 else quantity
+    ax.set_ylabel(with_unit(name, shared))
+
+
+def phase_plane(
+    solution: Solution,
+    entries: Any = None,
+    *,
+    units: Any = None,
+    label: str | None = None,
+    ax: Any = None,
+    **line: Any,
+) -> Any:
+    """Velocity over position, a curve for each entry, its start marked.
+
+    Args:
+        solution: of one run.
+        entries: which to draw, as in `trajectory`; all by default.
+        units: (of position, of velocity). label, ax, line: as in `trajectory`.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value; a rotation, which has no such plane.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
+    >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
+    >>> hhtjax.plot.phase_plane(run, units=("m", "m/s")).get_ylabel()
+    'v[0] (m/s)'
+    """
+    require_run("phase_plane", solution)
+    if units is not None and (isinstance(units, str) or len(units) != 2):
+        raise ValueError(f"phase_plane: `units` must be two, of position and velocity; received {units!r}.")
+    if solution.v is None:
+        raise ValueError("phase_plane: `solution` must have velocities; received a run without.")
+    q = chosen_entries("phase_plane", solution, "q", entries)
+    v = chosen_entries("phase_plane", solution, "v", None)
+    if missing := [name for name in q if name not in v]:
+        raise ValueError(f"phase_plane: `entries` must have a velocity of their own; received {missing[0]}.")
+    position, velocity = units or (None, None)
+    with canvas("phase_plane", ax, height=70) as (panel,):
+        start = len([x for x in panel.lines if len(x.get_xdata()) > 1])
+        for i, (name, (_, values)) in enumerate(q.items()):
+            shown = label if len(q) == 1 and label is not None else prefixed(label, shown_name("q", name))
+            (drawn,) = panel.plot(values, v[name][1], label=shown, **(look(start + i) | line))
+            panel.plot(values[:1], v[name][1][:1], "o", ms=4, color=drawn.get_color(), label="_start")
+        alone = next(iter(q)) if len(q) == 1 else None
+        rate = f"d{alone}/dt" if alone and not alone.startswith("[") else f"v{alone or ''}"
+        panel.set_xlabel(with_unit("q" if alone is None else shown_name("q", alone), position))
+        panel.set_ylabel(with_unit(rate, velocity))
+        if len(q) > 1 or label is not None:
+            legend(panel)
+    return panel
+
+
+def constraint_drift(
+    solution: Solution,
+    *,
+    unit: str | None = None,
+    time_unit: str = "s",
+    label: str | None = None,
+    ax: Any = None,
+    **line: Any,
+) -> Any:
+    """How far a run is from its constraints: the largest |Phi| and |dPhi/dt| between saved times, logarithmic.
+
+    What is zero does not show.
+
+    Args:
+        solution: of one run of a system with constraints. unit: of Phi. label, ax, line: as in `trajectory`.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind; a run without constraints.
+    """
+    require_run("constraint_drift", solution)
+    info = solution.info
+    found = {"|Phi|": info.constraint, "|dPhi/dt|": info.constraint_rate}
+    found = {name: np.asarray(x, float) for name, x in found.items() if x is not None}
+    if not found:
+        raise ValueError("constraint_drift: `solution` must be of a system with constraints; received one without.")
+    with canvas("constraint_drift", ax, height=60) as (panel,):
+        start = len(panel.lines)
+        t = np.asarray(solution.t)[1:]
+        for i, (name, values) in enumerate(found.items()):
+            shown = prefixed(label, with_unit(name, unit and (unit if name == "|Phi|" else f"{unit}/{time_unit}")))
+            panel.semilogy(t, np.where(values > 0, values, np.nan), label=shown, **(look(start + i) | line))
+        panel.set(xlabel=with_unit("t", time_unit), ylabel="violation of the constraints")
+        legend(panel)
+    return panel

@@ -1,0 +1,224 @@
+"""Systems as other packages take them: a diffrax term, a right-hand side for SciPy's `solve_ivp`; `hhtjax.interop`.
+
+The second-order system becomes the first-order one of y = (q, v),
+
+    q' = v,    v' = w with M(q) w = Q(q, v, t);    with constraints  [M -B^T; B 0] [w; L] = [Q; -(rest of d2Phi/dt2)]
+
+that is, of index 1: solutions leave Phi = 0 by what the solver's errors add up to. A rotation R has R' = R hat(Om),
+and stays orthogonal to the accuracy of the solver.
+"""
+
+import importlib
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.checks import require_number, require_params
+from hhtjax.description import Description, thaw
+from hhtjax.systems.consistent import require_consistent
+from hhtjax.systems.constraints import acceleration_and_multipliers
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.system import FirstOrderSystem, require_system
+
+__all__ = ["FlatODE", "ScipyRHS", "diffrax_term", "flat_ode", "ode", "scipy_rhs"]
+
+
+def ode(system):
+    """The system as an ODE on pytrees: the function (t, y, params) -> y' of y = (q, v); of y itself for y' = f(y, t).
+
+    Traceable and differentiable; of equal systems equal, also as a pytree.
+
+    Raises:
+        TypeError: what is no system; when called, a y that is no (q, v).
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> pendulum = hhtjax.System(jnp.ones(1), lambda q, v, t, params: {"angle": -params["g"] * jnp.sin(q["angle"])})
+    >>> rate = hhtjax.interop.ode(pendulum)
+    >>> rates = rate(0.0, ({"angle": jnp.pi / 2}, {"angle": 0.5}), {"g": 9.81})
+    >>> [float(x["angle"]) for x in rates]
+    [0.5, -9.81]
+    """
+    require_system("ode", system)
+    return jax.tree_util.Partial(_ode, system)
+
+
+class FlatODE(NamedTuple):
+    """rate: (t, y, params) -> y' on vectors (N,), traceable; y0: (N,); unravel: y -> (q, v), or of a first-order system
+    the pytree y."""
+
+    rate: Any
+    y0: Any
+    unravel: Any
+
+
+def flat_ode(system, q0, v0=None) -> FlatODE:
+    """The same on vectors: y holds the numbers of q, then those of v, both in the order of `ravel_pytree`.
+
+    Args:
+        system, q0, v0: as in `simulate`.
+
+    Raises:
+        TypeError, ValueError: as `simulate`, for these.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> body = hhtjax.System(lambda R, params: params, lambda R, Om, t, params: -jnp.cross(Om, params * Om))
+    >>> flat = hhtjax.interop.flat_ode(body, jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))         # a rotation
+    >>> flat.y0.shape, flat.rate(0.0, flat.y0, jnp.ones(3))[:9].reshape(3, 3)[0].tolist()
+    ((12,), [0.0, -2.0, 0.0])
+    """
+    require_system("flat_ode", system)
+    q0, v0 = initial_values("flat_ode", system, q0, v0)
+    q, unravel_q = ravel_pytree(q0)
+    if v0 is None:
+        return FlatODE(_FlatRate(system, q.size, unravel_q, None), q, unravel_q)
+    v, unravel_v = ravel_pytree(v0)
+    rate = _FlatRate(system, q.size, unravel_q, unravel_v)
+    return FlatODE(rate, jnp.concatenate([q, v]), rate.unravel)
+
+
+def diffrax_term(system):
+    """The system as a `diffrax.ODETerm`, for `diffeqsolve(term, solver, t0, t1, dt0, y0=(q0, v0), args=params)`.
+
+    y0 is (q0, v0), pytrees, or y0 of a `FirstOrderSystem`; args are the params, modules of equinox among them. All
+    that diffrax does with an ODE is there: step-size control, events, adjoints. Inputs that are held,
+    `sampled(order=0)`, jump: tell the step-size controller, `diffrax.ClipStepSizeController(..., jump_ts=)`.
+
+    Raises:
+        TypeError: what is no system. ImportError: diffrax is not installed; it comes with the extra "interop".
+
+    >>> import diffrax, jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q)
+    >>> found = diffrax.diffeqsolve(
+    ...     hhtjax.interop.diffrax_term(spring), diffrax.Tsit5(), 0.0, 1.0, None, (jnp.ones(1), jnp.zeros(1)),
+    ...     {"k": 4.0}, stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8))
+    >>> q, v = found.ys
+    >>> round(float(q[-1, 0]), 6)                                                                  # cos(2)
+    -0.416147
+    """
+    require_system("diffrax_term", system)
+    return _required("diffrax_term", "diffrax").ODETerm(ode(system))
+
+
+class ScipyRHS(NamedTuple):
+    """For `scipy.integrate.solve_ivp(fun, (t0, t1), y0, jac=jac)`.
+
+    fun: (t, y) -> y', (N,), and jac: (t, y) -> (N, N), compiled, of NumPy arrays. y0: (N,). unravel: y (N,), or
+    (N, times) as the result has it, -> (q, v), with a leading axis of times.
+    """
+
+    fun: Any
+    y0: np.ndarray
+    unravel: Any
+    jac: Any
+
+
+def scipy_rhs(system, q0, v0=None, params=None, t0=0.0) -> ScipyRHS:
+    """The system as SciPy takes it: right-hand side, start and Jacobian, for Radau, BDF and LSODA too.
+
+    Compiled once for each system and structure; new params, and a new start, cost no compilation. A call takes some
+    microseconds, most of them on the way into JAX and out again.
+
+    Args:
+        system, q0, v0, params, t0: as in `simulate`, in double precision.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value; initial values that violate a constraint; single
+            precision.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> from scipy.integrate import solve_ivp
+    >>> stiff = hhtjax.System(jnp.ones(1), lambda q, v, t, params: {"x": -1e4 * params * v["x"] - q["x"]})
+    >>> rhs = hhtjax.interop.scipy_rhs(stiff, {"x": 1.0}, {"x": 0.0}, 1.0)
+    >>> run = solve_ivp(rhs.fun, (0.0, 1e3), rhs.y0, "Radau", jac=rhs.jac, rtol=1e-8, atol=1e-10)
+    >>> q, v = rhs.unravel(run.y)
+    >>> q["x"].shape == run.t.shape, round(float(q["x"][-1]), 6), run.nfev < 500                   # exp(-0.1)
+    (True, 0.904837, True)
+    """
+    caller = "scipy_rhs"
+    require_system(caller, system)
+    params = require_params(caller, params)
+    require_number(caller, "t0", t0, np.isfinite, "be finite")
+    q0, v0 = initial_values(caller, system, q0, v0)
+    if jax.tree.leaves(q0)[0].dtype != np.float64:
+        raise ValueError(f"{caller}: SciPy computes in double precision: `q0` and `v0` must be float64 (with x64 on).")
+    if system.constraint is not None:
+        require_consistent(caller, system, q0, v0, t0, params)
+    flat = flat_ode(system, q0, v0)
+    packed, unpack = _packed(params)
+    rate, jacobian = _compiled(flat.rate, unpack)
+    jax.eval_shape(rate, t0, flat.y0, packed)  # raises here and not inside SciPy
+
+    def call(program, t, y):
+        return np.asarray(program(np.float64(t), y, packed))
+
+    def unravel(y):
+        return flat.unravel(jnp.asarray(y)) if np.ndim(y) == 1 else jax.vmap(flat.unravel)(jnp.asarray(y).T)
+
+    return ScipyRHS(partial(call, rate), np.asarray(flat.y0), unravel, partial(call, jacobian))
+
+
+def _ode(system, t, y, params):
+    """y' of a pytree y."""
+    y = jax.tree.map(jnp.asarray, y)
+    if isinstance(system, FirstOrderSystem):
+        flat, q, v = flatten("ode", system, y, None, t, params)
+        return flat.unravel(flat.force(q, v, jnp.asarray(t).astype(v.dtype), params))
+    if not isinstance(y, (tuple, list)) or len(y) != 2:
+        raise TypeError(f"ode: `y` must be (q, v), two pytrees; received {y!r}.")
+    q, v = y
+    flat, q, v = flatten("ode", system, q, v, t, params)
+    at = q, v, jnp.asarray(t).astype(q.dtype), params
+    w = acceleration_and_multipliers(flat, *at)[0] if flat.num_constraints else flat.acceleration(*at)
+    return flat.unravel(flat.rate(q, v)), flat.unravel_rates(w)
+
+
+class _FlatRate(Description):
+    """`ode` on vectors; frozen and hashable, so that equal ones share a program."""
+
+    def __init__(self, system, size, unravel_q, unravel_v):
+        self.system, self.size, self.unravel_q, self.unravel_v = system, size, unravel_q, unravel_v
+
+    def unravel(self, y):
+        """(q, v), or y."""
+        return self.unravel_q(y) if self.unravel_v is None else (
+            self.unravel_q(y[: self.size]), self.unravel_v(y[self.size :])
+        )  # fmt: skip
+
+    def __call__(self, t, y, params):
+        return ravel_pytree(_ode(self.system, t, self.unravel(y), params))[0]
+
+
+def _packed(params):
+    """The params as one vector, if that is what they are, because fewer arguments make a call quicker; the way back."""
+    leaves = jax.tree.leaves(params)
+    if leaves and all(jnp.result_type(x) == np.float64 for x in leaves):
+        vector, unpack = ravel_pytree(jax.tree.map(jnp.asarray, params))
+        return np.asarray(vector), unpack
+    return params, _same
+
+
+def _same(x):
+    return x
+
+
+@lru_cache(maxsize=64)
+def _compiled(rate, unpack):
+    """Right-hand side and Jacobian as compiled functions of (t, y, packed params)."""
+
+    def program(t, y, packed):
+        return rate(t, y, thaw(unpack(packed)))
+
+    return jax.jit(program), jax.jit(jax.jacfwd(program, argnums=1))
+
+
+def _required(caller, package):
+    """A package that not everybody has."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ImportError(f'{caller}: needs {package}: pip install "hhtjax[interop]".') from error

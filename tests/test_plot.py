@@ -1,0 +1,292 @@
+"""Charts: what is drawn, how it is labelled, how large its text is, and what happens without matplotlib."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+import plotted_runs
+import pytest
+
+import hhtjax
+from hhtjax import plot
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+SMALLEST = 7.0  # pt
+
+
+PENDULUM = hhtjax.System(
+    jnp.ones(2),
+    lambda q, v, t, params: jnp.array([0.0, -9.81]),
+    lambda q, t, params: jnp.array([jnp.sum(q**2) - 1.0]),
+)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    """No test leaves a figure behind, or a setting changed."""
+    before = dict(mpl.rcParams)
+    yield
+    plt.close("all")
+    assert dict(mpl.rcParams) == before
+
+
+@pytest.fixture
+def run():
+    return plotted_runs.run()
+
+
+@pytest.fixture
+def sweep():
+    return plotted_runs.sweep()
+
+
+@pytest.fixture(scope="module")
+def swing():
+    q0 = jnp.array([1.0, 0.0])
+    return hhtjax.simulate(PENDULUM, hhtjax.hht(), q0, jnp.zeros(2), dt=0.02, num_steps=20)
+
+
+@pytest.fixture(scope="module")
+def result():
+    t = jnp.arange(200.0) / 10
+    noise = 0.1 * jax.random.normal(jax.random.key(0), t.shape)
+    return hhtjax.fit(lambda p: p["a"] * jnp.sin(t) + p["b"] - 2 * jnp.sin(t) - 0.5 - noise, {"a": 1.0, "b": 0.0})
+
+
+def sizes(figure):
+    """Of all text that a figure shows, in pt; after drawing, when ticks have their labels."""
+    figure.canvas.draw()
+    texts = figure.findobj(mpl.text.Text)
+    return {text.get_text(): text.get_fontsize() for text in texts if text.get_text().strip() and text.get_visible()}
+
+
+def labels(ax):
+    return [line.get_label() for line in ax.lines if not line.get_label().startswith("_")]
+
+
+def test_trajectory_names_entries_and_units(run):
+    upper, lower = plot.trajectory(run, ("q", "v"), units={"q": {"phi": "rad", "x": "m"}, "v": "1/s"})
+    assert labels(upper) == ["phi (rad)", "x (m)"]
+    assert labels(lower) == ["phi", "x"]
+    assert (upper.get_ylabel(), lower.get_ylabel(), lower.get_xlabel()) == ("q", "v (1/s)", "t (s)")
+    np.testing.assert_array_equal(upper.lines[1].get_ydata(), run.q["x"])
+    np.testing.assert_array_equal(lower.lines[0].get_ydata(), run.v["phi"])
+    np.testing.assert_array_equal(lower.lines[0].get_xdata(), run.t)
+    looks = {(line.get_color(), line.get_linestyle()) for line in upper.lines}
+    assert len(looks) == 2
+    assert len({style for _, style in looks}) == 2
+
+
+def test_trajectory_draws_into_axes_given_run_after_run(run, swing):
+    figure, ax = plt.subplots()
+    assert plot.trajectory(run, "acceleration", entries="phi", units="rad/s^2", label="one", ax=ax) is ax
+    plot.trajectory(run, "acceleration", entries="phi", units="rad/s^2", label="two", ax=ax, lw=3)
+    assert ax.figure is figure
+    assert labels(ax) == ["one", "two"]
+    assert ax.lines[0].get_color() != ax.lines[1].get_color()
+    assert ax.lines[1].get_linewidth() == 3
+    assert ax.get_ylabel() == "phi (rad/s^2)"
+    multipliers = plot.trajectory(swing, "multipliers", units="N")
+    assert labels(multipliers) == ["L[0]"]
+    np.testing.assert_array_equal(multipliers.lines[0].get_ydata(), swing.multipliers[:, 0])
+
+
+def test_phase_plane(run):
+    ax = plot.phase_plane(run, "phi", units=("rad", "rad/s"))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("phi (rad)", "dphi/dt (rad/s)")
+    np.testing.assert_array_equal(ax.lines[0].get_xdata(), run.q["phi"])
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), run.v["phi"])
+
+
+def test_energy_balance_finds_the_potential_of_a_lagrangian():
+    def lagrangian(q, v, t, p):
+        return 0.5 * jnp.sum(v**2) - 0.5 * p["k"] * jnp.sum(q**2)
+
+    system = hhtjax.System.from_lagrangian(lagrangian)
+    run = hhtjax.simulate(system, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), plotted_runs.PARAMS, dt=0.1, num_steps=20)
+    upper, lower = plot.energy_balance(system, run, plotted_runs.PARAMS)
+    curves = {line.get_label(): line.get_ydata() for line in upper.lines}
+    np.testing.assert_allclose(curves["potential"], 2.0 * run.q[:, 0] ** 2)
+    np.testing.assert_allclose(curves["kinetic + potential"] - 2.0, lower.lines[0].get_ydata(), atol=1e-12)
+    assert upper.get_ylabel() == "energy (J)"
+    one, two = plot.energy_balance(
+        system, run, plotted_runs.PARAMS, energy=lambda q, v, t, p: lagrangian(q, v, t, {"k": -p["k"]})
+    )
+    np.testing.assert_allclose(one.lines[0].get_ydata(), curves["kinetic + potential"])
+    np.testing.assert_allclose(two.lines[0].get_ydata(), lower.lines[0].get_ydata(), atol=1e-12)
+    balance = hhtjax.analysis.energy_balance(system, run, plotted_runs.PARAMS)
+    assert labels(plot.energy_balance(balance)[0]) == ["kinetic", "work of all forces"]
+
+
+def test_constraint_drift(swing):
+    ax = plot.constraint_drift(swing, unit="m")
+    assert labels(ax) == ["|Phi| (m)", "|dPhi/dt| (m/s)"]
+    assert ax.get_yscale() == "log"
+    shown = ax.lines[0].get_ydata()
+    drift = np.asarray(swing.info.constraint)
+    np.testing.assert_array_equal(shown[drift > 0], drift[drift > 0])
+    assert np.isnan(shown[drift == 0]).all()
+
+
+def test_error_against_h_of_a_sweep_has_the_order_of_the_method(sweep):
+    ax = plot.error_against_h(sweep, label="hht", unit="rad")
+    (line,) = [line for line in ax.lines if not line.get_label().startswith("_")]
+    h, error = line.get_data()
+    finest = {name: q[0] for name, q in sweep.q.items()}
+    expected = [np.sqrt(np.mean([(q[i] - finest[n]) ** 2 for n, q in sweep.q.items()])) for i in range(1, 6)]
+    np.testing.assert_allclose(error, expected)
+    np.testing.assert_allclose(h, sweep.dt[1:])
+    name, order = line.get_label().split(": order ")
+    assert name == "hht"
+    assert abs(float(order) - 2) < 0.15
+    triangles = [line for line in ax.lines if line.get_label() == "_slope"]
+    (x0, y0), (x1, y1) = (triangles[0].get_xydata()[i] for i in (0, 2))
+    np.testing.assert_allclose(np.log(y1 / y0) / np.log(x1 / x0), 2)
+    assert "2" in [text.get_text() for text in ax.texts]
+
+
+def test_error_against_h_of_several_curves():
+    h = np.logspace(-3, -1, 5)
+    found = hhtjax.analysis.ObservedOrder(h, h**4, None)
+    rounded = np.array([np.nan, 0.0, 1e-2, 4e-2, 1.0])
+    ax = plot.error_against_h({"a": (h, 5 * h), "b": found, "c": (h[::-1], rounded[::-1])}, slopes=(1, 4))
+    slopes = np.log([4.0, 25.0]) / np.log(10) * 2
+    assert labels(ax) == ["a: order 1.00", "b: order 4.00", f"c: order {slopes[0]:.1f} to {slopes[1]:.1f}"]
+    assert len(ax.lines[2].get_xdata()) == 3
+    assert [text.get_text() for text in ax.texts] == ["1", "4"]
+    assert len({line.get_marker() for line in ax.lines[:3]}) == 3
+
+
+def test_work_precision():
+    curves = {"ours": ([1.0, 2.0, np.nan], [1e-2, 1e-3, 1.0]), "peer": ([3.0, 4.0], [0.0, 1e-3])}
+    ax = plot.work_precision(curves, ours=("ours",), xlabel="time (ms)", ylabel="error (m)")
+    assert ax.lines[0].get_xdata().tolist() == [1.0, 2.0]
+    assert ax.lines[1].get_xdata().tolist() == [4.0]
+    assert ax.lines[0].get_linewidth() > ax.lines[1].get_linewidth()
+    assert (ax.get_xscale(), ax.get_yscale(), ax.get_xlabel()) == ("log", "log", "time (ms)")
+
+
+def test_curves_over_frequency_are_those_of_analysis():
+    frequency = np.array([0.1, 1.0, 3.0])
+    stepper = hhtjax.hht(alpha=-0.1)
+    for name in ("spectral_radius", "damping_ratio", "period_elongation"):
+        ax = getattr(plot, name)({"hht": stepper}, frequency=frequency)
+        expected = getattr(hhtjax.analysis, name)(stepper, frequency)
+        np.testing.assert_array_equal(ax.lines[0].get_ydata(), expected)
+        assert ax.get_xlabel() == "w h (rad)"
+        assert labels(ax) == ["hht"]
+
+
+def test_stability_region():
+    ax = plot.stability_region({"rk4": hhtjax.rk4()}, real=(-4, 2), imag=(-4, 4), points=25)
+    edge = np.concatenate([path.vertices for path in ax.collections[1].get_paths()])
+    on_the_axis = edge[abs(edge[:, 1]) < 1e-9, 0]
+    assert abs(on_the_axis.min() + 2.785) < 0.05  # the real interval of RK4
+    assert ax.get_legend().get_texts()[0].get_text() == "rk4"
+
+
+def test_fit_against_data_shows_residual_and_spectrum():
+    t = np.arange(512) / 100
+    model, tone = np.sin(t), 0.1 * np.sin(2 * np.pi * 12.5 * t)
+    upper, middle, lower = plot.fit_against_data(t, model + tone, model, unit="mV", ylabel="voltage", show=(1.0, 2.0))
+    assert labels(upper) == ["measured", "simulated"]
+    assert (upper.get_ylabel(), middle.get_ylabel()) == ("voltage (mV)", "residual (mV)")
+    np.testing.assert_allclose(middle.lines[0].get_ydata(), tone[100:201], atol=1e-12)
+    frequency, density = lower.lines[1].get_data()
+    assert abs(frequency[np.argmax(density)] - 12.5) < 0.2
+    power = np.sum(density**2) * (frequency[1] - frequency[0])
+    assert abs(power - 0.005) < 2e-4  # half the square of the amplitude
+
+
+def test_estimates_are_relative_to_estimate_or_truth(result):
+    ax = plot.estimates(result)
+    assert [text.get_text() for text in ax.get_yticklabels()] == [f"{n} = {result.params[n]:.4g}" for n in "ab"]
+    ((left, right), _) = (sorted(bar[:, 0]) for bar in ax.collections[0].get_segments())
+    lower, upper = result.interval()
+    np.testing.assert_allclose([left, right], [100 * (x["a"] / result.params["a"] - 1) for x in (lower, upper)])
+    ax = plot.estimates({"one": result, "two": result}, truth={"a": 2.0, "b": 0.5}, entries="b", level=0.9)
+    assert ax.get_xlabel() == "90 % interval (% of the truth)"
+    np.testing.assert_allclose(ax.containers[1].lines[0].get_xdata(), 100 * (result.params["b"] / 0.5 - 1))
+    with pytest.raises(ValueError, match=r"estimates: `b` is 0"):
+        plot.estimates(result, truth={"a": 2.0, "b": 0.0})
+
+
+def test_correlations_and_profile(result):
+    ax = plot.correlations(result)
+    np.testing.assert_allclose(ax.images[0].get_array(), result.correlation)
+    assert ax.texts[0].get_text() == "1.00"
+    a, error = float(result.params["a"]), float(result.standard_errors["a"])
+    values = np.linspace(a - 2 * error, a + 2 * error, 5)
+    found = hhtjax.identification.Profile(values, None, ((values - a) / error) ** 2)
+    ax = plot.profile(found, name="a", unit="m", result=result)
+    assert ax.get_xlabel() == "a (m)"
+    on_parabola = np.interp(values, *ax.lines[1].get_data())
+    np.testing.assert_allclose(on_parabola, found.deviance, atol=2e-2)
+    assert ax.lines[2].get_ydata()[0] == 3.84
+
+
+def test_animation_moves_in_the_plane_and_in_space(swing, tmp_path):
+    film = plot.animation(swing, lambda q: jnp.stack([jnp.zeros(2), q]), fps=10, trace=1)
+    film.save(tmp_path / "film.gif", writer="pillow")
+    assert (tmp_path / "film.gif").stat().st_size > 1000
+    (ax,) = film._fig.axes
+    np.testing.assert_allclose(ax.lines[0].get_xydata()[1], swing.q[-1], atol=1e-12)
+    np.testing.assert_allclose(ax.lines[1].get_xydata(), swing.q[::5], atol=1e-12)
+    assert ax.get_xlabel() == "x (m)"
+    bars = plot.configuration(swing, lambda q: [np.array([[0.0, 0.0, 0.0], [q[0], 0.0, q[1]]])], [0.0, 0.4])
+    assert bars.get_zlabel() == "z (m)"
+    assert labels(bars) == ["t = 0", "t = 0.4"]
+
+
+def test_text_is_legible_and_files_are_written_without_a_warning(run, sweep, result, tmp_path):
+    t = np.arange(64.0)
+    figures = {
+        "trajectory": plot.trajectory(run, ("q", "v", "acceleration"))[0],
+        "order": plot.error_against_h(sweep, label="hht"),
+        "fit": plot.fit_against_data(t, np.sin(t), np.cos(t))[0],
+        "estimates": plot.estimates(result),
+        "correlations": plot.correlations(result),
+    }
+    for name, ax in figures.items():
+        figure = ax.figure
+        assert abs(25.4 * figure.get_size_inches()[0] - 85) < 1e-9
+        too_small = {text: size for text, size in sizes(figure).items() if size < SMALLEST}
+        assert not too_small, (name, too_small)
+    paths = plot.save(figures["order"].figure, tmp_path / "order", ("png", "pdf", "svg"))
+    assert [path.name for path in paths] == ["order.png", "order.pdf", "order.svg"]
+    assert paths[0].read_bytes()[:4] == b"\x89PNG"
+    assert b"/Type /Font" in paths[1].read_bytes()
+    assert "step size h (s)</text>" in paths[2].read_text()
+
+
+def test_legends_stand_above_the_curves(run):
+    ax = plot.trajectory(run, "q")
+    ax.figure.canvas.draw()
+    legend = ax.get_legend().get_window_extent()
+    assert legend.y0 >= ax.get_window_extent().y1
+    assert legend.x1 <= ax.figure.bbox.x1
+
+
+def test_the_library_works_without_matplotlib():
+    """`import hhtjax` leaves matplotlib alone; where there is none, asking for charts says what to install."""
+    program = """
+import sys
+import hhtjax
+assert "matplotlib" not in sys.modules
+sys.modules["matplotlib"] = None
+try:
+    hhtjax.plot
+except ImportError as error:
+    assert "pip install 'hhtjax[plot]'" in str(error), error
+else:
+    raise AssertionError("no error")
+assert not hasattr(hhtjax, "chart")
+del sys.modules["matplotlib"]
+assert hhtjax.plot.trajectory.__doc__
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
