@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import hhtjax
 from hhtjax import interop
-from hhtjax.scenes import double_pendulum, pendulum, top
+from hhtjax.scenes import double_pendulum, motor_joint, pendulum, top
 
 
 def by_scipy(system, q0, v0, params, duration, method="DOP853", **options):
@@ -120,6 +120,36 @@ def test_implicit_solvers_of_scipy_take_the_jacobian():
     assert run.nfev < 2000
 
 
+def test_internal_states_go_along():
+    system, params, q0, v0, _, z0 = motor_joint.tracking()
+    rhs = interop.scipy_rhs(system, q0, v0, params, z0=z0)
+    run = solve_ivp(rhs.fun, (0.0, 0.2), rhs.y0, "Radau", jac=rhs.jac, rtol=1e-8, atol=1e-10)
+    ours = hhtjax.simulate(
+        system, hhtjax.hht(linearize="predictor"), q0, v0, params, z0=z0,
+        dt=1e-3, num_steps=200, save_every=200, extrapolate=2,
+    )  # fmt: skip
+    ends = jax.tree.map(lambda x: x[-1], (ours.q, ours.v, ours.z))
+    assert_near(rhs.unravel(run.y[:, -1]), ends, 1e-5)
+    rates = rhs.unravel(rhs.fun(0.2, run.y[:, -1]))
+    assert_near(rates, interop.diffrax_term(system).vf(0.2, rhs.unravel(run.y[:, -1]), params), 1e-12)
+    assert_near(rates, jax.tree.map(lambda x: x[-1], (ours.v, ours.acceleration, ours.zdot)), 1e-2)
+
+
+def test_internal_states_beside_a_constraint():
+    """A point on a circle, pulled by z: w is what the constraint leaves, and z moves as it says."""
+    system = hhtjax.System(
+        jnp.ones(2),
+        lambda q, v, z, t, params: z,
+        lambda q, t, params: jnp.sum(q**2, keepdims=True) / 2 - 0.5,
+        internal=lambda q, v, z, t, params: -z + v,
+    )
+    y = jnp.array([1.0, 0.0]), jnp.array([0.0, 2.0]), jnp.array([3.0, 5.0])
+    v, w, zdot = interop.ode(system)(0.0, y, None)
+    np.testing.assert_allclose(w, [-4.0, 5.0])  # v^2/r inwards, z along
+    np.testing.assert_array_equal(v, y[1])
+    np.testing.assert_array_equal(zdot, y[1] - y[2])
+
+
 def test_new_params_and_another_module_cost_no_compilation():
     system = hhtjax.System(np.ones(1), driven)
     nets = [eqx.nn.MLP(2, 1, 3, 1, key=jax.random.key(i)) for i in range(2)]
@@ -176,6 +206,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
 
 
 BEAD = pendulum.cartesian()
+MOTOR = motor_joint.tracking()
 
 
 @pytest.mark.parametrize(
@@ -185,6 +216,13 @@ BEAD = pendulum.cartesian()
         (TypeError, r"diffrax_term: `system` must be a System", lambda: interop.diffrax_term(len)),
         (TypeError, r"scipy_rhs: `system` must be a System", lambda: interop.scipy_rhs(1.0, 1.0)),
         (TypeError, r"ode: `y` must be \(q, v\), two pytrees", lambda: interop.ode(ARM)(0.0, jnp.ones(4), None)),
+        (
+            TypeError,
+            r"ode: `y` must be \(q, v, z\), three pytrees",
+            lambda: interop.ode(MOTOR.system)(0.0, MOTOR[2:4], MOTOR.params),
+        ),
+        (ValueError, r"flat_ode: `z0` must be given", lambda: interop.flat_ode(MOTOR.system, *MOTOR[2:4])),
+        (ValueError, r"scipy_rhs: leave `z0` out", lambda: interop.scipy_rhs(ARM, *ARM_START, z0=1.0)),
         (ValueError, r"flat_ode: `v0` must have the shapes", lambda: interop.flat_ode(ARM, jnp.ones(2), jnp.ones(3))),
         (TypeError, r"scipy_rhs: `params` must be", lambda: interop.scipy_rhs(ARM, *ARM_START, "steel")),
         (ValueError, r"scipy_rhs: `t0` must be finite", lambda: interop.scipy_rhs(ARM, *ARM_START, None, np.nan)),

@@ -94,6 +94,9 @@ def test_trajectory_draws_into_axes_given_run_after_run(run, swing):
     multipliers = plot.trajectory(swing, "multipliers", units="N")
     assert labels(multipliers) == ["L[0]"]
     np.testing.assert_array_equal(multipliers.lines[0].get_ydata(), swing.multipliers[:, 0])
+    internal = plot.trajectory(run._replace(z={"current": run.q["x"]}), "z", units="A")
+    assert internal.get_ylabel() == "current (A)"
+    np.testing.assert_array_equal(internal.lines[0].get_ydata(), run.q["x"])
 
 
 def test_phase_plane(run):

@@ -54,6 +54,8 @@ def test_a_run_in_a_few_lines():
     assert "every step finite, and converged" in text
     assert re.search(r"q\.angle +\(501,\) +float64\n +q\.hub\.x +\(501, 2\) +float32\n", text)
     assert re.search(r"info\.converged +\(500,\) +bool", text)
+    text = repr(run(z={"current": jnp.ones((501, 2))}, zdot={"current": jnp.ones((501, 2))}))
+    assert re.search(r"z\.current +\(501, 2\) +float64\n +zdot\.current +\(501, 2\) +float64$", text)
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
@@ -87,6 +89,7 @@ def test_a_batch_and_a_sweep_say_how_many():
         (Info(jnp.ones(9), converged=jnp.ones(9, bool)), "Info(all converged, residual=float64[9], converged=bool[9])"),
         (Info(jnp.asarray(1e-12), converged=jnp.asarray(True)), "Info(residual=1e-12, converged=True)"),
         (run(failed=3).failure, "Failure(the velocity v is not finite, step=3, newton=False, quantity=1)"),
+        (run(failed=3, quantity=4).failure, "Failure(the internal state z is not finite, step=3"),
         (run(failed=3, newton=True).failure, "Failure(Newton did not converge, step=3, newton=True, quantity=1)"),
         (run(failed=3).failure._replace(row=jnp.asarray(2)), "Failure(a constraint depends on others, step=3, "),
         (run(failed=3).failure._replace(solve=jnp.asarray(0.1)), "Failure(the linear solve left too much, step=3, "),
@@ -189,7 +192,7 @@ def test_completion_shows_our_names():
     assert isinstance(run(), tuple)
     assert pickle.loads(pickle.dumps(State(1, 2, 3, 4))) == State(1, 2, 3, 4)
     assert run()._replace(t=1)[0] == 1
-    assert State(1, 2, 3, 4) == (1, 2, 3, 4, None, None, None)
+    assert State(1, 2, 3, 4) == (1, 2, 3, 4, *[None] * 6)
     assert jax.tree.leaves(State(1, 2, 3, 4)) == [1, 2, 3, 4]
     found = {x.name for x in jedi.Interpreter("run.", [{"run": run()}]).complete()}  # as in a kernel
     assert {"check", "q"} < found

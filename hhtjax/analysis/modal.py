@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_integer
 from hhtjax.description import Description, is_concrete
+from hhtjax.description.presentation import shown
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import SYMMETRIC, constant_matrix, is_sparse, require_mass
 
@@ -18,15 +19,28 @@ UNCOUPLED = 1e-9  # size of what couples modes, relative to their damping, that 
 SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first that is no eigenvalue
 
 
+@shown
 class NormalModes(NamedTuple):
-    """frequencies: (count,), rad/s, lowest first, 0 for rigid motions. shapes: T, (n, count), with T^T M T = 1."""
+    """What `modes` found.
+
+    Attributes:
+        frequencies: (count,), rad/s, lowest first, 0 for rigid motions.
+        shapes: T, (n, count), with T^T M T = 1.
+    """
 
     frequencies: Any
     shapes: Any
 
 
+@shown
 class ModalReduction(NamedTuple):
-    """What `modal_reduction` returns: the reduced system, and the way to it and back."""
+    """What `modal_reduction` returns: the reduced system, and the way to it and back.
+
+    Attributes:
+        system: the reduced `LinearSystem`.
+        frequencies: (count,), rad/s.
+        shapes: T, (n, count). inverse: T^T M, (count, n).
+    """
 
     system: LinearSystem
     frequencies: Any
@@ -50,6 +64,9 @@ def modes(M, K, count=None) -> NormalModes:
             diagonals, or matrices of scipy.sparse of any size. With more than 1000 rows these are solved by Lanczos's
             iteration on the shifted inverse (`scipy.sparse.linalg.eigsh`), the others by NumPy.
         count: how many; None for all.
+
+    Returns:
+        A `NormalModes`.
 
     Raises:
         TypeError, ValueError: matrices of a wrong kind or shape, not symmetric, or indefinite; a count out of range.

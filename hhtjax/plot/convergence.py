@@ -30,11 +30,15 @@ def error_against_h(
     more than 1 apart, the least and the largest are given.
 
     Args:
-        dt: step sizes, with `error` as long; or an `ObservedOrder`; or a sweep, whose error is the RMS over samples and
-            entries of q less `reference` (q like a member's; by default the finest member is it, and not drawn);
-            or several of these by name, {label: sweep} or {label: (dt, error)}.
+        dt: step sizes; or an `ObservedOrder`; or a sweep, whose error is the RMS over samples and entries of q less
+            the reference; or several of these by name, {label: sweep} or {label: (dt, error)}.
+        error: as long as dt, where these are step sizes.
+        reference: of a sweep, q like a member's; by default the finest member is it, and not drawn.
         label: of a single curve. slopes: orders of the triangles; by default the whole numbers that are observed.
-        unit: of the error. time_unit: of dt.
+        unit: of the error. time_unit: of dt. ax: axes.
+
+    Returns:
+        The axes.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape or value.
@@ -163,7 +167,10 @@ def work_precision(
     Args:
         curves: {label: (times, errors)}; what is not finite or not positive is left out.
         ours: labels that are drawn with bold, full lines, the others with thin, broken ones.
-        xlabel, ylabel: with their units, of whatever work is counted in.
+        xlabel, ylabel: with their units, of whatever work is counted in. ax: axes.
+
+    Returns:
+        The axes.
 
     Raises:
         TypeError, ValueError: curves is no dict, empty, or of arrays of different lengths; ours has other labels.

@@ -41,7 +41,7 @@ def energy_balance(
         system, solution, params, potential: as in `hhtjax.analysis.energy_balance`; the potential of a system
             `from_lagrangian` is known. Or an `EnergyBalance` alone.
         energy: in their place, `energy(q, v, t, params)`, the energy itself, which then is shown with its drift.
-        unit: of energy. ax: two axes.
+        unit: of energy. time_unit: of t. ax: two axes.
 
     Returns:
         Two axes, of energies and of the error.

@@ -35,7 +35,7 @@ def fit_against_data(
     Args:
         times: (N,), at equal distances. measured, simulated: (N,); NaN where nothing was measured, which counts as a
             residual of 0 in the spectrum.
-        unit, ylabel: of the output. frequency_unit: one over that of times.
+        unit, ylabel: of the output. time_unit: of times. frequency_unit: one over it.
         show: (first, last), the part of the time that is drawn; spectra are of all.
         ax: three axes.
 
@@ -112,9 +112,12 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
     Args:
         results: a FitResult, or several of one model by name, {label: result}. level: of the intervals.
         truth: params, where they are known: what intervals are relative to, instead of the first estimate.
-        entries: which parameters, by name as in `result.summary()`; by default all that were fitted.
+        entries: which parameters, by name as in `result.summary()`; by default all that were fitted. ax: axes.
 
     What the residuals do not determine has a cross and no interval.
+
+    Returns:
+        The axes.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a fit without covariance; a parameter that is 0,
@@ -182,8 +185,21 @@ def _intervals(ax, result, level, kept, size, at, label, number):
 def correlations(result: FitResult, *, ax: Any = None) -> Any:
     """The correlation matrix of the estimates that were fitted; of up to 8 its numbers too.
 
+    Args:
+        result: of `fit`, with its covariance.
+        ax: axes.
+
+    Returns:
+        The axes.
+
     Raises:
         TypeError, ValueError: no fit, or one without covariance.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> t = jnp.arange(100.0)
+    >>> result = hhtjax.fit(lambda p: p["a"] + p["b"] * jnp.sin(t) - jnp.sin(t + 1), {"a": 1.0, "b": 1.0})
+    >>> [x.get_text() for x in hhtjax.plot.correlations(result).get_yticklabels()]
+    ['a', 'b']
     """
     _require_fit("correlations", "result", result)
     free = np.flatnonzero(result.free)
@@ -210,7 +226,10 @@ def profile(
 
     Args:
         found: of `hhtjax.identification.profile`. name, unit: of the parameter.
-        result: of the fit, for the parabola, in which `name` then is a parameter's.
+        result: of the fit, for the parabola, in which `name` then is a parameter's. ax: axes.
+
+    Returns:
+        The axes.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; a name that the fit does not have.

@@ -41,6 +41,15 @@ def animation(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import pathlib, tempfile, jax.numpy as jnp, hhtjax
+    >>> ball = hhtjax.System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -9.81]))
+    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.zeros(2), jnp.ones(2), dt=0.1, num_steps=4)
+    >>> film = hhtjax.plot.animation(run, lambda q: jnp.stack([jnp.zeros(2), q]), fps=5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     film.save(pathlib.Path(folder) / "ball.gif", writer="pillow")
+    ...     sorted(path.name for path in pathlib.Path(folder).iterdir())
+    ['ball.gif']
     """
     require_number("animation", "fps", fps, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("animation", "speed", speed, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
@@ -74,6 +83,9 @@ def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = 
 
     Args:
         solution, points, unit, ax: as in `animation`. times: inside the run.
+
+    Returns:
+        The axes.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.

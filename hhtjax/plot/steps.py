@@ -19,7 +19,10 @@ def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.
 
     Args:
         steppers: a Stepper, or several by name, {label: stepper}. frequency: w h, an array; by default 0.01 to 1000.
-        damping: the damping ratio of the oscillator.
+        damping: the damping ratio of the oscillator. ax: axes.
+
+    Returns:
+        The axes.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
@@ -35,7 +38,21 @@ def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.
 def damping_ratio(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
     """The damping ratio that the discrete oscillator has, over w h; of an undamped one all of it is the method's.
 
-    Args, raises: as in `spectral_radius`; by default w h goes to 3.
+    By default w h goes to 3.
+
+    Args:
+        steppers, frequency, damping, ax: as in `hhtjax.plot.spectral_radius`.
+
+    Returns:
+        The axes.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import hhtjax, numpy as np
+    >>> ax = hhtjax.plot.damping_ratio(hhtjax.hht(alpha=-0.05), frequency=np.array([0.1, 1.0]))
+    >>> float(ax.lines[0].get_ydata()[0].round(7))
+    5.6e-06
     """
     return _over_frequency("damping_ratio", "damping ratio", steppers, frequency, damping, ax, NEAR)
 
@@ -43,7 +60,21 @@ def damping_ratio(steppers: Any, *, frequency: Any = None, damping: float = 0.0,
 def period_elongation(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
     """The relative error of the period, over w h.
 
-    Args, raises: as in `spectral_radius`; by default w h goes to 3.
+    By default w h goes to 3.
+
+    Args:
+        steppers, frequency, damping, ax: as in `hhtjax.plot.spectral_radius`.
+
+    Returns:
+        The axes.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import hhtjax, numpy as np
+    >>> ax = hhtjax.plot.period_elongation(hhtjax.hht(alpha=-0.05), frequency=np.array([0.1, 1.0]))
+    >>> float(ax.lines[0].get_ydata()[0].round(6))
+    0.000948
     """
     return _over_frequency("period_elongation", "relative period error", steppers, frequency, damping, ax, NEAR)
 
@@ -83,10 +114,18 @@ def stability_region(
 
     Args:
         steppers: a Stepper, or several by name, {label: stepper}. real, imag: the part of the plane.
-        points: in each direction.
+        points: in each direction. ax: axes.
+
+    Returns:
+        The axes.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import hhtjax
+    >>> ax = hhtjax.plot.stability_region(hhtjax.rk4(), points=21)
+    >>> [float(x) for x in ax.get_xlim()]
+    [-8.0, 8.0]
     """
     named = _named("stability_region", steppers)
     points = require_integer("stability_region", "points", points, 2)

@@ -72,6 +72,9 @@ def subplots(rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: 
         rows, columns: of panels. width: of the figure, 85 for a column of text, 175 for a page.
         height: of the figure; by default panels of four to three. options: as for `plt.subplots`.
 
+    Returns:
+        A figure, and its axes: one, or an array of them.
+
     Raises:
         TypeError, ValueError: rows, columns, width or height is no positive number.
 
@@ -147,6 +150,12 @@ def legend(ax, handles=None, labels=None, **options: Any):
     Args:
         ax: axes. handles, labels, options: as for `ax.legend`.
 
+    Returns:
+        The legend, or None.
+
+    Raises:
+        whatever `ax.legend` raises.
+
     >>> import hhtjax
     >>> figure, ax = hhtjax.plot.subplots()
     >>> line = ax.plot([0, 1], label="a line")
@@ -186,6 +195,14 @@ def _columns(labels, room):
 
 def save(figure, path, formats: Sequence[str] = ("png",)) -> list[Path]:
     """Writes a figure as path.png (200 dpi), path.pdf, path.svg, with text as text; returns what it wrote.
+
+    Args:
+        figure: of matplotlib.
+        path: with or without the folder, without a suffix.
+        formats: which files.
+
+    Returns:
+        The paths of the files.
 
     Raises:
         TypeError, ValueError: figure is none; formats has others than png, pdf and svg.

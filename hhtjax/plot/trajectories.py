@@ -29,6 +29,7 @@ def trajectory(
         quantities: "q", "v", "acceleration", "multipliers" or "z"; several as a tuple, one panel above the other.
         entries: which to draw, by name: "[0]" of an array, "phi" or "x[1]" of a dict, "x" for all of a leaf.
         units: a word; or words by entry or leaf, {"x": "m"}; or one of these by quantity, {"q": "rad", "v": "rad/s"}.
+        time_unit: of t.
         label: put before the names of the curves, to tell runs in one chart.
         ax: axes to draw into, as many as quantities. line: further options of `ax.plot`.
 
@@ -91,6 +92,9 @@ def phase_plane(
         entries: which to draw, as in `trajectory`; all by default.
         units: (of position, of velocity). label, ax, line: as in `trajectory`.
 
+    Returns:
+        The axes.
+
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a rotation, which has no such plane.
 
@@ -139,10 +143,20 @@ def constraint_drift(
     What is zero does not show.
 
     Args:
-        solution: of one run of a system with constraints. unit: of Phi. label, ax, line: as in `trajectory`.
+        solution: of one run of a system with constraints. unit: of Phi.
+        time_unit, label, ax, line: as in `trajectory`.
+
+    Returns:
+        The axes.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; a run without constraints.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> scene = hhtjax.scenes.pendulum.cartesian()
+    >>> run = hhtjax.simulate(scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params, dt=1e-2, num_steps=20)
+    >>> hhtjax.plot.constraint_drift(run, unit="m^2").get_yscale()
+    'log'
     """
     require_run("constraint_drift", solution)
     info = solution.info

@@ -33,6 +33,12 @@ def ode(system):
 
     With internal states y = (q, v, z). Traceable and differentiable; of equal systems equal, also as a pytree.
 
+    Args:
+        system: any.
+
+    Returns:
+        A function of (t, y, params).
+
     Raises:
         TypeError: what is no system; when called, a y that is no (q, v), or (q, v, z).
 
@@ -48,8 +54,13 @@ def ode(system):
 
 
 class FlatODE(NamedTuple):
-    """rate: (t, y, params) -> y' on vectors (N,), traceable; y0: (N,); unravel: y -> (q, v), or (q, v, z), or of a
-    first-order system the pytree y."""
+    """A system as an ODE on vectors; made by `flat_ode`.
+
+    Attributes:
+        rate: (t, y, params) -> y' on vectors (N,), traceable.
+        y0: (N,).
+        unravel: y -> (q, v), or (q, v, z), or of a first-order system the pytree y.
+    """
 
     rate: Any
     y0: Any
@@ -61,6 +72,9 @@ def flat_ode(system, q0, v0=None, z0=None) -> FlatODE:
 
     Args:
         system, q0, v0, z0: as in `simulate`.
+
+    Returns:
+        A `FlatODE`.
 
     Raises:
         TypeError, ValueError: as `simulate`, for these.
@@ -81,12 +95,19 @@ def flat_ode(system, q0, v0=None, z0=None) -> FlatODE:
 def diffrax_term(system):
     """The system as a `diffrax.ODETerm`, for `diffeqsolve(term, solver, t0, t1, dt0, y0=(q0, v0), args=params)`.
 
-    y0 is (q0, v0), pytrees, or (q0, v0, z0), or y0 of a `FirstOrderSystem`; args are the params, modules of equinox among them. All
-    that diffrax does with an ODE is there: step-size control, events, adjoints. Inputs that are held,
+    y0 is (q0, v0), pytrees, or (q0, v0, z0), or y0 of a `FirstOrderSystem`; args are the params, modules of equinox
+    among them. All that diffrax does with an ODE is there: step-size control, events, adjoints. Inputs that are held,
     `sampled(order=0)`, jump: tell the step-size controller, `diffrax.ClipStepSizeController(..., jump_ts=)`.
 
+    Args:
+        system: any.
+
+    Returns:
+        A `diffrax.ODETerm`.
+
     Raises:
-        TypeError: what is no system. ImportError: diffrax is not installed; it comes with the extra "interop".
+        TypeError: what is no system.
+        ImportError: diffrax is not installed; it comes with the extra "interop".
 
     >>> import diffrax, jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q)
@@ -102,10 +123,13 @@ def diffrax_term(system):
 
 
 class ScipyRHS(NamedTuple):
-    """For `scipy.integrate.solve_ivp(fun, (t0, t1), y0, jac=jac)`.
+    """For `scipy.integrate.solve_ivp(fun, (t0, t1), y0, jac=jac)`; made by `scipy_rhs`.
 
-    fun: (t, y) -> y', (N,), and jac: (t, y) -> (N, N), compiled, of NumPy arrays. y0: (N,). unravel: y (N,), or
-    (N, times) as the result has it, -> (q, v), or as `FlatODE` has it, with a leading axis of times.
+    Attributes:
+        fun: (t, y) -> y', (N,), compiled, of NumPy arrays.
+        jac: (t, y) -> (N, N), the same.
+        y0: (N,).
+        unravel: y (N,), or (N, times) as the result has it, -> as `FlatODE` has it, with a leading axis of times.
     """
 
     fun: Any
@@ -122,6 +146,9 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
 
     Args:
         system, q0, v0, params, t0, z0: as in `simulate`, in double precision.
+
+    Returns:
+        A `ScipyRHS`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; initial values that violate a constraint; single

@@ -45,6 +45,18 @@ def or_plain(run: Callable):
     """run(), or the same on plain JAX where XLA refuses what the machinery has made of it; a warning says so.
 
     The last resort of programs that start here: inside a jit of the user's, XLA is not asked before he has left it.
+
+    Args:
+        run: a function without arguments.
+
+    Returns:
+        What run returns.
+
+    Raises:
+        what run raises on plain JAX.
+
+    >>> or_plain(lambda: 1.0)
+    1.0
     """
     try:
         return run()
