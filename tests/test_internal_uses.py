@@ -83,16 +83,25 @@ def test_held_inputs_restart_internal_states(stepper):
     assert np.log2(changes[0] / changes[1]) == pytest.approx(2, abs=0.15)
 
 
-def test_z0_can_be_fitted():
-    system, stepper = linear_rates(A[:, :] * [1, 1, 1, 0]), hhtjax.hht(linearize="predictor")
+def test_z0_of_several_records_is_fitted_along():
+    """As a start that each record has of its own, with a parameter of g that they share."""
+    system = hhtjax.System(
+        jnp.ones(1), lambda q, v, z, t, params: z - 9.0 * q, internal=lambda q, v, z, t, params: -params["rate"] * z - v
+    )
 
-    def path(unknown):
-        z0 = jnp.stack([unknown["z0"], jnp.zeros(())])
-        return hhtjax.simulate(system, stepper, *STATES[:2], z0=z0, dt=0.02, num_steps=100).q
+    def path(params, start):
+        run = hhtjax.simulate(system, hhtjax.newmark(linearize="predictor"), *STATES[:2], params, z0=start["z"],
+                              dt=0.05, num_steps=40)  # fmt: skip
+        return run.q
 
-    measured = path({"z0": jnp.array(0.7)})
-    result = hhtjax.fit(lambda unknown: path(unknown) - measured, {"z0": 0.1})
-    assert float(result.params["z0"]) == pytest.approx(0.7, abs=1e-6)
+    true, starts = {"rate": 2.0}, {"z": jnp.array([[0.7], [-1.5]])}
+    records = jax.vmap(lambda start: path(true, start))(starts)
+    result = hhtjax.fit(
+        lambda params, start, record: path(params, start) - record,
+        {"rate": 1.0}, records=records, starts=jax.tree.map(jnp.zeros_like, starts),
+    )  # fmt: skip
+    assert float(result.params["rate"]) == pytest.approx(2.0, rel=1e-6)
+    np.testing.assert_allclose(result.starts["z"], starts["z"], rtol=1e-5)
 
 
 def test_sweeps_on_disk(tmp_path):

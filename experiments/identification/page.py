@@ -1,4 +1,4 @@
-"""README.md beside this file, made from page.md and the numbers of six experiments.
+"""README.md beside this file, made from page.md and the numbers of seven experiments.
 
 `python -m experiments.identification.page`
 """
@@ -13,7 +13,7 @@ from experiments.page import find, table
 HERE = Path(__file__).parent
 SHOWN = ("non-iterative, alpha = 0", "non-iterative, alpha = -0.3", "converged, alpha = 0", "Kim's step, alpha = 0")
 STEPS = 0.04, 0.01, 0.0025  # s
-MEASURED = "silverbox", "silverbox_comparison", "double_pendulum_measured"
+MEASURED = "silverbox", "silverbox_comparison", "double_pendulum_measured", "bouc_wen"
 GENERATED = "stiff_joint", "vehicle", "squeezer"
 
 
@@ -80,6 +80,28 @@ def pendulum_pieces(numbers):
     }
 
 
+def bouc_wen_pieces(numbers):
+    """Tables of Bouc-Wen's hysteresis."""
+    by_steps = [
+        [f"{row['substeps']}, alpha = {row['alpha']:g}", f"{row['multisine_m']:.2g} m",
+         f"{row['sinesweep_m']:.2g} m" if "sinesweep_m" in row else ""]
+        for row in numbers["true_parameters"]
+    ]  # fmt: skip
+    half = numbers["with_half_the_step"]
+    names = list(numbers["off_by_percent"])
+    off = [
+        [f"{by['substeps']} steps", *(f"{by['off_by_percent'][name]:+.3f} %" for name in names)]
+        + [f"{by[f'{test}_identified_m']:.2g} m" for test in ("multisine", "sinesweep")]
+        for by in (numbers, half)
+    ]
+    return {
+        "bouc_wen_steps": table(["steps in a sample", "multisine", "sweep"], by_steps),
+        "bouc_wen_off": table(["in a sample", *names, "multisine", "sweep"], off),
+        "bouc_wen_train": numbers["train_m"],
+        "bouc_wen_others": ", ".join(f"{x:.2g} m ({name})" for name, x in numbers["black_boxes_multisine_m"].items()),
+    }
+
+
 def covered(found):
     """Intervals that hold the truth, and their median half-width."""
     names = list(found["over_truth_with_interval"])
@@ -112,6 +134,7 @@ def page(numbers):
             piece=numbers["silverbox_comparison"]["far_starts_samples"],
             far=far_table(numbers["silverbox_comparison"]["far_starts"]),
             **pendulum_pieces(numbers["double_pendulum_measured"]),
+            **bouc_wen_pieces(numbers["bouc_wen"]),
             stiff_records=stiff["records"],
             stiff_converged=stiff["converged"],
             stiff_cost=stiff["largest_cost_per_residual"],

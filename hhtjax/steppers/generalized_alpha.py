@@ -184,7 +184,8 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         max_iterations: Newton iterations before a step counts as failed (iterations=None only).
         start: "simple", a0 = w0; "corrected", a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order
             value. q, v and w are of order 2 with both; only a needs the correction, which blows up when
-            h exceeds the fastest time scale of the system. Default: simple; corrected with constraints.
+            h exceeds the fastest time scale of the system. Default: simple; corrected with constraints. Internal
+            states start simple always.
         formulation: of constraints. "ggl": Phi = 0 and dPhi/dt = 0, by one more multiplier for each (Gear,
             Gupta, Leimkuhler 1985); "index3": Phi = 0 alone, of index 3 as an equation. With constraints the one
             linearisation is at the predictor.
