@@ -65,7 +65,9 @@ def style():
     return mpl.rc_context(PARAMETERS)
 
 
-def subplots(rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float | None = None, **options: Any):
+def subplots(
+    rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float | None = None, **options: Any
+) -> tuple[Any, Any]:
     """A figure and its axes as of `plt.subplots`, in this style, with sizes in mm.
 
     Args:
