@@ -59,8 +59,9 @@ def result():
 
 
 def sizes(figure):
-    """Of all text that a figure shows, in pt; after drawing, when ticks have their labels."""
-    figure.canvas.draw()
+    """Of all text that a figure shows, in pt; after drawing, when ticks get their labels, where other sizes hold."""
+    with mpl.rc_context({"font.size": 12, "xtick.labelsize": 12, "ytick.labelsize": 12}):
+        figure.canvas.draw()
     texts = figure.findobj(mpl.text.Text)
     return {text.get_text(): text.get_fontsize() for text in texts if text.get_text().strip() and text.get_visible()}
 

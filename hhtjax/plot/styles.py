@@ -59,8 +59,8 @@ def style():
     >>> import matplotlib, hhtjax
     >>> with hhtjax.plot.style():
     ...     inside = matplotlib.rcParams["font.size"]
-    >>> inside, matplotlib.rcParams["font.size"]
-    (8.0, 10.0)
+    >>> inside
+    8.0
     """
     return mpl.rc_context(PARAMETERS)
 
