@@ -1,6 +1,7 @@
 """Figs. 9-15, the spinning top: as the paper solved it, as a rotation alone, and with one linear solve per step."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +107,7 @@ def motion_figure(times, path, true):
     axes[0, 0].remove()
     fine = np.linspace(0, DURATION, 2001)
     x, _, R, Om = exact(fine)
-    space = drawn.add_subplot(2, 2, 1, projection="3d")
+    space: Any = drawn.add_subplot(2, 2, 1, projection="3d")
     space.plot(*x.T, color=COLOURS[0], lw=1, label="exact")
     space.plot(*path[0].T, MARKERS[0], color=COLOURS[1], ms=2.5, label="non-iterative, 100 steps")
     space.plot(*zip((0, 0, 0), x[0], strict=True), color="black", lw=1)
