@@ -95,6 +95,7 @@ def test_trajectory_draws_into_axes_given_run_after_run(run, swing):
     multipliers = plot.trajectory(swing, "multipliers", units="N")
     assert labels(multipliers) == ["L[0]"]
     np.testing.assert_array_equal(multipliers.lines[0].get_ydata(), swing.multipliers[:, 0])
+    assert labels(plot.trajectory(swing, units={"[0]": "m", "[1]": "mm"})) == ["q[0] (m)", "q[1] (mm)"]
 
 
 def test_phase_plane(run):
