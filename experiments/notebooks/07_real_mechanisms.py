@@ -2,8 +2,8 @@
 # # 7. Real mechanisms: friction, hysteresis, impacts
 #
 # Joints stick, rubber remembers, parts collide. What can be done today, with smooth stand-ins, and what that costs; and
-# what the library does not have yet: set-valued Coulomb friction, internal states beside `q` and `v`, and events that
-# are located within a step. Where a stand-in is at its limit, this notebook shows the limit.
+# what the library does not have yet: set-valued Coulomb friction, and events that are located within a step. Where a
+# stand-in is at its limit, this notebook shows the limit.
 
 # %%
 import jax
@@ -112,42 +112,43 @@ for name, (_, error) in curves.items():
 #
 # $$m\ddot q + c\dot q + k q + z = u(t), \qquad \dot z = A\dot q - \beta\,(\gamma\,|\dot q|\,z + \delta\,\dot q\,|z|)$$
 #
-# A `System` has no place for $z$ yet. A `FirstOrderSystem` has: $y = (q, v, z)$, any pytree, and every method takes it.
-# What is lost: mass matrices, constraints and rotations; the solution's `q` is $y$.
+# `System(mass, force, internal=)` has a place for such **internal states**, any pytree: `internal` is their rate, the
+# force takes them too, and runs take a `z0`. They are solved along with the motion, in the one linear solve of a step.
 
 
 # %%
-def rate(y, t, p):
-    q, v, z = y["q"], y["v"], y["z"]
+def mount_force(q, v, z, t, p):
     u = p["amplitude"] * t * jnp.sin(2 * jnp.pi * p["frequency"] * t)  # grows with time
-    zdot = p["A"] * v - p["beta"] * (p["gamma"] * jnp.abs(v) * z + p["delta"] * v * jnp.abs(z))
-    return {"q": v, "v": (u - p["c"] * v - p["k"] * q - z) / p["m"], "z": zdot}
+    return u - p["c"] * v - p["k"] * q - z
 
 
-mount = hhtjax.FirstOrderSystem(rate)
+def rate(q, v, z, t, p):
+    return p["A"] * v - p["beta"] * (p["gamma"] * jnp.abs(v) * z + p["delta"] * v * jnp.abs(z))
+
+
+mount = hhtjax.System(lambda q, p: jnp.reshape(p["m"], (1,)), mount_force, internal=rate)
 rubber = {"m": 2.0, "c": 10.0, "k": 5e4, "A": 5e4, "beta": 1e3, "gamma": 0.8, "delta": -1.1}
 rubber |= {"amplitude": 120.0, "frequency": 5.0}  # N/s, Hz
-y0 = {"q": jnp.zeros(()), "v": jnp.zeros(()), "z": jnp.zeros(())}
-loops = hhtjax.simulate(mount, hhtjax.hht(), y0, params=rubber, dt=2e-4, num_steps=10000)
+rest = jnp.zeros(1)
+loops = hhtjax.simulate(mount, hhtjax.hht(), rest, rest, rubber, z0=rest, dt=2e-4, num_steps=10000)
 loops.check()
 
 figure, axes = hhtjax.plot.subplots(width=100, height=75)
 for i, end in enumerate((0.6, 1.2, 2.0)):
     cycle = (loops.t > end - 1 / rubber["frequency"]) & (loops.t <= end)
-    axes.plot(
-        1e3 * loops.q["q"][cycle], loops.q["z"][cycle], ls=hhtjax.plot.LINES[i], label=f"cycle that ends at {end} s"
-    )
+    axes.plot(1e3 * loops.q[cycle, 0], loops.z[cycle, 0], ls=hhtjax.plot.LINES[i], label=f"cycle that ends at {end} s")
 axes.set(xlabel="displacement (mm)", ylabel="hysteretic force z (N)")
 axes.legend()
 plt.show()
 last = loops.t > loops.t[-1] - 1 / rubber["frequency"]
-eaten = float(jnp.sum((loops.q["z"] * loops.q["v"])[last]) * 2e-4)
-damped = float(jnp.sum(rubber["c"] * loops.q["v"][last] ** 2) * 2e-4)
+eaten = float(jnp.sum((loops.z * loops.v)[last]) * 2e-4)
+damped = float(jnp.sum(rubber["c"] * loops.v[last] ** 2) * 2e-4)
 print(f"the hysteresis takes {1e3 * eaten:.0f} mJ out of the last cycle, the damper {1e3 * damped:.1f} mJ")
 
 # %% [markdown]
 # **Look at** the area inside a loop: the energy that a cycle loses. Small motions hardly open a loop; large ones lose
-# much.
+# much. `hhtjax.scenes` has more that remembers: friction with bristles that bend before they slip (`lugre`), a rubber
+# mount of Maxwell branches (`maxwell`), a motor with its controller (`motor_joint`).
 #
 # ## A bouncing ball: a stiff contact
 #

@@ -199,7 +199,7 @@ def _ode(system, t, y, params):
     if not isinstance(y, (tuple, list)) or len(y) != 2 + internal:
         expected = "(q, v, z), three pytrees" if internal else "(q, v), two pytrees"
         raise TypeError(f"ode: `y` must be {expected}; received {y!r}.")
-    q, v, z = (*y, None)[:3]
+    q, v, z = y if internal else (*y, None)
     flat, q, v = flatten("ode", system, q, v, t, params, z)
     at = q, v, jnp.asarray(t).astype(q.dtype), params
     w = acceleration_and_multipliers(flat, *at)[0] if flat.num_constraints else flat.acceleration(*at)
@@ -216,8 +216,8 @@ class _FlatRate(Description):
     def unravel(self, y):
         """(q, v), or (q, v, z), or y."""
         parts = jnp.split(y, np.cumsum(self.sizes)[:-1])
-        found = tuple(unravel(part) for unravel, part in zip(self.unravels, parts, strict=True))
-        return found if len(found) > 1 else found[0]
+        found = [unravel(part) for unravel, part in zip(self.unravels, parts, strict=True)]
+        return tuple(found) if len(found) > 1 else found[0]
 
     def __call__(self, t, y, params):
         return ravel_pytree(_ode(self.system, t, self.unravel(y), params))[0]
