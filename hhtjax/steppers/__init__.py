@@ -26,7 +26,8 @@ stepper                            order                 solves per step   for
 =================================  ====================  ================  ==========================================
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
-Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it.
+Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it. Internal
+states are for the `hht` family, `rosenbrock`, `rowda` and `rk4`.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
 of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
@@ -68,6 +69,8 @@ A stepper of your own
 A family is a frozen dataclass that derives from `Stepper` and has three things, on vectors q, v of a flat system: its
 `order`; `begin`, the `State` at the start; and `bind`, which does once what is constant and returns the function State
 -> (State, Info) of one step. Everything else (pytrees, runs, sweeps, gradients, analysis, fits) then works with it.
+First-order and internal states are rates without positions, behind the others in v and w; `system.move` leaves them
+out, and a family that knows them sets `solves_internal = True`.
 
 >>> from dataclasses import dataclass
 >>> from hhtjax import Info, State, Stepper
@@ -79,7 +82,7 @@ A family is a frozen dataclass that derives from `Stepper` and has three things,
 ...     def bind(self, system, params, dt):
 ...         def step(s):
 ...             v = s.v + dt * s.w
-...             q = s.q + dt * v
+...             q = system.move(s.q, dt * v)
 ...             return State(s.t + dt, q, v, system.acceleration(q, v, s.t + dt, params)), Info()
 ...         return step
 >>> run = hhtjax.simulate(oscillator, SemiImplicitEuler(), *start, dt=1e-3, num_steps=1000)
@@ -97,7 +100,8 @@ Sources
 * H. Hilber, T. Hughes, R. Taylor, Earthquake Eng. Struct. Dyn. 5 (1977) 283-292: `hht`.
 * M. Kim et al., J. Mech. Sci. Tech. 33 (2019) 1087-1096: the non-iterative step; `kim_hht`, `conventional_hht`.
 * M. Arnold, O. Bruls, Multibody Syst. Dyn. 18 (2007) 185-202: second order with M(q) and constraints.
-* K. Jansen, C. Whiting, G. Hulbert, Comput. Methods Appl. Mech. Eng. 190 (2000) 305-319: first-order systems.
+* K. Jansen, C. Whiting, G. Hulbert, Comput. Methods Appl. Mech. Eng. 190 (2000) 305-319: first-order systems;
+  so are internal states solved.
 * W. Wood, M. Bossak, O. Zienkiewicz, Int. J. Numer. Methods Eng. 15 (1980) 1562-1566: `bossak`.
 * J. Chung, G. Hulbert, J. Appl. Mech. 60 (1993) 371-375: `generalized_alpha`.
 * A. Cardona, M. Geradin, Computers & Structures 33 (1989) 801-820: constraints and rotations.

@@ -54,10 +54,10 @@ beside it: an end stop, a joint, a damper. Matrices may be SciPy's sparse ones, 
 Other packages
 --------------
 
-`hhtjax.interop.diffrax_term` is a system as a diffrax term, with (q, v) for its state, and `hhtjax.interop.scipy_rhs`
-what SciPy's `solve_ivp` takes, Jacobian included; constraints are reduced to index 1. params may hold modules of
-equinox, a force that is a neural network among them: `simulate`, `sweep` and `fit` take them as they are, and
-`equinox.filter_grad` gives derivatives.
+`hhtjax.interop.diffrax_term` is a system as a diffrax term, with (q, v), or (q, v, z), for its state, and
+`hhtjax.interop.scipy_rhs` what SciPy's `solve_ivp` takes, Jacobian included; constraints are reduced to index 1. params
+may hold modules of equinox, a force that is a neural network among them: `simulate`, `sweep` and `fit` take them as
+they are, and `equinox.filter_grad` gives derivatives.
 
 Inputs
 ------
