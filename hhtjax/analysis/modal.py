@@ -19,19 +19,31 @@ SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first 
 
 
 class NormalModes(NamedTuple):
-    """frequencies: (count,), rad/s, lowest first, 0 for rigid motions. shapes: T, (n, count), with T^T M T = 1."""
+    """What `modes` returns, of free vibration about rest.
+
+    Attributes:
+        frequencies: (count,), rad per unit of time, lowest first, 0 for rigid motions.
+        shapes: T, (n, count), a mode in each column, with T^T M T = 1 and the largest entry of a column positive.
+    """
 
     frequencies: Any
     shapes: Any
 
 
 class ModalReduction(NamedTuple):
-    """What `modal_reduction` returns: the reduced system, and the way to it and back."""
+    """What `modal_reduction` returns: the reduced system, and the way to it and back.
+
+    Attributes:
+        system: the `LinearSystem` of the modal coordinates x, (count,).
+        frequencies: (count,), rad per unit of time, lowest first.
+        shapes: T, (n, count), q = T x.
+        inverse: T^T M, (count, n), x = T^T M q.
+    """
 
     system: LinearSystem
     frequencies: Any
-    shapes: Any  # T, (n, count)
-    inverse: Any  # T^T M, (count, n)
+    shapes: Any
+    inverse: Any
 
     def expand(self, q):
         """Coordinates (..., n) of modal ones (..., count), T q: positions, velocities, accelerations."""
@@ -50,6 +62,9 @@ def modes(M, K, count=None) -> NormalModes:
             diagonals, or matrices of scipy.sparse of any size. With more than 1000 rows these are solved by Lanczos's
             iteration on the shifted inverse (`scipy.sparse.linalg.eigsh`), the others by NumPy.
         count: how many; None for all.
+
+    Returns:
+        `NormalModes`, NumPy arrays.
 
     Raises:
         TypeError, ValueError: matrices of a wrong kind or shape, not symmetric, or indefinite; a count out of range.
@@ -231,7 +246,7 @@ def _by_lanczos(M, K, count):
         except (RuntimeError, ArpackError):  # a singular factor; no convergence
             continue
         order = np.argsort(squares)
-        squares, T = squares[order], T[:, order]
+        squares, T = squares[order], np.asarray(T)[:, order]
         T = T / np.sqrt(np.sum(T * (M @ T), axis=0))
         left, rounding = np.abs(K @ T - (M @ T) * squares), np.finfo(float).eps * (abs(K) @ np.abs(T))
         if np.all(left <= 1e-6 * np.abs(squares[-1]) * np.max(np.abs(M @ T), axis=0) + 1e3 * rounding):

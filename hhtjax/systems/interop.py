@@ -33,6 +33,12 @@ def ode(system):
 
     Traceable and differentiable; of equal systems equal, also as a pytree.
 
+    Args:
+        system: a `System`, `LinearSystem` or `FirstOrderSystem`.
+
+    Returns:
+        (t, y, params) -> y', structured like y, but with the rate of a rotation matrix (3, 3) in its place.
+
     Raises:
         TypeError: what is no system; when called, a y that is no (q, v).
 
@@ -48,8 +54,13 @@ def ode(system):
 
 
 class FlatODE(NamedTuple):
-    """rate: (t, y, params) -> y' on vectors (N,), traceable; y0: (N,); unravel: y -> (q, v), or of a first-order system
-    the pytree y."""
+    """What `flat_ode` returns.
+
+    Attributes:
+        rate: (t, y, params) -> y' on vectors (N,), traceable.
+        y0: (N,), the start.
+        unravel: y (N,) -> (q, v), pytrees; of a first-order system the pytree y.
+    """
 
     rate: Any
     y0: Any
@@ -61,6 +72,9 @@ def flat_ode(system, q0, v0=None) -> FlatODE:
 
     Args:
         system, q0, v0: as in `simulate`.
+
+    Returns:
+        A `FlatODE`.
 
     Raises:
         TypeError, ValueError: as `simulate`, for these.
@@ -88,8 +102,15 @@ def diffrax_term(system):
     that diffrax does with an ODE is there: step-size control, events, adjoints. Inputs that are held,
     `sampled(order=0)`, jump: tell the step-size controller, `diffrax.ClipStepSizeController(..., jump_ts=)`.
 
+    Args:
+        system: a `System`, `LinearSystem` or `FirstOrderSystem`.
+
+    Returns:
+        A `diffrax.ODETerm`.
+
     Raises:
-        TypeError: what is no system. ImportError: diffrax is not installed; it comes with the extra "interop".
+        TypeError: what is no system.
+        ImportError: diffrax is not installed; it comes with the extra "interop".
 
     >>> import diffrax, jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q)
@@ -107,8 +128,11 @@ def diffrax_term(system):
 class ScipyRHS(NamedTuple):
     """For `scipy.integrate.solve_ivp(fun, (t0, t1), y0, jac=jac)`.
 
-    fun: (t, y) -> y', (N,), and jac: (t, y) -> (N, N), compiled, of NumPy arrays. y0: (N,). unravel: y (N,), or
-    (N, times) as the result has it, -> (q, v), with a leading axis of times.
+    Attributes:
+        fun: (t, y) -> y', (N,), compiled, of NumPy arrays.
+        y0: (N,), the start.
+        unravel: y (N,), or (N, times) as the result has it, -> (q, v), pytrees, then with a leading axis of times.
+        jac: (t, y) -> the derivative of fun with respect to y, (N, N), compiled.
     """
 
     fun: Any
@@ -125,6 +149,9 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0) -> ScipyRHS:
 
     Args:
         system, q0, v0, params, t0: as in `simulate`, in double precision.
+
+    Returns:
+        A `ScipyRHS`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; initial values that violate a constraint; single

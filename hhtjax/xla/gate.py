@@ -45,6 +45,19 @@ def or_plain(run: Callable):
     """run(), or the same on plain JAX where XLA refuses what the machinery has made of it; a warning says so.
 
     The last resort of programs that start here: inside a jit of the user's, XLA is not asked before he has left it.
+
+    Args:
+        run: a function without arguments; where the machinery is on and XLA refuses, it is called twice.
+
+    Returns:
+        What run returns.
+
+    Raises:
+        jax.errors.JaxRuntimeError: XLA refuses the plain program too, or the machinery is off; whatever else run raises.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> float(hhtjax.xla.or_plain(lambda: jnp.sum(jnp.ones(3))))
+    3.0
     """
     try:
         return run()
