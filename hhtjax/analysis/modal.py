@@ -239,14 +239,14 @@ def _by_lanczos(M, K, count):
     if not np.min(diagonals[1]) > 0:
         raise ValueError("modes: `M` must be positive definite; received one with a diagonal that is not positive.")
     scale = np.max(diagonals[0] / diagonals[1])
-    start = np.random.default_rng(0).standard_normal(M.shape[0])
+    start = np.random.default_rng(0).standard_normal(len(diagonals[1]))
     for shift in SHIFTS:
         try:
             squares, T = eigsh(K, count, M, sigma=-shift * scale, v0=start)
         except (RuntimeError, ArpackError):  # a singular factor; no convergence
             continue
         order = np.argsort(squares)
-        squares, T = squares[order], np.asarray(T)[:, order]
+        squares, T = squares[order], T[:, order]
         T = T / np.sqrt(np.sum(T * (M @ T), axis=0))
         left, rounding = np.abs(K @ T - (M @ T) * squares), np.finfo(float).eps * (abs(K) @ np.abs(T))
         if np.all(left <= 1e-6 * np.abs(squares[-1]) * np.max(np.abs(M @ T), axis=0) + 1e3 * rounding):

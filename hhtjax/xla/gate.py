@@ -53,7 +53,7 @@ def or_plain(run: Callable):
         What run returns.
 
     Raises:
-        jax.errors.JaxRuntimeError: XLA refuses the plain program too, or the machinery is off; whatever else run raises.
+        jax.errors.JaxRuntimeError: XLA refuses the plain program too, or the machinery is off. And whatever run raises.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> float(hhtjax.xla.or_plain(lambda: jnp.sum(jnp.ones(3))))
