@@ -46,9 +46,9 @@ def as_json(x, indent=0):
 
 
 def reduce_colours(path):
-    """A PNG of 128 colours, a third as large: it lies in the repository."""
+    """A PNG of 256 colours, a third as large: it lies in the repository."""
     with Image.open(path) as image:
-        small = image.convert("RGB").quantize(128, dither=Image.Dither.NONE)
+        small = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         dpi = image.info["dpi"]
     small.save(path, optimize=True, dpi=dpi)
 

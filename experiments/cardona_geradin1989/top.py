@@ -1,6 +1,7 @@
 """Figs. 9-15, the spinning top: as the paper solved it, as a rotation alone, and with one linear solve per step."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +107,7 @@ def motion_figure(times, path, true):
     axes[0, 0].remove()
     fine = np.linspace(0, DURATION, 2001)
     x, _, R, Om = exact(fine)
-    space = drawn.add_subplot(2, 2, 1, projection="3d")
+    space: Any = drawn.add_subplot(2, 2, 1, projection="3d")
     space.plot(*x.T, color=COLOURS[0], lw=1, label="exact")
     space.plot(*path[0].T, MARKERS[0], color=COLOURS[1], ms=2.5, label="non-iterative, 100 steps")
     space.plot(*zip((0, 0, 0), x[0], strict=True), color="black", lw=1)
@@ -114,7 +115,7 @@ def motion_figure(times, path, true):
     space.tick_params(pad=-1)
     space.set_box_aspect(None, zoom=0.85)
     space.set(xticks=(-0.5, 0, 0.5), yticks=(0, 0.5, 1), zticks=(-1, -0.5, 0))
-    space.legend(loc="upper left")
+    space.legend(loc="upper left", bbox_to_anchor=(-0.3, 1.1))
     panels = axes.flat[1:]
     psi = np.array(jax.vmap(log)(jnp.asarray(R)))
     jumps = np.abs(np.diff(psi, axis=0)).max(axis=1) > 1
@@ -148,12 +149,15 @@ def methods_figure(times, paths, true):
             panel.plot(times, paths[name][1][:, 0], color=COLOURS[i], lw=1, label=name.replace("alpha", "$\\alpha$"))
         panel.plot(times, true[1][:, 0], color="black", ls=":", lw=1, label="exact")
         panel.set(xlabel="time (s)", ylabel="$\\ddot x$ (m/s$^2$)")
-        legend(panel, title=f"{title}: acceleration of the disk")
+        panel.set_title(f"{title}: acceleration")
     for i, name in enumerate(FIGURED):
         distance = np.linalg.norm(paths[name][0] - true[0], axis=1)
         panels[2].semilogy(times[2:], distance[2:], color=COLOURS[i], lw=1.2, label=name.replace("alpha", "$\\alpha$"))
     panels[2].set(xlabel="time (s)", ylabel="distance (m)")
-    legend(panels[2], title="Fig. 15: distance from the exact path")
+    panels[2].set_title("Fig. 15: from the exact path")
+    key = dict(zip(*reversed(panels[2].get_legend_handles_labels()), strict=True))
+    key["exact"] = panels[0].lines[-1]
+    drawn.legend(key.values(), key.keys(), loc="outside lower center", ncols=3)
     return drawn
 
 

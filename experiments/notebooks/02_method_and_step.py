@@ -82,7 +82,7 @@ def order_of(stepper, num_steps, **options):
 
 
 fine = hhtjax.simulate(scene.system, hhtjax.rk4(), *start, dt=10.0 / 20000, num_steps=20000, save_every=20000)
-found = {name: order_of(s, (50, 100, 200, 400, 800, 1600), reference=fine.q[-1]) for name, s in candidates.items()}
+found = {name: order_of(s, (200, 400, 800, 1600, 3200), reference=fine.q[-1]) for name, s in candidates.items()}
 axes = hhtjax.plot.error_against_h(found, unit="m")
 axes.figure.set_size_inches(5.6, 3.6)
 plt.show()

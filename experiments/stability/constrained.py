@@ -17,7 +17,7 @@ METHODS = {
     "index 3\nNewton": partial(hht, formulation="index3", iterations=None),
     "index 3\none solve": partial(hht, formulation="index3"),
 }
-INDEX_3 = "Index 3 with alpha = 0: multipliers grow with every step, by a Jordan block at infinity; GGL has none."
+INDEX_3 = "Index 3 with alpha = 0: multipliers grow with every step, by a Jordan block; GGL has none."
 CAUSES = {
     "pendulum on a rod": INDEX_3,
     "slider-crank": INDEX_3,

@@ -65,7 +65,7 @@ def page(scenes, causes):
     """Cells as of `cells`: scenes down, with why methods fail; methods across; the step shrinks to the right."""
     methods = list(next(iter(scenes.values()))["grades"])
     columns = max(len(row) for by_method in scenes.values() for rows in by_method["grades"].values() for row in rows)
-    pitch = 5.5 if causes else 4
+    pitch = 4 + 1.5 * max((len(wrap(why, 95)) for why in causes.values()), default=0)
     figure, axes = subplots(width=175, height=30 + 2 * pitch * len(scenes))
     style = {
         "cmap": ListedColormap(list(GRADES.values())),
@@ -80,7 +80,8 @@ def page(scenes, causes):
             x = (columns + 1) * column + np.arange(grades.shape[1] + 1)
             axes.pcolormesh(x, pitch * row + np.linspace(0, 3, len(grades) + 1), grades, **style)
         if causes:
-            line = axes.text(0, pitch * row + 4.1, causes.get(name, ""), va="center", style="italic", color="#444444")
+            why = "\n".join(wrap(causes.get(name, ""), 95))
+            line = axes.text(0, pitch * row + 3.2, why, va="top", style="italic", color="#444444")
             line.set_in_layout(False)
     axes.set_xticks(
         (columns + 1) * np.arange(len(methods)) + columns / 2, ["\n".join(wrap(name, 10)) for name in methods]

@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_integer
 from hhtjax.description import Description, is_concrete
+from hhtjax.description.presentation import shown
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import SYMMETRIC, constant_matrix, is_sparse, require_mass
 
@@ -18,6 +19,7 @@ UNCOUPLED = 1e-9  # size of what couples modes, relative to their damping, that 
 SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first that is no eigenvalue
 
 
+@shown
 class NormalModes(NamedTuple):
     """What `modes` returns, of free vibration about rest.
 
@@ -30,6 +32,7 @@ class NormalModes(NamedTuple):
     shapes: Any
 
 
+@shown
 class ModalReduction(NamedTuple):
     """What `modal_reduction` returns: the reduced system, and the way to it and back.
 

@@ -64,13 +64,15 @@ def style():
     >>> import matplotlib, hhtjax
     >>> with hhtjax.plot.style():
     ...     inside = matplotlib.rcParams["font.size"]
-    >>> inside, matplotlib.rcParams["font.size"]
-    (8.0, 10.0)
+    >>> inside
+    8.0
     """
     return mpl.rc_context(PARAMETERS)
 
 
-def subplots(rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float | None = None, **options: Any):
+def subplots(
+    rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float | None = None, **options: Any
+) -> tuple[Any, Any]:
     """A figure and its axes as of `plt.subplots`, in this style, with sizes in mm.
 
     Args:
@@ -81,6 +83,9 @@ def subplots(rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: 
 
     Returns:
         The figure, and its axes as `plt.subplots` gives them: one, (n,) or (rows, columns).
+
+    Returns:
+        A figure, and its axes: one, or an array of them.
 
     Raises:
         TypeError, ValueError: rows, columns, width or height is no positive number.
@@ -211,6 +216,14 @@ def save(figure, path, formats: Sequence[str] = ("png",)) -> list[Path]:
         figure: of matplotlib.
         path: without ending; its folder must exist.
         formats: a tuple of "png", "pdf", "svg".
+
+    Returns:
+        The paths of the files.
+
+    Args:
+        figure: of matplotlib.
+        path: with or without the folder, without a suffix.
+        formats: which files.
 
     Returns:
         The paths of the files.

@@ -64,7 +64,8 @@ members as `.npz`, continues where it was killed, and refuses other inputs. On a
     mesh = jax.make_mesh((jax.device_count(),), ("members",))
     sweep = hhtjax.sweep(pendulum, hhtjax.hht(), q0, v0, params, dts=dts, duration=2.0, num_samples=20, mesh=mesh)
 
-The results are bitwise those of one device. What this costs, with large systems (`hht(solve=hhtjax.banded(p))`, or
+The results are those of one device, to rounding: devices get blocks of members of their own, which XLA may compile
+otherwise. What this costs, with large systems (`hht(solve=hhtjax.banded(p))`, or
 `conjugate_gradients(k)`, whose steps grow with the number of unknowns) and a step at 1 kHz, is on a page,
 `experiments/sweeps/README.md`.
 

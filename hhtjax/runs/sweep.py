@@ -56,7 +56,8 @@ def sweep(
             leading axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A stepper with an
             axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
         mesh: devices that share the work, `jax.make_mesh((jax.device_count(),), ("members",))`, also of several
-            processes; each then holds all results, bitwise those of one device.
+            processes; each then holds all results, those of one device to rounding. They lie on all devices: take
+            `jax.device_get` of them before mixing them with others.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
 
     Returns:

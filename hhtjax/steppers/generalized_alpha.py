@@ -216,11 +216,8 @@ def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> 
         beta: in (0, 1]; gamma: in [1/2, 1].
         **options: those of `hht`.
 
-    Returns:
-        A `Stepper`.
-
-    Raises:
-        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+    Returns: a `Stepper`.
+    Raises: TypeError, ValueError: an argument of the wrong kind, or out of its range.
 
     References:
         Newmark (1959); Cardona, Geradin (1989), Eq. 36.
@@ -247,11 +244,8 @@ def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         alpha: in [-1, 0].
         **options: those of `hht`.
 
-    Returns:
-        A `Stepper`.
-
-    Raises:
-        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+    Returns: a `Stepper`.
+    Raises: TypeError, ValueError: an argument of the wrong kind, or out of its range.
 
     References:
         Wood, Bossak, Zienkiewicz (1980); Cardona, Geradin (1989), Sec. 2.
@@ -277,11 +271,8 @@ def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> Genera
         rho_inf: rho, the spectral radius at infinite frequency, in [0, 1].
         **options: those of `hht`.
 
-    Returns:
-        A `Stepper`.
-
-    Raises:
-        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+    Returns: a `Stepper`.
+    Raises: TypeError, ValueError: an argument of the wrong kind, or out of its range.
 
     References:
         Chung, Hulbert (1993); Arnold, Bruls (2007).

@@ -19,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import Description, thaw
+from hhtjax.description.presentation import shown
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.constraints import acceleration_and_multipliers
 from hhtjax.systems.flat_system import flatten
@@ -53,6 +54,7 @@ def ode(system):
     return jax.tree_util.Partial(_ode, system)
 
 
+@shown
 class FlatODE(NamedTuple):
     """What `flat_ode` returns.
 
@@ -125,8 +127,9 @@ def diffrax_term(system):
     return _required("diffrax_term", "diffrax").ODETerm(ode(system))
 
 
+@shown
 class ScipyRHS(NamedTuple):
-    """For `scipy.integrate.solve_ivp(fun, (t0, t1), y0, jac=jac)`.
+    """For `scipy.integrate.solve_ivp(fun, (t0, t1), y0, jac=jac)`; made by `scipy_rhs`.
 
     Attributes:
         fun: (t, y) -> y', (N,), compiled, of NumPy arrays.
