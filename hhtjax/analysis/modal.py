@@ -242,7 +242,7 @@ def _by_lanczos(M, K, count):
     if not np.min(diagonals[1]) > 0:
         raise ValueError("modes: `M` must be positive definite; received one with a diagonal that is not positive.")
     scale = np.max(diagonals[0] / diagonals[1])
-    start = np.random.default_rng(0).standard_normal(len(diagonals[1]))
+    start = np.random.default_rng(0).standard_normal(len(diagonals[0]))
     for shift in SHIFTS:
         try:
             squares, T = eigsh(K, count, M, sigma=-shift * scale, v0=start)

@@ -94,9 +94,6 @@ def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = 
     Returns:
         The axes.
 
-    Returns:
-        The axes.
-
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; points of another shape; times outside the run.
 

@@ -84,9 +84,6 @@ def subplots(
     Returns:
         The figure, and its axes as `plt.subplots` gives them: one, (n,) or (rows, columns).
 
-    Returns:
-        A figure, and its axes: one, or an array of them.
-
     Raises:
         TypeError, ValueError: rows, columns, width or height is no positive number.
 
@@ -216,14 +213,6 @@ def save(figure, path, formats: Sequence[str] = ("png",)) -> list[Path]:
         figure: of matplotlib.
         path: without ending; its folder must exist.
         formats: a tuple of "png", "pdf", "svg".
-
-    Returns:
-        The paths of the files.
-
-    Args:
-        figure: of matplotlib.
-        path: with or without the folder, without a suffix.
-        formats: which files.
 
     Returns:
         The paths of the files.

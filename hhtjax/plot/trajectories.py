@@ -98,9 +98,6 @@ def phase_plane(
     Returns:
         The axes.
 
-    Returns:
-        The axes.
-
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a rotation, which has no such plane.
 
