@@ -36,8 +36,8 @@ def public_names():
             is_at_top = getattr(hhtjax, name, None) is getattr(room, name)
             names[f"hhtjax.{short}.{name}"] = f"hhtjax.{name}" if is_at_top else f"hhtjax.{short}.{name}"
             names[f"{short}.{name}"] = names[f"hhtjax.{short}.{name}"]
-            if short in ("analysis", "identification"):
-                names[name] = names[f"{short}.{name}"]
+            if short in ("analysis", "identification", "interop", "plot"):  # of two with one name the first
+                names.setdefault(name, names[f"{short}.{name}"])
     top = [name for name in hhtjax.__all__ if name not in modules and name != "__version__"]
     return names | {f"hhtjax.{name}": f"hhtjax.{name}" for name in top} | {name: f"hhtjax.{name}" for name in top}
 

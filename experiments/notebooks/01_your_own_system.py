@@ -24,16 +24,14 @@ plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)  # the look of all figures
 # ## The record of the road
 #
 # Real records come with odd time stamps. This one has 300 heights at times that are not equally spaced. `sampled` makes
-# a smooth function of time out of equally spaced values, so we interpolate to these first.
+# a function of time out of them: `order=1` draws straight lines from one to the next, 3 a smooth spline, 0 holds each.
 
 # %%
 rng = np.random.default_rng(1)
 t_road = np.sort(np.append(rng.uniform(0.0, 3.0, 298), [0.0, 3.0]))  # s
 z_road = 0.05 * np.exp(-(((t_road - 1.0) / 0.08) ** 2)) - 0.03 * np.exp(-(((t_road - 1.9) / 0.15) ** 2))  # m
 
-dt_road = 5e-3
-equal = np.arange(0.0, 3.0 + dt_road / 2, dt_road)
-road = hhtjax.sampled(np.interp(equal, t_road, z_road), dt=dt_road, order=1)
+road = hhtjax.sampled(z_road, times=t_road, order=1)
 print(f"time steps of the record: {np.diff(t_road).min() * 1e3:.2f} to {np.diff(t_road).max() * 1e3:.0f} ms")
 
 # %% [markdown]

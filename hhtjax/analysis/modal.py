@@ -21,11 +21,11 @@ SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first 
 
 @shown
 class NormalModes(NamedTuple):
-    """What `modes` found.
+    """What `modes` returns, of free vibration about rest.
 
     Attributes:
-        frequencies: (count,), rad/s, lowest first, 0 for rigid motions.
-        shapes: T, (n, count), with T^T M T = 1.
+        frequencies: (count,), rad per unit of time, lowest first, 0 for rigid motions.
+        shapes: T, (n, count), a mode in each column, with T^T M T = 1 and the largest entry of a column positive.
     """
 
     frequencies: Any
@@ -37,15 +37,16 @@ class ModalReduction(NamedTuple):
     """What `modal_reduction` returns: the reduced system, and the way to it and back.
 
     Attributes:
-        system: the reduced `LinearSystem`.
-        frequencies: (count,), rad/s.
-        shapes: T, (n, count). inverse: T^T M, (count, n).
+        system: the `LinearSystem` of the modal coordinates x, (count,).
+        frequencies: (count,), rad per unit of time, lowest first.
+        shapes: T, (n, count), q = T x.
+        inverse: T^T M, (count, n), x = T^T M q.
     """
 
     system: LinearSystem
     frequencies: Any
-    shapes: Any  # T, (n, count)
-    inverse: Any  # T^T M, (count, n)
+    shapes: Any
+    inverse: Any
 
     def expand(self, q):
         """Coordinates (..., n) of modal ones (..., count), T q: positions, velocities, accelerations."""
@@ -66,7 +67,7 @@ def modes(M, K, count=None) -> NormalModes:
         count: how many; None for all.
 
     Returns:
-        A `NormalModes`.
+        `NormalModes`, NumPy arrays.
 
     Raises:
         TypeError, ValueError: matrices of a wrong kind or shape, not symmetric, or indefinite; a count out of range.

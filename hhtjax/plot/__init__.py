@@ -2,12 +2,13 @@
 
 Every function draws into the axes given as `ax`, or makes a figure, 85 mm wide with 8 pt text, and returns the axes:
 
->>> import jax.numpy as jnp, hhtjax
+>>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
 >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
 >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
 >>> ax = hhtjax.plot.trajectory(run, units="m")
 >>> ax.get_xlabel(), ax.get_ylabel()
 ('t (s)', 'q[0] (m)')
+>>> plt.close(ax.figure)
 
 Nothing is shown, no global setting changed; `hhtjax.plot.save(ax.figure, "run", ("png", "pdf"))` writes files.
 """

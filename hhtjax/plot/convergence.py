@@ -25,29 +25,36 @@ def error_against_h(
 ) -> Any:
     """Error over step size, both logarithmic, with the observed order of each curve and triangles of whole orders.
 
-    The order in the legend is the median of the slopes between neighbours, which rounding at one end, or steps too
-    coarse at the other, leave alone as long as most points are between them. Of a curve that bends, whose slopes are
-    more than 1 apart, the least and the largest are given.
+    Error and order are
+
+        e = sqrt(mean over samples and entries of (q - reference)^2)       of a sweep,
+        p = median over neighbours of log(e_2/e_1) / log(h_2/h_1),
+
+    where rounding at one end, or steps too coarse at the other, leave the median alone as long as most points are
+    between them. Of a curve that bends, whose slopes are more than 1 apart, the least and the largest are given.
 
     Args:
-        dt: step sizes; or an `ObservedOrder`; or a sweep, whose error is the RMS over samples and entries of q less
-            the reference; or several of these by name, {label: sweep} or {label: (dt, error)}.
-        error: as long as dt, where these are step sizes.
-        reference: of a sweep, q like a member's; by default the finest member is it, and not drawn.
-        label: of a single curve. slopes: orders of the triangles; by default the whole numbers that are observed.
-        unit: of the error. time_unit: of dt. ax: axes.
+        dt: step sizes (n,), with `error` as long; or an `ObservedOrder`; or a sweep over step sizes; or several of
+            these by name, {label: sweep} or {label: (dt, error)}.
+        error: (n,); None where dt is one of the others. What is not finite or not positive is left out.
+        reference: of a sweep, q like a member's, at the same times; by default the finest member, which is not drawn.
+        label: of a single curve.
+        slopes: orders of the triangles; by default the whole numbers that are observed.
+        unit: of the error. time_unit: of dt.
+        ax: axes to draw into; None for a figure of its own.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind, shape or value.
+        TypeError, ValueError: an argument of a wrong kind, shape or value; a run that is no sweep.
 
-    >>> import numpy as np, hhtjax
+    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
     >>> h = np.array([0.01, 0.02, 0.04])
     >>> ax = hhtjax.plot.error_against_h(h, 3 * h**2, label="hht", unit="m")
     >>> ax.get_legend().get_texts()[0].get_text(), ax.get_ylabel()
     ('hht: order 2.00', 'error (m)')
+    >>> plt.close(ax.figure)
     """
     given = dt if isinstance(dt, dict) else {label: dt if error is None else (dt, error)}
     curves = {name: _curve(one, reference) for name, one in given.items()}
@@ -165,9 +172,10 @@ def work_precision(
     """Error over the time that it takes, both logarithmic: what lies further down and left is better.
 
     Args:
-        curves: {label: (times, errors)}; what is not finite or not positive is left out.
+        curves: {label: (times, errors)}, two vectors each; what is not finite or not positive is left out.
         ours: labels that are drawn with bold, full lines, the others with thin, broken ones.
-        xlabel, ylabel: with their units, of whatever work is counted in. ax: axes.
+        xlabel, ylabel: with their units, of whatever work and error are counted in.
+        ax: axes to draw into; None for a figure of its own.
 
     Returns:
         The axes.
@@ -175,11 +183,12 @@ def work_precision(
     Raises:
         TypeError, ValueError: curves is no dict, empty, or of arrays of different lengths; ours has other labels.
 
-    >>> import hhtjax
+    >>> import matplotlib.pyplot as plt, hhtjax
     >>> curves = {"hht": ([1e-3, 2e-3], [1e-2, 2.5e-3]), "peer": ([1e-2, 2e-2], [1e-2, 6e-4])}
     >>> ax = hhtjax.plot.work_precision(curves, ours=("hht",), ylabel="error (m)")
     >>> [line.get_linewidth() for line in ax.lines]
     [1.8, 0.9]
+    >>> plt.close(ax.figure)
     """
     if not isinstance(curves, dict) or not curves:
         raise TypeError(f"work_precision: `curves` must be {{label: (times, errors)}}; received {curves!r}.")

@@ -35,26 +35,37 @@ def energy_balance(
     time_unit: str = "s",
     ax: Any = None,
 ) -> Any:
-    """Energies of a run over time, and below them the energy that the method made or lost.
+    """Energies of a run over time, and below them the energy that the method made or lost,
+
+        made by the method(t) = T(t) + V(t) - T(0) - V(0) - W(t),
+
+    with the work W of all forces that have no potential V.
 
     Args:
-        system, solution, params, potential: as in `hhtjax.analysis.energy_balance`; the potential of a system
-            `from_lagrangian` is known. Or an `EnergyBalance` alone.
-        energy: in their place, `energy(q, v, t, params)`, the energy itself, which then is shown with its drift.
-        unit: of energy. time_unit: of t. ax: two axes.
+        system: of the run; or an `EnergyBalance` alone, in place of it and the next three.
+        solution: of one run.
+        params: those of the run.
+        potential: `potential(q, t, params)`, a scalar; that of a system `from_lagrangian` is known. Without one the
+            work is that of all forces.
+        energy: `energy(q, v, t, params)`, a scalar: instead of the balance, this energy is drawn, and below it how far
+            it is from its first value. Then system and potential are not used.
+        unit: of energy. time_unit: of the times.
+        ax: two axes to draw into; None for a figure of its own.
 
     Returns:
-        Two axes, of energies and of the error.
+        Two axes, (2,), of energies and of the error.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value.
+        TypeError, ValueError: an argument of a wrong kind or value; no run, or a batch of them; otherwise as
+        `hhtjax.analysis.energy_balance`.
 
-    >>> import jax.numpy as jnp, hhtjax
+    >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> spring = hhtjax.System.from_lagrangian(lambda q, v, t, params: 0.5 * jnp.sum(v**2) - 2.0 * jnp.sum(q**2))
     >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
     >>> upper, lower = hhtjax.plot.energy_balance(spring, run)
     >>> [line.get_label() for line in upper.lines]
     ['kinetic', 'potential', 'work of other forces', 'kinetic + potential']
+    >>> plt.close(upper.figure)
     """
     if energy is not None:
         t, curves, error, drift = _given_energy(solution, params, energy)

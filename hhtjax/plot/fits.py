@@ -28,28 +28,36 @@ def fit_against_data(
     show: Any = None,
     ax: Any = None,
 ) -> Any:
-    """Measured and simulated output, below them the residual, measured - simulated, and the spectra of both.
+    """Measured and simulated output, below them the residual, measured - simulated, and the spectra of record and
+    residual.
 
-    Spectra are roots of one-sided power spectral densities, means over windows of about a quarter of the record.
+    Spectra are roots of one-sided power spectral densities, by Welch's method: means over half overlapping windows of
+    a quarter to a half of the record, each less its mean. So their unit is the output's over the root of a frequency,
+    and the integral of their square is the variance.
 
     Args:
-        times: (N,), at equal distances. measured, simulated: (N,); NaN where nothing was measured, which counts as a
-            residual of 0 in the spectrum.
-        unit, ylabel: of the output. time_unit: of times. frequency_unit: one over it.
+        times: (N,), at equal distances, N >= 8.
+        measured, simulated: (N,), in one unit; NaN where nothing was measured, which counts as 0 in the spectra.
+        unit, ylabel: of the output, and its name.
+        time_unit: of times. frequency_unit: one over that.
         show: (first, last), the part of the time that is drawn; spectra are of all.
-        ax: three axes.
+        ax: three axes to draw into; None for a figure of its own.
 
     Returns:
-        Three axes: output, residual, spectrum.
+        Three axes, (3,): output, residual, spectra.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind, shape or value.
+        TypeError, ValueError: an argument of a wrong kind, shape or value; times at unequal distances.
 
-    >>> import numpy as np, hhtjax
+    References:
+        Welch, The use of fast Fourier transform for the estimation of power spectra, 1967.
+
+    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
     >>> t = np.arange(256) / 100.0
     >>> upper, middle, lower = hhtjax.plot.fit_against_data(t, np.sin(t), np.sin(t) - 0.1, unit="mV")
     >>> middle.get_ylabel(), round(float(middle.lines[0].get_ydata()[7]), 3), lower.get_xlabel()
     ('residual (mV)', 0.1, 'frequency (Hz)')
+    >>> plt.close(upper.figure)
     """
     times, measured, simulated = _record(times, measured, simulated)
     inside = slice(None)
@@ -107,14 +115,18 @@ def _spectrum(values, rate):
 
 
 def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: Any = None, ax: Any = None) -> Any:
-    """Estimates with their confidence intervals, in per cent of the estimate, or of the truth.
+    """Estimates with their confidence intervals, in per cent of the estimate, or of the truth:
 
-    Args:
-        results: a FitResult, or several of one model by name, {label: result}. level: of the intervals.
-        truth: params, where they are known: what intervals are relative to, instead of the first estimate.
-        entries: which parameters, by name as in `result.summary()`; by default all that were fitted. ax: axes.
+        100 (x - reference) / |reference|,    x: the estimate and the ends of `result.interval(level)`
 
     What the residuals do not determine has a cross and no interval.
+
+    Args:
+        results: a `FitResult` with covariance, or several of one model by name, {label: result}.
+        level: of the intervals, between 0 and 1.
+        truth: params, where they are known: what intervals are relative to, instead of the first estimate.
+        entries: which parameters, by name as in `result.summary()`; by default all that were fitted.
+        ax: axes to draw into; None for a figure of its own.
 
     Returns:
         The axes.
@@ -123,12 +135,13 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
         TypeError, ValueError: an argument of a wrong kind or value; a fit without covariance; a parameter that is 0,
         of which there are no per cent (leave it out by `entries`).
 
-    >>> import jax.numpy as jnp, hhtjax
+    >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> t = jnp.arange(100.0)
     >>> result = hhtjax.fit(lambda p: p["a"] - 2.0 - jnp.sin(t), {"a": 1.0})
     >>> ax = hhtjax.plot.estimates(result)
     >>> [x.get_text() for x in ax.get_yticklabels()], ax.get_xlabel()
     (['a = 2.004'], '95 % interval (% of the estimate)')
+    >>> plt.close(ax.figure)
     """
     require_number("estimates", "level", level, lambda x: 0 < x < 1, "lie between 0 and 1")
     named = results if isinstance(results, dict) else {None: results}
@@ -185,9 +198,11 @@ def _intervals(ax, result, level, kept, size, at, label, number):
 def correlations(result: FitResult, *, ax: Any = None) -> Any:
     """The correlation matrix of the estimates that were fitted; of up to 8 its numbers too.
 
+        R_ij = C_ij / sqrt(C_ii C_jj),    C: the covariance of the fit
+
     Args:
-        result: of `fit`, with its covariance.
-        ax: axes.
+        result: a `FitResult` with covariance.
+        ax: axes to draw into, beside which a colour bar is put; None for a figure of its own.
 
     Returns:
         The axes.
@@ -195,11 +210,13 @@ def correlations(result: FitResult, *, ax: Any = None) -> Any:
     Raises:
         TypeError, ValueError: no fit, or one without covariance.
 
-    >>> import jax.numpy as jnp, hhtjax
+    >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> t = jnp.arange(100.0)
-    >>> result = hhtjax.fit(lambda p: p["a"] + p["b"] * jnp.sin(t) - jnp.sin(t + 1), {"a": 1.0, "b": 1.0})
-    >>> [x.get_text() for x in hhtjax.plot.correlations(result).get_yticklabels()]
-    ['a', 'b']
+    >>> result = hhtjax.fit(lambda p: p["a"] - 2.0 - jnp.sin(t), {"a": 1.0})
+    >>> ax = hhtjax.plot.correlations(result)
+    >>> [text.get_text() for text in ax.texts], [text.get_text() for text in ax.get_xticklabels()]
+    (['1.00'], ['a'])
+    >>> plt.close(ax.figure)
     """
     _require_fit("correlations", "result", result)
     free = np.flatnonzero(result.free)
@@ -222,11 +239,15 @@ def correlations(result: FitResult, *, ax: Any = None) -> Any:
 def profile(
     found: Profile, *, name: str = "parameter", unit: str | None = None, result: FitResult | None = None, ax: Any = None
 ) -> Any:
-    """The deviance over one parameter, with the 95 % bound, 3.84, and the parabola of the standard error.
+    """The deviance over one parameter, with its 95 % bound, 3.84, and the parabola that the standard error promises,
+
+        ((x - estimate) / standard error)^2.
 
     Args:
-        found: of `hhtjax.identification.profile`. name, unit: of the parameter.
-        result: of the fit, for the parabola, in which `name` then is a parameter's. ax: axes.
+        found: of `hhtjax.identification.profile`.
+        name, unit: of the parameter.
+        result: a `FitResult`, for the parabola, in which `name` then is a parameter's; None for none.
+        ax: axes to draw into; None for a figure of its own.
 
     Returns:
         The axes.
@@ -234,11 +255,13 @@ def profile(
     Raises:
         TypeError, ValueError: an argument of a wrong kind; a name that the fit does not have.
 
-    >>> import numpy as np, hhtjax
+    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
     >>> values = np.linspace(1.0, 3.0, 5)
     >>> found = hhtjax.identification.Profile(values, (values - 2) ** 2, 8 * (values - 2) ** 2)
-    >>> hhtjax.plot.profile(found, name="k", unit="N/m").get_xlabel()
+    >>> ax = hhtjax.plot.profile(found, name="k", unit="N/m")
+    >>> ax.get_xlabel()
     'k (N/m)'
+    >>> plt.close(ax.figure)
     """
     if not isinstance(found, Profile):
         raise TypeError(f"profile: `found` must be a Profile, of identification.profile; received {found!r}.")

@@ -31,25 +31,31 @@ def animation(
     Args:
         solution: of one run.
         points: `points(q)` -> (k, 2) or (k, 3), the corners of a polyline; or a list or tuple of these.
-        fps: frames per second of film. speed: time of the run for each second of film.
+        fps: frames per second of film.
+        speed: time of the run for each second of film.
         trace: number of a point of the first polyline whose path is drawn, or several.
-        unit: of length. ax: axes, for points in space with projection="3d".
+        unit: of length.
+        ax: axes to draw into, for points in space with projection="3d"; None for a figure of its own.
 
     Returns:
         A `FuncAnimation`: `.save("film.gif", writer="pillow")`, or `.to_jshtml()` in a notebook. Keep it, as matplotlib
         forgets what nobody holds.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value.
+        TypeError, ValueError: an argument of a wrong kind or value; points of another shape.
 
-    >>> import pathlib, tempfile, jax.numpy as jnp, hhtjax
-    >>> ball = hhtjax.System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -9.81]))
-    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.zeros(2), jnp.ones(2), dt=0.1, num_steps=4)
-    >>> film = hhtjax.plot.animation(run, lambda q: jnp.stack([jnp.zeros(2), q]), fps=5)
+    >>> import pathlib, tempfile, jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
+    >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
+    >>> figure, ax = hhtjax.plot.subplots()
+    >>> film = hhtjax.plot.animation(run, lambda q: jnp.array([[0.0, 0.0], [q[0], 0.0]]), fps=2, trace=1, ax=ax)
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     film.save(pathlib.Path(folder) / "ball.gif", writer="pillow")
-    ...     sorted(path.name for path in pathlib.Path(folder).iterdir())
-    ['ball.gif']
+    ...     film.save(pathlib.Path(folder) / "spring.gif", writer="pillow")
+    ...     [path.name for path in pathlib.Path(folder).iterdir()]
+    ['spring.gif']
+    >>> ax.get_title(), ax.lines[1].get_xdata().round(2).tolist()                        # the trace in the last frame
+    ('t = 1.00', [1.0, 0.54, -0.41])
+    >>> plt.close(figure)
     """
     require_number("animation", "fps", fps, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("animation", "speed", speed, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
@@ -82,20 +88,22 @@ def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = 
     """A mechanism at some times, the earlier the paler.
 
     Args:
-        solution, points, unit, ax: as in `animation`. times: inside the run.
+        solution, points, unit, ax: as in `animation`.
+        times: inside the run, one or a vector; dense output is between the steps.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value.
+        TypeError, ValueError: an argument of a wrong kind or value; points of another shape; times outside the run.
 
-    >>> import jax.numpy as jnp, hhtjax
-    >>> ball = hhtjax.System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -9.81]))
-    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.zeros(2), jnp.ones(2), dt=0.1, num_steps=10)
-    >>> ax = hhtjax.plot.configuration(run, lambda q: jnp.stack([jnp.zeros(2), q]), [0.0, 1.0])
-    >>> ax.lines[1].get_ydata().round(3).tolist(), ax.get_ylabel()
-    ([0.0, -3.905], 'y (m)')
+    >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
+    >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
+    >>> ax = hhtjax.plot.configuration(run, lambda q: jnp.array([[0.0, 0.0], [q[0], 0.0]]), [0.0, 1.0])
+    >>> ax.lines[1].get_xdata().round(3).tolist(), ax.get_ylabel()
+    ([0.0, -0.409], 'y (m)')
+    >>> plt.close(ax.figure)
     """
     require_run("configuration", solution)
     times = np.atleast_1d(np.asarray(times, float))

@@ -17,9 +17,13 @@ NEAR = np.linspace(0.02, 3.0, 150)  # w h that still turn
 def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
     """The factor by which a step changes an oscillation at most, over w h: below 1 it damps, above 1 it is unstable.
 
+        rho = max |eigenvalue of A|,    A: of `hhtjax.analysis.oscillator_matrix`
+
     Args:
-        steppers: a Stepper, or several by name, {label: stepper}. frequency: w h, an array; by default 0.01 to 1000.
-        damping: the damping ratio of the oscillator. ax: axes.
+        steppers: a stepper, or several by name, {label: stepper}.
+        frequency: w h, natural frequency times step size in rad, a vector of positive numbers; by default 0.01 to 1000.
+        damping: the damping ratio of the oscillator.
+        ax: axes to draw into; None for a figure of its own.
 
     Returns:
         The axes.
@@ -27,10 +31,11 @@ def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
 
-    >>> import hhtjax, numpy as np
+    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
     >>> ax = hhtjax.plot.spectral_radius({"hht": hhtjax.hht(alpha=-0.1)}, frequency=np.array([0.1, 10.0]))
     >>> ax.lines[0].get_ydata().round(3).tolist()
     [1.0, 0.838]
+    >>> plt.close(ax.figure)
     """
     return _over_frequency("spectral_radius", "spectral radius", steppers, frequency, damping, ax, WIDE)
 
@@ -38,10 +43,13 @@ def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.
 def damping_ratio(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
     """The damping ratio that the discrete oscillator has, over w h; of an undamped one all of it is the method's.
 
-    By default w h goes to 3.
+        -Re(r)/|r|,    r = log(principal eigenvalue of A)
+
+    Where nothing oscillates, there is no curve.
 
     Args:
-        steppers, frequency, damping, ax: as in `hhtjax.plot.spectral_radius`.
+        steppers, damping, ax: as in `hhtjax.plot.spectral_radius`.
+        frequency: w h in rad, a vector of positive numbers; by default up to 3.
 
     Returns:
         The axes.
@@ -49,21 +57,24 @@ def damping_ratio(steppers: Any, *, frequency: Any = None, damping: float = 0.0,
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
 
-    >>> import hhtjax, numpy as np
-    >>> ax = hhtjax.plot.damping_ratio(hhtjax.hht(alpha=-0.05), frequency=np.array([0.1, 1.0]))
-    >>> float(ax.lines[0].get_ydata()[0].round(7))
-    5.6e-06
+    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
+    >>> ax = hhtjax.plot.damping_ratio(hhtjax.hht(alpha=-0.1), frequency=np.array([0.1, 1.0]))
+    >>> ax.lines[0].get_ydata().round(5).tolist()
+    [1e-05, 0.00675]
+    >>> plt.close(ax.figure)
     """
     return _over_frequency("damping_ratio", "damping ratio", steppers, frequency, damping, ax, NEAR)
 
 
 def period_elongation(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
-    """The relative error of the period, over w h.
+    """The relative error of the natural period, over w h.
 
-    By default w h goes to 3.
+        w h/|r| - 1,    r = log(principal eigenvalue of A)
+
+    Where nothing oscillates, there is no curve.
 
     Args:
-        steppers, frequency, damping, ax: as in `hhtjax.plot.spectral_radius`.
+        steppers, frequency, damping, ax: as in `hhtjax.plot.damping_ratio`.
 
     Returns:
         The axes.
@@ -71,10 +82,11 @@ def period_elongation(steppers: Any, *, frequency: Any = None, damping: float = 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
 
-    >>> import hhtjax, numpy as np
-    >>> ax = hhtjax.plot.period_elongation(hhtjax.hht(alpha=-0.05), frequency=np.array([0.1, 1.0]))
-    >>> float(ax.lines[0].get_ydata()[0].round(6))
-    0.000948
+    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
+    >>> ax = hhtjax.plot.period_elongation(hhtjax.hht(alpha=-0.1), frequency=np.array([0.1, 1.0]))
+    >>> ax.lines[0].get_ydata().round(5).tolist()
+    [0.00104, 0.09448]
+    >>> plt.close(ax.figure)
     """
     return _over_frequency("period_elongation", "relative period error", steppers, frequency, damping, ax, NEAR)
 
@@ -112,9 +124,13 @@ def stability_region(
 ) -> Any:
     """Where y' = lambda y is stable, in the plane of z = h lambda: shaded, with its edge.
 
+        stable: |eigenvalue| <= 1 for all of the step's, as in `hhtjax.analysis.stability_region`
+
     Args:
-        steppers: a Stepper, or several by name, {label: stepper}. real, imag: the part of the plane.
-        points: in each direction. ax: axes.
+        steppers: a stepper, or several by name, {label: stepper}.
+        real, imag: the part of the plane, (least, largest) each.
+        points: in each direction, at least 2; the edge is interpolated between them.
+        ax: axes to draw into; None for a figure of its own.
 
     Returns:
         The axes.
@@ -122,10 +138,12 @@ def stability_region(
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
 
-    >>> import hhtjax
-    >>> ax = hhtjax.plot.stability_region(hhtjax.rk4(), points=21)
-    >>> [float(x) for x in ax.get_xlim()]
-    [-8.0, 8.0]
+    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
+    >>> ax = hhtjax.plot.stability_region(hhtjax.rk4(), real=(-4, 2), imag=(-1, 1), points=25)
+    >>> edge = np.concatenate([path.vertices for path in ax.collections[1].get_paths()])
+    >>> round(float(edge[abs(edge[:, 1]) < 1e-9, 0].min()), 1)                         # RK4 is stable from -2.785 to 0
+    -2.8
+    >>> plt.close(ax.figure)
     """
     named = _named("stability_region", steppers)
     points = require_integer("stability_region", "points", points, 2)

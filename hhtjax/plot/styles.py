@@ -56,6 +56,11 @@ MM = 1 / 25.4  # inches
 def style():
     """A context in which matplotlib draws like this module: 8 pt text, Okabe and Ito's colours, constrained layout.
 
+    The settings are `PARAMETERS`; outside, the user's own hold.
+
+    Returns:
+        A context manager.
+
     >>> import matplotlib, hhtjax
     >>> with hhtjax.plot.style():
     ...     inside = matplotlib.rcParams["font.size"]
@@ -71,19 +76,22 @@ def subplots(
     """A figure and its axes as of `plt.subplots`, in this style, with sizes in mm.
 
     Args:
-        rows, columns: of panels. width: of the figure, 85 for a column of text, 175 for a page.
-        height: of the figure; by default panels of four to three. options: as for `plt.subplots`.
+        rows, columns: how many panels.
+        width: of the figure in mm, 85 for a column of text, 175 for a page.
+        height: of the figure in mm; by default panels of four to three.
+        **options: as for `plt.subplots`.
 
     Returns:
-        A figure, and its axes: one, or an array of them.
+        The figure, and its axes as `plt.subplots` gives them: one, (n,) or (rows, columns).
 
     Raises:
         TypeError, ValueError: rows, columns, width or height is no positive number.
 
-    >>> import hhtjax
+    >>> import matplotlib.pyplot as plt, hhtjax
     >>> figure, axes = hhtjax.plot.subplots(1, 2, width=175)
     >>> axes.shape, [round(25.4 * float(x)) for x in figure.get_size_inches()]
     ((2,), [175, 66])
+    >>> plt.close(figure)
     """
     rows, columns = require_integer("subplots", "rows", rows), require_integer("subplots", "columns", columns)
     require_number("subplots", "width", width, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
@@ -150,19 +158,22 @@ def legend(ax, handles=None, labels=None, **options: Any):
     """A legend above the axes, where it covers no curve, in as many columns as fit; None where nothing has a label.
 
     Args:
-        ax: axes. handles, labels, options: as for `ax.legend`.
+        ax: axes.
+        handles, labels: as for `ax.legend`; by default all curves that have a label.
+        **options: further ones of `ax.legend`.
 
     Returns:
-        The legend, or None.
+        matplotlib's legend, or None.
 
     Raises:
-        whatever `ax.legend` raises.
+        TypeError: an option that `ax.legend` does not know.
 
-    >>> import hhtjax
+    >>> import matplotlib.pyplot as plt, hhtjax
     >>> figure, ax = hhtjax.plot.subplots()
     >>> line = ax.plot([0, 1], label="a line")
     >>> hhtjax.plot.legend(ax).get_texts()[0].get_text()
     'a line'
+    >>> plt.close(figure)
     """
     if handles is None:
         handles, labels = ax.get_legend_handles_labels()
@@ -196,24 +207,26 @@ def _columns(labels, room):
 
 
 def save(figure, path, formats: Sequence[str] = ("png",)) -> list[Path]:
-    """Writes a figure as path.png (200 dpi), path.pdf, path.svg, with text as text; returns what it wrote.
+    """Writes a figure as path.png (200 dpi), path.pdf, path.svg, with text as text.
 
     Args:
         figure: of matplotlib.
-        path: with or without the folder, without a suffix.
-        formats: which files.
+        path: without ending; its folder must exist.
+        formats: a tuple of "png", "pdf", "svg".
 
     Returns:
         The paths of the files.
 
     Raises:
         TypeError, ValueError: figure is none; formats has others than png, pdf and svg.
+        OSError: a file that cannot be written.
 
-    >>> import hhtjax, pathlib, tempfile
+    >>> import matplotlib.pyplot as plt, pathlib, tempfile, hhtjax
     >>> figure, ax = hhtjax.plot.subplots()
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     [path.name for path in hhtjax.plot.save(figure, pathlib.Path(folder) / "empty", ("png", "svg"))]
     ['empty.png', 'empty.svg']
+    >>> plt.close(figure)
     """
     if not hasattr(figure, "savefig"):
         raise TypeError(f"save: `figure` must be a matplotlib figure; received {figure!r}.")

@@ -25,26 +25,28 @@ def trajectory(
     """q, v, acceleration, multipliers or internal states over time, a curve for each entry.
 
     Args:
-        solution: of one run.
+        solution: of one run, of a batch its member by `jax.tree.map(lambda x: x[i], solution)`.
         quantities: "q", "v", "acceleration", "multipliers" or "z"; several as a tuple, one panel above the other.
         entries: which to draw, by name: "[0]" of an array, "phi" or "x[1]" of a dict, "x" for all of a leaf.
         units: a word; or words by entry or leaf, {"x": "m"}; or one of these by quantity, {"q": "rad", "v": "rad/s"}.
-        time_unit: of t.
+        time_unit: of the times.
         label: put before the names of the curves, to tell runs in one chart.
-        ax: axes to draw into, as many as quantities. line: further options of `ax.plot`.
+        ax: axes to draw into, as many as quantities; None for a figure of its own.
+        **line: further options of `ax.plot`.
 
     Returns:
-        The axes; of several quantities an array.
+        The axes; of several quantities an array of them.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value.
+        TypeError, ValueError: an argument of a wrong kind or value; a batch of runs; a quantity that the run lacks.
 
-    >>> import jax.numpy as jnp, hhtjax
+    >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
     >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
     >>> upper, lower = hhtjax.plot.trajectory(run, ("q", "v"), units={"q": "m", "v": "m/s"})
     >>> upper.get_ylabel(), lower.get_ylabel(), lower.get_xlabel()
     ('q[0] (m)', 'v[0] (m/s)', 't (s)')
+    >>> plt.close(upper.figure)
     """
     require_run("trajectory", solution)
     names = (quantities,) if isinstance(quantities, str) else tuple(quantities)
@@ -90,7 +92,8 @@ def phase_plane(
     Args:
         solution: of one run.
         entries: which to draw, as in `trajectory`; all by default.
-        units: (of position, of velocity). label, ax, line: as in `trajectory`.
+        units: (of position, of velocity).
+        label, ax, **line: as in `trajectory`.
 
     Returns:
         The axes.
@@ -98,11 +101,13 @@ def phase_plane(
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a rotation, which has no such plane.
 
-    >>> import jax.numpy as jnp, hhtjax
+    >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
     >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
-    >>> hhtjax.plot.phase_plane(run, units=("m", "m/s")).get_ylabel()
+    >>> ax = hhtjax.plot.phase_plane(run, units=("m", "m/s"))
+    >>> ax.get_ylabel()
     'v[0] (m/s)'
+    >>> plt.close(ax.figure)
     """
     require_run("phase_plane", solution)
     if units is not None and (isinstance(units, str) or len(units) != 2):
@@ -143,8 +148,9 @@ def constraint_drift(
     What is zero does not show.
 
     Args:
-        solution: of one run of a system with constraints. unit: of Phi.
-        time_unit, label, ax, line: as in `trajectory`.
+        solution: of one run of a system with constraints.
+        unit: of Phi. time_unit: of the times.
+        label, ax, **line: as in `trajectory`.
 
     Returns:
         The axes.
@@ -152,11 +158,14 @@ def constraint_drift(
     Raises:
         TypeError, ValueError: an argument of a wrong kind; a run without constraints.
 
-    >>> import jax.numpy as jnp, hhtjax
-    >>> scene = hhtjax.scenes.pendulum.cartesian()
-    >>> run = hhtjax.simulate(scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params, dt=1e-2, num_steps=20)
-    >>> hhtjax.plot.constraint_drift(run, unit="m^2").get_yscale()
-    'log'
+    >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
+    >>> pendulum = hhtjax.System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -9.81]),
+    ...                          lambda q, t, params: jnp.sum(q**2, keepdims=True) - 1.0)
+    >>> run = hhtjax.simulate(pendulum, hhtjax.hht(), jnp.array([1.0, 0.0]), jnp.zeros(2), dt=0.05, num_steps=10)
+    >>> ax = hhtjax.plot.constraint_drift(run, unit="m²")
+    >>> [line.get_label() for line in ax.lines], ax.get_yscale()
+    (['|Phi| (m²)', '|dPhi/dt| (m²/s)'], 'log')
+    >>> plt.close(ax.figure)
     """
     require_run("constraint_drift", solution)
     info = solution.info

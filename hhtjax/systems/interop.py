@@ -35,10 +35,10 @@ def ode(system):
     With internal states y = (q, v, z). Traceable and differentiable; of equal systems equal, also as a pytree.
 
     Args:
-        system: any.
+        system: a `System`, `LinearSystem` or `FirstOrderSystem`.
 
     Returns:
-        A function of (t, y, params).
+        (t, y, params) -> y', structured like y, but with the rate of a rotation matrix (3, 3) in its place.
 
     Raises:
         TypeError: what is no system; when called, a y that is no (q, v), or (q, v, z).
@@ -56,12 +56,12 @@ def ode(system):
 
 @shown
 class FlatODE(NamedTuple):
-    """A system as an ODE on vectors; made by `flat_ode`.
+    """What `flat_ode` returns.
 
     Attributes:
         rate: (t, y, params) -> y' on vectors (N,), traceable.
-        y0: (N,).
-        unravel: y -> (q, v), or (q, v, z), or of a first-order system the pytree y.
+        y0: (N,), the start.
+        unravel: y (N,) -> (q, v), or (q, v, z), pytrees; of a first-order system the pytree y.
     """
 
     rate: Any
@@ -102,7 +102,7 @@ def diffrax_term(system):
     `sampled(order=0)`, jump: tell the step-size controller, `diffrax.ClipStepSizeController(..., jump_ts=)`.
 
     Args:
-        system: any.
+        system: a `System`, `LinearSystem` or `FirstOrderSystem`.
 
     Returns:
         A `diffrax.ODETerm`.
@@ -130,9 +130,9 @@ class ScipyRHS(NamedTuple):
 
     Attributes:
         fun: (t, y) -> y', (N,), compiled, of NumPy arrays.
-        jac: (t, y) -> (N, N), the same.
-        y0: (N,).
-        unravel: y (N,), or (N, times) as the result has it, -> as `FlatODE` has it, with a leading axis of times.
+        y0: (N,), the start.
+        unravel: y (N,), or (N, times) as the result has it, -> as that of `FlatODE`, then with a leading axis of times.
+        jac: (t, y) -> the derivative of fun with respect to y, (N, N), compiled.
     """
 
     fun: Any
