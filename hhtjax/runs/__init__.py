@@ -72,8 +72,8 @@ otherwise. What this costs, with large systems (`hht(solve=hhtjax.banded(p))`, o
 Dense output
 ------------
 
-`interpolate` gives q, v and internal states at any times inside a run. Derivatives pass through it, so that a fit may compare at the
-times of the measurements.
+`interpolate` gives q, v and internal states at any times inside a run. Derivatives pass through it, so that a fit may
+compare at the times of the measurements.
 
 >>> run = hhtjax.simulate(pendulum, hhtjax.hht(), q0, v0, params, dt=1e-2, num_steps=600)
 >>> hhtjax.interpolate(run, jnp.array([0.123, 4.56])).q.shape
