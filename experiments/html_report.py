@@ -16,7 +16,12 @@ from experiments.results import Result
 
 HERE = Path(__file__).parent
 TYPES = {".png": "image/png", ".gif": "image/gif"}
-DATA = {"measured": "measured data", "generated": "generated data", "": "simulations"}
+DATA = {
+    "measured": "measured data",
+    "benchmark": "benchmark, simulated by its makers",
+    "generated": "generated data",
+    "": "simulations",
+}
 TOLD = ("made_by", "machine", "data", "fast", "mode")  # above the figures, in words
 MODES = {"fast": "smoke run, less data", "part": "a part of it"}
 

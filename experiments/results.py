@@ -20,7 +20,7 @@ class Result(NamedTuple):
 
     @property
     def data(self) -> str:
-        """measured, generated, or an empty string for simulations alone."""
+        """measured, benchmark, generated, or an empty string for simulations alone."""
         return (self.numbers or {}).get("data") or RECORDS.get(self.name, "")
 
     @property

@@ -11,13 +11,13 @@ import time
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hhtjax
 from experiments.identification import bouc_wen_data as data
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
+from hhtjax.plot import legend, subplots
 from hhtjax.scenes import bouc_wen
 
 SUBSTEPS = 5  # of the fit
@@ -40,7 +40,7 @@ def run(report: Report, fast: bool):
     if sets.measured and not fast:
         numbers["black_boxes_multisine_m"] = BLACK_BOXES
     plot(report, sets, outputs, table)
-    numbers |= {"true_parameters": table, "data": "measured" if sets.measured else "generated", "fast": fast}
+    numbers |= {"true_parameters": table, "data": "benchmark" if sets.measured else "generated", "fast": fast}
     report.numbers(rounded(numbers))
 
 
@@ -84,7 +84,7 @@ def identify(report: Report, sets, substeps):
     report.table(["parameter", "estimate", "true", "off by %", "start", "standard error", "unit"], rows)
     numbers = {
         "train_samples": len(record.y),
-        "train_m": float(np.sqrt(np.mean(np.asarray(result.residual) ** 2))),
+        "train_error_m": float(np.sqrt(np.mean(np.asarray(result.residual) ** 2))),
         "substeps": substeps,
         "iterations": int(result.iterations),
         "reason": result.reason,
@@ -97,7 +97,7 @@ def identify(report: Report, sets, substeps):
     outputs = {}
     for name, test in sets.tests.items():
         outputs[name], error = data.score(result.params, test, substeps)
-        numbers[f"{name}_identified_m"] = error
+        numbers[f"{name}_error_m"] = error
         report.progress(f"{name}: {error:.3g} m rms of {np.std(test.y):.3g} m")
     return numbers, outputs
 
@@ -107,14 +107,13 @@ def plot(report: Report, sets, outputs, table):
     record, output = sets.tests["multisine"], outputs["multisine"]
     part = slice(0, 200)
     t = data.DT * np.arange(len(record.y))[part]
-    figure, ((upper, steps), (lower, sweep)) = plt.subplots(2, 2, figsize=(9, 4.8), height_ratios=(3, 2))
+    figure, ((upper, steps), (lower, sweep)) = subplots(2, 2, width=175, height=110, height_ratios=(3, 2))
     upper.plot(t, 1e3 * record.y[part], color="black", lw=1.5, label="benchmark" if sets.measured else "generated")
-    upper.plot(t, 1e3 * output[part], color=COLOURS[4], lw=1.0, ls="--", label="fitted model, simulated")
-    upper.set_ylabel("y (mm)")
-    upper.legend(loc="upper right")
-    upper.set_title("multisine test", loc="left", fontsize=9)
+    upper.plot(t, 1e3 * output[part], color=COLOURS[4], lw=1.0, ls="--", label="fitted model")
+    upper.set_ylabel("multisine, y (mm)")
+    legend(upper)
     lower.plot(t, 1e6 * (output - record.y)[part], color=COLOURS[0], lw=0.8)
-    lower.set_ylabel("error (μm)")
+    lower.set_ylabel("its error (μm)")
     lower.set_xlabel("time (s)")
     for i, alpha in enumerate(sorted({row["alpha"] for row in table}, reverse=True)):
         rows = [row for row in table if row["alpha"] == alpha]
@@ -122,9 +121,9 @@ def plot(report: Report, sets, outputs, table):
         steps.loglog(x, errors, color=COLOURS[i], marker=MARKERS[i], label=f"alpha = {alpha}")
     steps.set_ylabel("RMSE, true parameters (μm)")
     steps.set_xlabel("steps in a sample")
-    steps.legend()
+    legend(steps)
     error = outputs["sinesweep"] - sets.tests["sinesweep"].y
     sweep.plot(data.DT * np.arange(len(error)), 1e6 * error, color=COLOURS[0], lw=0.3)
-    sweep.set_ylabel("error, sweep (μm)")
+    sweep.set_ylabel("error of the sweep (μm)")
     sweep.set_xlabel("time (s)")
     report.figure("bouc_wen", figure)

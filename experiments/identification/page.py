@@ -91,13 +91,13 @@ def bouc_wen_pieces(numbers):
     names = list(numbers["off_by_percent"])
     off = [
         [f"{by['substeps']} steps", *(f"{by['off_by_percent'][name]:+.3f} %" for name in names)]
-        + [f"{by[f'{test}_identified_m']:.2g} m" for test in ("multisine", "sinesweep")]
+        + [f"{by[f'{test}_error_m']:.2g} m" for test in ("multisine", "sinesweep")]
         for by in (numbers, half)
     ]
     return {
         "bouc_wen_steps": table(["steps in a sample", "multisine", "sweep"], by_steps),
         "bouc_wen_off": table(["in a sample", *names, "multisine", "sweep"], off),
-        "bouc_wen_train": numbers["train_m"],
+        "bouc_wen_train": numbers["train_error_m"],
         "bouc_wen_others": ", ".join(f"{x:.2g} m ({name})" for name, x in numbers["black_boxes_multisine_m"].items()),
     }
 
