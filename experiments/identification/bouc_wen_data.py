@@ -98,7 +98,7 @@ def reconstruct(u, period, substeps):
     return hhtjax.sampled(jnp.asarray(np.tile(fine, -(-len(u) // period))), DT / substeps)
 
 
-def simulate(params, u, samples, substeps, alpha=0.0):
+def simulate(params, u, samples, substeps, alpha: Any = 0.0):
     """Displacement at `samples` samples from rest on, in m, by the non-iterative step."""
     system, given, q0, v0, _, z0 = bouc_wen.measured(params, u, None)
     run = hhtjax.simulate(
@@ -115,7 +115,7 @@ def simulate(params, u, samples, substeps, alpha=0.0):
     return run.q[:, 0]
 
 
-def score(params, record: Record, substeps, alpha=0.0):
+def score(params, record: Record, substeps, alpha: Any = 0.0):
     """Simulated output, and its RMSE in m; of a period, the third one from rest."""
     periods = 1 if record.period is None else 3
     u = np.tile(record.u, periods)
