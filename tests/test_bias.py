@@ -208,6 +208,11 @@ def test_a_constraint_leaves_the_bias_of_the_minimal_form():
             "refine: `dt` must be positive; received -0.1",
         ),
         (
+            lambda: hhtjax.refine(through, 1.0, hhtjax.hht(), 0.1, covariance=False),
+            ValueError,
+            "refine: leave out `covariance`",
+        ),
+        (
             lambda: hhtjax.step_size_bias(spring, "hht", None, 0.1, q=jnp.zeros(1)),
             TypeError,
             "step_size_bias: `stepper` must be a stepper such as .* received 'hht'",

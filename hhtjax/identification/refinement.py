@@ -106,7 +106,7 @@ def refine(
         StepSizeWarning: some parameter is shifted by more than one standard error: names it.
 
     Raises:
-        TypeError, ValueError: dt is no positive number, and whatever `fit` raises.
+        TypeError, ValueError: dt is no positive number, covariance=False, and whatever `fit` raises.
 
     >>> import warnings, jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q)
@@ -127,6 +127,8 @@ def refine(
     require_function("refine", "residuals_at", residuals_at, "residuals_at(stepper, dt)")
     require_stepper("refine", stepper)
     require_number("refine", "dt", dt, lambda x: x > 0, "be positive")
+    if not options.get("covariance", True):
+        raise ValueError("refine: leave out `covariance`: shifts are told in standard errors; received False.")
     levels = needed_levels(stepper) if levels is None else require_integer("refine", "levels", levels, 2)
     fits = []
     for level in range(levels):
