@@ -30,7 +30,7 @@ class Inputs(NamedTuple):
     times: Any = None
 
     @classmethod
-    def checked(cls, system, stepper, q0, v0, params, *, z0, dts, duration, num_samples, t0, in_axes, times=None):
+    def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes, times=None, z0=None):
         """An error that names what is wrong, or the inputs."""
         require_system("sweep", system)
         require_stepper("sweep", stepper)
