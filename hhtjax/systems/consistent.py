@@ -1,6 +1,7 @@
 """Initial values that satisfy the constraints, and the check that they do."""
 
 import math
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -157,7 +158,8 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
     params = freeze(params)
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
-    with jax.ensure_compile_time_eval():  # under jit too
+    traced = not is_concrete(jnp.zeros(()))  # under jit too; elsewhere JAX 0.6 would leak a tracer
+    with jax.ensure_compile_time_eval() if traced else nullcontext():
         B, found = examine(system, q0, v0, t0, params, z0, redundant)
         found = jax.tree.map(float, found)
     if redundant is None:
