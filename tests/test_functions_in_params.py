@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -82,6 +83,11 @@ def test_a_module_is_fitted():
         assert np.all(p < high)
     assert middle.activation is jax.nn.tanh
     assert "net.layers.0.weight[2, 1]" in result.summary()
+    ax = hhtjax.plot.estimates(result)
+    labels = [label.get_text() for label in ax.get_yticklabels()]
+    assert len(labels) == 13
+    assert labels[0].startswith("net.layers.0.weight[0, 0] = ")
+    plt.close(ax.figure)
 
 
 def test_sweeps_and_initial_values_know_modules():

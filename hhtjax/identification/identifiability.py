@@ -23,6 +23,11 @@ def parameter_names(params):
     return names
 
 
+def parameter_values(params):
+    """The number of each entry, in the same order: (p,)."""
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(freeze(params))])
+
+
 def undetermined_combinations(names, values, singular_values, directions, num_residuals):
     """A phrase for each combination of parameters that does not matter to the residuals.
 

@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import freeze
 from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.identifiability import parameter_names, why_undetermined
+from hhtjax.identification.identifiability import parameter_names, parameter_values, why_undetermined
 from hhtjax.identification.progress import CONVERGED, REASONS
 
 
@@ -19,13 +18,16 @@ def summary(result) -> str:
     size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
     cost = f"cost {float(result.cost):.6g}, {float(result.history.cost[0]):.6g} at the start"
     lines = [f"{result.reason}; {int(result.iterations)} iterations, {cost}, {size} residuals"]
-    names, values = parameter_names(result.params), _flat(result.params)
+    names, values = parameter_names(result.params), parameter_values(result.params)
     rows = [["parameter", "estimate"]]
     columns = []
     if result.uncertainty is not None:
         rows[0] += ["standard error", "95 % interval", "error / naive"]
-        lower, upper = map(_flat, result.interval())
-        errors, naive = _flat(result.standard_errors), _flat(result.errors(result.uncertainty.naive))
+        lower, upper = map(parameter_values, result.interval())
+        errors, naive = (
+            parameter_values(result.standard_errors),
+            parameter_values(result.errors(result.uncertainty.naive)),
+        )
         columns = [_columns(*row) for row in zip(result.free, errors, lower, upper, naive, strict=True)]
     for i, (name, value) in enumerate(zip(names, values, strict=True)):
         rows.append([name, f"{value:.6g}", *(columns[i] if columns else [])])
@@ -46,7 +48,9 @@ def table(result) -> Table:
         return Table(f"FitResult: {title}", [["parameter", "shape", "dtype"], *leaf_rows(params=result.params)])
     code, iterations, cost, *leaves = numbers
     rows = [["parameter", "estimate"]]
-    rows += [[name, f"{x:.6g}"] for name, x in zip(parameter_names(result.params), _flat(leaves), strict=True)]
+    rows += [
+        [name, f"{x:.6g}"] for name, x in zip(parameter_names(result.params), parameter_values(leaves), strict=True)
+    ]
     covariance = None if result.uncertainty is None else known(result.uncertainty.covariance)
     if covariance is not None and covariance.shape == (np.sum(result.free),) * 2:
         errors = np.zeros(len(rows) - 1)
@@ -99,8 +103,8 @@ def plot(result, sampling_rate=1.0):
     if result.uncertainty is not None:
         names = np.asarray(parameter_names(result.params))[result.free]
         free = np.flatnonzero(result.free)
-        values = _flat(result.params)[free]
-        lower, upper = (_flat(end)[free] for end in result.interval())
+        values = parameter_values(result.params)[free]
+        lower, upper = (parameter_values(end)[free] for end in result.interval())
         size = np.where(values == 0, 1, np.abs(values))
         reach = 100 * np.stack([values - lower, upper - values]) / size
         axes[1, 0].errorbar(np.zeros(len(free)), np.arange(len(free)), xerr=reach, fmt="o", capsize=3)
@@ -110,10 +114,6 @@ def plot(result, sampling_rate=1.0):
         axes[1, 1].set_xticklabels(names, rotation=90)
         figure.colorbar(image, ax=axes[1, 1], label="correlation of the estimates")
     return figure
-
-
-def _flat(tree):
-    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(freeze(tree))])
 
 
 TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}

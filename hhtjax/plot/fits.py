@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib import mlab
 
 from hhtjax.checks import require_number
-from hhtjax.identification.identifiability import parameter_names
+from hhtjax.identification.identifiability import parameter_names, parameter_values
 from hhtjax.identification.inference import Profile
 from hhtjax.identification.result import FitResult
 from hhtjax.plot.styles import COLOURS, MARKERS, canvas, legend, look, with_unit
@@ -153,7 +153,7 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
     against = first.params if truth is None else truth
     if jax.tree.structure(against) != jax.tree.structure(first.params):
         raise ValueError("estimates: `truth` must be structured like the params of the fit.")
-    size = _flat(against)
+    size = parameter_values(against)
     if zero := [names[i] for i in kept if size[i] == 0]:
         raise ValueError(f"estimates: `{zero[0]}` is 0, of which there are no per cent; leave it out by `entries`.")
     with canvas("estimates", ax, height=22 + 8 * len(kept)) as (panel,):
@@ -163,7 +163,7 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
             _intervals(panel, result, level, kept, size, at, label, i)
         of = "estimate" if truth is None else "truth"
         panel.set_xlabel(f"{100 * level:g} % interval (% of the {of})")
-        value = (lambda i: f" = {_flat(first.params)[i]:.4g}") if len(named) == 1 else (lambda i: "")
+        value = (lambda i: f" = {parameter_values(first.params)[i]:.4g}") if len(named) == 1 else (lambda i: "")
         panel.set_yticks(np.arange(len(kept)), [f"{names[i]}{value(i)}" for i in kept])
         panel.set_ylim(len(kept) - 0.5, -0.5)
         legend(panel)
@@ -182,8 +182,8 @@ def _kept(names, result, entries):
 
 def _intervals(ax, result, level, kept, size, at, label, number):
     """The markers and bars of one fit."""
-    value = _flat(result.params)
-    lower, upper = map(_flat, result.interval(level))
+    value = parameter_values(result.params)
+    lower, upper = map(parameter_values, result.interval(level))
     middle, reach = 100 * (value - size) / abs(size), 100 * np.stack([value - lower, upper - value]) / abs(size)
     known = np.isfinite(reach).all(axis=0)[kept]
     colour, marker = COLOURS[number % 8], MARKERS[number % 8]
@@ -285,7 +285,7 @@ def _estimate_of(result, name):
     if name not in names:
         raise ValueError(f"profile: `name` must be one of {', '.join(names)}; received {name!r}.")
     at = names.index(name)
-    return _flat(result.params)[at], _flat(result.standard_errors)[at]
+    return parameter_values(result.params)[at], parameter_values(result.standard_errors)[at]
 
 
 def _require_fit(caller, name, result):
@@ -293,7 +293,3 @@ def _require_fit(caller, name, result):
         raise TypeError(f"{caller}: `{name}` must be a FitResult, as of fit; received {type(result).__name__}.")
     if result.uncertainty is None:
         raise ValueError(f"{caller}: `{name}` must have a covariance; received a fit made with covariance=False.")
-
-
-def _flat(tree):
-    return np.concatenate([np.ravel(np.asarray(x)) for x in jax.tree.leaves(tree)])

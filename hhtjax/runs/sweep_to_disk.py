@@ -83,7 +83,7 @@ def sweep_to_disk(
     for number, members in enumerate(places):
         path = folder / f"chunk-{number:05d}.npz"
         if not _is_whole(path):
-            compiled = compiled or or_plain(lambda: run_sweep.lower(*arguments, **keywords).compile())
+            compiled = compiled or or_plain(lowered.compile, lambda: run_sweep.lower(*arguments, **keywords).compile())
             runs = compiled(*inputs.chunk(members).call()[0])
             kept = min(chunk, size - number * chunk)
             _write(path, lambda file, runs=runs, kept=kept: np.savez(file, **_named(runs, kept)))

@@ -155,7 +155,6 @@ def examine(system, q0, v0, t0, params, z0, redundant):
 
 def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None):
     """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
-    params = freeze(params)
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
     traced = not is_concrete(jnp.zeros(()))  # under jit too; elsewhere JAX 0.6 would leak a tracer

@@ -41,16 +41,17 @@ def plain():
             yield
 
 
-def or_plain(run: Callable):
+def or_plain(run: Callable, again: Callable | None = None):
     """run(), or the same on plain JAX where XLA refuses what the machinery has made of it; a warning says so.
 
     The last resort of programs that start here: inside a jit of the user's, XLA is not asked before he has left it.
 
     Args:
-        run: a function without arguments; where the machinery is on and XLA refuses, it is called twice.
+        run: a function without arguments.
+        again: what is called on plain JAX, where that is not run: of a program that is lowered already, say.
 
     Returns:
-        What run returns.
+        What run, or again, returns.
 
     Raises:
         jax.errors.JaxRuntimeError: XLA refuses the plain program too, or the machinery is off. And whatever run raises.
@@ -66,7 +67,7 @@ def or_plain(run: Callable):
             raise
         refusal = error
     with plain():
-        result = run()  # where this fails too, the cause is another, and its error the one to see
+        result = (again or run)()  # where this fails too, the cause is another, and its error the one to see
     words = (str(refusal).splitlines() or [""])[0][:200]
     warnings.warn(
         f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the try.",
