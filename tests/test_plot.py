@@ -83,6 +83,8 @@ def test_trajectory_draws_into_axes_given_run_after_run(run, swing):
     assert labels(ax) == ["one", "two"]
     assert ax.lines[0].get_color() != ax.lines[1].get_color()
     assert ax.lines[1].get_linewidth() == 3
+    assert len(ax.get_legend().get_texts()) == 2
+    assert plot.trajectory(run, label="one", key=False).get_legend() is None
     assert ax.get_ylabel() == "phi (rad/s^2)"
     multipliers = plot.trajectory(swing, "multipliers", units="N")
     assert labels(multipliers) == ["L[0]"]

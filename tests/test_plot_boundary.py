@@ -44,6 +44,9 @@ WRONG = {
     r"fit_against_data: `times` must increase": lambda run, batch: plot.fit_against_data(
         np.arange(9) ** 2, range(9), range(9)
     ),
+    r"fit_against_data: `names` must be two": lambda run, batch: plot.fit_against_data(
+        range(9), range(9), range(9), names="ours"
+    ),
     r"estimates: `results` must be a FitResult": lambda run, batch: plot.estimates(run),
     r"estimates: `level` must": lambda run, batch: plot.estimates(None, level=95),
     r"fit_overview: `result` must be a FitResult": lambda run, batch: plot.fit_overview(run),

@@ -36,8 +36,9 @@ def test_fit_against_data_shows_residual_and_spectrum():
     power = np.sum(density**2) * (frequency[1] - frequency[0])
     assert abs(power - 0.005) < 2e-4  # half the square of the amplitude
     axes = plt.subplots(2)[1]
-    assert plot.fit_against_data(t, model + tone, model, ax=axes).tolist() == axes.tolist()
+    assert plot.fit_against_data(t, model + tone, model, names=("a", "b"), ax=axes).tolist() == axes.tolist()
     np.testing.assert_array_equal(axes[1].lines[0].get_ydata(), model + tone - model)
+    assert [line.get_label() for line in axes[0].lines] == ["a", "b"]
 
 
 def test_estimates_are_relative_to_estimate_or_truth(result):

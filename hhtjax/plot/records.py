@@ -20,6 +20,7 @@ def fit_against_data(
     time_unit: str = "s",
     frequency_unit: str = "Hz",
     show: Any = None,
+    names: Any = ("measured", "simulated"),
     ax: Any = None,
 ) -> Any:
     """Measured and simulated output, below them the residual, measured - simulated, and the spectra of record and
@@ -35,6 +36,7 @@ def fit_against_data(
         unit, ylabel: of the output, and its name.
         time_unit: of times. frequency_unit: one over that.
         show: (first, last), the part of the time that is drawn; spectra are of all.
+        names: of the two records in the legend.
         ax: three axes to draw into, or two, for output and residual alone; None for a figure of its own.
 
     Returns:
@@ -59,30 +61,32 @@ def fit_against_data(
         if np.shape(show) != (2,) or not show[0] < show[1]:
             raise ValueError(f"fit_against_data: `show` must be two increasing times; received {show!r}.")
         inside = (times >= show[0]) & (times <= show[1])
+    if isinstance(names, str) or len(names) != 2:
+        raise ValueError(f"fit_against_data: `names` must be two words; received {names!r}.")
     residual = measured - simulated
     rate = (len(times) - 1) / (times[-1] - times[0])
     options = {"height": 115, "gridspec_kw": {"height_ratios": [3, 2, 3]}}
     with canvas("fit_against_data", ax, 2 if np.size(ax) == 2 else 3, **options) as axes:
         upper, middle, *rest = axes
-        upper.plot(times[inside], measured[inside], label="measured", color=MEASURED, lw=1.6)
-        upper.plot(times[inside], simulated[inside], label="simulated", color=COLOURS[1], lw=0.8)
+        upper.plot(times[inside], measured[inside], label=names[0], color=MEASURED, lw=1.6)
+        upper.plot(times[inside], simulated[inside], label=names[1], color=COLOURS[1], lw=0.8)
         middle.plot(times[inside], residual[inside], color=COLOURS[0], lw=0.7)
         upper.set_ylabel(with_unit(ylabel, unit))
         middle.set(ylabel=with_unit("residual", unit), xlabel=with_unit("t", time_unit))
         upper.sharex(middle)
         upper.tick_params(labelbottom=False)
         for lower in rest:
-            densities(lower, {"measured": measured, "residual": residual}, rate, unit, frequency_unit)
+            densities(lower, {names[0]: measured, "residual": residual}, rate, unit, frequency_unit)
         upper.figure.align_ylabels(axes)
         legend(upper)
     return axes
 
 
 def densities(ax, records, rate, unit, frequency_unit):
-    """Spectra of records by name, of which the residual is blue and the measured one grey."""
+    """Spectra of records by name: the residual blue, what was measured grey."""
     for name, values in records.items():
         frequency, density = _spectrum(values, rate)
-        colour = MEASURED if name == "measured" else COLOURS[0]
+        colour = COLOURS[0] if name == "residual" else MEASURED
         ax.semilogy(frequency[1:], density[1:], label=name, color=colour, lw=0.9)
     ax.set_xlabel(with_unit("frequency", frequency_unit))
     root = f"{unit or '1'}/$\\sqrt{{\\mathrm{{{frequency_unit}}}}}$"
