@@ -221,8 +221,8 @@ def plot_fit(report: Report, sets, scores):
     signals = seconds, 1e3 * record.y, 1e3 * output
     fit_against_data(*signals, **words, ax=(axes[0, 0], axes[1, 0], spectra))
     fit_against_data(*signals, **words, show=seconds[[first, first + width - 1]], ax=axes[:2, 1])
-    axes[0, 0].set_title(f"arrow test set: RMSE {value:.3f} mV", loc="right")
-    axes[0, 1].set_title("a quarter of a second about its peak", loc="right")
+    legend(axes[0, 0], title=f"arrow test set: RMSE {value:.3f} mV", alignment="left")
+    legend(axes[0, 1], title="a quarter of a second about its peak", alignment="left")
     for panel in axes[:2, 1]:
         panel.set_ylabel("")
     report.figure("silverbox_fit", figure)
