@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from experiments.__main__ import EXPERIMENTS
+from experiments.check import check
 from experiments.parts import run_experiment
 
 ROOT = Path(__file__).parents[1]
@@ -104,7 +105,7 @@ def test_an_unknown_name_gives_the_list_and_fails():
 
 
 @pytest.mark.slow
-def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path):
+def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path, capsys):
     result = experiments("silverbox", "--fast", "--out", str(tmp_path), HHTJAX_DATA=str(tmp_path / "nowhere"))
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines()[0].startswith("GENERATED record, known parameters")
@@ -117,13 +118,12 @@ def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path):
     assert numbers["multisine_mV"] < 0.5
     assert len(list(tmp_path.glob("*.png"))) == 3
     assert numbers["made_by"]["command"] == "python -m experiments silverbox --fast"
-    checked = experiments("check", "--out", str(tmp_path))
-    assert checked.returncode == 2
-    assert "silverbox: a smoke run (--fast) has less data" in checked.stdout
+    assert check(EXPERIMENTS, tmp_path) == 2
+    assert "silverbox: a smoke run (--fast) has less data" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_silverbox_on_the_measured_record(tmp_path):
+def test_silverbox_on_the_measured_record(tmp_path, capsys):
     """As README's first command runs it: the best model on the whole record, one figure; the errors that it reaches."""
     if not (DATA / "silverbox").is_dir():
         pytest.skip("the measured Silverbox record is not here: set HHTJAX_DATA to the folder that holds silverbox/")
@@ -136,6 +136,5 @@ def test_silverbox_on_the_measured_record(tmp_path):
         assert numbers[f"{name}_mV"] == numbers["models"]["10 parameters"][f"{name}_mV"]
         assert numbers[f"{name}_mV"] == pytest.approx(value, abs=5e-4)
     assert [path.name for path in tmp_path.glob("*.png")] == ["silverbox_fit.png"]
-    checked = experiments("check", "--out", str(tmp_path))
-    assert checked.returncode == 0, checked.stdout
-    assert checked.stdout.startswith("silverbox: 30 numbers compared that it has, 0 worse.")
+    assert check(EXPERIMENTS, tmp_path) == 0
+    assert capsys.readouterr().out.startswith("silverbox: 30 numbers compared that it has, 0 worse.")

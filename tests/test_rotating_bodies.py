@@ -48,7 +48,16 @@ def constraint(q, t, params):
     return height[None] + 0.2 * q["s"] ** 2 - 0.55 - 0.05 * jnp.sin(2 * t)
 
 
+def alone(q, v, t, params):
+    """The moments on the body without the cart, its joint at rest: a top."""
+    R, Om = q["R"], v["R"]
+    return {
+        "R": params["m"] * cross(jnp.asarray(ARM), R.T @ jnp.array([0.0, 0.0, -9.81])) - cross(Om, params["J"] @ Om)
+    }
+
+
 FREE, HELD = hhtjax.System(mass, force), hhtjax.System(mass, force, constraint)
+TOP = hhtjax.System(lambda q, params: params["J"], alone)
 
 
 @cache
@@ -225,27 +234,41 @@ def test_leaves_of_several_rotations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("constrained", [False, True])
-def test_gradients(constrained):
+def test_gradients():
     """Forward = reverse = central: mass, inertia, length in the constraint, v0, dt; at zero rotation, from rest too."""
-    system = HELD if constrained else FREE
-    q0 = {"R": jnp.eye(3), "s": jnp.array([0.1])}
-    if constrained:
-        q0 = hhtjax.consistent_initial(system, q0, {"R": jnp.zeros(3), "s": jnp.zeros(1)}, PARAMS).q
+    zero = {"R": jnp.zeros(3), "s": jnp.zeros(1)}
+    q0 = hhtjax.consistent_initial(HELD, {"R": jnp.eye(3), "s": jnp.array([0.1])}, zero, PARAMS).q
 
     def loss(x):
         params = PARAMS | {"m": PARAMS["m"] * x["m"], "J": PARAMS["J"] * x["J"], "tip": PARAMS["tip"] * x["tip"]}
-        begin = q0, {"R": x["Om"] * jnp.asarray(OM0), "s": jnp.zeros(1)}
-        if constrained:
-            begin = hhtjax.consistent_initial(system, *begin, params)[:2]
-        stepper = hhtjax.hht(-0.05, linearize=None if constrained else "predictor")
-        run = hhtjax.simulate(system, stepper, *begin, params, dt=0.02 * x["dt"], num_steps=20)
-        parts = run.q["R"] * jnp.arange(9.0).reshape(1, 3, 3), run.v["R"], *([run.multipliers] if constrained else [])
+        begin = hhtjax.consistent_initial(HELD, q0, zero | {"R": x["Om"] * jnp.asarray(OM0)}, params)[:2]
+        run = hhtjax.simulate(HELD, hhtjax.hht(-0.05), *begin, params, dt=0.02 * x["dt"], num_steps=20)
+        parts = run.q["R"] * jnp.arange(9.0).reshape(1, 3, 3), run.v["R"], run.multipliers
         return sum(jnp.sum(jnp.mean(y, 0) ** 2) for y in parts)
 
     one = jnp.array(1.0)
     arguments = {"m": one, "J": one, "tip": one, "dt": one, "Om": one}
     check_gradients(loss, [arguments, arguments | {"Om": 0 * one}])
+
+
+@pytest.mark.slow
+def test_gradient_without_a_constraint():
+    """Forward along one direction in mass, inertia, v0 and dt = reverse = central; from rest too."""
+
+    def loss(x):
+        params = PARAMS | {"m": PARAMS["m"] * x[0], "J": PARAMS["J"] * x[1]}
+        stepper, Om0 = hhtjax.hht(-0.05, linearize="predictor"), x[2] * jnp.asarray(OM0)
+        run = hhtjax.simulate(TOP, stepper, {"R": jnp.eye(3)}, {"R": Om0}, params, dt=0.02 * x[3], num_steps=20)
+        parts = run.q["R"] * jnp.arange(9.0).reshape(1, 3, 3), run.v["R"]
+        return sum(jnp.sum(jnp.mean(y, 0) ** 2) for y in parts)
+
+    direction = jnp.array([0.6, -1.0, 0.8, 0.5])
+    along, reverse = jax.jit(lambda x: jax.jvp(loss, (x,), (direction,))), jax.jit(jax.grad(loss))
+    for x in (jnp.ones(4), jnp.array([1.0, 1.0, 0.0, 1.0])):
+        forward = float(along(x)[1])
+        assert abs(reverse(x) @ direction - forward) < 1e-10 * abs(forward)
+        one, two = (float(along(x + h * direction)[0] - along(x - h * direction)[0]) for h in (1e-4, 2e-4))
+        assert abs((8 * one - two) / 12e-4 - forward) < 1e-6 * abs(forward)
 
 
 @pytest.mark.slow

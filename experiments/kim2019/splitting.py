@@ -158,7 +158,7 @@ def error_panel(axes, case, errors):
         lines[method] = {"ls": "-", "lw": 1} | ({"ms": 3} if i % 2 else {"ms": 8, "fillstyle": "none"})
         curves[method] = dts, drawn
         axes.plot(lost, np.full(len(lost), 50 / 3**i), "x", color=COLOURS[i], label="_lost")
-    error_against_h(curves, lines=lines, slopes=(1, 2), key=False, ax=axes)
+    error_against_h(curves, lines=lines, key=False, ax=axes)
     axes.set(title=case.name, ylabel="relative RMS error of q", ylim=(1e-7, 100))
 
 
@@ -199,7 +199,7 @@ def draw(errors, limits, reach):
         axes.set_visible(case.name in errors)
     limit_panel(grid[0, 2], limits)
     spring_panel(grid[1, 2], reach)
-    title = f"Four scenes on the left: alpha = {ALPHAS[DRAWN]:g}; triangles: orders 1 and 2. Crosses: unbounded."
+    title = f"Four scenes on the left: alpha = {ALPHAS[DRAWN]:g}; triangles: orders. Crosses: unbounded."
     figure.legend(*grid[1, 1].get_legend_handles_labels(), loc="outside lower center", ncols=4, title=title)
     return figure
 

@@ -129,8 +129,7 @@ def trajectory_figure(scenes, methods, dt=1e-4):
             for angle in (0, 1):
                 line = {"label": method, "color": COLOURS[j]} | styles[j]
                 trajectory(path, entries=f"[{angle}]", key=False, ax=panels[angle, column], **line)
-                panels[angle, column].set_ylabel(f"$q_{angle + 1}$ (rad)")
-                panels[angle, column].label_outer()
-        panels[0, column].set_title(f"{scene}, h = {dt:g} s")
+                panels[angle, column].set(ylabel="" if column else f"$q_{angle + 1}$ (rad)")
+        panels[0, column].set(title=f"{scene}, h = {dt:g} s", xlabel="")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure

@@ -240,8 +240,8 @@ plt.show()
 #
 # The same posterior and the same sampler, with the simulation by diffrax. A force that jumps 1000 times a second makes
 # every solver stop at each jump, so steps of constant length, one a sample, are its best choice here. The midpoint rule
-# is of the same order as `hht`, and evaluates the force inside the step only. It is differentiated forwards, as ours is;
-# backwards, by its checkpoints, takes several times longer (below, "What to try next").
+# is of the same order as `hht`, and evaluates the force inside the step only. It is differentiated forwards, as ours
+# is; backwards, by its checkpoints, takes several times longer (below, "What to try next").
 #
 # Accurate enough: its error of the solution moves the estimate by less than a tenth of a standard error, computed from
 # the derivatives $J$ as $(J J^T)^{-1} J e$.
@@ -256,9 +256,12 @@ def rate(t, state, params):
     return v, (u - params["c"] * v - params["k"] * q - params["k3"] * q**3) / params["m"]
 
 
-def by_diffrax(params, adjoint=diffrax.ForwardMode()):
+ADJOINT = diffrax.ForwardMode()
+
+
+def by_diffrax(params):
     return diffrax.diffeqsolve(
-        diffrax.ODETerm(rate), diffrax.Midpoint(), 0.0, N * DT, DT, (0.0, 0.0), params, max_steps=N, adjoint=adjoint,
+        diffrax.ODETerm(rate), diffrax.Midpoint(), 0.0, N * DT, DT, (0.0, 0.0), params, max_steps=N, adjoint=ADJOINT,
         saveat=diffrax.SaveAt(steps=True), stepsize_controller=diffrax.ConstantStepSize(),
     ).ys[0]  # fmt: skip
 
@@ -359,7 +362,7 @@ print(f"a gradient: {1e3 * forward_time:.2f} ms by itself, {inside:.2f} ms with 
 # ## What to try next
 #
 # * Take 300 samples instead of 10 000: where do histogram and curve part?
-# * Differentiate diffrax backwards: `by_diffrax` with `adjoint=diffrax.RecursiveCheckpointAdjoint()`, and
+# * Differentiate diffrax backwards: `ADJOINT = diffrax.RecursiveCheckpointAdjoint()`, and
 #   `log_density(..., "reverse")`.
 # * Give $\sigma$ a prior too, as a fifth parameter.
 # * Colour the noise (`np.convolve` with a few ones): the posterior does not notice and becomes too narrow, `fit`'s
