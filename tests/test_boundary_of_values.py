@@ -1,6 +1,7 @@
 """What the library says to arguments of the right kind that mean nothing: masses, orders of arguments, params."""
 
 import re
+from contextlib import nullcontext
 from functools import partial
 
 import jax
@@ -41,13 +42,22 @@ def test_a_constant_mass_is_symmetric_and_positive_definite(mass, message):
 def test_masses_of_any_units_pass_and_with_constraints_massless_ones():
     mixed = np.array([1e9, 1e-9])
     System(np.diag(mixed) + 0.3 * (np.ones((2, 2)) - np.eye(2)), pull)
-    System(np.array([1.0, 0.0]), pull, lambda q, t, params: q[1:])
+    System(np.array([1.0, 0.0]), pull, lambda q, t, params: q[1:] - 1)
     jax.vmap(lambda m: System(m, pull).mass.sum())(-jnp.ones((3, 2)))  # a tracer
 
 
-def test_a_mass_that_is_singular_at_the_start_is_named():
-    found = run(System(lambda q, params: jnp.ones((2, 2)), pull))
-    with pytest.raises(hhtjax.SimulationError, match="not finite at the start already: there the mass is singular"):
+def test_a_mass_that_is_a_function_is_looked_at_where_the_run_starts():
+    masses = np.array([[[2, 0.5], [0.5, 2]], np.ones((2, 2)), -np.eye(2), [[1, 0.5], [0, 1]], np.full((2, 2), np.nan)])
+    found = jax.vmap(lambda M: run(System(lambda q, params: M, pull)))(masses)
+    messages = [None, *2 * ["`mass` must be positive definite"], "`mass` must be symmetric", "not finite at the start"]
+    for i, message in enumerate(messages):
+        one = jax.tree.map(lambda x, i=i: x[i], found)
+        with pytest.raises(hhtjax.SimulationError, match=message) if message else nullcontext():
+            one.check()
+    assert "mass is not symmetric" in repr(jax.tree.map(lambda x: x[3], found.failure))
+    slider = System(lambda q, params: jnp.array([1.0, 0.0]), pull, lambda q, t, params: q[1:] - 1)
+    run(slider).check()  # with constraints it may be singular
+    with pytest.raises(hhtjax.SimulationError, match="member 1 "):
         found.check()
 
 

@@ -11,6 +11,7 @@ from hhtjax.description.presentation import overwrite
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.stepper import Info, public
 from hhtjax.systems import held
+from hhtjax.systems.matrices import mass_flaw
 from hhtjax.xla import staged
 
 
@@ -60,13 +61,22 @@ def saved(flat, state):
     return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot
 
 
-def as_solution(flat, start, path, dt, info, failure):
-    """The start and the path after it as a `Solution`."""
+def as_solution(flat, start, path, dt, info, failure, flaw=None):
+    """The start and the path after it as a `Solution`; flaw: of the mass at the start, as `mass_flaw` says it."""
+    if flaw is not None:
+        failure = failure._replace(step=jnp.where(flaw > 0, 1, failure.step), mass=flaw)
     t, q, v, w, L, *z = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
     q = jax.vmap(flat.unravel)(q)
     v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in (v, w))
     z, zdot = (None if x is None else jax.vmap(flat.unravel_internal)(x) for x in z)
     return Solution(t, q, v, w, L, dt, info, failure, z, zdot)
+
+
+def flaw_at_start(system, flat, start, params):
+    """What is wrong with the mass there, where it is a function; a constant one has been looked at."""
+    if not callable(getattr(system, "mass", None)):
+        return None
+    return mass_flaw(flat.mass(start.q, params), system.constraint is not None)
 
 
 def no_failure(info):

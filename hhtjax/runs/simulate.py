@@ -11,7 +11,7 @@ from hhtjax.checks import require_integer, require_number, require_params
 from hhtjax.description import is_concrete, thaw
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.extrapolate import MOST, extrapolated
-from hhtjax.runs.loop import as_solution, loop_of, show_progress
+from hhtjax.runs.loop import as_solution, flaw_at_start, loop_of, show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, join_info, require_capable, require_stepper, require_system
 from hhtjax.systems.consistent import require_consistent
@@ -139,4 +139,5 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, z0, *, num_steps, save_ev
         return checkpointed_scan(interval, carry, num_steps // save_every)
 
     (_, _, failure), (path, info) = one_kernel(run, form.tree)
-    return as_solution(flat, loop.carry[0], form.joined(path), dt, info, failure)
+    start = loop.carry[0]
+    return as_solution(flat, start, form.joined(path), dt, info, failure, flaw_at_start(system, flat, start, params))

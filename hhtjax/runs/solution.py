@@ -27,6 +27,8 @@ class Failure(NamedTuple):
             constraints.
         solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is
             the library's own.
+        mass: what is wrong with a mass that is a function, at the start: 0 nothing, 1 it is not symmetric, 2 not
+            positive definite (with constraints: not positive semidefinite); None where the mass is constant.
     """
 
     step: Any
@@ -34,6 +36,7 @@ class Failure(NamedTuple):
     quantity: Any
     row: Any = None
     solve: Any = None
+    mass: Any = None
 
     def _verdict(self):
         """How many failed, or what did."""
@@ -42,6 +45,8 @@ class Failure(NamedTuple):
             return ""
         if step.ndim or not step:
             return f"{np.count_nonzero(step)} of {step.size} runs failed" if step.any() else "no step failed"
+        if flaw := known(self.mass):
+            return f"the mass is not {MASS[int(flaw)]}"
         if known(self.newton):
             return "Newton did not converge"
         if known(self.solve):
@@ -53,6 +58,7 @@ QUANTITIES = (
     "the position q", "the velocity v", "the acceleration", "the vector of multipliers",
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
+MASS = (None, "symmetric", "positive definite")
 INTERNAL_STATE = 4  # among them
 
 
@@ -145,7 +151,9 @@ class Solution(NamedTuple):
 
     def _why(self, member):
         """What `failure` says of one member of a batch."""
-        _, newton, quantity, row, left = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        _, newton, quantity, row, left, mass = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        if mass:
+            return f"`mass` must be {MASS[mass]}; at the start, mass(q0, params) is not"
         if left:
             return (
                 f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "

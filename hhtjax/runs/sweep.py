@@ -11,7 +11,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
-from hhtjax.runs.loop import advance_from, as_solution, loop_of, show_progress
+from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
@@ -178,4 +178,5 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
         return lax.scan(interval, carry, intervals, num_samples)
 
     (_, _, failure), (path, info) = one_kernel(samples, form.tree)
-    return as_solution(flat, loop.carry[0], form.joined(path), dt, info, failure)
+    start = loop.carry[0]
+    return as_solution(flat, start, form.joined(path), dt, info, failure, flaw_at_start(system, flat, start, params))
