@@ -17,8 +17,8 @@ def pull(q, v, t, params):
     return -4.0 * q
 
 
-def run(system, n=2, params=None, dt=0.1):
-    return hhtjax.simulate(system, hhtjax.hht(), jnp.ones(n), jnp.zeros(n), params, dt=dt, num_steps=2)
+def run(system, n=2, params=None, dt=0.1, t0=0.0):
+    return hhtjax.simulate(system, hhtjax.hht(), jnp.ones(n), jnp.zeros(n), params, dt=dt, num_steps=2, t0=t0)
 
 
 NO_MASS = [
@@ -137,7 +137,9 @@ def test_arrays_are_shown_by_their_shape():
     message = r"must be a real number; received an array of shape \(1000,\)\.(\n-|$)"
     with pytest.raises(TypeError, match=f"sampled: `dt` {message}"):
         hhtjax.sampled(np.ones(9), np.linspace(0, 1, 1000))
-    with pytest.raises(TypeError, match=f"simulate: `dt` {message}"):
+    with pytest.raises(TypeError, match=f"simulate: `t0` {message}"):
+        jax.jit(lambda t0: run(System(np.ones(2), pull), t0=t0).q)(jnp.ones(1000))
+    with pytest.raises(ValueError, match=r"simulate: `num_steps` must be the length of dt, 1000, or left out.*2\.(\n-|$)"):
         jax.jit(lambda dt: run(System(np.ones(2), pull), dt=dt).q)(jnp.ones(1000))
 
 
