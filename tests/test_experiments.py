@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from experiments.__main__ import EXPERIMENTS
+from experiments.parts import run_experiment
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("HHTJAX_DATA") or ROOT.parent / "shared" / "data")
@@ -65,6 +66,34 @@ def test_how_much_is_run_and_what_the_numbers_say_of_it(monkeypatch, tmp_path):
     assert told("vehicle", "vehicle") == ([False], "full", ["vehicle"])
     assert told("silverbox", "all") == ([False, True], "full", ["silverbox", "--full"])
     assert "python -m experiments vehicle" in (tmp_path / "experiments.html").read_text(encoding="utf-8")
+
+
+def test_a_part_is_made_anew_and_says_so(monkeypatch, tmp_path):
+    """The other parts keep their numbers and what made them."""
+    runner = importlib.import_module("experiments.__main__")
+    first, second = (SimpleNamespace(__name__=f"here.{name}", __doc__=name, __file__=__file__) for name in ("a", "b"))
+    module = SimpleNamespace(
+        GROUPS=([first], [second]), run=lambda report, fast: run_experiment(report, module.GROUPS, fast)
+    )
+    monkeypatch.setattr(runner, "EXPERIMENTS", {"stub": "stub"})
+    monkeypatch.setitem(sys.modules, "experiments.stub", module)
+
+    def told(value, *arguments):
+        first.run = second.run = lambda report, fast: value
+        assert runner.main(["stub", *arguments, "--out", str(tmp_path)]) == 0
+        return json.loads((tmp_path / "stub.json").read_text())
+
+    whole = told(1)
+    assert (whole["a"], whole["b"], whole["made_by"]["command"]) == (1, 1, "python -m experiments stub")
+    partly = told(2, "--parts", "b")
+    assert (partly["a"], partly["b"]) == (1, 2)
+    made_by = {**partly["made_by"]}
+    assert made_by.pop("parts")["b"]["command"] == "python -m experiments stub --parts b"
+    assert made_by == whole["made_by"]
+    again = told(3, "--parts", "a")
+    assert (again["a"], again["b"], list(again["made_by"]["parts"])) == (3, 2, ["b", "a"])
+    with pytest.raises(SystemExit, match=r"stub has the parts a, b; received 'c'"):
+        told(4, "--parts", "c")
 
 
 def test_an_unknown_name_gives_the_list_and_fails():

@@ -1,4 +1,4 @@
-"""A fit for readers: a text table, charts, and JSON."""
+"""A fit for readers: a text table, and JSON."""
 
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -120,35 +120,6 @@ def _about_estimates(result, names):
     condition = s[0] / s[-1] if s[-1] > 0 else np.inf
     remarks.append(f"condition number of the scaled Jacobian: {condition:.3g}")
     return remarks
-
-
-def plot(result, sampling_rate=1.0):
-    """The figure of `FitResult.plot`."""
-    import matplotlib.pyplot as plt
-
-    r = np.asarray(jax.tree.leaves(result.residual)[0])
-    r = r.reshape(r.shape[0], -1)[:, 0] if r.ndim else r.reshape(1)
-    figure, axes = plt.subplots(2, 2, figsize=(9, 6), layout="constrained")
-    time, frequency = np.arange(len(r)) / sampling_rate, np.fft.rfftfreq(len(r), 1 / sampling_rate)
-    axes[0, 0].plot(time, r, lw=0.7)
-    axes[0, 0].set(xlabel="time (samples / sampling rate)", ylabel="residual")
-    power = np.abs(np.fft.rfft(np.where(np.isfinite(r), r, 0))) ** 2 / len(r)
-    axes[0, 1].semilogy(frequency[1:], power[1:], lw=0.7)
-    axes[0, 1].set(xlabel="frequency (of the sampling rate's unit)", ylabel="power of the residual")
-    if result.uncertainty is not None:
-        names = np.asarray(parameter_names(result.params))[result.free]
-        free = np.flatnonzero(result.free)
-        values = parameter_values(result.params)[free]
-        lower, upper = (parameter_values(end)[free] for end in result.interval())
-        size = np.where(values == 0, 1, np.abs(values))
-        reach = 100 * np.stack([values - lower, upper - values]) / size
-        axes[1, 0].errorbar(np.zeros(len(free)), np.arange(len(free)), xerr=reach, fmt="o", capsize=3)
-        axes[1, 0].set(xlabel="95 % interval (% of the estimate)", yticks=np.arange(len(free)), yticklabels=names)
-        image = axes[1, 1].imshow(np.asarray(result.correlation)[np.ix_(free, free)], vmin=-1, vmax=1, cmap="RdBu")
-        axes[1, 1].set(xticks=np.arange(len(free)), yticks=np.arange(len(free)), yticklabels=names)
-        axes[1, 1].set_xticklabels(names, rotation=90)
-        figure.colorbar(image, ax=axes[1, 1], label="correlation of the estimates")
-    return figure
 
 
 TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}

@@ -131,8 +131,10 @@ class FitResult(NamedTuple):
         return report.table(self)
 
     def plot(self, sampling_rate: float = 1.0) -> Any:
-        """A figure: residual and its spectrum (of the first channel), intervals, correlations. Needs matplotlib."""
-        return report.plot(self, sampling_rate)
+        """The figure of `hhtjax.plot.fit_overview`."""
+        from hhtjax.plot import fit_overview  # upstairs: needs matplotlib, as nothing else here does
+
+        return fit_overview(self, sampling_rate)[0].figure
 
     def to_json(self) -> str:
         """The whole result as JSON, for `FitResult.from_json`; inf and NaN as Python writes them."""
