@@ -46,6 +46,7 @@ from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
 from hhtjax.identification.arguments import Gaussian
 from hhtjax.identification.bias import step_size_bias
+from hhtjax.identification.comparison import compare
 from hhtjax.identification.identify import fit, multistart
 from hhtjax.identification.measured import measure, windows
 from hhtjax.identification.refinement import refine
@@ -88,7 +89,7 @@ __all__ = [  # noqa: RUF022
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
     "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
     # identification
-    "FitResult", "Gaussian", "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
+    "FitResult", "Gaussian", "bounded", "compare", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
     "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip
 

@@ -33,6 +33,7 @@ class FitResult(NamedTuple):
         uncertainty: `Uncertainty` of the free entries; None if not asked for.
         segments: how many parts of the record the covariance rests on.
         starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
+        weights: as given to `fit`.
 
     `covariance` (p, p), whose rows follow ravel_pytree(params), and `standard_errors`, the root of its diagonal,
     structured like params, come from how much segments of the record disagree (a cluster-robust covariance:
@@ -50,6 +51,7 @@ class FitResult(NamedTuple):
     uncertainty: Uncertainty | None
     segments: int
     starts: Any = None
+    weights: Any = True
 
     @property
     def converged(self) -> Any:

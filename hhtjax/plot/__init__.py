@@ -18,6 +18,7 @@ try:
 except ModuleNotFoundError as error:
     raise ImportError("hhtjax.plot needs matplotlib: pip install 'hhtjax[plot]'") from error
 
+from hhtjax.plot.comparisons import held_out
 from hhtjax.plot.convergence import error_against_h, work_precision
 from hhtjax.plot.energies import energy_balance
 from hhtjax.plot.fits import correlations, estimates, profile
@@ -43,6 +44,7 @@ __all__ = [
     "estimates",
     "fit_against_data",
     "fit_overview",
+    "held_out",
     "legend",
     "period_elongation",
     "phase_plane",

@@ -27,6 +27,8 @@ class Failure(NamedTuple):
             constraints.
         solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is
             the library's own.
+        mass: what is wrong with a mass that is a function, at the start: 0 nothing, 1 it is not symmetric, 2 not
+            positive definite (with constraints: not positive semidefinite); None where the mass is constant.
     """
 
     step: Any
@@ -34,6 +36,7 @@ class Failure(NamedTuple):
     quantity: Any
     row: Any = None
     solve: Any = None
+    mass: Any = None
 
     def _verdict(self):
         """How many failed, or what did."""
@@ -42,6 +45,8 @@ class Failure(NamedTuple):
             return ""
         if step.ndim or not step:
             return f"{np.count_nonzero(step)} of {step.size} runs failed" if step.any() else "no step failed"
+        if flaw := known(self.mass):
+            return f"the mass is not {MASS[int(flaw)]}"
         if known(self.newton):
             return "Newton did not converge"
         if known(self.solve):
@@ -53,6 +58,7 @@ QUANTITIES = (
     "the position q", "the velocity v", "the acceleration", "the vector of multipliers",
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
+MASS = (None, "symmetric", "positive definite")
 INTERNAL_STATE = 4  # among them
 
 
@@ -64,7 +70,8 @@ class Solution(NamedTuple):
         t: (K + 1,).
         q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order system y, y' and None.
         multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L.
-        dt: the step size; (K,) of a sweep over `times`, one for each interval.
+        dt: the step size; (N,) of steps that were given, one for each; (K,) of a sweep over `times`, one for each
+            interval.
         info: `Info` for each of the K intervals between saved times: largest residual, number of Newton iterations, all
             converged; None where the method has nothing to tell.
         failure: the first step that failed, a `Failure`; `check` turns it into an error.
@@ -134,7 +141,7 @@ class Solution(NamedTuple):
         t, dt, *failed = numbers
         runs = failed[0].shape
         fitting = t.ndim == len(runs) + 1 and t.shape[:-1] == runs and all(x.shape == runs for x in failed)
-        if not fitting or not t.size or dt.shape not in (runs, (*runs, t.shape[-1] - 1)):
+        if not fitting or not t.size or dt.shape[: t.ndim - 1] != runs or dt.ndim > t.ndim:
             return f"t {brief(self.t)}"
         batch = f"{failed[0].size} runs {runs}, each of " if runs else ""
         fault = self._fault()
@@ -145,7 +152,9 @@ class Solution(NamedTuple):
 
     def _why(self, member):
         """What `failure` says of one member of a batch."""
-        _, newton, quantity, row, left = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        _, newton, quantity, row, left, mass = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        if mass:
+            return f"`mass` must be {MASS[mass]}; at the start, mass(q0, params) is not"
         if left:
             return (
                 f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "
@@ -184,16 +193,26 @@ class Solution(NamedTuple):
         """How many steps come before each saved time."""
         t, dt = np.asarray(self.t), np.asarray(self.dt)
         with np.errstate(all="ignore"):  # what was traced may be anything
-            if dt.ndim < t.ndim:
+            if self._is_every_step():
+                taken = np.arange(t.shape[-1]) * (dt.shape[-1] // (t.shape[-1] - 1))
+                taken = np.broadcast_to(taken, t.shape)
+            elif dt.ndim < t.ndim:
                 taken = (t - t[..., :1]) / dt[..., None]
             else:
                 counts = np.nan_to_num(np.rint(np.diff(t) / dt), nan=1)
                 taken = np.insert(np.cumsum(counts, axis=-1), 0, 0, axis=-1)
         return np.rint(np.nan_to_num(taken, posinf=0, neginf=0)).astype(int)
 
+    def _is_every_step(self):
+        """Whether dt has the size of each step, and more than one of them may come before a saved time."""
+        K = self.t.shape[-1] - 1
+        return np.ndim(self.dt) == self.t.ndim and self.dt.shape[-1] != K
+
     def _time_of(self, step, member):
         """The time at which a step of a member of a batch ends."""
         taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
+        if self._is_every_step():
+            return t[0] + np.sum(np.asarray(self.dt)[member][:step])
         dt = np.broadcast_to(np.asarray(self.dt)[member], t[1:].shape)
         i = np.clip(np.searchsorted(taken, step) - 1, 0, dt.size - 1)
         return t[i] + (step - taken[i]) * dt[i]

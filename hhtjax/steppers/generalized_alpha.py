@@ -16,11 +16,12 @@ from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with, reuse
 from hhtjax.numerics.low_rank import Changing
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
-from hhtjax.steppers.linearization import linearization_point
-from hhtjax.steppers.newton import left_by, linearized_solve, newton, told
+from hhtjax.steppers.linearization import linearization_point, refresh
+from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.stepper import State, Stepper, join_info
+from hhtjax.steppers.unequal import Resizing
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
 
@@ -47,16 +48,8 @@ def step(method, system, params, factorize, where, dt, s):
     return system.tidy(s1), info
 
 
-def refresh(system, params, c, s, factorize):
-    """The state with the acceleration that its q and v ask for, w = M^-1 Q, and what the solve left."""
-    Q = system.force(s.q, s.v, s.t, params)
-    w = system.acceleration(s.q, s.v, s.t, params, factorize)
-    left = left_by(factorize, lambda w: system.inertia(s.q, w, params), Q, w)
-    return s._replace(w=w, a=s.a + (1 - c.alpha_f) / (1 - c.alpha_m) * (w - s.w)), told(factorize, left)
-
-
 @dataclass(frozen=True, eq=False)
-class GeneralizedAlpha(Stepper):
+class GeneralizedAlpha(Resizing, Stepper):
     """A method of the family; made by `hht`, `newmark`, `bossak` and `generalized_alpha`."""
 
     coefficients: Coefficients

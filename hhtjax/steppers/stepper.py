@@ -105,6 +105,7 @@ class Stepper(Description):
     solves_rotations = False
     solves_internal = False
     needs_equal_steps = False  # what it remembers belongs to steps of one size
+    resizes = False  # whether `resized` does anything
     redundant: str | None = None  # how constraints that depend on each other are solved
 
     def begin(self, system, q, v, t, params, dt) -> State:
@@ -114,6 +115,20 @@ class Stepper(Description):
     def bind(self, system, params, dt):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
         raise NotImplementedError
+
+    def resized(self, state, r):
+        """The stepper and the state for a step r times as long as the one before: by default the same.
+
+        For those who write their own loop, before a step of another size:
+
+        >>> import jax.numpy as jnp, hhtjax
+        >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
+        >>> stepper = hhtjax.hht()
+        >>> state, _ = stepper.step(spring, stepper.init(spring, jnp.ones(1), jnp.zeros(1), None, 0.1), None, 0.1)
+        >>> smaller, state = stepper.resized(state, 0.5)
+        >>> state, _ = smaller.step(spring, state, None, 0.05)
+        """
+        return self, state
 
     def astype(self, dtype):
         """The same with its arrays, such as a traced alpha, in the dtype of the state."""

@@ -60,6 +60,11 @@ def terms(blocks, q0, q1, x):
     return _each(blocks, lambda q0, q1, x: jnp.abs(q0) + jnp.abs(q1) + x, lambda R, *_: jnp.ones_like(R), q0, q1, x)
 
 
+def sizes(blocks, q):
+    """|q| of each coordinate of a displacement, (n,); 0 for rotations, whose displacement starts there."""
+    return _each(blocks, jnp.abs, lambda R: jnp.zeros(3, R.dtype), q)
+
+
 def orthonormalize(blocks, q):
     """q with the rounding errors of its rotations squared."""
     return _each(blocks, lambda q: q, rotation.orthonormalize, q)

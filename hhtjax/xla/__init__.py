@@ -50,11 +50,13 @@ The rest of the library knows nine functions of this room, and works as well on 
 The contract
 ------------
 
-The same program gives the same numbers with and without, to rounding; signed zeros, NaN and infinities included. One
-licence: inside a sum of products a term with a factor that is zero by structure (a unit vector, a tangent that autodiff
-knows to be zero) may be left out, and the sign of a sum that is zero is rounding (XLA itself takes x + 0 for x). A rule
-names the parameters of its operation that it understands; what it does not understand runs on whole arrays. So a JAX
-that brings a new operation, or a new option of an old one, makes programs slower, and never wrong.
+The same program gives the same numbers with and without, to rounding; signed zeros, NaN and infinities included. Two
+licences: inside a sum of products a term with a factor that is zero by structure (a unit vector, a tangent that
+autodiff knows to be zero) may be left out, and the sign of a sum that is zero is rounding (XLA itself takes x + 0 for
+x). And in reverse mode such a zero becomes a number where a stage ends, as where a scan does: beside an infinite
+derivative, that of 1/x at zero, it makes NaN where plain JAX may have infinity. A rule names the parameters of its
+operation that it understands; what it does not understand runs on whole arrays. So a JAX that brings a new operation,
+or a new option of an old one, makes programs slower, and never wrong.
 
 A rule for an operation
 -----------------------

@@ -1,0 +1,175 @@
+"""Models compared, on generated data: rates of rejection against 5 %, the true model found, errors against NumPy's."""
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from test_uncertainty import coloured
+
+import hhtjax
+from hhtjax.identification.evidence import chi_squared_tail, f_tail
+
+N, RUNS = 1600, 300
+k = jnp.arange(float(N))
+COLUMNS = {"rest": jnp.ones(N), "slow": jnp.sin(0.02 * k), "slower": jnp.cos(0.013 * k), "fast": jnp.cos(0.9 * k)}
+MODELS = {
+    "small": ("rest",),
+    "true": ("rest", "slow"),
+    "large": ("rest", "slow", "slower"),
+    "larger": ("rest", "slow", "slower", "fast"),
+}
+
+
+def model(params):
+    return sum(params[name] * COLUMNS[name] for name in params)
+
+
+def many(noise, size):
+    """A comparison of each of many records with the parameters of "true"."""
+
+    y = jax.jit(jax.vmap(lambda key: noise(key, (N,) if noise is jax.random.normal else N)))
+    y = size * y(jax.random.split(jax.random.key(0), RUNS)) + model({"rest": 0.5, "slow": 0.3})[None, :]
+    every = {}
+    for name, terms in MODELS.items():  # one after the other: batches of LAPACK's calls side by side can lock XLA:CPU
+
+        def one(y, terms=terms):
+            return hhtjax.fit(lambda p: model(p) - y, dict.fromkeys(terms, 0.1))
+
+        every[name] = jax.device_get(jax.jit(jax.vmap(one))(y))
+    return [hhtjax.compare(jax.tree.map(lambda x: x[i], every)) for i in range(RUNS)]  # noqa: B023
+
+
+@pytest.fixture(scope="module")
+def white():
+    return many(jax.random.normal, 1.0)
+
+
+@pytest.fixture(scope="module")
+def correlated():
+    return many(coloured, 0.3)
+
+
+def rejected(found, smaller, larger):
+    """Share of records in which the larger model is taken at the level of 5 %: by us, and by the textbook."""
+    tests = [x for one in found for x in one.tests if (x.smaller, x.larger) == (smaller, larger)]
+    assert len(tests) == RUNS
+    return np.mean([[x.p_value < 0.05, x.naive_p_value < 0.05] for x in tests], axis=0)
+
+
+def bic_share(found, name):
+    """Share of records in which BIC takes a model, and in which it does with n in the place of the effective number."""
+    ours = [one.names[int(np.argmin(one.bic))] == name for one in found]
+    naive = [one.names[int(np.argmin(N * np.log(one.rms**2) + one.parameters * np.log(N)))] == name for one in found]
+    return np.mean(ours), np.mean(naive)
+
+
+def test_white_noise(white):
+    """Both tests have their size; the effective number is the number; BIC finds the truth."""
+    ours, naive = rejected(white, "true", "large")
+    assert 0.02 <= naive <= 0.08
+    assert 0.02 <= ours <= 0.08
+    assert np.median([one.effective for one in white]) > 0.9 * N
+    assert np.mean(rejected(white, "small", "true")) == 1
+    assert min(bic_share(white, "true")) > 0.9
+
+
+def test_correlated_noise(correlated):
+    """AR(1) of 0.9: the textbook takes a slow term that is not there in most records, and refuses a fast one always."""
+    ours, naive = rejected(correlated, "true", "large")
+    assert 0.02 <= ours <= 0.08
+    assert naive > 0.4
+    ours, naive = rejected(correlated, "large", "larger")
+    assert 0.02 <= ours <= 0.08
+    assert naive < 0.01
+    ours, naive = bic_share(correlated, "true")
+    assert ours > 0.8
+    assert naive < 0.75
+    effective = np.median([one.effective for one in correlated])
+    assert 50 < effective < 0.3 * N  # 84 for a constant, up to 16 times more for the others
+
+
+def test_errors_on_segments_left_out_are_those_of_numpy():
+    """Rows left out of a linear least-squares problem, solved by NumPy; weights and missing samples with them."""
+    y = model({"rest": 0.5, "slow": 0.3}) + 0.3 * coloured(jax.random.key(1), N)
+    weights = np.where(np.arange(N) % 7 == 3, 0.0, 2.0)
+    terms = {name: MODELS[name] for name in ("small", "true", "large")}
+
+    def residuals(p):
+        return model(p) - y
+
+    results = {
+        name: hhtjax.fit(residuals, dict.fromkeys(names, 0.1), weights=jnp.asarray(weights))
+        for name, names in terms.items()
+    }
+    found = hhtjax.compare(results, residuals, folds=5)
+    assert found.observations == np.sum(weights > 0)
+    assert found.converged.all()
+    for i, names in enumerate(terms.values()):
+        X = np.stack([COLUMNS[name] for name in names], axis=1)
+        for fold in range(5):
+            out = np.arange(N) // 320 == fold
+            kept = ~out & (weights > 0)
+            p, *_ = np.linalg.lstsq(X[kept], np.asarray(y)[kept], rcond=None)
+            left = 2 * (X @ p - np.asarray(y))[out & (weights > 0)]
+            assert found.held_out[i, fold] == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-6)
+    assert found.chosen == "true"
+    assert "takes 'true'" in repr(found)
+    assert "behind the best" in found._repr_html_()
+    ax = hhtjax.plot.held_out(found, unit="V")
+    np.testing.assert_allclose(ax.lines[3].get_xdata(), found.cross_validated[[0, 2]])
+    np.testing.assert_allclose(ax.lines[4].get_xdata(), found.cross_validated[[1]])
+    plt.close(ax.figure)
+
+
+def test_where_a_term_is_absent():
+    """Against 0.3, not 0, a term of 0.3 is not significant; a smaller model that holds it fixed says so itself."""
+    y = model({"rest": 0.5, "slow": 0.3}) + 0.1 * jax.random.normal(jax.random.key(2), (N,))
+
+    def residuals(p):
+        return model(p) - y
+
+    start = {"rest": 0.1, "slow": 0.3}
+    small = hhtjax.fit(lambda p: residuals(p | {"slow": 0.3}), {"rest": 0.1})
+    held = hhtjax.fit(residuals, start, transforms={"rest": None, "slow": hhtjax.fixed})
+    large = hhtjax.fit(residuals, start)
+    (at_zero,) = hhtjax.compare({"small": small, "large": large}).tests
+    (given,) = hhtjax.compare({"small": small, "large": large}, absent={"slow": 0.3}).tests
+    (own,) = hhtjax.compare({"small": held, "large": large}).tests
+    assert at_zero.p_value < 1e-6
+    assert given.p_value == own.p_value > 0.01
+    assert given.naive_p_value == own.naive_p_value > 0.01
+
+
+def test_tails_of_distributions():
+    """Printed in every table of statistics."""
+    assert f_tail(4.17, 1, 30) == pytest.approx(0.05, rel=2e-3)
+    assert f_tail(5.39, 2, 30) == pytest.approx(0.01, rel=2e-3)
+    assert chi_squared_tail(31.41, 20) == pytest.approx(0.05, rel=1e-3)
+    assert np.isnan(f_tail(1.0, 3, 0))
+
+
+def test_what_cannot_be_compared_is_named():
+    y = model({"rest": 0.5})
+
+    def residuals(p):
+        return model(p) - y
+
+    one = hhtjax.fit(residuals, {"rest": 0.1, "slow": 0.1})
+    with pytest.raises(TypeError, match="compare: `fits` must be a dict of two or more FitResult; received dict"):
+        hhtjax.compare({"one": one})
+    with pytest.raises(ValueError, match=r"compare: `fits\['b'\]` must have a covariance"):
+        hhtjax.compare({"a": one, "b": one._replace(uncertainty=None)})
+    short = one._replace(residual=one.residual[:7])
+    with pytest.raises(ValueError, match="same measurements; received 1600 of 'a', 7 of 'b' observations"):
+        hhtjax.compare({"a": one, "b": short})
+    with pytest.raises(ValueError, match="compare: `residuals` must be of a, b; received a"):
+        hhtjax.compare({"a": one, "b": one}, {"a": residuals})
+    with pytest.raises(ValueError, match="compare: `folds` must be an integer, 2 or more; received 1"):
+        hhtjax.compare({"a": one, "b": one}, residuals, folds=1)
+    with pytest.raises(NotImplementedError, match=r"compare: `fits\['a'\]` has records"):
+        hhtjax.compare({"a": one._replace(starts=jnp.ones((4, 1))), "b": one}, residuals)
+    with pytest.raises(ValueError, match="held_out: `found` has no errors on segments"):
+        hhtjax.plot.held_out(hhtjax.compare({"a": one, "b": one}))
+    with pytest.raises(TypeError, match="held_out: `found` must be a Comparison"):
+        hhtjax.plot.held_out(one)
