@@ -25,29 +25,31 @@ def model(params):
     return sum(params[name] * COLUMNS[name] for name in params)
 
 
+def fitted(terms):
+    """A function that fits a model to many records."""
+    return jax.jit(jax.vmap(lambda y: hhtjax.fit(lambda p: model(p) - y, dict.fromkeys(terms, 0.1))))
+
+
+FIT = {name: fitted(terms) for name, terms in MODELS.items()}
+
+
 def many(noise, size):
-    """A comparison of each of many records with the parameters of "true"."""
-
-    y = jax.jit(jax.vmap(lambda key: noise(key, (N,) if noise is jax.random.normal else N)))
-    y = size * y(jax.random.split(jax.random.key(0), RUNS)) + model({"rest": 0.5, "slow": 0.3})[None, :]
-    every = {}
-    for name, terms in MODELS.items():  # one after the other: batches of LAPACK's calls side by side can lock XLA:CPU
-
-        def one(y, terms=terms):
-            return hhtjax.fit(lambda p: model(p) - y, dict.fromkeys(terms, 0.1))
-
-        every[name] = jax.device_get(jax.jit(jax.vmap(one))(y))
+    """A comparison for each of many records made with the parameters of "true"."""
+    y = size * jax.jit(jax.vmap(noise))(jax.random.split(jax.random.key(0), RUNS))
+    y = y + model({"rest": 0.5, "slow": 0.3})[None, :]
+    # one after the other: batches of LAPACK's calls side by side can lock XLA:CPU
+    every = {name: jax.device_get(fit(y)) for name, fit in FIT.items()}
     return [hhtjax.compare(jax.tree.map(lambda x: x[i], every)) for i in range(RUNS)]  # noqa: B023
 
 
 @pytest.fixture(scope="module")
 def white():
-    return many(jax.random.normal, 1.0)
+    return many(lambda key: jax.random.normal(key, (N,)), 1.0)
 
 
 @pytest.fixture(scope="module")
 def correlated():
-    return many(coloured, 0.3)
+    return many(lambda key: coloured(key, N), 0.15)
 
 
 def rejected(found, smaller, larger):
@@ -64,6 +66,7 @@ def bic_share(found, name):
     return np.mean(ours), np.mean(naive)
 
 
+@pytest.mark.slow
 def test_white_noise(white):
     """Both tests have their size; the effective number is the number; BIC finds the truth."""
     ours, naive = rejected(white, "true", "large")
@@ -74,6 +77,7 @@ def test_white_noise(white):
     assert min(bic_share(white, "true")) > 0.9
 
 
+@pytest.mark.slow
 def test_correlated_noise(correlated):
     """AR(1) of 0.9: the textbook takes a slow term that is not there in most records, and refuses a fast one always."""
     ours, naive = rejected(correlated, "true", "large")
