@@ -95,6 +95,11 @@ def simulate(
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
     q0, v0, z0 = initial_values("simulate", system, q0, v0, z0)
     require_capable("simulate", system, stepper, q0, v0)
+    if system.friction is not None and extrapolate > 1:
+        raise NotImplementedError(
+            "simulate: leave `extrapolate` out: with dry friction the error is no power series in dt; "
+            f"received {extrapolate}."
+        )
     if system.constraint is not None:
         require_consistent("simulate", system, q0, v0, t0, params, stepper.redundant, z0)
     dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew

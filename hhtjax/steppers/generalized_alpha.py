@@ -16,8 +16,9 @@ from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with, reuse
 from hhtjax.numerics.low_rank import Changing
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
-from hhtjax.steppers.linearization import linearization_point
-from hhtjax.steppers.newton import left_by, linearized_solve, newton, told
+from hhtjax.steppers.friction import begin_friction, bind_friction
+from hhtjax.steppers.linearization import linearization_point, refresh
+from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.stepper import State, Stepper, join_info
@@ -47,14 +48,6 @@ def step(method, system, params, factorize, where, dt, s):
     return system.tidy(s1), info
 
 
-def refresh(system, params, c, s, factorize):
-    """The state with the acceleration that its q and v ask for, w = M^-1 Q, and what the solve left."""
-    Q = system.force(s.q, s.v, s.t, params)
-    w = system.acceleration(s.q, s.v, s.t, params, factorize)
-    left = left_by(factorize, lambda w: system.inertia(s.q, w, params), Q, w)
-    return s._replace(w=w, a=s.a + (1 - c.alpha_f) / (1 - c.alpha_m) * (w - s.w)), told(factorize, left)
-
-
 @dataclass(frozen=True, eq=False)
 class GeneralizedAlpha(Stepper):
     """A method of the family; made by `hht`, `newmark`, `bossak` and `generalized_alpha`."""
@@ -66,10 +59,13 @@ class GeneralizedAlpha(Stepper):
     solves_constraints = True
     solves_rotations = True
     solves_internal = True
+    solves_friction = True
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""
         c = self.coefficients
+        if system.friction is not None:
+            return begin_friction(self, system, q, v, t, params, dt)
         if system.num_constraints:
             return begin_constrained(self, system, q, v, t, params, dt)
 
@@ -122,6 +118,8 @@ class GeneralizedAlpha(Stepper):
 
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""
+        if system.friction is not None:
+            return bind_friction(self, system, params, dt)
         if system.num_constraints:
             return bind_constrained(self, system, params, dt)
         if system.local is not None and self.options.solve is None:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.elimination import diagonal
+from hhtjax.steppers.newton import left_by, told
 from hhtjax.steppers.residual import residual
 from hhtjax.xla import staged
 
@@ -35,3 +36,11 @@ def linearization_point(system, params, s, predicted, where):
         lambda: predicted_size <= size(held),
     )
     return jax.tree.map(partial(jnp.where, use_predictor), predicted, held)
+
+
+def refresh(system, params, c, s, factorize):
+    """The state with the acceleration that its q and v ask for, w = M^-1 Q, and what the solve left."""
+    Q = system.force(s.q, s.v, s.t, params)
+    w = system.acceleration(s.q, s.v, s.t, params, factorize)
+    left = left_by(factorize, lambda w: system.inertia(s.q, w, params), Q, w)
+    return s._replace(w=w, a=s.a + (1 - c.alpha_f) / (1 - c.alpha_m) * (w - s.w)), told(factorize, left)
