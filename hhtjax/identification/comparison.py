@@ -128,8 +128,8 @@ def compare(
 
     Residuals of a fit are correlated, because no model is quite right, and then n of them say less than n independent
     ones: textbook criteria take in term after term. Here the covariance C of a fit, from how much segments of the
-    record disagree, says how much less. With S_m the weighted sum of squares of model m, k_m its parameters, and n_e = n/d,
-    where d = tr(naive^-1 C)/p >= 1 is the design effect of the model with most parameters,
+    record disagree, says how much less. With S_m the weighted sum of squares of model m, k_m its parameters, and
+    n_e = n/d, where d = tr(naive^-1 C)/p >= 1 is the design effect of the model with most parameters,
 
         AIC = n_e log(S_m/n) + 2 k_m,        BIC = n_e log(S_m/n) + k_m log n_e,
 
