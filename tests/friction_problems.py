@@ -7,6 +7,7 @@ import numpy as np
 
 import hhtjax
 from hhtjax.rotation import cross
+from hhtjax.scenes import belt, dry_oscillator
 
 
 class Case(NamedTuple):
@@ -23,25 +24,6 @@ class Case(NamedTuple):
     exact: Any = None
 
 
-def coulomb(q, v, t, params):
-    return params["F"] + 0 * v
-
-
-def stribeck(q, v, t, params):
-    """mu (1 + .3 exp(-|v|/.05)) times the normal load."""
-    return params["F"] * (1 + 0.3 * jnp.exp(-jnp.abs(v) / 0.05))
-
-
-def spring_force(q, v, t, params):
-    return -params["k"] * q - params.get("c", 0.0) * v
-
-
-def free_vibration():
-    """Five reversals under full load, then it sticks."""
-    system = hhtjax.System(jnp.ones(1), spring_force, friction=coulomb)
-    return Case(system, {"k": 100.0, "F": 4.0}, jnp.array([0.5]), jnp.zeros(1), 2.2)
-
-
 def free_vibration_exact(times, k=100.0, F=4.0, x0=0.5):
     """q and v in closed form: half cosines about F/k and -F/k in turn, until the spring cannot move the mass."""
     rate, shift = np.sqrt(k), F / k
@@ -51,36 +33,6 @@ def free_vibration_exact(times, k=100.0, F=4.0, x0=0.5):
     amplitude, sign = x0 - shift - 2 * shift * n, 1 - 2 * (n % 2)
     phase = np.where(half < rest, rate * times - np.pi * n, 0)
     return sign * (shift + amplitude * np.cos(phase)), -sign * amplitude * rate * np.sin(phase) * (half < rest)
-
-
-def driven_force(q, v, t, params):
-    return -params["k"] * q - params["c"] * v + params["A"] * jnp.sin(2.0 * t)
-
-
-def stick_slip(limit=coulomb):
-    """A mass on a spring, driven by a sine that often cannot move it."""
-    system = hhtjax.System(jnp.ones(1), driven_force, friction=limit)
-    return Case(system, {"k": 20.0, "c": 0.1, "A": 6.0, "F": 3.0}, jnp.zeros(1), jnp.zeros(1), 8.0)
-
-
-def belt_force(q, v, t, params):
-    return jnp.array([-30.0 * q[0] - 40.0 * (q[0] - q[1]), -50.0 * q[1] - 40.0 * (q[1] - q[0])]) - 0.05 * v
-
-
-def belt_sliding(q, v, t, params):
-    return v - params["u"]
-
-
-def belt_limit(q, v, t, params):
-    s = v - params["u"]
-    return params["F"] * jnp.array([1.0, 0.8]) * (1 + 0.5 * jnp.exp(-jnp.abs(s) / 0.1))
-
-
-def belt():
-    """Two masses on a moving belt."""
-    system = hhtjax.System(jnp.array([1.0, 0.7]), belt_force, friction=belt_limit, sliding=belt_sliding)
-    params = {"F": 5.0, "u": 0.3}
-    return Case(system, params, jnp.array([0.1, 0.0]), jnp.array([0.0, 0.0]), 5.0)
 
 
 def arm_mass(q, params):
@@ -144,7 +96,9 @@ def rod():
     free = hhtjax.System(jnp.array([0.25]), angle_force, friction=angle_limit)
     start = np.array([0.9]), np.array([0.0])
     q0, v0 = on_the_rod(*(x[None] for x in start))
-    return Case(system, {"A": 2.5, "F": 0.4}, jnp.asarray(q0[0]), jnp.asarray(v0[0]), 3.0, None, free, start, on_the_rod)
+    return Case(
+        system, {"A": 2.5, "F": 0.4}, jnp.asarray(q0[0]), jnp.asarray(v0[0]), 3.0, None, free, start, on_the_rod
+    )
 
 
 def motor_force(q, v, z, t, params):
@@ -185,3 +139,18 @@ def body():
     """A top in two bearings that rub: one turns with it, one stays in space."""
     system = hhtjax.System(jnp.array([0.8, 0.5, 0.9]), body_torque, friction=body_limit, sliding=body_sliding)
     return Case(system, {"F": 1.5}, hhtjax.rotation.exp(jnp.array([0.8, 0.0, 0.0])), jnp.array([0.0, 0.5, 2.0]), 3.0)
+
+
+def of_scene(scene):
+    return Case(*scene)
+
+
+CASES = {
+    "stick-slip, Coulomb": of_scene(dry_oscillator.driven(0.0)),
+    "stick-slip, Stribeck": of_scene(dry_oscillator.driven()),
+    "two masses on a belt": of_scene(belt.two_masses()),
+    "M(q), two joints": arm(),
+    "an internal state": motor(),
+    "a constraint, H(q), a load": rod(),
+    "a rotation, H(q)": body(),
+}

@@ -96,7 +96,9 @@ class Motion:
             for event in events:
                 event.terminal, event.direction = True, -1
             span = self.t, times[-1]
-            run = solve_ivp(lambda t, y: self.state(t, y)[0], span, self.y, dense_output=True, events=events, **TOLERANCE)
+            run = solve_ivp(
+                lambda t, y: self.state(t, y)[0], span, self.y, dense_output=True, events=events, **TOLERANCE
+            )
             here = (times >= self.t) & (times <= run.t[-1])
             if here.any():
                 out[here], stuck[here] = run.sol(times[here]).T, self.sig == 0
