@@ -17,6 +17,7 @@ from hhtjax.steppers.stepper import Stepper, join_info, require_capable, require
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.rubbing import require_independent_friction
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import on_scalars, one_kernel, or_plain
 
@@ -100,6 +101,8 @@ def simulate(
             "simulate: leave `extrapolate` out: with dry friction the error is no power series in dt; "
             f"received {extrapolate}."
         )
+    if system.friction is not None:
+        require_independent_friction("simulate", system, q0, v0, t0, params, z0)
     if system.constraint is not None:
         require_consistent("simulate", system, q0, v0, t0, params, stepper.redundant, z0)
     dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew

@@ -10,18 +10,23 @@ motion on either side of it (friction_law.py). Behind it w, a, v and q go along 
 jump of the acceleration never enters the recursion, which therefore does not ring, and what sticks stays where it is.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
+from jax import lax
 
-from hhtjax.numerics.elimination import matvec
+from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.steppers.constrained import equations, report_constraints
 from hhtjax.steppers.friction_law import balance, is_settled, switch
 from hhtjax.steppers.newton import newton, solve_and_keep
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Rubbing, join_info
+from hhtjax.systems.constraints import acceleration_and_multipliers
 from hhtjax.systems.friction import across, directions, own_rate, reaction, responses, solve_some
 
 NOISE = 8  # roundings, of what it is the difference of, below which a number is 0
+LAGS = 20  # how often multipliers, and limits that depend on them, are made anew at the start
 
 
 def begin_friction(method, system, q, v, t, params, dt):
@@ -30,44 +35,52 @@ def begin_friction(method, system, q, v, t, params, dt):
         raise ValueError(
             f"hht: with friction, leave `linearize` out: it is at the predictor; received {method.options.linearize!r}."
         )
-    law, smooth = system.friction, system._replace(friction=None)
+    at = q, v, t, params
     factorize = method.factorize_for(system) if system.num_constraints else method.factorize
     H = directions(system, q, t, params)
     G = responses(system, q, t, params, H, factorize)
-    K, own = across(H, G), own_rate(system, q, v, t, params)
+    K, own = across(H, G), own_rate(system, *at)
+    settle = partial(_settle, system, at, factorize, H, K, own)
 
-    def start(sig, tau, L):
-        """Of the smooth system, with joints that slide, and the forces tau at those that do not."""
+    def again(_, L):
+        """L with the friction of limits that depend on L."""
+        return acceleration_and_multipliers(_smooth(system, *settle(L), L), *at, factorize)[1]
 
-        def force(q, v, t, params):
-            f = law.limit(q, v, L, t, params)
-            return system.force(q, v, t, params) - reaction(system, q, t, params, jnp.where(sig == 0, tau, sig * f))
-
-        return method.begin(smooth._replace(force=force), q, v, t, params, dt)
-
-    def settle(sig, L):
-        """Friction of the joints at rest: what holds them, within its limits; those it cannot hold slide."""
-        f, zero = law.limit(q, v, L, t, params), jnp.zeros(law.size, q.dtype)
-        load = matvec(H, start(sig, zero, L).w) + own
-        load = jnp.where(sig == 0, load, 0)
-        coupling = jnp.where((sig == 0)[:, None] & (sig == 0)[None, :], K, jnp.diag(jnp.diagonal(K)))
-        tau, _ = balance(lambda b: jnp.clip(b / jnp.diagonal(K), -f, f), load, coupling, zero, f)
-        slides = jnp.where(jnp.abs(tau) >= f, jnp.sign(tau), 0)
-        return jnp.where(sig == 0, slides, sig), jnp.where(sig == 0, tau, sig * f)
-
-    resting = jnp.sign(law.sliding(q, v, t, params))
-    L = jnp.zeros(system.num_constraints, q.dtype) if system.num_constraints else None
-    sig, tau = settle(resting, L)
-    if L is not None:  # limits may depend on L, and L on the friction
-        for _ in range(LAGS):
-            L = start(sig, tau, L).L
-            sig, tau = settle(resting, L)
-    s = start(sig, tau, L)
+    L = None
+    if system.num_constraints:
+        L = lax.fori_loop(0, LAGS, again, jnp.zeros(system.num_constraints, q.dtype))
+    sig, tau = settle(L)
+    s = method.begin(_smooth(system, sig, tau, L), *at, dt)
     a = _taken_off(s.a, solve_some(K, sig == 0, matvec(H, s.a) + own), G)
     return s._replace(a=a, friction=Rubbing(sig, tau))
 
 
-LAGS = 20  # how often multipliers and limits that depend on them are made anew at the start
+def _smooth(system, sig, tau, L):
+    """Without the law, but with the friction of joints that slide, and the forces tau at those that do not."""
+
+    def force(q, v, t, params):
+        f = system.friction.limit(q, v, L, t, params)
+        return system.force(q, v, t, params) - reaction(system, q, t, params, jnp.where(sig == 0, tau, sig * f))
+
+    return system._replace(force=force, friction=None)
+
+
+def _settle(system, at, factorize, H, K, own, L):
+    """sig and tau at the start. What rests is held, within the limits; what cannot be held slides."""
+    q, v, t, params = at
+    sig, f = jnp.sign(system.friction.sliding(*at)), system.friction.limit(q, v, L, t, params)
+    rests, zero = sig == 0, jnp.zeros_like(f)
+    free = _smooth(system, sig, zero, L)
+    if system.num_constraints:
+        w, _ = acceleration_and_multipliers(free, *at, factorize)
+    else:
+        w = free.acceleration(*at, factorize)
+    load = jnp.where(rests, matvec(H, w) + own, 0)
+    alone = diagonal(K)
+    coupling = jnp.where(rests[:, None] & rests[None, :], K, jnp.diag(alone))
+    tau, _ = balance(lambda b: jnp.clip(b / alone, -f, f), load, coupling, zero, f)
+    slides = jnp.where(jnp.abs(tau) >= f, jnp.sign(tau), 0)
+    return jnp.where(rests, slides, sig), jnp.where(rests, tau, sig * f)
 
 
 def bind_friction(method, system, params, dt):
@@ -93,13 +106,13 @@ def bind_friction(method, system, params, dt):
         held = path(z - matvec(G.T, solve_some(W, sig == 0, sf)))
         f = law.limit(held.q, held.v, held.L, held.t, params)
         K = across(H, G[:, :size])
-        rules = s0, sig, tau, f, jnp.diagonal(W), dt * jnp.diagonal(K)
+        rules = s0, sig, tau, f, diagonal(W), dt * diagonal(K)
 
         def answer(b):
             return switch(b, *rules).tau
 
         dtau, change = balance(answer, sf, W, jnp.where(sig == 0, tau, 0), f)
-        end = switch(sf - matvec(W, dtau) + jnp.diagonal(W) * dtau, *rules)
+        end = switch(sf - matvec(W, dtau) + diagonal(W) * dtau, *rules)
         z = z - matvec(G.T, dtau)
         x = method.advance(s, dt, z[:size])[0]
         taken = None if shift is None else shift(z[size + system.num_constraints :])
