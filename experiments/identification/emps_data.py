@@ -1,4 +1,4 @@
-"""EMPS, a measured positioning axis with dry friction: the benchmark's records, or generated ones; its equation of motion.
+"""EMPS, a measured positioning axis with dry friction: the benchmark's records, or generated ones, and its equation.
 
 A. Janot, M. Gautier, M. Brunot, "Data Set and Reference Models of EMPS", Workshop on Nonlinear System Identification
 Benchmarks, Eindhoven 2019. A motor moves a carriage by a ball screw, and a controller makes it follow a reference.
@@ -74,7 +74,7 @@ def read(file: Path):
 
 def force(q, v, t, params):
     """Of the motor, less viscous friction, which may differ from one direction to the other, and a constant, N."""
-    own, u = params
+    own, _ = params
     viscous = own.get("Fv", 0.0) * v + own.get("Fa", 0.0) * jnp.abs(v)
     return motor(t, params) - viscous - own["offset"]
 
