@@ -127,8 +127,6 @@ def test_arrays_are_shown_by_their_shape():
     message = r"must be a real number; received an array of shape \(1000,\)\.(\n-|$)"
     with pytest.raises(TypeError, match=f"sampled: `dt` {message}"):
         hhtjax.sampled(np.ones(9), np.linspace(0, 1, 1000))
-    with pytest.raises(TypeError, match=f"simulate: `dt` {message}"):
-        jax.jit(lambda dt: run(System(np.ones(2), pull), dt=dt).q)(jnp.ones(1000))
 
 
 def test_matrices_of_a_linear_system_fit():

@@ -78,9 +78,9 @@ def bind_constrained(method, system, params, dt):
         if options.iterations is None:
             z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
         else:
-            z, info = linearized_solve(r, path, z, factorize)
+            z, info = linearized_solve(r, path, z, factorize, again=method.estimating)
             for _ in range(options.iterations - 1):
-                z, more = linearized_solve(r, path, z, factorize)
+                z, more = linearized_solve(r, path, z, factorize, again=method.estimating)
                 info = join_info(info, more)
         s1 = system.tidy(path(z))
         return s1, report(system, params, s1, info, None if method.redundant else dependent(s, s1, B))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.numerics.linear_solve import Trusted, invert_and_bound, solve_map
+from hhtjax.numerics.linear_solve import Trusted, factorize_map, invert_and_bound, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems import kinematics
@@ -17,10 +17,11 @@ RELATIVE = 1e-6  # of the terms of a row, above which its residual is never smal
 SHAKE, NOISE, SHAKES = 2, 32, 3  # roundings by which a state is changed; how much more than that passes; how often
 
 
-def linearized_solve(r, path, w, factorize, at=None):
+def linearized_solve(r, path, w, factorize, at=None, again=False):
     """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)), and its `Info`.
 
-    One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
+    One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's. again: one solve
+    more, of the residual at the end, which becomes `Info.defect`.
     """
 
     def expand(w, at):
@@ -37,8 +38,10 @@ def linearized_solve(r, path, w, factorize, at=None):
         return tangent(along(dw))
 
     factorize = around(factorize, lambda: (path(w) if at is None else at, along))
-    dw = solve_map(f, value, factorize)
-    return w - dw, told(factorize, left_by(factorize, f, value, dw))
+    solve = factorize_map(f, value, factorize)
+    dw = solve(value)
+    info = told(factorize, left_by(factorize, f, value, dw))
+    return w - dw, info._replace(defect=solve(r(path(w - dw)))) if again else info
 
 
 def left_by(factorize, f, b, x):
