@@ -54,6 +54,9 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
 from hhtjax.numerics.structured_solve import banded, conjugate_gradients
+from hhtjax.runs.adaptive import adaptive
+from hhtjax.runs.choose import Steps
+from hhtjax.runs.chosen import choose_steps
 from hhtjax.runs.interpolate import InternalInterpolant, Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import Failure, SimulationError, Solution
@@ -61,6 +64,7 @@ from hhtjax.runs.sweep import sweep
 from hhtjax.runs.sweep_to_disk import load_sweep, sweep_to_disk
 from hhtjax.steppers.collocation import collocation, wilson
 from hhtjax.steppers.explicit import rk4
+from hhtjax.steppers.explicit_pair import dopri5
 from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, newmark
 from hhtjax.steppers.implicit_euler import implicit_euler
 from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_euler
@@ -83,11 +87,11 @@ __all__ = [  # noqa: RUF022
     "Sampled", "band_limited", "band_limited_motion", "sampled", "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
-    "bossak", "collocation", "conventional_hht", "generalized_alpha", "hht", "houbolt", "implicit_euler", "kim_hht",
-    "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
+    "bossak", "collocation", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
+    "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
     # runs
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
-    "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
+    "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
     # identification
     "FitResult", "Gaussian", "bounded", "compare", "equation_error", "fit", "fit_progressively", "fixed", "measure",
     "multistart", "positive", "refine", "step_size_bias", "windows",

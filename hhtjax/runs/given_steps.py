@@ -5,6 +5,7 @@ import numpy as np
 
 from hhtjax.checks import require_integer, require_number
 from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.runs.adaptive import Adaptive
 
 
 def require_steps(caller, stepper, dt, num_steps):
@@ -32,6 +33,18 @@ def require_steps(caller, stepper, dt, num_steps):
             bad = int(np.argmin(fine))
             raise ValueError(f"{caller}: `dt` must be positive and finite; received dt[{bad}] = {dt[bad]}.")
     return dt, dt.size
+
+
+def require_control_alone(caller, dt, times, num_steps, save_every, extrapolate):
+    """An error unless error control comes with times, and with nothing that belongs to steps of given sizes."""
+    if not isinstance(dt, Adaptive):
+        raise TypeError(f"{caller}: `times` is for dt=adaptive(...): leave it out, or take `sweep`.")
+    if times is None:
+        raise TypeError(f"{caller}: with dt=adaptive(...), give `times`, (K,), at the last of which the run ends.")
+    others = ("num_steps", num_steps, None), ("save_every", save_every, 1), ("extrapolate", extrapolate, 1)
+    for name, value, default in others:
+        if value != default:
+            raise ValueError(f"{caller}: with dt=adaptive(...), leave `{name}` out; received {value!r}.")
 
 
 def refined(dt, k):

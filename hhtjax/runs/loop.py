@@ -36,11 +36,11 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     return Loop(carry, counted(take_step, flat, t0, dt), partial(saved, flat), no_info)
 
 
-def loop_over(flat, stepper, q, v, t0, params, dt):
-    """The same with steps dt (N,), of any sizes; NaN where one is not positive."""
+def loop_over(flat, stepper, q, v, t0, params, dt, ends=None):
+    """The same with steps dt (N,), of any sizes; NaN where one is not positive. ends: where they end, if known."""
     stepper = stepper.astype(q.dtype)
     dt = jnp.where((dt > 0) & jnp.isfinite(dt), dt, jnp.nan)
-    steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt)
+    steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt) if ends is None else ends
     first = dt[0]
 
     @partial(jax.jit, inline=True)  # traced once, wherever it is called

@@ -82,6 +82,8 @@ class Solution(NamedTuple):
         z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without.
         friction: tau (K + 1, m), dry friction, positive against positive sliding; None without.
         sticking: (K + 1, m), whether a joint sticks; None without.
+        steps: what error control chose, the `Steps`; dt are those accepted. None without.
+        error: (K + 1,) of a run with `verify`, the error of q at each saved time, in its largest coordinate.
     """
 
     t: Any
@@ -96,6 +98,8 @@ class Solution(NamedTuple):
     zdot: Any = None
     friction: Any = None
     sticking: Any = None
+    steps: Any = None
+    error: Any = None
 
     def check(self, reach=None):
         """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
@@ -105,13 +109,15 @@ class Solution(NamedTuple):
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
-        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t)))):
+        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t, self.steps)))):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         if fault := self._fault(reach):
             raise SimulationError(f"simulate: {fault}")
 
     def _fault(self, reach=None):
         """What is wrong with the run, in words; None where nothing is."""
+        if self.steps is not None and (fault := self.steps._fault()):
+            return fault
         dt = np.asarray(self.dt)
         if np.any(dt <= 0):  # what is not finite shows in the state
             return f"`dt` must be positive and finite; it was {dt[dt <= 0].flat[0]:g}."

@@ -162,8 +162,9 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
         if interval is None:
             return form.of(loop.advance), substeps, longest
         t, h, mine, most, *part = interval
-        taken, last = part or (0, None)
-        return form.of(advance_from(flat, stepper, q.dtype, params, t, h, run[1] - taken, last)), mine, most
+        taken, last = part or (None, None)
+        count = run[1] if taken is None else run[1] - taken
+        return form.of(advance_from(flat, stepper, q.dtype, params, t, h, count, last)), mine, most
 
     def part(carry, here):
         advance, substeps, longest = pace(carry[0], here)

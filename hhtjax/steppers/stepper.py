@@ -77,6 +77,8 @@ class Info(NamedTuple):
         solved: whether that is within its tolerance.
         friction: how exactly the switches of several joints in one step are resolved, relative to the limits of dry
             friction; infinite where a limit is negative or not a number.
+        defect: S^-1 r, what a linearised step has left of its residual at its end, as a correction of the unknowns
+            (under error control only).
     """
 
     residual: Any = None
@@ -88,6 +90,7 @@ class Info(NamedTuple):
     solve_residual: Any = None
     solved: Any = None
     friction: Any = None
+    defect: Any = None
 
     def _verdict(self):
         """Of several steps."""
@@ -99,7 +102,12 @@ class Info(NamedTuple):
 
 def join_info(info, new):
     """Info of several steps as one: largest residuals, number of iterations, all converged."""
-    join = {"iterations": jnp.add, "converged": jnp.logical_and, "solved": jnp.logical_and}
+    join = {
+        "iterations": jnp.add,
+        "converged": jnp.logical_and,
+        "solved": jnp.logical_and,
+        "defect": lambda _, new: new,
+    }
     pairs = {name: (x, getattr(new, name)) for name, x in info._asdict().items() if x is not None}
     return info._replace(**{name: join.get(name, jnp.maximum)(*pair) for name, pair in pairs.items()})
 
@@ -125,6 +133,8 @@ class Stepper(Description):
     solves_friction = False
     needs_equal_steps = False  # what it remembers belongs to steps of one size
     resizes = False  # whether `resized` does anything
+    estimate_order: int | None = None  # power of h with which the estimated error of a step falls; None without
+    dense_term = False  # whether its memory is what dense output adds to cubics
     redundant: str | None = None  # how constraints that depend on each other are solved
 
     def begin(self, system, q, v, t, params, dt) -> State:
