@@ -16,6 +16,7 @@ class Recorder:
     def __init__(self):
         self.blocks, self.known = [Block()], [{}]
         self.places = {}  # {scalar: (array, index)} of what was read from an array
+        self.orders = {}  # {array of pivots: array of the order of rows}
 
     def record(self, name, dtype, *operands, **params):
         """The result of an operation, found if it was there before."""

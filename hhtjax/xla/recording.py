@@ -17,6 +17,7 @@ from hhtjax.xla.recording_arrays import ARRAYS
 from hhtjax.xla.scalar_rules import FOLDS, RULES
 from hhtjax.xla.source_lines import line_of
 
+UNKNOWN = "unknown"
 MOST = 100_000  # operations: of more, a compiler takes minutes
 INLINED = {  # a function called: the parameter that holds it
     **{"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr"},
@@ -58,6 +59,9 @@ def listed(f, *args) -> Listing:
         results = [each(as_operand, x) for x in _Listing(recorder).run(trace, values)]
     wanted = {x for value in results for x in value.flat if isinstance(x, Scalar)}
     operations = pruned(recorder.blocks[0].operations, wanted)
+    for x in everywhere(operations):
+        if x.name == UNKNOWN:
+            raise NotListed(x.params["what"], x.params["line"])
     if sum(1 for _ in everywhere(operations)) > MOST:
         raise NotListed(f"more than {MOST} operations")
     return Listing([x for value in values for x in value.flat], operations, jax.tree.structure(like).unflatten(results))
@@ -66,11 +70,14 @@ def listed(f, *args) -> Listing:
 def _fresh(recorder, aval):
     """A new scalar for each element."""
     count = int(np.prod(aval.shape, dtype=int))
-    return arranged([Scalar(np.dtype(aval.dtype), recorder) for _ in range(count)], aval.shape)
+    dtype = np.dtype(object if jnp.issubdtype(aval.dtype, jax.dtypes.extended) else aval.dtype)
+    return arranged([Scalar(dtype, recorder) for _ in range(count)], aval.shape)
 
 
 def known_pieces(x):
     """An array of numbers, taken to pieces whatever its size."""
+    if jnp.issubdtype(getattr(x, "dtype", float), jax.dtypes.extended):
+        raise NotListed("random numbers")
     x = np.asarray(x)
     return arranged(list(x.reshape(-1)), x.shape)
 
@@ -79,7 +86,7 @@ class _Listing:
     """The evaluator of a jaxpr on object arrays."""
 
     def __init__(self, recorder):
-        self.recorder = recorder
+        self.recorder, self.lines = recorder, []
 
     def run(self, closed, values):
         """The values of the results of a closed jaxpr."""
@@ -87,13 +94,16 @@ class _Listing:
         return evaluate(jaxpr, [*map(known_pieces, constants), *values], self.apply, known_pieces)
 
     def apply(self, eqn, values):
-        """The results of one operation."""
-        try:
-            results = self._results(eqn, eqn.primitive.name, values)
-        except NotListed as error:  # what JAX has traced once may not know who called it
-            raise NotListed(error.name, error.line or line_of(eqn)) from None
+        """The results of one operation; of one that is not known, results that nobody may need."""
+        self.lines.append(line_of(eqn))
+        results = self._results(eqn, eqn.primitive.name, values)
+        line = self.lines.pop() or next(filter(None, reversed(self.lines)), None)  # a cached trace has forgotten it
         if results is None:
-            raise NotListed(eqn.primitive.name, line_of(eqn))
+            what = {"what": eqn.primitive.name, "line": line}
+            results = [_fresh(self.recorder, x.aval) for x in eqn.outvars]
+            self.recorder.append(Operation(UNKNOWN, _flat(values), _flat(results), what))
+        if eqn.effects:
+            raise NotListed(eqn.primitive.name, line)
         return [each(as_operand, x) for x in results]
 
     def _results(self, eqn, name, values):
@@ -105,13 +115,15 @@ class _Listing:
             return values
         if name == "hhtjax_inside":  # functions come in two forms: outside of a kernel LAPACK's
             return [known_pieces(np.bool_(False))]
-        if name not in UNDERSTOOD or is_understood(eqn):
+        known = all(is_known(x) for value in values for x in value.flat)
+        if (name not in UNDERSTOOD or is_understood(eqn)) and not (known and any(not x.size for x in values)):
             rule = FOLDS.get(name) or RULES.get(name)
             results = None if rule is None else rule(eqn, *values)
             if results is not None:
                 return results
-        if not eqn.effects and all(is_known(x) for value in values for x in value.flat):
+        if known and not eqn.effects and not jnp.issubdtype(eqn.outvars[0].aval.dtype, jax.dtypes.extended):
             arrays = [np.asarray(v.tolist(), x.aval.dtype) for v, x in zip(values, eqn.invars, strict=True)]
+            arrays = [x.reshape(v.shape) for x, v in zip(arrays, values, strict=True)]
             with jax.ensure_compile_time_eval():
                 return [known_pieces(x) for x in alone(eqn)(*map(jnp.asarray, arrays))]
         return ARRAYS[name](self.recorder, eqn, *values) if name in ARRAYS else None

@@ -35,8 +35,6 @@ def _inside(recorder, start, largest):
     if is_known(start):
         return np.int32(min(max(int(start), 0), largest))
     dtype = start.dtype
-    if dtype == np.uint32:
-        raise ValueError("unsigned index")
     low = recorder.record("max", dtype, start, dtype.type(0))
     return recorder.record("convert_element_type", np.int32, recorder.record("min", dtype, low, dtype.type(largest)))
 
@@ -149,7 +147,24 @@ def _lu(recorder, eqn, A):
     dtype = eqn.outvars[0].aval.dtype
     likes = (dtype, n * n), (np.int32, n), (np.int32, n)
     found = recorder.arrays("lu", [recorder.array(A.flat, dtype)], likes, n=n)
+    recorder.orders[found[1]] = found[2]
     return [_elements(recorder, x, v.aval.shape) for x, v in zip(found, eqn.outvars, strict=True)]
+
+
+def _permutation(recorder, eqn, pivots):
+    """The order of the rows, which the elimination has told."""
+    place = recorder.places.get(pivots.flat[0])
+    order = None if place is None else recorder.orders.get(recorder.array(pivots.flat, np.int32))
+    return None if order is None else [_elements(recorder, order, pivots.shape)]
+
+
+def _moved(recorder, eqn, *values):
+    """Of what moves elements, and does nothing else: asked where it takes their numbers."""
+    sizes = np.cumsum([0, *(x.size for x in values)])
+    numbers = [np.arange(i, i + x.size, dtype=np.int32).reshape(x.shape) for i, x in zip(sizes, values, strict=False)]
+    elements = np.concatenate([x.ravel() for x in values])
+    with jax.ensure_compile_time_eval():
+        return [arranged(elements[np.ravel(x)], x.shape) for x in alone(eqn)(*numbers)]
 
 
 def _triangular_solve(recorder, eqn, A, b):
@@ -177,6 +192,9 @@ ARRAYS = {
     "dynamic_slice": _dynamic_slice,
     "gather": _gather,
     "lu": _lu,
+    "lu_pivots_to_permutation": _permutation,
     "scatter-add": _scatter_add,
+    "tile": _moved,
     "triangular_solve": _triangular_solve,
+    "unstack": _moved,
 }
