@@ -82,7 +82,9 @@ _of_floats = {
     "clamp": lambda x, kind, dtype, f, prefix, _: f"{prefix}_min{f}({prefix}_max{f}({x[1]}, {x[0]}), {x[2]})",
     "div": lambda x, *_: f"{x[0]} / {x[1]}",
     "is_finite": lambda x, *_: f"isfinite({x[0]}) != 0",
+    "le_to": lambda x, *_: f"isnan({x[1]}) || {x[0]} <= {x[1]}",
     "logistic": lambda x, kind, dtype, f, *_: f"1 / (1 + exp{f}(-{x[0]}))",
+    "lt_to": lambda x, *_: f"isnan({x[1]}) ? !isnan({x[0]}) : {x[0]} < {x[1]}",
     "max": lambda x, kind, dtype, f, prefix, _: f"{prefix}_max{f}({x[0]}, {x[1]})",
     "min": lambda x, kind, dtype, f, prefix, _: f"{prefix}_min{f}({x[0]}, {x[1]})",
     "rem": lambda x, kind, dtype, f, *_: f"fmod{f}({x[0]}, {x[1]})",
@@ -94,7 +96,7 @@ _ROUND = {0: "round", 1: "rint"}  # halves away from zero, or to even
 _of_integers = {
     "abs": lambda x, *_: f"{x[0]} < 0 ? -{x[0]} : {x[0]}",
     "clamp": lambda x, *_: f"{x[1]} < {x[0]} ? {x[0]} : {x[1]} > {x[2]} ? {x[2]} : {x[1]}",
-    "div": lambda x, *_: f"{x[1]} == 0 ? -1 : {x[0]} / {x[1]}",
+    "div": lambda x, kind, dtype, *_: f"{x[1]} == 0 ? ({TYPES[dtype]})-1 : {x[0]} / {x[1]}",
     "max": lambda x, *_: f"{x[0]} > {x[1]} ? {x[0]} : {x[1]}",
     "min": lambda x, *_: f"{x[0]} < {x[1]} ? {x[0]} : {x[1]}",
     "not": lambda x, kind, *_: f"!{x[0]}" if kind == bool else f"~{x[0]}",

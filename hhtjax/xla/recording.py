@@ -104,6 +104,7 @@ class _Listing:
             self.recorder.append(Operation(UNKNOWN, _flat(values), _flat(results), what))
         if eqn.effects:
             raise NotListed(eqn.primitive.name, line)
+        results = [x if isinstance(x, np.ndarray) else arranged([x], ()) for x in results]
         return [each(as_operand, x) for x in results]
 
     def _results(self, eqn, name, values):
@@ -111,7 +112,7 @@ class _Listing:
             return self.run(eqn.params[INLINED[name]], values)
         if name in LOOPS:
             return LOOPS[name](self, eqn, *values)
-        if name in ("hhtjax_watch", "optimization_barrier"):
+        if name in ("hhtjax_watch", "optimization_barrier", "device_put"):
             return values
         if name == "hhtjax_inside":  # functions come in two forms: outside of a kernel LAPACK's
             return [known_pieces(np.bool_(False))]

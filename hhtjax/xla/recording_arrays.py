@@ -184,6 +184,12 @@ def _triangular_solve(recorder, eqn, A, b):
     return [(rows if flips else rows.T).reshape(shape)]
 
 
+def _compared(recorder, eqn, x, y):
+    """In the order in which what is no number comes last."""
+    pairs = zip(x.flat, y.flat, strict=True)
+    return [arranged([recorder.record(eqn.primitive.name, bool, *pair) for pair in pairs], x.shape)]
+
+
 ARRAYS = {
     "argmax": partial(_largest, "gt"),
     "argmin": partial(_largest, "lt"),
@@ -191,6 +197,7 @@ ARRAYS = {
     "cumsum": partial(_cumulative, "add"),
     "dynamic_slice": _dynamic_slice,
     "gather": _gather,
+    **{"le_to": _compared, "lt_to": _compared},
     "lu": _lu,
     "lu_pivots_to_permutation": _permutation,
     "scatter-add": _scatter_add,
