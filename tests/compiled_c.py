@@ -1,6 +1,7 @@
 """Exported models, compiled and called: a run in C as arrays."""
 
 import ctypes
+import itertools
 import shutil
 import subprocess
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 STRICT = "-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror"
 SANITIZERS = "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
+COUNT = itertools.count()  # a file that is loaded must not be written over
 COMPILER = next((name for name in ("cc", "gcc", "clang") if shutil.which(name)), None)
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler on this machine")
 
@@ -35,7 +37,7 @@ class Library:
     def __init__(self, model, folder, *flags):
         self.model = model
         paths = model.write(Path(folder))
-        path = compiled(paths[:1], Path(folder) / f"{model.name}.so", "-O1", "-fPIC", "-shared", *flags)
+        path = compiled(paths[:1], Path(folder) / f"{model.name}{next(COUNT)}.so", "-O1", "-fPIC", "-shared", *flags)
         self.real = ctypes.c_float if "typedef float" in model.header else ctypes.c_double
         num_inputs = sum(field.size for field in model.inputs)
         members = [("t", self.real), *map(self._member, model.state), ("flags", ctypes.c_int)]
@@ -61,9 +63,7 @@ class Library:
         state = self.State()
         arrays = [self.array(x) for x in starts]
         params = self.defaults if params is None else params
-        flags = self._init(
-            ctypes.byref(state), ctypes.byref(params), *arrays, self.real(t0), self.real(dt)
-        )
+        flags = self._init(ctypes.byref(state), ctypes.byref(params), *arrays, self.real(t0), self.real(dt))
         return state, flags
 
     def step(self, state, u=None, *, dt, params=None):

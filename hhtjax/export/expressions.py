@@ -22,7 +22,7 @@ CALLS = {  # functions of <math.h>
 def number(x):
     """A known number."""
     dtype = np.dtype(x.dtype)
-    if dtype == bool:
+    if dtype.kind == "b":
         return "1" if x else "0"
     if dtype.kind in "iu":
         smallest = dtype.kind == "i" and x == np.iinfo(dtype).min  # whose absolute value has no constant
@@ -49,7 +49,7 @@ def expression(operation, x, prefix):
 
 
 def _converted(x, kind, dtype, suffix, prefix, params):
-    if dtype == bool:
+    if dtype.kind == "b":
         return f"{x[0]} != 0"
     if kind.kind == "f" and dtype.kind in "iu":
         return f"({TYPES[dtype]}){prefix}_whole({x[0]}, {_bound(dtype, 'min')}, {_bound(dtype, 'max')})"
@@ -99,7 +99,7 @@ _of_integers = {
     "div": lambda x, kind, dtype, *_: f"{x[1]} == 0 ? ({TYPES[dtype]})-1 : {x[0]} / {x[1]}",
     "max": lambda x, *_: f"{x[0]} > {x[1]} ? {x[0]} : {x[1]}",
     "min": lambda x, *_: f"{x[0]} < {x[1]} ? {x[0]} : {x[1]}",
-    "not": lambda x, kind, *_: f"!{x[0]}" if kind == bool else f"~{x[0]}",
+    "not": lambda x, kind, *_: f"!{x[0]}" if kind.kind == "b" else f"~{x[0]}",
     "rem": lambda x, *_: f"{x[1]} == 0 ? {x[0]} : {x[0]} % {x[1]}",
     "sign": lambda x, *_: f"({x[0]} > 0) - ({x[0]} < 0)",
 }
@@ -147,7 +147,8 @@ static void #_lu(const int n, @ *const a, int32_t *const pivots, int32_t *const 
     }
 }""",
     "triangular": """/* the x of a triangle of a, or of its transpose, in the place of its right-hand side */
-static void #_triangular(const int n, const @ *const a, @ *const x, const int lower, const int transpose, const int unit)
+static void #_triangular(const int n, const @ *const a, @ *const x, const int lower, const int transpose,
+                         const int unit)
 {
     int i, j;
     for (i = 0; i < n; i++) {

@@ -145,7 +145,7 @@ def header(parts: Parts):
         name=name, guard=f"{name.upper()}_H", version=VERSION, real=TYPES[np.dtype(parts.made.dtype)],
         stepper=_comment(parts.stepper),
         work=f"A step takes {operations} operations on numbers, {functions} of them functions such as sines.",
-        flags=",\n".join(f"    {name.upper()}_{flag} = {2**i} /* {text} */" for i, (flag, text) in enumerate(FLAGS.items())),
+        flags=",\n".join(f"    {name.upper()}_{key} = {2**i} /* {text} */" for i, (key, text) in enumerate(FLAGS.items())),
         state="\n".join(field.declaration(real) for field in parts.fields),
         rest="\n".join(rest), params="\n".join(params or ["    int none;"]),
         starts=" and ".join(sorted(parts.made.starts)), init_inputs=" and the inputs before" if num_inputs else "",
@@ -164,7 +164,8 @@ def source(parts: Parts):
     return SOURCE.format(
         name=parts.name, values=_values(parts), helpers="".join(f"\n{text}\n" for text in helpers),
         begin="\n".join(begin.lines), begin_unused=_unused(begin, arguments), begin_inputs=keep,
-        begin_flags=begin.flags, body="\n".join(body.lines), step_unused=_unused(body, ["p", *["u"] * (not num_inputs)]),
+        begin_flags=begin.flags, body="\n".join(body.lines),
+        step_unused=_unused(body, ["p", *["u"] * (not num_inputs)]),
         step_inputs=keep, step_flags=body.flags, **_signatures(parts, "restrict "),
     )  # fmt: skip
 

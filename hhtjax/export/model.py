@@ -64,11 +64,11 @@ class Numbers:
         self.leaves, self.structure = jax.tree.flatten(params, is_leaf=_is_input)
         self.places = [i for i, x in enumerate(self.leaves) if not _is_input(x) and _is_floating(x)]
         self.input_places = [i for i, x in enumerate(self.leaves) if _is_input(x)]
-        kept = self._with({i: None for i in set(range(len(self.leaves))) - set(self.places)})
+        kept = self._with(dict.fromkeys(set(range(len(self.leaves))) - set(self.places)))
         self.fields = fields(kept, "", "params")
         self.values = [self.leaves[i] for i in self.places]
         with_shapes = {i: np.zeros(self.leaves[i].polynomials.shape[2:]) for i in self.input_places}
-        rest = {i: None for i in set(range(len(self.leaves))) - set(self.input_places)}
+        rest = dict.fromkeys(set(range(len(self.leaves))) - set(self.input_places))
         self.inputs = fields(self._with(with_shapes | rest), "", "u")
         self.dtype = dtype
         require_different(f"{caller}: `params`", self.fields)

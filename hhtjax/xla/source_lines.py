@@ -5,11 +5,11 @@ from pathlib import Path
 import jax
 
 OURS = str(Path(__file__).parents[1])
-THEIRS = str(Path(jax.__file__).parent)
+THEIRS = str(Path(str(jax.__file__)).parent)
 
 
 def line_of(eqn):
-    """"file.py, line 12, in force" of the innermost function that is neither JAX's nor ours; None where none is."""
+    """ "file.py, line 12, in force" of the innermost function that is neither JAX's nor ours; None where none is."""
     traceback = getattr(eqn.source_info, "traceback", None)
     for frame in getattr(traceback, "frames", ()):
         if not frame.file_name.startswith((OURS, THEIRS, "<")):
