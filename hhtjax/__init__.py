@@ -46,6 +46,7 @@ import importlib
 from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
 from hhtjax.export.export_c import ExportedC, export_c
+from hhtjax.export.export_fmu import ExportedFMU, export_fmu
 from hhtjax.identification.arguments import Gaussian
 from hhtjax.identification.bias import step_size_bias
 from hhtjax.identification.identify import fit, multistart
@@ -90,7 +91,7 @@ __all__ = [  # noqa: RUF022
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
     "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
     # out of Python
-    "ExportedC", "export_c",
+    "ExportedC", "ExportedFMU", "export_c", "export_fmu",
     # identification
     "FitResult", "Gaussian", "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
     "positive", "refine", "step_size_bias", "windows",

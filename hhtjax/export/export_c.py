@@ -25,7 +25,7 @@ class ExportedC:
         header, source: the text of name.h and name.c.
         state, params, inputs: fields of the structs `name_state` and `name_params`, and the arrays that `u` holds one
             after the other: (name, shape) of each.
-        values: of the params, one for each of their numbers.
+        values, input_values: of the params, one for each of their numbers, and of the inputs at the start.
         operations, functions: how many operations on numbers a step has, and how many of them are sines, roots and the
             like. Of a loop, its body counts once.
     """
@@ -37,6 +37,7 @@ class ExportedC:
     params: tuple
     inputs: tuple
     values: tuple
+    input_values: tuple
     operations: int
     functions: int
 
@@ -95,7 +96,7 @@ def export_c(
     >>> [field.name for field in model.state], [field.name for field in model.params]
     (['q_x', 'v_x', 'w_x', 'a_x'], ['k'])
     >>> print(model.header.splitlines()[-7])
-    int spring_step(spring_state *s, const spring_params *p, const spring_real *u, spring_real dt);
+    spring_API int spring_step(spring_state *s, const spring_params *p, const spring_real *u, spring_real dt);
     """
     return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities)
 
@@ -107,7 +108,7 @@ def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities):
     made = given(caller, system, stepper, q0, v0, params, z0)
     numbers = Numbers(caller, made.params, made.dtype)
     rows, names = _rows(caller, numbers, sensitivities)
-    t, u = jnp.zeros((), made.dtype), numbers.no_inputs()
+    t, u = jnp.zeros((), made.dtype), numbers.first_inputs()
     functions = begin(made, numbers), step(made, numbers)
     start = made.starts, numbers.values, u, t, t
     try:
@@ -126,7 +127,7 @@ def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities):
     parts = files.Parts(name, made, stepper, code.fields, numbers, names, texts, helpers, code.counts)
     return ExportedC(
         name, files.header(parts), files.source(parts), tuple(code.fields), tuple(numbers.fields),
-        tuple(numbers.inputs), tuple(float(x) for value in numbers.values for x in np.ravel(value)), *code.counts,
+        tuple(numbers.inputs), _numbers(numbers.values), _numbers(numbers.first_inputs()), *code.counts,
     )  # fmt: skip
 
 
@@ -214,9 +215,12 @@ class _Code:
         values = [x for array in jax.tree.leaves(operands) for x in np.ravel(array)]
         for place, value in zip(targets, values, strict=True):
             text.line(f"{place} = {text.text(value)};")
-        text.flags = text.text(flags.item())
-        text.reads = {place for scalar, place in zip(self.listing.arguments, names, strict=True) if scalar in used}
-        return text
+        reads = {place for scalar, place in zip(self.listing.arguments, names, strict=True) if scalar in used}
+        return files.Body(text.lines, text.text(flags.item()), reads, text.helpers)
+
+
+def _numbers(values):
+    return tuple(float(x) for value in values for x in np.ravel(value))
 
 
 def _count(tree):

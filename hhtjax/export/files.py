@@ -25,6 +25,10 @@ HEADER = """/* {name}: {stepper}
 extern "C" {{
 #endif
 
+#ifndef {name}_API
+#define {name}_API /* "static inline", defined before {name}.c is included, lets a compiler take a loop as a whole */
+#endif
+
 typedef {real} {name}_real;
 
 enum {{
@@ -46,10 +50,10 @@ typedef struct {{
 extern const {name}_params {name}_defaults;
 
 /* The state at t0 from {starts}{init_inputs}, for steps of dt. Returns flags. */
-int {name}_init({init});
+{name}_API int {name}_init({init});
 
 /* One step of dt{step_inputs}. Returns flags. */
-int {name}_step({step});
+{name}_API int {name}_step({step});
 
 #ifdef __cplusplus
 }}
@@ -69,7 +73,7 @@ const {name}_params {name}_defaults = {{
 {values}
 }};
 {helpers}
-int {name}_init({init})
+{name}_API int {name}_init({init})
 {{
 {begin_unused}{begin}
     s->t = t0;
@@ -80,7 +84,7 @@ int {name}_init({init})
     return s->flags;
 }}
 
-int {name}_step({step})
+{name}_API int {name}_step({step})
 {{
 {step_unused}{body}
 {step_inputs}    if (s->dt != dt) {{
@@ -96,6 +100,15 @@ int {name}_step({step})
 """
 
 
+class Body(NamedTuple):
+    """Statements, the name of their flags, the places that they read, the helper functions that they call."""
+
+    lines: list[str]
+    flags: str
+    reads: set[str]
+    helpers: set
+
+
 class Parts(NamedTuple):
     """What the files are made of."""
 
@@ -105,7 +118,7 @@ class Parts(NamedTuple):
     fields: list[Field]
     numbers: Numbers
     sensitivities: list[str]
-    texts: list
+    texts: list[Body]
     helpers: list
     counts: tuple
 
@@ -145,7 +158,7 @@ def header(parts: Parts):
         name=name, guard=f"{name.upper()}_H", version=VERSION, real=TYPES[np.dtype(parts.made.dtype)],
         stepper=_comment(parts.stepper),
         work=f"A step takes {operations} operations on numbers, {functions} of them functions such as sines.",
-        flags=",\n".join(f"    {name.upper()}_{key} = {2**i} /* {text} */" for i, (key, text) in enumerate(FLAGS.items())),
+        flags=",\n".join(f"    {name.upper()}_{x} = {2**i} /* {text} */" for i, (x, text) in enumerate(FLAGS.items())),
         state="\n".join(field.declaration(real) for field in parts.fields),
         rest="\n".join(rest), params="\n".join(params or ["    int none;"]),
         starts=" and ".join(sorted(parts.made.starts)), init_inputs=" and the inputs before" if num_inputs else "",
