@@ -65,7 +65,7 @@ def run(report, fast):
         ["joint", "true", "found, relative error"],
         [[f"{key}{i + 1}", TRUTH[key][i], errors[key][i]] for key in TRUTH for i in (0, 1)],
     )
-    numbers = {"data": "generated", "relative_error_of": errors, "noise_rad": NOISE}
+    numbers = {"data": "generated", "num_samples": len(measured), "relative_error_of": errors, "noise_rad": NOISE}
     if native.compiler() is None:
         print("No C compiler: nothing is compiled.", flush=True)
         return numbers
