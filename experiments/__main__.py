@@ -30,6 +30,7 @@ EXPERIMENTS = {
     "linearization": "linearization.linearization",
     "stability": "stability.stability",
     "sweeps": "sweeps.sweeps",
+    "export": "export.export",
     "gradient_cost": "benchmarks.gradient_cost",
     "benchmarks": "benchmarks.benchmarks",
     "work_precision": "work_precision.work_precision",

@@ -17,6 +17,7 @@ test says so (`tests/test_floors.py` holds the floors as data).
     scenes            examples: systems with parameters and initial values
     identification    fits, and how far to trust them
     analysis          what a step does to a motion
+    export            out of Python: a step as C, or as an FMU
     runs              simulate, sweep, interpolate: steps in a loop
     steppers          one step; `residual.py` has the method in thirty lines, one file for each family
     systems           what moves: pytrees outside, one flat vector inside; constraints, rotations, inputs
@@ -44,6 +45,8 @@ import importlib
 
 from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
+from hhtjax.export.export_c import ExportedC, export_c
+from hhtjax.export.export_fmu import ExportedFMU, export_fmu
 from hhtjax.identification.arguments import Gaussian
 from hhtjax.identification.bias import step_size_bias
 from hhtjax.identification.comparison import compare
@@ -92,6 +95,8 @@ __all__ = [  # noqa: RUF022
     # runs
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
     "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
+    # out of Python
+    "ExportedC", "ExportedFMU", "export_c", "export_fmu",
     # identification
     "FitResult", "Gaussian", "bounded", "compare", "equation_error", "fit", "fit_progressively", "fixed", "measure",
     "multistart", "positive", "refine", "step_size_bias", "windows",

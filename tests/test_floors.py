@@ -16,7 +16,7 @@ FLOORS = [  # each imports from those before it, and from its own room
     ["systems"],
     ["steppers"],
     ["runs"],
-    ["analysis"],
+    ["analysis", "export"],
     ["identification"],
     ["scenes"],
     ["plot"],
@@ -104,7 +104,7 @@ def test_a_breach_is_seen(where, line):
 
 def test_the_top_of_the_house_is_small():
     entries = {path.name for path in HOUSE.iterdir() if path.name != "__pycache__"}
-    assert len(entries) <= 15, entries
+    assert len(entries) <= 16, entries
     assert {name.removesuffix(".py") for name in entries} == FLOOR.keys() | {"py.typed"}
 
 

@@ -36,13 +36,13 @@ def bind(stepper, system, params, dt, last=None):
 
     def step(s):
         now = held_at(params, s.t + dt / 2)
-        s = _jump(stepper, system, s, before(params, s.t, dt if last is None else last), now)
+        s = jump(stepper, system, s, before(params, s.t, dt if last is None else last), now)
         return stepper.bind(system, now, dt)(s)
 
     return step
 
 
-def _jump(stepper, system, s, old, new):
+def jump(stepper, system, s, old, new):
     """The state with the accelerations and multipliers that belong to the new params."""
     dQ = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old)
     if system.num_constraints:
