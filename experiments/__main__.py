@@ -18,10 +18,12 @@ os.environ["JAX_ENABLE_X64"] = "1"
 
 EXPERIMENTS = {
     "silverbox": "identification.silverbox",
+    "silverbox_terms": "identification.silverbox_terms",
     "silverbox_comparison": "identification.comparison",
     "double_pendulum_measured": "identification.double_pendulum_measured",
     "bouc_wen": "identification.bouc_wen",
     "emps": "identification.emps",
+    "tanks": "identification.tanks",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",
     "squeezer": "identification.squeezer",
