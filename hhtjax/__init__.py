@@ -89,8 +89,8 @@ __all__ = [  # noqa: RUF022
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
     "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
     # identification
-    "FitResult", "Gaussian", "bounded", "compare", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
-    "positive", "refine", "step_size_bias", "windows",
+    "FitResult", "Gaussian", "bounded", "compare", "equation_error", "fit", "fit_progressively", "fixed", "measure",
+    "multistart", "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip
 
 

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from scipy import stats
 from test_uncertainty import coloured
 
 import hhtjax
-from hhtjax.identification.evidence import chi_squared_tail, f_tail
+from hhtjax.identification.evidence import Residuals, chi_squared_tail, f_tail, whiteness
 
 N, RUNS = 1600, 300
 k = jnp.arange(float(N))
@@ -25,29 +26,31 @@ def model(params):
     return sum(params[name] * COLUMNS[name] for name in params)
 
 
+def fitted(terms):
+    """A function that fits a model to many records."""
+    return jax.jit(jax.vmap(lambda y: hhtjax.fit(lambda p: model(p) - y, dict.fromkeys(terms, 0.1))))
+
+
+FIT = {name: fitted(terms) for name, terms in MODELS.items()}
+
+
 def many(noise, size):
-    """A comparison of each of many records with the parameters of "true"."""
-
-    y = jax.jit(jax.vmap(lambda key: noise(key, (N,) if noise is jax.random.normal else N)))
-    y = size * y(jax.random.split(jax.random.key(0), RUNS)) + model({"rest": 0.5, "slow": 0.3})[None, :]
-    every = {}
-    for name, terms in MODELS.items():  # one after the other: batches of LAPACK's calls side by side can lock XLA:CPU
-
-        def one(y, terms=terms):
-            return hhtjax.fit(lambda p: model(p) - y, dict.fromkeys(terms, 0.1))
-
-        every[name] = jax.device_get(jax.jit(jax.vmap(one))(y))
+    """A comparison for each of many records made with the parameters of "true"."""
+    y = size * jax.jit(jax.vmap(noise))(jax.random.split(jax.random.key(0), RUNS))
+    y = y + model({"rest": 0.5, "slow": 0.3})[None, :]
+    # one after the other: batches of LAPACK's calls side by side can lock XLA:CPU
+    every = {name: jax.device_get(fit(y)) for name, fit in FIT.items()}
     return [hhtjax.compare(jax.tree.map(lambda x: x[i], every)) for i in range(RUNS)]  # noqa: B023
 
 
 @pytest.fixture(scope="module")
 def white():
-    return many(jax.random.normal, 1.0)
+    return many(lambda key: jax.random.normal(key, (N,)), 1.0)
 
 
 @pytest.fixture(scope="module")
 def correlated():
-    return many(coloured, 0.3)
+    return many(lambda key: coloured(key, N), 0.15)
 
 
 def rejected(found, smaller, larger):
@@ -64,6 +67,7 @@ def bic_share(found, name):
     return np.mean(ours), np.mean(naive)
 
 
+@pytest.mark.slow
 def test_white_noise(white):
     """Both tests have their size; the effective number is the number; BIC finds the truth."""
     ours, naive = rejected(white, "true", "large")
@@ -74,6 +78,7 @@ def test_white_noise(white):
     assert min(bic_share(white, "true")) > 0.9
 
 
+@pytest.mark.slow
 def test_correlated_noise(correlated):
     """AR(1) of 0.9: the textbook takes a slow term that is not there in most records, and refuses a fast one always."""
     ours, naive = rejected(correlated, "true", "large")
@@ -141,12 +146,46 @@ def test_where_a_term_is_absent():
     assert given.naive_p_value == own.naive_p_value > 0.01
 
 
-def test_tails_of_distributions():
-    """Printed in every table of statistics."""
-    assert f_tail(4.17, 1, 30) == pytest.approx(0.05, rel=2e-3)
-    assert f_tail(5.39, 2, 30) == pytest.approx(0.01, rel=2e-3)
-    assert chi_squared_tail(31.41, 20) == pytest.approx(0.05, rel=1e-3)
+def test_tails_of_distributions_are_those_of_scipy():
+    for x, q, n in ((4.17, 1, 30), (0.3, 2, 29), (12.0, 3, 1500)):
+        assert f_tail(x, q, n) == pytest.approx(stats.f.sf(x, q, n), rel=1e-9)
+        assert chi_squared_tail(x, q) == pytest.approx(stats.chi2.sf(x, q), rel=1e-9)
     assert np.isnan(f_tail(1.0, 3, 0))
+
+
+def test_white_noise_is_white_in_19_of_20_records():
+    rng, share = np.random.default_rng(0), {}
+    for name, r in {"white": rng.normal(size=(300, 400)), "slow": rng.normal(size=(300, 401))}.items():
+        r = r[:, 1:] + 0.3 * r[:, :-1] if name == "slow" else r
+        found = [whiteness(Residuals([""], [x], [x], [np.ones_like(x, bool)])) for x in r[:, :, None]]
+        share[name] = np.mean([p < 0.05 for _, p, _ in found])
+        assert np.mean([rho for rho, _, _ in found]) == pytest.approx(0.3 / 1.09 if name == "slow" else 0, abs=0.02)
+    assert 0.02 <= share["white"] <= 0.09
+    assert share["slow"] > 0.9
+
+
+def test_a_summary_says_what_the_residuals_are_worth():
+    """Observations and missing ones, rms of what is there, correlation, and estimates that are known together only."""
+    y = coloured(jax.random.key(3), N)
+    present = np.arange(N) % 16 > 0
+    weights = jnp.where(present, 2.0, 0.0)
+
+    def residuals(p):
+        return {"u": p["a"] * COLUMNS["rest"] + p["b"] * (COLUMNS["rest"] + 0.01 * COLUMNS["slow"]) - y}
+
+    result = hhtjax.fit(residuals, {"a": 0.1, "b": 0.1}, weights={"u": weights})
+    text = result.summary()
+    assert "observations: 1500 and 100 missing, worth " in text
+    r = np.asarray(result.residual["u"])[present]
+    assert f"residual: rms u {np.sqrt(np.mean(r**2)):.4g}; " in text
+    assert f"weighted sum of squares {4 * np.sum(r**2) / 1498:.3g} per degree of freedom" in text
+    assert "correlation at lag 1 +0.8" in text  # 0.9 but for the gaps
+    assert "not white (Ljung-Box, 20 lags: p = 0)" in text
+    assert "largest correlation: -1.000 between a and b" in text
+    assert float(text.rpartition("condition number of the scaled Jacobian: ")[2]) > 100
+    worth = float(text.partition("worth ")[2].split()[0])
+    u = result.uncertainty
+    assert worth == pytest.approx(1500 * 2 / np.trace(np.linalg.solve(u.naive, u.cluster)), rel=0.02)
 
 
 def test_what_cannot_be_compared_is_named():

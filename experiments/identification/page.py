@@ -1,4 +1,4 @@
-"""README.md beside this file, made from page.md and the numbers of seven experiments.
+"""README.md beside this file, made from page.md and the numbers of eight experiments.
 
 `python -m experiments.identification.page`
 """
@@ -13,7 +13,7 @@ from experiments.page import find, table
 HERE = Path(__file__).parent
 SHOWN = ("non-iterative, alpha = 0", "non-iterative, alpha = -0.3", "converged, alpha = 0", "Kim's step, alpha = 0")
 STEPS = 0.04, 0.01, 0.0025  # s
-MEASURED = "silverbox", "silverbox_comparison", "double_pendulum_measured", "bouc_wen"
+MEASURED = "silverbox", "silverbox_comparison", "double_pendulum_measured", "bouc_wen", "emps"
 GENERATED = "stiff_joint", "vehicle", "squeezer"
 
 
@@ -102,6 +102,40 @@ def bouc_wen_pieces(numbers):
     }
 
 
+def emps_pieces(numbers):
+    """Tables of the positioning axis."""
+    models = [
+        [name, f"{row['parameters']}", *(f"{row[f'{what}_mm']:.2f} mm" for what in ("train", "held_out")),
+         f"{row['behind_the_best_standard_errors']:.1f}" if row["behind_the_best_standard_errors"] else "best",
+         f"{row['test_mm']:.2f} mm"]
+        for name, row in numbers["models"].items()
+    ]  # fmt: skip
+    found, keys = numbers["estimate"], [key for key in numbers["estimate"] if f"lower_{key}" in numbers["estimate"]]
+    rows = [
+        [key.split("_in_")[0], f"{found[key]:.4g}", f"{found[f'lower_{key}']:.4g} .. {found[f'upper_{key}']:.4g}",
+         key.split("_in_")[1].replace("_", " ")]
+        for key in keys
+    ]  # fmt: skip
+    chosen, other = numbers["models"][numbers["chosen"]], numbers["other_friction"]
+    before, after = numbers["force_regression"]["train"], numbers["force_regression"]["test"]
+    header = ["model", "parameters", "training", "left out", "standard errors behind", "test"]
+    return {
+        "emps_models": table(header, models),
+        "emps_chosen": numbers["chosen"],
+        "emps_parameters": chosen["parameters"],
+        "emps_test": chosen["test_mm"],
+        "emps_published": numbers["published_parameters"]["test_mm"],
+        "emps_estimate": table(["parameter", "estimate", "95 % interval", "unit"], rows),
+        "emps_observations": numbers["observations"],
+        "emps_worth": numbers["worth_independent"],
+        "emps_naive": " to ".join(f"{x:.0f}" for x in numbers["standard_error_over_naive"]),
+        "emps_own": other["test_mm"],
+        "emps_more": 100 * (other["Fc_over_training"] - 1),
+        "emps_fv": 100 * (after["Fv_in_N_s/m"] / before["Fv_in_N_s/m"] - 1),
+        "emps_fc": 100 * (after["Fc_in_N"] / before["Fc_in_N"] - 1),
+    }
+
+
 def covered(found):
     """Intervals that hold the truth, and their median half-width."""
     names = list(found["over_truth_with_interval"])
@@ -135,6 +169,7 @@ def page(numbers):
             far=far_table(numbers["silverbox_comparison"]["far_starts"]),
             **pendulum_pieces(numbers["double_pendulum_measured"]),
             **bouc_wen_pieces(numbers["bouc_wen"]),
+            **emps_pieces(numbers["emps"]),
             stiff_records=stiff["records"],
             stiff_converged=stiff["converged"],
             stiff_cost=stiff["largest_cost_per_residual"],

@@ -13,7 +13,7 @@ from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.system import LinearSystem, System
+from hhtjax.systems.system import LinearSystem, System, require_smooth
 
 
 @shown
@@ -70,6 +70,7 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
     caller = "energy_balance"
     if not isinstance(system, (System, LinearSystem)):
         raise TypeError(f"{caller}: `system` must be a System or LinearSystem; received {system!r}.")
+    require_smooth(caller, system)
     if not isinstance(solution, Solution) or solution.t.ndim != 1:
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
     if potential is not None:

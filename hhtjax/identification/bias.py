@@ -23,7 +23,7 @@ from hhtjax.checks import require_number
 from hhtjax.description.presentation import all_known, between, shown
 from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import Stepper, require_stepper
-from hhtjax.systems.system import LinearSystem, System
+from hhtjax.systems.system import LinearSystem, System, require_smooth
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
 ON_CONSTRAINT = 1e-6  # largest residual of it
@@ -118,6 +118,7 @@ def step_size_bias(
         raise NotImplementedError(
             "step_size_bias: `system` has internal states, which M, C and K cannot hold; `refine` takes the bias out."
         )
+    require_smooth("step_size_bias", system)
     _require_on_constraint(system, params, q, t0)
     matrices = _linear_part(system, params, q, v, t0)
     fitted = _rates_of_equations(*matrices)

@@ -127,9 +127,9 @@ def compare(
     """Several models of the same measurements: AIC and BIC, F tests of nested ones, errors on segments left out.
 
     Residuals of a fit are correlated, because no model is quite right, and then n of them say less than n independent
-    ones: textbook criteria take in term after term. Here the covariance C of a fit, from how much segments of the record
-    disagree, says how much less. With S_m the weighted sum of squares of model m, k_m its parameters, and n_e = n/d,
-    where d = tr(naive^-1 C)/p >= 1 is the design effect of the model with most parameters,
+    ones: textbook criteria take in term after term. Here the covariance C of a fit, from how much segments of the
+    record disagree, says how much less. With S_m the weighted sum of squares of model m, k_m its parameters, and
+    n_e = n/d, where d = tr(naive^-1 C)/p >= 1 is the design effect of the model with most parameters,
 
         AIC = n_e log(S_m/n) + 2 k_m,        BIC = n_e log(S_m/n) + k_m log n_e,
 
@@ -137,11 +137,11 @@ def compare(
 
         (G - q)/(G - 1) (x - x0)^T C_xx^-1 (x - x0)/q ~ F(q, G - q),
 
-    beside the textbook's ((S_0 - S_1)/q)/(S_1/(n - k_1)) ~ F(q, n - k_1). One model is nested in another if the names of
-    its fitted parameters are among those of the other.
+    beside the textbook's ((S_0 - S_1)/q)/(S_1/(n - k_1)) ~ F(q, n - k_1). One model is nested in another if the names
+    of its fitted parameters are among those of the other.
 
-    With `residuals` each model is also fitted with one of `folds` segments left out, from its estimate on, and judged by
-    the residuals of this segment: no formula, and no trust in noise that is white. Segments are contiguous, so that
+    With `residuals` each model is also fitted with one of `folds` segments left out, from its estimate on, and judged
+    by the residuals of this segment: no formula, and no trust in noise that is white. Segments are contiguous, so that
     correlated residuals do not tell the fit about their neighbours that were left out.
 
     Args:
@@ -207,7 +207,9 @@ def _check_fits(fits):
         raise TypeError(f"compare: `fits` must be a dict of two or more FitResult; received {type(fits).__name__}.")
     for name, result in fits.items():
         if not is_concrete(result.code) or np.ndim(result.code):
-            raise ValueError(f"compare: `fits[{name!r}]` must be one finished fit; received a batch, or one inside jit.")
+            raise ValueError(
+                f"compare: `fits[{name!r}]` must be one finished fit; received a batch, or one inside jit."
+            )
         if result.uncertainty is None:
             raise ValueError(f"compare: `fits[{name!r}]` must have a covariance; it was made with covariance=False.")
 
@@ -231,7 +233,7 @@ def _nested_tests(fits, costs, n, absent):
     for smaller, larger in pairs:
         if any((smaller, c) in pairs and (c, larger) in pairs for c in fits):
             continue
-        result, (k0, S0), (k1, S1) = fits[larger], costs[smaller], costs[larger]
+        result, (_, S0), (k1, S1) = fits[larger], costs[smaller], costs[larger]
         extra, free = own[larger] - own[smaller], np.flatnonzero(result.free)
         names, q = np.asarray(parameter_names(result.params))[free], len(extra)
         at = [i for i, name in enumerate(names) if name in extra]

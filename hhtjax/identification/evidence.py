@@ -1,4 +1,5 @@
-"""What the residuals of a fit are worth: how many there are, whether they are white, how many independent ones they equal.
+"""What the residuals of a fit are worth: how many there are, whether they are white, how many independent ones they
+equal.
 
 Numbers of a finished fit, by NumPy: nothing here is traced.
 """

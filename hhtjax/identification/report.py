@@ -13,7 +13,6 @@ from hhtjax.identification.evidence import count, effective_observations, residu
 from hhtjax.identification.identifiability import parameter_names, parameter_values, why_undetermined
 from hhtjax.identification.progress import CONVERGED, REASONS
 
-
 CLOSE = 0.95  # correlation of two estimates that is worth a word
 MOST_PAIRS = 3
 
@@ -114,7 +113,9 @@ def _about_estimates(result, names):
     if np.sum(result.free) - len(unknown) > 1:
         R = np.triu(np.asarray(result.correlation), 1)
         pairs = np.argsort(-np.abs(R), axis=None)[: max(1, min(MOST_PAIRS, int(np.sum(np.abs(R) > CLOSE))))]
-        found = [f"{R[i, j]:+.3f} between {names[i]} and {names[j]}" for i, j in zip(*np.unravel_index(pairs, R.shape))]
+        rows, columns = np.unravel_index(pairs, R.shape)
+        together = zip(rows, columns, strict=True)
+        found = [f"{R[i, j]:+.3f} between {names[i]} and {names[j]}" for i, j in together]
         remarks.append(f"largest correlation{'s' * (len(found) > 1)}: {', '.join(found)}")
     s = np.asarray(believed.singular_values)
     condition = s[0] / s[-1] if s[-1] > 0 else np.inf

@@ -14,7 +14,7 @@ from hhtjax.identification.result import FitResult
 from hhtjax.systems.band_limited import band_limited_motion
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.sampled import Sampled, sampled
-from hhtjax.systems.system import System
+from hhtjax.systems.system import System, require_smooth
 
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
@@ -55,6 +55,7 @@ def equation_error(
         raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
     if system.internal is not None:
         raise NotImplementedError("equation_error: `system` has internal states, which are not measured.")
+    require_smooth("equation_error", system)
     if times is not None:
         values, dt, t0 = _at_equal_distances(values, dt, t0, times)
     motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)

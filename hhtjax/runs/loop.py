@@ -9,6 +9,7 @@ from jax import lax
 
 from hhtjax.description.presentation import overwrite
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
+from hhtjax.steppers.friction_law import is_settled
 from hhtjax.steppers.stepper import Info, public
 from hhtjax.systems import held
 from hhtjax.systems.matrices import mass_flaw
@@ -93,18 +94,19 @@ def counted(take_step, flat, t0, dt, before=None):
 def saved(flat, state):
     """What a run saves of a state."""
     state = public(flat, state)
-    return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot
+    return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot, state.friction
 
 
 def as_solution(flat, start, path, dt, info, failure, flaw=None):
     """The start and the path after it as a `Solution`; flaw: of the mass at the start, as `mass_flaw` says it."""
     if flaw is not None:
         failure = failure._replace(step=jnp.where(flaw > 0, 1, failure.step), mass=flaw)
-    t, q, v, w, L, *z = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
+    t, q, v, w, L, *z, friction = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
     q = jax.vmap(flat.unravel)(q)
     v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in (v, w))
     z, zdot = (None if x is None else jax.vmap(flat.unravel_internal)(x) for x in z)
-    return Solution(t, q, v, w, L, dt, info, failure, z, zdot)
+    solution = Solution(t, q, v, w, L, dt, info, failure, z, zdot)
+    return solution if friction is None else solution._replace(friction=friction.tau, sticking=friction.sig == 0)
 
 
 def flaw_at_start(system, flat, start, params):
@@ -117,32 +119,36 @@ def flaw_at_start(system, flat, start, params):
 def no_failure(info):
     """What `Solution.failure` says of a run in which all went well."""
     none = jnp.zeros((), jnp.int32)
-    return Failure(none, jnp.array(False), none, info.dependent_row, info.solve_residual)
+    return Failure(none, jnp.array(False), none, info.dependent_row, info.solve_residual, info.friction)
 
 
 def _first_failure(flat, failure, count, state, info):
     """The failure so far, or this step's. Of several quantities an internal state is named, then the first."""
-    _, *values = saved(flat, state)
+    _, *values, _ = saved(flat, state)
     known = [(i, x) for i, x in enumerate(values) if x is not None]
     known.sort(key=lambda x: x[0] < INTERNAL_STATE)
     checks = staged(lambda values: [jnp.all(jnp.isfinite(x)) for x in values])([x for _, x in known])
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
     for (i, _), fine in reversed(list(zip(known, checks, strict=True))):
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
-    failed, newton, row, left = ~finite, finite, failure.row, failure.solve
+    failed, newton, row, left, friction = ~finite, finite, failure.row, failure.solve, failure.friction
     if info.converged is not None:
         failed = failed | ~info.converged
     if info.dependent_row is not None:
         failed, newton = failed | (info.dependent_row > 0), newton & (info.dependent_row == 0)
     if info.solved is not None:
         failed, newton = failed | ~info.solved, newton & info.solved
+    if info.friction is not None:
+        newton = newton & is_settled(info.friction)
     first = failed & (failure.step == 0)
     if info.dependent_row is not None:
         row = jnp.where(first, info.dependent_row, failure.row)
     if info.solved is not None:
         left = jnp.where(first & finite & ~info.solved, info.solve_residual, failure.solve)
+    if info.friction is not None:
+        friction = jnp.where(first & ~is_settled(info.friction), info.friction, failure.friction)
     step, quantity = (jnp.where(first, new, old) for new, old in ((count, failure.step), (quantity, failure.quantity)))
-    return Failure(step, jnp.where(first, newton, failure.newton), quantity, row, left)
+    return Failure(step, jnp.where(first, newton, failure.newton), quantity, row, left, friction)
 
 
 def neutral_info(shapes):

@@ -18,6 +18,7 @@ from hhtjax.steppers.stepper import Stepper, join_info, require_capable, require
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.rubbing import require_independent_friction
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import on_scalars, one_kernel, or_plain
 
@@ -98,6 +99,13 @@ def simulate(
     require_number("simulate", "t0", t0, np.isfinite, "be finite")
     q0, v0, z0 = initial_values("simulate", system, q0, v0, z0)
     require_capable("simulate", system, stepper, q0, v0)
+    if system.friction is not None and extrapolate > 1:
+        raise NotImplementedError(
+            "simulate: leave `extrapolate` out: with dry friction the error is no power series in dt; "
+            f"received {extrapolate}."
+        )
+    if system.friction is not None:
+        require_independent_friction("simulate", system, q0, v0, t0, params, z0)
     if system.constraint is not None:
         require_consistent("simulate", system, q0, v0, t0, params, stepper.redundant, z0)
     t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew

@@ -27,6 +27,7 @@ class Failure(NamedTuple):
             constraints.
         solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is
             the library's own.
+        friction: `info.friction`, if that was too much, else 0; None without dry friction.
         mass: what is wrong with a mass that is a function, at the start: 0 nothing, 1 it is not symmetric, 2 not
             positive definite (with constraints: not positive semidefinite); None where the mass is constant.
     """
@@ -36,6 +37,7 @@ class Failure(NamedTuple):
     quantity: Any
     row: Any = None
     solve: Any = None
+    friction: Any = None
     mass: Any = None
 
     def _verdict(self):
@@ -51,6 +53,8 @@ class Failure(NamedTuple):
             return "Newton did not converge"
         if known(self.solve):
             return "the linear solve left too much"
+        if known(self.friction):
+            return "the dry friction was not found"
         return "a constraint depends on others" if known(self.row) else f"{QUANTITIES[quantity]} is not finite"
 
 
@@ -76,6 +80,8 @@ class Solution(NamedTuple):
             converged; None where the method has nothing to tell.
         failure: the first step that failed, a `Failure`; `check` turns it into an error.
         z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without.
+        friction: tau (K + 1, m), dry friction, positive against positive sliding; None without.
+        sticking: (K + 1, m), whether a joint sticks; None without.
     """
 
     t: Any
@@ -88,6 +94,8 @@ class Solution(NamedTuple):
     failure: Failure
     z: Any = None
     zdot: Any = None
+    friction: Any = None
+    sticking: Any = None
 
     def check(self, reach=None):
         """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
@@ -130,7 +138,7 @@ class Solution(NamedTuple):
     def _table(self):
         """The run in a line, and its arrays."""
         rows = leaf_rows(q=self.q, v=self.v, acceleration=self.acceleration, multipliers=self.multipliers)
-        rows += leaf_rows(z=self.z, zdot=self.zdot)
+        rows += leaf_rows(z=self.z, zdot=self.zdot, friction=self.friction, sticking=self.sticking)
         return Table(f"Solution: {self._title()}", [["", "shape", "dtype"], *rows, *leaf_rows(info=self.info)])
 
     def _title(self):
@@ -152,7 +160,8 @@ class Solution(NamedTuple):
 
     def _why(self, member):
         """What `failure` says of one member of a batch."""
-        _, newton, quantity, row, left, mass = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        _, newton, quantity, row, left, friction, mass = found
         if mass:
             return f"`mass` must be {MASS[mass]}; at the start, mass(q0, params) is not"
         if left:
@@ -160,6 +169,13 @@ class Solution(NamedTuple):
                 f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "
                 "half_bandwidth of banded(), more iterations of conjugate_gradients(), or another solve(A, b); a "
                 "larger `tolerance` of the first two accepts it"
+            )
+        if np.isinf(friction):
+            return "a limit of the dry friction is negative or not a number: see `friction` of the System"
+        if friction:
+            return (
+                f"the dry friction of several joints was found to {friction:.2g} of its limits only. Take a smaller "
+                "dt, or look for joints whose sliding velocities depend on each other"
             )
         if newton:
             return (

@@ -13,6 +13,7 @@ from hhtjax.runs.sweep_grid import require_one_grid, require_step_sizes, require
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 from hhtjax.systems.consistent import examine, require_consistent
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.rubbing import require_independent_friction
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 
@@ -49,6 +50,9 @@ class Inputs(NamedTuple):
         require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
         if system.constraint is not None:
             _require_consistent(system, data, mapped, t0)
+        if system.friction is not None:
+            _, q, v, p, z = _member(data, mapped, 0)
+            require_independent_friction("sweep", system, q, v, t0, p, z)
         duration, t0 = (x if x is None or not is_concrete(x) else float(x) for x in (duration, t0))
         return cls(system, data, dts, duration, t0, mapped, int(num_samples), times)
 

@@ -15,9 +15,11 @@ a closed form, a table in print, or SciPy.
 """
 
 from hhtjax.scenes import arm as arm
+from hhtjax.scenes import belt as belt
 from hhtjax.scenes import body_chain as body_chain
 from hhtjax.scenes import bouc_wen as bouc_wen
 from hhtjax.scenes import double_pendulum as double_pendulum
+from hhtjax.scenes import dry_oscillator as dry_oscillator
 from hhtjax.scenes import duffing as duffing
 from hhtjax.scenes import four_bars as four_bars
 from hhtjax.scenes import lugre as lugre

@@ -53,11 +53,15 @@ def directions(system, M, B):
     return B.T / jnp.where(d == 0, 1, d)[:, None]
 
 
-def bind_constrained(method, system, params, dt):
-    """The step: one Newton step from the predictor (w, L, 0), or Newton until done."""
-    c, options, factorize = method.coefficients, method.options, method.factorize_for(system)
-    n, m = system.size, system.num_constraints
-    ggl = options.formulation == "ggl"
+def equations(method, system, params, dt, s):
+    """The residual of a step from s as a function of the state, the state as one of z = (w, L, eta), and z to start at.
+
+    Also what eta takes off the displacement, as a function, and B at the start.
+    """
+    c, n, m = method.coefficients, system.size, system.num_constraints
+    ggl = method.options.formulation == "ggl"
+    B = jacobian(system, s.q, s.t, params)
+    D = directions(system, system.mass(s.q, params), B) if ggl else None
 
     def r(s):
         force = system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
@@ -65,16 +69,23 @@ def bind_constrained(method, system, params, dt):
         rows = [force - reaction(system, s.q, s.t, params, s.L), position / (c.beta * dt**2)]
         return jnp.concatenate(rows + [rate / (c.gamma * dt)] * ggl)
 
+    def shift(eta):
+        return None if D is None else c.beta * dt**2 * matvec(D, eta)
+
+    def path(z):
+        w, L, eta = z[:n], z[n : n + m], z[n + m :]
+        return method.arrive(system, s, dt, w, shift(eta))._replace(L=L)
+
+    z = jnp.concatenate([s.w, s.L] + [jnp.zeros(m, s.q.dtype)] * ggl)
+    return r, path, z, shift, B
+
+
+def bind_constrained(method, system, params, dt):
+    """The step: one Newton step from the predictor (w, L, 0), or Newton until done."""
+    options, factorize = method.options, method.factorize_for(system)
+
     def step(s):
-        B = jacobian(system, s.q, s.t, params)
-        D = directions(system, system.mass(s.q, params), B) if ggl else None
-
-        def path(z):
-            w, L, eta = z[:n], z[n : n + m], z[n + m :]
-            shift = None if D is None else c.beta * dt**2 * matvec(D, eta)
-            return method.arrive(system, s, dt, w, shift)._replace(L=L)
-
-        z = jnp.concatenate([s.w, s.L] + [jnp.zeros(m, s.q.dtype)] * ggl)
+        r, path, z, _, B = equations(method, system, params, dt, s)
         if options.iterations is None:
             z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
         else:
@@ -83,15 +94,22 @@ def bind_constrained(method, system, params, dt):
                 z, more = linearized_solve(r, path, z, factorize)
                 info = join_info(info, more)
         s1 = system.tidy(path(z))
-        return s1, report(system, params, s1, info, None if method.redundant else dependent(s, s1, B))
-
-    def dependent(s, s1, B):
-        """The row that depends on others at the start of the step, or, if the step failed, at its predicted end."""
-
-        def at_end():
-            predicted = method.arrive(system, s, dt, s.w)
-            return dependent_row(jacobian(system, predicted.q, predicted.t, params))
-
-        return lax.cond(jnp.all(jnp.isfinite(s1.w)), lambda: dependent_row(B), at_end)
+        return s1, report_constraints(method, system, params, dt, s, s1, info, B)
 
     return step
+
+
+def report_constraints(method, system, params, dt, s, s1, info, B):
+    """What the step tells about them: violations, and the row that depends on others at its start.
+
+    If the step failed, at its predicted end.
+    """
+
+    def at_end():
+        predicted = method.arrive(system, s, dt, s.w)
+        return dependent_row(jacobian(system, predicted.q, predicted.t, params))
+
+    def dependent():
+        return lax.cond(jnp.all(jnp.isfinite(s1.w)), lambda: dependent_row(B), at_end)
+
+    return report(system, params, s1, info, None if method.redundant else dependent())

@@ -16,6 +16,7 @@ from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with, reuse
 from hhtjax.numerics.low_rank import Changing
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
+from hhtjax.steppers.friction import begin_friction, bind_friction
 from hhtjax.steppers.linearization import linearization_point, refresh
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
@@ -59,10 +60,13 @@ class GeneralizedAlpha(Resizing, Stepper):
     solves_constraints = True
     solves_rotations = True
     solves_internal = True
+    solves_friction = True
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""
         c = self.coefficients
+        if system.friction is not None:
+            return begin_friction(self, system, q, v, t, params, dt)
         if system.num_constraints:
             return begin_constrained(self, system, q, v, t, params, dt)
 
@@ -115,6 +119,8 @@ class GeneralizedAlpha(Resizing, Stepper):
 
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""
+        if system.friction is not None:
+            return bind_friction(self, system, params, dt)
         if system.num_constraints:
             return bind_constrained(self, system, params, dt)
         if system.local is not None and self.options.solve is None:

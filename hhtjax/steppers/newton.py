@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.numerics.linear_solve import Trusted, invert_and_bound, solve_map
+from hhtjax.numerics.linear_solve import Trusted, factorize_map, invert_and_bound, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems import kinematics
@@ -22,6 +22,12 @@ def linearized_solve(r, path, w, factorize, at=None):
 
     One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
     """
+    w, info, _, _ = solve_and_keep(r, path, w, factorize, at)
+    return w, info
+
+
+def solve_and_keep(r, path, w, factorize, at=None):
+    """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
 
     def expand(w, at):
         start, along = jax.linearize(path, w)
@@ -37,8 +43,9 @@ def linearized_solve(r, path, w, factorize, at=None):
         return tangent(along(dw))
 
     factorize = around(factorize, lambda: (path(w) if at is None else at, along))
-    dw = solve_map(f, value, factorize)
-    return w - dw, told(factorize, left_by(factorize, f, value, dw))
+    inverse = factorize_map(f, value, factorize)
+    dw = inverse(value)
+    return w - dw, told(factorize, left_by(factorize, f, value, dw)), inverse, along
 
 
 def left_by(factorize, f, b, x):

@@ -27,6 +27,7 @@ class State(NamedTuple):
             where a method has none.
         z, zdot, za: internal states, their rates and their algorithmic rates, None without.
         L: multipliers (m,) of constraints, None without.
+        friction: `Rubbing`, the directions of sliding and the forces of dry friction, None without.
         memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
 
@@ -40,6 +41,20 @@ class State(NamedTuple):
     z: Any = None
     zdot: Any = None
     za: Any = None
+    friction: Any = None
+
+
+@shown
+class Rubbing(NamedTuple):
+    """What a step remembers of dry friction.
+
+    Attributes:
+        sig: (m,), the direction in which each joint slides: -1, 1, or 0 where it sticks.
+        tau: (m,), the friction, positive against positive sliding.
+    """
+
+    sig: Any
+    tau: Any
 
 
 INTERNAL = {"v": "z", "w": "zdot", "a": "za"}  # where a state has what is no rate of a position
@@ -60,6 +75,8 @@ class Info(NamedTuple):
         solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
             trust (`banded`, `conjugate_gradients`, a given function).
         solved: whether that is within its tolerance.
+        friction: how exactly the switches of several joints in one step are resolved, relative to the limits of dry
+            friction; infinite where a limit is negative or not a number.
     """
 
     residual: Any = None
@@ -70,6 +87,7 @@ class Info(NamedTuple):
     dependent_row: Any = None
     solve_residual: Any = None
     solved: Any = None
+    friction: Any = None
 
     def _verdict(self):
         """Of several steps."""
@@ -104,6 +122,7 @@ class Stepper(Description):
     solves_constraints = False
     solves_rotations = False
     solves_internal = False
+    solves_friction = False
     needs_equal_steps = False  # what it remembers belongs to steps of one size
     resizes = False  # whether `resized` does anything
     redundant: str | None = None  # how constraints that depend on each other are solved
@@ -148,7 +167,7 @@ class Stepper(Description):
         w = ravel_pytree((state.w if flat.positions else state.v, state.zdot))[0]
         a = None if state.a is None else ravel_pytree((state.a, state.za))[0]
         step = held.bind(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
-        state, info = step(State(state.t, q, v, w, a, state.L, state.memory))
+        state, info = step(State(state.t, q, v, w, a, state.L, state.memory, friction=state.friction))
         return _unravel(flat, state), info
 
 
@@ -159,7 +178,7 @@ def require_stepper(caller, stepper):
 
 
 def require_capable(caller, system, stepper, q0, v0):
-    """An error for a constraint, a rotation or internal states that the stepper does not know."""
+    """An error for a constraint, a rotation, internal states or friction that the stepper does not know."""
     name = type(stepper).__name__
     if system.constraint is not None and not stepper.solves_constraints:
         raise NotImplementedError(
@@ -174,6 +193,8 @@ def require_capable(caller, system, stepper, q0, v0):
             f"{caller}: {name} cannot solve the `internal` states; use hht() or another of its family, rk4(), "
             "rosenbrock() or rowda()."
         )
+    if system.friction is not None and not stepper.solves_friction:
+        raise NotImplementedError(f"{caller}: {name} cannot solve dry `friction`; use hht() or another of its family.")
 
 
 def public(flat, state):

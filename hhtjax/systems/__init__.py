@@ -114,8 +114,40 @@ it is fast) `rk4`, with constraints, rotations, sweeps and gradients. Forces tak
 >>> hhtjax.interpolate(run, jnp.array([0.123])).z["current"].shape
 (1, 1)
 
-`hhtjax.scenes` has motors, Bouc-Wen hysteresis, LuGre friction and a rubber mount. Relays and dry friction without
-bristles, whose g jumps, are none of these.
+`hhtjax.scenes` has motors, Bouc-Wen hysteresis, LuGre friction and a rubber mount. Relays, whose g jumps, are none of
+these, nor is dry friction without bristles.
+
+Dry friction
+------------
+
+Coulomb's law says what friction is while a joint slides, and only a bound while it sticks:
+
+    M(q) w = Q + B^T L - H^T tau,    tau = F sign(s) where s != 0,    |tau| <= F where s = 0
+
+`System(..., friction=limit)` has the limits F(q, v, t), one for each coordinate, 0 where nothing rubs; with `sliding`,
+s(q, v, t), one for each of its rows, up to 8. F may fall with speed from a stiction (Stribeck), and depend on position,
+time, internal states, and the multipliers of constraints, that is, on normal loads. Nothing is made smooth: what sticks
+does not creep. The `hht` family solves it with one factorisation per step and is of order 2 in q, v and z through every
+switch, with M(q), constraints, rotations and internal states; derivatives converge to those of the exact motion, so
+limits can be fitted. The best step is still short beside the time a joint slides or sticks: the second of two switches
+of one joint in one step waits for the next.
+
+>>> def force(q, v, t, params):
+...     return -params["k"] * q + 6.0 * jnp.sin(2.0 * t)
+>>> def limit(q, v, t, params):                                                               # Coulomb's, and stiction
+...     return params["F"] * (1 + 0.3 * jnp.exp(-jnp.abs(v) / 0.05))
+>>> block = hhtjax.System(jnp.ones(1), force, friction=limit)
+>>> params = {"k": 20.0, "F": 3.0}
+>>> run = hhtjax.simulate(block, hhtjax.hht(), jnp.zeros(1), jnp.zeros(1), params, dt=1e-2, num_steps=800)
+>>> run.check()
+>>> run.friction.shape, round(float(run.sticking.mean()), 2)                       # tau; part of the time it sticks
+((801, 1), 0.26)
+
+On a belt with the speed u, `sliding=lambda q, v, t, params: v - params["u"]`; between two bodies it is the difference
+of their velocities. s must be affine in v, and its rows independent of each other and of constraints. A limit in a
+system with internal states is called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F is
+to be continuous: a jump from stiction to sliding is written as a steep Stribeck curve. Between saved times
+`interpolate` is of order 2 only where a joint switches. `extrapolate` and `energy_balance` are not for dry friction.
 
 Rotations
 ---------

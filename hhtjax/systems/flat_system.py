@@ -4,16 +4,15 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.checks import describe
-from hhtjax.description import freeze, thaw
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.linear_solve import solve
 from hhtjax.systems import kinematics
+from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.matrices import as_matrix
+from hhtjax.systems.returned import check_like, check_matrix, count, evaluate
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem
 
 
@@ -38,6 +37,7 @@ class FlatSystem(NamedTuple):
     blocks: tuple = ()  # where the rotations are; empty without
     product: Callable | None = None  # q, w, params -> M(q) w, where the system has its own
     local: Any = None  # the `Local` force beside a linear system
+    friction: FrictionLaw | None = None  # dry friction, which `force` does not hold
 
     def inertia(self, q, w, params):
         """M(q) w, and zdot."""
@@ -127,7 +127,7 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
         )
     constraint, m = None, 0
     if system.constraint is not None:
-        m = _count_constraints(caller, system.constraint, n, dtype, q0, t0, params)
+        m = count(caller, "constraint", system.constraint, n, dtype, q0, t0, params)
         constraint = partial(_flat_constraint, system.constraint, unravel, dtype)
 
     linear = isinstance(system, LinearSystem)
@@ -142,12 +142,16 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
 
     product = None
     if not linear and system.inertia is not None:
-        _check_like(caller, "inertia", _evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
+        check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
         product = partial(_flat_product, system.inertia, unravel, unravel_rates, dtype)
     flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks, product)
     if linear and system.nonlinear is not None:
         flat = _with_local(system, flat, dtype)
-    return (flat, q, v) if system.internal is None else _with_internal(system, flat, q, v0, z0)
+    if system.internal is not None:
+        flat, q, v = _with_internal(system, flat, q, v0, z0)
+    if system.friction is not None:
+        flat = flat._replace(friction=flat_friction(caller, system, flat, q0, v0, z0, t0, params))
+    return flat, q, v
 
 
 def _with_local(system, flat, dtype):
@@ -181,7 +185,7 @@ def _flatten_first_order(caller, system, y0, t0, params):
     """y' = rate: internal states alone, without a position."""
     y, unravel = ravel_pytree(y0)
     n, dtype = y.size, y.dtype
-    _check_like(caller, "rate", _evaluate(caller, "rate", system.rate, y0, t0, params), "q0", y0, dtype)
+    check_like(caller, "rate", evaluate(caller, "rate", system.rate, y0, t0, params), "q0", y0, dtype)
 
     def rate(q, v, t, params):
         return ravel_pytree(system.rate(unravel(v), t, params))[0].astype(dtype)
@@ -198,19 +202,19 @@ def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):
         for name in ("M", "C", "K"):
             matrix = getattr(system, name)
             if matrix is not None:
-                _check_matrix(caller, name, matrix, n, dtype, params)
+                check_matrix(caller, name, matrix, n, dtype, params)
     else:
-        _check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
+        check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
     if linear and system.load is not None:
-        Q = _evaluate(caller, "force", system.load, t0, params)
+        Q = evaluate(caller, "force", system.load, t0, params)
     elif system.internal is None:
         function = system.linear_force if linear else system.force
-        Q = _evaluate(caller, "force", function, q0, v0, t0, params)
+        Q = evaluate(caller, "force", function, q0, v0, t0, params)
     else:
-        Q = _evaluate(caller, "force", system.force, q0, v0, z0, t0, params)
-        zdot = _evaluate(caller, "internal", system.internal, q0, v0, z0, t0, params)
-        _check_like(caller, "internal", zdot, "z0", z0, dtype)
-    _check_like(caller, "force", Q, "v0", v0, dtype)
+        Q = evaluate(caller, "force", system.force, q0, v0, z0, t0, params)
+        zdot = evaluate(caller, "internal", system.internal, q0, v0, z0, t0, params)
+        check_like(caller, "internal", zdot, "z0", z0, dtype)
+    check_like(caller, "force", Q, "v0", v0, dtype)
     if linear and system.nonlinear is not None:
         _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params)
 
@@ -224,7 +228,7 @@ def _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params):
     else:
         some = jnp.zeros(len(system.at), dtype)
         q0, v0, like = some, some, ("v0[at]", some)
-    _check_like(caller, "nonlinear", _evaluate(caller, "nonlinear", system.nonlinear, q0, v0, t0, params), *like, dtype)
+    check_like(caller, "nonlinear", evaluate(caller, "nonlinear", system.nonlinear, q0, v0, t0, params), *like, dtype)
 
 
 def _flat_constraint(constraint, unravel, dtype, q, t, params):
@@ -233,59 +237,3 @@ def _flat_constraint(constraint, unravel, dtype, q, t, params):
 
 def _flat_product(inertia, unravel, unravel_rates, dtype, q, w, params):
     return ravel_pytree(inertia(unravel(q), unravel_rates(w), params))[0].astype(dtype)
-
-
-def _check_matrix(caller, name, matrix, n, dtype, *args):
-    """A constant matrix, or the result of a function, of a shape that fits n and a dtype that fits the state."""
-    value = _evaluate(caller, name, matrix, *args) if callable(matrix) else matrix
-    shapes = [(n, n), (n,)] + [()] * (n == 1)
-    if not (hasattr(value, "shape") and value.shape in shapes):
-        raise ValueError(
-            f"{caller}: `{name}` must give an array of shape ({n}, {n}), or ({n},) for a diagonal; "
-            f"received {describe(value)}."
-        )
-    if callable(matrix):
-        _check_dtype(caller, name, value, dtype)
-
-
-def _count_constraints(caller, constraint, n, dtype, *args):
-    """m, for a constraint that returns (m,) with m <= n."""
-    value = _evaluate(caller, "constraint", constraint, *args)
-    if not hasattr(value, "shape") or len(value.shape) != 1 or not 1 <= value.shape[0] <= n:
-        raise ValueError(
-            f"{caller}: `constraint` must return an array (m,) with 1 <= m <= {n}, the number of coordinates; "
-            f"received {describe(value)}."
-        )
-    _check_dtype(caller, "constraint", value, dtype)
-    return value.shape[0]
-
-
-def _check_like(caller, name, value, like, reference, dtype):
-    """What a function returned, of the structure, the shapes and a dtype that fit the state."""
-    if jax.tree.structure(value) != jax.tree.structure(reference) or (
-        jax.tree.map(jnp.shape, value) != jax.tree.map(jnp.shape, reference)
-    ):
-        raise ValueError(
-            f"{caller}: `{name}` must return a pytree like {like}, {describe(reference)}; received {describe(value)}."
-        )
-    _check_dtype(caller, name, value, dtype)
-
-
-def _check_dtype(caller, name, value, dtype):
-    for leaf in jax.tree.leaves(value):
-        found = jnp.result_type(leaf)
-        number = jnp.issubdtype(found, jnp.integer) or (leaf.weak_type and jnp.issubdtype(found, jnp.floating))
-        if found != dtype and not number:
-            raise TypeError(
-                f"{caller}: `{name}` returned {found} for a state of {dtype}; give params, and arrays made "
-                f"inside `{name}`, the dtype of q0, or q0 and v0 the dtype of params."
-            )
-
-
-def _evaluate(caller, name, function, *args):
-    """Shape of function(*args); `name` is added to what the function raises."""
-    try:
-        return jax.eval_shape(lambda *args: function(*thaw(args)), *freeze(args))
-    except Exception as error:
-        error.add_note(f"{caller}: raised while tracing `{name}` with " + ", ".join(describe(x) for x in args) + ".")
-        raise

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.systems.constraints import factorize_constrained, saddle_point
+from hhtjax.systems.friction import held_back
 from hhtjax.systems.sampled import Sampled
 
 
@@ -51,6 +52,9 @@ def _jump(stepper, system, s, old, new):
         s = s._replace(L=s.L + dL)
     else:
         dw = system.solve_mass(system.mass(s.q, new), dQ)
+    if system.friction is not None:
+        dw, friction = held_back(system, s, new, dw)
+        s = s._replace(friction=friction)
     return s._replace(w=s.w + dw, a=None if s.a is None else s.a + dw)
 
 

@@ -24,7 +24,7 @@ from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.constraints import acceleration_and_multipliers
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
-from hhtjax.systems.system import FirstOrderSystem, require_system
+from hhtjax.systems.system import FirstOrderSystem, require_smooth, require_system
 
 __all__ = ["FlatODE", "ScipyRHS", "diffrax_term", "flat_ode", "ode", "scipy_rhs"]
 
@@ -195,6 +195,7 @@ def _ode(system, t, y, params):
     if isinstance(system, FirstOrderSystem):
         flat, q, v = flatten("ode", system, y, None, t, params)
         return flat.unravel(flat.force(q, v, jnp.asarray(t).astype(v.dtype), params))
+    require_smooth("ode", system)
     internal = system.internal is not None
     if not isinstance(y, (tuple, list)) or len(y) != 2 + internal:
         expected = "(q, v, z), three pytrees" if internal else "(q, v), two pytrees"

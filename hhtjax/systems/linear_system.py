@@ -93,6 +93,7 @@ class LinearSystem(Description):
 
     constraint = None
     internal = None
+    friction = None
 
     def mass(self, q, params):
         """M, whatever q."""

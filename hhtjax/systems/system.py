@@ -10,7 +10,7 @@ from hhtjax.systems.lagrangian import InternalLagrangianForce, LagrangianForce, 
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass
 
-__all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_system"]
+__all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_smooth", "require_system"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,18 @@ class System(Description):
             about them for ever, as the trapezoidal rule does: damp, or start it there.) For the `hht` family, `rk4`,
             `rosenbrock` and `rowda`. g should have bounded slopes: no relays, and |z|^nu at z = 0 has derivatives in
             nu that are not finite, unless written exp(nu log(|z| + 1e-12)).
+        friction: F >= 0, the limits of dry friction, `friction(q, v, t, params)`, a pytree structured like v: of each
+            coordinate, 0 where nothing rubs; with `sliding` (m,), one for each of its rows. It is called with z behind
+            v where there are internal states, and with the multipliers L before t where there is a constraint, for
+            limits that depend on normal loads. The law is set-valued (Coulomb 1785):
+
+                M(q) w = Q + B^T L - H^T tau,    tau = F sign(s) where s != 0,    |tau| <= F where s = 0
+
+            F(q, v, t) may be any continuous function, a Stribeck curve among them; its value at s = 0 is the stiction.
+            Friction that differs from one direction to the other, from -F1 to F2, is F = (F1 + F2)/2 with the constant
+            force (F1 - F2)/2 in `force`. For the `hht` family; see `hhtjax.systems`.
+        sliding: s, the sliding velocities, `sliding(q, v, t, params)` -> (m,), m <= 8, affine in v, H = ds/dv. Relative
+            velocities of bodies, v - u(t) on a moving belt. Rows must be independent. Default: v itself.
 
     q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
     leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
@@ -74,6 +86,14 @@ class System(Description):
     ...     arm, hhtjax.hht(), zero, zero, {"kt": 0.5, "R": 1.0, "L": 1e-3}, z0=zero, dt=1e-2, num_steps=500)
     >>> [round(float(x[-1, 0]), 3) for x in (solution.v, solution.z)]         # 2 kt/(kt^2 + 0.01 R), 0.01 v/kt
     [3.846, 0.077]
+
+    Example: a block of 1 kg on a spring, with dry friction of 1 N: it stops for good where the spring cannot move it.
+
+    >>> block = hhtjax.System(
+    ...     mass=jnp.array([1.0]), force=lambda q, v, t, params: -9.0 * q, friction=lambda q, v, t, params: 1.0 + 0 * q)
+    >>> solution = hhtjax.simulate(block, hhtjax.hht(), jnp.array([1.0]), jnp.zeros(1), dt=1e-2, num_steps=500)
+    >>> bool(solution.sticking[-1, 0]), round(float(solution.friction[-1, 0]), 4), round(float(solution.q[-1, 0]), 4)
+    (True, -1.0, 0.1111)
     """
 
     mass: Any
@@ -81,6 +101,8 @@ class System(Description):
     constraint: Callable | None = None
     inertia: Callable | None = None
     internal: Callable | None = None
+    friction: Callable | None = None
+    sliding: Callable | None = None
 
     def __post_init__(self):
         if self.internal is None:
@@ -92,12 +114,23 @@ class System(Description):
             require_function("System", "inertia", self.inertia, "inertia(q, w, params)")
         if self.constraint is not None:
             require_function("System", "constraint", self.constraint, "constraint(q, t, params)")
+        if self.friction is not None:
+            self._require_friction()
+        elif self.sliding is not None:
+            raise ValueError("System: `sliding` must go with `friction`, the limits of the forces there.")
         if callable(self.mass):
             require_function("System", "mass", self.mass, "mass(q, params)")
         else:
             mass = constant_matrix("System", "mass", self.mass)
             require_mass("System", "mass", mass, self.constraint is not None)
             object.__setattr__(self, "mass", mass)
+
+    def _require_friction(self):
+        z, L = "z, " * (self.internal is not None), "L, " * (self.constraint is not None)
+        signature = f"friction(q, v, {z}{L}t, params)"
+        require_function("System", "friction", self.friction, signature, count=4 + bool(z) + bool(L))
+        if self.sliding is not None:
+            require_function("System", "sliding", self.sliding, "sliding(q, v, t, params)", count=4)
 
     @classmethod
     def from_lagrangian(cls, lagrangian, force=None, internal=None):
@@ -160,6 +193,7 @@ class FirstOrderSystem(Description):
     rate: Callable
     constraint = None
     internal = None
+    friction = None
 
     def __post_init__(self):
         require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")
@@ -169,3 +203,12 @@ def require_system(caller, system):
     """An error for what is no system."""
     if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
         raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
+
+
+def require_smooth(caller, system):
+    """An error for dry friction, which is no function of the state."""
+    if system.friction is not None:
+        raise NotImplementedError(
+            f"{caller}: `system` has dry friction, which is no function of q and v: leave `friction` out, or put a "
+            "smooth one into `force`."
+        )

@@ -1,0 +1,40 @@
+"""Two masses on a moving belt, each held by a spring, and by one between them: they stick to it and slip.
+
+s = v - u,    |tau_i| <= F_i (1 + stiction exp(-|s_i|/vs))
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import Scene
+from hhtjax.systems.system import System
+
+
+def mass(q, params):
+    """M, a diagonal."""
+    return params["m"]
+
+
+def force(q, v, t, params):
+    """Q, without the friction."""
+    spring = params["between"] * (q[1] - q[0]) * jnp.array([1.0, -1.0], q.dtype)
+    return spring - params["k"] * q - params["c"] * v
+
+
+def sliding(q, v, t, params):
+    """Velocities relative to the belt."""
+    return v - params["u"]
+
+
+def limit(q, v, t, params):
+    """F, with a Stribeck curve."""
+    return params["F"] * (1 + params["stiction"] * jnp.exp(-jnp.abs(sliding(q, v, t, params)) / params["vs"]))
+
+
+def two_masses() -> Scene:
+    """25 switches in 5 s (SI units)."""
+    params = {
+        "m": jnp.array([1.0, 0.7]), "k": jnp.array([30.0, 50.0]), "between": 40.0, "c": 0.05, "u": 0.3,
+        "F": jnp.array([5.0, 4.0]), "stiction": 0.5, "vs": 0.1,
+    }  # fmt: skip
+    system = System(mass, force, friction=limit, sliding=sliding)
+    return Scene(system, params, jnp.array([0.1, 0.0]), jnp.zeros(2), 5.0)

@@ -1,0 +1,41 @@
+"""A mass on a spring and a dry surface: free, and driven by a sine, with stiction.
+
+    m w = -k q - c v + A sin(W t) - tau,    |tau| <= F (1 + stiction exp(-|v|/vs))
+
+Free, without damping and stiction, its motion is half cosines about F/k and -F/k in turn, until the spring is too weak.
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import Scene
+from hhtjax.systems.system import System
+
+
+def mass(q, params):
+    """M = [m]."""
+    return params["m"] * jnp.ones(1, q.dtype)
+
+
+def force(q, v, t, params):
+    """Q, without the friction."""
+    return params["A"] * jnp.sin(params["W"] * t) - params["k"] * q - params["c"] * v
+
+
+def limit(q, v, t, params):
+    """F, with a Stribeck curve."""
+    return params["F"] * (1 + params["stiction"] * jnp.exp(-jnp.abs(v) / params["vs"]))
+
+
+SYSTEM = System(mass, force, friction=limit)
+
+
+def free() -> Scene:
+    """Five reversals, then it sticks (SI units)."""
+    params = {"m": 1.0, "k": 100.0, "c": 0.0, "A": 0.0, "W": 0.0, "F": 4.0, "stiction": 0.0, "vs": 0.05}
+    return Scene(SYSTEM, params, jnp.array([0.5]), jnp.zeros(1), 2.2)
+
+
+def driven(stiction=0.3) -> Scene:
+    """Stick and slip: 20 switches (SI units)."""
+    params = {"m": 1.0, "k": 20.0, "c": 0.1, "A": 6.0, "W": 2.0, "F": 3.0, "stiction": stiction, "vs": 0.05}
+    return Scene(SYSTEM, params, jnp.zeros(1), jnp.zeros(1), 15.0)

@@ -1,0 +1,201 @@
+"""The generalised-alpha step with dry friction: set-valued, one factorisation, order 2 through every switch.
+
+While a joint slides one way its friction is a smooth force, and part of the residual, with the direction sig of the
+start of the step. Joints that stick, or switch inside the step, get a multiplier dtau, which the step answers linearly:
+
+    w1 = wf - G dtau,    G = A^-1 H^T,    s1 = sf - W dtau,    W = H dv/dw G,
+
+by the one factorisation of A, f standing for the free step, with sig. A switch is resolved within the step, by the
+motion on either side of it (friction_law.py). Behind it w, a, v and q go along G to where the new branch has them: the
+jump of the acceleration never enters the recursion, which therefore does not ring, and what sticks stays where it is.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.numerics.elimination import diagonal, matvec
+from hhtjax.steppers.constrained import equations, report_constraints
+from hhtjax.steppers.friction_law import balance, is_settled, switch
+from hhtjax.steppers.newton import newton, solve_and_keep
+from hhtjax.steppers.residual import residual
+from hhtjax.steppers.stepper import Rubbing, join_info
+from hhtjax.systems.constraints import acceleration_and_multipliers
+from hhtjax.systems.friction import across, directions, own_rate, reaction, responses, solve_some
+
+NOISE = 8  # roundings, of what it is the difference of, below which a number is 0
+LAGS = 20  # how often multipliers, and limits that depend on them, are made anew at the start
+
+
+def begin_friction(method, system, q, v, t, params, dt):
+    """The state at the start: who slides, who sticks, and the accelerations of that."""
+    if method.options.linearize in ("held", "state"):
+        raise ValueError(
+            f"hht: with friction, leave `linearize` out: it is at the predictor; received {method.options.linearize!r}."
+        )
+    at = q, v, t, params
+    factorize = method.factorize_for(system) if system.num_constraints else method.factorize
+    H = directions(system, q, t, params)
+    G = responses(system, q, t, params, H, factorize)
+    K, own = across(H, G), own_rate(system, *at)
+    settle = partial(_settle, system, at, factorize, H, K, own)
+
+    def again(_, L):
+        """L with the friction of limits that depend on L."""
+        return acceleration_and_multipliers(_smooth(system, *settle(L), L), *at, factorize)[1]
+
+    L = None
+    if system.num_constraints:
+        L = lax.fori_loop(0, LAGS, again, jnp.zeros(system.num_constraints, q.dtype))
+    sig, tau = settle(L)
+    s = method.begin(_smooth(system, sig, tau, L), *at, dt)
+    a = _taken_off(s.a, solve_some(K, sig == 0, matvec(H, s.a) + own), G)
+    return s._replace(a=a, friction=Rubbing(sig, tau))
+
+
+def _smooth(system, sig, tau, L):
+    """Without the law, but with the friction of joints that slide, and the forces tau at those that do not."""
+
+    def force(q, v, t, params):
+        f = system.friction.limit(q, v, L, t, params)
+        return system.force(q, v, t, params) - reaction(system, q, t, params, jnp.where(sig == 0, tau, sig * f))
+
+    return system._replace(force=force, friction=None)
+
+
+def _settle(system, at, factorize, H, K, own, L):
+    """sig and tau at the start. What rests is held, within the limits; what cannot be held slides."""
+    q, v, t, params = at
+    sig, f = jnp.sign(system.friction.sliding(*at)), system.friction.limit(q, v, L, t, params)
+    rests, zero = sig == 0, jnp.zeros_like(f)
+    free = _smooth(system, sig, zero, L)
+    if system.num_constraints:
+        w, _ = acceleration_and_multipliers(free, *at, factorize)
+    else:
+        w = free.acceleration(*at, factorize)
+    load = jnp.where(rests, matvec(H, w) + own, 0)
+    alone = diagonal(K)
+    coupling = jnp.where(rests[:, None] & rests[None, :], K, jnp.diag(alone))
+    tau, _ = balance(lambda b: jnp.clip(b / alone, -f, f), load, coupling, zero, f)
+    slides = jnp.where(jnp.abs(tau) >= f, jnp.sign(tau), 0)
+    return jnp.where(rests, slides, sig), jnp.where(rests, tau, sig * f)
+
+
+def bind_friction(method, system, params, dt):
+    """The step: the free one, the switches within it, and what becomes of the state behind them."""
+    law, size = system.friction, system.size
+
+    def step(s):
+        r, path, z, shift, B = _equations(method, system, params, dt, s)
+
+        def rubbing(s1):
+            f = law.limit(s1.q, s1.v, s1.L, s1.t, params)
+            force = reaction(system, s1.q, s1.t, params, s.friction.sig * f)
+            return r(s1) + jnp.pad(force, (0, z.size - size))
+
+        at = path(z)
+        z, info, inverse, along = _free_step(method, system, rubbing, path, z, s)
+        H = directions(system, at.q, at.t, params)
+        G = _each(inverse, jnp.pad(H, ((0, 0), (0, z.size - size))))
+        free, W = path(z), across(H, _each(along, G).v)
+
+        s0, sf = (law.sliding(x.q, x.v, x.t, params) for x in (s, free))
+        sig, tau = s.friction
+        held = path(z - matvec(G.T, solve_some(W, sig == 0, sf)))
+        f = law.limit(held.q, held.v, held.L, held.t, params)
+        K = across(H, G[:, :size])
+        rules = s0, sig, tau, f, diagonal(W), dt * diagonal(K)
+
+        def answer(b):
+            return switch(b, *rules).tau
+
+        dtau, change = balance(answer, sf, W, jnp.where(sig == 0, tau, 0), f)
+        end = switch(sf - matvec(W, dtau) + diagonal(W) * dtau, *rules)
+        z = z - matvec(G.T, dtau)
+        x = method.advance(s, dt, z[:size])[0]
+        taken = None if shift is None else shift(z[size + system.num_constraints :])
+        x = x if taken is None else x - taken
+        s1 = _behind(system, params, s, path(z), x, end, dtau, f, G, K)
+        s1 = system.tidy(s1)
+        info = _told(info, change, _is_limit(law, at, params) & ~jnp.any(f < 0))
+        return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
+
+    return step
+
+
+def _equations(method, system, params, dt, s):
+    """As for constraints, also without."""
+    if system.num_constraints:
+        return equations(method, system, params, dt, s)
+    return lambda s: residual(system, params, s), lambda w: method.arrive(system, s, dt, w), s.w, None, None
+
+
+def _free_step(method, system, r, path, z, s):
+    """The step in which every joint keeps its friction, and those that stuck have none; its factors are kept."""
+    options = method.options
+    factorize = method.factorize_for(system) if system.num_constraints else method.factorize
+    if options.iterations is None:
+        z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
+        z, _, inverse, along = solve_and_keep(r, path, z, factorize)
+        return z, info, inverse, along
+    z, info, inverse, along = solve_and_keep(r, path, z, factorize)
+    for _ in range(options.iterations - 1):
+        z, more, inverse, along = solve_and_keep(r, path, z, factorize)
+        info = join_info(info, more)
+    return z, info, inverse, along
+
+
+def _behind(system, params, s, s1, x, end, dtau, f, G, K):
+    """The state s1 at the end of the step, displaced by x, moved onto the branches on which its joints end."""
+    h, sig = s1.t - s.t, s.friction.sig
+    size, sliding = system.size, system.friction.sliding
+    moves, sticks = ~end.kept & (end.sig != 0), ~end.kept & (end.sig == 0)
+    Gv = system.widened(G[:, : system.positions])  # internal states do not jump
+    middle = directions(system, system.move(s.q, x / 2), s.t + h / 2, params)
+    zero = jnp.zeros(size, x.dtype)
+    own = [sliding(y.q, zero, y.t, params) for y in (s, s1)]
+    slid = matvec(middle, x) + h / 2 * (own[0] + own[1])
+    x = _taken_off(x, solve_some(K, ~end.kept, slid - end.slid * h), Gv)
+    s1 = s1._replace(q=system.move(s.q, x))
+    s1 = s1._replace(v=_taken_off(s1.v, solve_some(K, sticks, sliding(s1.q, s1.v, s1.t, params)), Gv))
+
+    H = directions(system, s1.q, s1.t, params)
+    own = own_rate(system, s1.q, s1.v, s1.t, params)
+    onto = jnp.where(moves, (end.sig - sig) * f - dtau, 0)
+    w = s1.w - matvec(Gv.T, onto)
+    y = solve_some(K, sticks, matvec(H, w) + own)
+    w = _taken_off(w, y, Gv)
+    a = _taken_off(s1.a, solve_some(K, ~end.kept, matvec(H, s1.a - w)), Gv)
+    if s1.L is not None:
+        s1 = s1._replace(L=s1.L - matvec(G[:, size : size + system.num_constraints].T, onto + y))
+    tau = jnp.where(sticks, sig * f + dtau + y, end.sig * f)
+    return s1._replace(w=w, a=a, friction=Rubbing(end.sig, tau))
+
+
+def _taken_off(x, y, G):
+    """x - G^T y, and 0 where that is rounding."""
+    left = x - matvec(G.T, y)
+    noise = NOISE * float(jnp.finfo(x.dtype).eps) * matvec(jnp.abs(G.T), jnp.abs(y))
+    return jnp.where(jnp.abs(left) < noise, 0, left)
+
+
+def _each(f, rows):
+    """f of each row; without vmap of a single one, which leaves less to compile."""
+    if len(rows) == 1:
+        return jax.tree.map(lambda x: x[None], f(rows[0]))
+    return jax.vmap(f)(rows)
+
+
+def _is_limit(law, s, params):
+    """Whether the limits at a state are numbers >= 0; of a state that is not finite others tell."""
+    f = law.limit(s.q, s.v, s.L, s.t, params)
+    return jnp.all(f >= 0) | ~(jnp.all(jnp.isfinite(s.q)) & jnp.all(jnp.isfinite(s.v)))
+
+
+def _told(info, change, is_limit):
+    """The `Info` of a step."""
+    change = jnp.where(is_limit, change, jnp.inf)
+    found = is_settled(change)
+    return info._replace(friction=change, converged=found if info.converged is None else info.converged & found)

@@ -1,0 +1,122 @@
+"""Dry friction of a system: where it acts, how large it may become, and what it does to the accelerations.
+
+    s = sliding(q, v, t),    H = ds/dv,    F = limit(q, v, t) >= 0
+    M(q) w = Q(q, v, t) + B^T L - H^T tau,    tau = F sign(s) if s != 0, else |tau| <= F
+
+How a step finds tau is in hhtjax/steppers/friction.py.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.checks import describe
+from hhtjax.numerics.elimination import factorize, matvec
+from hhtjax.numerics.linear_solve import solve
+from hhtjax.systems import returned
+from hhtjax.systems.constraints import saddle_point
+from hhtjax.xla import linear_map
+
+MOST = 8  # directions of friction
+
+
+class FrictionLaw(NamedTuple):
+    """Dry friction on vectors; made by `flat_friction`."""
+
+    limit: Callable  # q, v, L, t, params -> F (m,)
+    sliding: Callable  # q, v, t, params -> s (m,), affine in v
+    size: int  # m
+
+
+def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
+    """The `FrictionLaw` of a system, or an error for what its functions return."""
+    dtype, n = ravel_pytree(q0)[0].dtype, flat.positions
+    z = () if z0 is None else (z0,)
+    L = (jnp.zeros(flat.num_constraints, dtype),) if flat.num_constraints else ()
+    F = returned.evaluate(caller, "friction", system.friction, q0, v0, *z, *L, t0, params)
+    if system.sliding is None:
+        returned.check_like(caller, "friction", F, "v0", v0, dtype)
+        m = n
+        if m > MOST:
+            raise ValueError(
+                f"{caller}: `friction` acts on at most {MOST} directions; received one for each of {n} coordinates: "
+                "give `sliding`, the sliding velocities of those that rub."
+            )
+    else:
+        m = returned.count(caller, "sliding", system.sliding, min(n, MOST), dtype, q0, v0, t0, params)
+        if not hasattr(F, "shape") or F.shape != (m,):
+            raise ValueError(
+                f"{caller}: `friction` must return ({m},), one limit for each of `sliding`; received {describe(F)}."
+            )
+        returned.check_dtype(caller, "friction", F, dtype)
+    unravel_internal = (lambda V: ()) if z0 is None else (lambda V: (flat.unravel_internal(V[n:]),))
+
+    def limit(q, V, L, t, params):
+        multipliers = (L,) if flat.num_constraints else ()
+        at = flat.unravel(q), flat.unravel_rates(flat.located(V)), *unravel_internal(V), *multipliers
+        return ravel_pytree(system.friction(*at, t, params))[0].astype(dtype)
+
+    def sliding(q, V, t, params):
+        v = flat.located(V)
+        if system.sliding is None:
+            return v
+        return jnp.asarray(system.sliding(flat.unravel(q), flat.unravel_rates(v), t, params)).astype(dtype)
+
+    return FrictionLaw(limit, sliding, m)
+
+
+def directions(system, q, t, params):
+    """H (m, N), the derivative of the sliding velocities in the rates."""
+    zero = jnp.zeros(system.size, q.dtype)
+    s = partial(system.friction.sliding, q, t=t, params=params)
+    return linear_map(jax.linearize(s, zero)[1], zero)
+
+
+def reaction(system, q, t, params, tau):
+    """H^T tau: (N,)."""
+    zero = jnp.zeros(system.size, q.dtype)
+    return jax.vjp(lambda v: system.friction.sliding(q, v, t, params), zero)[1](tau)[0]
+
+
+def own_rate(system, q, v, t, params):
+    """The part of ds/dt that w does not enter: (m,)."""
+
+    def s(q, t):
+        return system.friction.sliding(q, v, t, params)
+
+    return jax.jvp(s, (q, t), (system.rate(q, v), jnp.ones_like(t)))[1]
+
+
+def responses(system, q, t, params, H, factorize=factorize):
+    """G (m, N): the accelerations that a unit of force in each direction of H makes, M^-1 H^T, with constraints."""
+    if system.num_constraints:
+        rows = jnp.zeros(system.num_constraints, q.dtype)
+        return jax.vmap(lambda h: saddle_point(system, q, t, params, h, rows, factorize)[0])(H)
+    M = system.mass(q, params)
+    return jax.vmap(lambda h: system.solve_mass(M, h, factorize))(H)
+
+
+def across(H, G):
+    """H G^T (m, m): what a unit of force in direction j does in direction i."""
+    return jnp.stack([matvec(H, g) for g in G], axis=1)
+
+
+def solve_some(K, some, b):
+    """y with K y = b on those rows and columns, and 0 elsewhere."""
+    b = jnp.where(some, b, 0)
+    if len(b) == 1:
+        return b / jnp.where(some, K[0], 1)
+    block = some[:, None] & some[None, :]
+    return solve(jnp.where(block, K, jnp.eye(len(b), dtype=K.dtype)), b)
+
+
+def held_back(system, s, params, dw):
+    """A jump dw of the accelerations at a state, but where joints stick, and the friction that takes it up there."""
+    H = directions(system, s.q, s.t, params)
+    G = responses(system, s.q, s.t, params, H)
+    y = solve_some(across(H, G), s.friction.sig == 0, matvec(H, dw))
+    return dw - matvec(G.T, y), s.friction._replace(tau=s.friction.tau + y)

@@ -1,0 +1,63 @@
+"""What the functions of a system return: the checks of shapes, structures and dtypes, made while tracing."""
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.checks import describe
+from hhtjax.description import freeze, thaw
+
+
+def check_matrix(caller, name, matrix, n, dtype, *args):
+    """A constant matrix, or the result of a function, of a shape that fits n and a dtype that fits the state."""
+    value = evaluate(caller, name, matrix, *args) if callable(matrix) else matrix
+    shapes = [(n, n), (n,)] + [()] * (n == 1)
+    if not (hasattr(value, "shape") and value.shape in shapes):
+        raise ValueError(
+            f"{caller}: `{name}` must give an array of shape ({n}, {n}), or ({n},) for a diagonal; "
+            f"received {describe(value)}."
+        )
+    if callable(matrix):
+        check_dtype(caller, name, value, dtype)
+
+
+def count(caller, name, function, most, dtype, *args):
+    """m, for a function that returns (m,) with m <= most."""
+    value = evaluate(caller, name, function, *args)
+    if not hasattr(value, "shape") or len(value.shape) != 1 or not 1 <= value.shape[0] <= most:
+        raise ValueError(
+            f"{caller}: `{name}` must return an array (m,) with 1 <= m <= {most}; received {describe(value)}."
+        )
+    check_dtype(caller, name, value, dtype)
+    return value.shape[0]
+
+
+def check_like(caller, name, value, like, reference, dtype):
+    """What a function returned, of the structure, the shapes and a dtype that fit the state."""
+    if jax.tree.structure(value) != jax.tree.structure(reference) or (
+        jax.tree.map(jnp.shape, value) != jax.tree.map(jnp.shape, reference)
+    ):
+        raise ValueError(
+            f"{caller}: `{name}` must return a pytree like {like}, {describe(reference)}; received {describe(value)}."
+        )
+    check_dtype(caller, name, value, dtype)
+
+
+def check_dtype(caller, name, value, dtype):
+    """An error for leaves of another dtype than that of the state; integers and Python numbers pass."""
+    for leaf in jax.tree.leaves(value):
+        found = jnp.result_type(leaf)
+        number = jnp.issubdtype(found, jnp.integer) or (leaf.weak_type and jnp.issubdtype(found, jnp.floating))
+        if found != dtype and not number:
+            raise TypeError(
+                f"{caller}: `{name}` returned {found} for a state of {dtype}; give params, and arrays made "
+                f"inside `{name}`, the dtype of q0, or q0 and v0 the dtype of params."
+            )
+
+
+def evaluate(caller, name, function, *args):
+    """Shape of function(*args); `name` is added to what the function raises."""
+    try:
+        return jax.eval_shape(lambda *args: function(*thaw(args)), *freeze(args))
+    except Exception as error:
+        error.add_note(f"{caller}: raised while tracing `{name}` with " + ", ".join(describe(x) for x in args) + ".")
+        raise

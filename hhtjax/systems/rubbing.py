@@ -1,0 +1,46 @@
+"""The check that directions of friction do not depend on each other, or on constraints, at the start."""
+
+from contextlib import nullcontext
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.description import is_concrete, thaw
+from hhtjax.systems.constraints import jacobian
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.friction import directions
+
+DEPENDENT = 1e-6  # relative size of what is left of a row, below which it is rounding
+
+
+@jax.jit
+def _rows(system, q0, v0, t0, params, z0):
+    """B and H at the start."""
+    params = thaw(params)
+    flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
+    t = jnp.asarray(t0).astype(q.dtype)
+    B = jacobian(flat, q, t, params) if flat.num_constraints else jnp.zeros((0, flat.size), q.dtype)
+    return B, directions(flat, q, t, params)
+
+
+def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
+    """An error that names directions of friction that others, or constraints, make redundant; tracers pass."""
+    if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
+        return
+    traced = not is_concrete(jnp.zeros(()))
+    with jax.ensure_compile_time_eval() if traced else nullcontext():
+        B, H = map(np.asarray, _rows(system, q0, v0, t0, params, z0))
+    if not np.all(np.isfinite(H)):
+        raise ValueError(f"{caller}: `sliding` has no finite derivative in v at the start.")
+    basis = np.linalg.svd(B, full_matrices=False)[2] if B.size else np.zeros((0, H.shape[1]))
+    for i, row in enumerate(H):
+        left = row
+        for _ in range(2):  # once more, for what rounding leaves
+            left = left - basis.T @ (basis @ left)
+        if np.linalg.norm(left) <= DEPENDENT * np.linalg.norm(row):
+            why = "does not depend on v" if not np.any(row) else "depends on those before it, or on constraints"
+            raise ValueError(
+                f"{caller}: row {i} of `sliding` {why}: friction there cannot be told from other forces. Leave it out."
+            )
+        basis = np.vstack([basis, left / np.linalg.norm(left)])

@@ -1,0 +1,212 @@
+"""Dry friction: orders, rest, derivatives, one factorisation, batches, dtypes."""
+
+import warnings
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from friction_problems import arm, free_vibration_exact, of_scene
+from jax.flatten_util import ravel_pytree
+from zoo import everywhere
+
+import hhtjax
+from hhtjax.scenes import belt, dry_oscillator
+from hhtjax.steppers.residual import Coefficients
+
+FAMILY = [*map(hhtjax.hht, (0.0, -0.05, -0.3)), *map(hhtjax.generalized_alpha, (0.0, 0.5, 1.0))]
+COLUMNS = zip(*(s.coefficients for s in FAMILY), strict=True)
+STACKED = replace(FAMILY[0], coefficients=Coefficients(*map(jnp.array, COLUMNS)))
+NUM_STEPS = 400, 1600
+
+
+def run(case, stepper, num_steps, save_every=1):
+    system, params, q0, v0, duration, *_ = case
+    dt = duration / num_steps
+    return hhtjax.simulate(system, stepper, q0, v0, params, dt=dt, num_steps=num_steps, save_every=save_every)
+
+
+@pytest.fixture(scope="module")
+def family():
+    """The free vibration by each of FAMILY, with each of NUM_STEPS."""
+    return [jax.vmap(lambda s, n=n: run(of_scene(dry_oscillator.free()), s, n))(STACKED) for n in NUM_STEPS]
+
+
+def test_order_two_through_reversals(family):
+    errors = []
+    for found in family:
+        q, v = free_vibration_exact(np.asarray(found.t[0]))
+        errors.append([np.max(np.abs(np.asarray(x)[..., 0] - y), axis=1) for x, y in ((found.q, q), (found.v, v))])
+    order = np.log(np.divide(*errors)) / np.log(NUM_STEPS[1] / NUM_STEPS[0])
+    assert np.all(np.abs(order - 2) < 0.1), order
+
+
+def test_what_stopped_stays(family):
+    """Exactly: no creep, and no acceleration that alternates, also for alpha = 0."""
+    for found in family:
+        stuck = np.asarray(found.sticking[..., 0])
+        assert np.all(stuck[:, -1] & (np.sum(stuck, axis=1) > 0.1 * stuck.shape[1]))
+        for member, here in enumerate(stuck):
+            q, tau = found.q[member, here, 0], found.friction[member, here, 0]
+            assert np.ptp(q) == 0
+            np.testing.assert_array_equal(found.v[member, here], 0)
+            np.testing.assert_array_equal(found.acceleration[member, here], 0)
+            np.testing.assert_allclose(tau[1:], -100 * q[1:], rtol=1e-12)
+
+
+def test_a_load_below_the_limit_moves_nothing():
+    """For 10 s, however long the steps; tanh(v/vt) would creep."""
+    system = hhtjax.System(jnp.ones(1), lambda q, v, t, F: 0.9 * F + 0 * q, friction=lambda q, v, t, F: F + 0 * q)
+    for h in (0.01, 1.0):
+        found = hhtjax.simulate(system, hhtjax.hht(0.0), jnp.zeros(1), jnp.zeros(1), 2.0, dt=h, num_steps=round(10 / h))
+        assert not np.any(found.q)
+        np.testing.assert_allclose(found.friction, 1.8, rtol=1e-14)
+        assert found.sticking.all()
+
+
+def test_stuck_joints_of_a_mechanism_stay_to_the_order_of_the_step():
+    """The relative velocity of two links, with M(q), is 0 to rounding while they stick, the angle exactly constant."""
+    found = run(arm(), hhtjax.hht(0.0), 2000)
+    found.check()
+    stuck = np.asarray(found.sticking)
+    for joint in range(2):
+        here = stuck[1:, joint] & stuck[:-1, joint]
+        assert here.sum() > 50 or joint
+        np.testing.assert_array_equal(np.diff(found.q[:, joint])[here], 0)
+        assert np.max(np.abs(np.asarray(found.v)[stuck[:, joint], joint]), initial=0) < 1e-16
+        assert np.max(np.abs(np.asarray(found.acceleration)[stuck[:, joint], joint]), initial=0) < 1e-13
+
+
+def test_without_limit_it_is_the_step_without_friction():
+    case = of_scene(dry_oscillator.driven(0.0))
+    smooth = replace(case.system, friction=None)
+    params = {**case.params, "F": 0.0}
+    found, expected = (run(case._replace(system=x, params=params), hhtjax.hht(), 200) for x in (case.system, smooth))
+    for x, y in ((found.q, expected.q), (found.v, expected.v), (found.acceleration, expected.acceleration)):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-14)
+
+
+def chain(n, **more):
+    """n masses between springs, of which the first two rub."""
+    return hhtjax.System(
+        mass=jnp.ones(n),
+        force=lambda q, v, t, p: -(q**3) - q + jnp.sin(t),
+        friction=lambda q, v, *_: 0.1 * jnp.ones(2),
+        sliding=lambda q, v, t, p: v[:2],
+        **more,
+    )
+
+
+def test_one_factorisation_per_step():
+    """Of the step's matrix, whatever switches; with constraints too."""
+    n, zero = 20, jnp.zeros(20)
+    held = chain(n, constraint=lambda q, t, p: q[-1:])
+    for system, L in ((chain(n), None), (held, jnp.zeros(1))):
+        state = jax.eval_shape(lambda x=system: hhtjax.hht().init(x, zero, zero, None, 0.01))
+        trace = jax.make_jaxpr(lambda s, x=system: hhtjax.hht().step(x, s, None, 0.01))(state)
+        assert (state.L is None) == (L is None)
+        assert sum(eqn.primitive.name == "lu" for eqn in everywhere(trace.jaxpr)) == 1
+
+
+def check_derivatives(end, start):
+    """Forward = reverse = central differences, so short that no switch leaves its step between them."""
+    x, unravel = ravel_pytree(start)
+
+    @jax.jit
+    def with_forward(x):
+        return jax.vmap(lambda e: jax.jvp(lambda x: end(unravel(x)), (x,), (e,)), out_axes=(None, 0))(jnp.eye(x.size))
+
+    forward, reverse = with_forward(x)[1], jax.jit(jax.grad(lambda x: end(unravel(x))))(x)
+    size = np.abs(forward) + 1e-2 * np.max(np.abs(forward))
+    assert np.max(np.abs(forward - reverse) / size) < 1e-10
+    for i, e in enumerate(1e-6 * np.eye(x.size)):
+        central = (with_forward(x + e)[0] - with_forward(x - e)[0]) / 2e-6
+        assert abs(central - forward[i]) < 1e-6 * size[i], (i, central, forward[i])
+
+
+NAMES = "k", "c", "F", "m"
+
+
+def test_derivatives_are_those_of_the_exact_motion():
+    """Forward = reverse = central differences; and those of steps 16 times shorter."""
+    case = of_scene(dry_oscillator.driven())._replace(duration=6.0)
+
+    def path(values, dts):
+        params = {**case.params, **dict(zip(NAMES, values, strict=True))}
+        options = {"dts": dts, "duration": case.duration, "num_samples": 40}
+        return hhtjax.sweep(case.system, hhtjax.hht(), case.q0, case.v0, params, **options).q[..., 0]
+
+    values = jnp.array([case.params[name] for name in NAMES])
+    dts = jnp.array([case.duration / 3200, case.duration / 51200])
+    coarse, fine = jax.jit(jax.jacfwd(path))(values, dts)
+    away = np.max(np.abs(coarse - fine), axis=0) / np.max(np.abs(fine), axis=0)
+    assert dict(zip(NAMES, away < 0.02, strict=True)) == dict.fromkeys(NAMES, True), away
+
+    def end(params):
+        return run(case._replace(params={**case.params, **params}), hhtjax.hht(), 400, save_every=400).q[-1, 0]
+
+    check_derivatives(end, {name: case.params[name] for name in NAMES})
+
+
+def test_derivatives_through_coupled_switches():
+    """Of two joints, whose friction is found by an iteration that is differentiated implicitly."""
+    case = arm()._replace(duration=2.0)
+
+    def end(start):
+        found = run(case._replace(params={"F": start[0]}, q0=start[1]), hhtjax.hht(), 250, save_every=250)
+        return jnp.sum(found.q[-1] * jnp.array([1.0, 2.0]))
+
+    check_derivatives(end, (2.5, case.q0))
+
+
+def test_the_plain_program_gives_the_same():
+    case = of_scene(belt.two_masses())._replace(duration=0.5)
+    fast = run(case, hhtjax.hht(), 100)
+    with hhtjax.plain():
+        np.testing.assert_allclose(run(case, hhtjax.hht(), 100).q, fast.q, atol=1e-13)
+
+
+def test_batches_dtypes_and_single_steps():
+    case = of_scene(dry_oscillator.driven())._replace(duration=1.0)
+
+    def with_limit(F):
+        return run(case._replace(params={**case.params, "F": F}), hhtjax.hht(), 100)
+
+    single, batch = with_limit(3.0), jax.vmap(with_limit)(jnp.array([1.0, 3.0, 7.0]))
+    np.testing.assert_allclose(batch.q[1], single.q, atol=1e-13)
+    assert batch.sticking.all(axis=(1, 2)).tolist() == [False, False, True]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hhtjax.PrecisionWarning)
+        rough = run(case._replace(q0=jnp.zeros(1, jnp.float32), v0=jnp.zeros(1, jnp.float32)), hhtjax.hht(), 100)
+    rough.check()
+    assert {x.dtype for x in (rough.q, rough.friction)} == {np.dtype("float32")}
+    np.testing.assert_allclose(rough.q, single.q, atol=2e-5)
+    arguments = case.system, case.q0, case.v0, case.params, 0.01
+    state = hhtjax.hht().init(*arguments)
+    step = jax.jit(lambda s: hhtjax.hht().step(case.system, s, case.params, 0.01)[0])
+    for i in range(1, 4):
+        state = step(state)
+        np.testing.assert_allclose(state.friction.tau, single.friction[i], rtol=1e-12)
+
+
+def test_more_joints_and_iterations():
+    """Eight joints in a row, that stick and slip one after the other; Newton's iteration in the free step."""
+    n, rates = 8, 1 + 0.3 * jnp.arange(8.0)
+
+    relative = hhtjax.System(
+        jnp.ones(n),
+        lambda q, v, t, p: 3.0 * jnp.sin(rates * t) - q,
+        friction=lambda q, v, t, p: 0.5 * jnp.ones(n),
+        sliding=lambda q, v, t, p: jnp.diff(v, prepend=0.0),
+    )
+    zero = jnp.zeros(n)
+    ends = []
+    for stepper, steps in ((hhtjax.hht(), 500), (hhtjax.hht(iterations=None), 500), (hhtjax.hht(), 4000)):
+        found = hhtjax.simulate(relative, stepper, zero, zero, dt=5 / steps, num_steps=steps, save_every=steps // 10)
+        found.check()
+        assert float(found.info.friction.max()) < 1e-12
+        ends.append(found)
+    np.testing.assert_allclose(ends[0].q, ends[1].q, atol=1e-10)  # a linear system
+    np.testing.assert_allclose(ends[0].q, ends[2].q, atol=1e-3)
+    assert 0.02 < np.mean(ends[2].sticking) < 0.9

@@ -1,0 +1,138 @@
+"""Dry friction: bad input, refusals, held inputs, sweeps, dense output, and what shows itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from hhtjax.scenes import belt, dry_oscillator
+
+ONE, TWO, ZERO = jnp.ones(1), jnp.ones(2), jnp.zeros(1)
+SCENE = dry_oscillator.driven()
+
+
+def force(q, v, t, params):
+    return -q
+
+
+def limit(q, v, t, params):
+    return 0.1 + 0 * q
+
+
+def two(sliding=None, friction=limit):
+    return hhtjax.System(TWO, force, friction=friction, sliding=sliding)
+
+
+def simulate(system, stepper=hhtjax.hht(), q0=TWO, **options):  # noqa: B008 (frozen)
+    return hhtjax.simulate(system, stepper, q0, 0 * q0, dt=0.1, num_steps=2, **options)
+
+
+@pytest.mark.parametrize(
+    ("error", "message", "call"),
+    [
+        (TypeError, "System: `friction` must be a function", lambda: two(friction=1.0)),
+        (TypeError, r"friction\(q, v, t, params\)", lambda: two(friction=lambda q, v, params: q)),
+        (TypeError, r"sliding\(q, v, t, params\)", lambda: two(sliding=lambda v: v)),
+        (ValueError, "`sliding` must go with `friction`", lambda: hhtjax.System(ONE, force, sliding=limit)),
+        (ValueError, "`friction` must return a pytree like v0", lambda: simulate(two(friction=lambda *_: 0.1))),
+        (ValueError, r"`friction` must return \(1,\)", lambda: simulate(two(lambda q, v, t, p: v[:1]))),
+        (ValueError, "`sliding` must return an array", lambda: simulate(two(lambda q, v, t, p: v[0]))),
+        (ValueError, "row 1 of `sliding` depends", lambda: simulate(two(lambda q, v, t, p: v[0] * TWO))),
+        (
+            ValueError,
+            "row 1 of `sliding` does not depend",
+            lambda: simulate(two(lambda q, v, t, p: v * q * jnp.arange(2) - v)),
+        ),
+        (ValueError, "leave `linearize` out", lambda: simulate(two(), hhtjax.hht(linearize="held"))),
+        (NotImplementedError, "RK4 cannot solve dry `friction`; use hht", lambda: simulate(two(), hhtjax.rk4())),
+        (NotImplementedError, "Rosenbrock cannot solve dry", lambda: simulate(two(), hhtjax.rowda())),
+        (NotImplementedError, "leave `extrapolate` out", lambda: simulate(two(), extrapolate=2)),
+        (NotImplementedError, "ode: `system` has dry", lambda: hhtjax.interop.ode(two())(0.0, (TWO, TWO), None)),
+    ],
+)
+def test_bad_input_is_named(error, message, call):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_nine_joints_are_too_many():
+    system = hhtjax.System(jnp.ones(9), force, friction=limit)
+    with pytest.raises(ValueError, match="at most 8 directions; received one for each of 9 coordinates"):
+        simulate(system, q0=jnp.ones(9))
+
+
+def test_a_constrained_direction_is_named():
+    system = hhtjax.System(
+        TWO,
+        force,
+        constraint=lambda q, t, p: q[:1] - 1.0,
+        friction=lambda q, v, L, t, p: 0.1 * TWO,
+        sliding=lambda q, v, t, p: v[::-1],
+    )
+    with pytest.raises(ValueError, match="row 1 of `sliding` depends on those before it, or on constraints"):
+        simulate(system)
+
+
+@pytest.mark.parametrize("worst", [-1.0, np.nan])
+def test_a_limit_that_is_none_is_named(worst):
+    """At the step where it becomes so, and of a batch the member."""
+    system = hhtjax.System(ONE, force, friction=lambda q, v, t, p: jnp.where(t > 0.25, p, 0.1) + 0 * q)
+
+    def run(p):
+        return hhtjax.simulate(system, hhtjax.hht(), ONE, ZERO, p, dt=0.1, num_steps=5)
+
+    with pytest.raises(hhtjax.SimulationError, match=r"step 3 .* a limit of the dry friction is negative"):
+        run(worst).check()
+    batch = jax.vmap(run)(jnp.array([0.1, worst]))
+    assert batch.failure.step.tolist() == [0, 3]
+    assert "the dry friction was not found" in repr(jax.tree.map(lambda x: x[1], batch.failure))
+
+
+def test_what_shows_itself():
+    found = simulate(two())
+    assert "friction" in repr(found)
+    assert "sticking" in repr(found)
+    assert simulate(hhtjax.System(TWO, force)).friction is None
+
+
+def test_sweeps_files_and_dense_output(tmp_path):
+    scene = belt.two_masses()
+    arguments = scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params
+    grid = {"dts": jnp.array([0.01, 0.005]), "duration": 0.2, "num_samples": 4}
+    found = hhtjax.sweep(*arguments, **grid)
+    loaded = hhtjax.load_sweep(hhtjax.sweep_to_disk(tmp_path / "runs", *arguments, **grid))
+    assert found.friction.shape == found.sticking.shape == (2, 5, 2)
+    np.testing.assert_array_equal(loaded["friction"], found.friction)
+    np.testing.assert_array_equal(loaded["sticking"], found.sticking)
+    one = hhtjax.simulate(*arguments, dt=0.005, num_steps=40, save_every=10)
+    np.testing.assert_allclose(one.friction, found.friction[1], rtol=1e-10)
+    np.testing.assert_allclose(hhtjax.interpolate(one, one.t[2]).q, one.q[2], rtol=1e-12)
+
+
+def test_a_held_input_breaks_a_joint_away_at_its_jump():
+    """F/m (1 - limit) from the jump on: exact, since all is constant between."""
+    u = hhtjax.sampled(jnp.array([0.5, 0.9, 1.5, 1.5]), dt=1.0, order=0)
+    system = hhtjax.System(ONE, lambda q, v, t, u: u(t) + 0 * q, friction=lambda q, v, t, u: 1 + 0 * q)
+    found = hhtjax.simulate(system, hhtjax.hht(0.0), ZERO, ZERO, u, dt=0.25, num_steps=11)
+    found.check()
+    t = np.maximum(np.asarray(found.t) - 2, 0)
+    np.testing.assert_allclose(found.v[:, 0], 0.5 * t, atol=1e-12)
+    np.testing.assert_array_equal(found.sticking[:9, 0], True)
+    np.testing.assert_allclose(found.friction[1:8, 0], [0.5] * 4 + [0.9] * 3, rtol=1e-12)
+
+
+def test_a_limit_is_fitted():
+    """With a start off by a factor of 1.5."""
+
+    def path(params):
+        run = hhtjax.simulate(
+            SCENE.system, hhtjax.hht(), SCENE.q0, SCENE.v0, {**SCENE.params, **params}, dt=0.02, num_steps=300
+        )
+        return run.q[:, 0]
+
+    truth = {"F": 3.0, "k": 20.0}
+    measured = path(truth)
+    found = hhtjax.fit(lambda params: path(params) - measured, {"F": 2.0, "k": 24.0})
+    assert found.params["F"] == pytest.approx(3.0, rel=1e-5)
+    assert found.params["k"] == pytest.approx(20.0, rel=1e-5)
