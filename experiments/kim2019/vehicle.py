@@ -187,10 +187,19 @@ def draw(scene, times, q, errors, factors):
     h, lines = 1e3 * np.array(STEP_SIZES), {}
     for i, (name, error) in enumerate(errors.items()):
         size = {"HHT, converged": 8, "HHT, auto": 5.5}.get(name, 3.5)  # these and the predictor lie on each other
-        style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": size, "lw": 1.2, "mfc": "none" if size > 5 else None}
+        style = {
+            "color": COLOURS[i],
+            "marker": MARKERS[i],
+            "ms": size,
+            "lw": 1.2,
+            "ls": "-",
+            "mfc": "none" if size > 5 else None,
+        }
         lines[name] = style
         by_error.loglog(error, factors[name], **style)
-    curves = {name: (h, error) for name, error in errors.items()}
+    curves = {
+        name: (h, np.where(error > 1e-6, error, np.nan)) for name, error in errors.items()
+    }  # what is in the picture
     error_against_h(curves, lines=lines, slopes=(1, 2, 4), key=False, ax=by_step)
     by_step.axhline(1, color="black", ls=":")
     by_error.axvline(1, color="black", ls=":")
