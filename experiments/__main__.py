@@ -21,6 +21,7 @@ EXPERIMENTS = {
     "silverbox_comparison": "identification.comparison",
     "double_pendulum_measured": "identification.double_pendulum_measured",
     "bouc_wen": "identification.bouc_wen",
+    "friction": "friction.friction",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",
     "squeezer": "identification.squeezer",
