@@ -24,6 +24,7 @@ EXPERIMENTS = {
     "bouc_wen": "identification.bouc_wen",
     "emps": "identification.emps",
     "tanks": "identification.tanks",
+    "friction": "friction.friction",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",
     "squeezer": "identification.squeezer",

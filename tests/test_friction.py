@@ -190,23 +190,29 @@ def test_batches_dtypes_and_single_steps():
         np.testing.assert_allclose(state.friction.tau, single.friction[i], rtol=1e-12)
 
 
-def test_more_joints_and_iterations():
-    """Eight joints in a row, that stick and slip one after the other; Newton's iteration in the free step."""
-    n, rates = 8, 1 + 0.3 * jnp.arange(8.0)
+def test_newton_in_the_free_step():
+    """Which is linear here: one solve or many."""
+    case = of_scene(dry_oscillator.driven(0.0))._replace(duration=5.0)
+    once, converged = (run(case, hhtjax.hht(iterations=k), 250) for k in (1, None))
+    converged.check()
+    np.testing.assert_allclose(once.q, converged.q, atol=1e-10)
 
-    relative = hhtjax.System(
+
+@pytest.mark.slow
+def test_eight_joints_in_a_row():
+    """They stick and slip one on the other, strongly coupled."""
+    n, rates = 8, 1 + 0.3 * jnp.arange(8.0)
+    row = hhtjax.System(
         jnp.ones(n),
         lambda q, v, t, p: 3.0 * jnp.sin(rates * t) - q,
         friction=lambda q, v, t, p: 0.5 * jnp.ones(n),
         sliding=lambda q, v, t, p: jnp.diff(v, prepend=0.0),
     )
-    zero = jnp.zeros(n)
-    ends = []
-    for stepper, steps in ((hhtjax.hht(), 500), (hhtjax.hht(iterations=None), 500), (hhtjax.hht(), 4000)):
-        found = hhtjax.simulate(relative, stepper, zero, zero, dt=5 / steps, num_steps=steps, save_every=steps // 10)
-        found.check()
-        assert float(found.info.friction.max()) < 1e-12
-        ends.append(found)
-    np.testing.assert_allclose(ends[0].q, ends[1].q, atol=1e-10)  # a linear system
-    np.testing.assert_allclose(ends[0].q, ends[2].q, atol=1e-3)
-    assert 0.02 < np.mean(ends[2].sticking) < 0.9
+    zero, steps = jnp.zeros(n), np.array([500, 1000, 8000])
+    found = hhtjax.sweep(row, hhtjax.hht(), zero, zero, dts=5 / steps, duration=5.0, num_samples=10)
+    found.check()
+    assert float(found.info.friction.max()) < 1e-12
+    coarse, fine = (np.max(np.abs(found.q[i] - found.q[2])) for i in range(2))
+    assert coarse < 1e-3
+    assert fine < 0.35 * coarse
+    assert 0.02 < np.mean(found.sticking[2]) < 0.9

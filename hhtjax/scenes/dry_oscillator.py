@@ -36,6 +36,16 @@ def free() -> Scene:
 
 
 def driven(stiction=0.3) -> Scene:
-    """Stick and slip: 20 switches (SI units)."""
+    """Stick and slip: 20 switches (SI units).
+
+    Args:
+        stiction: how much larger the limit is at rest than in fast sliding, over that; with 0 it is Coulomb's.
+
+    Returns:
+        A `Scene`.
+
+    >>> float(driven(stiction=0.5).params["stiction"])
+    0.5
+    """
     params = {"m": 1.0, "k": 20.0, "c": 0.1, "A": 6.0, "W": 2.0, "F": 3.0, "stiction": stiction, "vs": 0.05}
     return Scene(SYSTEM, params, jnp.zeros(1), jnp.zeros(1), 15.0)

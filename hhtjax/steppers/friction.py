@@ -16,14 +16,15 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.numerics.balance import balance
 from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.steppers.constrained import equations, report_constraints
-from hhtjax.steppers.friction_law import balance, is_settled, switch
+from hhtjax.steppers.friction_law import is_settled, switch
 from hhtjax.steppers.newton import newton, solve_and_keep
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Rubbing, join_info
 from hhtjax.systems.constraints import acceleration_and_multipliers
-from hhtjax.systems.friction import across, directions, own_rate, reaction, responses, solve_some
+from hhtjax.systems.friction import across, at_rest, directions, own_rate, reaction, responses, solve_some
 
 NOISE = 8  # roundings, of what it is the difference of, below which a number is 0
 LAGS = 20  # how often multipliers, and limits that depend on them, are made anew at the start
@@ -75,11 +76,7 @@ def _settle(system, at, factorize, H, K, own, L):
         w, _ = acceleration_and_multipliers(free, *at, factorize=factorize)
     else:
         w = free.acceleration(*at, factorize=factorize)
-    load = jnp.where(rests, matvec(H, w) + own, 0)
-    alone = diagonal(K)
-    coupling = jnp.where(rests[:, None] & rests[None, :], K, jnp.diag(alone))
-    tau, _ = balance(lambda b: jnp.clip(b / alone, -f, f), load, coupling, zero, f)
-    slides = jnp.where(jnp.abs(tau) >= f, jnp.sign(tau), 0)
+    slides, tau = at_rest(K, rests, matvec(H, w) + own, f, zero)
     return jnp.where(rests, slides, sig), jnp.where(rests, tau, sig * f)
 
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe
-from hhtjax.numerics.elimination import factorize, matvec
+from hhtjax.numerics.balance import balance
+from hhtjax.numerics.elimination import diagonal, factorize, matvec
 from hhtjax.numerics.linear_solve import solve
 from hhtjax.systems import returned
 from hhtjax.systems.constraints import saddle_point
@@ -114,9 +115,21 @@ def solve_some(K, some, b):
     return solve(jnp.where(block, K, jnp.eye(len(b), dtype=K.dtype)), b)
 
 
+def at_rest(K, rests, load, f, start):
+    """sig and tau of joints at rest: what holds them against their loads, within their limits; the others slide."""
+    alone = diagonal(K)
+    coupling = jnp.where(rests[:, None] & rests[None, :], K, jnp.diag(alone))
+    tau, _ = balance(lambda b: jnp.clip(b / alone, -f, f), jnp.where(rests, load, 0), coupling, start, f)
+    return jnp.where(jnp.abs(tau) >= f, jnp.sign(tau), 0), tau
+
+
 def held_back(system, s, params, dw):
-    """A jump dw of the accelerations at a state, but where joints stick, and the friction that takes it up there."""
+    """A jump dw of the accelerations at a state, with what the friction of joints at rest does about it."""
     H = directions(system, s.q, s.t, params)
     G = responses(system, s.q, s.t, params, H)
-    y = solve_some(across(H, G), s.friction.sig == 0, matvec(H, dw))
-    return dw - matvec(G.T, y), s.friction._replace(tau=s.friction.tau + y)
+    K, (sig, tau) = across(H, G), s.friction
+    rests, f = sig == 0, system.friction.limit(s.q, s.v, s.L, s.t, params)
+    load = matvec(H, dw) + matvec(K, jnp.where(rests, tau, 0))
+    slides, held = at_rest(K, rests, load, f, tau)
+    change = jnp.where(rests, held - tau, 0)
+    return dw - matvec(G.T, change), s.friction._replace(sig=jnp.where(rests, slides, sig), tau=tau + change)

@@ -133,7 +133,7 @@ class System(Description):
             require_function("System", "sliding", self.sliding, "sliding(q, v, t, params)", count=4)
 
     @classmethod
-    def from_lagrangian(cls, lagrangian, force=None, internal=None):
+    def from_lagrangian(cls, lagrangian, force=None, internal=None, friction=None, sliding=None):
         """The system of Lagrange's equations  d/dt (dL/dv) - dL/dq = F, with M and Q by autodiff.
 
             M = d2L/dv2,    Q = F + dL/dq - (d2L/dv dq) v - d2L/dv dt
@@ -143,6 +143,7 @@ class System(Description):
                 a mass matrix that depends on q and params only: M is evaluated at v = 0, t = 0.
             force: F, the forces that no potential holds (damping, inputs): `force(q, v, t, params)`.
             internal: as for `System`; then `force(q, v, z, t, params)`.
+            friction, sliding: as for `System`.
 
         Example: a mass on a spring, L = m v^2/2 - k q^2/2.
 
@@ -157,7 +158,8 @@ class System(Description):
             require_function("System.from_lagrangian", "force", force, f"force({arguments})", count)
         own_force = (LagrangianForce if internal is None else InternalLagrangianForce)(lagrangian, force)
         inertia = LagrangianInertia(lagrangian)
-        return cls(LagrangianMass(lagrangian), own_force, inertia=inertia, internal=internal)
+        more = {"inertia": inertia, "internal": internal, "friction": friction, "sliding": sliding}
+        return cls(LagrangianMass(lagrangian), own_force, **more)
 
 
 @dataclass(frozen=True, eq=False)

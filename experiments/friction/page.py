@@ -1,0 +1,43 @@
+"""README.md beside this file, made from page.md and friction.json.
+
+`python -m experiments.friction.page`
+"""
+
+import json
+from pathlib import Path
+
+from experiments.page import table
+
+HERE = Path(__file__).parent
+
+
+def page(numbers):
+    """The text of README.md."""
+    saved = [
+        [
+            way,
+            f"{x['error_m']:.1e}",
+            f"{x['steps']:.0f}",
+            f"{x['solves']:.0f}" if x["solves"] else "",
+            f"{x['time']:.0f}",
+        ]
+        for way, x in numbers["steps_saved"].items()
+    ]
+    creep = [[way, f"{abs(q[-1]):.2g}"] for way, q in numbers["creep"]["q_m"].items()]
+    return (
+        (HERE / "page.md")
+        .read_text()
+        .format(
+            machine=numbers["machine"],
+            switches=numbers["switches"],
+            samples=numbers["samples"],
+            most=max(row["steps"] for row in numbers["rows"]),
+            saved=table(["", "its error (m)", "steps", "solves", "time"], saved),
+            duration=numbers["creep"]["t_s"][-1],
+            creep=table(["", "m"], creep),
+        )
+    )
+
+
+if __name__ == "__main__":
+    (HERE / "README.md").write_text(page(json.loads((HERE / "friction.json").read_text())))
