@@ -11,7 +11,7 @@ from zoo import PROBLEMS
 
 import hhtjax
 from hhtjax import export_c, hht
-from hhtjax.scenes import pendulum
+from hhtjax.scenes import motor_joint, pendulum, top
 
 pytestmark = needs_compiler
 
@@ -43,6 +43,34 @@ def test_sensitivities_are_those_of_jax(pendulum_library):
         for j, param in enumerate(("k_0", "c_1")):
             ours = numbers(state, f"d{name}_d{param}")
             assert np.max(abs(ours - expected[i, :, j])) < 1e-10 * np.max(abs(expected[i, :, j])), (name, param)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["rod", "motor", "top"])
+def test_sensitivities_with_constraints_newton_and_rotations(scene, tmp_path):
+    """Of velocities (and multipliers), in a parameter that moves them."""
+    make, stepper, name, dt = {
+        "rod": (pendulum.cartesian, hht(-0.1), "g", 1e-3),
+        "motor": (motor_joint.tracking, hht(-0.1, iterations=None), "gear", 1e-3),
+        "top": (top.minimal, hht(-0.1), "g", 1e-4),
+    }[scene]
+    own = make()
+    z0, steps = getattr(own, "z0", None), 200
+    arguments = own.system, stepper, own.q0, own.v0
+    library = Library(export_c(*arguments, own.params, z0=z0, sensitivities=(name,)), tmp_path)
+    starts = [ravel_pytree(x)[0] for x in (own.q0, own.v0, z0) if x is not None]
+    state, _ = library.begin(*starts, dt=dt)
+    assert library.run(state, steps, dt) == 0
+
+    def end(x):
+        run = hhtjax.simulate(*arguments, own.params | {name: x}, z0=z0, dt=dt, num_steps=steps, save_every=steps)
+        return run.v[-1] if run.multipliers is None else jnp.concatenate([run.v[-1], run.multipliers[-1]])
+
+    expected = jax.jacfwd(end)(jnp.asarray(own.params[name]))
+    fields = [field.name for field in library.model.state if field.name in (f"dv_d{name}", f"dL_d{name}")]
+    ours = np.concatenate([numbers(state, field) for field in fields])
+    assert np.max(abs(expected)) > 1e-6
+    assert np.max(abs(ours - expected)) < 1e-10 * np.max(abs(expected))
 
 
 def test_states_are_independent_and_params_may_change(pendulum_library):

@@ -5,7 +5,9 @@
 
    program paced PERIOD COUNT STEPS   starts STEPS steps at each PERIOD (ns), COUNT times; STEPS is 1, or 0 for an empty
                                       loop; prints for each how late it woke, and how late it ended, in ns
-   program turns COUNT STEPS          COUNT times back to back: the number of times for each length in ns, and the worst */
+   program turns COUNT STEPS          COUNT times back to back: the number of times for each length in ns, and the worst
+
+   Both ask for real-time scheduling and locked memory first, and print whether they got the first. */
 
 #define _POSIX_C_SOURCE 200112L
 #define JOIN_(a, b) a##_##b
@@ -13,8 +15,10 @@
 #define OF(name) JOIN(MODEL, name)
 #include SOURCE
 
+#include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <sys/mman.h>
 #include <time.h>
 
 #define LONGEST 200000 /* ns, of the lengths that are counted one by one */
@@ -35,9 +39,10 @@ unsigned long export_sizes(void) { return sizeof(OF(state)); }
 int export_run(OF(state) *s, const OF(params) *p, long steps, double dt, double *path)
 {
     OF(state) y = *s;
+    const OF(params) own = *p; /* which a path cannot overlap */
     long i;
     for (i = 0; i < steps; i++) {
-        (void)OF(step)(&y, p, NULL, dt);
+        (void)OF(step)(&y, &own, NULL, dt);
         if (path != NULL) {
             path[i] = ((const double *)&y)[1];
         }
@@ -53,24 +58,40 @@ static int begin(OF(state) *s, double dt)
     return OF(init)(s, &OF(defaults), q0, v0, 0, dt);
 }
 
+static void ask_for_real_time(void)
+{
+    struct sched_param priority;
+    priority.sched_priority = 50;
+    printf("%d 0\n", sched_setscheduler(0, SCHED_FIFO, &priority) == 0);
+    (void)mlockall(MCL_CURRENT | MCL_FUTURE);
+}
+
 static int paced(long period, long count, int steps)
 {
     static OF(state) s;
+    long long *const woken = calloc((size_t)count, sizeof *woken), *const ended = calloc((size_t)count, sizeof *ended);
     long long due = now() + 10000000;
     long i;
+    if (woken == NULL || ended == NULL) {
+        return 1;
+    }
     (void)begin(&s, 1e-9 * (double)period);
     for (i = 0; i < count; i++, due += period) {
         struct timespec t;
-        long long woke;
         t.tv_sec = due / 1000000000LL, t.tv_nsec = due % 1000000000LL;
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) != 0) {
         }
-        woke = now();
+        woken[i] = now() - due;
         if (steps) {
             (void)OF(step)(&s, &OF(defaults), NULL, 1e-9 * (double)period);
         }
-        printf("%lld %lld\n", woke - due, now() - due);
+        ended[i] = now() - due;
     }
+    for (i = 0; i < count; i++) {
+        printf("%lld %lld\n", woken[i], ended[i]);
+    }
+    free(woken);
+    free(ended);
     return s.flags;
 }
 
@@ -102,6 +123,7 @@ static int turns(long count, int steps)
 
 int main(int argc, char **argv)
 {
+    ask_for_real_time();
     if (argc == 5) {
         return paced(atol(argv[2]), atol(argv[3]), atoi(argv[4]));
     }

@@ -90,6 +90,11 @@ def page(numbers):
                     for r in speed["scenes"]
                 ],
             ),
+            policy=(
+                "Both run with real-time scheduling (`SCHED_FIFO`) and locked memory; Python does not."
+                if real["real_time_scheduling"]
+                else "The operating system gave them no real-time scheduling."
+            ),
             deadlines=deadlines_table(real["deadlines"]),
             verdict=" ".join(
                 f"At {rate} the step missed {step}, the empty loop {empty}."

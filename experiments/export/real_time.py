@@ -17,13 +17,16 @@ from hhtjax.plot import legend, subplots
 TURNS = 10  # step and empty loop in turns
 RATES = {"1 kHz": (1_000_000, 20_000), "10 kHz": (100_000, 200_000)}  # period in ns, number of periods
 BACK_TO_BACK = 10_000_000
+GRANTED = set()
 FORMS = {"step": "1", "empty loop": "0"}
 
 
 def printed(program, *arguments):
-    """(lines, 2), the integers that it prints."""
+    """(lines, 2), the integers that it prints after the first line, which says whether it got real-time scheduling."""
     done = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True, check=True)
-    return np.array(done.stdout.split(), int).reshape(-1, 2)
+    first, *lines = np.array(done.stdout.split(), int).reshape(-1, 2)
+    GRANTED.add(bool(first[0]))
+    return np.array(lines)
 
 
 def build(folder):
@@ -109,7 +112,7 @@ def run(report, fast):
     report.table(header, [[f"{r['rate']}, {r['form']}", *(r[key] for key in keys)] for r in rows])
     report.table(["back to back", *list(steps[0])[1:]], [list(row.values()) for row in steps])
     report.figure("export_real_time", figure(samples, lengths))
-    return {"deadlines": rows, "back_to_back": steps}
+    return {"deadlines": rows, "back_to_back": steps, "real_time_scheduling": {True} == GRANTED}
 
 
 def figure(samples, lengths):

@@ -17,6 +17,7 @@ class Recorder:
         self.blocks, self.known = [Block()], [{}]
         self.places = {}  # {scalar: (array, index)} of what was read from an array
         self.orders = {}  # {array of pivots: array of the order of rows}
+        self.multiples = {}  # {c x: (c, x)} for known c
 
     def record(self, name, dtype, *operands, **params):
         """The result of an operation, found if it was there before."""
@@ -25,7 +26,10 @@ class Recorder:
         if found is not None:
             return found
         order = sorted(map(_key, operands)) if name in COMMUTES else map(_key, operands)
-        return self._once((name, dtype, *order, *sorted(params.items())), name, operands, params, dtype)
+        result = self._once((name, dtype, *order, *sorted(params.items())), name, operands, params, dtype)
+        if name == "mul" and any(map(is_known, operands)):
+            self.multiples[result] = operands if is_known(operands[0]) else operands[::-1]
+        return result
 
     def array(self, elements, dtype):
         """The name of an array of these elements; of all that were read from one array, in their order, its own."""
@@ -91,6 +95,10 @@ def _simple(recorder, name, dtype, x, params):
         return x[0]
     if name == "add" and any(is_known(y) and y == 0 for y in x):
         return x[0] if is_known(x[1]) and x[1] == 0 else x[1]
+    if name == "add" and all(y in recorder.multiples for y in x if isinstance(y, Scalar)) and not any(map(is_known, x)):
+        (a, y), (b, z) = (recorder.multiples[y] for y in x)
+        if y is z:  # the weights of an average, of what did not change
+            return y if a + b == 1 else recorder.record("mul", dtype, a + b, y)
     if name == "sub" and is_known(x[1]) and x[1] == 0:
         return x[0]
     if name == "select_n" and len(x) == 3 and _key(x[1]) == _key(x[2]):
