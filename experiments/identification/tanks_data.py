@@ -1,8 +1,8 @@
 """Cascaded tanks: the measured records of the benchmark, or generated ones of the same shape, and the model's terms.
 
 M. Schoukens, P. Mattsson, T. Wigren, J.-P. Noel, "Cascaded tanks benchmark combining soft and hard nonlinearities",
-Workshop on Nonlinear System Identification Benchmarks, Brussels 2016. A pump fills the upper tank, which drains into the
-lower one, whose level is read. Both overflow, the upper one in part into the lower.
+Workshop on Nonlinear System Identification Benchmarks, Brussels 2016. A pump fills the upper tank, which drains into
+the lower one, whose level is read. Both overflow, the upper one in part into the lower.
 """
 
 from pathlib import Path
@@ -66,7 +66,9 @@ def read(path: Path):
         raise ValueError(f"{path} has no columns {', '.join(missing)}: {HOW_TO_GET_IT}.")
     table = np.array([[float(line.split(",")[names.index(name)]) for name in wanted] for line in lines if line.strip()])
     if table.shape != (SAMPLES, len(STORED)) or not np.all(np.isfinite(table)):
-        raise ValueError(f"{path} must hold {SAMPLES} rows of finite numbers; received shape {table.shape}: {HOW_TO_GET_IT}.")
+        raise ValueError(
+            f"{path} must hold {SAMPLES} rows of finite numbers; received shape {table.shape}: {HOW_TO_GET_IT}."
+        )
     return dict(zip(STORED, table.T, strict=True))
 
 
@@ -92,9 +94,9 @@ def positive(x, width):
 def rate(x, t, params):
     """Rates of both levels in V/s, with those of the further terms that params names.
 
-        x1' = k4 (u - u0) - k1 sqrt(x1) - over1
-        x2' = k2 (1 + caught x2) sqrt(x1) + over over1 - k3 sqrt(x2) - linear x2 - over2
-        over1 = WEIR max(x1 - RIM, 0),    over2 = WEIR max(x2 - rim, 0)
+    x1' = k4 (u - u0) - k1 sqrt(x1) - over1
+    x2' = k2 (1 + caught x2) sqrt(x1) + over over1 - k3 sqrt(x2) - linear x2 - over2
+    over1 = WEIR max(x1 - RIM, 0),    over2 = WEIR max(x2 - rim, 0)
     """
     own, u = params
     upper, lower = (jnp.sqrt(positive(level, 0.01)) for level in x)
