@@ -149,11 +149,15 @@ def terms_pieces(numbers):
     tests = [
         ", ".join(f"{n} {x['cost_drop_percent']:.1f}" for n, x in found.items()) for found in numbers["score_tests"]
     ]
+    last = [row for row in numbers["models"] if row["kept"]][-1]
     return {
         "terms": table(["model", "parameters", *errors.values()], rows),
         "terms_first_score": tests[0],
         "terms_second_score": tests[1],
         "terms_parts": numbers["parts"],
+        "terms_lag_us": -1e6 * 0.2**2 * last["estimates"]["amplitude_lag"],
+        "terms_arrow": last["arrow_full_mV"],
+        "terms_relaxing": find(numbers["models"], model="+ relaxing_cubic")["arrow_full_mV"],
         "terms_candidates": len(numbers["score_tests"][0]),
     }
 

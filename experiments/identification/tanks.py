@@ -1,9 +1,9 @@
-"""Two tanks that overflow (cascaded tanks), a first-order system under a held input; the model chosen by cross-validation.
+"""Two tanks that overflow, a first-order system under a held input; the model chosen by cross-validation.
 
 The equations and their further terms are in `tanks_data`. Each model starts from the estimate of the one that it adds
-to, and the first one from longer and longer parts of the record. Estimates and choice use the training record alone: its
-quarters are left out in turn, and simulated by the fit to the rest. The test record is scored from the initial state of
-the training record, as the benchmark has it, and also with the lower level of its first samples.
+to, and the first one is fitted to a part of the record before the whole. Estimates and choice use the training record
+alone: its quarters are left out in turn, and simulated by the fit to the rest. The test record is scored from the
+initial state of the training record, as the benchmark has it, and also with the lower level of its first samples.
 """
 
 import time
@@ -41,7 +41,7 @@ PUBLISHED = {"linear": 0.75, "Volterra": 0.54, "Gaussian process state space": 0
 
 
 def run(report: Report, fast: bool):
-    """Fits the models, each in turn, compares them by cross-validation, and scores the one chosen on the test record."""
+    """Fits the models, compares them by cross-validation, and scores the one chosen on the test record."""
     sets = data.load(fast)
     if sets.measured:
         print("Cascaded tanks, the measured records (Schoukens et al. 2016)." + " Parts of them only." * fast)
@@ -68,7 +68,7 @@ def run(report: Report, fast: bool):
 
 
 def compare(report: Report, name, sets, start):
-    """One model's fit to the training record, and its row: errors in V, of training, of the parts left out, of the test."""
+    """One model's fit to the training record, and its row: errors in V."""
     record = sets.train
     begun = time.perf_counter()
     result = fit_record(record, start, growing=name == next(iter(MODELS)))

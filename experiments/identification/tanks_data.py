@@ -1,8 +1,8 @@
 """Cascaded tanks: the measured records of the benchmark, or generated ones of the same shape, and the model's terms.
 
 M. Schoukens, P. Mattsson, T. Wigren, J.-P. Noel, "Cascaded tanks benchmark combining soft and hard nonlinearities",
-Workshop on Nonlinear System Identification Benchmarks, Brussels 2016. A pump fills the upper tank, which drains into the
-lower one, whose level is read. Both overflow, the upper one in part into the lower.
+Workshop on Nonlinear System Identification Benchmarks, Brussels 2016. A pump fills the upper tank, which drains into
+the lower one, whose level is read. Both overflow, the upper one in part into the lower.
 """
 
 from pathlib import Path
