@@ -117,6 +117,10 @@ class FitResult(NamedTuple):
     def summary(self) -> str:
         """A table of estimates, standard errors and intervals, and what limits them.
 
+        Below it: how many observations there are, and how many independent ones they are worth (`compare` has the
+        formula); the rms of the residual, in its unit, and whether it is white (Ljung and Box 1978); where the standard
+        errors come from; what is not determined, and what is only together.
+
         >>> import jax.numpy as jnp, hhtjax
         >>> wave = jnp.sin(jnp.arange(400.0))
         >>> print(hhtjax.fit(lambda p: p["a"] * wave + p["b"] - 2 * wave - 0.1, {"a": 1.0, "b": 0.0}).summary())
