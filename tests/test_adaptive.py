@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import zoo
-from helpers import ONE, SPRING, ZERO, check_message, run
+from helpers import ONE, SPRING, ZERO, run
 from scipy.integrate import solve_ivp
 
 import hhtjax
@@ -70,7 +70,7 @@ def error_of(found, reference):
     return np.max(abs(found.q[1:] - reference)) / np.max(abs(reference))
 
 
-@pytest.mark.parametrize("name", zoo.each(METHODS, quick=("hht", "rowda", "rosenbrock", "dopri5")))
+@pytest.mark.parametrize("name", zoo.each(METHODS, quick=("hht", "rowda", "dopri5")))
 def test_the_error_follows_the_tolerance(name, references):
     for rtol in (1e-2, 1e-4, 1e-6):
         found = controlled("double pendulum", METHODS[name], rtol)
@@ -81,7 +81,7 @@ def test_the_error_follows_the_tolerance(name, references):
         np.testing.assert_allclose(np.sum(found.dt), 3.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("name", "most"), [("hht", 351), ("rowda", 194)])
+@pytest.mark.parametrize(("name", "most"), [("hht", 351), ("rowda", 194), ("rosenbrock", 351)])
 def test_contact_takes_small_steps_where_it_is_and_nowhere_else(name, most, references):
     """For an error of 1e-3 equal steps take 3443, and 3345. Without the defect the ball goes through the floor."""
     coarse = controlled("contact", METHODS[name], 1e-2)
@@ -140,11 +140,11 @@ def test_first_order_systems_and_internal_states():
     times = np.linspace(0, 4, 9)[1:]
     exact = np.array([jax.scipy.linalg.expm(A * t) @ np.array([1.0, 0, 1]) for t in times])
     internal = hhtjax.System(ONE, lambda q, v, z, t, p: -4 * q - z, internal=lambda q, v, z, t, p: -3 * z + v)
-    for stepper in (METHODS["hht"], METHODS["dopri5"]):
+    for other in (METHODS["hht"], METHODS["dopri5"]):
         for rtol in (1e-3, 1e-5):
             dt = hhtjax.adaptive(rtol, 1e-8)
-            first = hhtjax.simulate(hhtjax.FirstOrderSystem(rate), stepper, y0, dt=dt, times=times)
-            second = hhtjax.simulate(internal, stepper, ONE, ZERO, z0=ONE, dt=dt, times=times)
+            first = hhtjax.simulate(hhtjax.FirstOrderSystem(rate), METHODS["hht"], y0, dt=dt, times=times)
+            second = hhtjax.simulate(internal, other, ONE, ZERO, z0=ONE, dt=dt, times=times)
             found = [first.q["q"], first.q["z"], second.q, second.z]
             for x, y in zip(found, exact.T[[0, 2, 0, 2]], strict=True):
                 assert 0.001 < np.max(abs(x[1:, 0] - y)) / rtol < 10
@@ -218,58 +218,31 @@ def test_order_of_the_pair_its_estimate_and_its_dense_output():
     assert order > 4.3
 
 
-def failing(force, **options):
-    dt = hhtjax.adaptive(**{"rtol": 1e-3, "atol": 1e-6} | options)
-    return hhtjax.simulate(hhtjax.System(ONE, force), hhtjax.hht(), ONE, ZERO, dt=dt, times=np.array([0.02, 2.0]))
+def test_the_error_of_the_whole_run(references):
+    """Of a resolved motion it is stated to a tenth; where no estimate of a step sees it, as here, `check` does."""
+    found = controlled("double pendulum", METHODS["hht"], 1e-3, verify=True)
+    found.check()
+    assert found.error.shape == (SAMPLES + 1,)
+    assert found.error[0] == 0
+    true = float(np.max(abs(found.q[1:] - references["double pendulum"])))
+    assert float(np.max(found.error)) == pytest.approx(true, rel=0.1)
+    assert float(found.allowed) == pytest.approx(10 * (1e-3 * float(np.max(abs(found.q))) + 1e-6))
+    spring = hhtjax.System(ONE, lambda q, v, t, p: -100 * q - 1e4 * q**3)  # undamped, some 30 periods
+    times = np.linspace(0, 2, 65)[1:]
+    for verify in (True, "tolerance"):
+        run = hhtjax.simulate(
+            spring, METHODS["hht"], ONE, ZERO, dt=hhtjax.adaptive(1e-3, 1e-6, verify=verify), times=times
+        )
+        with pytest.raises(
+            hhtjax.SimulationError, match=r"at t = 0.\d+ the error of the run is 0.01\d+, by a finer run"
+        ):
+            run.check()
+        assert 0.1 < np.max(run.error) < 0.3
 
 
-FAILURES = {
-    "not finite": (
-        lambda q, v, t, p: jnp.where(t > 0.5, jnp.nan, -q), {"dt_min": 1e-6},
-        "stopped at t = 0.(49|5).*: the step is not finite, at dt_min=1e-06",
-    ),
-    "too many": (lambda q, v, t, p: -q, {"max_steps": 20}, r"stopped at t = 0.\d+: max_steps=20 used up"),
-    "too short": (
-        lambda q, v, t, p: jnp.where(t > 0.5, 1e3, -q), {"dt_min": 1e-2},
-        r"stopped at t = 0.\d+: the step size fell below dt_min=0.01, the error estimate being \d.* times",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", FAILURES)
-def test_failures_are_named_with_their_time(name):
-    force, options, message = FAILURES[name]
-    found = failing(force, **options)
-    with pytest.raises(hhtjax.SimulationError, match=f"simulate: {message}"):
-        found.check()
-    assert np.isfinite(found.q[:, 0]).tolist() == [True, True, False]
-    with pytest.raises(hhtjax.SimulationError, match=message):
-        found.steps.check()
-
-
-HELD = hhtjax.sampled(np.ones(4), 0.5, order=0)
-WRONG = {
-    "no times": ({}, {"times": None}, "simulate: with dt=adaptive(...), give `times`"),
-    "times back": ({}, {"times": [1.0, 0.5]}, "simulate: `times` must be strictly increasing"),
-    "steps too": ({}, {"num_steps": 4}, "simulate: with dt=adaptive(...), leave `num_steps` out; received 4."),
-    "extrapolate": ({}, {"extrapolate": 2}, "simulate: with dt=adaptive(...), leave `extrapolate` out; received 2."),
-    "times alone": ({}, {"dt": 0.1}, "simulate: `times` is for dt=adaptive(...)"),
-    "no estimate": ({}, {"stepper": hhtjax.kim_hht()}, "as a number, or take hht, newmark (gamma = 1/2), bossak, "),
-    "gamma": ({}, {"stepper": hhtjax.newmark(0.3025, 0.6)}, "simulate: GeneralizedAlpha has no estimate of its error"),
-    "held": ({}, {"params": HELD}, "simulate: error control does not know when held inputs, sampled(order=0), jump"),
-    "rtol": ({"rtol": 0.0}, {}, "adaptive: `rtol` must be positive and finite; received 0.0."),
-    "atol": ({"atol": -1.0}, {}, "adaptive: `atol` must be positive and finite; received -1.0."),
-    "bounds": ({"dt_min": 0.2, "dt_max": 0.1}, {}, "adaptive: `dt_min` must not exceed dt_max=0.1; received 0.2."),
-    "max_steps": ({"max_steps": 0}, {}, "adaptive: `max_steps` must be a positive integer; received 0."),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_bad_input_is_named(name):
-    tolerances, changed, message = WRONG[name]
-
-    def call():
-        dt = hhtjax.adaptive(**{"rtol": 1e-3, "atol": 1e-6} | tolerances)
-        run(**{"num_steps": None, "dt": dt, "times": [0.5, 1.0], "stepper": hhtjax.hht()} | changed)
-
-    check_message((ValueError, TypeError, NotImplementedError), message, call)
+def test_a_quarter_of_the_tolerance_gives_no_false_alarm(references):
+    """Jumps move by more than a step: with halved steps the error is 1e4 times what it was."""
+    found = controlled("van der Pol", METHODS["rowda"], 1e-3, verify="tolerance")
+    found.check()
+    true = float(np.max(abs(found.q[1:] - references["van der Pol"])))
+    assert float(np.max(found.error)) == pytest.approx(true, rel=0.2)

@@ -22,11 +22,18 @@ class Adaptive(Description):
     dt_min: Any
     dt_max: Any
     max_steps: int
-    verify: bool
+    verify: Any
 
 
 def adaptive(
-    rtol: Any, atol: Any, *, atol_v: Any = None, dt_min: Any = 0.0, dt_max: Any = np.inf, max_steps=10_000, verify=False
+    rtol: Any,
+    atol: Any,
+    *,
+    atol_v: Any = None,
+    dt_min: Any = 0.0,
+    dt_max: Any = np.inf,
+    max_steps: int = 10_000,
+    verify: Any = False,
 ) -> Adaptive:
     """Steps chosen by the error of each, for `simulate(..., dt=adaptive(...), times=...)`.
 
@@ -44,8 +51,10 @@ def adaptive(
         dt_min, dt_max: bounds of the step; a step below dt_min is a failure that `check()` names. Never below 16
             roundings of t.
         max_steps: steps at most, the rejected included. Part of the program; all else is data.
-        verify: run again with every step halved, and state `run.error`, the error at each of `times`; three times the
-            solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|).
+        verify: True, run again with every step halved, and state `run.error`, the error of the whole run at each of
+            `times`, for three times the solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|). Where
+            the motion jumps, as in relaxation oscillations, at times that move by more than a step, that is a false
+            alarm: "tolerance" runs again with steps for a quarter of the tolerance instead.
 
     Returns:
         An `Adaptive`.
@@ -67,8 +76,8 @@ def adaptive(
     require_number("adaptive", "dt_max", dt_max, lambda x: x > 0, "be positive")
     if is_concrete(dt_min) and is_concrete(dt_max) and dt_min > dt_max:
         raise ValueError(f"adaptive: `dt_min` must not exceed dt_max={dt_max}; received {dt_min}.")
-    if not isinstance(verify, bool):
-        raise TypeError(f"adaptive: `verify` must be True or False; received {verify!r}.")
+    if not isinstance(verify, bool) and verify != "tolerance":
+        raise ValueError(f'adaptive: `verify` must be True, False or "tolerance"; received {verify!r}.')
     max_steps = require_integer("adaptive", "max_steps", max_steps)
     rtol, atol, atol_v, dt_min, dt_max = map(_as_data, (rtol, atol, atol_v, dt_min, dt_max))
     return Adaptive(rtol, atol, atol_v, dt_min, dt_max, max_steps, verify)

@@ -1,5 +1,6 @@
 """Runs over chosen steps, read off at any times: differentiable, the steps being constant."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,6 +20,8 @@ from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import State, Stepper, join_info, public
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import on_scalars, one_kernel, or_plain
+
+ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
 @partial(jax.jit, static_argnames=("progress",))
@@ -160,8 +163,32 @@ def run_controlled(problem, times, control, progress) -> Solution:
     times = checked_times("simulate", problem, times)
     steps, ends = or_plain(partial(chosen_steps, problem, times, control, progress))
     run = or_plain(partial(run_over, problem, times, ends, steps.accepted))
+    if control.verify:
+        run = run._replace(**verified(run, finer(problem, times, control, steps, ends), control, problem.stepper.order))
     steps = trimmed(steps)
     return run._replace(dt=steps.dt, steps=steps)
+
+
+def finer(problem, times, control, steps, ends):
+    """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
+    if control.verify == "tolerance":
+        quarter = replace(control, **{name: getattr(control, name) / 4 for name in ("rtol", "atol", "atol_v")})
+        steps, ends = or_plain(partial(chosen_steps, problem, times, quarter))
+    halved = control.verify != "tolerance"
+    return or_plain(partial(run_over, problem, times, ends, steps.accepted, halved=halved))
+
+
+def verified(run, finer, control, order):
+    """The error of the whole run at each of its times, by Richardson from a finer one, and what is allowed."""
+
+    def largest(q):
+        return jnp.max(jnp.stack([jnp.max(jnp.abs(x).reshape(len(x), -1), axis=1) for x in jax.tree.leaves(q)]), axis=0)
+
+    q, better = lax.stop_gradient((run.q, finer.q))
+    left = 0.25 if control.verify == "tolerance" else 0.5**order  # of the error
+    error = largest(jax.tree.map(jnp.subtract, better, q)) / (1 - left)
+    rtol, atol = (jnp.asarray(x).astype(error.dtype) for x in (control.rtol, control.atol))
+    return {"error": error, "allowed": lax.stop_gradient(ALARM * (rtol * jnp.max(largest(q)) + atol))}
 
 
 def checked_times(caller, problem, times):

@@ -81,7 +81,7 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
         H = jnp.full_like(times, t[1] - t[0])
     x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
 
-    known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None)
+    known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
     a, b = (jax.tree.map(lambda y: y[j], known) for j in (i, i + 1))  # noqa: B023 (called at once)
     found = between(a, b, H, x)
     v = None if solution.acceleration is None else found.v

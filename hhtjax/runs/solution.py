@@ -83,7 +83,8 @@ class Solution(NamedTuple):
         friction: tau (K + 1, m), dry friction, positive against positive sliding; None without.
         sticking: (K + 1, m), whether a joint sticks; None without.
         steps: what error control chose, the `Steps`; dt are those accepted. None without.
-        error: (K + 1,) of a run with `verify`, the error of q at each saved time, in its largest coordinate.
+        error: (K + 1,) of a run with `adaptive(verify=)`, that of q at each saved time, in its largest coordinate.
+        allowed: what `check` lets pass of it, 10 (rtol max|q| + atol).
     """
 
     t: Any
@@ -100,6 +101,7 @@ class Solution(NamedTuple):
     sticking: Any = None
     steps: Any = None
     error: Any = None
+    allowed: Any = None
 
     def check(self, reach=None):
         """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
@@ -109,7 +111,7 @@ class Solution(NamedTuple):
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
-        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t, self.steps)))):
+        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t, self.steps, self.error)))):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         if fault := self._fault(reach):
             raise SimulationError(f"simulate: {fault}")
@@ -117,6 +119,8 @@ class Solution(NamedTuple):
     def _fault(self, reach=None):
         """What is wrong with the run, in words; None where nothing is."""
         if self.steps is not None and (fault := self.steps._fault()):
+            return fault
+        if self.error is not None and (fault := self._excess()):
             return fault
         dt = np.asarray(self.dt)
         if np.any(dt <= 0):  # what is not finite shows in the state
@@ -140,6 +144,21 @@ class Solution(NamedTuple):
             else self._why(member)
         )
         return f"{which}step {step} (to t = {time:.6g}) failed: {why}."
+
+    def _excess(self):
+        """Where the error of the whole run is more than what was asked for, in words."""
+        error, allowed = np.asarray(self.error), np.asarray(self.allowed)
+        bad = ~(error <= allowed[..., None])
+        if not bad.any():
+            return None
+        *member, i = (int(x) for x in np.argwhere(bad)[0])
+        which = f"member {', '.join(map(str, member))}, " if member else ""
+        where = (*member, i)
+        time = np.asarray(self.t)[where]
+        return (
+            f"{which}at t = {time:.6g} the error of the run is {error[where]:.3g}, by a finer run, "
+            f"and {allowed[tuple(member)]:.3g} was allowed, 10 times the tolerance. Take a smaller rtol."
+        )
 
     def _table(self):
         """The run in a line, and its arrays."""

@@ -11,7 +11,8 @@ A linearisation may have missed what is there, a contact say; so the residual at
     d = -S^-1 r(q1, v1, w1, t1),    e_q := |e_q| + beta k h^2 |d|,  e_v := |e_v| + gamma k h |d|,
     k = (1 - alpha_f)/(1 - alpha_m)
 
-for one more residual and substitution. Methods of several stages have an embedded one of lower order instead.
+for one more residual and substitution. Methods of several stages have an embedded one of lower order instead, and those
+with a matrix g h d and g^2 h^2 d besides.
 """
 
 from dataclasses import replace
