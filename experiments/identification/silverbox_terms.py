@@ -25,7 +25,7 @@ from hhtjax.identification import score_test
 from hhtjax.plot import legend, subplots
 from hhtjax.scenes import duffing
 
-SUBSTEPS = 4  # of rk4: the non-iterative step with 8, as in `silverbox`, is no longer exact enough
+SUBSTEPS = 4  # of rk4, more exact than the 8 non-iterative ones of `silverbox`
 ROUNDS = 2  # terms added
 WORTH = 1 / 3  # of the largest drop of the cost that the score test promises: candidates below are not fitted
 PARTS = 8  # of the training record, left out in turn
