@@ -151,13 +151,13 @@ def compare(report, sets, fits, numbers, fast):
         found[name] = scores(sets, result.params) | {
             "parameters": int(compared.parameters[i]),
             "held_out_mm": float(compared.cross_validated[i]),
-            "behind_the_best_standard_errors": float(compared.behind[i, 0] / (compared.behind[i, 1] or 1.0)),
+            "behind_the_best": float(compared.behind[i, 0] / (compared.behind[i, 1] or 1.0)),
             "BIC_less_the_least": float(compared.bic[i] - compared.bic.min()),
             "iterations": int(result.iterations),
             "reason": result.reason,
-            "lowered_by_the_last_iterations": lowered_last(result),
+            "still_lowered_by": lowered_last(result),
         }
-    columns = ("parameters", "train_mm", "held_out_mm", "behind_the_best_standard_errors", "test_mm")
+    columns = ("parameters", "train_mm", "held_out_mm", "behind_the_best", "test_mm")
     report.table(["model", *columns], [[name, *(row[c] for c in columns)] for name, row in found.items()])
     numbers |= {"observations": compared.observations, "worth_independent": compared.effective, "models": found}
     if not fast:

@@ -143,7 +143,7 @@ def controlled(q, v, t, params):
 
 def command(q, v, t, reference, pulses):
     """The controller's voltage."""
-    pulse = PULSE * pulses * (jnp.sin(2 * jnp.pi * t) > 0)
+    pulse = jnp.where(jnp.sin(2 * jnp.pi * t) > 0, PULSE * pulses, 0.0)
     return KP * KV * (reference(t) - q) - KV * v + pulse
 
 

@@ -108,7 +108,7 @@ def emps_pieces(numbers):
     """Tables of the positioning axis."""
     models = [
         [name, f"{row['parameters']}", *(f"{row[f'{what}_mm']:.2f} mm" for what in ("train", "held_out")),
-         f"{row['behind_the_best_standard_errors']:.1f}" if row["behind_the_best_standard_errors"] else "best",
+         f"{row['behind_the_best']:.1f}" if row["behind_the_best"] else "best",
          f"{row['test_mm']:.2f} mm"]
         for name, row in numbers["models"].items()
     ]  # fmt: skip

@@ -46,7 +46,7 @@ def held_out(found: Comparison, *, unit: str | None = None, ax: Any = None) -> A
         for i, errors in enumerate(found.held_out):
             segments = "each segment" if i == 0 else None
             panel.plot(errors, np.full(len(errors), i), "|", color=GREY, ms=7, label=segments)
-        for name, face, words in zip(("o", "s"), ("white", COLOURS[0]), ("together", "together, taken"), strict=True):
+        for name, face, words in zip(("o", "s"), ("white", COLOURS[0]), ("together", "taken"), strict=True):
             at = [i for i in range(count) if (found.names[i] == found.chosen) == (name == "s")]
             panel.plot(found.cross_validated[at], at, name, color=COLOURS[0], mfc=face, label=words)
         panel.set_yticks(range(count), [f"{n} ({k})" for n, k in zip(found.names, found.parameters, strict=True)])
