@@ -99,6 +99,6 @@ def test_committed_numbers_compare_with_themselves(name):
     """And every one that counts is needed."""
     numbers = json.loads(COMMITTED[name].read_text())
     count, bad = compare(numbers, numbers)
-    assert count >= 20
+    assert count >= (5 if name == "export" else 20)  # of export, nearly all are times
     assert not bad
     assert len(compare(numbers, {})[1]) == count
