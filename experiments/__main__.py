@@ -18,9 +18,12 @@ os.environ["JAX_ENABLE_X64"] = "1"
 
 EXPERIMENTS = {
     "silverbox": "identification.silverbox",
+    "silverbox_terms": "identification.silverbox_terms",
     "silverbox_comparison": "identification.comparison",
     "double_pendulum_measured": "identification.double_pendulum_measured",
     "bouc_wen": "identification.bouc_wen",
+    "emps": "identification.emps",
+    "tanks": "identification.tanks",
     "friction": "friction.friction",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",
@@ -30,6 +33,7 @@ EXPERIMENTS = {
     "linearization": "linearization.linearization",
     "stability": "stability.stability",
     "sweeps": "sweeps.sweeps",
+    "export": "export.export",
     "gradient_cost": "benchmarks.gradient_cost",
     "benchmarks": "benchmarks.benchmarks",
     "work_precision": "work_precision.work_precision",
@@ -70,7 +74,7 @@ def run_side_by_side(options: list[str]) -> int:
         return int(any(list(pool.map(run, EXPERIMENTS))))
 
 
-USAGE = "python -m experiments NAME [--fast | --full] [--out DIR] [--formats png,pdf,svg]"
+USAGE = "python -m experiments NAME [--fast | --full | --parts A,B] [--out DIR] [--formats png,pdf,svg]"
 
 
 def parse(arguments: list[str]):
@@ -80,11 +84,14 @@ def parse(arguments: list[str]):
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--fast", action="store_true", help="a smoke run: less data, fewer settings")
     size.add_argument("--full", action="store_true", help=f"everything, where less is shown by default: {IN_PART[0]}")
+    size.add_argument("--parts", default="", help="of an experiment in parts, these; the numbers of the others stay")
     parser.add_argument("--out", type=Path, default=HERE / "output", help="folder for figures, JSON and page")
     parser.add_argument("--formats", default="png", help="of figures: png, pdf, svg, or several with commas")
     options = parser.parse_args(arguments)
     if options.full and options.name not in (*IN_PART, "all"):
         parser.error(f"--full is for {', '.join(IN_PART)}; the others show everything they have anyway")
+    if options.parts and options.name in COMMANDS:
+        parser.error("--parts is for one experiment")
     return options
 
 
@@ -94,10 +101,15 @@ def run(name: str, options) -> None:
 
     full = options.full or options.name == "all"
     part = name in IN_PART and not full and not options.fast
+    parts = tuple(filter(None, options.parts.split(",")))
     flag = " --fast" if options.fast else " --full" if name in IN_PART and full else ""
+    flag += f" --parts {options.parts}" if parts else ""
     mode = "fast" if options.fast else "part" if part else "full"
-    report = Report(name, options.out, mode, f"python -m experiments {name}{flag}", options.formats.split(","))
+    report = Report(name, options.out, mode, f"python -m experiments {name}{flag}", options.formats.split(","), parts)
     module = importlib.import_module(f"experiments.{EXPERIMENTS[name]}")
+    known = [part.__name__.rpartition(".")[2] for group in getattr(module, "GROUPS", []) for part in group]
+    if unknown := [part for part in parts if part not in known]:
+        sys.exit(f"{name} has {'the parts ' + ', '.join(known) if known else 'no parts'}; received {unknown[0]!r}.")
     module.run(report, options.fast, *([full] if name in IN_PART else []))
     report.close()
 

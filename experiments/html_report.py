@@ -40,12 +40,20 @@ def badges(result: Result) -> str:
 
 
 def made_by(result: Result) -> str:
-    """Command, versions and hardware."""
+    """Command, versions and hardware; of the parts that were run later, theirs."""
     numbers = result.numbers or {}
     known = dict(numbers.get("made_by", {}))
-    command = known.pop("command", f"python -m experiments {result.name}")
-    known.pop("mode", None)
-    machine = known or numbers.get("machine") or "versions and hardware were not recorded"
+    parts = known.pop("parts", {})
+    first = {"command": f"python -m experiments {result.name}"} | known
+    lines = [words_of(first, numbers.get("machine")), *(words_of(part, None) for part in parts.values())]
+    return "".join(dict.fromkeys(lines))
+
+
+def words_of(known: dict, machine) -> str:
+    """One run: its command, and on what; machine: where the run itself has not recorded it."""
+    known = {k.replace("_", " "): v for k, v in known.items() if k != "mode" and v not in ("", None)}
+    command = known.pop("command")
+    machine = known or machine or "versions and hardware were not recorded"
     if isinstance(machine, dict):
         machine = " · ".join(f"{k.replace('_', ' ')} {v}" for k, v in machine.items() if v not in ("", None))
     return f'<p class="m"><code>{escape(command)}</code> {escape(machine)}</p>'

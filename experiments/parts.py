@@ -10,9 +10,12 @@ import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stdout
+from pathlib import Path
 from typing import Any
 
 import jax
+
+from experiments.results import read
 
 
 def rounded(x) -> Any:
@@ -36,6 +39,12 @@ def run_parts(report, modules, fast):
     return numbers
 
 
+def earlier(report, module) -> dict:
+    """The numbers in the folder of the run, otherwise those beside the experiment; none where there are neither."""
+    places = report.out, Path(module.__file__).parent
+    return next((x for place in places if (x := read(place / f"{report.name}.json"))), {})
+
+
 def run_group(report, names):
     """The same in a process of its own, fast: numbers, what it printed, and the files it wrote."""
     with redirect_stdout(io.StringIO()) as text:
@@ -47,7 +56,14 @@ def run_experiment(report, groups, fast, machine: Any = None):
     """All parts: one after the other, so that times are undisturbed; the smoke run in as many processes as cores.
 
     groups: lists of parts that share what they compute. machine: what it is run on; by default in a few words.
+    Where the report names parts, these alone are run, and their numbers put into those of the run before, or the
+    committed ones.
     """
+    if report.parts:
+        before = earlier(report, groups[0][0])
+        chosen = [part for group in groups for part in group if part.__name__.rpartition(".")[2] in report.parts]
+        report.numbers(rounded(before | run_parts(report, chosen, fast)), before)
+        return
     words = f"{os.cpu_count()} cores ({jax.devices()[0].device_kind}), jax {jax.__version__}"
     numbers: dict = {"machine": words if machine is None else machine}
     if fast:

@@ -56,9 +56,20 @@ def reduce_colours(path):
 class Report:
     """Collects what an experiment has to show."""
 
-    def __init__(self, name: str, out: Path, mode: str = "full", command: str = "", formats: Sequence[str] = ("png",)):
-        """mode: full, fast (a smoke run) or part (less than the experiment has); command: what was typed."""
-        self.name, self.out, self.formats = name, out, formats
+    def __init__(
+        self,
+        name: str,
+        out: Path,
+        mode: str = "full",
+        command: str = "",
+        formats: Sequence[str] = ("png",),
+        parts: Sequence[str] = (),
+    ):
+        """mode: full, fast (a smoke run) or part (less than the experiment has); command: what was typed.
+
+        parts: those that are run, of an experiment in parts; all of them if none is named.
+        """
+        self.name, self.out, self.formats, self.parts = name, out, formats, parts
         self.mode, self.command = mode, command or f"python -m experiments {name}"
         self.start = time.perf_counter()
         self.written: list[Path] = []
@@ -86,11 +97,17 @@ class Report:
             self.progress(f"figure {path}")
         self.written += paths
 
-    def numbers(self, values: dict):
-        """Saves numbers as JSON, named after the experiment, with what they were made by."""
+    def numbers(self, values: dict, before: dict | None = None):
+        """Saves numbers as JSON, named after the experiment, with what they were made by.
+
+        before: the numbers of an earlier run, of which values hold all but the parts that are run now.
+        """
         from experiments.provenance import provenance  # imports JAX, whose seconds belong to the run
 
         made_by = provenance(self.command, self.mode, time.perf_counter() - self.start)
+        if before is not None:
+            earlier = before.get("made_by", {})
+            made_by = earlier | {"parts": earlier.get("parts", {}) | dict.fromkeys(self.parts, made_by)}
         path = self.out / f"{self.name}.json"
         path.write_text(as_json({**values, "made_by": made_by}) + "\n")
         self.written.append(path)

@@ -17,6 +17,7 @@ test says so (`tests/test_floors.py` holds the floors as data).
     scenes            examples: systems with parameters and initial values
     identification    fits, and how far to trust them
     analysis          what a step does to a motion
+    export            out of Python: a step as C, or as an FMU
     runs              simulate, sweep, interpolate: steps in a loop
     steppers          one step; `residual.py` has the method in thirty lines, one file for each family
     systems           what moves: pytrees outside, one flat vector inside; constraints, rotations, inputs
@@ -44,8 +45,11 @@ import importlib
 
 from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
+from hhtjax.export.export_c import ExportedC, export_c
+from hhtjax.export.export_fmu import ExportedFMU, export_fmu
 from hhtjax.identification.arguments import Gaussian
 from hhtjax.identification.bias import step_size_bias
+from hhtjax.identification.comparison import compare
 from hhtjax.identification.identify import fit, multistart
 from hhtjax.identification.measured import measure, windows
 from hhtjax.identification.refinement import refine
@@ -53,6 +57,9 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
 from hhtjax.numerics.structured_solve import banded, conjugate_gradients
+from hhtjax.runs.adaptive import adaptive
+from hhtjax.runs.choose import Steps
+from hhtjax.runs.chosen import choose_steps
 from hhtjax.runs.interpolate import InternalInterpolant, Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import Failure, SimulationError, Solution
@@ -60,6 +67,7 @@ from hhtjax.runs.sweep import sweep
 from hhtjax.runs.sweep_to_disk import load_sweep, sweep_to_disk
 from hhtjax.steppers.collocation import collocation, wilson
 from hhtjax.steppers.explicit import rk4
+from hhtjax.steppers.explicit_pair import dopri5
 from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, newmark
 from hhtjax.steppers.implicit_euler import implicit_euler
 from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_euler
@@ -82,14 +90,16 @@ __all__ = [  # noqa: RUF022
     "Sampled", "band_limited", "band_limited_motion", "sampled", "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
-    "bossak", "collocation", "conventional_hht", "generalized_alpha", "hht", "houbolt", "implicit_euler", "kim_hht",
-    "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
+    "bossak", "collocation", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
+    "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
     # runs
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
-    "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
+    "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
+    # out of Python
+    "ExportedC", "ExportedFMU", "export_c", "export_fmu",
     # identification
-    "FitResult", "Gaussian", "bounded", "equation_error", "fit", "fit_progressively", "fixed", "measure", "multistart",
-    "positive", "refine", "step_size_bias", "windows",
+    "FitResult", "Gaussian", "bounded", "compare", "equation_error", "fit", "fit_progressively", "fixed", "measure",
+    "multistart", "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip
 
 

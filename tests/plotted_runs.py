@@ -27,3 +27,11 @@ def run():
 def sweep():
     dts = jnp.logspace(-3, -1.3, 6)
     return hhtjax.sweep(SYSTEM, hhtjax.hht(), Q0, Q0, PARAMS, dts=dts, duration=1.0, num_samples=5)
+
+
+@cache
+def fit():
+    """A sine with an offset, in noise."""
+    t = jnp.arange(200.0) / 10
+    record = 2 * jnp.sin(t) + 0.5 + 0.1 * jax.random.normal(jax.random.key(0), t.shape)
+    return hhtjax.fit(lambda p: p["a"] * jnp.sin(t) + p["b"] - record, {"a": 1.0, "b": 0.0})

@@ -1,6 +1,7 @@
 """What the library says to arguments of the right kind that mean nothing: masses, orders of arguments, params."""
 
 import re
+from contextlib import nullcontext
 from functools import partial
 
 import jax
@@ -16,8 +17,8 @@ def pull(q, v, t, params):
     return -4.0 * q
 
 
-def run(system, n=2, params=None, dt=0.1):
-    return hhtjax.simulate(system, hhtjax.hht(), jnp.ones(n), jnp.zeros(n), params, dt=dt, num_steps=2)
+def run(system, n=2, params=None, dt=0.1, t0=0.0):
+    return hhtjax.simulate(system, hhtjax.hht(), jnp.ones(n), jnp.zeros(n), params, dt=dt, num_steps=2, t0=t0)
 
 
 NO_MASS = [
@@ -41,13 +42,22 @@ def test_a_constant_mass_is_symmetric_and_positive_definite(mass, message):
 def test_masses_of_any_units_pass_and_with_constraints_massless_ones():
     mixed = np.array([1e9, 1e-9])
     System(np.diag(mixed) + 0.3 * (np.ones((2, 2)) - np.eye(2)), pull)
-    System(np.array([1.0, 0.0]), pull, lambda q, t, params: q[1:])
+    System(np.array([1.0, 0.0]), pull, lambda q, t, params: q[1:] - 1)
     jax.vmap(lambda m: System(m, pull).mass.sum())(-jnp.ones((3, 2)))  # a tracer
 
 
-def test_a_mass_that_is_singular_at_the_start_is_named():
-    found = run(System(lambda q, params: jnp.ones((2, 2)), pull))
-    with pytest.raises(hhtjax.SimulationError, match="not finite at the start already: there the mass is singular"):
+def test_a_mass_that_is_a_function_is_looked_at_where_the_run_starts():
+    masses = np.array([[[2, 0.5], [0.5, 2]], np.ones((2, 2)), -np.eye(2), [[1, 0.5], [0, 1]], np.full((2, 2), np.nan)])
+    found = jax.vmap(lambda M: run(System(lambda q, params: M, pull)))(masses)
+    messages = [None, *2 * ["`mass` must be positive definite"], "`mass` must be symmetric", "not finite at the start"]
+    for i, message in enumerate(messages):
+        one = jax.tree.map(lambda x, i=i: x[i], found)
+        with pytest.raises(hhtjax.SimulationError, match=message) if message else nullcontext():
+            one.check()
+    assert "mass is not symmetric" in repr(jax.tree.map(lambda x: x[3], found.failure))
+    slider = System(lambda q, params: jnp.array([1.0, 0.0]), pull, lambda q, t, params: q[1:] - 1)
+    run(slider).check()  # with constraints it may be singular
+    with pytest.raises(hhtjax.SimulationError, match="member 1 "):
         found.check()
 
 
@@ -127,7 +137,9 @@ def test_arrays_are_shown_by_their_shape():
     message = r"must be a real number; received an array of shape \(1000,\)\.(\n-|$)"
     with pytest.raises(TypeError, match=f"sampled: `dt` {message}"):
         hhtjax.sampled(np.ones(9), np.linspace(0, 1, 1000))
-    with pytest.raises(TypeError, match=f"simulate: `dt` {message}"):
+    with pytest.raises(TypeError, match=f"simulate: `t0` {message}"):
+        jax.jit(lambda t0: run(System(np.ones(2), pull), t0=t0).q)(jnp.ones(1000))
+    with pytest.raises(ValueError, match=r"simulate: `num_steps` must be the length of dt, 1000.*received 2\.(\n-|$)"):
         jax.jit(lambda dt: run(System(np.ones(2), pull), dt=dt).q)(jnp.ones(1000))
 
 

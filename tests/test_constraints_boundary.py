@@ -36,6 +36,7 @@ BAD = [
     (SHAPE, run_from(lambda q, t, params: q[0], ONE, ONE)),
     (SHAPE, run_from(lambda q, t, params: jnp.tile(q, 2), ONE, ONE)),
     (f"simulate: `q0` violates the constraint: max|Phi| = 1, {AWAY}", run_from(level, (2.0, 2.0), ZERO)),
+    ("simulate: `q0` violates the constraint: max|Phi| = 1, 1 away", run_from(level, (2.0, 1e8), ZERO)),
     (f"simulate: `v0` violates the constraint: max|dPhi/dt| = 1, {AWAY}", run_from(level, ONE, ONE)),
     (
         "simulate: `constraint` rows [1] have no gradient in q",

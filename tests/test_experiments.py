@@ -11,6 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from experiments.__main__ import EXPERIMENTS
+from experiments.check import check
+from experiments.parts import run_experiment
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("HHTJAX_DATA") or ROOT.parent / "shared" / "data")
@@ -67,6 +69,34 @@ def test_how_much_is_run_and_what_the_numbers_say_of_it(monkeypatch, tmp_path):
     assert "python -m experiments vehicle" in (tmp_path / "experiments.html").read_text(encoding="utf-8")
 
 
+def test_a_part_is_made_anew_and_says_so(monkeypatch, tmp_path):
+    """The other parts keep their numbers and what made them."""
+    runner = importlib.import_module("experiments.__main__")
+    first, second = (SimpleNamespace(__name__=f"here.{name}", __doc__=name, __file__=__file__) for name in ("a", "b"))
+    module = SimpleNamespace(
+        GROUPS=([first], [second]), run=lambda report, fast: run_experiment(report, module.GROUPS, fast)
+    )
+    monkeypatch.setattr(runner, "EXPERIMENTS", {"stub": "stub"})
+    monkeypatch.setitem(sys.modules, "experiments.stub", module)
+
+    def told(value, *arguments):
+        first.run = second.run = lambda report, fast: value
+        assert runner.main(["stub", *arguments, "--out", str(tmp_path)]) == 0
+        return json.loads((tmp_path / "stub.json").read_text())
+
+    whole = told(1)
+    assert (whole["a"], whole["b"], whole["made_by"]["command"]) == (1, 1, "python -m experiments stub")
+    partly = told(2, "--parts", "b")
+    assert (partly["a"], partly["b"]) == (1, 2)
+    made_by = {**partly["made_by"]}
+    assert made_by.pop("parts")["b"]["command"] == "python -m experiments stub --parts b"
+    assert made_by == whole["made_by"]
+    again = told(3, "--parts", "a")
+    assert (again["a"], again["b"], list(again["made_by"]["parts"])) == (3, 2, ["b", "a"])
+    with pytest.raises(SystemExit, match=r"stub has the parts a, b; received 'c'"):
+        told(4, "--parts", "c")
+
+
 def test_an_unknown_name_gives_the_list_and_fails():
     result = experiments("silverbocks")
     assert result.returncode == 2
@@ -75,7 +105,7 @@ def test_an_unknown_name_gives_the_list_and_fails():
 
 
 @pytest.mark.slow
-def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path):
+def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path, capsys):
     result = experiments("silverbox", "--fast", "--out", str(tmp_path), HHTJAX_DATA=str(tmp_path / "nowhere"))
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines()[0].startswith("GENERATED record, known parameters")
@@ -88,13 +118,12 @@ def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path):
     assert numbers["multisine_mV"] < 0.5
     assert len(list(tmp_path.glob("*.png"))) == 3
     assert numbers["made_by"]["command"] == "python -m experiments silverbox --fast"
-    checked = experiments("check", "--out", str(tmp_path))
-    assert checked.returncode == 2
-    assert "silverbox: a smoke run (--fast) has less data" in checked.stdout
+    assert check(EXPERIMENTS, tmp_path) == 2
+    assert "silverbox: a smoke run (--fast) has less data" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_silverbox_on_the_measured_record(tmp_path):
+def test_silverbox_on_the_measured_record(tmp_path, capsys):
     """As README's first command runs it: the best model on the whole record, one figure; the errors that it reaches."""
     if not (DATA / "silverbox").is_dir():
         pytest.skip("the measured Silverbox record is not here: set HHTJAX_DATA to the folder that holds silverbox/")
@@ -107,6 +136,5 @@ def test_silverbox_on_the_measured_record(tmp_path):
         assert numbers[f"{name}_mV"] == numbers["models"]["10 parameters"][f"{name}_mV"]
         assert numbers[f"{name}_mV"] == pytest.approx(value, abs=5e-4)
     assert [path.name for path in tmp_path.glob("*.png")] == ["silverbox_fit.png"]
-    checked = experiments("check", "--out", str(tmp_path))
-    assert checked.returncode == 0, checked.stdout
-    assert checked.stdout.startswith("silverbox: 30 numbers compared that it has, 0 worse.")
+    assert check(EXPERIMENTS, tmp_path) == 0
+    assert capsys.readouterr().out.startswith("silverbox: 30 numbers compared that it has, 0 worse.")

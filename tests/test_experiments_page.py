@@ -77,13 +77,15 @@ def test_each_says_where_its_data_are_from_and_what_made_it(committed):
 
 def test_everything_is_escaped_and_a_smoke_run_says_so():
     numbers = {"<b>": "<script>alert(1)</script>", "rows": [{"a&b": '"quoted"', "deep": [[1, "<i>"]]}]}
-    numbers["made_by"] = {"command": "<command>", "mode": "fast"}
+    part = {"command": "<command> --parts a", "jax": "0.10"}
+    numbers["made_by"] = {"command": "<command>", "mode": "fast", "parts": {"a": part, "b": part}}
     text = page([Result("name", "<first>\n\n<second> `code`", numbers, [])])
     assert not Reader(text).open
     for harmful in ("<b>", "<script>alert", "<i>", "<first>", "<second>", "<command>"):
         assert harmful not in text
     assert "<code>code</code>" in text
     assert "smoke run, less data" in text
+    assert text.count("--parts a</code> jax 0.10</p>") == 1  # one run
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ FLOORS = [  # each imports from those before it, and from its own room
     ["systems"],
     ["steppers"],
     ["runs"],
-    ["analysis"],
+    ["analysis", "export"],
     ["identification"],
     ["scenes"],
     ["plot"],
@@ -24,6 +24,7 @@ FLOORS = [  # each imports from those before it, and from its own room
 ]
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 NEIGHBOURS = {("checks", "description")}  # on one floor
+UPSTAIRS = {("identification/result.py", "hhtjax.plot.fit_overview")}  # FitResult.plot hands itself to its chart
 INTERNALS = ("jax.extend", "jax.interpreters", "jax._src", "jaxlib")  # of JAX, for the machinery alone
 DOOR = [[name] for name in hhtjax.xla.__all__]
 FILES = {path: ast.parse(path.read_text()) for path in sorted(HOUSE.rglob("*.py"))}
@@ -59,7 +60,7 @@ def breaches(path, tree):
         first, *rest = name.split(".")
         if first == "hhtjax":
             there = rest[0] if rest and rest[0] in FLOOR else "__init__"
-            if not allowed(here, there):
+            if not allowed(here, there) and (str(path.relative_to(HOUSE)), name) not in UPSTAIRS:
                 yield f"{here} is below {there}: {name}"
             if there == "xla" != here and rest[1:] not in DOOR:
                 yield f"past the door of xla: {name}"
@@ -85,6 +86,8 @@ def test_imports_run_downwards_and_through_the_door(path):
         ("rotation.py", "def f():\n    import hhtjax"),
         ("systems/new.py", "from hhtjax.steppers.stepper import State"),
         ("scenes/new.py", "from hhtjax.plot import style"),
+        ("identification/new.py", "from hhtjax.plot import fit_overview"),
+        ("identification/result.py", "from hhtjax.plot import style"),
         ("runs/new.py", "from hhtjax import __version__"),
         ("runs/new.py", "from hhtjax.xla.kernels import staged"),
         ("runs/new.py", "import hhtjax.xla.kernels"),
@@ -101,7 +104,7 @@ def test_a_breach_is_seen(where, line):
 
 def test_the_top_of_the_house_is_small():
     entries = {path.name for path in HOUSE.iterdir() if path.name != "__pycache__"}
-    assert len(entries) <= 15, entries
+    assert len(entries) <= 16, entries
     assert {name.removesuffix(".py") for name in entries} == FLOOR.keys() | {"py.typed"}
 
 

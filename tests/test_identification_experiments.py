@@ -52,6 +52,24 @@ def test_measured_systems():
     assert pendulum["long_windows_mrad"]["viscous and dry, progressive horizon"] <= 1.6
 
 
+def test_choices_are_by_the_parts_left_out_and_hold_on_the_test_records():
+    tanks = NUMBERS["tanks"]
+    chosen = min(tanks["models"], key=lambda row: row["left_out_V"])
+    assert tanks["chosen"] == chosen["model"]
+    assert tanks["data"] == "measured"
+    assert tanks["test_V"] == chosen["test_V"] <= 0.2
+    for name, (lower, upper) in tanks["interval_95"].items():
+        (estimate,) = (x for key, x in tanks["estimates"].items() if key.startswith(f"{name}_in_"))
+        assert lower < estimate < upper
+    first, *added = NUMBERS["silverbox_terms"]["models"]
+    assert first["parameters"] == 10
+    for count in (11, 12):
+        tried = [row for row in added if row["parameters"] == count]
+        (kept,) = (row for row in tried if row["kept"])
+        assert kept["left_out_mV"] == min(row["left_out_mV"] for row in tried) < first["left_out_mV"]
+    assert find(added, model="+ relaxing_cubic")["arrow_full_mV"] <= 0.26 < first["arrow_full_mV"]
+
+
 def test_the_page_is_made_from_the_committed_numbers():
     text = (page.HERE / "README.md").read_text()
     assert text == page.page(NUMBERS)

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 
-import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
@@ -51,13 +50,6 @@ def swing():
     return hhtjax.simulate(PENDULUM, hhtjax.hht(), q0, jnp.zeros(2), dt=0.02, num_steps=20)
 
 
-@pytest.fixture(scope="module")
-def result():
-    t = jnp.arange(200.0) / 10
-    noise = 0.1 * jax.random.normal(jax.random.key(0), t.shape)
-    return hhtjax.fit(lambda p: p["a"] * jnp.sin(t) + p["b"] - 2 * jnp.sin(t) - 0.5 - noise, {"a": 1.0, "b": 0.0})
-
-
 def sizes(figure):
     """Of all text that a figure shows, in pt; after drawing, when ticks get their labels, where other sizes hold."""
     with mpl.rc_context({"font.size": 12, "xtick.labelsize": 12, "ytick.labelsize": 12}):
@@ -91,6 +83,8 @@ def test_trajectory_draws_into_axes_given_run_after_run(run, swing):
     assert labels(ax) == ["one", "two"]
     assert ax.lines[0].get_color() != ax.lines[1].get_color()
     assert ax.lines[1].get_linewidth() == 3
+    assert len(ax.get_legend().get_texts()) == 2
+    assert plot.trajectory(run, label="one", key=False).get_legend() is None
     assert ax.get_ylabel() == "phi (rad/s^2)"
     multipliers = plot.trajectory(swing, "multipliers", units="N")
     assert labels(multipliers) == ["L[0]"]
@@ -165,6 +159,18 @@ def test_error_against_h_of_several_curves():
     assert len(ax.lines[2].get_xdata()) == 3
     assert [text.get_text() for text in ax.texts] == ["1", "4"]
     assert len({line.get_marker() for line in ax.lines[:3]}) == 3
+    assert len(ax.get_legend().get_texts()) == 3
+
+
+def test_curves_can_look_otherwise_and_share_a_legend():
+    h = np.array([0.1, 0.2])
+    ax = plot.error_against_h({"a": (h, h), "b": (h, h**2)}, lines={"b": {"marker": "x", "ls": ":"}}, key=False)
+    assert labels(ax) == ["a", "b"]
+    assert ax.get_legend() is None
+    assert [line.get_marker() for line in ax.lines[:2]] == ["o", "x"]
+    ax = plot.work_precision({"a": (h, h), "b": (h, h**2)}, lines={"a": {"color": "red"}}, key=False)
+    assert (labels(ax), ax.get_legend()) == (["a", "b"], None)
+    assert [line.get_color() for line in ax.lines] == ["red", plot.COLOURS[1]]
 
 
 def test_work_precision():
@@ -195,46 +201,6 @@ def test_stability_region():
     assert ax.get_legend().get_texts()[0].get_text() == "rk4"
 
 
-def test_fit_against_data_shows_residual_and_spectrum():
-    t = np.arange(512) / 100
-    model, tone = np.sin(t), 0.1 * np.sin(2 * np.pi * 12.5 * t)
-    upper, middle, lower = plot.fit_against_data(t, model + tone, model, unit="mV", ylabel="voltage", show=(1.0, 2.0))
-    assert labels(upper) == ["measured", "simulated"]
-    assert (upper.get_ylabel(), middle.get_ylabel()) == ("voltage (mV)", "residual (mV)")
-    np.testing.assert_allclose(middle.lines[0].get_ydata(), tone[100:201], atol=1e-12)
-    frequency, density = lower.lines[1].get_data()
-    assert abs(frequency[np.argmax(density)] - 12.5) < 0.2
-    power = np.sum(density**2) * (frequency[1] - frequency[0])
-    assert abs(power - 0.005) < 2e-4  # half the square of the amplitude
-
-
-def test_estimates_are_relative_to_estimate_or_truth(result):
-    ax = plot.estimates(result)
-    assert [text.get_text() for text in ax.get_yticklabels()] == [f"{n} = {result.params[n]:.4g}" for n in "ab"]
-    ((left, right), _) = (sorted(bar[:, 0]) for bar in ax.collections[0].get_segments())
-    lower, upper = result.interval()
-    np.testing.assert_allclose([left, right], [100 * (x["a"] / result.params["a"] - 1) for x in (lower, upper)])
-    ax = plot.estimates({"one": result, "two": result}, truth={"a": 2.0, "b": 0.5}, entries="b", level=0.9)
-    assert ax.get_xlabel() == "90 % interval (% of the truth)"
-    np.testing.assert_allclose(ax.containers[1].lines[0].get_xdata(), 100 * (result.params["b"] / 0.5 - 1))
-    with pytest.raises(ValueError, match=r"estimates: `b` is 0"):
-        plot.estimates(result, truth={"a": 2.0, "b": 0.0})
-
-
-def test_correlations_and_profile(result):
-    ax = plot.correlations(result)
-    np.testing.assert_allclose(ax.images[0].get_array(), result.correlation)
-    assert ax.texts[0].get_text() == "1.00"
-    a, error = float(result.params["a"]), float(result.standard_errors["a"])
-    values = np.linspace(a - 2 * error, a + 2 * error, 5)
-    found = hhtjax.identification.Profile(values, None, ((values - a) / error) ** 2)
-    ax = plot.profile(found, name="a", unit="m", result=result)
-    assert ax.get_xlabel() == "a (m)"
-    on_parabola = np.interp(values, *ax.lines[1].get_data())
-    np.testing.assert_allclose(on_parabola, found.deviance, atol=2e-2)
-    assert ax.lines[2].get_ydata()[0] == 3.84
-
-
 def test_animation_moves_in_the_plane_and_in_space(swing, tmp_path):
     film = plot.animation(swing, lambda q: jnp.stack([jnp.zeros(2), q]), fps=10, trace=1)
     film.save(tmp_path / "film.gif", writer="pillow")
@@ -248,7 +214,8 @@ def test_animation_moves_in_the_plane_and_in_space(swing, tmp_path):
     assert labels(bars) == ["t = 0", "t = 0.4"]
 
 
-def test_text_is_legible_and_files_are_written_without_a_warning(run, sweep, result, tmp_path):
+def test_text_is_legible_and_files_are_written_without_a_warning(run, sweep, tmp_path):
+    result = plotted_runs.fit()
     t = np.arange(64.0)
     figures = {
         "trajectory": plot.trajectory(run, ("q", "v", "acceleration"))[0],

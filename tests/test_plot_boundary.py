@@ -30,6 +30,10 @@ WRONG = {
     r"error_against_h: `dt` and `error` must be": lambda run, batch: plot.error_against_h([0.1, 0.2], [1.0]),
     r"error_against_h: `dt` must be positive": lambda run, batch: plot.error_against_h([0.0, 0.2], [1.0, 2.0]),
     r"error_against_h: `reference` must be shaped": lambda run, batch: plot.error_against_h(batch, reference=run.q),
+    r"error_against_h: `lines` must be of a; received 'b'": lambda run, batch: plot.error_against_h(
+        {"a": ([0.1], [1.0])}, lines={"b": {}}
+    ),
+    r"work_precision: `lines` must be of a": lambda run, batch: plot.work_precision({"a": ([1], [1])}, lines={"b": {}}),
     r"work_precision: `curves` must be": lambda run, batch: plot.work_precision([1, 2]),
     r"work_precision: `ours` must be among a": lambda run, batch: plot.work_precision({"a": ([1], [1])}, ours="b"),
     r"work_precision: `curves` must hold": lambda run, batch: plot.work_precision({"a": ([1], [1, 2])}),
@@ -40,8 +44,12 @@ WRONG = {
     r"fit_against_data: `times` must increase": lambda run, batch: plot.fit_against_data(
         np.arange(9) ** 2, range(9), range(9)
     ),
+    r"fit_against_data: `names` must be two": lambda run, batch: plot.fit_against_data(
+        range(9), range(9), range(9), names="ours"
+    ),
     r"estimates: `results` must be a FitResult": lambda run, batch: plot.estimates(run),
     r"estimates: `level` must": lambda run, batch: plot.estimates(None, level=95),
+    r"fit_overview: `result` must be a FitResult": lambda run, batch: plot.fit_overview(run),
     r"profile: `found` must be a Profile": lambda run, batch: plot.profile([1.0]),
     r"animation: `points` must return": lambda run, batch: plot.animation(run, lambda q: q["phi"]),
     r"animation: `fps` must be positive": lambda run, batch: plot.animation(run, lambda q: q, fps=0),

@@ -90,6 +90,7 @@ STEPPERS = {
     "wilson": hhtjax.wilson(),
     "rowda": hhtjax.rowda(),
     "rk4": hhtjax.rk4(),
+    "dopri5": hhtjax.dopri5(),
 }
 
 

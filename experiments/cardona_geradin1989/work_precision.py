@@ -23,9 +23,9 @@ from experiments.cardona_geradin1989.index_1 import (
     violation,
 )
 from experiments.cardona_geradin1989.runs import constrained_hht, end, least_seconds
-from experiments.report import COLOURS, MARKERS, side_by_side
+from experiments.report import MARKERS, side_by_side
 from hhtjax import rk4
-from hhtjax.plot import subplots
+from hhtjax.plot import subplots, work_precision
 from hhtjax.scenes import squeezer
 
 ALPHA = -0.1
@@ -224,13 +224,18 @@ def figure(entries, work, label):
     """Errors against time or solves."""
     methods = list(dict.fromkeys(e["method"] for e in entries))
     drawn, panels = subplots(1, len(UNITS), width=175, height=95)
+    names = {method: f"HHT, {method}" if i < 4 else method for i, method in enumerate(methods)}
     markers = (*MARKERS, "<", "h")
+    lines = {
+        name: {"marker": markers[i], "mfc": "none" if i % 2 else None} | ({"lw": 1.2} if i < 4 else {})
+        for i, name in enumerate(names.values())
+    }
     for axes, (x, unit) in zip(panels, UNITS.items(), strict=True):
-        for i, method in enumerate(methods):
+        curves = {}
+        for method, name in names.items():
             mine = [e for e in entries if e["method"] == method]
-            style = {"color": COLOURS[i % len(COLOURS)], "marker": markers[i], "mfc": "none" if i % 2 else None}
-            style |= {"ms": 4, "lw": 1, "ls": "-" if i < 4 else "--", "label": f"HHT, {method}" if i < 4 else method}
-            axes.loglog([e[work] for e in mine], [e[f"{x}_error_{unit}"] for e in mine], **style)
-        axes.set(xlabel=label, ylabel=f"error of {x} ({unit.replace('_', '/')})")
+            curves[name] = [e[work] for e in mine], [e[f"{x}_error_{unit}"] for e in mine]
+        words = {"xlabel": label, "ylabel": f"error of {x} ({unit.replace('_', '/')})"}
+        work_precision(curves, ours=list(curves)[:4], lines=lines, **words, key=False, ax=axes)
     drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return drawn

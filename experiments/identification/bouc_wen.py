@@ -16,8 +16,8 @@ import numpy as np
 import hhtjax
 from experiments.identification import bouc_wen_data as data
 from experiments.parts import rounded
-from experiments.report import COLOURS, MARKERS, Report
-from hhtjax.plot import legend, subplots
+from experiments.report import COLOURS, Report
+from hhtjax.plot import error_against_h, fit_against_data, subplots
 from hhtjax.scenes import bouc_wen
 
 SUBSTEPS = 5  # of the fit
@@ -108,20 +108,15 @@ def plot(report: Report, sets, outputs, table):
     part = slice(0, 200)
     t = data.DT * np.arange(len(record.y))[part]
     figure, ((upper, steps), (lower, sweep)) = subplots(2, 2, width=175, height=110, height_ratios=(3, 2))
-    upper.plot(t, 1e3 * record.y[part], color="black", lw=1.5, label="benchmark" if sets.measured else "generated")
-    upper.plot(t, 1e3 * output[part], color=COLOURS[4], lw=1.0, ls="--", label="fitted model")
-    upper.set_ylabel("multisine, y (mm)")
-    legend(upper)
-    lower.plot(t, 1e6 * (output - record.y)[part], color=COLOURS[0], lw=0.8)
-    lower.set_ylabel("its error (μm)")
-    lower.set_xlabel("time (s)")
-    for i, alpha in enumerate(sorted({row["alpha"] for row in table}, reverse=True)):
+    names = "benchmark" if sets.measured else "generated", "fitted model"
+    curves = 1e3 * record.y[part], 1e3 * output[part]
+    fit_against_data(t, *curves, names=names, unit="mm", ylabel="multisine, y", ax=(upper, lower))
+    errors = {}
+    for alpha in sorted({row["alpha"] for row in table}, reverse=True):
         rows = [row for row in table if row["alpha"] == alpha]
-        x, errors = [row["substeps"] for row in rows], [1e6 * row["multisine_m"] for row in rows]
-        steps.loglog(x, errors, color=COLOURS[i], marker=MARKERS[i], label=f"alpha = {alpha}")
+        errors[f"alpha = {alpha}"] = [data.DT / x["substeps"] for x in rows], [1e6 * x["multisine_m"] for x in rows]
+    error_against_h(errors, slopes=(2,), ax=steps)
     steps.set_ylabel("RMSE, true parameters (μm)")
-    steps.set_xlabel("steps in a sample")
-    legend(steps)
     error = outputs["sinesweep"] - sets.tests["sinesweep"].y
     sweep.plot(data.DT * np.arange(len(error)), 1e6 * error, color=COLOURS[0], lw=0.3)
     sweep.set_ylabel("error of the sweep (μm)")

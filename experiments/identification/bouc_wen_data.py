@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
-from experiments.identification.data import data_folder
+from experiments.identification.data import columns, data_folder, downloaded
 from hhtjax.scenes import bouc_wen
 
 SAMPLING_RATE = 750.0  # Hz
@@ -23,9 +23,9 @@ FINEST = 20  # steps in a sample: the rate of the benchmark's own integrator
 NOISE = 8e-6  # m, standard deviation
 STORED = ("train_u", "train_y", "multisine_u", "multisine_y", "sinesweep_u", "sinesweep_y")
 HOW_TO_GET_IT = (
-    "make bouc_wen/bouc_wen.npz from the data of the Bouc-Wen benchmark of nonlinearbenchmark.org, with the arrays "
-    f"{', '.join(STORED)} in N and m at 750 Hz, and set the environment variable HHTJAX_DATA to the folder that holds "
-    "bouc_wen/"
+    "install what downloads it, `pip install -e '.[data]'`; or make bouc_wen/bouc_wen.npz from the data of the "
+    f"Bouc-Wen benchmark of nonlinearbenchmark.org, with the arrays {', '.join(STORED)} in N and m at 750 Hz, and set "
+    "the environment variable HHTJAX_DATA to the folder that holds bouc_wen/"
 )
 
 
@@ -48,8 +48,12 @@ class Records(NamedTuple):
 def load(fast: bool) -> Records:
     """The benchmark's records where they are found, else generated ones; fast: a part of each."""
     path = data_folder() / "bouc_wen" / "bouc_wen.npz"
-    measured = path.is_file()
-    found = read(path) if measured else generate(1024 if fast else PERIOD, 6000 if fast else 153000)
+    files = [] if path.is_file() else downloaded("BoucWen")
+    measured = path.is_file() or bool(files)
+    if path.is_file():
+        found = read(path)
+    else:
+        found = generate(1024 if fast and not files else PERIOD, 6000 if fast or files else 153000) | tests_of(files)
     period = len(found["multisine_u"])
     samples = period if fast else 2 * period
     train = Record(found["train_u"][:samples], found["train_y"][:samples], period)
@@ -68,6 +72,16 @@ def read(path: Path):
         if missing:
             raise ValueError(f"{path} does not hold {', '.join(missing)}: {HOW_TO_GET_IT}.")
         return {name: file[name] for name in STORED}
+
+
+def tests_of(files):
+    """The benchmark's own test records among files of its package; there is no training record of its own."""
+    found = {}
+    for file in files:
+        name = Path(file).stem  # uval_multisine
+        if name[1:5] == "val_" and f"{name[5:]}_{name[0]}" in STORED:
+            (found[f"{name[5:]}_{name[0]}"],) = columns(file, name)
+    return found
 
 
 def generate(period, sweep):

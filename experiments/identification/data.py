@@ -5,6 +5,7 @@ identification", ECC 2013, pp. 2933-2938. The data are public but not ours to re
 """
 
 import hashlib
+import importlib
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +22,7 @@ SAMPLING_RATE = 1e7 / 2**14  # Hz
 FINER = 8  # points of the reconstructed input for each sample
 WASHOUT = 50  # samples at the start of each set that serve to find the initial state and are not scored
 SHA256 = "ae62d5a91230c10f76e6dd02c8a4fac3c9d4d8a95fbf50e87cb0c4885003e0f1"
-HOW_TO_GET_IT = (
-    "download SNLS80mV.csv of the Silverbox benchmark from nonlinearbenchmark.org into a folder silverbox/ "
-    "and set the environment variable HHTJAX_DATA to the folder that holds silverbox/"
-)
+PACKAGE = "nonlinear_benchmarks"  # which downloads the benchmarks of nonlinearbenchmark.org
 GENERATED = {"m": 5.4e-6, "c": 2.2e-4, "k": 1.0, "k2": -0.03, "k3": 4.0, "offset": -5e-3}
 NOISE = 3e-4  # V, standard deviation
 
@@ -36,6 +34,17 @@ SCALE = {"m": 5e-6, "c": 1e-4, "k": 1.0, "k2": 1.0, "k3": 1.0, "offset": 0.01}
 SCALE |= {"c2": 1e-3, "d": 1e-5, "e": 1e-5, "delay": 1e-4}
 SCALE_OF_LINEAR = {name: SCALE[name] for name in LINEAR}
 STATE_SCALE = {"y": 0.01, "v": 5.0}
+
+
+def how_to_get(files: str, folder: str) -> str:
+    """Two ways to a benchmark's records, in words: by the package that downloads them, or by hand."""
+    return (
+        f"install what downloads it, `pip install -e '.[data]'`; or download {files} from nonlinearbenchmark.org into "
+        f"a folder {folder}/ and set the environment variable HHTJAX_DATA to the folder that holds {folder}/"
+    )
+
+
+HOW_TO_GET_IT = how_to_get("SNLS80mV.csv of the Silverbox benchmark", "silverbox")
 
 
 class Record(NamedTuple):
@@ -54,10 +63,15 @@ class Silverbox(NamedTuple):
 
 
 def load(fast: bool) -> Silverbox:
-    """The measured record where it is found, else a generated one; fast: a part of each set."""
+    """The measured record where it is found or can be downloaded, else a generated one; fast: a part of each set."""
     path = data_folder() / "silverbox" / "SNLS80mV.csv"
-    measured = path.is_file()
-    u, y = read(path) if measured else generate()
+    measured = True
+    if path.is_file():
+        u, y = read(path)
+    elif files := downloaded("Silverbox"):
+        u, y = columns(next(file for file in files if "SNLS80mV" in file), "V1", "V2")
+    else:
+        measured, (u, y) = False, generate()
     train_end = 40650 + int(0.75 * (127400 - 40650))
     tests = {"arrow_full": (100, 40575), "arrow_no_extrapolation": (100, 32100), "multisine": (train_end, 127400)}
 
@@ -72,6 +86,33 @@ def data_folder() -> Path:
     """HHTJAX_DATA, or shared/data beside the checkout."""
     beside = Path(__file__).resolve().parents[3] / "shared" / "data"
     return Path(os.environ.get("HHTJAX_DATA") or beside)
+
+
+def downloaded(benchmark: str) -> list[str]:
+    """Files of a benchmark (EMPS, Silverbox, Cascaded_Tanks, BoucWen), which the package `nonlinear_benchmarks`
+    downloads the first time; none where it is not installed, or cannot, and then it says so."""
+    try:
+        package = importlib.import_module(PACKAGE)
+    except ImportError:
+        return []
+    home = package if hasattr(package, benchmark) else importlib.import_module(f"{PACKAGE}.not_splitted_benchmarks")
+    try:
+        files = getattr(home, benchmark)(data_file_locations=True)
+    except Exception as error:  # of the network, of the server, of a file that is not what it should be
+        print(f"{PACKAGE} could not download {benchmark}: {type(error).__name__}: {error}")
+        return []
+    files = [files] if isinstance(files, str) else list(files)
+    return [str(path) for file in files for path in (sorted(Path(file).iterdir()) if Path(file).is_dir() else [file])]
+
+
+def columns(file: str, *names: str):
+    """Arrays of a MATLAB file, flat, one by one."""
+    from scipy.io import loadmat
+
+    content = loadmat(file)
+    if missing := [name for name in names if name not in content]:
+        raise ValueError(f"{file} does not hold {', '.join(missing)}.")
+    return [np.ravel(np.asarray(content[name], float)) for name in names]
 
 
 def read(path: Path):

@@ -1,4 +1,4 @@
-"""README.md beside this file, made from page.md and the numbers of seven experiments.
+"""README.md beside this file, made from page.md and the numbers of ten experiments.
 
 `python -m experiments.identification.page`
 """
@@ -13,7 +13,9 @@ from experiments.page import find, table
 HERE = Path(__file__).parent
 SHOWN = ("non-iterative, alpha = 0", "non-iterative, alpha = -0.3", "converged, alpha = 0", "Kim's step, alpha = 0")
 STEPS = 0.04, 0.01, 0.0025  # s
-MEASURED = "silverbox", "silverbox_comparison", "double_pendulum_measured", "bouc_wen"
+MEASURED = (
+    "silverbox", "silverbox_comparison", "silverbox_terms", "double_pendulum_measured", "bouc_wen", "emps", "tanks",
+)  # fmt: skip
 GENERATED = "stiff_joint", "vehicle", "squeezer"
 
 
@@ -102,6 +104,86 @@ def bouc_wen_pieces(numbers):
     }
 
 
+def emps_pieces(numbers):
+    """Tables of the positioning axis."""
+    models = [
+        [name, f"{row['parameters']}", *(f"{row[f'{what}_mm']:.2f} mm" for what in ("train", "held_out")),
+         f"{row['behind_the_best_standard_errors']:.1f}" if row["behind_the_best_standard_errors"] else "best",
+         f"{row['test_mm']:.2f} mm"]
+        for name, row in numbers["models"].items()
+    ]  # fmt: skip
+    found, keys = numbers["estimate"], [key for key in numbers["estimate"] if f"lower_{key}" in numbers["estimate"]]
+    rows = [
+        [key.split("_in_")[0], f"{found[key]:.4g}", f"{found[f'lower_{key}']:.4g} .. {found[f'upper_{key}']:.4g}",
+         key.split("_in_")[1].replace("_", " ")]
+        for key in keys
+    ]  # fmt: skip
+    chosen, other = numbers["models"][numbers["chosen"]], numbers["other_friction"]
+    before, after = numbers["force_regression"]["train"], numbers["force_regression"]["test"]
+    header = ["model", "parameters", "training", "left out", "standard errors behind", "test"]
+    return {
+        "emps_models": table(header, models),
+        "emps_chosen": numbers["chosen"],
+        "emps_parameters": chosen["parameters"],
+        "emps_test": chosen["test_mm"],
+        "emps_published": numbers["published_parameters"]["test_mm"],
+        "emps_estimate": table(["parameter", "estimate", "95 % interval", "unit"], rows),
+        "emps_observations": numbers["observations"],
+        "emps_worth": numbers["worth_independent"],
+        "emps_naive": " to ".join(f"{x:.0f}" for x in numbers["standard_error_over_naive"]),
+        "emps_own": other["test_mm"],
+        "emps_more": 100 * (other["Fc_over_training"] - 1),
+        "emps_fv": 100 * (after["Fv_in_N_s/m"] / before["Fv_in_N_s/m"] - 1),
+        "emps_fc": 100 * (after["Fc_in_N"] / before["Fc_in_N"] - 1),
+    }
+
+
+def terms_pieces(numbers):
+    """What was added to Silverbox's model, and what the score tests said."""
+    errors = {"train_mV": "training", "left_out_mV": "left out", "arrow_full_mV": "arrow, full"}
+    errors |= {"arrow_no_extrapolation_mV": "arrow, no extrapolation", "multisine_mV": "multisine"}
+    rows = [
+        [row["model"] + ", kept" * row["kept"], row["parameters"], *(f"{row[key]:.4f} mV" for key in errors)]
+        for row in numbers["models"]
+    ]
+    tests = [
+        ", ".join(f"{n} {x['cost_drop_percent']:.1f}" for n, x in found.items()) for found in numbers["score_tests"]
+    ]
+    last = [row for row in numbers["models"] if row["kept"]][-1]
+    return {
+        "terms": table(["model", "parameters", *errors.values()], rows),
+        "terms_first_score": tests[0],
+        "terms_second_score": tests[1],
+        "terms_parts": numbers["parts"],
+        "terms_lag_us": -1e6 * 0.2**2 * last["estimates"]["amplitude_lag"],
+        "terms_arrow": last["arrow_full_mV"],
+        "terms_relaxing": find(numbers["models"], model="+ relaxing_cubic")["arrow_full_mV"],
+        "terms_candidates": len(numbers["score_tests"][0]),
+    }
+
+
+def tanks_pieces(numbers):
+    """Models of the cascaded tanks, and the estimates of the one chosen."""
+    rows = [
+        [row["model"], row["parameters"], *(f"{row[f'{part}_V']:.3f} V" for part in ("train", "left_out", "test"))]
+        for row in numbers["models"]
+    ]
+    bounds = numbers["interval_95"]
+    estimates = [
+        [name, f"{value:.4g}", f"{bounds[name][0]:.4g} to {bounds[name][1]:.4g}", unit.replace("_", " ")]
+        for (name, unit), value in ((key.split("_in_"), x) for key, x in numbers["estimates"].items())
+    ]
+    return {
+        "tanks": table(["added, one after the other", "parameters", "training", "left out of it", "test"], rows),
+        "tanks_estimates": table(["", "estimate", "95 % interval", "unit"], estimates),
+        "tanks_chosen": numbers["chosen"],
+        "tanks_test": numbers["test_V"],
+        "tanks_own_start": numbers["test_from_its_first_samples_V"],
+        "tanks_finest": list(numbers["test_by_steps_in_a_sample_V"].values())[-1],
+        "tanks_others": ", ".join(f"{x:g} V ({name})" for name, x in numbers["published_test_V"].items()),
+    }
+
+
 def covered(found):
     """Intervals that hold the truth, and their median half-width."""
     names = list(found["over_truth_with_interval"])
@@ -135,6 +217,9 @@ def page(numbers):
             far=far_table(numbers["silverbox_comparison"]["far_starts"]),
             **pendulum_pieces(numbers["double_pendulum_measured"]),
             **bouc_wen_pieces(numbers["bouc_wen"]),
+            **emps_pieces(numbers["emps"]),
+            **terms_pieces(numbers["silverbox_terms"]),
+            **tanks_pieces(numbers["tanks"]),
             stiff_records=stiff["records"],
             stiff_converged=stiff["converged"],
             stiff_cost=stiff["largest_cost_per_residual"],

@@ -31,7 +31,7 @@ from experiments.identification.scatter import over_scatter
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
 from hhtjax.numerics.richardson import richardson
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import fit_against_data, legend, subplots
 
 SUBSTEPS = 8
 MODELS = {
@@ -210,24 +210,21 @@ def plot_fit(report: Report, sets, scores):
     """Measured and simulated output with the residual below: the whole arrow, and where it is loudest."""
     record, (output, value, _) = sets.tests["arrow_full"], scores["arrow_full"]
     seconds = np.arange(len(record.y)) / SAMPLING_RATE
-    residual = 1e3 * (record.y - output)
     width, peak = int(0.25 * SAMPLING_RATE), int(np.argmax(np.abs(record.y)))
     first = min(max(0, peak - width // 2), len(record.y) - width)
-    figure, axes = subplots(2, 2, width=175, height=95, sharex="col", height_ratios=(2, 1))
-    name = "measured" if sets.measured else "generated"
-    parts = {
-        f"arrow test set: RMSE {value:.3f} mV": slice(None),
-        "a quarter of a second about its peak": slice(first, first + width),
-    }
-    for (upper, lower), (title, part) in zip(axes.T, parts.items(), strict=True):
-        upper.plot(seconds[part], record.y[part], color="#808080", lw=1.6, label=f"{name} output")
-        upper.plot(seconds[part], output[part], color=COLOURS[1], lw=0.7, label="fitted model, simulated")
-        upper.set_title(title, loc="left")
-        lower.plot(seconds[part], residual[part], color=COLOURS[0], lw=0.6)
-        lower.set_xlabel("time (s)")
-    axes[0, 0].set_ylabel("output y (V)")
-    axes[1, 0].set_ylabel("residual (mV)")
-    figure.legend(*axes[0, 1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure, axes = subplots(3, 2, width=175, height=135, height_ratios=(3, 2, 3))
+    spectra = figure.add_subplot(axes[2, 0].get_gridspec()[2, :])
+    for panel in axes[2]:
+        panel.remove()
+    names = "measured" if sets.measured else "generated", "fitted model, simulated"
+    words = {"unit": "mV", "ylabel": "output", "names": names}
+    signals = seconds, 1e3 * record.y, 1e3 * output
+    fit_against_data(*signals, **words, ax=(axes[0, 0], axes[1, 0], spectra))
+    fit_against_data(*signals, **words, show=seconds[[first, first + width - 1]], ax=axes[:2, 1])
+    legend(axes[0, 0], title=f"arrow test set: RMSE {value:.3f} mV", alignment="left")
+    legend(axes[0, 1], title="a quarter of a second about its peak", alignment="left")
+    for panel in axes[:2, 1]:
+        panel.set_ylabel("")
     report.figure("silverbox_fit", figure)
 
 

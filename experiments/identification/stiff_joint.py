@@ -20,7 +20,7 @@ from experiments.identification import stiff_joint_gradients
 from experiments.identification.coverage import fit_logarithms, judge, tell
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import legend, subplots, work_precision
 from hhtjax.scenes import double_pendulum
 
 SCENE = double_pendulum.stiff()
@@ -145,17 +145,19 @@ def plot_recovery(report, found):
 def plot_gradients(report, rows):
     """Error of the gradient over h^2 against the step, and the error against time."""
     figure, (left, right) = subplots(1, 2, width=175, height=80)
+    curves, lines = {}, {}
     for i, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
         mine = [row for row in rows if row["method"] == method]
         error = np.array([row["relative_error"] for row in mine])
-        style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 4, "lw": 1}
+        style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 4, "lw": 1, "ls": "-"}
+        curves[method], lines[method] = ([1e3 * row["seconds"] for row in mine], error), style
         if "h_s" in mine[0]:
             h = np.array([row["h_s"] for row in mine])
             left.semilogx(h, error / h**2, **style)
             left.set_xticks(h, [f"{x:g}" for x in h])
-        right.loglog([1e3 * row["seconds"] for row in mine], error, **style, label=method)
+    words = {"xlabel": "time of a gradient (ms)", "ylabel": "relative error of the gradient"}
+    work_precision(curves, lines=lines, **words, key=False, ax=right)
     left.minorticks_off()
     left.set(xlabel="step h (s)", ylabel="relative error of the gradient / h² (1/s²)", ylim=(0, None))
-    right.set(xlabel="time of a gradient (ms)", ylabel="relative error of the gradient")
     figure.legend(loc="outside lower center", ncols=3)
     report.figure("stiff_joint_gradients", figure)

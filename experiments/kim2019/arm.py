@@ -9,9 +9,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from experiments.report import COLOURS, MARKERS, side_by_side
+from experiments.report import COLOURS, side_by_side
 from hhtjax import hht, kim_hht, kim_implicit_euler
-from hhtjax.plot import subplots
+from hhtjax.plot import error_against_h, subplots, work_precision
 from hhtjax.scenes import arm
 
 ALPHA = -0.05
@@ -180,15 +180,14 @@ def figure(scene, exact, numbers):
     by_step, by_time = axes[1]
     h = np.array(numbers["step_sizes_s"])
     fastest = min(e["time_per_step_s"] for e in numbers["entries"])
-    for i, entry in enumerate(numbers["entries"]):
-        style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 4, "lw": 1, "label": entry["method"]}
-        style |= {"ls": ":" if "printed" in entry["method"] else "-", "mfc": "none" if i > 2 else COLOURS[i]}
-        by_step.loglog(h, entry["rms_error_rad"], **style)
-        by_time.loglog(np.array(entry["time_per_run_s"]) / fastest, entry["rms_error_rad"], **style)
-    for order, end in ((1, 6e-4), (2, 4e-6)):
-        by_step.loglog(h, end * (h / h[-1]) ** order, color="black", lw=0.8, ls="--")
-        by_step.text(h[-1], end * 0.9, f"slope {order}", ha="left", va="top")
-    by_step.set_xlabel("step size h (s)")
+    errors = {e["method"]: np.array(e["rms_error_rad"]) for e in numbers["entries"]}
+    times = {e["method"]: np.array(e["time_per_run_s"]) / fastest for e in numbers["entries"]}
+    lines = {
+        name: {"ls": ":" if "printed" in name else "-", "lw": 1, "mfc": "none" if i > 2 else None}
+        for i, name in enumerate(errors)
+    }
+    error_against_h({name: (h, x) for name, x in errors.items()}, lines=lines, key=False, ax=by_step)
+    work_precision({name: (times[name], x) for name, x in errors.items()}, lines=lines, key=False, ax=by_time)
     by_time.set_xlabel("time of the run / least time of a step")
     for axes in (by_step, by_time):
         axes.set_ylabel("RMS error of q (rad)")

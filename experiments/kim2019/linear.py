@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.report import COLOURS, MARKERS
 from hhtjax import FirstOrderSystem, LinearSystem, hht, kim_hht, simulate
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import legend, subplots, trajectory
 
 RATE = 1000.0  # 1/s, of y' = -RATE y
 STIFFNESS = 1000.0  # 1/s^2, of q'' + STIFFNESS q = 0
@@ -40,15 +40,13 @@ def damped(report):
         for i, alpha in enumerate(ALPHAS):
             path = simulate(DAMPED, kim_hht(jnp.asarray(alpha)), jnp.ones(1), params=RATE, dt=h, num_steps=num_steps)
             path.check()
-            axes.plot(
-                path.t, path.q[:, 0], color=COLOURS[i], marker=MARKERS[i], ms=3, lw=0.8, label=f"$\\alpha$ = {alpha:g}"
-            )
+            line = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 3, "lw": 0.8, "ls": "-"}
+            trajectory(path, label=f"$\\alpha$ = {alpha:g}", key=False, ax=axes, **line)
             theta, z = (0.5 - alpha) * (1 + alpha), -RATE * h
             measured, theory = float(path.q[1, 0]), 1 + z / (1 - theta * z)
             rows.append([f"{h:g}", f"{alpha:g}", measured, theory, float(np.exp(z))])
             numbers.append({"h_s": h, "alpha": alpha, "factor_per_step": measured, "closed_form": theory})
-        axes.set_title(f"h = {h:g} s")
-        axes.set_xlabel("time (s)")
+        axes.set(title=f"h = {h:g} s", ylabel="")
     panels[0].set_ylabel("y")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     report.figure("kim2019_damped", figure)

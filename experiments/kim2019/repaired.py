@@ -3,8 +3,7 @@
 import numpy as np
 
 from experiments.kim2019 import pendulum
-from experiments.report import COLOURS, MARKERS
-from hhtjax.plot import subplots
+from hhtjax.plot import error_against_h, subplots
 
 METHODS = ("conventional HHT", "non-iterative HHT", "converged", "refreshed", "predictor", "auto")
 SHOWN = (0.0, -0.05, -0.1, -0.3)
@@ -50,18 +49,13 @@ def figure(sizes, numbers):
     shape = {"sharex": True, "sharey": "row", "squeeze": False}
     drawn, panels = subplots(len(scenes), 3, width=175, height=25 + 55 * len(scenes), **shape)
     for axes, (scene, alpha) in zip(panels.flat, ((s, a) for s in scenes for a in alphas), strict=True):
-        for entry in numbers:
-            if (entry["scene"], entry["alpha"]) == (scene, alpha):
-                j = METHODS.index(entry["method"])
-                old = entry["method"] in METHODS[:2]
-                label = f"{entry['method']}, as printed" if old else f"hht, {entry['method']}"
-                style = {"color": COLOURS[j], "marker": MARKERS[j], "ms": 4, "lw": 1, "ls": ":" if old else "-"}
-                axes.loglog(sizes, entry["rms_error_q1_rad"], label=label, **style)
-        axes.set_title(f"{scene}, $\\alpha$ = {alpha:g}")
-        axes.set_ylim(top=10)
-    for axes in panels[-1]:
-        axes.set_xlabel("step size h (s)")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("RMS error of $q_1$ (rad)")
+        curves, lines = {}, {}
+        for entry in (x for x in numbers if (x["scene"], x["alpha"]) == (scene, alpha)):
+            old = entry["method"] in METHODS[:2]
+            label = f"{entry['method']}, as printed" if old else f"hht, {entry['method']}"
+            curves[label], lines[label] = (sizes, entry["rms_error_q1_rad"]), {"ls": ":" if old else "-", "lw": 1}
+        error_against_h(curves, lines=lines, key=False, ax=axes)
+        axes.set(title=f"{scene}, $\\alpha$ = {alpha:g}", ylabel="RMS error of $q_1$ (rad)", ylim=(None, 10))
+        axes.label_outer()
     drawn.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawn

@@ -21,7 +21,7 @@ from experiments.cells import FARTHEST, SAMPLES, relative_error, solve_reference
 from experiments.linearization.scenes import Case
 from experiments.report import COLOURS, MARKERS
 from hhtjax import System, hht, operator_splitting, simulate
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import error_against_h, legend, subplots
 from hhtjax.scenes import double_pendulum, duffing
 
 ALPHAS = (0.0, -0.05, -0.3)
@@ -151,17 +151,15 @@ def spring_reach(scene, alpha):
 
 def error_panel(axes, case, errors):
     """Error against h; runs that are not bounded are crosses along the upper edge."""
-    dts = case.scene.duration / NUM_STEPS
+    dts, curves, lines = case.scene.duration / NUM_STEPS, {}, {}
     for i, (method, error) in enumerate(errors.items()):
         drawn = error[:, DRAWN]
         lost = dts[np.isnan(drawn)]
-        style = {"markersize": 3, "linewidth": 1} if i % 2 else {"markersize": 8, "fillstyle": "none", "linewidth": 1}
-        axes.loglog(dts, drawn, MARKERS[i] + "-", color=COLOURS[i], label=method, **style)
-        axes.plot(lost, np.full(len(lost), 50 / 3**i), "x", color=COLOURS[i])
-    for order in (1, 2):
-        axes.plot(dts[:4], 2e-7 * (dts[:4] / dts[0]) ** order, color="0.5", linewidth=0.8)
-        axes.annotate(f" {order}", (dts[3], 2e-7 * 8**order), color="0.4", va="center")
-    axes.set(title=case.name, xlabel="h in s", ylabel="relative RMS error of q", ylim=(1e-7, 100))
+        lines[method] = {"ls": "-", "lw": 1} | ({"ms": 3} if i % 2 else {"ms": 8, "fillstyle": "none"})
+        curves[method] = dts, drawn
+        axes.plot(lost, np.full(len(lost), 50 / 3**i), "x", color=COLOURS[i], label="_lost")
+    error_against_h(curves, lines=lines, key=False, ax=axes)
+    axes.set(title=case.name, ylabel="relative RMS error of q", ylim=(1e-7, 100))
 
 
 def limit_panel(axes, limits):
@@ -201,7 +199,7 @@ def draw(errors, limits, reach):
         axes.set_visible(case.name in errors)
     limit_panel(grid[0, 2], limits)
     spring_panel(grid[1, 2], reach)
-    title = f"Four scenes on the left: alpha = {ALPHAS[DRAWN]:g}; grey: slopes 1 and 2. Crosses: unbounded."
+    title = f"Four scenes on the left: alpha = {ALPHAS[DRAWN]:g}; triangles: orders. Crosses: unbounded."
     figure.legend(*grid[1, 1].get_legend_handles_labels(), loc="outside lower center", ncols=4, title=title)
     return figure
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.kim2019 import pendulum, printed
-from experiments.report import COLOURS, MARKERS, side_by_side
+from experiments.report import COLOURS, side_by_side
 from hhtjax import simulate
-from hhtjax.plot import subplots
+from hhtjax.plot import error_against_h, subplots, trajectory
 
 REPRODUCED = Path(__file__).parents[2] / "tests" / "data" / "kim2019.json"  # by an independent program
 KEYS = ("implicit_euler", "conventional_hht", "non_iterative_hht")
@@ -82,13 +82,6 @@ def compare(report, table, scene, sizes, errors):
     return entries
 
 
-def slope_line(axes, x, y, order, **style):
-    """A line of slope `order` from (x, y) over a decade and a half, labelled with it."""
-    ends = np.array([x, 30 * x])
-    axes.loglog(ends, y * (ends / x) ** order, color="black", lw=0.8, ls=":", **style)
-    axes.annotate(f"slope {order}", (ends[0], y), ha="left", va="top")
-
-
 def error_figure(sizes, errors):
     """Figs. 7 and 9: RMS error of q1 against the step size, with the printed points as crosses."""
     titles = {
@@ -100,17 +93,13 @@ def error_figure(sizes, errors):
     figure, panels = subplots(1, len(scenes), width=175, height=80, sharey=True, squeeze=False)
     panels = panels[0]
     for axes, scene in zip(panels, scenes, strict=True):
-        for j, method in enumerate(printed.COLUMNS):
-            style = {"color": COLOURS[j], "marker": MARKERS[j], "ms": 5 - j, "label": method}
-            axes.loglog(sizes, errors[scene, method][:, 0], **style)
-            if scene in printed.TABLES:
-                points = [printed.read(scene, i, 0)[1][j] for i in range(4)]
-                axes.loglog(printed.STEP_SIZES, points, "x", color=COLOURS[j], ms=7)
-        slope_line(axes, 2e-4, 3e-4 if scene != "free" else 2e-2, 1)
-        slope_line(axes, 6e-4, 1e-7 if scene != "free" else 4e-7, 2)
-        axes.set_title(titles[scene])
-        axes.set_xlabel("step size h (s)")
-    panels[0].set_ylabel("RMS error of $q_1$ (rad)")
+        curves = {method: (sizes, errors[scene, method][:, 0]) for method in printed.COLUMNS}
+        error_against_h(curves, lines={x: {"ms": 5 - j} for j, x in enumerate(curves)}, key=False, ax=axes)
+        for j in range(len(curves)) if scene in printed.TABLES else ():
+            points = [printed.read(scene, i, 0)[1][j] for i in range(4)]
+            axes.loglog(printed.STEP_SIZES, points, "x", color=COLOURS[j], ms=7)
+        axes.set(title=titles[scene], ylabel="RMS error of $q_1$ (rad)")
+        axes.label_outer()
     panels[0].plot([], [], "kx", label="printed, misprints mended")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
@@ -138,10 +127,9 @@ def trajectory_figure(scenes, methods, dt=1e-4):
         for j, (method, path) in enumerate(zip(methods, trajectories(scene, methods, dt, every), strict=True)):
             path.check()
             for angle in (0, 1):
-                panels[angle, column].plot(path.t, path.q[:, angle], color=COLOURS[j], label=method, **styles[j])
-        panels[0, column].set_title(f"{scene}, h = {dt:g} s")
-        panels[1, column].set_xlabel("time (s)")
-    for angle in (0, 1):
-        panels[angle, 0].set_ylabel(f"$q_{angle + 1}$ (rad)")
+                line = {"label": method, "color": COLOURS[j]} | styles[j]
+                trajectory(path, entries=f"[{angle}]", key=False, ax=panels[angle, column], **line)
+                panels[angle, column].set(ylabel="" if column else f"$q_{angle + 1}$ (rad)")
+        panels[0, column].set(title=f"{scene}, h = {dt:g} s", xlabel="")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure

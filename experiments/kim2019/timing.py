@@ -7,8 +7,7 @@ import jax
 import numpy as np
 
 from experiments.kim2019 import pendulum
-from experiments.report import COLOURS, MARKERS
-from hhtjax.plot import subplots
+from hhtjax.plot import subplots, work_precision
 
 METHODS = ("implicit Euler", "conventional HHT", "non-iterative HHT", "refreshed", "predictor", "auto")
 ALPHA = 0.0  # as in the paper
@@ -112,15 +111,14 @@ def figure(numbers):
     scenes = list(dict.fromkeys(n["scene"] for n in numbers))
     drawn, panels = subplots(1, len(scenes), width=175, height=90, squeeze=False)
     for axes, scene in zip(panels[0], scenes, strict=True):
-        for j, method in enumerate(METHODS):
+        curves = {}
+        for method in METHODS:
             mine = [n for n in numbers if (n["scene"], n["method"]) == (scene, method)]
+            x, y = ([n[key] for n in mine] for key in ("time_per_run_s", "rms_error_q1_rad"))
             if mine:
-                x, y = ([n[key] for n in mine] for key in ("time_per_run_s", "rms_error_q1_rad"))
-                label = method if j < 3 else f"hht, {method}"
-                axes.loglog(1e3 * np.array(x), y, color=COLOURS[j], marker=MARKERS[j], ms=4, lw=1, label=label)
-        axes.set_title(f"{scene} double pendulum, $\\alpha$ = 0")
-        axes.set_xlabel("time of one run (ms)")
-        axes.set_ylabel("RMS error of $q_1$ (rad)")
-        axes.set_ylim(top=10)
+                curves[method if method in METHODS[:3] else f"hht, {method}"] = 1e3 * np.array(x), y
+        names = {"xlabel": "time of one run (ms)", "ylabel": "RMS error of $q_1$ (rad)"}
+        work_precision(curves, ours=[x for x in curves if x.startswith("hht")], **names, key=False, ax=axes)
+        axes.set(title=f"{scene} double pendulum, $\\alpha$ = 0", ylim=(None, 10))
     drawn.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawn

@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 
 import hhtjax
 from experiments.report import COLOURS, MARKERS
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import error_against_h, legend, subplots
 from hhtjax.scenes import vehicle
 
 ALPHA = -0.05
@@ -184,16 +184,23 @@ def draw(scene, times, q, errors, factors):
     ride.set(xlabel="time (s)", ylabel="height, front left (mm)", xlim=(0, scene.duration))
     legend(ride)
 
-    h = 1e3 * np.array(STEP_SIZES)
+    h, lines = 1e3 * np.array(STEP_SIZES), {}
     for i, (name, error) in enumerate(errors.items()):
         size = {"HHT, converged": 8, "HHT, auto": 5.5}.get(name, 3.5)  # these and the predictor lie on each other
-        style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": size, "lw": 1.2, "mfc": "none" if size > 5 else None}
-        by_step.loglog(h, error, label=name, **style)
+        style = {
+            "color": COLOURS[i],
+            "marker": MARKERS[i],
+            "ms": size,
+            "lw": 1.2,
+            "ls": "-",
+            "mfc": "none" if size > 5 else None,
+        }
+        lines[name] = style
         by_error.loglog(error, factors[name], **style)
-    for order, level in ((1, 0.15), (2, 0.006), (4, 3e-6)):
-        ends = np.array([0.5, 2])
-        by_step.plot(ends, level * ends**order, color="black", lw=0.8)
-        by_step.annotate(f"{order}", (2, level * 2**order), textcoords="offset points", xytext=(3, -3))
+    curves = {
+        name: (h, np.where(error > 1e-6, error, np.nan)) for name, error in errors.items()
+    }  # what is in the picture
+    error_against_h(curves, lines=lines, slopes=(1, 2, 4), key=False, ax=by_step)
     by_step.axhline(1, color="black", ls=":")
     by_error.axvline(1, color="black", ls=":")
     by_error.axhline(1000, color="black", ls=":")

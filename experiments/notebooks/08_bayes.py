@@ -169,11 +169,11 @@ def sample(density, keys, starts):
     return jax.lax.map(lambda c: jax.lax.scan(draw, nuts.init(c[1]), c[0])[1], (keys, starts))
 
 
-chains, draws = 4, 300
+chains, draws = 4, 200
 keys = jax.random.split(jax.random.key(1), (chains, draws))
 starts = jax.random.normal(jax.random.key(2), (chains, 4))
 (x, gradients, diverged), sampling_time = seconds(lambda *a: sample(log_density(ours), *a), keys, starts)
-ess, rhat = blackjax.diagnostics.ess_bulk(x), blackjax.diagnostics.rhat(x)
+ess, rhat = jax.jit(lambda x: (blackjax.diagnostics.ess_bulk(x), blackjax.diagnostics.rhat(x)))(x)
 print(f"{chains * draws} draws, {gradients.sum()} gradients, {diverged.sum()} divergences, {sampling_time:.1f} s")
 print(f"smallest ESS {ess.min():.0f}, largest rhat {rhat.max():.3f}")
 print(f"{float(ess.min()) / sampling_time:.0f} effective samples per second (compiling not counted)")
@@ -240,8 +240,8 @@ plt.show()
 #
 # The same posterior and the same sampler, with the simulation by diffrax. A force that jumps 1000 times a second makes
 # every solver stop at each jump, so steps of constant length, one a sample, are its best choice here. The midpoint rule
-# is of the same order as `hht`, and evaluates the force inside the step only. We try both ways to differentiate; the
-# fastest that is accurate enough goes into the sampler.
+# is of the same order as `hht`, and evaluates the force inside the step only. It is differentiated forwards, as ours
+# is; backwards, by its checkpoints, takes several times longer (below, "What to try next").
 #
 # Accurate enough: its error of the solution moves the estimate by less than a tenth of a standard error, computed from
 # the derivatives $J$ as $(J J^T)^{-1} J e$.
@@ -256,14 +256,14 @@ def rate(t, state, params):
     return v, (u - params["c"] * v - params["k"] * q - params["k3"] * q**3) / params["m"]
 
 
-def by_diffrax(solver, adjoint):
-    def motion(params):
-        return diffrax.diffeqsolve(
-            diffrax.ODETerm(rate), solver, 0.0, N * DT, DT, (0.0, 0.0), params, max_steps=N, adjoint=adjoint,
-            saveat=diffrax.SaveAt(steps=True), stepsize_controller=diffrax.ConstantStepSize(),
-        ).ys[0]  # fmt: skip
+ADJOINT = diffrax.ForwardMode()
 
-    return motion
+
+def by_diffrax(params):
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(rate), diffrax.Midpoint(), 0.0, N * DT, DT, (0.0, 0.0), params, max_steps=N, adjoint=ADJOINT,
+        saveat=diffrax.SaveAt(steps=True), stepsize_controller=diffrax.ConstantStepSize(),
+    ).ys[0]  # fmt: skip
 
 
 _, J = jax.jit(lambda x: misfit(ours, x))(here)
@@ -277,25 +277,19 @@ def shift(motion):
     return float(jnp.abs(relative * estimate / errors["textbook"]).max())
 
 
-def row(name, motion, mode):
+def row(name, motion):
     """Time of the value with its gradient."""
-    _, duration = seconds(jax.value_and_grad(log_density(motion, mode)), here)
+    _, duration = seconds(jax.value_and_grad(log_density(motion)), here)
     moved = shift(motion)
     print(f"{name:<46}{1e3 * duration:8.2f} ms a gradient; the estimate moves by {moved:.4f} standard errors")
     return duration, moved
 
 
-table = {"hhtjax, hht, forwards": row("hhtjax, hht, forwards", ours, "forward")}
-candidates = {}
-for mode, adjoint in (("forward", diffrax.ForwardMode()), ("reverse", diffrax.RecursiveCheckpointAdjoint())):
-    solver = diffrax.Midpoint()
-    name = f"diffrax, {type(solver).__name__}, {type(adjoint).__name__}"
-    candidates[name] = by_diffrax(solver, adjoint), mode
-    table[name] = row(name, *candidates[name])
-accurate = [name for name, (_, moved) in table.items() if moved < 0.1]
-assert "hhtjax, hht, forwards" in accurate
-best = min(candidates.keys() & accurate, key=lambda name: table[name][0])
-print(f"\nfastest of diffrax: {best}; {table[best][0] / forward_time:.0f} times the time of a gradient of hhtjax")
+moved = shift(ours)
+print(f"{'hhtjax, hht':<46}{1e3 * forward_time:8.2f} ms a gradient; the estimate moves by {moved:.4f} standard errors")
+diffrax_time, diffrax_moved = row("diffrax, Midpoint", by_diffrax)
+assert max(moved, diffrax_moved) < 0.1
+print(f"\ndiffrax: {diffrax_time / forward_time:.0f} times the time of a gradient of hhtjax")
 
 # %% [markdown]
 # In the sampler: both posteriors are the same to a few hundredths of a standard error, so NUTS needs as many gradients
@@ -303,8 +297,8 @@ print(f"\nfastest of diffrax: {best}; {table[best][0] / forward_time:.0f} times 
 # diffrax draws a few samples only, from the same random numbers, or this would take minutes.
 
 # %%
-few = 4
-density = log_density(*candidates[best])
+few = 2
+density = log_density(by_diffrax)
 (_, theirs, _), t_theirs = seconds(lambda *a: sample(density, *a), keys[:, :few], starts)
 t_gradient = {"hhtjax": sampling_time / int(gradients.sum()), "diffrax": t_theirs / int(theirs.sum())}
 per_second = {name: float(ess.min()) / int(gradients.sum()) / t for name, t in t_gradient.items()}
@@ -347,8 +341,8 @@ def diffrax_smooth(params):
     ).ys[0]  # fmt: skip
 
 
-smooth_ours = row("hhtjax, RK4, forwards", ours_smooth, "forward")
-smooth_theirs = row("diffrax, Tsit5, step-size control, ForwardMode", diffrax_smooth, "forward")
+smooth_ours = row("hhtjax, RK4", ours_smooth)
+smooth_theirs = row("diffrax, Tsit5, step-size control", diffrax_smooth)
 assert max(smooth_ours[1], smooth_theirs[1]) < 0.1
 print(f"{smooth_theirs[0] / smooth_ours[0]:.0f} times the time; diffrax smoothed against hhtjax as posed:", end=" ")
 print(f"{smooth_theirs[0] / forward_time:.0f} times")
@@ -359,9 +353,7 @@ print(f"{smooth_theirs[0] / forward_time:.0f} times")
 # The sampler calls the simulation in loops of its own, compiled with it. Each loop over steps stays what it is without:
 
 # %%
-explanation = hhtjax.explain(lambda *a: sample(log_density(ours), *a), keys, starts)
-print(explanation)
-assert set(explanation.paths) == set(hhtjax.explain(jax.value_and_grad(log_density(ours)), here).paths)
+print(hhtjax.explain(lambda *a: sample(log_density(ours), *a), keys, starts))
 print(f"a step with its four derivatives: {1e9 * forward_time / N:.0f} ns (the step alone {1e9 * run_time / N:.0f} ns)")
 inside = 1e3 * t_gradient["hhtjax"]
 print(f"a gradient: {1e3 * forward_time:.2f} ms by itself, {inside:.2f} ms with the sampler's own work")
@@ -370,6 +362,8 @@ print(f"a gradient: {1e3 * forward_time:.2f} ms by itself, {inside:.2f} ms with 
 # ## What to try next
 #
 # * Take 300 samples instead of 10 000: where do histogram and curve part?
+# * Differentiate diffrax backwards: `ADJOINT = diffrax.RecursiveCheckpointAdjoint()`, and
+#   `log_density(..., "reverse")`.
 # * Give $\sigma$ a prior too, as a fifth parameter.
 # * Colour the noise (`np.convolve` with a few ones): the posterior does not notice and becomes too narrow, `fit`'s
 #   errors do notice. Which of the two is right? Repeat with 20 records.

@@ -132,17 +132,20 @@ def run(report, fast):
 def figure(entries, num_steps):
     """Energy of each scene, and what else each keeps or loses."""
     panels = ("dumbbell", "energy"), ("dumbbell", "angular momentum"), ("free body", "energy"), ("pendulum", "energy")
-    drawn, grid = subplots(2, 2, width=175, height=210, sharex=True)
+    drawn, grid = subplots(2, 2, width=175, height=185, sharex=True)
     steps = num_steps / WINDOWS * np.arange(1, WINDOWS + 1)
     for axes, (scene, quantity) in zip(grid.ravel(), panels, strict=True):
         for i, e in enumerate(e for e in entries if e["scene"] == scene):
             marker = {"marker": MARKERS[(i + i // 8) % 8], "ms": 4, "markevery": (i, 9)}
             x = np.maximum(e["path"][quantity], 1e-16)
             axes.loglog(steps, x, color=COLOURS[i % 8], lw=1, ls=("-", "--")[i // 8], label=e["method"], **marker)
-        axes.set_title(f"{scene}, h = {1e3 * next(e['h_s'] for e in entries if e['scene'] == scene):g} ms")
+        title = f"{scene}, h = {1e3 * next(e['h_s'] for e in entries if e['scene'] == scene):g} ms"
         axes.set_ylabel(f"relative error of {quantity}")
-        if (scene, quantity) != panels[1]:
-            legend(axes)
+        if scene == "dumbbell":
+            axes.set_title(title)
+        else:
+            legend(axes, title=title, alignment="left")
+    drawn.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, title="dumbbell")
     for axes in grid[1]:
         axes.set_xlabel("number of steps")
     return drawn

@@ -12,7 +12,7 @@ import numpy as np
 import hhtjax
 from experiments.report import COLOURS, MARKERS
 from hhtjax import trigonometry
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import error_against_h, legend, subplots
 from hhtjax.scenes import double_pendulum
 
 DURATION = 1.0
@@ -137,24 +137,23 @@ def figure(rows, coarse, biases):
     drawn, grid = subplots(2, 2, width=175, height=165)
     left, middle, right, key = grid.flat
     shown = [row for row in rows if row["alpha"] in (None, -0.1) and row["method"] != "hht predictor"]
-    for i, row in enumerate(shown):
-        style = {"color": COLOURS[i % 8], "marker": MARKERS[i % 8], "ms": 3, "ls": ("-", "--")[i // 8], "lw": 1}
-        left.loglog(row["h_s"], row["error_rad"], label=f"{row['method']} ({row['order']:.2f})", **style)
+    curves = {f"{row['method']} ({row['order']:.2f})": (row["h_s"], row["error_rad"]) for row in shown}
+    lines = {name: {"ms": 3, "ls": ("-", "--")[i // 8], "lw": 1} for i, name in enumerate(curves)}
+    error_against_h(curves, lines=lines, key=False, ax=left)
     left.set_ylim(1e-13, 10)
+    curves, lines = {}, {}
     for i, alpha in enumerate(ALPHAS):
         for name, line in (("hht predictor", "-"), ("kim_hht", "--")):
             row = next(r for r in rows if r["method"] == name and r["alpha"] == alpha)
             label = f"{name}, {alpha:g} ({row['order']:.2f})"
-            middle.loglog(row["h_s"], row["error_rad"], line, color=COLOURS[i], marker=MARKERS[i], ms=3, label=label)
-    for i, (name, bias) in enumerate(biases.items()):
-        right.loglog(coarse, np.abs(bias), color=COLOURS[i], marker=MARKERS[i], ms=3, label=name)
+            curves[label] = row["h_s"], row["error_rad"]
+            lines[label] = {"ls": line, "color": COLOURS[i], "marker": MARKERS[i], "ms": 3}
+    error_against_h(curves, lines=lines, key=False, ax=middle)
+    error_against_h({name: (coarse, np.abs(bias)) for name, bias in biases.items()}, ax=right)
     right.set_ylabel("relative error of the stiffness")
     for axes in (left, middle):
         axes.set_ylabel("error of the angles after 1 s (rad)")
-    for axes in (left, middle, right):
-        axes.set_xlabel("step size (s)")
     key.axis("off")
     key.legend(*left.get_legend_handles_labels(), title="upper left", loc="center")
     legend(middle)
-    legend(right)
     return drawn

@@ -5,7 +5,7 @@ import textwrap
 import numpy as np
 
 from experiments.report import COLOURS, MARKERS
-from hhtjax.plot import subplots
+from hhtjax.plot import subplots, work_precision
 
 WORST = 10  # error beyond which a run is not drawn
 PACKAGES = "ours", "diffrax", "SciPy", "MuJoCo", "exudyn"
@@ -75,8 +75,10 @@ def panels(lines, names, x, xlabel, ylabel, shown=None):
             row, (ours, others), (others, ours), ("best of others", "best of ours"), keys, strict=True
         ):
             front(panel, rest, label)
-            for method, (work, error, look) in (item for methods in mine for item in methods.items()):
-                panel.loglog(work, error, label=method, **look)
+            points = {method: (work, error) for methods in mine for method, (work, error, _) in methods.items()}
+            looks = {method: look for methods in mine for method, (_, _, look) in methods.items()}
+            if points:
+                work_precision(points, lines=looks, xlabel="", ylabel="", key=False, ax=panel)
             handles, labels = panel.get_legend_handles_labels()
             key |= dict(zip(labels, handles, strict=True))
         unit = next((line["unit"] for line in lines if line["case"] == name and "unit" in line), "1")

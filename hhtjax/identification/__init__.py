@@ -50,6 +50,12 @@ A start that is poor
 `fit_progressively` goes from a poor one over longer and longer parts of a record. `multistart` tries many at once.
 `measure` adds a sensor's gain, offset and delay to what is simulated.
 
+Which model
+-----------
+
+`score_test` ranks terms that a model does not have yet. `compare` judges models that were fitted: by AIC and BIC, by F
+tests of nested ones, and by their errors on segments that were left out; all of it knows that residuals are correlated.
+
 The step size is part of the model
 ----------------------------------
 
@@ -65,6 +71,7 @@ principle, in stiff joints, a vehicle and a mechanism with six constraints, is o
 
 from hhtjax.identification.arguments import Gaussian
 from hhtjax.identification.bias import ModeBias, step_size_bias
+from hhtjax.identification.comparison import Comparison, NestedTest, compare
 from hhtjax.identification.identifiability import IdentifiabilityWarning
 from hhtjax.identification.identify import Multistart, fit, multistart
 from hhtjax.identification.inference import Profile, Score, prediction_errors, profile, score_test
@@ -77,12 +84,14 @@ from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
 
 __all__ = [
+    "Comparison",
     "FitResult",
     "Gaussian",
     "History",
     "IdentifiabilityWarning",
     "ModeBias",
     "Multistart",
+    "NestedTest",
     "Profile",
     "Refined",
     "Score",
@@ -90,6 +99,7 @@ __all__ = [
     "Uncertainty",
     "Windows",
     "bounded",
+    "compare",
     "equation_error",
     "fit",
     "fit_progressively",

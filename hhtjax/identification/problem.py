@@ -99,7 +99,8 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
         tau = variance_inflation(found.leaves)
         believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau)
     ended = found.residual, found.cost, found.history, found.iterations, found.code
-    return FitResult(freeze(coordinates.params(found.x)), *ended, options.transforms, believed, segments, found.starts)
+    params, last = freeze(coordinates.params(found.x)), (found.starts, data.weights)
+    return FitResult(params, *ended, options.transforms, believed, segments, *last)
 
 
 def _solve_dense(residuals, options, coordinates, data, limits):

@@ -1,4 +1,4 @@
-"""A fit for readers: a text table, charts, and JSON."""
+"""A fit for readers: a text table, and JSON."""
 
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -9,15 +9,18 @@ import numpy as np
 
 from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
+from hhtjax.identification.evidence import count, effective_observations, residuals_of, rms, whiteness
 from hhtjax.identification.identifiability import parameter_names, parameter_values, why_undetermined
 from hhtjax.identification.progress import CONVERGED, REASONS
+
+CLOSE = 0.95  # correlation of two estimates that is worth a word
+MOST_PAIRS = 3
 
 
 def summary(result) -> str:
     """The text of `FitResult.summary`."""
-    size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
     cost = f"cost {float(result.cost):.6g}, {float(result.history.cost[0]):.6g} at the start"
-    lines = [f"{result.reason}; {int(result.iterations)} iterations, {cost}, {size} residuals"]
+    lines = [f"{result.reason}; {int(result.iterations)} iterations, {cost}"]
     names, values = parameter_names(result.params), parameter_values(result.params)
     rows = [["parameter", "estimate"]]
     columns = []
@@ -33,8 +36,9 @@ def summary(result) -> str:
         rows.append([name, f"{value:.6g}", *(columns[i] if columns else [])])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines += ["  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines += _about_residuals(result)
     if result.uncertainty is not None:
-        lines += _remarks(result, np.asarray(names))
+        lines += _about_estimates(result, np.asarray(names))
     return "\n".join(lines)
 
 
@@ -69,7 +73,35 @@ def _columns(free, error, lower, upper, naive):
     return [f"{error:.3g}", f"{lower:.6g} .. {upper:.6g}", f"{error / naive:.2f}" if naive else ""]
 
 
-def _remarks(result, names):
+def _about_residuals(result):
+    """How many there are and what they are worth, how large, whether they are white; starts that were fitted too."""
+    residuals = residuals_of(result)
+    n = count(residuals)
+    missing = sum(x.size for x in residuals.plain) - n
+    words = [f"observations: {n}{f' and {missing} missing' if missing else ''}"]
+    if result.uncertainty is not None:
+        words.append(f"worth {effective_observations(n, result.uncertainty):.0f} independent ones")
+    lines = [", ".join(words)]
+    leaves = zip(residuals.names, residuals.plain, residuals.present, strict=True)
+    words = ["residual: rms " + ", ".join(f"{name} {rms(r, here):.4g}".strip() for name, r, here in leaves)]
+    starts = jax.tree.leaves(result.starts)
+    unknowns = int(np.sum(result.free)) + sum(map(np.size, starts))
+    if any(np.asarray(w).dtype != bool for w in jax.tree.leaves(result.weights)) and n > unknowns:
+        square = sum(np.sum(r**2) for r in residuals.weighted)
+        words.append(f"weighted sum of squares {square / (n - unknowns):.3g} per degree of freedom")
+    if found := whiteness(residuals):
+        rho, p, lags = found
+        words.append(f"correlation at lag 1 {rho:+.2f}")
+        words.append(f"{'' if p > 0.05 else 'not '}white (Ljung-Box, {lags} lags: p = {p:.2g})")
+    lines.append("; ".join(words))
+    if starts:
+        each = sum(map(np.size, starts)) // len(starts[0])
+        lines.append(f"starts: of {len(starts[0])} records, {each} unknowns each")
+    return lines
+
+
+def _about_estimates(result, names):
+    """Where standard errors come from, what is not determined, and what is only together."""
     believed = result.uncertainty
     segments = f"how much {result.segments} segments of the record disagree (cluster sandwich)"
     kind = f"from {segments}" if believed.cluster is not None else "from the autocorrelation of the residuals"
@@ -78,42 +110,17 @@ def _remarks(result, names):
     unknown, why = why_undetermined(result.params, result.free, believed, size)
     if unknown:
         remarks.append(f"undetermined: {', '.join(unknown)}: {why}")
-    R = np.triu(np.abs(np.asarray(result.correlation)), 1)
     if np.sum(result.free) - len(unknown) > 1:
-        i, j = np.unravel_index(np.argmax(R), R.shape)
-        remarks.append(f"largest correlation: {float(result.correlation[i, j]):+.3f} between {names[i]} and {names[j]}")
+        R = np.triu(np.asarray(result.correlation), 1)
+        pairs = np.argsort(-np.abs(R), axis=None)[: max(1, min(MOST_PAIRS, int(np.sum(np.abs(R) > CLOSE))))]
+        rows, columns = np.unravel_index(pairs, R.shape)
+        together = zip(rows, columns, strict=True)
+        found = [f"{R[i, j]:+.3f} between {names[i]} and {names[j]}" for i, j in together]
+        remarks.append(f"largest correlation{'s' * (len(found) > 1)}: {', '.join(found)}")
     s = np.asarray(believed.singular_values)
-    remarks.append(f"singular values of the scaled Jacobian: {s[0]:.3g} .. {s[-1]:.3g}")
+    condition = s[0] / s[-1] if s[-1] > 0 else np.inf
+    remarks.append(f"condition number of the scaled Jacobian: {condition:.3g}")
     return remarks
-
-
-def plot(result, sampling_rate=1.0):
-    """The figure of `FitResult.plot`."""
-    import matplotlib.pyplot as plt
-
-    r = np.asarray(jax.tree.leaves(result.residual)[0])
-    r = r.reshape(r.shape[0], -1)[:, 0] if r.ndim else r.reshape(1)
-    figure, axes = plt.subplots(2, 2, figsize=(9, 6), layout="constrained")
-    time, frequency = np.arange(len(r)) / sampling_rate, np.fft.rfftfreq(len(r), 1 / sampling_rate)
-    axes[0, 0].plot(time, r, lw=0.7)
-    axes[0, 0].set(xlabel="time (samples / sampling rate)", ylabel="residual")
-    power = np.abs(np.fft.rfft(np.where(np.isfinite(r), r, 0))) ** 2 / len(r)
-    axes[0, 1].semilogy(frequency[1:], power[1:], lw=0.7)
-    axes[0, 1].set(xlabel="frequency (of the sampling rate's unit)", ylabel="power of the residual")
-    if result.uncertainty is not None:
-        names = np.asarray(parameter_names(result.params))[result.free]
-        free = np.flatnonzero(result.free)
-        values = parameter_values(result.params)[free]
-        lower, upper = (parameter_values(end)[free] for end in result.interval())
-        size = np.where(values == 0, 1, np.abs(values))
-        reach = 100 * np.stack([values - lower, upper - values]) / size
-        axes[1, 0].errorbar(np.zeros(len(free)), np.arange(len(free)), xerr=reach, fmt="o", capsize=3)
-        axes[1, 0].set(xlabel="95 % interval (% of the estimate)", yticks=np.arange(len(free)), yticklabels=names)
-        image = axes[1, 1].imshow(np.asarray(result.correlation)[np.ix_(free, free)], vmin=-1, vmax=1, cmap="RdBu")
-        axes[1, 1].set(xticks=np.arange(len(free)), yticks=np.arange(len(free)), yticklabels=names)
-        axes[1, 1].set_xticklabels(names, rotation=90)
-        figure.colorbar(image, ax=axes[1, 1], label="correlation of the estimates")
-    return figure
 
 
 TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}

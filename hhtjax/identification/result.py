@@ -33,6 +33,7 @@ class FitResult(NamedTuple):
         uncertainty: `Uncertainty` of the free entries; None if not asked for.
         segments: how many parts of the record the covariance rests on.
         starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
+        weights: as given to `fit`.
 
     `covariance` (p, p), whose rows follow ravel_pytree(params), and `standard_errors`, the root of its diagonal,
     structured like params, come from how much segments of the record disagree (a cluster-robust covariance:
@@ -50,6 +51,7 @@ class FitResult(NamedTuple):
     uncertainty: Uncertainty | None
     segments: int
     starts: Any = None
+    weights: Any = True
 
     @property
     def converged(self) -> Any:
@@ -115,6 +117,10 @@ class FitResult(NamedTuple):
     def summary(self) -> str:
         """A table of estimates, standard errors and intervals, and what limits them.
 
+        Below it: how many observations there are, and how many independent ones they are worth (`compare` has the
+        formula); the rms of the residual, in its unit, and whether it is white (Ljung and Box 1978); where the standard
+        errors come from; what is not determined, and what is only together.
+
         >>> import jax.numpy as jnp, hhtjax
         >>> wave = jnp.sin(jnp.arange(400.0))
         >>> print(hhtjax.fit(lambda p: p["a"] * wave + p["b"] - 2 * wave - 0.1, {"a": 1.0, "b": 0.0}).summary())
@@ -129,8 +135,10 @@ class FitResult(NamedTuple):
         return report.table(self)
 
     def plot(self, sampling_rate: float = 1.0) -> Any:
-        """A figure: residual and its spectrum (of the first channel), intervals, correlations. Needs matplotlib."""
-        return report.plot(self, sampling_rate)
+        """The figure of `hhtjax.plot.fit_overview`."""
+        from hhtjax.plot import fit_overview  # upstairs: needs matplotlib, as nothing else here does
+
+        return fit_overview(self, sampling_rate)[0].figure
 
     def to_json(self) -> str:
         """The whole result as JSON, for `FitResult.from_json`; inf and NaN as Python writes them."""

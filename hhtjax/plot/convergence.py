@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from hhtjax.analysis.convergence import ObservedOrder
-from hhtjax.plot.styles import LINES, MARKERS, canvas, legend, look, with_unit
+from hhtjax.plot.styles import LINES, canvas, legend, look, with_unit
 from hhtjax.runs.solution import Solution
 
 GREY = "#606060"
@@ -21,6 +21,8 @@ def error_against_h(
     slopes: Any = None,
     unit: str | None = None,
     time_unit: str = "s",
+    lines: Any = None,
+    key: bool = True,
     ax: Any = None,
 ) -> Any:
     """Error over step size, both logarithmic, with the observed order of each curve and triangles of whole orders.
@@ -41,13 +43,17 @@ def error_against_h(
         label: of a single curve.
         slopes: orders of the triangles; by default the whole numbers that are observed.
         unit: of the error. time_unit: of dt.
+        lines: options of `ax.plot` for some of the curves, {label: {"marker": "x"}}.
+        key: whether there is a legend; without one, curves are called by their names alone, for a legend of several
+            axes together.
         ax: axes to draw into; None for a figure of its own.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind, shape or value; a run that is no sweep.
+        TypeError, ValueError: an argument of a wrong kind, shape or value; a run that is no sweep; lines of no
+        curve.
 
     >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
     >>> h = np.array([0.01, 0.02, 0.04])
@@ -58,13 +64,14 @@ def error_against_h(
     """
     given = dt if isinstance(dt, dict) else {label: dt if error is None else (dt, error)}
     curves = {name: _curve(one, reference) for name, one in given.items()}
+    lines = _lines("error_against_h", lines, curves)
     with canvas("error_against_h", ax) as (panel,):
         orders = {name: _order(*curve) for name, curve in curves.items()}
         start = len([line for line in panel.lines if not line.get_label().startswith("_")])
         for i, (name, (h, e)) in enumerate(curves.items()):
-            order = _in_words(h, e)
+            order = _in_words(h, e) if key else ""
             shown = ": ".join(x for x in (name, order) if x)
-            panel.loglog(h, e, label=shown, **look(start + i, marker=True))
+            panel.loglog(h, e, label=shown, **(look(start + i, marker=True) | lines.get(name, {})))
         if slopes is None:
             slopes = sorted({round(p) for p in orders.values() if abs(p - round(p)) < 0.3 and round(p) > 0})
         taken = []
@@ -72,8 +79,17 @@ def error_against_h(
             nearest = min(curves, key=lambda name: abs(np.nan_to_num(orders[name], nan=np.inf) - p))
             taken.append(_triangle(panel, p, curves[nearest], list(curves.values()), taken))
         panel.set(xlabel=with_unit("step size h", time_unit), ylabel=with_unit("error", unit))
-        legend(panel)
+        if key:
+            legend(panel)
     return panel
+
+
+def _lines(caller, lines, curves):
+    """{label: options} of the user's, which must be of curves that there are."""
+    lines = lines or {}
+    if unknown := [label for label in lines if label not in curves]:
+        raise ValueError(f"{caller}: `lines` must be of {', '.join(map(str, curves))}; received {unknown[0]!r}.")
+    return lines
 
 
 def _curve(one, reference):
@@ -167,6 +183,8 @@ def work_precision(
     ours: Any = (),
     xlabel: str = "time of a run (s)",
     ylabel: str = "error",
+    lines: Any = None,
+    key: bool = True,
     ax: Any = None,
 ) -> Any:
     """Error over the time that it takes, both logarithmic: what lies further down and left is better.
@@ -175,13 +193,14 @@ def work_precision(
         curves: {label: (times, errors)}, two vectors each; what is not finite or not positive is left out.
         ours: labels that are drawn with bold, full lines, the others with thin, broken ones.
         xlabel, ylabel: with their units, of whatever work and error are counted in.
-        ax: axes to draw into; None for a figure of its own.
+        lines, key, ax: as in `hhtjax.plot.error_against_h`.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: curves is no dict, empty, or of arrays of different lengths; ours has other labels.
+        TypeError, ValueError: curves is no dict, empty, or of arrays of different lengths; ours or lines have other
+        labels.
 
     >>> import matplotlib.pyplot as plt, hhtjax
     >>> curves = {"hht": ([1e-3, 2e-3], [1e-2, 2.5e-3]), "peer": ([1e-2, 2e-2], [1e-2, 6e-4])}
@@ -196,12 +215,14 @@ def work_precision(
     if unknown := [label for label in ours if label not in curves]:
         raise ValueError(f"work_precision: `ours` must be among {', '.join(curves)}; received {unknown[0]!r}.")
     points = {label: _points(label, *curve) for label, curve in curves.items()}
+    lines = _lines("work_precision", lines, curves)
     with canvas("work_precision", ax) as (panel,):
         for i, (label, (times, errors)) in enumerate(points.items()):
             mine = {"ls": "-", "lw": 1.8, "zorder": 3} if label in ours else {"ls": LINES[1 + i % 3], "lw": 0.9}
-            panel.loglog(times, errors, label=label, **(look(i) | {"marker": MARKERS[i % 8]} | mine))
+            panel.loglog(times, errors, label=label, **(look(i, marker=True) | mine | lines.get(label, {})))
         panel.set(xlabel=xlabel, ylabel=ylabel)
-        legend(panel)
+        if key:
+            legend(panel)
     return panel
 
 

@@ -1,117 +1,18 @@
-"""Charts of an identification: measured and simulated, estimates with their intervals, correlations, a profile."""
+"""Charts of an identification: estimates with their intervals, correlations, a profile."""
 
 from typing import Any
 
 import jax
 import numpy as np
-from matplotlib import mlab
 
 from hhtjax.checks import require_number
 from hhtjax.identification.identifiability import parameter_names, parameter_values
 from hhtjax.identification.inference import Profile
 from hhtjax.identification.result import FitResult
+from hhtjax.plot.records import MEASURED
 from hhtjax.plot.styles import COLOURS, MARKERS, canvas, legend, look, with_unit
 
-MEASURED = "#808080"
 SHOWN_NUMBERS = 8  # parameters up to which the correlations are written into the matrix
-
-
-def fit_against_data(
-    times: Any,
-    measured: Any,
-    simulated: Any,
-    *,
-    unit: str | None = None,
-    ylabel: str = "output",
-    time_unit: str = "s",
-    frequency_unit: str = "Hz",
-    show: Any = None,
-    ax: Any = None,
-) -> Any:
-    """Measured and simulated output, below them the residual, measured - simulated, and the spectra of record and
-    residual.
-
-    Spectra are roots of one-sided power spectral densities, by Welch's method: means over half overlapping windows of
-    a quarter to a half of the record, each less its mean. So their unit is the output's over the root of a frequency,
-    and the integral of their square is the variance.
-
-    Args:
-        times: (N,), at equal distances, N >= 8.
-        measured, simulated: (N,), in one unit; NaN where nothing was measured, which counts as 0 in the spectra.
-        unit, ylabel: of the output, and its name.
-        time_unit: of times. frequency_unit: one over that.
-        show: (first, last), the part of the time that is drawn; spectra are of all.
-        ax: three axes to draw into; None for a figure of its own.
-
-    Returns:
-        Three axes, (3,): output, residual, spectra.
-
-    Raises:
-        TypeError, ValueError: an argument of a wrong kind, shape or value; times at unequal distances.
-
-    References:
-        Welch, The use of fast Fourier transform for the estimation of power spectra, 1967.
-
-    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
-    >>> t = np.arange(256) / 100.0
-    >>> upper, middle, lower = hhtjax.plot.fit_against_data(t, np.sin(t), np.sin(t) - 0.1, unit="mV")
-    >>> middle.get_ylabel(), round(float(middle.lines[0].get_ydata()[7]), 3), lower.get_xlabel()
-    ('residual (mV)', 0.1, 'frequency (Hz)')
-    >>> plt.close(upper.figure)
-    """
-    times, measured, simulated = _record(times, measured, simulated)
-    inside = slice(None)
-    if show is not None:
-        if np.shape(show) != (2,) or not show[0] < show[1]:
-            raise ValueError(f"fit_against_data: `show` must be two increasing times; received {show!r}.")
-        inside = (times >= show[0]) & (times <= show[1])
-    residual = measured - simulated
-    rate = (len(times) - 1) / (times[-1] - times[0])
-    options = {"height": 115, "gridspec_kw": {"height_ratios": [3, 2, 3]}}
-    with canvas("fit_against_data", ax, 3, **options) as (upper, middle, lower):
-        data, model = {"color": MEASURED, "lw": 1.6}, {"color": COLOURS[1], "lw": 0.8}
-        upper.plot(times[inside], measured[inside], label="measured", **data)
-        upper.plot(times[inside], simulated[inside], label="simulated", **model)
-        middle.plot(times[inside], residual[inside], color=COLOURS[0], lw=0.7)
-        for values, name, line in ((measured, "measured", data), (residual, "residual", {"color": COLOURS[0]})):
-            frequency, density = _spectrum(values, rate)
-            lower.semilogy(frequency[1:], density[1:], label=name, **(line | {"lw": 0.9}))
-        upper.set_ylabel(with_unit(ylabel, unit))
-        middle.set(ylabel=with_unit("residual", unit), xlabel=with_unit("t", time_unit))
-        upper.sharex(middle)
-        upper.tick_params(labelbottom=False)
-        lower.set_xlabel(with_unit("frequency", frequency_unit))
-        root = f"{unit or '1'}/$\\sqrt{{\\mathrm{{{frequency_unit}}}}}$"
-        lower.set_ylabel(f"density\n({root})")
-        upper.figure.align_ylabels([upper, middle, lower])
-        legend(upper)
-        legend(lower)
-    return np.array([upper, middle, lower], dtype=object)
-
-
-def _record(times, measured, simulated):
-    times, measured, simulated = (np.asarray(x, float) for x in (times, measured, simulated))
-    for name, x in {"measured": measured, "simulated": simulated}.items():
-        if times.ndim != 1 or x.shape != times.shape or len(times) < 8:
-            raise ValueError(
-                f"fit_against_data: `{name}` must be as long as `times`, 8 samples or more; "
-                f"received the shapes {x.shape} and {times.shape}."
-            )
-    distances = np.diff(times)
-    if not np.all(distances > 0) or np.ptp(distances) > 1e-3 * distances.mean():
-        raise ValueError(
-            "fit_against_data: `times` must increase by equal distances; received distances from "
-            f"{distances.min():.6g} to {distances.max():.6g}."
-        )
-    return times, measured, simulated
-
-
-def _spectrum(values, rate):
-    """Frequencies, and roots of the power spectral density, by Welch's method."""
-    values = np.where(np.isfinite(values), values, 0.0)
-    length = 2 ** int(np.log2(max(8, len(values) // 2)))
-    power, frequency = mlab.psd(values, NFFT=length, Fs=rate, noverlap=length // 2, detrend="mean")
-    return np.asarray(frequency), np.sqrt(power)
 
 
 def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: Any = None, ax: Any = None) -> Any:

@@ -19,6 +19,7 @@ def trajectory(
     units: Any = None,
     time_unit: str = "s",
     label: str | None = None,
+    key: bool = True,
     ax: Any = None,
     **line: Any,
 ) -> Any:
@@ -31,6 +32,7 @@ def trajectory(
         units: a word; or words by entry or leaf, {"x": "m"}; or one of these by quantity, {"q": "rad", "v": "rad/s"}.
         time_unit: of the times.
         label: put before the names of the curves, to tell runs in one chart.
+        key: whether there is a legend; without one the caller makes one, of several axes together.
         ax: axes to draw into, as many as quantities; None for a figure of its own.
         **line: further options of `ax.plot`.
 
@@ -59,7 +61,8 @@ def trajectory(
         for panel, name, found in zip(axes, names, curves, strict=True):
             by_quantity = isinstance(units, dict) and set(units) <= set(SYMBOLS)
             _draw(panel, solution.t, name, found, units.get(name) if by_quantity else units, label, line)
-            legend(panel)
+            if key:
+                legend(panel)
         axes[-1].set_xlabel(with_unit("t", time_unit))
         axes[0].figure.align_ylabels(axes)
     return axes[0] if isinstance(quantities, str) else axes

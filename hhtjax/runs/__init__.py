@@ -3,6 +3,7 @@
     simulate          one run: a `Solution`, whose `check()` names the first step that failed
     sweep             many runs at once, with step sizes, parameters, starts and coefficients of their own
     sweep_to_disk     the same in pieces, which survive being killed
+    adaptive          a tolerance in the place of the step size; `choose_steps` gives the steps alone
     interpolate       what lies between the saved times
 
 Everything composes with `jit`, `vmap` and `grad`: dt, alpha, q0, v0 and params can all be differentiated.
@@ -78,6 +79,19 @@ compare at the times of the measurements.
 >>> run = hhtjax.simulate(pendulum, hhtjax.hht(), q0, v0, params, dt=1e-2, num_steps=600)
 >>> hhtjax.interpolate(run, jnp.array([0.123, 4.56])).q.shape
 (2, 1)
+
+Tolerances
+----------
+
+`dt=adaptive(rtol, atol)` chooses steps by their errors, in one loop, and then runs them; the run is differentiable, and
+the steps constant. `run.steps` tells how many were accepted and rejected, `check()` names the time at which there were
+no more. It pays where a motion has parts of very different speed, as contacts and relaxation; conservative motions of
+one time scale want equal steps, whose errors cancel over a period.
+
+>>> run = hhtjax.simulate(pendulum, hhtjax.hht(), q0, v0, params, dt=hhtjax.adaptive(1e-3, 1e-6), times=[0.123, 4.56])
+>>> run.check()
+>>> run.q.shape
+(3, 1)
 
 Extrapolation
 -------------

@@ -81,22 +81,44 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
         H = jnp.full_like(times, t[1] - t[0])
     x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
 
+    known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
+    a, b = (jax.tree.map(lambda y: y[j], known) for j in (i, i + 1))  # noqa: B023 (called at once)
+    found = between(a, b, H, x)
+    v = None if solution.acceleration is None else found.v
+    return Interpolant(found.q, v) if solution.z is None else InternalInterpolant(found.q, v, found.z)
+
+
+def between(a, b, H, x):
+    """The saved values between those of a and b, which are H apart, at the part x of it, 0 to 1; any leading axes.
+
+    Rates are those of the polynomials where nothing else is known; multipliers are linear.
+    """
+
     def on_axes(x, y):
-        return x.reshape(x.shape + (1,) * (y.ndim - 1))
+        return x.reshape(x.shape + (1,) * (y.ndim - x.ndim))
 
-    def hermite(y, slope):
-        s, h = on_axes(x, y), on_axes(H, y)
-        return y[i] + kinematics.hermite(y[i + 1] - y[i], h * slope[i], h * slope[i + 1], s)
+    def hermite(y0, y1, slope0, slope1):
+        s, h = on_axes(x, y0), on_axes(H, y0)
+        return y0 + kinematics.hermite(y1 - y0, h * slope0, h * slope1, s)
 
-    def position(q, v):
-        if not kinematics.is_rotation(q.shape, v.shape):
-            return hermite(q, v)
-        s, h = on_axes(x, v), on_axes(H, v)
-        return kinematics.interpolate_rotation(q[i], q[i + 1], h * v[i], h * v[i + 1], s)
+    def rate(y0, y1, slope0, slope1):
+        s, h = on_axes(x, y0), on_axes(H, y0)
+        return kinematics.hermite_rate(y1 - y0, h * slope0, h * slope1, s) / h
 
-    first_order = solution.acceleration is None
-    v = None if first_order else jax.tree.map(hermite, solution.v, solution.acceleration)
-    q = jax.tree.map(position, solution.q, solution.v)
-    if solution.z is None:
-        return Interpolant(q, v)
-    return InternalInterpolant(q, v, jax.tree.map(hermite, solution.z, solution.zdot))
+    def position(q0, q1, v0, v1):
+        if not kinematics.is_rotation(q0.shape, v0.shape):
+            return hermite(q0, q1, v0, v1)
+        s, h = on_axes(x, v0), on_axes(H, v0)
+        return kinematics.interpolate_rotation(q0, q1, h * v0, h * v1, s)
+
+    def linear(y0, y1):
+        return y0 + on_axes(x, y0) * (y1 - y0)
+
+    q = jax.tree.map(position, a.q, b.q, a.v, b.v)
+    if a.acceleration is None:
+        return a._replace(q=q, v=jax.tree.map(rate, a.q, b.q, a.v, b.v))
+    velocities, internal = (a.v, b.v, a.acceleration, b.acceleration), (a.z, b.z, a.zdot, b.zdot)
+    v, w = (jax.tree.map(f, *velocities) for f in (hermite, rate))
+    z, zdot = (jax.tree.map(f, *internal) for f in (hermite, rate))
+    L = jax.tree.map(linear, a.multipliers, b.multipliers)
+    return a._replace(q=q, v=v, acceleration=w, multipliers=L, z=z, zdot=zdot)

@@ -12,6 +12,7 @@ from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_law import is_settled
 from hhtjax.steppers.stepper import Info, public
 from hhtjax.systems import held
+from hhtjax.systems.matrices import mass_flaw
 from hhtjax.xla import staged
 
 
@@ -35,9 +36,44 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     return Loop(carry, counted(take_step, flat, t0, dt), partial(saved, flat), no_info)
 
 
-def advance_from(flat, stepper, dtype, params, t, dt, count):
-    """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken."""
-    take_step = held.bind(stepper.astype(dtype), flat, params, dt)
+def loop_over(flat, stepper, q, v, t0, params, dt, ends=None):
+    """The same with steps dt (N,), of any sizes; NaN where one is not positive. ends: where they end, if known."""
+    stepper = stepper.astype(q.dtype)
+    dt = jnp.where((dt > 0) & jnp.isfinite(dt), dt, jnp.nan)
+    steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt) if ends is None else ends
+    first = dt[0]
+
+    @partial(jax.jit, inline=True)  # traced once, wherever it is called
+    def take_step(state, number):
+        h, last, end = (lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps)
+        state, info = resized_step(flat, stepper, params, h, last)(state)
+        return state._replace(t=end), info
+
+    def step(carry):
+        state, count, failure = carry
+        state, info = take_step(state, count)
+        return (state, count + 1, _first_failure(flat, failure, count + 1, state, info)), info
+
+    start = stepper.begin(flat, q, v, t0, held.before(params, t0, first), first)
+    no_info = neutral_info(jax.eval_shape(take_step, start, 0)[1])
+    carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
+    return Loop(carry, step, partial(saved, flat), no_info)
+
+
+def resized_step(flat, stepper, params, dt, last):
+    """State -> (State, Info) for a step dt after one of another size."""
+
+    def step(state):
+        resized, state = stepper.resized(state, dt / last)
+        return held.bind(resized, flat, params, dt, last)(state)
+
+    return step
+
+
+def advance_from(flat, stepper, dtype, params, t, dt, count, last=None):
+    """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken, each of size `last`."""
+    stepper = stepper.astype(dtype)
+    take_step = held.bind(stepper, flat, params, dt) if last is None else resized_step(flat, stepper, params, dt, last)
     return counted(take_step, flat, t, dt, count)
 
 
@@ -61,14 +97,23 @@ def saved(flat, state):
     return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot, state.friction
 
 
-def as_solution(flat, start, path, dt, info, failure):
-    """The start and the path after it as a `Solution`."""
+def as_solution(flat, start, path, dt, info, failure, flaw=None):
+    """The start and the path after it as a `Solution`; flaw: of the mass at the start, as `mass_flaw` says it."""
+    if flaw is not None:
+        failure = failure._replace(step=jnp.where(flaw > 0, 1, failure.step), mass=flaw)
     t, q, v, w, L, *z, friction = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
     q = jax.vmap(flat.unravel)(q)
     v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in (v, w))
     z, zdot = (None if x is None else jax.vmap(flat.unravel_internal)(x) for x in z)
     solution = Solution(t, q, v, w, L, dt, info, failure, z, zdot)
     return solution if friction is None else solution._replace(friction=friction.tau, sticking=friction.sig == 0)
+
+
+def flaw_at_start(system, flat, start, params):
+    """What is wrong with the mass there, where it is a function; a constant one has been looked at."""
+    if not callable(getattr(system, "mass", None)):
+        return None
+    return mass_flaw(flat.mass(start.q, params), system.constraint is not None)
 
 
 def no_failure(info):

@@ -5,19 +5,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from hhtjax.checks import require_integer, require_number, require_params
-from hhtjax.description import is_concrete, thaw
+from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
+from hhtjax.runs.adaptive import Adaptive
+from hhtjax.runs.chosen import run_controlled
 from hhtjax.runs.extrapolate import MOST, extrapolated
-from hhtjax.runs.loop import as_solution, loop_of, show_progress
+from hhtjax.runs.given_steps import refined, require_control_alone, require_steps
+from hhtjax.runs.loop import as_solution, flaw_at_start, loop_of, loop_over, show_progress
+from hhtjax.runs.problem import Problem
 from hhtjax.runs.solution import Solution
-from hhtjax.steppers.stepper import Stepper, join_info, require_capable, require_stepper, require_system
-from hhtjax.systems.consistent import require_consistent
-from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.initial_values import initial_values
-from hhtjax.systems.rubbing import require_independent_friction
+from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import on_scalars, one_kernel, or_plain
 
@@ -31,7 +29,8 @@ def simulate(
     *,
     z0: Any = None,
     dt: Any,
-    num_steps: int,
+    num_steps: int | None = None,
+    times: Any = None,
     t0: Any = 0.0,
     save_every: int = 1,
     progress: bool = False,
@@ -48,15 +47,21 @@ def simulate(
             such as the activations of a neural network in an `equinox.Module`, are part of the program, and told apart
             by identity: a new module of the same structure costs no compilation, a new lambda does.
         z0: internal states of a `System(..., internal=)`, any pytree of arrays.
-        dt: step size, positive. num_steps: number of steps.
+        dt: step size, positive; or (N,), the sizes of N steps, whatever they are, and `num_steps` is left out.
+            The `hht` family keeps its order 2 (with index 3 not in the multipliers), and a `LinearSystem` is factorised
+            anew in each step. A step more than twice as long as the one before can make rho_inf near 0 unstable.
+            Or `adaptive(rtol, atol)`, steps that are chosen by their errors, and constant to derivatives.
+        num_steps: number of steps.
+        times: (K,), with `adaptive`: increasing, after t0. The run ends at the last, and is read off at the others, by
+            cubics between its steps (multipliers by lines).
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
         extrapolate: number of runs, with steps of dt, dt/2, dt/4, ..., that Richardson's extrapolation joins at the
             same saved times, 1 to 4. For a stepper of order p, 2 takes the error dt^p out, for three times the work, 3
-            dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already). For
-            motions that dt resolves, elsewhere it makes errors larger; and for smooth steps, such as
-            linearize="predictor": where "auto" changes its choice, dt^3 is left.
+            dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already; with
+            uneven steps only alpha = 0, of order 3). For motions that dt resolves, elsewhere it makes errors larger;
+            and for smooth steps, such as linearize="predictor": where "auto" changes its choice, dt^3 is left.
         t0: time of the start.
 
     Returns:
@@ -83,44 +88,34 @@ def simulate(
     >>> [round(float(q), 4) for q in solution.q[:, 0]]                       # cos(2 t)
     [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
     """
-    require_system("simulate", system)
-    require_stepper("simulate", stepper)
-    num_steps = require_integer("simulate", "num_steps", num_steps)
+    problem = Problem.checked("simulate", system, stepper, q0, v0, params, t0, z0)
     save_every = require_integer("simulate", "save_every", save_every)
-    if num_steps % save_every:
-        raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
-    params = require_params("simulate", params)
-    require_number("simulate", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    require_number("simulate", "t0", t0, np.isfinite, "be finite")
-    q0, v0, z0 = initial_values("simulate", system, q0, v0, z0)
-    require_capable("simulate", system, stepper, q0, v0)
     if system.friction is not None and extrapolate > 1:
         raise NotImplementedError(
             "simulate: leave `extrapolate` out: with dry friction the error is no power series in dt; "
             f"received {extrapolate}."
         )
-    if system.friction is not None:
-        require_independent_friction("simulate", system, q0, v0, t0, params, z0)
-    if system.constraint is not None:
-        require_consistent("simulate", system, q0, v0, t0, params, stepper.redundant, z0)
-    dt, t0 = (float(x) if is_concrete(x) else x for x in (dt, t0))  # other number types would be compiled anew
+    if isinstance(dt, Adaptive) or times is not None:
+        require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
+        return run_controlled(problem, times, dt, progress)
+    dt, num_steps = require_steps("simulate", stepper, dt, num_steps)
+    if num_steps % save_every:
+        raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every}
-        arguments = system, stepper, q0, v0, params, dt / k, t0, z0
-        return or_plain(partial(_simulate, *arguments, **sizes, progress=progress))
+        return or_plain(partial(_simulate, problem, refined(dt, k), **sizes, progress=progress))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "save_every", "progress"))
-def _simulate(system, stepper, q0, v0, params, dt, t0, z0, *, num_steps, save_every, progress):
-    params = thaw(params)
-    flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
-    dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
-    loop = loop_of(flat, stepper, q, v, t0, params, dt)
+def _simulate(problem, dt, *, num_steps, save_every, progress):
+    flat, q, v, t0, params = problem.flat()
+    dt = jnp.asarray(dt).astype(q.dtype)
+    loop = (loop_over if dt.ndim else loop_of)(flat, problem.stepper, q, v, t0, params, dt)
 
     def with_progress(carry):
         carry, info = loop.advance(carry)
@@ -147,4 +142,7 @@ def _simulate(system, stepper, q0, v0, params, dt, t0, z0, *, num_steps, save_ev
         return checkpointed_scan(interval, carry, num_steps // save_every)
 
     (_, _, failure), (path, info) = one_kernel(run, form.tree)
-    return as_solution(flat, loop.carry[0], form.joined(path), dt, info, failure)
+    start = loop.carry[0]
+    return as_solution(
+        flat, start, form.joined(path), dt, info, failure, flaw_at_start(problem.system, flat, start, params)
+    )

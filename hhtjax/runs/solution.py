@@ -28,6 +28,8 @@ class Failure(NamedTuple):
         solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is
             the library's own.
         friction: `info.friction`, if that was too much, else 0; None without dry friction.
+        mass: what is wrong with a mass that is a function, at the start: 0 nothing, 1 it is not symmetric, 2 not
+            positive definite (with constraints: not positive semidefinite); None where the mass is constant.
     """
 
     step: Any
@@ -36,6 +38,7 @@ class Failure(NamedTuple):
     row: Any = None
     solve: Any = None
     friction: Any = None
+    mass: Any = None
 
     def _verdict(self):
         """How many failed, or what did."""
@@ -44,6 +47,8 @@ class Failure(NamedTuple):
             return ""
         if step.ndim or not step:
             return f"{np.count_nonzero(step)} of {step.size} runs failed" if step.any() else "no step failed"
+        if flaw := known(self.mass):
+            return f"the mass is not {MASS[int(flaw)]}"
         if known(self.newton):
             return "Newton did not converge"
         if known(self.solve):
@@ -57,6 +62,7 @@ QUANTITIES = (
     "the position q", "the velocity v", "the acceleration", "the vector of multipliers",
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
+MASS = (None, "symmetric", "positive definite")
 INTERNAL_STATE = 4  # among them
 
 
@@ -68,13 +74,17 @@ class Solution(NamedTuple):
         t: (K + 1,).
         q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order system y, y' and None.
         multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L.
-        dt: the step size; (K,) of a sweep over `times`, one for each interval.
+        dt: the step size; (N,) of steps that were given, one for each; (K,) of a sweep over `times`, one for each
+            interval.
         info: `Info` for each of the K intervals between saved times: largest residual, number of Newton iterations, all
             converged; None where the method has nothing to tell.
         failure: the first step that failed, a `Failure`; `check` turns it into an error.
         z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without.
         friction: tau (K + 1, m), dry friction, positive against positive sliding; None without.
         sticking: (K + 1, m), whether a joint sticks; None without.
+        steps: what error control chose, the `Steps`; dt are those accepted. None without.
+        error: (K + 1,) of a run with `adaptive(verify=)`, that of q at each saved time, in its largest coordinate.
+        allowed: what `check` lets pass of it, 10 (rtol max|q| + atol).
     """
 
     t: Any
@@ -89,6 +99,9 @@ class Solution(NamedTuple):
     zdot: Any = None
     friction: Any = None
     sticking: Any = None
+    steps: Any = None
+    error: Any = None
+    allowed: Any = None
 
     def check(self, reach=None):
         """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
@@ -98,13 +111,17 @@ class Solution(NamedTuple):
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
-        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t)))):
+        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t, self.steps, self.error)))):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         if fault := self._fault(reach):
             raise SimulationError(f"simulate: {fault}")
 
     def _fault(self, reach=None):
         """What is wrong with the run, in words; None where nothing is."""
+        if self.steps is not None and (fault := self.steps._fault()):
+            return fault
+        if self.error is not None and (fault := self._excess()):
+            return fault
         dt = np.asarray(self.dt)
         if np.any(dt <= 0):  # what is not finite shows in the state
             return f"`dt` must be positive and finite; it was {dt[dt <= 0].flat[0]:g}."
@@ -128,6 +145,21 @@ class Solution(NamedTuple):
         )
         return f"{which}step {step} (to t = {time:.6g}) failed: {why}."
 
+    def _excess(self):
+        """Where the error of the whole run is more than what was asked for, in words."""
+        error, allowed = np.asarray(self.error), np.asarray(self.allowed)
+        bad = ~(error <= allowed[..., None])
+        if not bad.any():
+            return None
+        *member, i = (int(x) for x in np.argwhere(bad)[0])
+        which = f"member {', '.join(map(str, member))}, " if member else ""
+        where = (*member, i)
+        time = np.asarray(self.t)[where]
+        return (
+            f"{which}at t = {time:.6g} the error of the run is {error[where]:.3g}, by a finer run, "
+            f"and {allowed[tuple(member)]:.3g} was allowed, 10 times the tolerance. Take a smaller rtol."
+        )
+
     def _table(self):
         """The run in a line, and its arrays."""
         rows = leaf_rows(q=self.q, v=self.v, acceleration=self.acceleration, multipliers=self.multipliers)
@@ -142,7 +174,7 @@ class Solution(NamedTuple):
         t, dt, *failed = numbers
         runs = failed[0].shape
         fitting = t.ndim == len(runs) + 1 and t.shape[:-1] == runs and all(x.shape == runs for x in failed)
-        if not fitting or not t.size or dt.shape not in (runs, (*runs, t.shape[-1] - 1)):
+        if not fitting or not t.size or dt.shape[: t.ndim - 1] != runs or dt.ndim > t.ndim:
             return f"t {brief(self.t)}"
         batch = f"{failed[0].size} runs {runs}, each of " if runs else ""
         fault = self._fault()
@@ -153,7 +185,10 @@ class Solution(NamedTuple):
 
     def _why(self, member):
         """What `failure` says of one member of a batch."""
-        _, newton, quantity, row, left, friction = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
+        _, newton, quantity, row, left, friction, mass = found
+        if mass:
+            return f"`mass` must be {MASS[mass]}; at the start, mass(q0, params) is not"
         if left:
             return (
                 f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "
@@ -199,16 +234,26 @@ class Solution(NamedTuple):
         """How many steps come before each saved time."""
         t, dt = np.asarray(self.t), np.asarray(self.dt)
         with np.errstate(all="ignore"):  # what was traced may be anything
-            if dt.ndim < t.ndim:
+            if self._is_every_step():
+                taken = np.arange(t.shape[-1]) * (dt.shape[-1] // (t.shape[-1] - 1))
+                taken = np.broadcast_to(taken, t.shape)
+            elif dt.ndim < t.ndim:
                 taken = (t - t[..., :1]) / dt[..., None]
             else:
                 counts = np.nan_to_num(np.rint(np.diff(t) / dt), nan=1)
                 taken = np.insert(np.cumsum(counts, axis=-1), 0, 0, axis=-1)
         return np.rint(np.nan_to_num(taken, posinf=0, neginf=0)).astype(int)
 
+    def _is_every_step(self):
+        """Whether dt has the size of each step, and more than one of them may come before a saved time."""
+        K = self.t.shape[-1] - 1
+        return np.ndim(self.dt) == self.t.ndim and self.dt.shape[-1] != K
+
     def _time_of(self, step, member):
         """The time at which a step of a member of a batch ends."""
         taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
+        if self._is_every_step():
+            return t[0] + np.sum(np.asarray(self.dt)[member][:step])
         dt = np.broadcast_to(np.asarray(self.dt)[member], t[1:].shape)
         i = np.clip(np.searchsorted(taken, step) - 1, 0, dt.size - 1)
         return t[i] + (step - taken[i]) * dt[i]

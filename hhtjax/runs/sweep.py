@@ -11,7 +11,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
-from hhtjax.runs.loop import advance_from, as_solution, loop_of, show_progress
+from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
@@ -51,8 +51,7 @@ def sweep(
         duration: positive. num_samples: K, the number of samples after the start.
         times: (K,), in the place of both: strictly increasing, after t0; data too. Steps end at each: unlike SciPy's
             `t_eval` they shorten steps, and dts are upper bounds, like its `max_step`. A dt larger than H, or infinite,
-            takes the one step H. The `hht` family is of order 2 as dts shrink between given times; where there is one
-            step from sample to sample, unequal ones add an error of first order unless alpha = 0.
+            takes the one step H. The `hht` family is of order 2 whatever they are.
         in_axes: what else differs between members: (stepper, q0, v0, params), or one more for z0, each 0 where all its
             arrays have a leading axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A
             stepper with an axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
@@ -146,11 +145,14 @@ def _by_many(hand, mesh):
 def _run(system, data, dt, substeps, longest, t0, num_samples, times):
     """One member; it rests from `substeps` to `longest`, where its block still works.
 
-    With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval.
+    With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval, and
+    after the first step there, where that is to know of the steps before.
     """
     stepper, q0, v0, params, z0 = *data[:3], thaw(data[3]), data[4]
     flat, q, v = flatten("sweep", system, q0, v0, t0, params, z0)
-    intervals = None if times is None else (times[:-1], dt, substeps, longest)
+    resizes = times is not None and stepper.resizes
+    whole = in_two_parts if resizes else lambda *intervals: intervals
+    intervals = None if times is None else whole(times[:-1], dt, substeps, longest)
     loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
     form = on_scalars(loop.advance, loop.carry)
     keep = form.of(loop.keep)
@@ -159,23 +161,38 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
         """The step, and how many of them this member takes, and its block."""
         if interval is None:
             return form.of(loop.advance), substeps, longest
-        t, h, mine, most = interval
-        return form.of(advance_from(flat, stepper, q.dtype, params, t, h, run[1])), mine, most
+        t, h, mine, most, *part = interval
+        taken, last = part or (None, None)
+        count = run[1] if taken is None else run[1] - taken
+        return form.of(advance_from(flat, stepper, q.dtype, params, t, h, count, last)), mine, most
 
-    @checkpoint
-    def interval(run, here):
-        advance, substeps, longest = pace(run, here)
+    def part(carry, here):
+        advance, substeps, longest = pace(carry[0], here)
 
         def step(i, carry):
             run, info = advance(carry[0])
             new = run, join_info(carry[1], info)
             return jax.tree.map(partial(jnp.where, i < substeps), new, carry)
 
-        run, info = repeat(step, (run, loop.no_info), longest)
+        return repeat(step, carry, longest), None
+
+    @checkpoint
+    def interval(run, here):
+        carry = run, loop.no_info
+        (run, info), _ = lax.scan(part, carry, here) if resizes else part(carry, here)
         return run, (keep(run[0]), info)
 
     def samples(carry):
         return lax.scan(interval, carry, intervals, num_samples)
 
     (_, _, failure), (path, info) = one_kernel(samples, form.tree)
-    return as_solution(flat, loop.carry[0], form.joined(path), dt, info, failure)
+    start = loop.carry[0]
+    return as_solution(flat, start, form.joined(path), dt, info, failure, flaw_at_start(system, flat, start, params))
+
+
+def in_two_parts(t, dt, substeps, longest):
+    """The intervals (K, 2), the first step of each apart; behind them the steps before it, and the size of the last."""
+    last = jnp.concatenate([dt[:1], dt[:-1]])
+    firsts = t, dt, jnp.ones_like(substeps), jnp.ones_like(longest), jnp.zeros_like(substeps), last
+    others = t, dt, substeps - 1, longest - 1, jnp.ones_like(substeps), dt
+    return tuple(map(partial(jnp.stack, axis=1), zip(firsts, others, strict=True)))

@@ -27,26 +27,26 @@ def require_one_grid(stepper, duration, num_samples, times):
     require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
 
 
-def require_times(times, t0, dtype):
+def require_times(times, t0, dtype, caller="sweep"):
     """times (K,) in the dtype of the state, in which they must increase, checked as far as they are known."""
     times = times if is_array(times) else np.asarray(times)
     if not is_real(times):
-        raise TypeError(f"sweep: `times` must be real numbers; received {times!r}.")
+        raise TypeError(f"{caller}: `times` must be real numbers; received {times!r}.")
     if times.ndim != 1 or not times.size:
-        raise ValueError(f"sweep: `times` must have shape (K,), one or more; received {times.shape}.")
+        raise ValueError(f"{caller}: `times` must have shape (K,), one or more; received {times.shape}.")
     if not is_concrete(times):
         return times
     times = np.asarray(times).astype(dtype)
     if not np.all(np.isfinite(times)):
         bad = int(np.argmin(np.isfinite(times)))
-        raise ValueError(f"sweep: `times` must be finite; received times[{bad}] = {times[bad]}.")
+        raise ValueError(f"{caller}: `times` must be finite; received times[{bad}] = {times[bad]}.")
     before = np.full(1, t0 if is_concrete(t0) else -np.inf, dtype)
     late = np.diff(times, prepend=before) > 0
     if not late.all():
         bad = int(np.argmin(late))
         last = f"times[{bad - 1}] = {times[bad - 1]}" if bad else f"t0 = {before[0]}"
         raise ValueError(
-            f"sweep: `times` must be strictly increasing, and after t0, in {times.dtype}; "
+            f"{caller}: `times` must be strictly increasing, and after t0, in {times.dtype}; "
             f"received times[{bad}] = {times[bad]} after {last}."
         )
     return times

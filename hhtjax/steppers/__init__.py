@@ -23,11 +23,12 @@ stepper                            order                 solves per step   for
                                    damping, else 1
 `implicit_euler()`                 1                     Newton's          robustness
 `rk4()`                            4                     explicit          where nothing is stiff
+`dopri5()`                         5                     explicit          the same with a tolerance, `adaptive`
 =================================  ====================  ================  ==========================================
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
 Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it. Internal
-states are for the `hht` family, `rosenbrock`, `rowda` and `rk4`. Dry friction is for the `hht` family.
+states are for the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`. Dry friction is for the `hht` family.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
 of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
@@ -40,8 +41,9 @@ a point of linearisation that is cheap and good enough: which is best is measure
 Which one
 ---------
 
-Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker. If more than five digits are
-wanted of something stiff, take `rowda()`, or `simulate(..., extrapolate=2)`. For fitting by gradients take
+Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and `dopri5()` with a tolerance.
+If more than five digits are wanted of something stiff, take `rowda()`, or `simulate(..., extrapolate=2)`. For fitting
+by gradients take
 `hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are to be far longer than the
 fastest vibration and the run blows up, try `hht(linearize="held")`, more damping (`alpha=-0.3`), or
 `hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`, and what became of
@@ -89,9 +91,14 @@ out, and a family that knows them sets `solves_internal = True`.
 >>> abs(float(run.q[-1, 0] - jnp.cos(10.0))) < 5e-3
 True
 
+A method that remembers something of the size of the last step has a `resized`, too, as in `unequal.py`.
+
 A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
 `implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
 refusals are tested on all problems there; what is its own gets a test with a closed form.
+
+For error control, `simulate(..., dt=adaptive(...))`, a method also has an `estimate_order` k, a `begin_estimates`, and
+a `bind_estimated`, whose step returns the errors, of size h^k, too (`estimate.py`).
 
 Sources
 -------
@@ -109,6 +116,7 @@ Sources
 * O. Bruls, A. Cardona, J. Comput. Nonlinear Dyn. 5 (2010) 031002: `kinematics="lie"`.
 * E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, Sec. IV.7: `rosenbrock`.
 * C. Lubich, M. Roche, Computing 43 (1990) 325-342: `rowda`.
+* J. Dormand, P. Prince, J. Comput. Appl. Math. 6 (1980) 19-26: `dopri5`.
 * J. Houbolt, J. Aeronaut. Sci. 17 (1950) 540-550: `houbolt`. K. Park, J. Appl. Mech. 42 (1975) 464-470: `park`.
 * E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1 (1973) 241-252: `wilson`.
 * H. Hilber, T. Hughes, Earthquake Eng. Struct. Dyn. 6 (1978) 99-117: `collocation`.

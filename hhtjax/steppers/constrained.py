@@ -89,9 +89,9 @@ def bind_constrained(method, system, params, dt):
         if options.iterations is None:
             z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
         else:
-            z, info = linearized_solve(r, path, z, factorize)
+            z, info = linearized_solve(r, path, z, factorize, again=method.estimating)
             for _ in range(options.iterations - 1):
-                z, more = linearized_solve(r, path, z, factorize)
+                z, more = linearized_solve(r, path, z, factorize, again=method.estimating)
                 info = join_info(info, more)
         s1 = system.tidy(path(z))
         return s1, report_constraints(method, system, params, dt, s, s1, info, B)

@@ -73,9 +73,9 @@ def _settle(system, at, factorize, H, K, own, L):
     rests, zero = sig == 0, jnp.zeros_like(f)
     free = _smooth(system, sig, zero, L)
     if system.num_constraints:
-        w, _ = acceleration_and_multipliers(free, *at, factorize)
+        w, _ = acceleration_and_multipliers(free, *at, factorize=factorize)
     else:
-        w = free.acceleration(*at, factorize)
+        w = free.acceleration(*at, factorize=factorize)
     slides, tau = at_rest(K, rests, matvec(H, w) + own, f, zero)
     return jnp.where(rests, slides, sig), jnp.where(rests, tau, sig * f)
 

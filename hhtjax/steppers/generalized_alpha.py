@@ -16,6 +16,7 @@ from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with, reuse
 from hhtjax.numerics.low_rank import Changing
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
+from hhtjax.steppers.estimate import Controlled
 from hhtjax.steppers.friction import begin_friction, bind_friction
 from hhtjax.steppers.linearization import linearization_point, refresh
 from hhtjax.steppers.newton import linearized_solve, newton
@@ -37,9 +38,9 @@ def step(method, system, params, factorize, where, dt, s):
         w, info = newton(system, r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
         return system.tidy(path(w)), info
     at = linearization_point(system, params, s, path(s.w), where)
-    w, info = linearized_solve(r, path, s.w, factorize, at)
+    w, info = linearized_solve(r, path, s.w, factorize, at, method.estimating)
     for _ in range(options.iterations - 1):
-        w, more = linearized_solve(r, path, w, factorize)
+        w, more = linearized_solve(r, path, w, factorize, again=method.estimating)
         info = join_info(info, more)
     s1 = path(w)
     if where == "state" and options.iterations == 1:
@@ -49,12 +50,13 @@ def step(method, system, params, factorize, where, dt, s):
 
 
 @dataclass(frozen=True, eq=False)
-class GeneralizedAlpha(Stepper):
+class GeneralizedAlpha(Controlled, Stepper):
     """A method of the family; made by `hht`, `newmark`, `bossak` and `generalized_alpha`."""
 
     coefficients: Coefficients
     order: int
     options: Options
+    estimating: bool = False  # whether steps tell their defect
 
     solves_constraints = True
     solves_rotations = True

@@ -17,16 +17,17 @@ RELATIVE = 1e-6  # of the terms of a row, above which its residual is never smal
 SHAKE, NOISE, SHAKES = 2, 32, 3  # roundings by which a state is changed; how much more than that passes; how often
 
 
-def linearized_solve(r, path, w, factorize, at=None):
+def linearized_solve(r, path, w, factorize, at=None, again=False):
     """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)), and its `Info`.
 
-    One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's.
+    One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's. again: one solve
+    more, of the residual at the end, which becomes `Info.defect`.
     """
-    w, info, _, _ = solve_and_keep(r, path, w, factorize, at)
+    w, info, _, _ = solve_and_keep(r, path, w, factorize, at, again)
     return w, info
 
 
-def solve_and_keep(r, path, w, factorize, at=None):
+def solve_and_keep(r, path, w, factorize, at=None, again=False):
     """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
 
     def expand(w, at):
@@ -46,6 +47,10 @@ def solve_and_keep(r, path, w, factorize, at=None):
     inverse = factorize_map(f, value, factorize)
     dw = inverse(value)
     return w - dw, told(factorize, left_by(factorize, f, value, dw)), inverse, along
+    solve = factorize_map(f, value, factorize)
+    dw = solve(value)
+    info = told(factorize, left_by(factorize, f, value, dw))
+    return w - dw, info._replace(defect=solve(r(path(w - dw)))) if again else info
 
 
 def left_by(factorize, f, b, x):

@@ -22,22 +22,26 @@ import jax.numpy as jnp
 from hhtjax.checks import require_number
 from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import factorize_map
+from hhtjax.steppers.estimate import Embedded, Errors
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.xla import staged
 
+EMBEDDED = 0.47990028, 0.51762038, 0.00247934, 0.0  # of order 2, L-stable, from the stages of `rowda`
+
 
 class Tableau(NamedTuple):
-    """g, and the rows of A and G below the diagonal, of any length up to it; b."""
+    """g, and the rows of A and G below the diagonal, of any length up to it; b, and the one of an embedded method."""
 
     g: Any
     A: tuple
     G: tuple
     b: tuple
+    embedded: tuple
 
 
 @dataclass(frozen=True, eq=False)
-class Rosenbrock(Stepper):
+class Rosenbrock(Embedded, Stepper):
     """A method given by its tableau; made by `rosenbrock` and `rowda`."""
 
     tableau: Tableau
@@ -45,12 +49,26 @@ class Rosenbrock(Stepper):
 
     solves_internal = True
 
+    @property
+    def estimate_order(self):
+        """One more than the order of the embedded method, which is one less than that of this."""
+        return self.order
+
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
 
     def bind(self, system, params, dt):
-        """The step; for a linear system its matrix is factorised here, once."""
+        """The step without its estimate."""
+        step = self.bind_pair(system, params, dt, estimating=False)
+
+        def plain(s):
+            return step(s)[:2]
+
+        return plain
+
+    def bind_pair(self, system, params, dt, estimating=True):
+        """State -> State, Info, Errors; for a linear system the matrix is factorised here, once."""
         g, r = self.tableau.g, partial(residual, system, params)
         zero, instant = jnp.zeros(system.size, dt.dtype), jnp.zeros_like(dt)
 
@@ -66,14 +84,18 @@ class Rosenbrock(Stepper):
         def step(s):
             value, tangent = staged(partial(jax.linearize, r), system.size)(s)
             solve = once if system.linear else factorized(tangent)
-            return stages(system, self.tableau, s, dt, r, value, tangent, solve), Info()
+            end, errors = stages(system, self.tableau, s, dt, r, value, tangent, solve)
+            if estimating and not system.linear:  # what the derivatives at the start do not know of the end
+                d = g * dt * jnp.abs(solve(r(end)))
+                errors = Errors(jnp.abs(errors.q) + g * dt * d, jnp.abs(errors.v) + d)
+            return end, Info(), errors
 
         return step
 
 
 def stages(system, tableau, s, dt, r, value, tangent, solve):
-    """The state at t + dt, by the formulas at the top of this file; value, tangent: of r at s."""
-    g, A, G, b = tableau
+    """The state at t + dt, by the formulas at the top of this file, and its errors; value, tangent: of r at s."""
+    g, A, G, b, embedded = tableau
     zero = jnp.zeros(system.size, s.q.dtype)
 
     def increment(weights, rates):
@@ -103,7 +125,8 @@ def stages(system, tableau, s, dt, r, value, tangent, solve):
         if row != before:
             started, before = staged(partial(start, row))(rates), row
         rates.append(staged(partial(stage, coupling))(rates, *started))
-    return moved(dt, b, rates)
+    e_q, e_v, _ = increment([x - y for x, y in zip(b, embedded, strict=True)], rates)
+    return moved(dt, b, rates), Errors(e_q, e_v)
 
 
 def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:
@@ -137,7 +160,7 @@ def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:
     """
     rho = require_number("rosenbrock", "rho_inf", rho_inf, lambda x: 0 <= x <= 1, "lie in [0, 1]")
     g = 0.5 / (1 + ((1 + rho) / 2) ** 0.5)
-    return Rosenbrock(Tableau(g, ((), (g,)), ((), (-2 * g**2,)), (1 - 0.5 / g, 0.5 / g)), 2)
+    return Rosenbrock(Tableau(g, ((), (g,)), ((), (-2 * g**2,)), (1 - 0.5 / g, 0.5 / g), (1.0, 0.0)), 2)
 
 
 def rowda() -> Rosenbrock:
@@ -155,4 +178,4 @@ def rowda() -> Rosenbrock:
     """
     stage_2, stage_3 = (0.5,), (0.28, 0.72)  # stage 4 starts from where stage 3 does
     G = (), (-0.1121794871794876,), (2.54, -3.84), (29 / 75, -0.72, 1 / 30)
-    return Rosenbrock(Tableau(0.3, ((), stage_2, stage_3, stage_3), G, (2 / 3, 0.0, 1 / 30, 0.3)), 3)
+    return Rosenbrock(Tableau(0.3, ((), stage_2, stage_3, stage_3), G, (2 / 3, 0.0, 1 / 30, 0.3), EMBEDDED), 3)

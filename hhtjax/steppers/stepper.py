@@ -77,6 +77,8 @@ class Info(NamedTuple):
         solved: whether that is within its tolerance.
         friction: how exactly the switches of several joints in one step are resolved, relative to the limits of dry
             friction; infinite where a limit is negative or not a number.
+        defect: S^-1 r, what a linearised step has left of its residual at its end, as a correction of the unknowns
+            (under error control only).
     """
 
     residual: Any = None
@@ -88,6 +90,7 @@ class Info(NamedTuple):
     solve_residual: Any = None
     solved: Any = None
     friction: Any = None
+    defect: Any = None
 
     def _verdict(self):
         """Of several steps."""
@@ -99,7 +102,12 @@ class Info(NamedTuple):
 
 def join_info(info, new):
     """Info of several steps as one: largest residuals, number of iterations, all converged."""
-    join = {"iterations": jnp.add, "converged": jnp.logical_and, "solved": jnp.logical_and}
+    join = {
+        "iterations": jnp.add,
+        "converged": jnp.logical_and,
+        "solved": jnp.logical_and,
+        "defect": lambda _, new: new,
+    }
     pairs = {name: (x, getattr(new, name)) for name, x in info._asdict().items() if x is not None}
     return info._replace(**{name: join.get(name, jnp.maximum)(*pair) for name, pair in pairs.items()})
 
@@ -124,6 +132,9 @@ class Stepper(Description):
     solves_internal = False
     solves_friction = False
     needs_equal_steps = False  # what it remembers belongs to steps of one size
+    resizes = False  # whether `resized` does anything
+    estimate_order: int | None = None  # power of h with which the estimated error of a step falls; None without
+    dense_term = False  # whether its memory is what dense output adds to cubics
     redundant: str | None = None  # how constraints that depend on each other are solved
 
     def begin(self, system, q, v, t, params, dt) -> State:
@@ -133,6 +144,20 @@ class Stepper(Description):
     def bind(self, system, params, dt):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
         raise NotImplementedError
+
+    def resized(self, state, r):
+        """The stepper and the state for a step r times as long as the one before: by default the same.
+
+        For those who write their own loop, before a step of another size:
+
+        >>> import jax.numpy as jnp, hhtjax
+        >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
+        >>> stepper = hhtjax.hht()
+        >>> state, _ = stepper.step(spring, stepper.init(spring, jnp.ones(1), jnp.zeros(1), None, 0.1), None, 0.1)
+        >>> smaller, state = stepper.resized(state, 0.5)
+        >>> state, _ = smaller.step(spring, state, None, 0.05)
+        """
+        return self, state
 
     def astype(self, dtype):
         """The same with its arrays, such as a traced alpha, in the dtype of the state."""

@@ -13,6 +13,7 @@ from jax import lax
 from hhtjax.description import freeze, is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.linear_solve import solve_map
+from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import (
     acceleration_and_multipliers,
     check_redundant,
@@ -26,7 +27,7 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 
 MAX_ITERATIONS = 50
-CONSISTENT = 1e-6  # relative distance of initial values from consistent ones that passes
+CONSISTENT = 1e-6  # distance of initial values from consistent ones that passes, beside 1 + |q|, each coordinate
 
 
 @shown
@@ -143,14 +144,19 @@ def nearest_position(system, q0, t, params, factorize):
 
 @partial(jax.jit, static_argnames="redundant")
 def examine(system, q0, v0, t0, params, z0, redundant):
-    """B, and for Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not."""
+    """B, and for Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not, in the
+    coordinate that is farthest, and in that which is farthest beside its own size."""
     params = thaw(params)
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     B = jacobian(flat, q, t, params)
     both = violation(flat, q, v, t, params)
     away = partial(correction, flat, q, t, params, factorize=factorize_constrained(flat.size, redundant))
-    return B, [(jnp.max(jnp.abs(x)), jnp.max(jnp.abs(away(x)))) for x in both]
+    found = []
+    for x, size in zip(both, (kinematics.sizes(flat.blocks, q), flat.located(jnp.abs(v))), strict=True):
+        distance = flat.located(jnp.abs(away(x)))
+        found.append((jnp.max(jnp.abs(x)), jnp.max(distance), jnp.max(distance / (1 + size))))
+    return B, found
 
 
 def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None):
@@ -163,9 +169,8 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
         found = jax.tree.map(float, found)
     if redundant is None:
         require_independent(caller, np.asarray(B))
-    for name, meaning, x, (violated, distance) in zip(("q0", "v0"), ("Phi", "dPhi/dt"), (q0, v0), found, strict=True):
-        size = max(np.max(np.abs(leaf)) for leaf in jax.tree.leaves(x))
-        if not distance <= CONSISTENT * (1 + size):
+    for name, meaning, (violated, distance, relative) in zip(("q0", "v0"), ("Phi", "dPhi/dt"), found, strict=True):
+        if not relative <= CONSISTENT:
             raise ValueError(
                 f"{caller}: `{name}` violates the constraint: max|{meaning}| = {violated:.3g}, {distance:.3g} away "
                 "from consistent values; hhtjax.consistent_initial gives them."

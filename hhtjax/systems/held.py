@@ -2,8 +2,8 @@
 
 A step that ends on a jump must not see the new value at its end, nor the next one the old value at its start. So a step
 gets the value in its middle, and where that differs from the step's before, the accelerations and multipliers that the
-state carries on take the jump along: M dw - B^T dL = Q(new) - Q(old), B dw = 0. Steps are taken to be equal, but where
-one ends on a sample of uneven times: the old value there is the one held until then.
+state carries on take the jump along: M dw - B^T dL = Q(new) - Q(old), B dw = 0. Where a step
+ends on a sample of uneven times, the old value there is the one held until then.
 """
 
 import jax
@@ -29,20 +29,20 @@ def before(params, t, dt):
     return _with_held(params, lambda x: x.held_before(t, dt)) if holds(params) else params
 
 
-def bind(stepper, system, params, dt):
-    """`stepper.bind`, with held inputs constant over each step."""
+def bind(stepper, system, params, dt, last=None):
+    """`stepper.bind`, with held inputs constant over each step. last: the step before, where it is another than dt."""
     if not holds(params):
         return stepper.bind(system, params, dt)
 
     def step(s):
         now = held_at(params, s.t + dt / 2)
-        s = _jump(stepper, system, s, before(params, s.t, dt), now)
+        s = jump(stepper, system, s, before(params, s.t, dt if last is None else last), now)
         return stepper.bind(system, now, dt)(s)
 
     return step
 
 
-def _jump(stepper, system, s, old, new):
+def jump(stepper, system, s, old, new):
     """The state with the accelerations and multipliers that belong to the new params."""
     dQ = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old)
     if system.num_constraints:

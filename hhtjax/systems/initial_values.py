@@ -18,7 +18,7 @@ class PrecisionWarning(UserWarning):
     """The state is in single precision."""
 
 
-def initial_values(caller, system, q0, v0, z0=None):
+def initial_values(caller, system, q0, v0, z0=None, level=3):
     """q0, v0 and z0 as arrays of one float dtype, checked; those that the system does not have are None."""
     first_order = isinstance(system, FirstOrderSystem)
     if first_order:
@@ -53,7 +53,7 @@ def initial_values(caller, system, q0, v0, z0=None):
             f"{caller}: in float32 expect about 4 correct digits at best, fewer on stiff systems and small steps: "
             "for float64 call jax.config.update('jax_enable_x64', True) before creating arrays.",
             PrecisionWarning,
-            stacklevel=3,
+            stacklevel=level,
         )
     q0, v0, z0 = (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0, z0))
     return q0, None if first_order else v0, z0

@@ -60,6 +60,11 @@ def terms(blocks, q0, q1, x):
     return _each(blocks, lambda q0, q1, x: jnp.abs(q0) + jnp.abs(q1) + x, lambda R, *_: jnp.ones_like(R), q0, q1, x)
 
 
+def sizes(blocks, q):
+    """Of displacements, (n,): |q| of positions, and one radian for rotations."""
+    return _each(blocks, jnp.abs, lambda R: jnp.ones(3, R.dtype), q)
+
+
 def orthonormalize(blocks, q):
     """q with the rounding errors of its rotations squared."""
     return _each(blocks, lambda q: q, rotation.orthonormalize, q)
@@ -94,6 +99,11 @@ def end_of_chart(blocks, x, v, w, a):
 def hermite(rise, d0, d1, s):
     """The cubic in s from 0 at 0 to `rise` at 1, with slopes d0 and d1 there."""
     return s * (d0 + s * (3 * rise - 2 * d0 - d1 + s * (d0 + d1 - 2 * rise)))
+
+
+def hermite_rate(rise, d0, d1, s):
+    """Its slope."""
+    return d0 + s * (2 * (3 * rise - 2 * d0 - d1) + s * (3 * (d0 + d1 - 2 * rise)))
 
 
 def interpolate_rotation(R0, R1, d0, d1, s):

@@ -2,10 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from hhtjax.description import is_array, is_concrete, is_real
 
-LARGEST_CHECKED = 256  # rows of a constant mass matrix whose eigenvalues are looked at
+LARGEST_CHECKED = 256  # rows of a mass matrix that is looked at
 LARGEST_DENSE = 5000  # rows of a sparse matrix that is made dense: 200 MB
 SYMMETRIC = 1e-6  # relative size of M - M^T that passes
 
@@ -84,3 +85,29 @@ def require_mass(caller, name, M, massless=False):
     if smallest < -rounding or (not massless and smallest <= rounding):
         what = "singular" if smallest >= -rounding else "not"
         raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is {what}.")
+
+
+UNSYMMETRIC, INDEFINITE = 1, 2  # what mass_flaw finds
+
+
+def mass_flaw(M, massless):
+    """What `require_mass` would find wrong with a mass that is known when it runs, as a number; 0: nothing.
+
+    NaN passes: the acceleration tells of it.
+    """
+    if len(M) > LARGEST_CHECKED:
+        return jnp.zeros((), jnp.int32)
+    M = lax.stop_gradient(M)
+    symmetric, rounding = jnp.array(True), 0.0
+    smallest = jnp.min(M if M.ndim == 1 else jnp.diagonal(M))
+    if M.ndim == 2 and len(M) > 1:
+        n, d, rounding = len(M), jnp.diagonal(M), float(jnp.finfo(M.dtype).eps)
+        size = jnp.sqrt(jnp.where(d > 0, d, 1))
+        scaled = M / jnp.outer(size, size)
+        symmetric = ~(jnp.max(jnp.abs(scaled - scaled.T)) > SYMMETRIC + 16 * n * rounding)
+        shift = 8 * n * rounding * massless * jnp.eye(n, dtype=M.dtype)
+        pivots = jnp.diagonal(lax.linalg.cholesky(scaled + shift)) ** 2  # NaN where there is none
+        smallest = jnp.where(smallest > 0, jnp.min(jnp.where(jnp.isnan(pivots), -1, pivots)), smallest)
+    positive = (smallest >= -rounding) if massless else (smallest > rounding)
+    flaw = jnp.where(symmetric, jnp.where(positive, 0, INDEFINITE), UNSYMMETRIC)
+    return jnp.where(jnp.any(jnp.isnan(M)), 0, flaw).astype(jnp.int32)

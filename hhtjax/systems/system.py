@@ -20,7 +20,8 @@ class System(Description):
     Args:
         mass: M, the generalised mass matrix: `mass(q, params)`, or an array where M is constant.
             Shape (n, n), symmetric positive definite, or (n,) for a diagonal. Its rows follow
-            `jax.flatten_util.ravel_pytree(v)`; for a dict that is the order of the *sorted* keys.
+            `jax.flatten_util.ravel_pytree(v)`; for a dict that is the order of the *sorted* keys. What is no such
+            matrix is an error here if it is an array, and named by `Solution.check` if it is so where a run starts.
         force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v.
         constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), m <= n, rows independent. Then
             M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.

@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows nine functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows ten functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -43,6 +43,7 @@ The rest of the library knows nine functions of this room, and works as well on 
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
     linear_map(f, like)       the matrix of a linear map, from what depends on what
+    listed(f, *args)          f as a list of operations on scalars, to be written in another language
     explain(f, *args)         what became of the loops of a program
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
@@ -50,11 +51,13 @@ The rest of the library knows nine functions of this room, and works as well on 
 The contract
 ------------
 
-The same program gives the same numbers with and without, to rounding; signed zeros, NaN and infinities included. One
-licence: inside a sum of products a term with a factor that is zero by structure (a unit vector, a tangent that autodiff
-knows to be zero) may be left out, and the sign of a sum that is zero is rounding (XLA itself takes x + 0 for x). A rule
-names the parameters of its operation that it understands; what it does not understand runs on whole arrays. So a JAX
-that brings a new operation, or a new option of an old one, makes programs slower, and never wrong.
+The same program gives the same numbers with and without, to rounding; signed zeros, NaN and infinities included. Two
+licences: inside a sum of products a term with a factor that is zero by structure (a unit vector, a tangent that
+autodiff knows to be zero) may be left out, and the sign of a sum that is zero is rounding (XLA itself takes x + 0 for
+x). And in reverse mode such a zero becomes a number where a stage ends, as where a scan does: beside an infinite
+derivative, that of 1/x at zero, it makes NaN where plain JAX may have infinity. A rule names the parameters of its
+operation that it understands; what it does not understand runs on whole arrays. So a JAX that brings a new operation,
+or a new option of an old one, makes programs slower, and never wrong.
 
 A rule for an operation
 -----------------------
@@ -73,13 +76,19 @@ from hhtjax.xla.explanation import Explanation, explain
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.kernels import choose, one_kernel, staged, structural
 from hhtjax.xla.linear_maps import linear_map
+from hhtjax.xla.listing import Listing, Scalar
+from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.scalars import on_scalars
 
 __all__ = [
     "Explanation",
+    "Listing",
+    "NotListed",
+    "Scalar",
     "choose",
     "explain",
     "linear_map",
+    "listed",
     "on_scalars",
     "one_kernel",
     "or_plain",

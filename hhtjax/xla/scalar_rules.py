@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.xla.arithmetic import LAX, compute, recorder_of
 from hhtjax.xla.parameters import ELEMENTWISE
 from hhtjax.xla.pieces import ZEROS, arranged, each, is_known, is_structural, pieces, unmarked
 
@@ -26,7 +27,10 @@ def _elementwise(eqn, *values):
 
 def _scalar(eqn, dtype, *x):
     """One operation on scalars, or what is known without it."""
-    found = _without(eqn.primitive.name, dtype, *x)
+    name = eqn.primitive.name
+    found = _without(name, dtype, *x)
+    if found is None and (recorder := recorder_of(x)) is not None:
+        return recorder.record(name, dtype, *x, **{key: eqn.params[key] for key in RECORDED if key in eqn.params})
     if found is None:
         with eqn.ctx.manager:
             found = eqn.primitive.bind(*map(unmarked, x), **eqn.params)
@@ -63,7 +67,7 @@ def _sum(dtype, x, y):
 def _difference(dtype, x, y):
     if is_structural(y) or _is(y, 0.0):
         return x
-    return lax.neg(y) if _is(x, -0.0) and not is_known(y) else None
+    return compute("neg", y) if _is(x, -0.0) and not is_known(y) else None
 
 
 def _quotient(dtype, x, y):
@@ -105,7 +109,7 @@ def _fold(name, dtype, x):
 
     def combine(x, y):
         found = _without(name, dtype, x, y)
-        return LAX[name](x, y) if found is None else found
+        return compute(name, x, y) if found is None else found
 
     return reduce(combine, x)
 
@@ -282,11 +286,9 @@ NUMPY = {
     **{"and": _exactly(np.bitwise_and), "or": _exactly(np.bitwise_or), "copy": _exactly(lambda x: x)},
     "convert_element_type": _converted_number,
 }
+FOLDS = {f"reduce_{kind}": _reduction(kind) for kind in ("max", "min")}  # where no derivative is taken
+RECORDED = "y", "rounding_method"  # parameters, all others being shapes and types
 SHORT = {
     **{"mul": _product, "add": _sum, "add_any": _sum, "sub": _difference, "div": _quotient, "neg": _negative},
     **{"select_n": _selected, "convert_element_type": _converted},
-}
-LAX = {
-    **{"add": lax.add, "mul": lax.mul, "max": lax.max, "min": lax.min},
-    **{"and": lax.bitwise_and, "or": lax.bitwise_or},
 }

@@ -1,0 +1,114 @@
+"""README.md beside this file, made from page.md and export.json.
+
+`python -m experiments.export.page`
+"""
+
+import json
+from pathlib import Path
+
+from experiments.page import busy, find, table
+
+HERE = Path(__file__).parent
+
+
+def verdict(value, bar):
+    """A row's last cells."""
+    return f"{value:.3g}", "yes" if value <= bar else "**no**"
+
+
+def explained(rows, rate):
+    """Deadlines missed by the step, and by the empty loop beside it."""
+    return tuple(find(rows, rate=rate, form=form)["missed_count"] for form in ("step", "empty loop"))
+
+
+def bars_table(numbers):
+    """What was asked for, what was measured, and whether it holds."""
+    speed, fitted = numbers["speed"], numbers["pendulum"]
+    slowest = max(row["c_time_over_xla"] for row in speed["scenes"])
+    rows = [
+        [
+            f"C and Python after {fitted['num_steps']} steps (rad)",
+            "<= 1e-12",
+            *verdict(fitted["difference_rad"], 1e-12),
+        ],
+        ["a step over C written by hand", "<= 1.1", *verdict(speed["time_over_by_hand"], 1.1)],
+        ["a step over XLA's kernel, worst scene", "<= 1.5", *verdict(slowest, 1.5)],
+    ]
+    for rate in ("1 kHz", "10 kHz"):
+        step, empty = explained(numbers["real_time"]["deadlines"], rate)
+        rows.append([f"deadlines missed at {rate}, {empty} by the empty loop", f"<= {empty}", *verdict(step, empty)])
+        own = find(numbers["real_time"]["deadlines"], rate=rate, form="step")
+        rest = own["missed_count"] - own["woke_too_late_count"]
+        rows.append([f"deadlines missed at {rate} by a loop that woke before them", "0", *verdict(rest, 0)])
+    return table(["what", "bar", "measured", "holds"], rows)
+
+
+def deadlines_table(rows):
+    """Latencies after the due time."""
+    keys = "median_us", "worst_us", "longest_step_us"
+    cells = []
+    for r in rows:
+        times = ["-" if r.get(key) is None else f"{r[key]:.1f}" for key in keys]
+        cells.append([r["rate"], r["form"], r["calls"], r["missed_count"], r.get("woke_too_late_count", "-"), *times])
+    header = ["rate", "form", "periods", "missed", "woke too late"]
+    header += ["median end (µs)", "worst end (µs)", "longest step (µs)"]
+    return table(header, cells)
+
+
+def page(numbers):
+    """The text of README.md."""
+    machine, fitted, speed, real = (numbers[part] for part in ("machine", "pendulum", "speed", "real_time"))
+    missed = [explained(real["deadlines"], rate) for rate in ("1 kHz", "10 kHz")]
+    errors = {key: max(map(abs, values)) for key, values in fitted["relative_error_of"].items()}
+    return (
+        (HERE / "page.md")
+        .read_text()
+        .format(
+            machine=(
+                f"On {machine['processor']}, {machine['cores']} cores, with a load of {machine['load_at_start']:.1f}"
+                f"{busy(machine)}; jax {machine['jax']}, {machine['compiler']}. All of it is in float64."
+            ),
+            bars=bars_table(numbers),
+            samples=2 * fitted["num_samples"],
+            noise=1e3 * fitted["noise_rad"],
+            k_error=errors["k"],
+            c_error=errors["c"],
+            lines=fitted["lines"],
+            operations=fitted["operations"],
+            functions=fitted["functions"],
+            steps=fitted["num_steps"],
+            difference=fitted["difference_rad"],
+            flags=f"`{speed['flags']}`",
+            by_hand=table(["form", "ns per step"], [[k, f"{x:.1f}"] for k, x in speed["by_hand_ns"].items()]),
+            scenes=table(
+                ["scene", "operations", "sines and the like", "C (ns)", "XLA (ns)", "C over XLA"],
+                [
+                    [r["scene"], r["operations"], r["functions"], f"{r['c_ns']:.0f}", f"{r['xla_ns']:.0f}",
+                     f"{r['c_time_over_xla']:.2f}"]
+                    for r in speed["scenes"]
+                ],
+            ),
+            policy=(
+                "Both run with real-time scheduling (`SCHED_FIFO`) and locked memory; Python does not."
+                if real["real_time_scheduling"]
+                else "The operating system gave them no real-time scheduling."
+            ),
+            deadlines=deadlines_table(real["deadlines"]),
+            verdict=" ".join(
+                f"At {rate} the step missed {step}, the empty loop {empty}."
+                for rate, (step, empty) in zip(("1 kHz", "10 kHz"), missed, strict=True)
+            ),
+            calls=real["back_to_back"][0]["calls"],
+            back_to_back=table(
+                ["form", "median (ns)", "99.9999 % (ns)", "worst (ns)", "worst over median"],
+                [
+                    [r["form"], r["median_ns"], r["p999999_ns"], r["worst_ns"], f"{r['worst_time_over_median']:.0f}"]
+                    for r in real["back_to_back"]
+                ],
+            ),
+        )
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    (HERE / "README.md").write_text(page(json.loads((HERE / "export.json").read_text())))

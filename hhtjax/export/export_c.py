@@ -1,0 +1,227 @@
+"""A system, a stepper and parameters as one file of C99, and its header."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.export import files
+from hhtjax.export.fields import require_different
+from hhtjax.export.model import Given, Layout, Numbers, begin, derivative_field, given, step, with_derivatives
+from hhtjax.export.statements import NotWritten, Statements
+from hhtjax.xla import Listing, NotListed, listed
+
+
+@dataclass(frozen=True)
+class ExportedC:
+    """A model in C; made by `export_c`.
+
+    Attributes:
+        name: of the files, and before every name in them.
+        header, source: the text of name.h and name.c.
+        state, params, inputs: fields of the structs `name_state` and `name_params`, and the arrays that `u` holds one
+            after the other: (name, shape) of each.
+        values, input_values: of the params, one for each of their numbers, and of the inputs at the start.
+        operations, functions: how many operations on numbers a step has, and how many of them are sines, roots and the
+            like. Of a loop, its body counts once.
+    """
+
+    name: str
+    header: str
+    source: str
+    state: tuple
+    params: tuple
+    inputs: tuple
+    values: tuple
+    input_values: tuple
+    operations: int
+    functions: int
+
+    def write(self, folder) -> list[Path]:
+        """Writes name.c and name.h into a folder, which is made where it is not there; their paths."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = [folder / f"{self.name}.{kind}" for kind in "ch"]
+        for path, text in zip(paths, (self.source, self.header), strict=True):
+            path.write_text(text)
+        return paths
+
+
+def export_c(
+    system: Any, stepper: Any, q0: Any, v0: Any = None, params: Any = None, *,
+    z0: Any = None, name: str = "model", sensitivities: tuple = (),
+) -> ExportedC:  # fmt: skip
+    """The step of a system as C99 without dependencies: for hard real time, where Python cannot go.
+
+        int NAME_init(NAME_state *s, const NAME_params *p, const NAME_real *q0, const NAME_real *v0,
+                      NAME_real t0, NAME_real dt);
+        int NAME_step(NAME_state *s, const NAME_params *p, const NAME_real *u, NAME_real dt);
+
+    The same operations as `stepper.step`, each on a number: C and `simulate` agree to rounding. Nothing is allocated,
+    nothing is global, all sizes are fixed; steps of several states may run at once. Both functions return flags, 0
+    where all is well, which the state keeps: NAME_NOT_FINITE, NAME_NOT_CONVERGED, NAME_DEPENDENT, NAME_NOT_SOLVED. A
+    non-iterative step without contacts has no loop, so that its worst case is its case; Newton's iteration is bounded
+    by its `max_iterations`.
+
+    Args:
+        system: a `System`, `LinearSystem` or `FirstOrderSystem`. What is constant in it is written out.
+        stepper: `hht()`, `rk4()`, ...
+        q0, v0: position and velocity, whose keys name the fields of the state, and whose type, float64 or float32, is
+            `NAME_real`. A `FirstOrderSystem` has y0 in the place of q0, no v0, and `NAME_init` no argument for it.
+        params: their floating numbers are the fields of `NAME_params`, these values `NAME_defaults`. Integers and
+            booleans are written out. Each `sampled` is an input: `u` holds their values, one after the other, in the
+            order of the leaves of params; a step holds them from its start to its end, as one with
+            `sampled(..., order=0)` does. `NAME_init` then takes the values before the start, too.
+        z0: internal states, where the system has some; `NAME_init` then takes them behind v0.
+        name: of the files and before all names in C.
+        sensitivities: names of fields of `NAME_params` in which derivatives are stepped along: with "k", the state has
+            dq_dk, dv_dk, ... They are those of a run whose q0 and v0 do not depend on the params.
+
+    Returns:
+        An `ExportedC`; its `write(folder)` writes both files.
+
+    Raises:
+        NotImplementedError: an operation that cannot be written in C (a callback, sort, random numbers, a singular
+            value decomposition as of `redundant="least_squares"`): with its name, and the line where it is used.
+        ValueError, TypeError: as `simulate`; a name that is none in C, sensitivities that are no fields, tracers.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: {"x": -p["k"] * q["x"]})
+    >>> start = {"x": jnp.ones(1)}, {"x": jnp.zeros(1)}
+    >>> model = hhtjax.export_c(spring, hhtjax.hht(), *start, {"k": 4.0}, name="spring")
+    >>> [field.name for field in model.state], [field.name for field in model.params]
+    (['q_x', 'v_x', 'w_x', 'a_x'], ['k'])
+    >>> print(model.header.splitlines()[-7])
+    spring_API int spring_step(spring_state *s, const spring_params *p, const spring_real *u, spring_real dt);
+    """
+    return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities)
+
+
+def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities):
+    """`export_c`, under the name of its caller."""
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
+        raise ValueError(f"{caller}: `name` must be one that C allows, such as 'pendulum'; received {name!r}.")
+    made = given(caller, system, stepper, q0, v0, params, z0)
+    numbers = Numbers(caller, made.params, made.dtype)
+    rows, names = _rows(caller, numbers, sensitivities)
+    t, u = jnp.zeros((), made.dtype), numbers.first_inputs()
+    functions = begin(made, numbers), step(made, numbers)
+    start = made.starts, numbers.values, u, t, t
+    try:
+        state = jax.eval_shape(functions[0], *start)[0]
+        after = state, numbers.values, u, u, t
+        layout = Layout.of(made, state)
+        code = _Code(name, made, numbers, layout, rows, names, state)
+        texts = [code.begin(functions[0], start), code.step(functions[1], after)]
+    except NotListed as error:
+        where = "" if error.line is None else f"; it is used in {error.line}"
+        raise NotImplementedError(f"{caller}: `{error.name}` cannot be written in C{where}.") from None
+    except NotWritten as error:
+        raise NotImplementedError(f"{caller}: `{error}` cannot be written in C.") from None
+    require_different(caller, code.fields)
+    helpers = sorted({x for text in texts for x in text.helpers}, key=str)
+    parts = files.Parts(name, made, stepper, code.fields, numbers, names, texts, helpers, code.counts)
+    return ExportedC(
+        name, files.header(parts), files.source(parts), tuple(code.fields), tuple(numbers.fields),
+        tuple(numbers.inputs), _numbers(numbers.values), _numbers(numbers.first_inputs()), *code.counts,
+    )  # fmt: skip
+
+
+def _rows(caller, numbers, sensitivities):
+    """(leaf, number in it) of each sensitivity, and the names of their numbers."""
+    known = {field.name: i for i, field in enumerate(numbers.fields)}
+    names = [sensitivities] if isinstance(sensitivities, str) else list(sensitivities)
+    wrong = [name for name in names if name not in known]
+    if wrong or len(set(names)) < len(names):
+        raise ValueError(
+            f"{caller}: `sensitivities` must be different names among {', '.join(known)}; received {sensitivities!r}."
+        )
+    rows = [(known[name], j) for name in names for j in range(numbers.fields[known[name]].size)]
+    shaped = {known[name] for name in names if numbers.fields[known[name]].shape}
+    return rows, [f"{numbers.fields[i].name}{f'_{j}' * (i in shaped)}" for i, j in rows]
+
+
+class _Code:
+    """The bodies of both functions."""
+
+    def __init__(self, name, made: Given, numbers: Numbers, layout: Layout, rows, names, state):
+        self.name, self.made, self.numbers, self.layout = name, made, numbers, layout
+        self.rows, self.names = rows, names
+        self.floating = [jnp.issubdtype(x.dtype, jnp.floating) for x in jax.tree.leaves(state)]
+        self.derivatives = [  # for each floating leaf but the time, the fields of each row
+            [[derivative_field(field, name) for field in leaf] for name in names]
+            for leaf, floats in list(zip(layout.leaves, self.floating, strict=True))[1:]
+            if floats
+        ]
+        own = [field for leaf in layout.leaves[1:] for field in leaf]
+        self.fields = own + [field for rows in self.derivatives for row in rows for field in row]
+        self.counts = 0, 0
+
+    def begin(self, f, args):
+        """Of NAME_init."""
+        starts = [f"{key}[{i}]" for key, x in sorted(self.made.starts.items()) for i in range(_count(x))]
+        if self.rows:
+            f, args = with_derivatives(f, self.rows), ([], *args)
+        return self._text(f, args, [*starts, *self._values(), *self._inputs("u"), "t0", "dt"])
+
+    def step(self, f, args):
+        """Of NAME_step."""
+        state = ["s->t"]
+        for leaf, floats in list(zip(self.layout.places("s->"), self.floating, strict=True))[1:]:
+            state += leaf if floats else [f"(int32_t){place}" for place in leaf]
+        names = [*state, *self._values(), *self._inputs("s->u"), *self._inputs("u"), "dt"]
+        if self.rows:
+            leaves = [x for x, floats in zip(jax.tree.leaves(args[0]), self.floating, strict=True) if floats][1:]
+            tangents = [jax.ShapeDtypeStruct((len(self.rows), *x.shape), x.dtype) for x in leaves]
+            f, args = with_derivatives(f, self.rows), (tangents, *args)
+            names = [*self._derivative_places(), *names]
+        text = self._text(f, args, names)
+        self.counts = self.listing.count()
+        return text
+
+    def _values(self):
+        return [place for field in self.numbers.fields for place in field.places("p->")]
+
+    def _inputs(self, where):
+        return [f"{where}[{i}]" for i in range(sum(field.size for field in self.numbers.inputs))]
+
+    def _derivative_places(self):
+        return [place for rows in self.derivatives for row in rows for field in row for place in field.places("s->")]
+
+    def _text(self, f, args, names):
+        """Statements that read arguments, compute, and write the state and the flags."""
+
+        def numbers_of(*args):
+            state, *change, flags = f(*args)
+            return [*jax.tree.leaves(state)[1:], *change], flags
+
+        self.listing: Listing = listed(numbers_of, *args)
+        operands, flags = self.listing.results
+        targets = [place for leaf in self.layout.places("s->")[1:] for place in leaf]
+        targets += self._derivative_places() if self.rows else []
+        real = np.dtype(self.made.dtype), f"{self.name}_real"
+        text = Statements({}, self.name, real)
+        used = files.used(self.listing)
+        for scalar, place in zip(self.listing.arguments, names, strict=True):
+            if scalar in used:
+                text.names[scalar] = files.local(place)
+                if files.local(place) != place:
+                    text.line(f"const {text.type(scalar.dtype)} {files.local(place)} = {place};")
+        text.write(self.listing.operations)
+        values = [x for array in jax.tree.leaves(operands) for x in np.ravel(array)]
+        for place, value in zip(targets, values, strict=True):
+            text.line(f"{place} = {text.text(value)};")
+        reads = {place for scalar, place in zip(self.listing.arguments, names, strict=True) if scalar in used}
+        return files.Body(text.lines, text.text(flags.item()), reads, text.helpers)
+
+
+def _numbers(values):
+    return tuple(float(x) for value in values for x in np.ravel(value))
+
+
+def _count(tree):
+    return sum(np.size(x) for x in jax.tree.leaves(tree))

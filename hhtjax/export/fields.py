@@ -1,0 +1,63 @@
+"""Names in C for the leaves of a pytree: q["arm"]["angle"] is q_arm_angle, an array of numbers if it has a shape."""
+
+import re
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+KEYWORDS = {
+    *("auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum"),
+    *("extern", "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return"),
+    *("short", "signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void"),
+    *("volatile", "while"),
+}
+
+
+class Field(NamedTuple):
+    """A member of a struct: its name, and the shape of its numbers."""
+
+    name: str
+    shape: tuple
+
+    @property
+    def size(self):
+        """How many numbers it holds."""
+        return int(np.prod(self.shape, dtype=int))
+
+    def places(self, struct):
+        """C for each of them, given that of the struct with its dot or arrow."""
+        return [f"{struct}{self.name}" if self.shape == () else f"{struct}{self.name}[{i}]" for i in range(self.size)]
+
+    def declaration(self, real):
+        """In the struct, its shape told where it has more than one axis."""
+        size = f"[{self.size}]" if self.shape else ""
+        shape = f"  /* {' x '.join(map(str, self.shape))}, row by row */" if len(self.shape) > 1 else ""
+        return f"    {real} {self.name}{size};{shape}"
+
+
+def fields(tree, prefix, alone):
+    """A field for each leaf of a pytree. alone: the name of one that has no path."""
+    return [
+        Field(identifier([prefix, *map(_word, path)]) if path or prefix else alone, np.shape(leaf))
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    ]
+
+
+def identifier(words):
+    """Words, joined, as a name that C allows."""
+    text = re.sub(r"\W", "_", "_".join(filter(None, words)), flags=re.ASCII)
+    text = f"p{text}" if text[:1].isdigit() else text
+    return f"{text}_" if text in KEYWORDS else text
+
+
+def require_different(caller, found):
+    """An error for two fields of one name."""
+    names = [x.name for x in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{caller}: the keys must give different names in C; received several for {', '.join(twice)}.")
+
+
+def _word(key):
+    return str(next(getattr(key, name) for name in ("key", "idx", "name") if hasattr(key, name)))

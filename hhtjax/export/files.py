@@ -1,0 +1,213 @@
+"""The text of the two files."""
+
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hhtjax.description import VERSION
+from hhtjax.export.expressions import TYPES, helper, number
+from hhtjax.export.fields import Field
+from hhtjax.export.model import FLAGS, Given, Numbers
+from hhtjax.xla import Listing, Scalar
+
+HEADER = """/* {name}: {stepper}
+
+   Made by hhtjax {version}. {work}
+   C99, no memory allocated, no global state. Flags are 0 where all is well, and stay in the state. */
+
+#ifndef {guard}
+#define {guard}
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+#ifndef {name}_API
+#define {name}_API /* "static inline", defined before {name}.c is included, lets a compiler take a loop as a whole */
+#endif
+
+typedef {real} {name}_real;
+
+enum {{
+{flags}
+}};
+
+typedef struct {{
+    {name}_real t; /* time */
+{state}
+    int flags; /* of all steps so far */
+    /* what the next step needs besides */
+{rest}
+}} {name}_state;
+
+typedef struct {{
+{params}
+}} {name}_params;
+
+extern const {name}_params {name}_defaults;
+
+/* The state at t0 from {starts}{init_inputs}, for steps of dt. Returns flags. */
+{name}_API int {name}_init({init});
+
+/* One step of dt{step_inputs}. Returns flags. */
+{name}_API int {name}_step({step});
+
+#ifdef __cplusplus
+}}
+#endif
+
+#endif
+"""
+
+SOURCE = """/* {name}: see {name}.h */
+
+#include "{name}.h"
+
+#include <math.h>
+#include <string.h>
+
+const {name}_params {name}_defaults = {{
+{values}
+}};
+{helpers}
+{name}_API int {name}_init({init})
+{{
+{begin_unused}{begin}
+    s->t = t0;
+    s->t0 = t0;
+    s->dt = dt;
+    s->steps = 0;
+{begin_inputs}    s->flags = {begin_flags};
+    return s->flags;
+}}
+
+{name}_API int {name}_step({step})
+{{
+{step_unused}{body}
+{step_inputs}    if (s->dt != dt) {{
+        s->t0 = s->t;
+        s->dt = dt;
+        s->steps = 0;
+    }}
+    s->steps += 1;
+    s->t = s->t0 + ({name}_real)s->steps * dt; /* so that no rounding piles up */
+    s->flags |= {step_flags};
+    return s->flags;
+}}
+"""
+
+
+class Body(NamedTuple):
+    """Statements, the name of their flags, the places that they read, the helper functions that they call."""
+
+    lines: list[str]
+    flags: str
+    reads: set[str]
+    helpers: set
+
+
+class Parts(NamedTuple):
+    """What the files are made of."""
+
+    name: str
+    made: Given
+    stepper: Any
+    fields: list[Field]
+    numbers: Numbers
+    sensitivities: list[str]
+    texts: list[Body]
+    helpers: list
+    counts: tuple
+
+
+def used(listing: Listing):
+    """The scalars that its operations and results read."""
+    found = {x for value in _arrays(listing.results) for x in value.flat if isinstance(x, Scalar)}
+    pending = list(listing.operations)
+    while pending:
+        x = pending.pop()
+        found.update(y for y in x.operands if isinstance(y, Scalar))
+        for block in x.blocks:
+            found.update(y for y in block.results if isinstance(y, Scalar))
+            pending += block.operations
+    return found
+
+
+def _arrays(tree):
+    return [tree] if isinstance(tree, np.ndarray) else [x for y in tree for x in _arrays(y)]
+
+
+def local(place):
+    """The name of a constant for a member of a struct or an element of an array."""
+    return re.sub(r"\W+", "_", place.replace("(int32_t)", "").replace("[", "__").replace("]", ""))
+
+
+def header(parts: Parts):
+    """Of name.h."""
+    name, real = parts.name, f"{parts.name}_real"
+    operations, functions = parts.counts
+    num_inputs = sum(field.size for field in parts.numbers.inputs)
+    rest = [Field("u", (num_inputs,)).declaration(real)] if num_inputs else []
+    rest += [Field("t0", ()).declaration(real), Field("dt", ()).declaration(real), "    int64_t steps;"]
+    layout = ", ".join(f"{field.name}{f'[{field.size}]' * bool(field.shape)}" for field in parts.numbers.inputs)
+    params = [field.declaration(real) for field in parts.numbers.fields]
+    return HEADER.format(
+        name=name, guard=f"{name.upper()}_H", version=VERSION, real=TYPES[np.dtype(parts.made.dtype)],
+        stepper=_comment(parts.stepper),
+        work=f"A step takes {operations} operations on numbers, {functions} of them functions such as sines.",
+        flags=",\n".join(f"    {name.upper()}_{x} = {2**i} /* {text} */" for i, (x, text) in enumerate(FLAGS.items())),
+        state="\n".join(field.declaration(real) for field in parts.fields),
+        rest="\n".join(rest), params="\n".join(params or ["    int none;"]),
+        starts=" and ".join(sorted(parts.made.starts)), init_inputs=" and the inputs before" if num_inputs else "",
+        step_inputs=f", u = {layout} held over it" if num_inputs else "; u is not read, and may be NULL",
+        **_signatures(parts, ""),
+    )  # fmt: skip
+
+
+def source(parts: Parts):
+    """Of name.c."""
+    begin, body = parts.texts
+    num_inputs = sum(field.size for field in parts.numbers.inputs)
+    keep = f"    memcpy(s->u, u, {num_inputs} * sizeof *u);\n" if num_inputs else ""
+    helpers = [helper(name, parts.name, dtype) for name, dtype in parts.helpers]
+    arguments = [*sorted(parts.made.starts), "p", *["u"] * bool(num_inputs)]
+    return SOURCE.format(
+        name=parts.name, values=_values(parts), helpers="".join(f"\n{text}\n" for text in helpers),
+        begin="\n".join(begin.lines), begin_unused=_unused(begin, arguments), begin_inputs=keep,
+        begin_flags=begin.flags, body="\n".join(body.lines),
+        step_unused=_unused(body, ["p", *["u"] * (not num_inputs)]),
+        step_inputs=keep, step_flags=body.flags, **_signatures(parts, "restrict "),
+    )  # fmt: skip
+
+
+def _signatures(parts, restrict):
+    name = parts.name
+    const = f"const {name}_real *{restrict}"
+    both = [f"{name}_state *{restrict}s", f"const {name}_params *{restrict}p"]
+    starts = [f"{const}{key}" for key in sorted(parts.made.starts)]
+    inputs = [f"{const}u"] if parts.numbers.inputs else []
+    init = [*both, *starts, *inputs, f"{name}_real t0", f"{name}_real dt"]
+    return {"init": ", ".join(init), "step": ", ".join([*both, f"{const}u", f"{name}_real dt"])}
+
+
+def _unused(text, arguments):
+    """Statements that keep compilers quiet."""
+    read = {re.split(r"\W", place)[0] for place in text.reads}
+    return "".join(f"    (void){name};\n" for name in arguments if name not in read)
+
+
+def _values(parts):
+    """Of the params."""
+    lines = []
+    for field, value in zip(parts.numbers.fields, parts.numbers.values, strict=True):
+        numbers = [number(x) for x in np.ravel(np.asarray(value, parts.made.dtype))]
+        text = f"{{{', '.join(numbers)}}}" if field.shape else numbers[0]
+        lines.append(f"    {text}, /* {field.name} */")
+    return "\n".join(lines or ["    0,"])
+
+
+def _comment(x):
+    return " ".join(repr(x).replace("*/", "* /").split())

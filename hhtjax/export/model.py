@@ -1,0 +1,218 @@
+"""A system and a stepper as two functions of flat lists of numbers: to begin, and to step; with derivatives or not."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.checks import require_params
+from hhtjax.description import is_concrete, thaw
+from hhtjax.export.fields import Field, fields, require_different
+from hhtjax.steppers.stepper import INTERNAL, require_capable, require_stepper, require_system
+from hhtjax.systems import held
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.sampled import Sampled
+from hhtjax.systems.system import FirstOrderSystem
+from hhtjax.xla import structural
+
+FLAGS = {  # what failed, in bits
+    "NOT_FINITE": "a number of the state is infinite or none",
+    "NOT_CONVERGED": "Newton's iteration did not converge",
+    "DEPENDENT": "a constraint depends on those before it",
+    "NOT_SOLVED": "the linear solve left more than its tolerance",
+}
+
+
+class Given(NamedTuple):
+    """What was given, checked. starts: {name in C: tree} of q0, v0, z0, without those that the system has not."""
+
+    caller: str
+    system: Any
+    stepper: Any
+    starts: dict
+    params: Any  # without functions that JAX would not take
+    dtype: Any
+
+    def flat(self, t0, params):
+        """The system on vectors."""
+        q0, v0, z0 = (self.starts.get(name) for name in ("q0", "v0", "z0"))
+        return flatten(self.caller, self.system, q0, v0, t0, params, z0)[0]
+
+
+def given(caller, system, stepper, q0, v0, params, z0):
+    """The arguments of an export, checked."""
+    require_system(caller, system)
+    require_stepper(caller, stepper)
+    q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
+    require_capable(caller, system, stepper, q0, v0)
+    params = require_params(caller, params)
+    if not all(map(is_concrete, jax.tree.leaves((system, stepper, q0, v0, params, z0)))):
+        raise TypeError(f"{caller}: all arguments must be numbers, because they are written out; received tracers.")
+    starts = {name: x for name, x in (("q0", q0), ("v0", v0), ("z0", z0)) if x is not None}
+    return Given(caller, system, stepper, starts, params, jax.tree.leaves(q0)[0].dtype)
+
+
+class Numbers:
+    """The params as what may change in C: `fields` of floating numbers with their `values`, and `inputs`.
+
+    Every `sampled` is an input, held over each step. Integers and booleans stay what they are.
+    """
+
+    def __init__(self, caller, params, dtype):
+        self.leaves, self.structure = jax.tree.flatten(params, is_leaf=_is_input)
+        self.places = [i for i, x in enumerate(self.leaves) if not _is_input(x) and _is_floating(x)]
+        self.input_places = [i for i, x in enumerate(self.leaves) if _is_input(x)]
+        kept = self._with(dict.fromkeys(set(range(len(self.leaves))) - set(self.places)))
+        self.fields = fields(kept, "", "params")
+        self.values = [self.leaves[i] for i in self.places]
+        with_shapes = {i: np.zeros(self.leaves[i].polynomials.shape[2:]) for i in self.input_places}
+        rest = dict.fromkeys(set(range(len(self.leaves))) - set(self.input_places))
+        self.inputs = fields(self._with(with_shapes | rest), "", "u")
+        self.dtype = dtype
+        require_different(f"{caller}: `params`", self.fields)
+
+    def _with(self, changes):
+        return self.structure.unflatten([changes.get(i, x) for i, x in enumerate(self.leaves)])
+
+    def params(self, values, u):
+        """The params with other numbers, and inputs of the values u, one array for each."""
+        constant = [self.leaves[i].constant(x) for i, x in zip(self.input_places, u, strict=True)]
+        changes = dict(zip([*self.places, *self.input_places], [*values, *constant], strict=True))
+        return thaw(self._with(changes))
+
+    def first_inputs(self):
+        """Their values at the first of their samples."""
+        return [self.leaves[i].polynomials[0, 0] for i in self.input_places]
+
+
+def _is_input(x):
+    return isinstance(x, Sampled)
+
+
+def _is_floating(x):
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def begin(made: Given, numbers: Numbers):
+    """The function (starts, values, u, t0, dt) -> (state on vectors, flags); the time of the state is for others."""
+
+    def f(starts, values, u, t0, dt):
+        params = numbers.params(values, u)
+        q0, v0, z0 = (starts.get(name) for name in ("q0", "v0", "z0"))
+        flat, q, v = flatten(made.caller, made.system, q0, v0, t0, params, z0)
+        state = made.stepper.astype(q.dtype).begin(flat, q, v, t0, params, dt)
+        return state, _flags(state, None)
+
+    return f
+
+
+def step(made: Given, numbers: Numbers):
+    """The function (state, values, u of the step before, u, dt) -> (state, flags)."""
+
+    def f(state, values, before, u, dt):
+        old, now = numbers.params(values, before), numbers.params(values, u)
+        flat, stepper = made.flat(state.t, now), made.stepper.astype(made.dtype)
+        if numbers.inputs:
+            state = held.jump(stepper, flat, state, old, now)
+        state, info = stepper.bind(flat, now, dt)(state)
+        return state, _flags(state, info)
+
+    return f
+
+
+def _flags(state, info):
+    """FLAGS as an integer."""
+    found = [~jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in _floats(state)]))]
+    told = (info.converged, info.dependent_row, info.solved) if info is not None else (None,) * 3
+    converged, row, solved = told
+    found += [None if converged is None else ~converged, None if row is None else row > 0]
+    found += [None if solved is None else ~solved]
+    bits = [jnp.where(x, jnp.int32(2**i), jnp.int32(0)) for i, x in enumerate(found) if x is not None]
+    return sum(bits[1:], bits[0])
+
+
+def _floats(tree):
+    return [x for x in jax.tree.leaves(tree) if _is_floating(x)]
+
+
+def with_derivatives(f, rows):
+    """The same function with derivatives in the numbers of the params that `rows` names: (leaf, number in it).
+
+    A first argument before the others: for each floating leaf of a state that is the first of the others, but its time,
+    the derivatives (rows, ...); else none. Results: state, derivatives, flags.
+    """
+
+    def g(tangents, first, values, *rest):
+        moves = bool(tangents)
+
+        def along(tangent, units):
+            def moved(leaves, values):
+                state, flags = f(_replaced(first, leaves) if moves else first, values, *rest)
+                return _floats(state)[1:], (state, flags)
+
+            leaves = _floats(first) if moves else []
+            zero = [structural(np.zeros((), leaves[0].dtype))] if moves else []
+            _, change, told = jax.jvp(moved, (leaves, values), (zero + tangent, units), has_aux=True)
+            return change, told
+
+        units = [_units(value, [j if i == leaf else None for leaf, j in rows]) for i, value in enumerate(values)]
+        change, (state, flags) = jax.vmap(along, out_axes=(0, None))(tangents, units)
+        fine = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in change]))
+        return state, change, flags | jnp.where(fine, jnp.int32(0), jnp.int32(1))
+
+    return g
+
+
+def _units(value, places):
+    """For each place the unit vector in the shape of a value, or zeros."""
+    found = np.zeros((len(places), np.size(value)), jnp.result_type(value))
+    for row, place in zip(found, places, strict=True):
+        row[[] if place is None else [place]] = 1
+    return structural(found.reshape(-1, *np.shape(value)))
+
+
+def _replaced(tree, floats):
+    floats, (leaves, structure) = iter(floats), jax.tree.flatten(tree)
+    return structure.unflatten([next(floats) if _is_floating(x) else x for x in leaves])
+
+
+class Layout(NamedTuple):
+    """The fields of a state in C, and for each of its leaves, in their order, the fields that hold it."""
+
+    fields: list
+    leaves: list
+
+    @classmethod
+    def of(cls, made: Given, state):
+        """state: on vectors, or its shapes."""
+        first_order = isinstance(made.system, FirstOrderSystem)
+        trees = dict(made.starts)
+        q, v, z = trees.get("q0"), trees.get("v0"), trees.get("z0")
+        names = {"q": [("q", q)], "v": [("v", v)], "w": [("w", v)], "a": [("a", v)]}
+        if first_order:  # q is y, and v is y'
+            names = {"q": [], "v": [("q", q)], "w": [("v", q)], "a": [("a", q)]}
+        for name, inner in INTERNAL.items():
+            names[name] = names[name] + ([(inner, z)] if z is not None else [])
+        leaves = []
+        for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+            name = path[0].name
+            if name in names and len(path) == 1:
+                leaves.append([field for prefix, tree in names[name] for field in fields(tree, prefix, prefix)])
+            else:
+                leaves.append(fields(leaf, "_".join([name, *map(_index, path[1:])]), name))
+        return cls([field for leaf in leaves for field in leaf], leaves)
+
+    def places(self, struct):
+        """C for every number of the state, leaf by leaf."""
+        return [[place for field in leaf for place in field.places(struct)] for leaf in self.leaves]
+
+
+def _index(key):
+    return str(next(getattr(key, name) for name in ("key", "idx", "name") if hasattr(key, name)))
+
+
+def derivative_field(field: Field, name):
+    """Of the derivative of a field with respect to a number of the params."""
+    return Field(f"d{field.name}_d{name}", field.shape)

@@ -1,0 +1,290 @@
+"""Which of several models does a record support: information criteria, F tests, and errors on what was left out."""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hhtjax.checks import require_function, require_integer, require_number
+from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.description.presentation import Table, as_text, overwrite, shown
+from hhtjax.identification.arguments import spread_weights
+from hhtjax.identification.evidence import count, effective_observations, f_tail, residuals_of
+from hhtjax.identification.identifiability import parameter_names, parameter_values
+from hhtjax.identification.identify import fit
+from hhtjax.identification.result import FitResult
+
+
+@shown
+class NestedTest(NamedTuple):
+    """Are the further parameters of the larger of two nested models there? Two answers.
+
+    Attributes:
+        smaller, larger: names of the models. extra: how many parameters the larger one has more, q.
+        statistic, p_value: by the covariance of the fit, which allows for correlated residuals.
+        naive_statistic, naive_p_value: the textbook's F test, as if every residual were independent noise.
+    """
+
+    smaller: str
+    larger: str
+    extra: int
+    statistic: float
+    p_value: float
+    naive_statistic: float
+    naive_p_value: float
+
+
+@shown
+class Comparison(NamedTuple):
+    """What `compare` found; arrays have an entry for each of the M models.
+
+    Attributes:
+        names: of the models.
+        parameters: (M,), how many were fitted, the starts of records included.
+        observations: n, residuals that are not missing. effective: how many independent ones they are worth.
+        rms: (M,), root of the mean squared (weighted) residual.
+        aic, bic: (M,), only their differences matter.
+        tests: a `NestedTest` for each pair of nested models without a third between them.
+        held_out: (M, folds), rms of each segment, by the parameters fitted to the others; None if not asked for.
+        converged: (M, folds), whether these fits did; None if not asked for.
+    """
+
+    names: tuple
+    parameters: Any
+    observations: int
+    effective: float
+    rms: Any
+    aic: Any
+    bic: Any
+    tests: tuple
+    held_out: Any = None
+    converged: Any = None
+
+    @property
+    def cross_validated(self) -> Any:
+        """(M,), root of the mean over segments of `held_out`^2; None without."""
+        return None if self.held_out is None else np.sqrt(np.mean(self.held_out**2, axis=1))
+
+    @property
+    def behind(self) -> Any:
+        """(M, 2), held-out mean square less that of the best model, and the standard error of this difference.
+
+        With the difference d_g of each of G segments: mean(d) and sd(d)/sqrt(G). None without cross-validation.
+        """
+        if self.held_out is None:
+            return None
+        square = self.held_out**2
+        away = square - square[np.argmin(square.mean(axis=1))]
+        return np.stack([away.mean(axis=1), away.std(axis=1, ddof=1) / math.sqrt(away.shape[1])], axis=1)
+
+    @property
+    def chosen(self) -> str:
+        """The model to take.
+
+        With cross-validation the one of fewest parameters that is behind the best by no more than the standard error
+        of the difference (Breiman, Friedman, Olshen, Stone 1984, Sec. 3.4.3); else that of the least BIC.
+        """
+        if self.held_out is None:
+            return self.names[int(np.argmin(self.bic))]
+        close = self.behind[:, 0] <= self.behind[:, 1]
+        return self.names[int(np.argmin(np.where(close, self.parameters, np.inf)))]
+
+    def summary(self) -> str:
+        """The table as text; p values have the model they belong to, and in brackets those of the textbook."""
+        return as_text(self._table())
+
+    def _table(self):
+        rows = [["model", "parameters", "rms", "AIC - least", "BIC - least"]]
+        for i, name in enumerate(self.names):
+            criteria = (f"{x[i] - np.min(x):.4g}" for x in (self.aic, self.bic))
+            rows.append([name, str(self.parameters[i]), f"{self.rms[i]:.5g}", *criteria])
+        if self.tests:
+            rows[0].append("F test: p (naive p)")
+            for i, name in enumerate(self.names):
+                found = [test for test in self.tests if test.larger == name]
+                words = (f"{x.p_value:.2g} ({x.naive_p_value:.2g}) against {x.smaller}" for x in found)
+                rows[i + 1].append("; ".join(words))
+        if self.held_out is not None:
+            rows[0] += ["held-out rms", "behind the best"]
+            for i, (away, error) in enumerate(self.behind):
+                words = f"{away / error:.1f} standard errors" if away else "best"
+                rows[i + 1] += [f"{self.cross_validated[i]:.5g}", words]
+        worth = f"{self.observations} observations, worth {self.effective:.0f} independent ones"
+        return Table(f"Comparison: {worth}; takes {self.chosen!r}", rows)
+
+
+def compare(
+    fits: dict[str, FitResult],
+    residuals: Callable[..., Any] | dict[str, Callable[..., Any]] | None = None,
+    *,
+    folds: int = 8,
+    absent: float | dict[str, float] = 0.0,
+    progress: bool = False,
+    **options: Any,
+) -> Comparison:
+    """Several models of the same measurements: AIC and BIC, F tests of nested ones, errors on segments left out.
+
+    Residuals of a fit are correlated, because no model is quite right, and then n of them say less than n independent
+    ones: textbook criteria take in term after term. Here the covariance C of a fit, from how much segments of the
+    record disagree, says how much less. With S_m the weighted sum of squares of model m, k_m its parameters, and
+    n_e = n/d, where d = tr(naive^-1 C)/p >= 1 is the design effect of the model with most parameters,
+
+        AIC = n_e log(S_m/n) + 2 k_m,        BIC = n_e log(S_m/n) + k_m log n_e,
+
+    and for q further parameters x of a nested model, absent at x0, with G segments (Hotelling's T^2),
+
+        (G - q)/(G - 1) (x - x0)^T C_xx^-1 (x - x0)/q ~ F(q, G - q),
+
+    beside the textbook's ((S_0 - S_1)/q)/(S_1/(n - k_1)) ~ F(q, n - k_1). One model is nested in another if the names
+    of its fitted parameters are among those of the other.
+
+    With `residuals` each model is also fitted with one of `folds` segments left out, from its estimate on, and judged
+    by the residuals of this segment: no formula, and no trust in noise that is white. Segments are contiguous, so that
+    correlated residuals do not tell the fit about their neighbours that were left out.
+
+    Args:
+        fits: {name: `FitResult`, with covariance}, all of the same measurements with the same weights.
+        residuals: the function that was fitted, or {name: function}; for errors on segments left out. None: without.
+        folds: how many segments, cut as those of the covariance; each long against the correlation time.
+        absent: the value at which a parameter of nested models has no effect, or {parameter: value}, by the names in
+            `FitResult.summary()`, 0 for others. Where the smaller model holds it fixed, that value is taken.
+        progress: show in one line on stderr which fit is running.
+        options: loss, prior, scale, max_iterations, tolerance, as they were given to `fit`.
+
+    Returns:
+        A `Comparison`; `chosen` names one model.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind; fewer than two fits; fits without covariance, made inside
+            jit, or with different numbers of observations; residuals not of these fits. NotImplementedError: segments
+            left out of fits with records.
+
+    References:
+        Akaike, IEEE Trans. Autom. Control 19 (1974); Schwarz, Ann. Stat. 6 (1978); Rao, Scott, J. Am. Stat. Assoc. 76
+        (1981), the design effect; Pustejovsky, Tipton, J. Bus. Econ. Stat. 36 (2018), tests by cluster covariances;
+        Burman, Chow, Nolan, Biometrika 81 (1994), cross-validation by blocks.
+
+    >>> import jax, jax.numpy as jnp, hhtjax
+    >>> x = jnp.linspace(-1.0, 1.0, 400)
+    >>> y = 2.0 * x + 0.5 * x**3 + 0.1 * jax.random.normal(jax.random.key(0), (400,))
+    >>> def residuals(p):
+    ...     return p["a"] * x + p.get("cube", 0.0) * x**3 + p.get("square", 0.0) * x**2 - y
+    >>> starts = {"line": {"a": 1.0}, "cubic": {"a": 1.0, "cube": 0.0}, "full": {"a": 1.0, "cube": 0.0, "square": 0.0}}
+    >>> found = hhtjax.compare({name: hhtjax.fit(residuals, start) for name, start in starts.items()}, residuals)
+    >>> found.chosen, found.names[found.bic.argmin()], [test.p_value < 0.05 for test in found.tests]
+    ('cubic', 'cubic', [True, False])
+    """
+    _check_fits(fits)
+    names, results = tuple(fits), list(fits.values())
+    all_residuals = list(map(residuals_of, results))
+    observations = {name: count(r) for name, r in zip(names, all_residuals, strict=True)}
+    if len(set(observations.values())) > 1:
+        told = ", ".join(f"{n} of {name!r}" for name, n in observations.items())
+        raise ValueError(f"compare: `fits` must be of the same measurements; received {told} observations.")
+    n = observations[names[0]]
+    k = np.array([int(np.sum(x.free)) + sum(np.size(s) for s in jax.tree.leaves(x.starts)) for x in results])
+    square = np.array([sum(np.sum(r**2) for r in x.weighted) for x in all_residuals])
+    effective = effective_observations(n, results[int(np.argmax(k))].uncertainty)
+    with np.errstate(divide="ignore"):
+        likelihood = effective * np.log(square / n)
+    tests = tuple(_nested_tests(fits, dict(zip(names, zip(k, square, strict=True), strict=True)), n, absent))
+    found = Comparison(
+        names, k, n, effective, np.sqrt(square / n), likelihood + 2 * k, likelihood + k * np.log(effective), tests
+    )
+    if residuals is None:
+        return found
+    functions = _check_functions(residuals, fits)
+    folds = require_integer("compare", "folds", folds, 2)
+    left = [_leave_out(name, fits[name], functions[name], folds, options, progress) for name in names]
+    held_out, converged = (np.array(x) for x in zip(*left, strict=True))
+    return found._replace(held_out=held_out, converged=converged)
+
+
+def _check_fits(fits):
+    if not isinstance(fits, dict) or len(fits) < 2 or not all(isinstance(x, FitResult) for x in fits.values()):
+        raise TypeError(f"compare: `fits` must be a dict of two or more FitResult; received {type(fits).__name__}.")
+    for name, result in fits.items():
+        if not is_concrete(result.code) or np.ndim(result.code):
+            raise ValueError(
+                f"compare: `fits[{name!r}]` must be one finished fit; received a batch, or one inside jit."
+            )
+        if result.uncertainty is None:
+            raise ValueError(f"compare: `fits[{name!r}]` must have a covariance; it was made with covariance=False.")
+
+
+def _check_functions(residuals, fits):
+    """{name: residual function} of all models."""
+    functions = residuals if isinstance(residuals, dict) else dict.fromkeys(fits, residuals)
+    if functions.keys() != fits.keys():
+        raise ValueError(f"compare: `residuals` must be of {', '.join(fits)}; received {', '.join(functions)}.")
+    for name, function in functions.items():
+        require_function("compare", "residuals", function, "residuals(params)")
+        if fits[name].starts is not None:
+            raise NotImplementedError(f"compare: `fits[{name!r}]` has records: no segments of them can be left out.")
+    return functions
+
+
+def _nested_tests(fits, costs, n, absent):
+    """A `NestedTest` of each pair of nested models without a third between them."""
+    own = {name: set(np.asarray(parameter_names(x.params))[x.free]) for name, x in fits.items()}
+    pairs = [(a, b) for a in fits for b in fits if own[a] < own[b] and _same_constants(fits[a], fits[b], own[b])]
+    for smaller, larger in pairs:
+        if any((smaller, c) in pairs and (c, larger) in pairs for c in fits):
+            continue
+        result, (_, S0), (k1, S1) = fits[larger], costs[smaller], costs[larger]
+        extra, free = own[larger] - own[smaller], np.flatnonzero(result.free)
+        names, q = np.asarray(parameter_names(result.params))[free], len(extra)
+        at = [i for i, name in enumerate(names) if name in extra]
+        held = dict(zip(parameter_names(fits[smaller].params), parameter_values(fits[smaller].params), strict=True))
+        x0 = np.array([held.get(names[i], _absent(absent, names[i])) for i in at])
+        away = parameter_values(result.params)[free[at]] - x0
+        C = np.asarray(result.uncertainty.covariance)[np.ix_(at, at)]
+        known, degrees = bool(np.all(np.isfinite(C)) and np.all(np.diagonal(C) > 0)), result.segments - q
+        wald = float(away @ np.linalg.solve(C, away)) / q if known else math.nan
+        if result.uncertainty.cluster is None:  # more parameters than segments
+            degrees = effective_observations(n, result.uncertainty) - k1
+        else:
+            wald *= degrees / (result.segments - 1)
+        naive = float((S0 - S1) / q / (S1 / (n - k1))) if S1 > 0 and n > k1 else math.nan
+        p = f_tail(wald, q, degrees), f_tail(naive, q, n - k1)
+        yield NestedTest(smaller, larger, q, wald, p[0], naive, p[1])
+
+
+def _same_constants(smaller, larger, fitted):
+    """Whether parameters that both models have, and neither fits, are the same."""
+    a, b = (dict(zip(parameter_names(x.params), parameter_values(x.params), strict=True)) for x in (smaller, larger))
+    return all(a[name] == b[name] for name in a.keys() & b.keys() - fitted)
+
+
+def _absent(absent, name):
+    value = absent.get(name, 0.0) if isinstance(absent, dict) else absent
+    return float(require_number("compare", "absent", value, math.isfinite, "be finite"))
+
+
+def _leave_out(name, result, function, folds, options, progress):
+    """rms of each segment by the parameters fitted to the others, and whether these fits converged."""
+    weights = spread_weights("compare", result.weights, result.residual)
+    sizes = [w.size for w in weights]
+    structure = jax.tree.structure(freeze(result.params))
+    structured, errors, converged = jax.tree.structure(result.residual), [], []
+    for fold in range(folds):
+        if progress:
+            overwrite(f"compare: {name}, segment {fold + 1} of {folds} left out", last=fold + 1 == folds)
+        out = [(np.arange(n) // -(-n // folds) == fold).reshape(w.shape) for n, w in zip(sizes, weights, strict=True)]
+        kept = [np.where(x, 0, w) for x, w in zip(out, weights, strict=True)]
+        again = fit(
+            function,
+            thaw(result.params),
+            transforms=structure.unflatten(result.transforms),
+            weights=structured.unflatten(kept),
+            covariance=False,
+            **options,
+        )
+        left = [np.where(x, w, 0) for x, w in zip(out, weights, strict=True)]
+        judged = residuals_of(again._replace(weights=structured.unflatten(left)))
+        square = sum(np.sum(r**2) for r in judged.weighted)
+        errors.append(math.sqrt(square / max(count(judged), 1)))
+        converged.append(bool(again.converged))
+    return errors, converged

@@ -1,0 +1,104 @@
+"""What the residuals of a fit are worth: how many there are, whether they are white, how many independent ones they
+equal.
+
+Numbers of a finished fit, by NumPy: nothing here is traced.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import betainc, gammaincc
+
+from hhtjax.identification.arguments import spread_weights
+
+LAGS = 20  # of the test for white residuals
+
+
+class Residuals(NamedTuple):
+    """Leaves of the residuals, each (entries along its longest axis, others): as returned, weighted with 0 where they
+    are missing, and where they are present."""
+
+    names: list
+    plain: list
+    weighted: list
+    present: list
+
+
+def residuals_of(result) -> Residuals:
+    """Of a fit that is finished."""
+    weights = jax.tree.leaves(spread_weights("fit", result.weights, result.residual))
+    names, plain, weighted, present = [], [], [], []
+    for (path, leaf), weight in zip(jax.tree_util.tree_leaves_with_path(result.residual), weights, strict=True):
+        r, w = np.asarray(leaf, float), np.asarray(weight, float)
+        axis = int(np.argmax(r.shape)) if r.ndim else 0
+        r, w = (np.moveaxis(np.atleast_1d(x), axis, 0) for x in (r, w))
+        r, w = (x.reshape(len(x), -1) for x in (r, w))
+        names.append(jax.tree_util.keystr(path, simple=True, separator="."))
+        plain.append(r)
+        present.append(w != 0)
+        weighted.append(np.where(w != 0, w * np.where(w != 0, r, 0), 0))
+    return Residuals(names, plain, weighted, present)
+
+
+def count(residuals: Residuals) -> int:
+    """Of residuals that are not missing."""
+    return int(sum(np.sum(x) for x in residuals.present))
+
+
+def design_effect(uncertainty) -> float:
+    """tr(naive^-1 C)/p of the p parameters that are determined: the mean factor by which correlated residuals enlarge
+    variances (Rao and Scott, J. Am. Stat. Assoc. 76, 1981, 221-230); less than 1 where they make them smaller."""
+    known = ~np.asarray(uncertainty.undetermined)
+    naive, C = (np.asarray(x)[np.ix_(known, known)] for x in (uncertainty.naive, uncertainty.covariance))
+    size = np.sqrt(np.diagonal(naive))
+    if not known.any() or not np.all(size > 0) or not np.all(np.isfinite(C)):
+        return 1.0
+    scale = np.outer(size, size)
+    return float(np.trace(np.linalg.pinv(naive / scale, hermitian=True) @ (C / scale)) / len(size))
+
+
+def effective_observations(observations: int, uncertainty) -> float:
+    """How many independent ones would be worth as much: n / max(design effect, 1)."""
+    return observations / max(design_effect(uncertainty), 1.0)
+
+
+def whiteness(residuals: Residuals):
+    """Autocorrelation at lag 1, and p value and lags of Ljung and Box's test that there is none; None if too few.
+
+    Q = n (n + 2) sum_k rho_k^2/(n - k), k = 1 .. lags, is chi-squared with as many degrees of freedom as there are lags
+    (Biometrika 65, 1978, 297-303). The Q of all columns are added.
+    """
+    lags = min(LAGS, min(len(r) for r in residuals.weighted) // 5) if residuals.weighted else 0
+    if lags < 1:
+        return None
+    Q, degrees, products, energy = 0.0, 0, 0.0, 0.0
+    for r, present in zip(residuals.weighted, residuals.present, strict=True):
+        r = np.where(present, r - r.sum(axis=0) / np.maximum(present.sum(axis=0), 1), 0)
+        square, n = np.sum(r**2, axis=0), len(r)
+        lagged = np.array([np.sum(r[k:] * r[:-k], axis=0) for k in range(1, lags + 1)])
+        rho = lagged / np.where(square > 0, square, 1)
+        Q += float(np.sum(n * (n + 2) * rho**2 / (n - np.arange(1, lags + 1))[:, None]))
+        degrees += lags * r.shape[1]
+        products, energy = products + lagged[0].sum(), energy + square.sum()
+    return float(products / energy) if energy else 0.0, chi_squared_tail(Q, degrees), lags
+
+
+def chi_squared_tail(x, degrees) -> float:
+    """Probability of more than x."""
+    return float(gammaincc(jnp.asarray(degrees / 2), jnp.asarray(x / 2)))
+
+
+def f_tail(x, numerator, denominator) -> float:
+    """Probability of more than x in Fisher's F distribution; NaN where there are no degrees of freedom."""
+    if denominator <= 0 or not math.isfinite(x):
+        return math.nan
+    at = denominator / (denominator + numerator * max(x, 0.0))
+    return float(betainc(*(jnp.asarray(y) for y in (denominator / 2, numerator / 2, at))))
+
+
+def rms(r: Any, present: Any) -> float:
+    """Root of the mean square of what is present."""
+    return float(np.sqrt(np.sum(np.where(present, r, 0) ** 2) / max(np.sum(present), 1)))

@@ -1,0 +1,106 @@
+"""A tolerance in the place of a step size: what a user asks for, and its checks."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hhtjax.checks import require_integer, require_number
+from hhtjax.description import Description, is_array, is_concrete
+from hhtjax.systems import held
+
+WITH_ESTIMATES = "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda or dopri5"
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptive(Description):
+    """Error control; made by `adaptive`."""
+
+    rtol: Any
+    atol: Any
+    atol_v: Any
+    dt_min: Any
+    dt_max: Any
+    max_steps: int
+    verify: Any
+
+
+def adaptive(
+    rtol: Any,
+    atol: Any,
+    *,
+    atol_v: Any = None,
+    dt_min: Any = 0.0,
+    dt_max: Any = np.inf,
+    max_steps: int = 10_000,
+    verify: Any = False,
+) -> Adaptive:
+    """Steps chosen by the error of each, for `simulate(..., dt=adaptive(...), times=...)`.
+
+    The estimated error of each step in q_i stays below (atol + rtol max|q_i|) rtol^(1/2), that in v_i alike, with the
+    largest values so far; rtol^(1/2) because errors of steps add up, and only for the `hht` family. So errors of the
+    run follow rtol, but nothing is promised: an error that grows, the phase of an undamped vibration or chaos, is seen
+    by no estimate of one step, and what happens and is over within a step neither (give dt_max). `verify` sees the
+    first.
+
+    Args:
+        rtol: relative to the largest |q_i|, and |v_i|, so far; positive. Below 1e-4 float32 has nothing but rounding.
+        atol: in the unit of q (radians for rotations, and the unit of internal states and of y), positive. At rest it
+            alone rules.
+        atol_v: in that of v; by default atol per unit of time.
+        dt_min, dt_max: bounds of the step; a step below dt_min is a failure that `check()` names. Never below 16
+            roundings of t.
+        max_steps: steps at most, the rejected included. Part of the program; all else is data.
+        verify: True, run again with every step halved, and state `run.error`, the error of the whole run at each of
+            `times`, for three times the solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|). Where
+            the motion jumps, as in relaxation oscillations, at times that move by more than a step, that is a false
+            alarm: "tolerance" runs again with steps for a quarter of the tolerance instead.
+
+    Returns:
+        An `Adaptive`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+
+    >>> import hhtjax
+    >>> hhtjax.adaptive(rtol=1e-4, atol=1e-7).max_steps
+    10000
+    >>> hhtjax.adaptive(rtol=0.0, atol=1e-7)
+    Traceback (most recent call last):
+    ValueError: adaptive: `rtol` must be positive and finite; received 0.0.
+    """
+    atol_v = atol if atol_v is None else atol_v
+    for name, value in {"rtol": rtol, "atol": atol, "atol_v": atol_v}.items():
+        require_number("adaptive", name, value, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    require_number("adaptive", "dt_min", dt_min, lambda x: np.isfinite(x) and x >= 0, "be finite, and 0 or more")
+    require_number("adaptive", "dt_max", dt_max, lambda x: x > 0, "be positive")
+    if is_concrete(dt_min) and is_concrete(dt_max) and dt_min > dt_max:
+        raise ValueError(f"adaptive: `dt_min` must not exceed dt_max={dt_max}; received {dt_min}.")
+    if not isinstance(verify, bool) and verify != "tolerance":
+        raise ValueError(f'adaptive: `verify` must be True, False or "tolerance"; received {verify!r}.')
+    max_steps = require_integer("adaptive", "max_steps", max_steps)
+    rtol, atol, atol_v, dt_min, dt_max = map(_as_data, (rtol, atol, atol_v, dt_min, dt_max))
+    return Adaptive(rtol, atol, atol_v, dt_min, dt_max, max_steps, verify)
+
+
+def _as_data(x):
+    return x if is_array(x) else np.asarray(x, float)
+
+
+def require_controlled(caller, problem):
+    """An error for a stepper without an estimate, for inputs that jump, and for dry friction."""
+    stepper = problem.stepper
+    if stepper.estimate_order is None:
+        raise NotImplementedError(
+            f"{caller}: {type(stepper).__name__} has no estimate of its error: give `dt` as a number, or take "
+            f"{WITH_ESTIMATES}."
+        )
+    if held.holds(problem.params):
+        raise NotImplementedError(
+            f"{caller}: error control does not know when held inputs, sampled(order=0), jump: give `dt` as an array "
+            "whose steps end there, or take order=1."
+        )
+    if problem.system.friction is not None:
+        raise NotImplementedError(
+            f"{caller}: error control takes a switch of dry `friction` for an error: give `dt` as a number or an array."
+        )

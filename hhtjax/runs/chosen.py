@@ -1,0 +1,197 @@
+"""Runs over chosen steps, read off at any times: differentiable, the steps being constant."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.numerics.counted_loop import repeat
+from hhtjax.runs.adaptive import adaptive, require_controlled
+from hhtjax.runs.choose import Steps, choose, trimmed
+from hhtjax.runs.interpolate import between
+from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, saved
+from hhtjax.runs.problem import Problem
+from hhtjax.runs.solution import Solution
+from hhtjax.runs.sweep_grid import require_times
+from hhtjax.steppers.stepper import State, Stepper, join_info, public
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.xla import on_scalars, one_kernel, or_plain
+
+ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
+
+
+@partial(jax.jit, static_argnames=("progress",))
+def chosen_steps(problem, times, control, progress=False):
+    """`Steps` to the last of the times, and the times at which they end."""
+    problem, times, control = lax.stop_gradient((problem, times, control))
+    flat, q, v, t0, params = problem.flat()
+    end = jnp.asarray(times).astype(q.dtype)[-1]
+    return choose(flat, problem.stepper, q, v, t0, end, params, control, progress)
+
+
+@partial(jax.jit, static_argnames=("halved",))
+def run_over(problem, times, ends, accepted, halved=False):
+    """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
+    flat, q, v, t0, params = problem.flat()
+    times = jnp.asarray(times).astype(q.dtype)
+    ends = lax.stop_gradient(ends)
+    behind = jnp.arange(ends.size, dtype=jnp.int32) >= accepted
+    # the last accepted end, behind it: steps that nothing takes
+    reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
+    grid = jnp.concatenate([t0[None], jnp.where(behind, jnp.inf, ends)])
+    needed = jnp.searchsorted(grid, jnp.minimum(times, reached))
+    if halved:
+        middles = (grid[:-1] + jnp.where(behind, grid[:-1], grid[1:])) / 2
+        grid = jnp.concatenate([grid[:1], jnp.stack([middles, grid[1:]], 1).ravel()])
+        needed = 2 * needed - (grid[2 * needed - 1] >= times).astype(needed.dtype)
+    dt = jnp.diff(grid)
+    loop = loop_over(flat, problem.stepper, q, v, t0, params, jnp.where(jnp.isfinite(dt), dt, 1), ends=grid[1:])
+    counts = jnp.diff(needed, prepend=0).astype(jnp.int32)
+    form = on_scalars(loop.advance, loop.carry)
+    advance, keep = form.of(loop.advance), form.of(partial(kept, flat, problem.stepper))
+
+    @checkpoint
+    def interval(carry, count):
+        def step(_, carry):
+            _, run, info = carry
+            after, new = advance(run)
+            return run[0], after, join_info(info, new)
+
+        last, run, info = repeat(step, (*carry, loop.no_info), count)
+        return (last, run), (keep(last), keep(run[0]), info)
+
+    def samples(carry):
+        return lax.scan(interval, (carry[0], carry), counts)
+
+    (_, (_, _, failure)), (first, second, info) = one_kernel(samples, form.tree)
+    (first, _), (second, extra) = form.joined(first), form.joined(second)
+    start = loop.carry[0]
+    flaw = flaw_at_start(problem.system, flat, start, params)
+    pair = [as_solution(flat, start, path, dt, info, failure, flaw) for path in (first, second)]
+    return read_off(flat, pair, extra, times, reached)
+
+
+def kept(flat, stepper, state):
+    """What is saved of a state, and what its dense output adds."""
+    extra = None
+    if stepper.dense_term:
+        e_q, e_v = state.memory
+        extra = public(flat, State(state.t, e_q, e_v, 0 * e_v))
+        extra = extra.q, (None if flat.positions == 0 else extra.v), extra.z
+    return saved(flat, state), extra
+
+
+def read_off(flat, pair, extra, times, reached):
+    """The `Solution` at the times, each between the two of a pair; NaN beyond what was reached."""
+    a, b = (jax.tree.map(lambda x: x[1:], run._replace(dt=None, info=None, failure=None)) for run in pair)
+    s = jnp.where(times <= reached, (times - a.t) / (b.t - a.t), jnp.nan)
+    found = between(a, b, b.t - a.t, s)
+    if extra is not None:
+        found = with_dense_term(flat, found, extra, s, b.t - a.t)
+    start = jax.tree.map(lambda x: x[:1], pair[0]._replace(dt=None, info=None, failure=None))
+    path = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), start, found._replace(t=times))
+    return path._replace(info=pair[1].info, failure=pair[1].failure)
+
+
+def with_dense_term(flat, found, extra, s, H):
+    """`found`, with s^2 (1 - s)^2 times what the stepper's dense output adds to cubics, and the rate of that."""
+    weight, rate = (s * (1 - s)) ** 2, 2 * s * (1 - s) * (1 - 2 * s) / H
+    e_q, e_v, e_z = extra
+    terms = [("q", flat.unravel, weight, e_q)]
+    if flat.positions:
+        terms += [("v", flat.unravel_rates, weight, e_v), ("acceleration", flat.unravel_rates, rate, e_v)]
+        terms += [("z", flat.unravel_internal, weight, e_z), ("zdot", flat.unravel_internal, rate, e_z)]
+    else:
+        terms += [("v", flat.unravel_rates, rate, e_q)]
+    for name, unravel, factor, e in terms:
+        if e is not None:
+            more = jax.vmap(unravel)(factor[:, None] * e)
+            found = found._replace(**{name: jax.tree.map(jnp.add, getattr(found, name), more)})
+    return found
+
+
+def choose_steps(
+    system: System | LinearSystem | FirstOrderSystem,
+    stepper: Stepper,
+    q0: Any,
+    v0: Any = None,
+    params: Any = None,
+    *,
+    times: Any,
+    z0: Any = None,
+    t0: Any = 0.0,
+    progress: bool = False,
+    **tolerances: Any,
+) -> Steps:
+    """The steps that error control takes: `simulate(..., dt=adaptive(...))` without the run.
+
+    The run over them, `simulate(..., dt=steps.dt)`, is differentiable, smooth in all its arguments, and frozen: it is
+    for the motion that the steps were chosen for, and others near by.
+
+    Args:
+        system, stepper, q0, v0, params, z0, t0, progress: those of `simulate`.
+        times: (K,); steps go to the last, and end at no other.
+        **tolerances: those of `adaptive`: rtol, atol, and others; not `verify`.
+
+    Returns:
+        `Steps`, constant to derivatives. Nothing raises while they are chosen: call `steps.check()`.
+
+    Raises:
+        TypeError, ValueError, NotImplementedError: those of `simulate` and `adaptive`; a stepper without an estimate.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> oscillator = hhtjax.LinearSystem(M=jnp.ones(1), C=jnp.full(1, 8.0), K=jnp.full(1, 16.0))
+    >>> start = jnp.ones(1), jnp.zeros(1)
+    >>> steps = hhtjax.choose_steps(oscillator, hhtjax.hht(), *start, times=[4.0], rtol=1e-3, atol=1e-6)
+    >>> steps.check()
+    >>> run = hhtjax.simulate(oscillator, hhtjax.hht(), *start, dt=steps.dt)
+    >>> bool(steps.dt[-1] > 10 * steps.dt[0]), bool(abs(run.q[-1, 0] - 17 * jnp.exp(-16.0)) < 1e-3)
+    (True, True)
+    """
+    problem = Problem.checked("choose_steps", system, stepper, q0, v0, params, t0, z0)
+    times = checked_times("choose_steps", problem, times)
+    arguments = problem, times, adaptive(**tolerances), progress
+    return trimmed(or_plain(partial(chosen_steps, *arguments))[0])
+
+
+def run_controlled(problem, times, control, progress) -> Solution:
+    """The run that `simulate` returns for an `Adaptive` in the place of dt."""
+    times = checked_times("simulate", problem, times)
+    steps, ends = or_plain(partial(chosen_steps, problem, times, control, progress))
+    run = or_plain(partial(run_over, problem, times, ends, steps.accepted))
+    if control.verify:
+        run = run._replace(**verified(run, finer(problem, times, control, steps, ends), control, problem.stepper.order))
+    steps = trimmed(steps)
+    return run._replace(dt=steps.dt, steps=steps)
+
+
+def finer(problem, times, control, steps, ends):
+    """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
+    if control.verify == "tolerance":
+        quarter = replace(control, **{name: getattr(control, name) / 4 for name in ("rtol", "atol", "atol_v")})
+        steps, ends = or_plain(partial(chosen_steps, problem, times, quarter))
+    halved = control.verify != "tolerance"
+    return or_plain(partial(run_over, problem, times, ends, steps.accepted, halved=halved))
+
+
+def verified(run, finer, control, order):
+    """The error of the whole run at each of its times, by Richardson from a finer one, and what is allowed."""
+
+    def largest(q):
+        return jnp.max(jnp.stack([jnp.max(jnp.abs(x).reshape(len(x), -1), axis=1) for x in jax.tree.leaves(q)]), axis=0)
+
+    q, better = lax.stop_gradient((run.q, finer.q))
+    left = 0.25 if control.verify == "tolerance" else 0.5**order  # of the error
+    error = largest(jax.tree.map(jnp.subtract, better, q)) / (1 - left)
+    rtol, atol = (jnp.asarray(x).astype(error.dtype) for x in (control.rtol, control.atol))
+    return {"error": error, "allowed": lax.stop_gradient(ALARM * (rtol * jnp.max(largest(q)) + atol))}
+
+
+def checked_times(caller, problem, times):
+    """times, for a stepper that can be controlled."""
+    require_controlled(caller, problem)
+    return require_times(times, problem.t0, jax.tree.leaves(problem.q0)[0].dtype, caller)

@@ -1,0 +1,48 @@
+"""What a run starts from: the checks of what a user hands over, and the same on vectors."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.checks import require_number, require_params
+from hhtjax.description import is_concrete, thaw
+from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.systems.consistent import require_consistent
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.rubbing import require_independent_friction
+
+
+class Problem(NamedTuple):
+    """A system, how to step it, and from where; params hold no functions, as `freeze` leaves them."""
+
+    system: Any
+    stepper: Any
+    q0: Any
+    v0: Any
+    params: Any
+    t0: Any
+    z0: Any
+
+    @classmethod
+    def checked(cls, caller, system, stepper, q0, v0, params, t0, z0):
+        """The same of what a user hands over, or an error that names what is wrong with it."""
+        require_system(caller, system)
+        require_stepper(caller, stepper)
+        params = require_params(caller, params)
+        require_number(caller, "t0", t0, np.isfinite, "be finite")
+        q0, v0, z0 = initial_values(caller, system, q0, v0, z0, level=4)
+        require_capable(caller, system, stepper, q0, v0)
+        if system.friction is not None:
+            require_independent_friction(caller, system, q0, v0, t0, params, z0)
+        if system.constraint is not None:
+            require_consistent(caller, system, q0, v0, t0, params, stepper.redundant, z0)
+        t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew
+        return cls(system, stepper, q0, v0, params, t0, z0)
+
+    def flat(self):
+        """The system on vectors, q, v, t0 and the params."""
+        params = thaw(self.params)
+        flat, q, v = flatten("simulate", self.system, self.q0, self.v0, self.t0, params, self.z0)
+        return flat, q, v, jnp.asarray(self.t0).astype(q.dtype), params

@@ -1,0 +1,102 @@
+"""The error of a step, estimated without a further factorisation: what error control is made of.
+
+Local errors of the generalised-alpha family, s = alpha_m - alpha_f (for the next two lines see Arnold, Bruls 2007):
+
+    e_q = c_q h^2 (w1 - w),    c_q = beta + s/2 - 1/6
+    e_v = c_v h^3 w'',         c_v = 1/12 - s^2/2 + s (alpha_m + alpha_f - 1)/2
+
+w'' is the second divided difference of w over this step and the one before. Both take the end of the step at its word.
+A linearisation may have missed what is there, a contact say; so the residual at the end goes through the same factors,
+
+    d = -S^-1 r(q1, v1, w1, t1),    e_q := |e_q| + beta k h^2 |d|,  e_v := |e_v| + gamma k h |d|,
+    k = (1 - alpha_f)/(1 - alpha_m)
+
+for one more residual and substitution. Methods of several stages have an embedded one of lower order instead, and those
+with a matrix g h d and g^2 h^2 d besides.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from hhtjax.steppers.residual import Coefficients
+from hhtjax.steppers.unequal import Resizing
+
+
+class Errors(NamedTuple):
+    """Of a step, (N,): of the displacement, whose entries beyond the positions mean nothing, and of the rates."""
+
+    q: Any
+    v: Any
+
+
+class Past(NamedTuple):
+    """What the estimate of the family remembers of the step before: (w1 - w)/h, and h, which is 0 before the first."""
+
+    slope: Any
+    h: Any
+
+
+class Controlled(Resizing):
+    """The generalised-alpha family under error control."""
+
+    coefficients: Coefficients
+    order: int
+    options: Any
+
+    @property
+    def estimate_order(self):
+        """3, for methods of order 2."""
+        return 3 if self.order == 2 else None
+
+    def begin_estimates(self, system, state):
+        """No step before."""
+        return Past(jnp.zeros_like(state.w), jnp.zeros_like(state.t))
+
+    def bind_estimated(self, system, params, dt, past):
+        """State -> State, Info, Errors, Past, by the formulas above."""
+        asks = not system.linear and self.options.iterations is not None  # else nothing is left at the end
+        step = replace(self, estimating=asks).bind(system, params, dt)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+        def estimated(s):
+            s1, info = step(s)
+            errors, now = family_errors(self.coefficients, dt, s.w, s1.w, past, info.defect)
+            return s1, info._replace(defect=None), errors, now
+
+        return estimated
+
+
+def family_errors(c, h, w, w1, past, d):
+    """The errors of a step from the accelerations w to w1, and what is to be remembered; d: S^-1 r, or None."""
+    s = c.alpha_m - c.alpha_f
+    slope = (w1 - w) / h
+    jerk = jnp.where(past.h > 0, 2 * (slope - past.slope) / (h + past.h), slope / (2 * h))
+    e_q = jnp.abs((c.beta + s / 2 - 1 / 6) * h**2 * (w1 - w))
+    e_v = jnp.abs((1 / 12 - s**2 / 2 + s * (c.alpha_m + c.alpha_f - 1) / 2) * h**3 * jerk)
+    if d is not None:
+        k = (1 - c.alpha_f) / (1 - c.alpha_m) * jnp.abs(d[: w.size])  # multipliers are behind
+        e_q, e_v = e_q + c.beta * h**2 * k, e_v + c.gamma * h * k
+    return Errors(e_q, e_v), Past(slope, h)
+
+
+class Embedded:
+    """A method of several stages, among which is one of lower order: their difference is the estimate."""
+
+    def begin_estimates(self, system, state):
+        """Nothing is remembered."""
+        return ()
+
+    def bind_estimated(self, system, params, dt, past):
+        """State -> State, Info, Errors, ()."""
+        step = self.bind_pair(system, params, dt)
+
+        def estimated(s):
+            s1, info, errors = step(s)
+            return s1, info, errors, ()
+
+        return estimated
+
+    def bind_pair(self, system, params, dt) -> Any:
+        """State -> State, Info, Errors."""
+        raise NotImplementedError

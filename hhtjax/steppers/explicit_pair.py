@@ -1,0 +1,94 @@
+"""An explicit Runge-Kutta pair with an error estimate and dense output: Dormand and Prince's, of order 5(4).
+
+Coefficients: J. Dormand, P. Prince, J. Comput. Appl. Math. 6, 1980, 19-26, Table 2; dense output of order 4: L.
+Shampine, Math. Comp. 46, 1986, 135-150, in the form of E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential
+Equations I, Sec. II.6, which is the cubic Hermite polynomial and one more term, s^2 (1 - s)^2 h sum d_i k_i.
+"""
+
+from dataclasses import dataclass
+
+from hhtjax.steppers.estimate import Embedded, Errors
+from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.xla import staged
+
+A = (
+    (1 / 5,),
+    (3 / 40, 9 / 40),
+    (44 / 45, -56 / 15, 32 / 9),
+    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+    (
+        35 / 384,
+        0.0,
+        500 / 1113,
+        125 / 192,
+        -2187 / 6784,
+        11 / 84,
+    ),  # the end of the step, and the next one's first stage
+)
+ERROR = 71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40  # order 5 minus order 4
+DENSE = (
+    *(-12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072),
+    *(701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class DormandPrince(Embedded, Stepper):
+    """The pair; made by `dopri5`."""
+
+    order: int = 5
+
+    solves_internal = True
+    estimate_order = 5
+    dense_term = True
+
+    def begin(self, system, q, v, t, params, dt):
+        """w0 = M^-1 Q, the first stage of the first step."""
+        return State(t, q, v, system.acceleration(q, v, t, params), memory=Errors(0 * q, 0 * v))
+
+    def bind(self, system, params, dt):
+        """The step without its estimate."""
+        step = self.bind_pair(system, params, dt)
+
+        def plain(s):
+            return step(s)[:2]
+
+        return plain
+
+    def bind_pair(self, system, params, dt):
+        """Six stages; the first is the acceleration that the step before ended with."""
+        acceleration = staged(system.acceleration, system.size)
+
+        def step(s):
+            V, W = [s.v], [s.w]
+            for row in A:
+                q, v = s.q + system.located(dt * mean(row, V)), s.v + dt * mean(row, W)
+                V.append(v)
+                W.append(acceleration(q, v, s.t + sum(row) * dt, params))
+            dense = Errors(system.located(dt * mean(DENSE, V)), dt * mean(DENSE, W))
+            end = State(s.t + dt, q, v, W[-1], memory=dense)
+            return end, Info(), Errors(dt * mean(ERROR, V), dt * mean(ERROR, W))
+
+        return step
+
+
+def mean(weights, rates):
+    """Their weighted sum, without those of weight 0."""
+    return sum(weight * k for weight, k in zip(weights, rates, strict=True) if weight)
+
+
+def dopri5() -> DormandPrince:
+    """Dormand and Prince's pair of order 5(4), for the first-order form (q, v)' = (v, M^-1 Q).
+
+    Explicit: six solves with M per step, and unstable once w h > 3.3 for any natural frequency w of the system. For
+    error control, `simulate(..., dt=adaptive(...))`, of what is not stiff; it refuses constraints and rotations.
+
+    References:
+        Dormand, Prince, J. Comput. Appl. Math. 6, 1980, 19-26; Shampine, Math. Comp. 46, 1986, 135-150.
+
+    >>> import hhtjax
+    >>> hhtjax.dopri5().order
+    5
+    """
+    return DormandPrince()

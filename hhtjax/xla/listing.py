@@ -1,0 +1,111 @@
+"""A program as a list of operations on scalars, for who writes it in another language.
+
+An operand is a `Scalar`, or a known number. Three operations hold lists of their own: `cond` one for each branch,
+`while` its condition and its body, whose carried variables are its results. Others make and read small arrays, whose
+name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu` and `triangular_solve`.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+FUNCTIONS = {  # operations of which each takes as long as ten or more sums
+    *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "erf", "exp", "exp2"),
+    *("expm1", "log", "log1p", "logistic", "pow", "sin", "sinh", "tan", "tanh"),
+}
+
+
+@dataclass(eq=False)
+class Scalar:
+    """A number that is not known yet, or the name of an array of `size` of them."""
+
+    dtype: Any
+    recorder: Any  # that made it
+    size: int = 0
+
+
+@dataclass(eq=False)
+class Block:
+    """Operations in their order, and the operands that they end with."""
+
+    operations: list = field(default_factory=list)
+    results: list = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Operation:
+    """One of the list."""
+
+    name: str
+    operands: list
+    results: list
+    params: dict = field(default_factory=dict)
+    blocks: list = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A function as a list. arguments: its scalars, one for each number; results: a tree with operands for numbers."""
+
+    arguments: list
+    operations: list
+    results: Any
+
+    def count(self):
+        """Numbers of operations, and of those that are sines and the like; of a loop, its body counts once."""
+        names = [x.name for x in everywhere(self.operations)]
+        names = [x for x in names if x not in ("array", "element", "cond", "while")]
+        return len(names), sum(x in FUNCTIONS for x in names)
+
+
+def everywhere(operations):
+    """All operations, those of inner lists included."""
+    for x in operations:
+        yield x
+        for block in x.blocks:
+            yield from everywhere(block.operations)
+
+
+def pruned(operations, wanted):
+    """The operations that the scalars `wanted` come from, a set that grows by all that these need."""
+    kept = []
+    for x in reversed(operations):
+        if wanted.isdisjoint(x.results):
+            continue
+        x = _SHORTER.get(x.name, lambda x, wanted: x)(x, wanted)
+        kept.append(x)
+        wanted.update(_scalars(x.operands))
+    return kept[::-1]
+
+
+def _scalars(operands):
+    return [x for x in operands if isinstance(x, Scalar)]
+
+
+def _shorter(block, places, wanted):
+    """The block with those of its results alone."""
+    results = [block.results[i] for i in places]
+    wanted.update(_scalars(results))
+    return Block(pruned(block.operations, wanted), results)
+
+
+def _branches(x, wanted):
+    places = [i for i, result in enumerate(x.results) if result in wanted]
+    blocks = [_shorter(block, places, wanted) for block in x.blocks]
+    return replace(x, results=[x.results[i] for i in places], blocks=blocks)
+
+
+def _loop(x, wanted):
+    """A carried variable is needed after the loop, by its condition, or by the next value of one that is."""
+    unfinished, body = x.blocks
+    unfinished = _shorter(unfinished, [0], wanted)
+    places = []
+    while (found := [i for i, result in enumerate(x.results) if result in wanted]) != places:
+        places = found
+        shorter = _shorter(body, places, wanted)
+    if not places:
+        return replace(x, results=[], operands=[], blocks=[unfinished, Block()])
+    results, operands = ([y[i] for i in places] for y in (x.results, x.operands))
+    return replace(x, results=results, operands=operands, blocks=[unfinished, shorter])
+
+
+_SHORTER = {"cond": _branches, "while": _loop}

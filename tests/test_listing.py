@@ -1,0 +1,106 @@
+"""Every operation with a rule, with its options, in C: the numbers of NumPy, NaN, infinities and zeros included."""
+
+import ctypes
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from by_numpy import Numbers, is_close
+from columns import traced, value
+from compiled_c import compiled, needs_compiler
+from operations_table import TABLE
+from program_writer import usual_promotion
+from test_conformance import expression
+
+from hhtjax.export.expressions import helper
+from hhtjax.export.statements import NotWritten, Statements
+from hhtjax.xla import NotListed, Scalar, listed
+
+pytestmark = [needs_compiler, pytest.mark.filterwarnings("ignore")]
+# what has no counterpart in C, or none yet; with options that are not understood; a loop that vmap has made of several
+REFUSED = {
+    *("bitcast_convert_type", "cholesky", "clz", "conv_general_dilated", "cumlogsumexp", "cummax", "cummin"),
+    *("dot_general", "dynamic_update_slice", "exp", "population_count", "pure_callback", "reduce"),
+    *("reduce_precision", "reduce_xor", "scatter", "scatter-add", "scatter-max", "scatter-min", "scatter-mul"),
+    *("scatter-sub", "shift_left", "shift_right_arithmetic", "shift_right_logical", "sin", "sort", "top_k"),
+    *("while"),
+}
+
+
+class Written:
+    """An expression as a function of C: `void f0(double *out)`, its arguments numbers in the text."""
+
+    def __init__(self, number, f, arguments):
+        self.listing = listed(f, *arguments)
+        operands = [x for array in jax.tree.leaves(self.listing.results) for x in np.ravel(array)]
+        numbers = [x for argument in arguments for x in np.ravel(argument)]
+        text = Statements({}, "m", (np.dtype(float), "double"))
+        names = dict(zip(self.listing.arguments, numbers, strict=True))
+        for i, (scalar, x) in enumerate(names.items()):
+            text.names[scalar] = f"argument{i}"
+            of_c = text.type(np.dtype(scalar.dtype))
+            text.line(f"volatile {of_c} given{i} = {text.text(x)}; const {of_c} argument{i} = given{i};")
+            text.line(f"(void)argument{i};")
+        text.write(self.listing.operations)
+        for i, x in enumerate(operands):
+            text.line(f"out[{i}] = (double)({text.text(x)});")
+        self.size, self.helpers = len(operands), text.helpers
+        self.text = f"void f{number}(double *out)\n{{\n    (void)out;\n" + "\n".join(text.lines) + "\n}\n"
+
+
+def written(group):
+    """{text: `Written`}, and {text: the operation that is refused}."""
+    found, refused = {}, {}
+    for text in dict.fromkeys(TABLE[group]):
+        try:
+            found[text] = Written(len(found), *expression(text))
+        except (NotListed, NotWritten) as error:
+            refused[text] = getattr(error, "name", str(error))
+    return found, refused
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", TABLE)
+def test_c_computes_what_numpy_does(group, tmp_path):
+    with usual_promotion(), np.errstate(all="ignore"):
+        found, refused = written(group)
+        helpers = sorted({x for f in found.values() for x in f.helpers}, key=str)
+        parts = ["#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"]
+        parts += [helper(name, "m", dtype) for name, dtype in helpers] + [f.text for f in found.values()]
+        (tmp_path / "all.c").write_text("\n".join(parts))
+        library = ctypes.CDLL(str(compiled([tmp_path / "all.c"], tmp_path / "all.so", "-O1", "-fPIC", "-shared")))
+        wrong = []
+        for number, (text, f) in enumerate(found.items()):
+            function, arguments = expression(text)
+            out = (ctypes.c_double * max(f.size, 1))()
+            getattr(library, f"f{number}")(out)
+            expected = Numbers()(traced(value(function), arguments)[0], *arguments)
+            expected = np.concatenate([np.ravel(x).astype(float) for x in expected] or [np.zeros(0)])
+            ours = np.array(out[: f.size])
+            if not is_close(ours, expected, 1e-6 if "g" in text else 1e-13):
+                wrong.append(f"{text}: {ours}, not {expected}")
+    assert not wrong, "\n".join(wrong)
+    assert set(refused.values()) <= REFUSED
+    assert len(found) > 2 * len(refused)
+
+
+def test_each_operation_stands_once():
+    found = listed(lambda x: (jnp.sin(x) * 2, 2 * jnp.sin(x), x * x, x**2, x + 0.0), jnp.ones(()))
+    assert [x.name for x in found.operations] == ["sin", "mul", "mul"]
+
+
+def test_what_nobody_needs_is_left_out():
+    def loop(x):
+        return jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * x, jnp.sin(c[2])), (0, x, x))[1]
+
+    def either(x):
+        return jax.lax.cond(x > 0, lambda x: (jnp.sin(x), x), lambda x: (jnp.cos(x), -x), x)[1]
+
+    for f, names in ((loop, {"lt", "add", "mul"}), (either, {"gt", "neg"})):
+        (operation,) = [x for x in listed(f, jnp.ones(())).operations if x.blocks]
+        assert len(operation.results) == (2 if f is loop else 1)
+        inner = {x.name for block in operation.blocks for x in block.operations}
+        assert inner <= names | {"convert_element_type"}
+        assert "sin" not in inner
+    assert isinstance(listed(jnp.sin, jnp.ones(())).arguments[0], Scalar)
