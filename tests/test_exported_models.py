@@ -195,7 +195,7 @@ def sorted_force(q, v, t, params):
 def test_what_cannot_be_written_is_named_with_its_line():
     system, x = hhtjax.System(jnp.ones(2), sorted_force), jnp.ones(2)
     line = sorted_force.__code__.co_firstlineno + 1
-    message = f"`sort` cannot be written in C; it is used in test_export_c.py, line {line}, in sorted_force."
+    message = f"`sort` cannot be written in C; it is used in test_exported_models.py, line {line}, in sorted_force."
     check_message(NotImplementedError, message, lambda: export_c(system, hht(), x, x))
     rod = pendulum.cartesian()
     stepper = hht(redundant="least_squares")
