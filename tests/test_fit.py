@@ -215,7 +215,7 @@ def test_undetermined_parameters_are_named():
     assert lines[2].split() == ["a", f"{float(result.params['a']):.6g}", "undetermined"]
     why = "undetermined: a, b, unused[0]: the residuals determine a, b only through their product; unused[0] not at all"
     assert why in lines
-    assert "correlation" not in result.summary()
+    assert "largest correlation" not in result.summary()
     assert float(result.params["a"] * result.params["b"]) == pytest.approx(2.0, rel=1e-6)
     assert np.isinf(result.standard_errors["a"])
     assert np.isfinite(result.standard_errors["c"])
