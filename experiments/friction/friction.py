@@ -1,8 +1,8 @@
-"""Dry friction without smoothing: error against steps and time, beside tanh(v/vt) and MuJoCo; creep in an hour.
+"""Dry friction without smoothing: error against steps and time, beside tanh(v/vt), MuJoCo, exudyn; creep in an hour.
 
 A mass on a spring, driven by a sine, sticks and slips 20 times (hhtjax.scenes.dry_oscillator); its exact motion is
 solved from switch to switch. MuJoCo's `frictionloss` is part of its soft constraints: with their default, and with the
-stiffest that it takes. exudyn has no friction of a joint that sticks, and is left out.
+stiffest that it takes. exudyn's is linear below a speed, or a stiff spring where a joint sticks.
 """
 
 import importlib.util
@@ -16,6 +16,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import hhtjax
+from experiments.friction import by_exudyn
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
 from hhtjax.plot import legend, subplots
@@ -24,7 +25,7 @@ from hhtjax.scenes import dry_oscillator
 ALPHA = -0.05
 SAMPLES = 50
 SOLVES = 4  # of tanh, in a step
-SPEEDS = 1e-2, 1e-3, 1e-4, 1e-5  # vt of tanh(v/vt), m/s
+SPEEDS = 1e-3, 1e-4, 1e-5  # vt of tanh(v/vt), m/s
 IMPEDANCES = {"MuJoCo, default": None, "MuJoCo, stiffest": 0.9999}
 HOUR = 3600.0
 TARGETS = 1e-2, 1.5e-3, 1.5e-4, 1.5e-5  # m, just above what each vt comes down to
@@ -120,6 +121,11 @@ def work_precision(report, scene, sizes):
             for way, impedance in IMPEDANCES.items():
                 path, seconds = timed(lambda size=size, x=impedance: mujoco_path(scene, size, x))
                 entry(way, size, path, seconds, None)
+        if importlib.util.find_spec("exudyn"):
+            load = float(scene.params["A"]), float(scene.params["W"]), 0.0
+            for way in by_exudyn.WAYS:
+                run = partial(by_exudyn.path, scene.params, way, *load, scene.duration, size * SAMPLES, SAMPLES)
+                entry(way, size, *timed(run), None)
         report.progress(f"{size * SAMPLES} steps: {rows[-1]['way']} {rows[-1]['error_m']:.2g} m")
     return rows
 
@@ -182,7 +188,7 @@ def creep(report, scene, duration):
     zero, paths = jnp.zeros(1), {}
     found = hhtjax.simulate(dry, hhtjax.hht(ALPHA), zero, zero, params, **options)
     paths["set-valued"] = found.q[:, 0]
-    for vt in SPEEDS[1:3]:
+    for vt in SPEEDS[:2]:
         stepper = hhtjax.hht(ALPHA, iterations=None)
         path = hhtjax.simulate(smooth, stepper, zero, zero, {**params, "vt": vt}, **options)
         if not np.any(path.failure.step):  # Newton's iteration converged
@@ -191,6 +197,9 @@ def creep(report, scene, duration):
         for way, impedance in IMPEDANCES.items():
             model = mujoco_model(params, 0.01, impedance)
             paths[way] = mujoco_run(model, np.full(steps, params["load"]), steps // keep)
+    if importlib.util.find_spec("exudyn"):
+        for way in by_exudyn.WAYS:
+            paths[way] = by_exudyn.path(params, way, 0.0, 0.0, float(params["load"]), duration, steps, keep)
     for way, path in paths.items():
         report.progress(f"creep in {duration:.0f} s, {way}: {float(path[-1]):.3g} m")
     return {"t_s": np.asarray(found.t).tolist(), "q_m": {way: np.asarray(path).tolist() for way, path in paths.items()}}
@@ -198,7 +207,9 @@ def creep(report, scene, duration):
 
 def steps_saved(rows):
     """For some errors: the steps of the set-valued step, and those that the others take over them, by the best vt."""
-    groups = {way: [row for row in rows if row["way"].startswith(way)] for way in ("set-valued", "tanh", "MuJoCo")}
+    groups = {
+        way: [row for row in rows if row["way"].startswith(way)] for way in ("set-valued", "tanh", "MuJoCo", "exudyn")
+    }
     line = sorted((np.log(row["error_m"]), np.log(row["steps"])) for row in groups.pop("set-valued"))
     found = []
     for target in TARGETS:

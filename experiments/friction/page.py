@@ -17,7 +17,7 @@ def page(numbers):
         [
             f"{x['error_m']:.1e}",
             f"{x['steps']:.0f}",
-            *(f"{x[way]:.0f}" if way in x else "" for way in ("tanh", "MuJoCo")),
+            *(f"{x[way]:.0f}" if way in x else "" for way in ("tanh", "MuJoCo", "exudyn")),
         ]
         for x in numbers["equal_errors"]
     ]
@@ -30,7 +30,7 @@ def page(numbers):
             switches=numbers["switches"],
             samples=numbers["samples"],
             most=max(row["steps"] for row in numbers["rows"]),
-            saved=table(["error (m)", "steps, set-valued", "tanh takes times as many", "MuJoCo"], saved),
+            saved=table(["error (m)", "steps, set-valued", "tanh takes times as many", "MuJoCo", "exudyn"], saved),
             duration=numbers["creep"]["t_s"][-1],
             creep=table(["", "m"], creep),
         )
