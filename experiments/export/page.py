@@ -81,10 +81,10 @@ def page(numbers):
             flags=f"`{speed['flags']}`",
             by_hand=table(["form", "ns per step"], [[k, f"{x:.1f}"] for k, x in speed["by_hand_ns"].items()]),
             scenes=table(
-                ["scene", "operations", "sines and the like", "C (ns)", "XLA (ns)", "C over XLA"],
+                ["scene", "operations", "sines and the like", "C (ns)", "XLA (ns)", "C over XLA", "difference"],
                 [
                     [r["scene"], r["operations"], r["functions"], f"{r['c_ns']:.0f}", f"{r['xla_ns']:.0f}",
-                     f"{r['c_time_over_xla']:.2f}"]
+                     f"{r['c_time_over_xla']:.2f}", f"{r['relative_difference']:.0e}"]
                     for r in speed["scenes"]
                 ],
             ),

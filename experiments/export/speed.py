@@ -85,15 +85,19 @@ def run(report, fast):
     for name, (make, stepper, dt) in list(SCENES.items())[: 1 if fast else None]:
         num_steps = 500 if fast else 5000
         ours = Run(make(), stepper, dt, num_steps)
-        times = least_seconds({"C": ours, "XLA": in_python(make(), stepper, dt, num_steps)}, 3 if fast else 15)
+        python = in_python(make(), stepper, dt, num_steps)
+        times = least_seconds({"C": ours, "XLA": python}, 3 if fast else 15)
+        ours(path=True)
+        expected = float(np.ravel(jax.tree.leaves(python())[0][-1])[0])
+        difference = abs(float(ours.path[-1]) - expected) / float(np.max(abs(ours.path)))
         c, xla = (1e9 * times[form] / num_steps for form in ("C", "XLA"))
         rows.append(
             {
                 "scene": name, "operations": ours.model.operations, "functions": ours.model.functions,
-                "c_ns": c, "xla_ns": xla, "c_time_over_xla": c / xla,
+                "c_ns": c, "xla_ns": xla, "c_time_over_xla": c / xla, "relative_difference": difference,
             }
         )  # fmt: skip
         report.progress(f"{name}: {c:.0f} ns, XLA {xla:.0f} ns")
-    header = ["scene", "operations", "sines and the like", "C (ns)", "XLA (ns)", "ratio"]
+    header = ["scene", "operations", "sines and the like", "C (ns)", "XLA (ns)", "ratio", "difference"]
     report.table(header, [list(row.values()) for row in rows])
     return {"by_hand_ns": hand, "time_over_by_hand": ratio, "scenes": rows, "flags": " ".join(("-O3", "-march=native"))}
