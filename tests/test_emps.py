@@ -11,6 +11,7 @@ from scipy.io import savemat
 
 from experiments.identification import data as silverbox
 from experiments.identification import emps_data as data
+from experiments.identification import tanks_data
 
 NUMBERS = json.loads((Path(data.__file__).parent / "emps.json").read_text())
 PUBLISHED = {"M": 95.1089, "Fv": 203.5034, "Fc": 20.3935, "offset": -3.1648, "delay": data.HOLD}
@@ -84,6 +85,16 @@ def test_silverbox_is_downloaded_too(monkeypatch, tmp_path):
     assert sets.measured
     assert sets.train.u[0] == 40650
     assert sets.train.y[0] == -40650
+
+
+def test_tanks_are_downloaded_too(monkeypatch, tmp_path):
+    file = tmp_path / "dataBenchmark.mat"
+    savemat(file, {name: np.arange(1024.0)[:, None] + i for i, name in enumerate(("uEst", "uVal", "yEst", "yVal"))})
+    package(monkeypatch, tmp_path, Cascaded_Tanks=lambda data_file_locations: [str(tmp_path / "about.txt"), str(file)])
+    sets = tanks_data.load(fast=True)
+    assert sets.measured
+    assert [x[0] for record in (sets.train, sets.test) for x in record] == [0, 2, 1, 3]
+    assert len(sets.test.y) == 400
 
 
 def test_a_download_that_fails_says_so(monkeypatch, tmp_path, capsys):

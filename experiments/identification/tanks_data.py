@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
-from experiments.identification.data import data_folder
+from experiments.identification.data import columns, data_folder, downloaded, how_to_get
 
 DT = 4.0  # s, sampling period
 SAMPLES = 1024
@@ -24,10 +24,7 @@ RELEASE = 5.5  # V, where a reading that had been higher falls, twice in the tra
 WEIR = 1.0  # 1/s, of water above a rim: fast beside DT, so that its value does not matter
 NOISE = 0.02  # V, standard deviation
 STORED = {"u_train": "uEst", "u_test": "uVal", "y_train": "yEst", "y_test": "yVal"}  # and the benchmark's own names
-HOW_TO_GET_IT = (
-    "download dataBenchmark.csv of the cascaded tanks from nonlinearbenchmark.org into a folder cascaded_tanks/ as "
-    "tanks.csv, and set the environment variable HHTJAX_DATA to the folder that holds cascaded_tanks/"
-)
+HOW_TO_GET_IT = how_to_get("dataBenchmark.csv of the cascaded tanks (as tanks.csv)", "cascaded_tanks")
 GENERATED = {"k1": 0.037, "k2": 0.054, "k3": 0.087, "k4": 0.028, "u0": -1.0, "x1": 7.5, "x2": 5.2}
 GENERATED |= {"over": 1.2, "rim": 10.2, "caught": 0.06}
 
@@ -48,13 +45,23 @@ class Records(NamedTuple):
 
 
 def load(fast: bool) -> Records:
-    """The benchmark's records where they are found, else generated ones; fast: a part of each."""
-    path = data_folder() / "cascaded_tanks" / "tanks.csv"
-    measured = path.is_file()
-    found = read(path) if measured else generate()
+    """The benchmark's records where they are found or can be downloaded, else generated ones; fast: a part of each."""
+    measured = found()
+    data = measured or generate()
     end = 400 if fast else None
-    train, test = (Record(found[f"u_{part}"][:end], found[f"y_{part}"][:end]) for part in ("train", "test"))
-    return Records(train, test, measured)
+    train, test = (Record(data[f"u_{part}"][:end], data[f"y_{part}"][:end]) for part in ("train", "test"))
+    return Records(train, test, measured is not None)
+
+
+def found():
+    """Its columns by name: of the folder of data, or downloaded; None where there are none."""
+    path = data_folder() / "cascaded_tanks" / "tanks.csv"
+    if path.is_file():
+        return read(path)
+    for file in downloaded("Cascaded_Tanks"):
+        if file.endswith(".mat"):
+            return dict(zip(STORED, columns(file, *STORED.values()), strict=True))
+    return None
 
 
 def read(path: Path):
