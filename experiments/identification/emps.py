@@ -62,7 +62,8 @@ def run(report: Report, fast: bool):
     numbers |= {"chosen": compared.chosen, "estimate": estimate(chosen)}
     numbers["standard_error_over_naive"] = over_naive(chosen)
     numbers["published_parameters"] = by_unit(PUBLISHED) | scores(sets, PUBLISHED | {"delay": sets.hold})
-    numbers["other_friction"] = other_friction(report, sets, chosen)
+    if not fast:
+        numbers["other_friction"] = other_friction(report, sets, chosen)
     numbers["valley"] = {name: valley(report, sets, chosen, name, fast) for name in ("M", "Fc")[: 2 - fast]}
     plot_fit(report, sets, chosen)
     plot_valley(report, numbers["valley"], chosen)
@@ -123,7 +124,7 @@ def fit(report, sets, name, terms, start):
     begun = time.perf_counter()
     every = {"max_iterations": ITERATIONS, **options(own, terms)}
     result, costs, rng = hhtjax.fit(residuals_of(sets), own, **every), [], np.random.default_rng(0)
-    for _ in range(1 if len(sets.train.y) < 5000 else RESTARTS):
+    for _ in range(1 if len(sets.train.y) < 20_000 else RESTARTS):
         costs.append(float(result.cost))
         again = hhtjax.fit(residuals_of(sets), drawn(result, rng), **every)
         result = min(result, again, key=lambda x: float(x.cost))
