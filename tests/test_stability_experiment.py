@@ -96,7 +96,9 @@ def test_the_dry_motion_is_exact():
 
 
 def test_the_committed_cells_of_the_set_valued_step_are_what_it_does():
+    """And its order is 2."""
     case, committed = DRY["stick-slip"], COMMITTED["dry"]["scenes"]["stick-slip"]
     outcome = dry.assess(dry.dry_case(case), committed["num_steps"], dry.dry_reference(case)[0], dry.STEPPER)
     found = cells({case.name: {dry.SET_VALUED: outcome}}, {case.name: committed["num_steps"]})[case.name]
     assert found["grades"][dry.SET_VALUED] == committed["grades"][dry.SET_VALUED]
+    assert np.all(np.log2(outcome.error[5] / outcome.error[9]) / 4 > 1.9)
