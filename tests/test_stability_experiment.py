@@ -55,7 +55,7 @@ def test_the_boundaries_are_those_pinned():
 
 
 def test_the_set_valued_step_takes_fewer_steps_than_any_with_tanh():
-    """A quarter of the same step's at most, half of any one's; no more than those with tanh by their own motion."""
+    """A quarter of the default's at most, half of any one's; no more than those with tanh by their own motion."""
     for name, fewest in COMMITTED["dry"]["fewest_accurate_steps"].items():
         steps, *others = fewest.values()
         assert next(iter(fewest)) == dry.SET_VALUED

@@ -1,7 +1,8 @@
 """Dry friction: the gallery's two scenes of it with their tanh, beside the set-valued law, by the exact dry motion.
 
 The law that tanh stands for, F sign(s) with any force up to F at s = 0, is solved from one switch to the next, and all
-columns are graded by that motion. The set-valued step is `hht(alpha)`, one solve a step, on `System(..., friction=F)`.
+columns are graded by that motion. The set-valued step is `hht(alpha)` on `System(..., friction=F)`: one solve a step,
+linearised at the predictor, as always with friction.
 """
 
 from functools import partial

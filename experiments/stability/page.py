@@ -7,8 +7,7 @@ import json
 from pathlib import Path
 
 from experiments.page import table
-from experiments.stability.dry import SET_VALUED, STEPPER, fewest_accurate
-from experiments.stability.grades import plain
+from experiments.stability.dry import SET_VALUED, fewest_accurate
 from experiments.stability.peers import MAX_STEPS
 
 HERE = Path(__file__).parent
@@ -108,7 +107,8 @@ def page(numbers):
             dry_switches=both(x["switches"] for x in motions),
             dry_away=both(f"{100 * x['tanh_motion_error']:.2g} %" for x in motions),
             dry_set_valued=both(x[SET_VALUED] for x in fewest),
-            dry_same=both(x[plain(STEPPER)] for x in fewest),
+            dry_default=both(x["HHT auto"] for x in fewest),
+            dry_predictor=both(x["HHT predictor"] for x in fewest),
             dry=dry_table(dry, gallery),
             blown_up=reported["cells"]["again"],
             once=reported["cells"]["blown_up"],
