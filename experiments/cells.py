@@ -42,7 +42,7 @@ def march(stepper, start, scene, num_steps, record=position, track=position):
         # the last one to write is the one on time
         path = jax.tree.map(lambda x, new: x.at[i // steps_between].set(new), path, record(state))
         farthest = jnp.maximum(farthest, jnp.max(jnp.abs(track(state) - track(start))))
-        return state, path, farthest, failures + (0 if info.converged is None else ~info.converged)
+        return state, path, farthest, failures + (0 if info.converged is None else jnp.where(info.converged, 0, 1))
 
     path = jax.tree.map(lambda x: jnp.zeros((SAMPLES, *x.shape)), record(start))
     return jax.lax.fori_loop(0, num_steps, step, (start, path, 0.0, 0))[1:]

@@ -1,14 +1,26 @@
-"""The stability experiment: what its committed numbers must show, and its page."""
+"""The stability experiment: what its committed numbers must show, and its scenes with dry friction."""
 
 import json
 from pathlib import Path
 
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from friction_problems import free_vibration_exact
+from friction_reference import Motion
+
+from experiments.cells import SAMPLES
+from experiments.dry_motion import dry_motion
 from experiments.page import find
+from experiments.stability import dry
+from experiments.stability.grades import cells
+from experiments.stability.scenes import all_cases
 
 ROOT = Path(__file__).parents[1]
 
 HERE = ROOT / "experiments" / "stability"
 COMMITTED = json.loads((HERE / "stability.json").read_text())
+DRY = {case.name: case for case in all_cases() if case.name in dry.LAWS}
 PINNED = json.loads((ROOT / "tests" / "data" / "stability.json").read_text())
 
 
@@ -40,3 +52,53 @@ def test_the_committed_numbers_hold_what_is_claimed():
 
 def test_the_boundaries_are_those_pinned():
     assert COMMITTED["gallery"]["boundaries"] == PINNED
+
+
+def test_the_set_valued_step_takes_fewer_steps_than_any_with_tanh():
+    """A quarter of the default's at most, half of any one's; no more than those with tanh by their own motion."""
+    for name, fewest in COMMITTED["dry"]["fewest_accurate_steps"].items():
+        steps, *others = fewest.values()
+        assert next(iter(fewest)) == dry.SET_VALUED
+        assert 4 * steps <= fewest["HHT auto"]
+        assert all(x is None or 2 * steps <= x for x in others)
+        gallery = dry.fewest_accurate(COMMITTED["gallery"]["scenes"][name])
+        assert all(x is None or steps <= x for x in gallery.values())
+        assert fewest == dry.fewest_accurate(COMMITTED["dry"]["scenes"][name])
+    motions = COMMITTED["dry"]["motions"]
+    assert motions["tanh friction"]["tanh_motion_error"] < 1e-3 < motions["stick-slip"]["tanh_motion_error"] < 0.05
+
+
+@pytest.mark.parametrize("name", DRY)
+def test_the_dry_law_is_the_one_that_tanh_smooths(name):
+    """In the system and in the reference."""
+    law, case = dry.LAWS[name], DRY[name]
+    q, v, t, params = jnp.full(9, 0.3), jnp.linspace(-2, 2, 9), 0.7, case.scene.params
+    s = v - law.belt
+    smooth = law.force(q, v, t, params) - law.limit(q, v, t, params) * jnp.tanh(s / params["width"])
+    np.testing.assert_allclose(smooth, case.scene.system.force(q, v, t, params), rtol=1e-14)
+    np.testing.assert_allclose(law.load(t, (q[0], 0)), law.force(q, v, t, params)[0], rtol=1e-14)
+    np.testing.assert_allclose(law.limit(q, v, t, params), [law.limit_at(x) for x in s], rtol=1e-14)
+    np.testing.assert_array_equal(s, v if law.sliding is None else law.sliding(q, v, t, params))
+
+
+def test_the_dry_motion_is_exact():
+    """By the closed form of a mass that comes to rest, and on the belt by another solver."""
+    times = np.linspace(0, 2.2, 23)
+    q, switches = dry_motion(lambda t, y: -100 * y[0], lambda s: 4.0, [0.5, 0.0], times)
+    np.testing.assert_allclose(q, free_vibration_exact(times)[0], atol=1e-10)
+    np.testing.assert_allclose(switches, np.pi / 10 * np.arange(1, len(switches) + 1), atol=1e-9)
+    scene = dry.dry_case(DRY["stick-slip"]).scene
+    motion = Motion(scene.system, scene.params, np.array(scene.q0), np.array(scene.v0))
+    expected = motion.at(np.linspace(0, scene.duration, SAMPLES + 1))[0]
+    reference, switches = dry.dry_reference(DRY["stick-slip"])
+    np.testing.assert_allclose(reference.q, expected[1:], atol=1e-10)
+    assert switches == COMMITTED["dry"]["motions"]["stick-slip"]["switches"]
+
+
+def test_the_committed_cells_of_the_set_valued_step_are_what_it_does():
+    """And its order is 2."""
+    case, committed = DRY["stick-slip"], COMMITTED["dry"]["scenes"]["stick-slip"]
+    outcome = dry.assess(dry.dry_case(case), committed["num_steps"], dry.dry_reference(case)[0], dry.STEPPER)
+    found = cells({case.name: {dry.SET_VALUED: outcome}}, {case.name: committed["num_steps"]})[case.name]
+    assert found["grades"][dry.SET_VALUED] == committed["grades"][dry.SET_VALUED]
+    assert np.all(np.log2(outcome.error[5] / outcome.error[9]) / 4 > 1.9)

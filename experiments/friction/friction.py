@@ -13,9 +13,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import solve_ivp
 
 import hhtjax
+from experiments.dry_motion import dry_motion
 from experiments.friction import by_exudyn
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
@@ -29,7 +29,6 @@ SPEEDS = 1e-3, 1e-4, 1e-5  # vt of tanh(v/vt), m/s
 IMPEDANCES = {"MuJoCo, default": None, "MuJoCo, stiffest": 0.9999}
 HOUR = 3600.0
 TARGETS = 1e-2, 1.5e-3, 1.5e-4, 1.5e-5  # m, just above what each vt comes down to
-REFERENCE: dict = {"rtol": 1e-12, "atol": 1e-13, "max_step": 0.02}
 
 
 def smooth_force(q, v, t, params):
@@ -52,38 +51,14 @@ def run(report: Report, fast: bool):
 
 
 def exact(scene):
-    """q at the samples and the times of switches, by DOP853 from one to the next."""
-    p, F = scene.params, scene.params["F"]
-    times = np.linspace(0, scene.duration, SAMPLES + 1)
-    q, t, y, sig, found = np.zeros(SAMPLES + 1), 0.0, np.zeros(2), 0.0, []
+    """q at the samples and the times of switches."""
+    p = scene.params
 
     def load(t, y):
         return p["A"] * np.sin(p["W"] * t) - p["k"] * y[0] - p["c"] * y[1]
 
-    while t < scene.duration:
-
-        def rate(t, y, sig=sig):
-            return [y[1], (load(t, y) - sig * F) / p["m"] if sig else 0.0]
-
-        def event(t, y, sig=sig):
-            return sig * y[1] if sig else F - abs(load(t, y))
-
-        event.terminal, event.direction = True, -1
-        leap = solve_ivp(rate, (t, scene.duration), y, "DOP853", events=event, dense_output=True, **REFERENCE)
-        here = (times >= t) & (times <= leap.t[-1])
-        if here.any():
-            q[here] = leap.sol(times[here])[0]
-        t, y = leap.t[-1], leap.y[:, -1]
-        if t < scene.duration:
-            found.append(t)
-            y = np.array([y[0], 0.0]) if sig else y
-            pull = load(t, y)
-            sig = 0.0 if sig and abs(pull) <= F else float(np.sign(pull))
-            if sig:  # a little past it, so that it is not found again
-                h, w = 1e-7, (pull - sig * F) / p["m"]
-                jerk = (load(t + 1e-7, y) - pull) / 1e-7 / p["m"]
-                y, t = np.array([y[0], y[1] + h * w + h**2 * jerk / 2]), t + h
-    return q, found
+    times = np.linspace(0, scene.duration, SAMPLES + 1)
+    return dry_motion(load, lambda s: p["F"], np.zeros(2), times, p["m"])
 
 
 def switches(scene):

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from experiments.page import table
+from experiments.stability.dry import SET_VALUED, fewest_accurate
 from experiments.stability.peers import MAX_STEPS
 
 HERE = Path(__file__).parent
@@ -43,6 +44,19 @@ def exceptions(entries):
     return f" (not flagged: {', '.join(words)})" if entries else ""
 
 
+def both(of_scenes):
+    """Of the scenes with dry friction, in words."""
+    return " and ".join(map(str, of_scenes))
+
+
+def dry_table(dry, gallery):
+    """Fewest steps by the dry motion, and, of tanh, by its own."""
+    by_scene = [(x, fewest_accurate(gallery["scenes"][name])) for name, x in dry["fewest_accurate_steps"].items()]
+    header = ["method", *(x for name in dry["scenes"] for x in (name, "by its own motion"))]
+    rows = [[m, *(y or "-" for x, own in by_scene for y in (x[m], own.get(m, x[m])))] for m in by_scene[0][0]]
+    return table(header, rows)
+
+
 def drift_table(entries):
     """One row per scene and method."""
     names = list(dict.fromkeys(key for e in entries for key in e["last"]))
@@ -71,6 +85,8 @@ def dampers_table(rows):
 def page(numbers):
     """The text of README.md."""
     gallery, reported, advice, peers = (numbers[part] for part in ("gallery", "reported", "advice", "peers"))
+    dry = numbers["dry"]
+    fewest, motions = dry["fewest_accurate_steps"].values(), dry["motions"].values()
     drift, spin = numbers["drift"], numbers["rotating"]["spin_error"]
     scenes = gallery["scenes"]
     first = next(iter(scenes.values()))
@@ -88,6 +104,12 @@ def page(numbers):
             held_scenes=held,
             tuned=summary_table(gallery["summary_tuned_on"]),
             held=summary_table(gallery["summary_held_out"]),
+            dry_switches=both(x["switches"] for x in motions),
+            dry_away=both(f"{100 * x['tanh_motion_error']:.2g} %" for x in motions),
+            dry_set_valued=both(x[SET_VALUED] for x in fewest),
+            dry_default=both(x["HHT auto"] for x in fewest),
+            dry_predictor=both(x["HHT predictor"] for x in fewest),
+            dry=dry_table(dry, gallery),
             blown_up=reported["cells"]["again"],
             once=reported["cells"]["blown_up"],
             named=reported["cells"]["named_by_check"],
