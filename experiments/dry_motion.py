@@ -1,5 +1,7 @@
 """The exact motion of a mass with set-valued dry friction, solved from one switch to the next."""
 
+from typing import Any
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -20,16 +22,16 @@ def dry_motion(load, limit, start, times, mass=1.0, belt=0.0):
     q, t, y, found = np.zeros(len(times)), times[0], np.array(start, float), []
     pull, end = load(t, y), times[-1]
     sig = float(np.sign(y[1] - belt)) or float(np.sign(pull) * (abs(pull) > limit(0.0)))
+
+    def rate(t, y, sig):
+        return [y[1], (load(t, y) - sig * limit(y[1] - belt)) / mass if sig else 0.0]
+
+    def event(t, y, sig):
+        return sig * (y[1] - belt) if sig else limit(0.0) - abs(load(t, y))
+
+    event.terminal, event.direction = True, -1
     while t < end:
-
-        def rate(t, y, sig=sig):
-            return [y[1], (load(t, y) - sig * limit(y[1] - belt)) / mass if sig else 0.0]
-
-        def event(t, y, sig=sig):
-            return sig * (y[1] - belt) if sig else limit(0.0) - abs(load(t, y))
-
-        event.terminal, event.direction = True, -1
-        leap = solve_ivp(rate, (t, end), y, "DOP853", events=event, dense_output=True, **TOLERANCES)
+        leap: Any = solve_ivp(rate, (t, end), y, "DOP853", events=event, dense_output=True, args=(sig,), **TOLERANCES)
         here = (times >= t) & (times <= leap.t[-1])
         if here.any():
             q[here] = leap.sol(times[here])[0]

@@ -185,10 +185,10 @@ def steps_saved(rows):
     groups = {
         way: [row for row in rows if row["way"].startswith(way)] for way in ("set-valued", "tanh", "MuJoCo", "exudyn")
     }
-    line = sorted((np.log(row["error_m"]), np.log(row["steps"])) for row in groups.pop("set-valued"))
+    line = np.log(sorted((row["error_m"], row["steps"]) for row in groups.pop("set-valued")))
     found = []
     for target in TARGETS:
-        own = float(np.exp(np.interp(np.log(target), *zip(*line, strict=True))))
+        own = float(np.exp(np.interp(np.log(target), line[:, 0], line[:, 1])))
         entry = {"error_m": target, "steps": own}
         for way, group in groups.items():
             enough = [row["steps"] for row in group if row["error_m"] <= target]

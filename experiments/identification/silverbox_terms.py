@@ -97,7 +97,7 @@ def simulate(own, start, u, samples, substeps=SUBSTEPS):
         dt=1 / SAMPLING_RATE / substeps,
         num_steps=(samples - 1) * substeps,
         save_every=substeps,
-        **({"z0": jnp.zeros(2)} if states else {}),
+        z0=jnp.zeros(2) if states else None,
     )
     y, v = run.q[:, 0], run.v[:, 0]
     return y + sum(own[name] * term(y, v) for name, (term, *_) in READINGS.items() if name in own)
@@ -163,7 +163,8 @@ def fit_and_score(report: Report, sets, u, name, guess):
     scale = {key: sizes[key] for key in own}, STATE_SCALE
 
     def residuals(unknown):
-        return simulate(*unknown, u, len(y)) - y
+        own, start = unknown
+        return simulate(own, start, u, len(y)) - y
 
     result = hhtjax.fit(residuals, guess, scale=scale)
     fitted, errors = result.params[0], result.standard_errors[0]
