@@ -150,7 +150,7 @@ def test_derivatives_are_those_of_the_exact_motion():
 
 
 def test_derivatives_through_coupled_switches():
-    """Of two joints, whose friction is found by an iteration that is differentiated implicitly."""
+    """Of two joints: the times of the events within a step are differentiated, their order is not."""
     case = arm()._replace(duration=2.0)
 
     def end(start):
@@ -200,7 +200,7 @@ def test_newton_in_the_free_step():
 
 @pytest.mark.slow
 def test_eight_joints_in_a_row():
-    """They stick and slip one on the other; the switch of one jerks its neighbours, which costs an order."""
+    """They stick and slip one on the other; the switch of one jerks its neighbours within the step."""
     n, rates = 8, 1 + 0.3 * jnp.arange(8.0)
     row = hhtjax.System(
         jnp.ones(n),
@@ -211,8 +211,8 @@ def test_eight_joints_in_a_row():
     zero, steps = jnp.zeros(n), np.array([250, 2000, 16000])
     found = hhtjax.sweep(row, hhtjax.hht(), zero, zero, dts=5 / steps, duration=5.0, num_samples=10)
     found.check()
-    assert float(found.info.friction.max()) < 1e-12
+    assert not np.any(found.info.friction)
     errors = [np.max(np.abs(found.q[i] - found.q[-1])) for i in range(2)]
     assert errors[0] < 1.5e-3
-    assert np.log(errors[0] / errors[1]) / np.log(steps[1] / steps[0]) > 0.95
+    assert np.log(errors[0] / errors[1]) / np.log(steps[1] / steps[0]) > 1.85
     assert 0.02 < np.mean(found.sticking[-1]) < 0.9

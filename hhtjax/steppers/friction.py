@@ -6,8 +6,9 @@ start of the step. Joints that stick, or switch inside the step, get a multiplie
     w1 = wf - G dtau,    G = A^-1 H^T,    s1 = sf - W dtau,    W = H dv/dw G,
 
 by the one factorisation of A, f standing for the free step, with sig. A switch is resolved within the step, by the
-motion on either side of it (friction_law.py). Behind it w, a, v and q go along G to where the new branch has them: the
-jump of the acceleration never enters the recursion, which therefore does not ring, and what sticks stays where it is.
+motion on either side of it (friction_law.py; of several joints, friction_events.py). Behind it w, a, v and q go along G
+to where the new branch has them: the jump of the acceleration never enters the recursion, which therefore does not
+ring, and what sticks stays where it is.
 """
 
 from functools import partial
@@ -16,9 +17,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.balance import balance
 from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.steppers.constrained import equations, report_constraints
+from hhtjax.steppers.friction_events import run_events
 from hhtjax.steppers.friction_law import is_settled, switch
 from hhtjax.steppers.newton import newton, solve_and_keep
 from hhtjax.steppers.residual import residual
@@ -103,20 +104,18 @@ def bind_friction(method, system, params, dt):
         held = path(z - matvec(G.T, solve_some(W, sig == 0, sf)))
         f = law.limit(held.q, held.v, held.L, held.t, params)
         K = across(H, G[:, :size])
-        rules = s0, sig, tau, f, diagonal(W), dt * diagonal(K)
-
-        def answer(b):
-            return switch(b, *rules).tau
-
-        dtau, change = balance(answer, sf, W, jnp.where(sig == 0, tau, 0), f)
-        end = switch(sf - matvec(W, dtau) + diagonal(W) * dtau, *rules)
+        if law.size == 1:
+            end, left = switch(sf, s0, sig, tau, f, diagonal(W), dt * diagonal(K)), jnp.zeros((), sf.dtype)
+        else:
+            end, left = run_events(sf, s0, sig, tau, f, W, dt * K)
+        dtau = end.tau
         z = z - matvec(G.T, dtau)
         x = method.advance(s, dt, z[:size])[0]
         taken = None if shift is None else shift(z[size + system.num_constraints :])
         x = x if taken is None else x - taken
         s1 = _behind(system, params, s, path(z), x, end, dtau, f, G, K)
         s1 = system.tidy(s1)
-        info = _told(info, change, _is_limit(law, at, params) & ~jnp.any(f < 0))
+        info = _told(info, left, _is_limit(law, at, params) & ~jnp.any(f < 0))
         return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
 
     return step
@@ -191,8 +190,8 @@ def _is_limit(law, s, params):
     return jnp.all(f >= 0) | ~(jnp.all(jnp.isfinite(s.q)) & jnp.all(jnp.isfinite(s.v)))
 
 
-def _told(info, change, is_limit):
+def _told(info, left, is_limit):
     """The `Info` of a step."""
-    change = jnp.where(is_limit, change, jnp.inf)
-    found = is_settled(change)
-    return info._replace(friction=change, converged=found if info.converged is None else info.converged & found)
+    left = jnp.where(is_limit, left, jnp.inf)
+    found = is_settled(left)
+    return info._replace(friction=left, converged=found if info.converged is None else info.converged & found)

@@ -75,8 +75,8 @@ class Info(NamedTuple):
         solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
             trust (`banded`, `conjugate_gradients`, a given function).
         solved: whether that is within its tolerance.
-        friction: how exactly the switches of several joints in one step are resolved, relative to the limits of dry
-            friction; infinite where a limit is negative or not a number.
+        friction: the part of a step that is left where several joints switch more often than it resolves; infinite
+            where a limit is negative or not a number.
         defect: S^-1 r, what a linearised step has left of its residual at its end, as a correction of the unknowns
             (under error control only).
     """

@@ -130,8 +130,8 @@ time, internal states, and the multipliers of constraints, that is, on normal lo
 does not creep. The `hht` family solves it with one factorisation per step and is of order 2 in q, v and z through every
 switch, with M(q), constraints, rotations and internal states; derivatives converge to those of the exact motion, so
 limits can be fitted. The best step is still short beside the time a joint slides or sticks: the second of two switches
-of one joint in one step waits for the next. Where several joints are coupled by their inertia (H M^-1 H^T is not
-diagonal), and the switch of one jerks others that stick, that step is of order 1.
+of a single joint in one step waits for the next. Several joints, coupled by their inertia or not, are followed from
+switch to switch within the step, as the switch of one jerks the others.
 
 >>> def force(q, v, t, params):
 ...     return -params["k"] * q + 6.0 * jnp.sin(2.0 * t)

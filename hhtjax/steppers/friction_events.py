@@ -1,0 +1,128 @@
+"""What the dry friction of several joints does within a step: from event to event, as what one does jerks the others.
+
+Between events the sliding velocities go linearly: p, by which the friction differs from that of the step in which
+nobody switches, is known where a joint slides, and at rest it is what keeps the velocity there at 0,
+
+    ds/dtheta = c - Wh p,    p = (sig f - base) where sliding,    (c - Wh p) = 0 where at rest,    theta = (t - t0)/h.
+
+An event: a joint that slides comes to rest, or the load of one at rest grows to its limit and it breaks away. Who does
+it first switches; of several at once, the first of them, until none is left (Murty 1974: finite, as K is positive).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.numerics.elimination import matvec
+from hhtjax.steppers.friction_law import Switch
+from hhtjax.systems.friction import solve_some
+
+EVENTS = 2  # per joint and step, as a reversal is two
+
+
+class Moment(NamedTuple):
+    """Within a step: time since its start over h, sliding velocities, directions, distances over h, who kept on."""
+
+    theta: Any
+    s: Any
+    sig: Any
+    slid: Any
+    kept: Any
+
+
+class Steady(NamedTuple):
+    """A step in which nobody switches: its ds/dtheta, and its friction, base = start + theta rise; limits; and Wh."""
+
+    c: Any
+    start: Any
+    rise: Any
+    f: Any
+    Wh: Any
+
+
+def run_events(sf, s, sig, tau, f, W, Wh):
+    """How joints come out of a step that start with s and, unless they stick, would come out with sf; and what part of
+    the step is left where the events were too many. W: fall of sf by units of friction; Wh: that of s in a time h."""
+    smooth = f == 0  # where nothing rubs, nothing switches
+    stuck = (sig == 0) & ~smooth
+    held = solve_some(W, stuck, sf)
+    still = sf - matvec(W, held)
+    start, rise = jnp.where(stuck, tau, sig * f), jnp.where(stuck, held - tau, 0)
+    begin = Moment(jnp.zeros((), s.dtype), jnp.where(stuck, 0, s), sig, jnp.zeros_like(s), ~stuck)
+    end = _to_the_end(begin, Steady(jnp.where(stuck, 0, still - s), start, rise, f, Wh))
+    s1 = jnp.where(end.kept, still, end.s)
+    dtau = solve_some(W, ~end.kept, sf - s1)
+    to = jnp.where(smooth, jnp.sign(sf - matvec(W, dtau)), end.sig)
+    return Switch(s1, to, dtau, end.slid, end.kept), 1 - end.theta
+
+
+@jax.custom_jvp
+def _to_the_end(at, steady):
+    """The end of the step, by as many events as there are."""
+
+    def unfinished(carry):
+        at, i = carry
+        return (at.theta < 1) & (i < EVENTS * len(at.s))
+
+    return lax.while_loop(unfinished, lambda x: (_event(x[0], steady), x[1] + 1), (at, 0))[0]
+
+
+@_to_the_end.defjvp
+def _(primals, tangents):
+    return jax.jvp(_skipping, primals, tangents)
+
+
+def _skipping(at, steady):
+    """The same in a fixed number of events, for reverse mode."""
+
+    def visit(at, _):
+        return lax.cond(at.theta < 1, lambda at: _event(at, steady), lambda at: at, at), None
+
+    return lax.scan(visit, at, length=EVENTS * len(at.s))[0]
+
+
+def _event(at, steady):
+    """On to the next event, and past it; or to the end of the step."""
+    wait, to, speed = _next(at, steady)
+    first, rest = jnp.argmin(wait), 1 - at.theta
+    due = wait[first] < rest
+    go = jnp.where(due, wait[first], rest)
+    who = due & (jnp.arange(len(wait)) == first)
+    s = at.s + go * speed
+    slid = at.slid + go * (at.s + s) / 2
+    theta = jnp.where(due, at.theta + go, 1)
+    return Moment(theta, jnp.where(who, 0, s), jnp.where(who, to, at.sig), slid, at.kept & ~who)
+
+
+def _next(at, steady):
+    """How long until each joint switches, to what, and ds/dtheta till then."""
+    f, smooth = steady.f, steady.f == 0
+    rests = (at.sig == 0) & ~smooth
+    rate, load = _motion(at.sig, rests, steady)
+    middle = (1 + at.theta) / 2
+    speed = rate(middle)
+    stops = ~rests & ~smooth & (at.sig * speed < 0)
+    until_rest = jnp.maximum(-at.s / jnp.where(stops, speed, 1), 0)
+
+    now, end = load(at.theta), load(1.0)
+    d = jnp.sign(end)
+    beyond = d * now >= f
+    breaks = rests & jnp.where(beyond, d * load(middle) > f, d * end > f)
+    grows = breaks & ~beyond
+    crossed = (1 - at.theta) * (f - d * now) / jnp.where(grows, d * (end - now), 1)
+    wait = jnp.where(stops, until_rest, jnp.where(breaks, jnp.where(grows, crossed, 0), jnp.inf))
+    return wait, jnp.where(rests, d, 0), speed
+
+
+def _motion(sig, rests, steady):
+    """ds/dtheta and the friction as functions of theta, with these directions; both are linear."""
+    c, start, rise, f, Wh = steady
+    p = [jnp.where(rests, 0, sig * f - start), jnp.where(rests, 0, -rise)]
+    p = [x + solve_some(Wh, rests, y - matvec(Wh, x)) for x, y in zip(p, (c, jnp.zeros_like(c)), strict=True)]
+
+    def rate(theta):
+        return jnp.where(rests, 0, c - matvec(Wh, p[0] + theta * p[1]))
+
+    return rate, lambda theta: start + p[0] + theta * (rise + p[1])
