@@ -143,14 +143,14 @@ def _require_consistent(system, data, mapped, t0):
     worst = {0}
     if any(mapped):
 
-        def distances(leaves):
+        def relative_distances(leaves):
             stepper, q0, v0, params, z0 = jax.tree.unflatten(structure, leaves)
             _, found = examine(system, q0, v0, t0, params, z0, stepper.redundant)
-            return [distance for _, distance in found]
+            return [relative for _, _, relative in found]
 
         with jax.ensure_compile_time_eval():  # under jit too
-            found = jax.vmap(distances, ([0 if flag else None for flag in mapped],))(leaves)
-        worst |= {int(np.argmax(distance)) for distance in found}
+            found = jax.vmap(relative_distances, ([0 if flag else None for flag in mapped],))(leaves)
+        worst |= {int(np.argmax(relative)) for relative in found}
     for i in sorted(worst):
         stepper, q0, v0, params, z0 = _member(data, mapped, i)
         require_consistent(f"sweep: member {i}", system, q0, v0, t0, params, stepper.redundant, z0)

@@ -46,11 +46,8 @@ def solve_and_keep(r, path, w, factorize, at=None, again=False):
     factorize = around(factorize, lambda: (path(w) if at is None else at, along))
     inverse = factorize_map(f, value, factorize)
     dw = inverse(value)
-    return w - dw, told(factorize, left_by(factorize, f, value, dw)), inverse, along
-    solve = factorize_map(f, value, factorize)
-    dw = solve(value)
     info = told(factorize, left_by(factorize, f, value, dw))
-    return w - dw, info._replace(defect=solve(r(path(w - dw)))) if again else info
+    return w - dw, info._replace(defect=inverse(r(path(w - dw)))) if again else info, inverse, along
 
 
 def left_by(factorize, f, b, x):
