@@ -95,8 +95,7 @@ print(f"\nnoise: {1e3 * sigma:.2f} mm estimated, {1e3 * 0.05 * clean.std():.2f} 
 # parameters, four forward derivatives along with the run cost less than one pass backwards through it. NUTS asks for
 # a gradient in reverse mode, so we hand it over by `jax.custom_vjp`.
 #
-# All times here are processor times of this process: what else the machine does counts little in them. On an idle
-# machine they are what a clock shows, since one core does nearly all of the work.
+# A time is the least of many calls, so that what else the machine does counts little.
 
 # %%
 estimate, unravel = ravel_pytree(result.params)
@@ -132,12 +131,12 @@ def log_density(motion, mode="forward"):
 
 
 def seconds(f, *args, longest=0.3):
-    """The result of the compiled function, and the shortest processor time of calls for 0.3 s."""
+    """The result of the compiled function, and the shortest time of calls for 0.3 s."""
     compiled, times, value = jax.jit(f).lower(*args).compile(), [], None
     while not times or sum(times) < longest:
-        begin = time.process_time()
+        begin = time.perf_counter()
         value = jax.block_until_ready(compiled(*args))
-        times.append(time.process_time() - begin)
+        times.append(time.perf_counter() - begin)
     return value, min(times)
 
 
