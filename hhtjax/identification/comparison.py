@@ -64,7 +64,7 @@ class Comparison(NamedTuple):
 
     @property
     def cross_validated(self) -> Any:
-        """(M,), root of the mean over segments of `held_out`^2; None without."""
+        """(M,), root of the mean square of `held_out` over segments; None without."""
         return None if self.held_out is None else np.sqrt(np.mean(self.held_out**2, axis=1))
 
     @property
