@@ -1,5 +1,7 @@
 """Frozen descriptions: hashable under jit, and pytrees whose arrays are data."""
 
+from contextlib import nullcontext
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,12 @@ def is_array(x):
 def is_concrete(x):
     """False for a tracer, whose value is not known while a function is being traced."""
     return not isinstance(x, Tracer)
+
+
+def evaluated_now():
+    """A context in which what is concrete is computed while a function is being traced, too."""
+    # not elsewhere: JAX 0.6 would leak a tracer
+    return nullcontext() if is_concrete(jnp.zeros(())) else jax.ensure_compile_time_eval()
 
 
 def is_real(x):

@@ -10,7 +10,7 @@ from jax import lax
 
 from hhtjax.description import is_concrete
 from hhtjax.description.presentation import overwrite, shown
-from hhtjax.runs.solution import SimulationError
+from hhtjax.runs.solution import SimulationError, first_bad
 from hhtjax.systems import kinematics
 from hhtjax.xla import on_scalars, one_kernel
 
@@ -58,10 +58,7 @@ class Steps(NamedTuple):
         stop = np.asarray(self.stop)
         if not stop.any():
             return None
-        member = tuple(int(i) for i in np.argwhere(stop)[0])
-        which = (
-            f"member {', '.join(map(str, member))} ({np.count_nonzero(stop)} of {stop.size} failed), " if member else ""
-        )
+        member, which = first_bad(stop)
         _, accepted, rejected, reached, why, estimate, least = (np.asarray(x)[member] for x in self)
         values = {TOO_SHORT: (least, estimate), TOO_MANY: (accepted + rejected,), BROKEN: (least,)}[int(why)]
         return f"{which}stopped at t = {reached:.6g}: {WHY[int(why)].format(*values)}."

@@ -11,6 +11,13 @@ from hhtjax.description.presentation import Table, all_known, between, brief, kn
 from hhtjax.steppers.stepper import Info
 
 
+def first_bad(bad):
+    """The index of the first bad member of a batch, and words for it; () and none where there is no batch."""
+    member = tuple(int(i) for i in np.argwhere(bad)[0])
+    words = f"member {', '.join(map(str, member))} ({np.count_nonzero(bad)} of {bad.size} failed), "
+    return member, words if member else ""
+
+
 class SimulationError(RuntimeError):
     """A run in which a step failed; raised by `Solution.check`."""
 
@@ -134,10 +141,8 @@ class Solution(NamedTuple):
         bad = np.where(strays > 0, strays, steps)
         if not bad.any():
             return None
-        member = tuple(int(i) for i in np.argwhere(bad)[0])
+        member, which = first_bad(bad)
         step, time = bad[member], self._time_of(bad[member], member)
-        failed = f"({np.count_nonzero(bad)} of {bad.size} failed)"
-        which = f"member {', '.join(map(str, member))} {failed}, " if member else ""
         why = (
             f"the position q is farther than {reach:g} from its start. Take a smaller dt, or a method that damps"
             if strays[member]

@@ -8,7 +8,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import is_array, is_concrete
+from hhtjax.description import evaluated_now, is_array, is_concrete
 from hhtjax.runs.sweep_grid import require_one_grid, require_step_sizes, require_steps_within, require_times
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 from hhtjax.systems.consistent import examine, require_consistent
@@ -148,7 +148,7 @@ def _require_consistent(system, data, mapped, t0):
             _, found = examine(system, q0, v0, t0, params, z0, stepper.redundant)
             return [relative for _, _, relative in found]
 
-        with jax.ensure_compile_time_eval():  # under jit too
+        with evaluated_now():
             found = jax.vmap(relative_distances, ([0 if flag else None for flag in mapped],))(leaves)
         worst |= {int(np.argmax(relative)) for relative in found}
     for i in sorted(worst):

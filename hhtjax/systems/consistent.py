@@ -1,7 +1,6 @@
 """Initial values that satisfy the constraints, and the check that they do."""
 
 import math
-from contextlib import nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.description import evaluated_now, freeze, is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.linear_solve import solve_map
 from hhtjax.systems import kinematics
@@ -163,8 +162,7 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
     """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
-    traced = not is_concrete(jnp.zeros(()))  # under jit too; elsewhere JAX 0.6 would leak a tracer
-    with jax.ensure_compile_time_eval() if traced else nullcontext():
+    with evaluated_now():
         B, found = examine(system, q0, v0, t0, params, z0, redundant)
         found = jax.tree.map(float, found)
     if redundant is None:

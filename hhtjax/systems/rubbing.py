@@ -1,12 +1,10 @@
 """The check that directions of friction do not depend on each other, or on constraints, at the start."""
 
-from contextlib import nullcontext
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import is_concrete, thaw
+from hhtjax.description import evaluated_now, is_concrete, thaw
 from hhtjax.systems.constraints import jacobian
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.friction import directions
@@ -28,8 +26,7 @@ def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
     """An error that names directions of friction that others, or constraints, make redundant; tracers pass."""
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
-    traced = not is_concrete(jnp.zeros(()))
-    with jax.ensure_compile_time_eval() if traced else nullcontext():
+    with evaluated_now():
         B, H = map(np.asarray, _rows(system, q0, v0, t0, params, z0))
     if not np.all(np.isfinite(H)):
         raise ValueError(f"{caller}: `sliding` has no finite derivative in v at the start.")
