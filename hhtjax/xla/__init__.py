@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows ten functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows eleven functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -45,6 +45,7 @@ The rest of the library knows ten functions of this room, and works as well on p
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     explain(f, *args)         what became of the loops of a program
+    polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
 
@@ -79,8 +80,10 @@ from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
 from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.scalars import on_scalars
+from hhtjax.xla.sines import RANGE, polynomial_sines
 
 __all__ = [
+    "RANGE",
     "Explanation",
     "Listing",
     "NotListed",
@@ -93,6 +96,7 @@ __all__ = [
     "one_kernel",
     "or_plain",
     "plain",
+    "polynomial_sines",
     "staged",
     "structural",
 ]

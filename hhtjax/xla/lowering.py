@@ -7,7 +7,7 @@ knows: with LAPACK, sort, scatter or a large product, compilation fails.
 So the called function is looked through, operation by operation, with vmap and autodiff done, and the attribute is
 attached only if all are known; where one is not proven, and XLA refuses the kernel on trial, it is not either.
 Platforms other than the CPU never see it. The verdict is attached too, for `explain` to read. A function may come in
-two forms, one for either case, of which the program keeps one.
+two forms, one for either case, of which the program keeps one. The sines of a kernel are those of sines.py.
 """
 
 from typing import Any
@@ -21,6 +21,7 @@ from hhtjax.xla.gate import is_possible
 from hhtjax.xla.inspection import ATTRIBUTES, Inspection, callee, directly_in, form_inside
 from hhtjax.xla.kernels import KERNEL, inside_p, structural_p, watch_p
 from hhtjax.xla.products import size, written_out
+from hhtjax.xla.sines import write_sines
 from hhtjax.xla.trial import Module
 
 VERDICT = "hhtjax_kernels"
@@ -69,6 +70,7 @@ def _cut(module, found, call):
         _take_form_inside(choice)
     for product in found.products:
         _call_stage([product], _insert(module, _as_stage(written_out(module, product))))
+    write_sines(module, found.finished)
     for name in found.finished:  # what a stage calls comes before it
         stages = found.stages.get(name, [])
         if stages and _may_be_divided(stages[0]):
