@@ -1,8 +1,9 @@
-"""Sine and cosine by polynomials: for systems on the CPU, whose batches and loops XLA then vectorises.
+"""Sine and cosine by polynomials: for arrays outside of kernels, which XLA then vectorises on the CPU.
 
 XLA:CPU evaluates `jnp.sin` of float64 numbers one by one, at some 5 ns each. These are sums and products, 2 ns for sine
-and cosine together. Put them in place of `jnp.sin` and `jnp.cos` in `mass` and `force`; the module as a whole can stand
-where `jnp` does (`hhtjax.scenes.double_pendulum.stiff(trigonometry=hhtjax.trigonometry)`).
+and cosine together. Inside a kernel `jnp.sin` and `jnp.cos` are such polynomials anyway (`hhtjax.xla`); where a system
+is too large for one, put these in their place in `mass` and `force`; the module as a whole can stand where `jnp` does
+(`hhtjax.scenes.double_pendulum.stiff(trigonometry=hhtjax.trigonometry)`).
 
 >>> import jax.numpy as jnp
 >>> from hhtjax import trigonometry

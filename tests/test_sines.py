@@ -1,4 +1,4 @@
-"""Sines and cosines inside a kernel: polynomials for |x| <= RANGE, XLA's own beyond; the same values and derivatives."""
+"""Sines and cosines inside a kernel: polynomials up to RANGE, XLA's own beyond; the same derivatives."""
 
 import jax
 import jax.numpy as jnp
