@@ -134,12 +134,13 @@ def _replace(module, group, written):
     operands = list(dict.fromkeys(op.operands[0] for op in group))
     wanted = tuple((op.name, operands.index(op.operands[0])) for op in group)
     kind = ir.RankedTensorType(operands[0].type)
+    results: list[ir.Type] = [kind] * len(group)
     key = tuple(kind.shape), len(operands), wanted
     with group[0].location:
         if key not in written:
             written[key] = _insert(module, ir.Module.parse(_text(*key)))
         with ir.InsertionPoint(group[0]):
-            call = func.CallOp([kind] * len(group), written[key], operands)
+            call = func.CallOp(results, written[key], operands)
         _compute_once(call.operation)
     for op, result in zip(group, call.results, strict=True):
         op.results[0].replace_all_uses_with(result)
