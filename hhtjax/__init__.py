@@ -60,6 +60,7 @@ from hhtjax.numerics.structured_solve import banded, conjugate_gradients
 from hhtjax.runs.adaptive import adaptive
 from hhtjax.runs.choose import Steps
 from hhtjax.runs.chosen import choose_steps
+from hhtjax.runs.events import Events
 from hhtjax.runs.interpolate import InternalInterpolant, Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import Failure, SimulationError, Solution
@@ -78,6 +79,7 @@ from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.systems import interop
 from hhtjax.systems.band_limited import band_limited, band_limited_motion, spline_gain_error
 from hhtjax.systems.consistent import ConsistentInitial, consistent_initial
+from hhtjax.systems.events import Event, impact
 from hhtjax.systems.initial_values import PrecisionWarning
 from hhtjax.systems.sampled import Sampled, sampled
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System

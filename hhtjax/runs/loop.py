@@ -18,22 +18,32 @@ from hhtjax.xla import staged
 
 class Loop(NamedTuple):
     """What a run is made of. carry: (state, number of steps, first failure), before the first; advance: carry -> carry,
-    Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged."""
+    Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged; bound: params -> advance, with others;
+    sizes: number of steps taken -> that of the next, and of the one before."""
 
     carry: Any
     advance: Any
     keep: Any
     no_info: Info
+    bound: Any
+    sizes: Any
 
 
 def loop_of(flat, stepper, q, v, t0, params, dt):
     """The loop over a stepper's steps."""
     stepper = stepper.astype(q.dtype)
-    take_step = jax.jit(held.bind(stepper, flat, params, dt), inline=True)  # traced once, wherever it is called
+
+    def take_step(params):
+        return jax.jit(held.bind(stepper, flat, params, dt), inline=True)  # traced once, wherever it is called
+
+    def advance(params):
+        return counted(take_step(params), flat, t0, dt)
+
     start = stepper.begin(flat, q, v, t0, held.before(params, t0, dt), dt)
-    no_info = neutral_info(jax.eval_shape(take_step, start)[1])
+    step = take_step(params)
+    no_info = neutral_info(jax.eval_shape(step, start)[1])
     carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    return Loop(carry, counted(take_step, flat, t0, dt), partial(saved, flat), no_info)
+    return Loop(carry, counted(step, flat, t0, dt), partial(saved, flat), no_info, advance, lambda count: (dt, dt))
 
 
 def loop_over(flat, stepper, q, v, t0, params, dt, ends=None):
@@ -43,21 +53,28 @@ def loop_over(flat, stepper, q, v, t0, params, dt, ends=None):
     steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt) if ends is None else ends
     first = dt[0]
 
-    @partial(jax.jit, inline=True)  # traced once, wherever it is called
-    def take_step(state, number):
-        h, last, end = (lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps)
-        state, info = resized_step(flat, stepper, params, h, last)(state)
-        return state._replace(t=end), info
+    def here(number):
+        return [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
 
-    def step(carry):
-        state, count, failure = carry
-        state, info = take_step(state, count)
-        return (state, count + 1, _first_failure(flat, failure, count + 1, state, info)), info
+    def advance(params):
+        @partial(jax.jit, inline=True)  # traced once, wherever it is called
+        def take_step(state, number):
+            h, last, end = here(number)
+            state, info = resized_step(flat, stepper, params, h, last)(state)
+            return state._replace(t=end), info
+
+        def step(carry):
+            state, count, failure = carry
+            state, info = take_step(state, count)
+            return (state, count + 1, first_failure(flat, failure, count + 1, state, info)), info
+
+        return step
 
     start = stepper.begin(flat, q, v, t0, held.before(params, t0, first), first)
-    no_info = neutral_info(jax.eval_shape(take_step, start, 0)[1])
+    one = jax.eval_shape(resized_step(flat, stepper, params, first, first), start)
+    no_info = neutral_info(one[1])
     carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    return Loop(carry, step, partial(saved, flat), no_info)
+    return Loop(carry, advance(params), partial(saved, flat), no_info, advance, lambda count: tuple(here(count)[:2]))
 
 
 def resized_step(flat, stepper, params, dt, last):
@@ -86,7 +103,7 @@ def counted(take_step, flat, t0, dt, before=None):
         count = count + 1
         taken = count if before is None else count - before
         state = state._replace(t=t0 + taken.astype(dt.dtype) * dt)  # no rounding piles up
-        return (state, count, _first_failure(flat, failure, count, state, info)), info
+        return (state, count, first_failure(flat, failure, count, state, info)), info
 
     return step
 
@@ -122,7 +139,7 @@ def no_failure(info):
     return Failure(none, jnp.array(False), none, info.dependent_row, info.solve_residual, info.friction)
 
 
-def _first_failure(flat, failure, count, state, info):
+def first_failure(flat, failure, count, state, info):
     """The failure so far, or this step's. Of several quantities an internal state is named, then the first."""
     _, *values, _ = saved(flat, state)
     known = [(i, x) for i, x in enumerate(values) if x is not None]

@@ -10,6 +10,8 @@ from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.chosen import run_controlled
+from hhtjax.runs.event_checks import require_events
+from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
 from hhtjax.runs.given_steps import refined, require_control_alone, require_steps
 from hhtjax.runs.loop import as_solution, flaw_at_start, loop_of, loop_over, show_progress
@@ -35,6 +37,9 @@ def simulate(
     save_every: int = 1,
     progress: bool = False,
     extrapolate: int = 1,
+    events: Any = None,
+    max_events: int = 2,
+    keep_events: int = 100,
 ) -> Solution:
     """Steps `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), num_steps times by dt.
 
@@ -63,6 +68,11 @@ def simulate(
             uneven steps only alpha = 0, of order 3). For motions that dt resolves, elsewhere it makes errors larger;
             and for smooth steps, such as linearize="predictor": where "auto" changes its choice, dt^3 is left.
         t0: time of the start.
+        events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
+            happen; the grid stays what it is. Steps without one take as long as before, and a look at the guards. For
+            the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`.
+        max_events: how many may fall into one step; more are a failure.
+        keep_events: how many `run.events` has room for.
 
     Returns:
         A `Solution`. Nothing raises while the steps run: call `solution.check()`.
@@ -104,27 +114,34 @@ def simulate(
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
+    room = require_integer("simulate", "max_events", max_events), require_integer("simulate", "keep_events", keep_events)
+    if events is not None:
+        events = require_events("simulate", problem, events)
+
     def run(k):
-        sizes = {"num_steps": k * num_steps, "save_every": k * save_every}
-        return or_plain(partial(_simulate, problem, refined(dt, k), **sizes, progress=progress))
+        sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room}
+        return or_plain(partial(_simulate, problem, refined(dt, k), events, **sizes, progress=progress))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
-@partial(jax.jit, static_argnames=("num_steps", "save_every", "progress"))
-def _simulate(problem, dt, *, num_steps, save_every, progress):
+@partial(jax.jit, static_argnames=("num_steps", "save_every", "progress", "room"))
+def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
     flat, q, v, t0, params = problem.flat()
     dt = jnp.asarray(dt).astype(q.dtype)
-    loop = (loop_over if dt.ndim else loop_of)(flat, problem.stepper, q, v, t0, params, dt)
+    plain = loop = (loop_over if dt.ndim else loop_of)(flat, problem.stepper, q, v, t0, params, dt)
+    if events is not None:
+        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room)
 
-    def with_progress(carry):
-        carry, info = loop.advance(carry)
+    def with_progress(advance, carry):
+        carry, info = advance(carry)
         if progress:
             show_progress(carry[1], num_steps, "step")
         return carry, info
 
-    form = on_scalars(with_progress, loop.carry)  # never with a callback, which keeps XLA from making one kernel
-    step, keep = form.of(with_progress), form.of(loop.keep)
+    # without events, which are seldom; never with a callback, which keeps XLA from making one kernel
+    form = on_scalars(lambda carry: with_progress(plain.advance, carry[:3]), loop.carry)
+    step, keep = form.of(partial(with_progress, loop.advance)), form.of(loop.keep)
 
     def interval(carry, _):
         if save_every == 1:
@@ -141,8 +158,8 @@ def _simulate(problem, dt, *, num_steps, save_every, progress):
     def run(carry):
         return checkpointed_scan(interval, carry, num_steps // save_every)
 
-    (_, _, failure), (path, info) = one_kernel(run, form.tree)
+    (_, _, failure, *met), (path, info) = one_kernel(run, form.tree)
     start = loop.carry[0]
-    return as_solution(
-        flat, start, form.joined(path), dt, info, failure, flaw_at_start(problem.system, flat, start, params)
-    )
+    flaw = flaw_at_start(problem.system, flat, start, params)
+    solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
+    return with_told_events(flat, solution, form.joined(met[0])) if met else solution

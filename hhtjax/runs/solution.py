@@ -37,6 +37,7 @@ class Failure(NamedTuple):
         friction: `info.friction`, if that was too much, else 0; None without dry friction.
         mass: what is wrong with a mass that is a function, at the start: 0 nothing, 1 it is not symmetric, 2 not
             positive definite (with constraints: not positive semidefinite); None where the mass is constant.
+        event: what went wrong at an event, 0 nothing; None without events. guard: the number of that event.
     """
 
     step: Any
@@ -46,6 +47,8 @@ class Failure(NamedTuple):
     solve: Any = None
     friction: Any = None
     mass: Any = None
+    event: Any = None
+    guard: Any = None
 
     def _verdict(self):
         """How many failed, or what did."""
@@ -56,6 +59,8 @@ class Failure(NamedTuple):
             return f"{np.count_nonzero(step)} of {step.size} runs failed" if step.any() else "no step failed"
         if flaw := known(self.mass):
             return f"the mass is not {MASS[int(flaw)]}"
+        if event := known(self.event):
+            return f"{EVENTS[int(event)][0]} {int(known(self.guard))}"
         if known(self.newton):
             return "Newton did not converge"
         if known(self.solve):
@@ -71,6 +76,27 @@ QUANTITIES = (
 )  # fmt: skip
 MASS = (None, "symmetric", "positive definite")
 INTERNAL_STATE = 4  # among them
+EVENTS = (  # what may go wrong at event i, and what to do about it
+    ("", ""),
+    (
+        "more than max_events in a step, the first of them event",
+        "A motion that comes to rest on a guard gives infinitely many: let it rest by a stiff force, or a constraint in a "
+        "run of its own. Else take a smaller dt, or a larger max_events",
+    ),
+    (
+        "the motion stays beyond the guard of event",
+        "A body that rests there needs a stiff force, or a constraint in a run of its own. An event that turns nothing "
+        "back needs a guard that depends on the mode its switch changes. Forces must not jump at the guard but by a mode",
+    ),
+    (
+        "no velocity changes the guard of event",
+        "An impact needs a guard that depends on q, and a motion that may follow it",
+    ),
+    (
+        "another event happens at the same time as event",
+        "Impacts one after the other are not the same as at once: say what happens by one event with a reset of its own",
+    ),
+)
 
 
 @shown
@@ -92,6 +118,7 @@ class Solution(NamedTuple):
         steps: what error control chose, the `Steps`; dt are those accepted. None without.
         error: (K + 1,) of a run with `adaptive(verify=)`, that of q at each saved time, in its largest coordinate.
         allowed: what `check` lets pass of it, 10 (rtol max|q| + atol).
+        events: what happened on the way, `Events`; None without.
     """
 
     t: Any
@@ -109,6 +136,7 @@ class Solution(NamedTuple):
     steps: Any = None
     error: Any = None
     allowed: Any = None
+    events: Any = None
 
     def check(self, reach=None):
         """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
@@ -191,9 +219,12 @@ class Solution(NamedTuple):
     def _why(self, member):
         """What `failure` says of one member of a batch."""
         found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
-        _, newton, quantity, row, left, friction, mass = found
+        _, newton, quantity, row, left, friction, mass, event, guard = found
         if mass:
             return f"`mass` must be {MASS[mass]}; at the start, mass(q0, params) is not"
+        if event:
+            what, advice = EVENTS[event]
+            return f"{what} {guard}. {advice}"
         if left:
             return (
                 f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "

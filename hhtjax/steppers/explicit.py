@@ -13,6 +13,7 @@ class RK4(Stepper):
     order: int = 4
 
     solves_internal = True
+    meets_events = True
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, the first stage of the first step."""

@@ -40,6 +40,7 @@ class DormandPrince(Embedded, Stepper):
     order: int = 5
 
     solves_internal = True
+    meets_events = True
     estimate_order = 5
     dense_term = True
 

@@ -62,6 +62,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     solves_rotations = True
     solves_internal = True
     solves_friction = True
+    meets_events = True
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""

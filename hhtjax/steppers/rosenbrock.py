@@ -48,6 +48,7 @@ class Rosenbrock(Embedded, Stepper):
     order: int
 
     solves_internal = True
+    meets_events = True
 
     @property
     def estimate_order(self):

@@ -131,6 +131,7 @@ class Stepper(Description):
     solves_rotations = False
     solves_internal = False
     solves_friction = False
+    meets_events = False  # whether `begin` gives all that a step needs behind an event
     needs_equal_steps = False  # what it remembers belongs to steps of one size
     resizes = False  # whether `resized` does anything
     estimate_order: int | None = None  # power of h with which the estimated error of a step falls; None without
