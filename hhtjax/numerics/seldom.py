@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.core import eval_jaxpr
 
+from hhtjax.numerics.checkpointed_scan import checkpoint
+
 
 def seldom(f, asked, carry):
     """f(carry), of the same structure, where `asked`, else the carry.
@@ -41,6 +43,6 @@ def _seldom(f, asked, carry, constants):
 @_seldom.defjvp
 def _(f, primals, tangents):
     def branch(asked, carry, constants):
-        return lax.cond(asked, f, lambda carry, *_: carry, carry, *constants)
+        return lax.cond(asked, checkpoint(f), lambda carry, *_: carry, carry, *constants)
 
     return jax.jvp(branch, primals, tangents)

@@ -86,7 +86,7 @@ class Found(NamedTuple):
 
 def asks(ways, s, s1, params, h):
     """Whether an event may fall into the step from s to s1: no more than a look at both ends."""
-    (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in (s, s1))
+    (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in lax.stop_gradient((s, s1)))
     noted = jnp.asarray(ways.events.noted)
     below = (g1 <= 0) & (~noted | (g0 > 0))
     turns = (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
@@ -102,28 +102,34 @@ def pass_events(ways, params, carry):
         params = held.held_at(params, part.start.t + h / 2)
         part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, params))
 
-    def slot(part, _):
+    def slot(part, number):
         found = look(ways, part, params)
-        go_on = jnp.any(found.hit) & (part.met.code == FINE) & ~part.met.ended
-        return lax.cond(go_on, partial(meet, ways, params, h), lambda part, _: part, part, found), None
+        going = (part.met.code == FINE) & ~part.met.ended
+        part = flag(part, going & ~jnp.any(found.hit), STAYS, found.stays)
+        found_any = going & jnp.any(found.hit)
+        part = flag(part, found_any & (number == ways.max_events), MANY, found.hit & ~found.touches)
+        here = found_any & (number < ways.max_events)
+        return lax.cond(here, partial(meet, ways, params, h), lambda part, _: part, part, found), None
 
-    part, _ = lax.scan(slot, part, None, length=ways.max_events)
-    found, met = look(ways, part, params), part.met
-    left = found.hit & ~found.touches
-    bad = (left | found.stays) & (met.code == FINE) & ~met.ended
-    code = jnp.where(jnp.any(left), MANY, STAYS).astype(met.code.dtype)
-    first = jnp.min(jnp.where(bad, jnp.arange(bad.size), bad.size)).astype(met.event.dtype)
-    flawed = jnp.any(bad)
-    met = met._replace(code=jnp.where(flawed, code, met.code), event=jnp.where(flawed, first, met.event))
+    part, _ = lax.scan(slot, part, jnp.arange(ways.max_events + 1, dtype=jnp.int32))
+    met = part.met
 
     def anew(part):
         s = part.end
         return begin(ways, s.q, s.v, s.t, ways.events.with_modes(params, part.met.modes), h)
 
     end = lax.cond(part.divided & ~met.ended, anew, lambda part: part.end, part)
-    lost = jnp.where(met.code == FINE, 0, jnp.nan)
-    end = end._replace(**{name: getattr(end, name) + lost.astype(end.v.dtype) for name in ("q", "v", "w")})
-    return part._replace(end=end, met=met), h
+    lost = jnp.where(met.code == FINE, 0, jnp.nan).astype(end.v.dtype)
+    return part._replace(end=end._replace(q=end.q + lost, v=end.v + lost, w=end.w + lost)), h
+
+
+def flag(part, bad, code, which):
+    """The part with what went wrong, if it did: at the first of these events."""
+    met = part.met
+    bad = bad & jnp.any(which) & (met.code == FINE)
+    first = jnp.min(jnp.where(which, jnp.arange(which.size, dtype=met.event.dtype), which.size))
+    met = met._replace(code=jnp.where(bad, code, met.code), event=jnp.where(bad, first, met.event))
+    return part._replace(met=met)
 
 
 def begin(ways, q, v, t, params, h):
@@ -133,6 +139,7 @@ def begin(ways, q, v, t, params, h):
 
 def look(ways, part, params):
     """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
+    part, params = lax.stop_gradient((part, params))
     now = ways.events.with_modes(params, part.met.modes)
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, s, now) for s in (part.start, part.end))
     noted = jnp.asarray(ways.events.noted)
@@ -166,8 +173,8 @@ def meet(ways, params, h, part, found):
     i = jnp.min(jnp.where(found.place == jnp.min(found.place), numbers, numbers.size))
     this = (numbers == i).astype(h.dtype)
     now = events.with_modes(params, met.modes)
-    tau = locate(ways, now, part, this, lax.stop_gradient(jnp.min(found.place)))
-    e, info = resized_step(flat, ways.stepper, now, tau, part.last)(part.start)
+    tau = locate(ways, now, part, this, lax.stop_gradient(jnp.min(found.place)), h)
+    e, info = go(ways, now, part.start, tau, part.last, h)
     g, d = events.rates(flat, e, now)
     rate = pick(this, d)
     noise = 1e3 * float(jnp.finfo(h.dtype).eps)
@@ -185,23 +192,27 @@ def meet(ways, params, h, part, found):
     beyond = jnp.where(noted, float(jnp.finfo(h.dtype).eps) ** 0.5 * h, 0)  # so that it is not met again
     rest = jnp.where(ends, 0, part.rest - tau - beyond)
     size = jnp.maximum(rest, SHORT * h)
-    q, v, _ = taylor(flat, e._replace(v=v), beyond)
-    start = begin(ways, q, v, e.t + beyond, then, size)
-    end, more = resized_step(flat, ways.stepper, then, size, size)(start)
-    q, v, _ = taylor(flat, start, rest)
-    end = choose(rest <= SHORT * h, flat.tidy(start._replace(q=q, v=v)), end)
+    e = drifted(flat, e._replace(v=v), beyond)
+    start = begin(ways, e.q, e.v, e.t, then, size)
+    end, more = go(ways, then, start, rest, size, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
-    infos = join_info(choose(part.divided, part.info, ways.no_info), info)
-    infos = join_info(infos, choose(rest <= SHORT * h, ways.no_info, more))
+    infos = join_info(join_info(choose(part.divided, part.info, ways.no_info), info), more)
     new = Part(start, end, infos, rest, size, after, jnp.ones_like(part.divided))
     return choose(missed & (pick(this, found.touches.astype(h.dtype)) > 0), part, new)
 
 
-def locate(ways, params, part, this, place):
+def go(ways, params, s, tau, last, h):
+    """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
+    short = tau <= SHORT * h
+    s1, info = resized_step(ways.flat, ways.stepper, params, jnp.maximum(tau, SHORT * h), last)(s)
+    return choose(short, drifted(ways.flat, s, tau), s1), choose(short, ways.no_info, info)
+
+
+def locate(ways, params, part, this, place, h):
     """tau, by Newton from where the cubic has its zero; differentiable as the implicit function of all else."""
 
     def reached(tau):
-        return resized_step(ways.flat, ways.stepper, params, tau, part.last)(part.start)[0]
+        return go(ways, params, part.start, tau, part.last, h)[0]
 
     def guard(tau):
         s = reached(tau)
@@ -211,11 +222,11 @@ def locate(ways, params, part, this, place):
         def improve(_, tau):
             g, d = ways.events.rates(ways.flat, reached(tau), params)
             g, d = pick(this, g), pick(this, d)
-            return jnp.clip(tau - jnp.where(d < 0, g / d, 0), TOGETHER * part.rest, part.rest)
+            return jnp.clip(tau - jnp.where(d < 0, g / d, 0), 0, part.rest)
 
         return lax.fori_loop(0, IMPROVEMENTS, improve, tau)
 
-    start = jnp.clip(place, TOGETHER, 1) * lax.stop_gradient(part.rest)
+    start = jnp.clip(place, 0, 1) * lax.stop_gradient(part.rest)
     return lax.custom_root(guard, start, search, lambda g, y: y / g(jnp.ones_like(y)))
 
 
@@ -225,9 +236,10 @@ def is_corner(g, d, h, this, noted):
     return (this == 0) & ~jnp.asarray(noted) & (d < 0) & (jnp.abs(g) <= near * h * jnp.abs(d))
 
 
-def taylor(flat, s, h):
-    """q, v, t a very short time h later."""
-    return flat.move(s.q, h * (s.v + h / 2 * s.w)), s.v + h * s.w, s.t + h
+def drifted(flat, s, h):
+    """The state a very short time h later."""
+    s1 = s._replace(t=s.t + h, q=flat.move(s.q, h * (s.v + h / 2 * s.w)), v=s.v + h * s.w)
+    return flat.tidy(s1)
 
 
 def told(flat, v):
