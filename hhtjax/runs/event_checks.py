@@ -54,7 +54,9 @@ def _require_shapes(caller, problem, event):
 def _require_impact(caller, params, law, first_order):
     """An error for an impact that has no velocity to change, or no restitution."""
     if first_order:
-        raise TypeError(f"{caller}: an impact needs velocities, and a FirstOrderSystem has none: give reset(y, t, params).")
+        raise TypeError(
+            f"{caller}: an impact needs velocities, and a FirstOrderSystem has none: give reset(y, t, params)."
+        )
     e = law.restitution
     if isinstance(e, str) and not (isinstance(params, dict) and e in params):
         raise ValueError(f"{caller}: `restitution` of the impact must be the name of one in params; received {e!r}.")
@@ -66,7 +68,9 @@ def _require_same(caller, params, after):
     """An error for params that a switch has given another form."""
     before = freeze(params)
     if jax.tree.structure(before) != jax.tree.structure(after):
-        raise TypeError(f"{caller}: `switch` must return params like its own, {describe(before)}; received {describe(after)}.")
+        raise TypeError(
+            f"{caller}: `switch` must return params like its own, {describe(before)}; received {describe(after)}."
+        )
     for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True):
         if jnp.shape(x) != y.shape or jnp.result_type(x) != y.dtype:
             raise TypeError(
@@ -83,8 +87,13 @@ def _guards_at_start(problem, events):
     size = jnp.ones_like(t0)
     start = problem.stepper.astype(q.dtype).begin(flat, q, v, t0, held.before(params, t0, size), size)
     g, rates = flat_events.rates(flat, start, params)
-    along_q, along_v = (jax.jacfwd(f)(x) for f, x in (
-        (lambda q: flat_events.guards(q, v, t0, params), q), (lambda v: flat_events.guards(q, v, t0, params), v)))
+    along_q, along_v = (
+        jax.jacfwd(f)(x)
+        for f, x in (
+            (lambda q: flat_events.guards(q, v, t0, params), q),
+            (lambda v: flat_events.guards(q, v, t0, params), v),
+        )
+    )
     terms = jnp.sum(jnp.abs(along_q.reshape(len(g), -1) * q.reshape(-1)), axis=1)
     return g, rates, terms, jnp.any(along_v != 0, axis=1)
 

@@ -72,4 +72,3 @@ def with_told_events(flat, solution, met):
     rows, log = flat.unravel_rates if flat.positions else flat.unravel, met.log
     events = Events(log.count, log.t, log.which, jax.vmap(rows)(log.before), jax.vmap(rows)(log.after), log.rate)
     return solution._replace(events=events, failure=solution.failure._replace(event=met.code, guard=met.event))
-

@@ -255,5 +255,3 @@ def pick(this, x):
 def choose(where, x, y):
     """One of two trees."""
     return jax.tree.map(partial(jnp.where, where), x, y)
-
-

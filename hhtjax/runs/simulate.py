@@ -114,7 +114,10 @@ def simulate(
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
-    room = require_integer("simulate", "max_events", max_events), require_integer("simulate", "keep_events", keep_events)
+    room = (
+        require_integer("simulate", "max_events", max_events),
+        require_integer("simulate", "keep_events", keep_events),
+    )
     if events is not None:
         events = require_events("simulate", problem, events)
 
