@@ -11,8 +11,11 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
+
+from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, show_progress
 from hhtjax.runs.solution import Solution
+from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.steppers.stepper import join_info
@@ -87,6 +90,10 @@ def sweep(
     """
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
+    if isinstance(dts, Adaptive):
+        if mesh is not None:
+            raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
+        return sweep_chosen(inputs, progress)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
     return or_plain(partial(run_sweep, *arguments, **keywords))
 
