@@ -68,12 +68,14 @@ def choose_many(problem_of, data, axes, size, end, lanes, max_steps):
 
     def block(order, number, carry):
         walks, ends = carry
-        members = order[jnp.minimum(number * lanes + np.arange(lanes), size - 1)]  # the last one fills the last block
+        members = order[
+            jnp.minimum(number * lanes + np.arange(lanes, dtype=np.int32), size - 1)
+        ]  # the last one fills up
         mine = [x if axis is None else x[members] for x, axis in zip(data, axes, strict=True)]
         before, limits = (jax.tree.map(lambda x: x[members], tree) for tree in (walks, bounds))
         after, rows = one_kernel(tries, before, mine, limits)
         took = ~jnp.isnan(rows)
-        places = jnp.where(took, before.accepted + jnp.cumsum(took, axis=0) - 1, max_steps)
+        places = jnp.where(took, before.accepted[None] + jnp.cumsum(took, axis=0, dtype=jnp.int32) - 1, max_steps)
         ends = ends.at[jnp.broadcast_to(members, places.shape), places].set(rows, mode="drop")
         return jax.tree.map(lambda x, y: x.at[members].set(y), walks, after), ends
 

@@ -34,8 +34,8 @@ def chosen_steps(problem, times, control, progress=False):
 
 
 class Grid(NamedTuple):
-    """Frozen steps. ends: (N,), inf behind the last; dt: (N,), 1 behind it; counts: (K,), how many there are from one of
-    the times to the next, the last of them ending at it or beyond; reached: the end of the last."""
+    """Frozen steps. ends: (N,), inf behind the last; dt: (N,), 1 behind it; counts: (K,), how many there are from one
+    of the times to the next, the last of them ending at it or beyond; reached: the end of the last."""
 
     ends: Any
     dt: Any
@@ -63,7 +63,7 @@ class Grid(NamedTuple):
 @partial(jax.jit, static_argnames=("halved",))
 def run_over(problem, times, ends, accepted, halved=False):
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
-    flat, q, _, t0, _ = problem.flat()
+    _, q, _, t0, _ = problem.flat()
     times = jnp.asarray(times).astype(q.dtype)
     return follow(problem, times, Grid.of(t0, times, ends, accepted, halved))
 

@@ -27,8 +27,8 @@ NAMES = "stepper", "q0", "v0", "params", "z0"  # of what may differ
 
 
 class Inputs(NamedTuple):
-    """What a sweep is made from, checked: `data` is (stepper, q0, v0, params, z0), `mapped` which leaves differ; dts may
-    be an `Adaptive`, and then comes with times."""
+    """What a sweep is made from, checked: `data` is (stepper, q0, v0, params, z0), `mapped` which leaves differ. With
+    an `Adaptive` for dts, times are given."""
 
     system: Any
     data: Any
@@ -110,9 +110,7 @@ def _members(control, trees, in_axes):
         for x, flag in zip(jax.tree.leaves(tree), _flags(name, tree, axes), strict=True):
             if flag and jnp.ndim(x):
                 return jnp.shape(x)[0]
-    raise ValueError(
-        "sweep: with dts=adaptive(...), give a tolerance as an array (B,), or `in_axes`, where members differ."
-    )
+    raise ValueError("sweep: with dts=adaptive(...), give an array (B,) of tolerances, or `in_axes`, else none differ.")
 
 
 def _initial_values(system, q0, v0, params, z0, stepper, in_axes, size):
