@@ -93,6 +93,14 @@ one time scale want equal steps, whose errors cancel over a period.
 >>> run.q.shape
 (3, 1)
 
+In a sweep each member has steps of its own, and tolerances may be data: error against tolerance is one call.
+
+>>> rtol = jnp.array([1e-2, 1e-3, 1e-4])
+>>> sweep = hhtjax.sweep(
+...     pendulum, hhtjax.hht(), q0, v0, params, dts=hhtjax.adaptive(rtol, 1e-3 * rtol), times=[0.123, 4.56])
+>>> sweep.q.shape, bool(jnp.all(jnp.diff(sweep.steps.accepted) > 0))
+((3, 3, 1), True)
+
 Extrapolation
 -------------
 

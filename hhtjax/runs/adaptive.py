@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 from hhtjax.checks import require_integer, require_number
-from hhtjax.description import Description, is_array, is_concrete
+from hhtjax.description import Description, is_array, is_concrete, is_real
 from hhtjax.systems import held
 
 WITH_ESTIMATES = "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda or dopri5"
@@ -43,6 +44,8 @@ def adaptive(
     by no estimate of one step, and what happens and is over within a step neither (give dt_max). `verify` sees the
     first.
 
+    In `sweep(..., dts=adaptive(...))` each of the numbers may be an array (B,), one for each member.
+
     Args:
         rtol: relative to the largest |q_i|, and |v_i|, so far; positive. Below 1e-4 float32 has nothing but rounding.
         atol: in the unit of q (radians for rotations, and the unit of internal states and of y), positive. At rest it
@@ -71,36 +74,58 @@ def adaptive(
     """
     atol_v = atol if atol_v is None else atol_v
     for name, value in {"rtol": rtol, "atol": atol, "atol_v": atol_v}.items():
-        require_number("adaptive", name, value, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    require_number("adaptive", "dt_min", dt_min, lambda x: np.isfinite(x) and x >= 0, "be finite, and 0 or more")
-    require_number("adaptive", "dt_max", dt_max, lambda x: x > 0, "be positive")
-    if is_concrete(dt_min) and is_concrete(dt_max) and dt_min > dt_max:
+        _require(name, value, lambda x: np.isfinite(x) & (x > 0), "be positive and finite")
+    _require("dt_min", dt_min, lambda x: np.isfinite(x) & (x >= 0), "be finite, and 0 or more")
+    _require("dt_max", dt_max, lambda x: x > 0, "be positive")
+    if len(sizes := lengths((rtol, atol, atol_v, dt_min, dt_max))) > 1:
+        raise ValueError(f"adaptive: arrays must have one length, that of the members; received {sizes}.")
+    if is_concrete(dt_min) and is_concrete(dt_max) and np.any(np.greater(dt_min, dt_max)):
         raise ValueError(f"adaptive: `dt_min` must not exceed dt_max={dt_max}; received {dt_min}.")
     if not isinstance(verify, bool) and verify != "tolerance":
         raise ValueError(f'adaptive: `verify` must be True, False or "tolerance"; received {verify!r}.')
     max_steps = require_integer("adaptive", "max_steps", max_steps)
-    rtol, atol, atol_v, dt_min, dt_max = map(_as_data, (rtol, atol, atol_v, dt_min, dt_max))
-    return Adaptive(rtol, atol, atol_v, dt_min, dt_max, max_steps, verify)
+    limits = map(_as_data, (rtol, atol, atol_v, dt_min, dt_max))
+    return Adaptive(*limits, max_steps, verify)
+
+
+def _require(name, value, valid, expectation):
+    """An error unless a number, or each of several, (B,), is what is expected; it names the first that is not."""
+    value = np.asarray(value) if isinstance(value, (list, tuple)) else value
+    if not (is_real(value) and np.ndim(value) == 1 and np.size(value)):
+        require_number("adaptive", name, value, valid, expectation)
+    elif is_concrete(value) and not (fine := valid(np.asarray(value))).all():
+        bad = int(np.argmin(fine))
+        raise ValueError(f"adaptive: `{name}` must {expectation}; received {name}[{bad}] = {value[bad]}.")
 
 
 def _as_data(x):
     return x if is_array(x) else np.asarray(x, float)
 
 
-def require_controlled(caller, problem):
+def lengths(values):
+    """Those of the arrays among numbers, each once."""
+    return sorted({np.size(x) for x in values if np.ndim(x)})
+
+
+def require_single(caller, control):
+    """An error for the tolerances of several members."""
+    if lengths(jax.tree.leaves(control)):
+        raise ValueError(f"{caller}: tolerances must be numbers; arrays (B,), one for each member, are for `sweep`.")
+
+
+def require_controlled(caller, system, stepper, params):
     """An error for a stepper without an estimate, for inputs that jump, and for dry friction."""
-    stepper = problem.stepper
     if stepper.estimate_order is None:
         raise NotImplementedError(
             f"{caller}: {type(stepper).__name__} has no estimate of its error: give `dt` as a number, or take "
             f"{WITH_ESTIMATES}."
         )
-    if held.holds(problem.params):
+    if held.holds(params):
         raise NotImplementedError(
             f"{caller}: error control does not know when held inputs, sampled(order=0), jump: give `dt` as an array "
             "whose steps end there, or take order=1."
         )
-    if problem.system.friction is not None:
+    if system.friction is not None:
         raise NotImplementedError(
             f"{caller}: error control takes a switch of dry `friction` for an error: give `dt` as a number or an array."
         )

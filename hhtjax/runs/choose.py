@@ -142,6 +142,11 @@ def succeeded(state, info, error):
     return fine
 
 
+def is_walking(walk, end):
+    """Whether there is more to try."""
+    return (walk.state.t < end) & (walk.stop == DONE)
+
+
 def attempt(flat, stepper, params, end, bounds, max_steps, walk):
     """Walk -> Walk after one try, and the time at which it would have ended."""
     left = end - walk.state.t
@@ -187,8 +192,7 @@ def choose(flat, stepper, q, v, t0, end, params, control, progress=False):
     one_try = form.of(one_try)
 
     def unfinished(carry):
-        walk, _ = carry
-        return (walk.state.t < end) & (walk.stop == DONE)
+        return is_walking(carry[0], end)
 
     def body(carry):
         walk, times = carry
@@ -201,11 +205,14 @@ def choose(flat, stepper, q, v, t0, end, params, control, progress=False):
         return lax.while_loop(unfinished, body, (walk, jnp.zeros(control.max_steps, t0.dtype)))
 
     walk, times = one_kernel(run, form.tree)
-    walk = form.joined(walk)
-    numbers = jnp.arange(control.max_steps, dtype=jnp.int32)
+    return as_steps(form.joined(walk), times, t0, bounds.least), times
+
+
+def as_steps(walk, times, t0, least):
+    """The `Steps` of a walk that is over, which end at these times."""
+    numbers = jnp.arange(times.size, dtype=jnp.int32)
     dt = jnp.where(numbers < walk.accepted, jnp.diff(times, prepend=t0), jnp.nan)
-    steps = Steps(dt, walk.accepted, walk.rejected, walk.state.t, walk.stop, walk.error, bounds.least)
-    return steps, times
+    return Steps(dt, walk.accepted, walk.rejected, walk.state.t, walk.stop, walk.error, least)
 
 
 def show(before, now, t0, end):
@@ -219,7 +226,7 @@ def show(before, now, t0, end):
 
 
 def trimmed(steps):
-    """Without what is behind the accepted ones, where their number is known."""
-    if not is_concrete(steps.accepted) or jnp.ndim(steps.accepted):
+    """Without what is behind the accepted ones, of a batch the most, where their numbers are known."""
+    if not is_concrete(steps.accepted):
         return steps
-    return steps._replace(dt=steps.dt[: int(steps.accepted)])
+    return steps._replace(dt=steps.dt[..., : int(np.max(steps.accepted))])

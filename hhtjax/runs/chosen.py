@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jax import lax
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
-from hhtjax.runs.adaptive import adaptive, require_controlled
+from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
 from hhtjax.runs.choose import Steps, choose, trimmed
 from hhtjax.runs.interpolate import between
 from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, saved
@@ -33,46 +33,74 @@ def chosen_steps(problem, times, control, progress=False):
     return choose(flat, problem.stepper, q, v, t0, end, params, control, progress)
 
 
+class Grid(NamedTuple):
+    """Frozen steps. ends: (N,), inf behind the last; dt: (N,), 1 behind it; counts: (K,), how many there are from one
+    of the times to the next, the last of them ending at it or beyond; reached: the end of the last."""
+
+    ends: Any
+    dt: Any
+    counts: Any
+    reached: Any
+
+    @classmethod
+    def of(cls, t0, times, ends, accepted, halved=False):
+        """Those with these ends, of which so many were accepted; each halved or not."""
+        ends = lax.stop_gradient(ends)
+        behind = jnp.arange(ends.size, dtype=jnp.int32) >= accepted
+        # the last accepted end, behind it: steps that nothing takes
+        reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
+        grid = jnp.concatenate([t0[None], jnp.where(behind, jnp.inf, ends)])
+        needed = jnp.searchsorted(grid, jnp.minimum(times, reached))
+        if halved:
+            middles = (grid[:-1] + jnp.where(behind, grid[:-1], grid[1:])) / 2
+            grid = jnp.concatenate([grid[:1], jnp.stack([middles, grid[1:]], 1).ravel()])
+            needed = 2 * needed - (grid[2 * needed - 1] >= times).astype(needed.dtype)
+        dt = jnp.diff(grid)
+        counts = jnp.diff(needed, prepend=0).astype(jnp.int32)
+        return cls(grid[1:], jnp.where(jnp.isfinite(dt), dt, 1), counts, reached)
+
+
 @partial(jax.jit, static_argnames=("halved",))
 def run_over(problem, times, ends, accepted, halved=False):
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
-    flat, q, v, t0, params = problem.flat()
+    _, q, _, t0, _ = problem.flat()
     times = jnp.asarray(times).astype(q.dtype)
-    ends = lax.stop_gradient(ends)
-    behind = jnp.arange(ends.size, dtype=jnp.int32) >= accepted
-    # the last accepted end, behind it: steps that nothing takes
-    reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
-    grid = jnp.concatenate([t0[None], jnp.where(behind, jnp.inf, ends)])
-    needed = jnp.searchsorted(grid, jnp.minimum(times, reached))
-    if halved:
-        middles = (grid[:-1] + jnp.where(behind, grid[:-1], grid[1:])) / 2
-        grid = jnp.concatenate([grid[:1], jnp.stack([middles, grid[1:]], 1).ravel()])
-        needed = 2 * needed - (grid[2 * needed - 1] >= times).astype(needed.dtype)
-    dt = jnp.diff(grid)
-    loop = loop_over(flat, problem.stepper, q, v, t0, params, jnp.where(jnp.isfinite(dt), dt, 1), ends=grid[1:])
-    counts = jnp.diff(needed, prepend=0).astype(jnp.int32)
+    return follow(problem, times, Grid.of(t0, times, ends, accepted, halved))
+
+
+def follow(problem, times, grid, longest=None):
+    """The `Solution` at `times` over the steps of a grid.
+
+    longest: (K,), how many steps are taken between the times by the members of a block, among which this one rests.
+    """
+    flat, q, v, t0, params = problem.flat()
+    dt, rests = grid.dt, longest is not None
+    loop = loop_over(flat, problem.stepper, q, v, t0, params, dt, ends=grid.ends)
     form = on_scalars(loop.advance, loop.carry)
     advance, keep = form.of(loop.advance), form.of(partial(kept, flat, problem.stepper))
 
     @checkpoint
-    def interval(carry, count):
-        def step(_, carry):
-            _, run, info = carry
-            after, new = advance(run)
-            return run[0], after, join_info(info, new)
+    def interval(carry, counts):
+        count, most = counts
 
-        last, run, info = repeat(step, (*carry, loop.no_info), count)
+        def step(i, carry):
+            _, run, info = carry
+            after, now = advance(run)
+            new = run[0], after, join_info(info, now)
+            return jax.tree.map(partial(jnp.where, i < count), new, carry) if rests else new
+
+        last, run, info = repeat(step, (*carry, loop.no_info), most)
         return (last, run), (keep(last), keep(run[0]), info)
 
     def samples(carry):
-        return lax.scan(interval, (carry[0], carry), counts)
+        return lax.scan(interval, (carry[0], carry), (grid.counts, longest if rests else grid.counts))
 
     (_, (_, _, failure)), (first, second, info) = one_kernel(samples, form.tree)
     (first, _), (second, extra) = form.joined(first), form.joined(second)
     start = loop.carry[0]
     flaw = flaw_at_start(problem.system, flat, start, params)
     pair = [as_solution(flat, start, path, dt, info, failure, flaw) for path in (first, second)]
-    return read_off(flat, pair, extra, times, reached)
+    return read_off(flat, pair, extra, times, grid.reached)
 
 
 def kept(flat, stepper, state):
@@ -153,14 +181,15 @@ def choose_steps(
     (True, True)
     """
     problem = Problem.checked("choose_steps", system, stepper, q0, v0, params, t0, z0)
-    times = checked_times("choose_steps", problem, times)
-    arguments = problem, times, adaptive(**tolerances), progress
+    control = adaptive(**tolerances)
+    times = checked_times("choose_steps", problem, times, control)
+    arguments = problem, times, control, progress
     return trimmed(or_plain(partial(chosen_steps, *arguments))[0])
 
 
 def run_controlled(problem, times, control, progress) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
-    times = checked_times("simulate", problem, times)
+    times = checked_times("simulate", problem, times, control)
     steps, ends = or_plain(partial(chosen_steps, problem, times, control, progress))
     run = or_plain(partial(run_over, problem, times, ends, steps.accepted))
     if control.verify:
@@ -172,10 +201,14 @@ def run_controlled(problem, times, control, progress) -> Solution:
 def finer(problem, times, control, steps, ends):
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
     if control.verify == "tolerance":
-        quarter = replace(control, **{name: getattr(control, name) / 4 for name in ("rtol", "atol", "atol_v")})
-        steps, ends = or_plain(partial(chosen_steps, problem, times, quarter))
+        steps, ends = or_plain(partial(chosen_steps, problem, times, quarter(control)))
     halved = control.verify != "tolerance"
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, halved=halved))
+
+
+def quarter(control):
+    """A quarter of the tolerance."""
+    return replace(control, **{name: getattr(control, name) / 4 for name in ("rtol", "atol", "atol_v")})
 
 
 def verified(run, finer, control, order):
@@ -191,7 +224,8 @@ def verified(run, finer, control, order):
     return {"error": error, "allowed": lax.stop_gradient(ALARM * (rtol * jnp.max(largest(q)) + atol))}
 
 
-def checked_times(caller, problem, times):
+def checked_times(caller, problem, times, control):
     """times, for a stepper that can be controlled."""
-    require_controlled(caller, problem)
+    require_controlled(caller, problem.system, problem.stepper, problem.params)
+    require_single(caller, control)
     return require_times(times, problem.t0, jax.tree.leaves(problem.q0)[0].dtype, caller)

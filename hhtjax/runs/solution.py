@@ -209,6 +209,8 @@ class Solution(NamedTuple):
         fitting = t.ndim == len(runs) + 1 and t.shape[:-1] == runs and all(x.shape == runs for x in failed)
         if not fitting or not t.size or dt.shape[: t.ndim - 1] != runs or dt.ndim > t.ndim:
             return f"t {brief(self.t)}"
+        if self.steps is not None and np.isfinite(dt).any():
+            dt = dt[np.isfinite(dt)]  # behind the steps of a member is nothing
         batch = f"{failed[0].size} runs {runs}, each of " if runs else ""
         fault = self._fault()
         verdict = "every step finite" if fault is None else fault.partition(". ")[0].removesuffix(".")
@@ -269,6 +271,11 @@ class Solution(NamedTuple):
     def _steps_taken(self):
         """How many steps come before each saved time."""
         t, dt = np.asarray(self.t), np.asarray(self.dt)
+        if self.steps is not None:  # the one that ends at a saved time, or beyond
+            taken = np.zeros(t.shape, int)
+            for i in np.ndindex(t.shape[:-1]):
+                taken[i][1:] = 1 + np.searchsorted(t[i][0] + np.cumsum(dt[i]), t[i][1:])
+            return np.minimum(taken, np.asarray(self.steps.accepted)[..., None])
         with np.errstate(all="ignore"):  # what was traced may be anything
             if self._is_every_step():
                 taken = np.arange(t.shape[-1]) * (dt.shape[-1] // (t.shape[-1] - 1))
@@ -283,7 +290,7 @@ class Solution(NamedTuple):
     def _is_every_step(self):
         """Whether dt has the size of each step, and more than one of them may come before a saved time."""
         K = self.t.shape[-1] - 1
-        return np.ndim(self.dt) == self.t.ndim and self.dt.shape[-1] != K
+        return self.steps is not None or (np.ndim(self.dt) == self.t.ndim and self.dt.shape[-1] != K)
 
     def _time_of(self, step, member):
         """The time at which a step of a member of a batch ends."""

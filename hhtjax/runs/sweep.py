@@ -11,8 +11,10 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
+from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, show_progress
 from hhtjax.runs.solution import Solution
+from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.steppers.stepper import join_info
@@ -48,6 +50,8 @@ def sweep(
     Args:
         system, stepper, q0, v0, params, z0, t0: as for `simulate`.
         dts: (B,) step sizes, positive, at most H. Their number B is part of the program, their values are data.
+            Or `adaptive(rtol, atol)`, of which each number may be (B,): each member has steps that its errors choose,
+            and that end at no sample; with max_steps numbers in memory for each.
         duration: positive. num_samples: K, the number of samples after the start.
         times: (K,), in the place of both: strictly increasing, after t0; data too. Steps end at each: unlike SciPy's
             `t_eval` they shorten steps, and dts are upper bounds, like its `max_step`. A dt larger than H, or infinite,
@@ -63,7 +67,8 @@ def sweep(
     Returns:
         A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for
         all; dt (B,), the step sizes used, or (B, K), those before each of `times`; failure.step counts each member's
-        own steps.
+        own steps. Under error control `steps` are those of each member, dt is (B, N), NaN
+        behind the last of each.
 
     Compiled once for each system, stepper, structure, B and K. To be used inside jit and under vmap over all but dts
     and times; differentiable, forward and reverse, in all that `simulate` is, and in times, except that the dts only
@@ -72,7 +77,8 @@ def sweep(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape or value; those of `simulate`.
-        NotImplementedError: `times` for a stepper that needs equal steps, `houbolt` or `park`; those of `simulate`.
+        NotImplementedError: `times` for a stepper that needs equal steps, `houbolt` or `park`; `adaptive` with a
+            mesh, or for a stepper without an estimate; those of `simulate`.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: -params["k"] * q)
@@ -84,9 +90,23 @@ def sweep(
     [0.1, 0.028571, 0.01]
     >>> [round(float(q), 4) for q in runs.q[:, -1, 0]]                        # cos(2) = -0.4161
     [-0.4101, -0.4157, -0.4161]
+
+    Error against tolerance:
+
+    >>> rtol = jnp.array([1e-2, 1e-4, 1e-6])
+    >>> runs = hhtjax.sweep(
+    ...     spring, hhtjax.hht(alpha=0.0), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0},
+    ...     dts=hhtjax.adaptive(rtol, 1e-3 * rtol), duration=1.0, num_samples=5)
+    >>> runs.check()
+    >>> bool(jnp.all(abs(runs.q[:, -1, 0] - jnp.cos(2.0)) < 2 * rtol))
+    True
     """
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
+    if isinstance(dts, Adaptive):
+        if mesh is not None:
+            raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
+        return sweep_chosen(inputs, progress)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
     return or_plain(partial(run_sweep, *arguments, **keywords))
 

@@ -27,6 +27,11 @@ def require_one_grid(stepper, duration, num_samples, times):
     require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
 
 
+def equal_times(t0, duration, num_samples):
+    """The times of so many samples at equal distances."""
+    return t0 + duration * np.arange(1, num_samples + 1) / num_samples
+
+
 def require_times(times, t0, dtype, caller="sweep"):
     """times (K,) in the dtype of the state, in which they must increase, checked as far as they are known."""
     times = times if is_array(times) else np.asarray(times)

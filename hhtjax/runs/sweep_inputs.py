@@ -9,17 +9,26 @@ from jax.sharding import Mesh
 
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import evaluated_now, is_array, is_concrete
-from hhtjax.runs.sweep_grid import require_one_grid, require_step_sizes, require_steps_within, require_times
+from hhtjax.runs.adaptive import Adaptive, lengths, require_controlled
+from hhtjax.runs.sweep_grid import (
+    equal_times,
+    require_one_grid,
+    require_step_sizes,
+    require_steps_within,
+    require_times,
+)
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 from hhtjax.systems.consistent import examine, require_consistent
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.rubbing import require_independent_friction
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
+NAMES = "stepper", "q0", "v0", "params", "z0"  # of what may differ
 
 
 class Inputs(NamedTuple):
-    """What a sweep is made from, checked: `data` is (stepper, q0, v0, params, z0), `mapped` which leaves differ."""
+    """What a sweep is made from, checked: `data` is (stepper, q0, v0, params, z0), `mapped` which leaves differ. With
+    an `Adaptive` for dts, times are given."""
 
     system: Any
     data: Any
@@ -28,7 +37,8 @@ class Inputs(NamedTuple):
     t0: Any
     mapped: tuple
     num_samples: int
-    times: Any = None
+    times: Any
+    size: int
 
     @classmethod
     def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes, times=None, z0=None):
@@ -38,9 +48,18 @@ class Inputs(NamedTuple):
         params = require_params("sweep", params)
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
-        dts = require_step_sizes(dts)
-        (q0, v0, z0), mapped = _initial_values(system, q0, v0, params, z0, stepper, in_axes, dts.size)
-        if times is None:
+        if isinstance(dts, Adaptive):
+            require_controlled("sweep", system, stepper, params)
+            size = _members(dts, dict(zip(NAMES, (stepper, q0, v0, params, z0), strict=True)), in_axes)
+        else:
+            dts = require_step_sizes(dts)
+            size = dts.size
+        (q0, v0, z0), mapped = _initial_values(system, q0, v0, params, z0, stepper, in_axes, size)
+        if isinstance(dts, Adaptive):
+            times = equal_times(t0, duration, num_samples) if times is None else times
+            times = require_times(times, t0, jax.tree.leaves(q0)[0].dtype)
+            num_samples = times.size
+        elif times is None:
             require_steps_within(dts, 0.0, duration, num_samples)
         else:
             times = require_times(times, t0, jax.tree.leaves(q0)[0].dtype)
@@ -54,11 +73,12 @@ class Inputs(NamedTuple):
             _, q, v, p, z = _member(data, mapped, 0)
             require_independent_friction("sweep", system, q, v, t0, p, z)
         duration, t0 = (x if x is None or not is_concrete(x) else float(x) for x in (duration, t0))
-        return cls(system, data, dts, duration, t0, mapped, int(num_samples), times)
+        return cls(system, data, dts, duration, t0, mapped, int(num_samples), times, size)
 
     def chunk(self, members):
         """The same for the members of these numbers."""
-        return self._replace(data=_member(self.data, self.mapped, members), dts=self.dts[members])
+        dts = self.dts[members]
+        return self._replace(data=_member(self.data, self.mapped, members), dts=dts, size=dts.size)
 
     def call(self, mesh=None, progress=False):
         """The arguments of `run_sweep`."""
@@ -69,17 +89,28 @@ class Inputs(NamedTuple):
             mesh = Mesh(mesh.devices.ravel(), ("members",))  # whatever its shape and its types of axes
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
-        static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": _lanes(dts.size)}
+        static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes_for(self.size)}
         arguments = self.system, data, dts, self.duration, self.t0, self.times
         return arguments, {**static, "mesh": mesh, "progress": progress}
 
 
-def _lanes(size):
+def lanes_for(size):
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
     A batch takes half the time of single runs, so blocks have to be short enough for their members to be alike.
     """
     return min(LANES, 1 << (size // BLOCKS).bit_length())
+
+
+def _members(control, trees, in_axes):
+    """How many members a sweep under error control has: as many as there are tolerances, or of what else differs."""
+    if sizes := lengths(jax.tree.leaves(control)):
+        return sizes[0]
+    for (name, tree), axes in zip(trees.items(), in_axes if isinstance(in_axes, tuple) else (), strict=False):
+        for x, flag in zip(jax.tree.leaves(tree), _flags(name, tree, axes), strict=True):
+            if flag and jnp.ndim(x):
+                return jnp.shape(x)[0]
+    raise ValueError("sweep: with dts=adaptive(...), give an array (B,) of tolerances, or `in_axes`, else none differ.")
 
 
 def _initial_values(system, q0, v0, params, z0, stepper, in_axes, size):
@@ -91,10 +122,9 @@ def _initial_values(system, q0, v0, params, z0, stepper, in_axes, size):
             "sweep: `in_axes` must be a tuple of four, (stepper, q0, v0, params), or of five, with z0; "
             f"received {in_axes!r}."
         )
-    names = "stepper", "q0", "v0", "params", "z0"
-    trees = dict(zip(names, (stepper, q0, v0, params, z0), strict=True))
+    trees = dict(zip(NAMES, (stepper, q0, v0, params, z0), strict=True))
     in_axes = (*in_axes, None)[:5]
-    flags = {name: _flags(name, trees[name], axes, size) for name, axes in zip(names, in_axes, strict=True)}
+    flags = {name: _flags(name, trees[name], axes, size) for name, axes in zip(NAMES, in_axes, strict=True)}
     if v0 is not None and any(flags["q0"] + flags["v0"]) and not all(flags["q0"] + flags["v0"]):
         for name in ("q0", "v0"):
             leaves, structure = jax.tree.flatten(trees[name])
@@ -104,10 +134,10 @@ def _initial_values(system, q0, v0, params, z0, stepper, in_axes, size):
             ]
             trees[name], flags[name] = jax.tree.unflatten(structure, leaves), [True] * len(leaves)
     values = initial_values("sweep", system, trees["q0"], trees["v0"], z0)
-    return values, tuple(flag for name in names for flag in flags[name])
+    return values, tuple(flag for name in NAMES for flag in flags[name])
 
 
-def _flags(name, tree, axes, size):
+def _flags(name, tree, axes, size=None):
     """For each leaf of `tree` whether it has an axis of members, from a prefix of 0 and None as for `jax.vmap`."""
     try:
         flags = jax.tree.map(lambda axis, part: [axis] * len(jax.tree.leaves(part)), axes, tree, is_leaf=_is_none)
@@ -117,7 +147,7 @@ def _flags(name, tree, axes, size):
     for x, flag in zip(jax.tree.leaves(tree), flags, strict=True):
         if flag is not None and (flag != 0 or isinstance(flag, bool)):
             raise ValueError(f"sweep: `in_axes` must hold 0 and None; received {flag!r} for {name}.")
-        if flag == 0 and (jnp.ndim(x) == 0 or jnp.shape(x)[0] != size):
+        if size is not None and flag == 0 and (jnp.ndim(x) == 0 or jnp.shape(x)[0] != size):
             raise ValueError(
                 f"sweep: `{name}` must have a leading axis of {size} members, as many as dts, where in_axes is 0; "
                 f"received shape {jnp.shape(x)}."

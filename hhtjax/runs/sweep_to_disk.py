@@ -14,6 +14,7 @@ import numpy as np
 
 from hhtjax.checks import require_integer
 from hhtjax.description import VERSION, is_concrete
+from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.xla import or_plain
@@ -70,6 +71,8 @@ def sweep_to_disk(
     (3, 6, 1)
     """
     chunk = require_integer("sweep_to_disk", "chunk", chunk)
+    if isinstance(dts, Adaptive):
+        raise NotImplementedError("sweep_to_disk: `dts` must be step sizes; adaptive(...) is for `sweep`.")
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
     if not all(map(is_concrete, jax.tree.leaves(inputs))):

@@ -75,13 +75,18 @@ def split(tree):
 
 class Form(NamedTuple):
     """How functions of a tree are evaluated. tree: with `Scalars` for its small arrays, or as it was; `of` gives the
-    form of a function, and `joined` arrays again."""
+    form of a function, `like` that of another such tree, and `joined` arrays again."""
 
     tree: Any
+    is_split: bool = False
 
     def of(self, f):
         """f of such trees, to such trees."""
         return by_scalars(f)
+
+    def like(self, tree):
+        """Another tree of the same arrays, in this form."""
+        return split(tree) if self.is_split else tree
 
     def joined(self, tree):
         """Any such tree as arrays; what its scalars are stacked along comes first."""
@@ -105,7 +110,8 @@ def on_scalars(f, tree):
     >>> bool(jnp.all(form.joined(form.of(jnp.sin)(form.tree)) == jnp.sin(1.0)))
     True
     """
-    return Form(split(tree) if pays(f, tree) else tree)
+    form = Form(tree, pays(f, tree))
+    return form._replace(tree=form.like(tree))
 
 
 def join(tree):
