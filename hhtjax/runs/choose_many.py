@@ -20,7 +20,7 @@ ROUND = 256  # tries of a block, before members are sorted anew
 
 
 class Members(NamedTuple):
-    """Problems and tolerances of many, of which they share a part: arrays, with 0 or None for each, as in `jax.vmap`."""
+    """Problems and tolerances of many, sharing a part: arrays, with 0 or None for each, as in `jax.vmap`."""
 
     system: Any
     arrays: list
