@@ -125,7 +125,7 @@ def test_a_run_that_goes_too_far_is_named_with_the_step_that_got_there():
     runs = sweep()
     with pytest.raises(hhtjax.SimulationError, match=r"member 0 \(5 of 5 failed\), step \d+ \(to t = ") as told:
         runs.check(reach=0.5)
-    step, time = re.search(r"step (\d+) \(to t = (.*)\) failed", str(told.value)).groups()
+    step, time = re.findall(r"step (\d+) \(to t = (.*)\) failed", str(told.value))[0]
     first = TIMES[np.argmax(abs(runs.q[0, 1:, 0] - 1) > 0.5)]
     ends = 2 + np.cumsum(runs.dt[0])
     assert ends[int(step) - 2] < first <= ends[int(step) - 1] == pytest.approx(float(time), rel=1e-5)

@@ -84,8 +84,8 @@ def adaptive(
     if not isinstance(verify, bool) and verify != "tolerance":
         raise ValueError(f'adaptive: `verify` must be True, False or "tolerance"; received {verify!r}.')
     max_steps = require_integer("adaptive", "max_steps", max_steps)
-    limits = map(_as_data, (rtol, atol, atol_v, dt_min, dt_max))
-    return Adaptive(*limits, max_steps, verify)
+    rtol, atol, atol_v, dt_min, dt_max = map(_as_data, (rtol, atol, atol_v, dt_min, dt_max))
+    return Adaptive(rtol, atol, atol_v, dt_min, dt_max, max_steps, verify)
 
 
 def _require(name, value, valid, expectation):

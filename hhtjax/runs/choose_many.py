@@ -1,6 +1,11 @@
-"""The steps of many members: tried in blocks, each member at its own pace, and sorted again and again on the way."""
+"""The steps of many members: tried in blocks, each member at its own pace, and sorted again and again on the way.
+
+How many tries a member needs is not known before. So each round takes those that are not done, sorted by how many more
+their present steps would be, in blocks, and each block for a number of tries, or until the last of it is done.
+"""
 
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,88 +13,122 @@ import numpy as np
 from jax import lax
 
 from hhtjax.runs.choose import Bounds, as_steps, attempt, begin, is_walking
+from hhtjax.runs.problem import Problem
 from hhtjax.xla import on_scalars, one_kernel
 
 ROUND = 256  # tries of a block, before members are sorted anew
 
 
-def choose_many(problem_of, data, axes, size, end, lanes, max_steps):
-    """`Steps` of each member up to `end`, and (size, max_steps) the times at which they end; inf behind them.
+class Members(NamedTuple):
+    """Problems and tolerances of many, sharing a part: arrays, with 0 or None for each, as in `jax.vmap`."""
 
-    How many tries a member needs is not known before. So each round takes those that are not done, sorted by how many
-    more their present steps would be, in blocks, and each block for a number of tries, or until the last is done.
-    No tracer of autodiff may come in.
+    system: Any
+    arrays: list
+    structure: Any  # of (stepper, q0, v0, params, z0), tolerances
+    axes: list
+    t0: Any
+    times: Any
+    size: int
+    lanes: int  # members in a block
 
-    Args:
-        problem_of: one member's data -> its `Problem` and `Adaptive`.
-        data, axes: a list of arrays, and 0 or None for each, as for `jax.vmap`.
-        size, lanes: number of members, and of those in a block.
-        max_steps: as in `adaptive`.
+    def problem(self, arrays):
+        """One member's."""
+        (stepper, q0, v0, params, z0), _ = jax.tree.unflatten(self.structure, arrays)
+        return Problem(self.system, stepper, q0, v0, params, self.t0, z0)
+
+    def control(self, arrays):
+        """Its tolerances."""
+        return jax.tree.unflatten(self.structure, arrays)[1]
+
+    def of(self, numbers):
+        """The arrays of the members of these numbers."""
+        return [x if axis is None else x[numbers] for x, axis in zip(self.arrays, self.axes, strict=True)]
+
+
+def choose_many(members, control_of):
+    """`Steps` of each member to the last of the times, and (size, max_steps) where they end; inf behind them.
+
+    control_of: a member's arrays -> its `Adaptive`. No tracer of autodiff may come in.
     """
-
-    def parts(data):
-        problem, control = problem_of(data)
-        flat, q, v, t0, params = problem.flat()
-        return control, flat, problem.stepper.astype(q.dtype), q, v, t0, params
-
-    def ready(data):
-        control, flat, stepper, q, v, t0, params = parts(data)
-        bounds = Bounds.of(flat, stepper, control, t0, end)
-        return bounds, begin(flat, stepper, q, v, t0, end, params, bounds)
-
-    def trying(data, bounds):
-        _, flat, stepper, _, _, _, params = parts(data)
-        return partial(attempt, flat, stepper, params, end, bounds, max_steps)
-
-    first = [x if axis is None else x[0] for x, axis in zip(data, axes, strict=True)]
-    bounds, walk = ready(first)
-    form = on_scalars(trying(first, bounds), walk)
-    bounds, walks = jax.vmap(ready, (axes,))(data)
-    walks = jax.vmap(form.like)(walks)
-
-    def one_try(data, bounds, walk):
-        """The next walk, and the time at which the step ends, NaN where none was accepted."""
-        new, t = form.of(trying(data, bounds))(walk)
-        new = jax.tree.map(partial(jnp.where, is_walking(walk, end)), new, walk)
-        return new, jnp.where(new.accepted > walk.accepted, t, jnp.nan)
-
-    def tries(walks, data, bounds):
-        def unfinished(carry):
-            walks, _, number = carry
-            return jnp.any(is_walking(walks, end)) & (number < ROUND)
-
-        def body(carry):
-            walks, rows, number = carry
-            walks, t = jax.vmap(one_try, (axes, 0, 0))(data, bounds, walks)
-            return walks, lax.dynamic_update_index_in_dim(rows, t, number, 0), number + 1
-
-        rows = jnp.full((ROUND, lanes), jnp.nan, end.dtype)  # of all members, so that no try writes to several places
-        return lax.while_loop(unfinished, body, (walks, rows, jnp.zeros((), jnp.int32)))[:2]
+    search, bounds, walks = Search.begun(members, control_of)
+    max_steps, size, lanes = search.max_steps, members.size, members.lanes
 
     def block(order, number, carry):
         walks, ends = carry
-        members = order[
-            jnp.minimum(number * lanes + np.arange(lanes, dtype=np.int32), size - 1)
-        ]  # the last one fills up
-        mine = [x if axis is None else x[members] for x, axis in zip(data, axes, strict=True)]
-        before, limits = (jax.tree.map(lambda x: x[members], tree) for tree in (walks, bounds))
-        after, rows = one_kernel(tries, before, mine, limits)
+        those = order[jnp.minimum(number * lanes + np.arange(lanes, dtype=np.int32), size - 1)]  # the last one fills up
+        before, limits = (jax.tree.map(lambda x: x[those], tree) for tree in (walks, bounds))
+        after, rows = one_kernel(search.tries, before, members.of(those), limits)
         took = ~jnp.isnan(rows)
         places = jnp.where(took, before.accepted[None] + jnp.cumsum(took, axis=0, dtype=jnp.int32) - 1, max_steps)
-        ends = ends.at[jnp.broadcast_to(members, places.shape), places].set(rows, mode="drop")
-        return jax.tree.map(lambda x, y: x.at[members].set(y), walks, after), ends
+        ends = ends.at[jnp.broadcast_to(those, places.shape), places].set(rows, mode="drop")
+        return jax.tree.map(lambda x, y: x.at[those].set(y), walks, after), ends
 
     def rounds(carry):
         walks, _ = carry
-        waiting = is_walking(walks, end)
-        order = jnp.argsort(jnp.where(waiting, -(end - walks.state.t) / walks.h, jnp.inf))
+        waiting = is_walking(walks, search.end)
+        order = jnp.argsort(jnp.where(waiting, -(search.end - walks.state.t) / walks.h, jnp.inf))
         blocks = -(-jnp.sum(waiting, dtype=jnp.int32) // lanes)
         return lax.fori_loop(0, blocks, partial(block, order), carry)
 
     def unfinished(carry):
-        return jnp.any(is_walking(carry[0], end))
+        return jnp.any(is_walking(carry[0], search.end))
 
-    ends = jnp.full((size, max_steps), jnp.inf, end.dtype)
+    ends = jnp.full((size, max_steps), jnp.inf, search.end.dtype)
     walks, ends = lax.while_loop(unfinished, rounds, (walks, ends))
-    t0 = jax.vmap(lambda data: parts(data)[5], (axes,), axis_size=size)(data)
-    return jax.vmap(as_steps)(walks, ends, t0, bounds.least), ends
+    return jax.vmap(as_steps, (0, 0, None, 0))(walks, ends, members.t0, bounds.least), ends
+
+
+class Search(NamedTuple):
+    """How the members of a block try steps."""
+
+    members: Members
+    control_of: Any
+    end: Any
+    max_steps: int
+    form: Any  # of a walk
+
+    @classmethod
+    def begun(cls, members, control_of):
+        """The search, and the `Bounds` and walks of all members before their first steps."""
+        one = members.of(0)
+        search = cls(members, control_of, members.times[-1], control_of(one).max_steps, None)
+        bounds, walk = search.start(one)
+        search = search._replace(form=on_scalars(search.one_try(one, bounds), walk))
+        bounds, walks = jax.vmap(search.start, (members.axes,))(members.arrays)
+        return search, bounds, jax.vmap(search.form.like)(walks)
+
+    def start(self, arrays):
+        """A member's `Bounds` and walk."""
+        problem = self.members.problem(arrays)
+        flat, q, v, t0, params = problem.flat()
+        stepper = problem.stepper.astype(q.dtype)
+        bounds = Bounds.of(flat, stepper, self.control_of(arrays), t0, self.end)
+        return bounds, begin(flat, stepper, q, v, t0, self.end, params, bounds)
+
+    def one_try(self, arrays, bounds):
+        """Walk -> Walk, and the time at which it would have ended."""
+        problem = self.members.problem(arrays)
+        flat, q, _, _, params = problem.flat()
+        return partial(attempt, flat, problem.stepper.astype(q.dtype), params, self.end, bounds, self.max_steps)
+
+    def next(self, arrays, bounds, walk):
+        """The walk after one try, the same if it is over, and the end of the step; NaN where none was accepted."""
+        new, t = self.form.of(self.one_try(arrays, bounds))(walk)
+        new = jax.tree.map(partial(jnp.where, is_walking(walk, self.end)), new, walk)
+        return new, jnp.where(new.accepted > walk.accepted, t, jnp.nan)
+
+    def tries(self, walks, arrays, bounds):
+        """The walks of a block after a number of tries, and (ROUND, lanes) the ends of steps."""
+
+        def unfinished(carry):
+            walks, _, number = carry
+            return jnp.any(is_walking(walks, self.end)) & (number < ROUND)
+
+        def body(carry):
+            walks, rows, number = carry
+            walks, t = jax.vmap(self.next, (self.members.axes, 0, 0))(arrays, bounds, walks)
+            return walks, lax.dynamic_update_index_in_dim(rows, t, number, 0), number + 1
+
+        # a row for all members, so that no try writes to several places
+        rows = jnp.full((ROUND, self.members.lanes), jnp.nan, self.end.dtype)
+        return lax.while_loop(unfinished, body, (walks, rows, jnp.zeros((), jnp.int32)))[:2]

@@ -8,10 +8,9 @@ import numpy as np
 from jax import lax
 
 from hhtjax.runs.choose import trimmed
-from hhtjax.runs.choose_many import choose_many
+from hhtjax.runs.choose_many import Members, choose_many
 from hhtjax.runs.chosen import Grid, follow, quarter, verified
 from hhtjax.runs.loop import show_progress
-from hhtjax.runs.problem import Problem
 from hhtjax.runs.sweep_inputs import lanes_for
 from hhtjax.xla import or_plain
 
@@ -30,50 +29,43 @@ def run_chosen(system, data, control, t0, times, *, mapped, size, lanes, progres
     """The same, compiled, with all max_steps."""
     dtype = jax.tree.leaves(data[1])[0].dtype
     times, t0 = (jnp.asarray(x).astype(dtype) for x in (times, t0))
-    leaves, structure = jax.tree.flatten((data, control))
+    arrays, structure = jax.tree.flatten((data, control))
     axes = [0 if flag else None for flag in mapped] + [0 if jnp.ndim(x) else None for x in jax.tree.leaves(control)]
+    members = Members(system, arrays, structure, axes, t0, times, size, lanes)
+    frozen = members._replace(**lax.stop_gradient({"arrays": arrays, "t0": t0, "times": times}))
 
-    def problem_of(leaves):
-        (stepper, q0, v0, params, z0), control = jax.tree.unflatten(structure, leaves)
-        return Problem(system, stepper, q0, v0, params, t0, z0), control
+    def error(arrays, run, finer):
+        return verified(run, finer, members.control(arrays), members.problem(arrays).stepper.order)
 
-    def quarter_of(leaves):
-        problem, control = problem_of(leaves)
-        return problem, quarter(control)
-
-    def choose(problem_of):
-        data, end = lax.stop_gradient((leaves, times[-1]))
-        return choose_many(problem_of, data, axes, size, end, lanes, control.max_steps)
-
-    def over(steps, ends, halved=False):
-        """The runs over these steps."""
-
-        def grid(ends, accepted):
-            return Grid.of(t0, times, ends, accepted, halved)
-
-        def member(leaves, grid, longest):
-            return follow(problem_of(leaves)[0], times, grid, longest)
-
-        def block(numbered):
-            number, members = numbered
-            if progress:
-                show_progress(number + 1, len(blocks), "block")
-            mine = [x if axis is None else x[members] for x, axis in zip(leaves, axes, strict=True)]
-            grids = jax.vmap(grid)(ends[members], steps.accepted[members])
-            return jax.vmap(member, (axes, 0, None))(mine, grids, jnp.max(grids.counts, axis=0))
-
-        order = jnp.argsort(-steps.accepted)
-        blocks = np.minimum(np.arange(-(-size // lanes) * lanes), size - 1).reshape(-1, lanes)  # the last one fills up
-        runs = lax.map(block, (jnp.arange(len(blocks), dtype=jnp.int32), order[blocks]))
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[jnp.argsort(order)], runs)
-
-    def error(leaves, run, finer):
-        problem, control = problem_of(leaves)
-        return verified(run, finer, control, problem.stepper.order)
-
-    steps, ends = choose(problem_of)
-    runs = over(steps, ends)
-    if control.verify:
-        again = over(*choose(quarter_of)) if control.verify == "tolerance" else over(steps, ends, halved=True)
-        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(leaves, runs, again))
+    steps, ends = choose_many(frozen, frozen.control)
+    runs = run_many(members, steps, ends, progress)
+    if control.verify == "tolerance":
+        finer = run_many(members, *choose_many(frozen, lambda arrays: quarter(frozen.control(arrays))), progress)
+        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(arrays, runs, finer))
+    elif control.verify:
+        finer = run_many(members, steps, ends, progress, halved=True)
+        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(arrays, runs, finer))
     return runs._replace(dt=steps.dt, steps=steps)
+
+
+def run_many(members, steps, ends, progress, halved=False):
+    """The runs over these steps, each halved or not, in blocks: of the longest members, the next longest, and so on."""
+    t0, times, size, lanes = members.t0, members.times, members.size, members.lanes
+
+    def grid(ends, accepted):
+        return Grid.of(t0, times, ends, accepted, halved)
+
+    def member(arrays, grid, longest):
+        return follow(members.problem(arrays), times, grid, longest)
+
+    def block(numbered):
+        number, those = numbered
+        if progress:
+            show_progress(number + 1, len(blocks), "block")
+        grids = jax.vmap(grid)(ends[those], steps.accepted[those])
+        return jax.vmap(member, (members.axes, 0, None))(members.of(those), grids, jnp.max(grids.counts, axis=0))
+
+    order = jnp.argsort(-steps.accepted)
+    blocks = np.minimum(np.arange(-(-size // lanes) * lanes), size - 1).reshape(-1, lanes)  # the last one fills up
+    runs = lax.map(block, (jnp.arange(len(blocks), dtype=jnp.int32), order[blocks]))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[jnp.argsort(order)], runs)
