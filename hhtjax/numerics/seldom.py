@@ -1,48 +1,34 @@
-"""A branch that is seldom taken, at its price only where it is: also in a batch."""
+"""A branch that is seldom taken: a batch takes it where one of its members asks, and pays nothing elsewhere."""
 
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.core import eval_jaxpr
 
-from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.xla import any_member
 
 
-def seldom(f, asked, carry):
-    """f(carry), of the same structure, where `asked`, else the carry.
+def choose(where, x, y):
+    """One of two trees."""
+    return jax.tree.map(partial(jnp.where, where), x, y)
 
-    A loop of at most one round: of a condition vmap would make a choice between both for every member, where of a loop
-    it makes the rounds that some member needs. Derivatives are those of the condition, forward and reverse. Whatever f
-    takes long for must depend on the carry: what does not, XLA computes before the loop, each time.
+
+def seldom(f, asked, carry, *more):
+    """f(carry, *more), of the structure of the carry, where `asked`; else the carry.
+
+    Of a plain condition vmap makes a choice between both, for every member and in every step. Members that have not
+    asked go through f too where another one has, but neither its values nor its derivatives reach them.
 
     >>> import jax, jax.numpy as jnp
     >>> def root(x):
     ...     return seldom(jnp.sqrt, x > 1, x)
-    >>> [float(y) for y in jax.vmap(root)(jnp.array([4.0, 0.5]))], float(jax.grad(root)(4.0))
-    ([2.0, 0.5], 0.25)
+    >>> [float(y) for y in jax.vmap(root)(jnp.array([4.0, 0.0]))], [float(jax.grad(root)(x)) for x in (4.0, 0.0)]
+    ([2.0, 0.0], [0.25, 1.0])
     """
-    trace = jax.make_jaxpr(f)(carry)  # tells what f closes over
-    structure = jax.tree.structure(carry)
 
-    def traced(carry, *constants):
-        return jax.tree.unflatten(structure, eval_jaxpr(trace.jaxpr, constants, *jax.tree.leaves(carry)))
+    def branch(carry, *more):
+        known = choose(asked, (carry, more), lax.stop_gradient((carry, more)))
+        return choose(asked, f(known[0], *known[1]), carry)
 
-    return _seldom(traced, asked, carry, trace.consts)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _seldom(f, asked, carry, constants):
-    def once(state):
-        return jnp.zeros_like(state[0]), f(state[1], *constants)
-
-    return lax.while_loop(lambda state: state[0], once, (jnp.asarray(asked), carry))[1]
-
-
-@_seldom.defjvp
-def _(f, primals, tangents):
-    def branch(asked, carry, constants):
-        return lax.cond(asked, checkpoint(f), lambda carry, *_: carry, carry, *constants)
-
-    return jax.jvp(branch, primals, tangents)
+    return lax.cond(any_member(asked), branch, lambda carry, *_: carry, carry, *more)

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description.presentation import shown
-from hhtjax.numerics.seldom import seldom
+from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.numerics.seldom import choose, seldom
 from hhtjax.runs.loop import first_failure
-from hhtjax.runs.meeting import FINE, Log, Met, Part, Ways, asks, choose, pass_events, told
+from hhtjax.runs.meeting import FINE, Log, Met, Part, Ways, asks, pass_events, told
 from hhtjax.systems.events import flatten_events
 
 
@@ -36,35 +37,49 @@ class Events(NamedTuple):
 
 def loop_with_events(loop, flat, stepper, events, params, max_events, keep):
     """The `Loop` with events: its carry has `Met` behind (state, number of steps, first failure)."""
-    stepper = stepper.astype(loop.carry[0].v.dtype)
-    flat_events = flatten_events(flat, events, params, stepper.redundant)
-    ways = Ways(flat, stepper, flat_events, max_events, loop.no_info)
-    fixed = None if flat_events.modes(params) else loop.bound(params)
+    start = loop.carry[0]
+    stepper = stepper.astype(start.v.dtype)
+    ways = Ways(flat, stepper, flatten_events(flat, events, params, stepper.redundant), max_events, loop.no_info)
+    met = before_any(ways, start, params, keep)
+    step = past_events(ways, params, loop.bound, loop.sizes)
+    return loop._replace(carry=(*loop.carry, met), advance=step, past=partial(past_events, ways, params))
 
-    def step(carry):
+
+def past_events(ways, params, bound, sizes):
+    """The step of a run with events, where `here`; else the same without a look at them.
+
+    bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
+    """
+    events = ways.events
+    fixed = None if events.modes(params) else bound(params)
+
+    @checkpoint  # reverse mode would keep all that is in there for each step
+    def across(part, h, params):
+        return pass_events(ways, params, part, h)
+
+    def step(carry, here=True):
         *run, met = carry
-        state, count, failure = run
-        now = flat_events.with_modes(params, met.modes)
-        (new, after, _), info = (fixed or loop.bound(now))(tuple(run))
-        h, last = loop.sizes(count)
-        if any(flat_events.ends):
-            new, info = choose(met.ended, state, new), choose(met.ended, loop.no_info, info)
-        part = Part(state, new, info, h, last, met, jnp.zeros_like(met.ended))
-        asked = asks(ways, state, new, now, h) & ~met.ended
-        part, _ = seldom(partial(pass_events, ways, params), asked, (part, h))
-        failure = first_failure(flat, failure, after, part.end, part.info)
-        return (part.end, after, failure, part.met), part.info
+        now = events.with_modes(params, met.modes)
+        (new, count, _), info = (fixed or bound(now))(tuple(run))
+        state, before, failure = run
+        h, last = sizes(before)
+        if any(events.ends):
+            new, info = choose(met.ended, state, new), choose(met.ended, ways.no_info, info)
+        asked = asks(ways, state, new, now, h) & ~met.ended & here
+        part = Part(state, new, info, h, last, met, jnp.zeros_like(met.ended), asked)
+        part = seldom(across, asked, part, h, params)
+        failure = first_failure(ways.flat, failure, count, part.end, part.info)
+        return (part.end, count, failure, part.met), part.info
 
-    met = before_any(flat, flat_events, loop.carry[0], params, keep)
-    return loop._replace(carry=(*loop.carry, met), advance=step)
+    return step
 
 
-def before_any(flat, events, start, params, keep):
+def before_any(ways, start, params, keep):
     """`Met` before the first event."""
     none, nan = jnp.zeros((), jnp.int32), jnp.full(keep, jnp.nan, start.v.dtype)
-    rows = jnp.full((keep, told(flat, start.v).size), jnp.nan, start.v.dtype)
+    rows = jnp.full((keep, told(ways.flat, start.v).size), jnp.nan, start.v.dtype)
     log = Log(none, nan, jnp.full(keep, -1, jnp.int32), rows, rows, nan)
-    return Met(events.modes(params), jnp.array(False), none + FINE, none, log)
+    return Met(ways.events.modes(params), jnp.array(False), none + FINE, none, log)
 
 
 def with_told_events(flat, solution, met):

@@ -18,8 +18,8 @@ from hhtjax.xla import staged
 
 class Loop(NamedTuple):
     """What a run is made of. carry: (state, number of steps, first failure), before the first; advance: carry -> carry,
-    Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged; bound: params -> advance, with others;
-    sizes: number of steps taken -> that of the next, and of the one before."""
+    Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged; bound: params -> advance; sizes:
+    number of steps taken -> the size of the next, and of the last; past: bound, sizes -> advance past events."""
 
     carry: Any
     advance: Any
@@ -27,6 +27,7 @@ class Loop(NamedTuple):
     no_info: Info
     bound: Any
     sizes: Any
+    past: Any = None
 
 
 def loop_of(flat, stepper, q, v, t0, params, dt):

@@ -10,17 +10,17 @@ A rest of a millionth of the step is a Taylor polynomial: skipping it would lose
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.numerics.seldom import choose, seldom
 from hhtjax.runs.loop import resized_step
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
 
 FINE, MANY, STAYS, ALONG, CORNER = range(5)  # what may be wrong, see `solution.EVENTS`
 SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two events that are one
-HALVINGS, IMPROVEMENTS = 52, 2
+HALVINGS, IMPROVEMENTS = 24, 2
 
 
 class Ways(NamedTuple):
@@ -71,6 +71,7 @@ class Part(NamedTuple):
     last: Any
     met: Met
     divided: Any  # whether an event came before
+    asked: Any  # whether there may be one
 
 
 class Found(NamedTuple):
@@ -94,9 +95,8 @@ def asks(ways, s, s1, params, h):
     return jnp.any(below | (turns & (g0 + d0 * crossing <= 0)))
 
 
-def pass_events(ways, params, carry):
-    """The step across all events in it: (Part, h) -> (Part, h), of the first nothing but end, info and met to be used."""
-    part, h = carry
+def pass_events(ways, params, part, h):
+    """The step across all events in it: of the `Part` that is returned, end, info and met are to be used."""
     if held.holds(params):
         old = held.before(params, part.start.t, part.last)
         params = held.held_at(params, part.start.t + h / 2)
@@ -104,23 +104,23 @@ def pass_events(ways, params, carry):
 
     def slot(part, number):
         found = look(ways, part, params)
-        going = (part.met.code == FINE) & ~part.met.ended
+        going = part.asked & (part.met.code == FINE) & ~part.met.ended
         part = flag(part, going & ~jnp.any(found.hit), STAYS, found.stays)
         found_any = going & jnp.any(found.hit)
         part = flag(part, found_any & (number == ways.max_events), MANY, found.hit & ~found.touches)
         here = found_any & (number < ways.max_events)
-        return lax.cond(here, partial(meet, ways, params, h), lambda part, _: part, part, found), None
+        return seldom(partial(meet, ways), here, part, found, h, params), None
 
     part, _ = lax.scan(slot, part, jnp.arange(ways.max_events + 1, dtype=jnp.int32))
     met = part.met
 
-    def anew(part):
-        s = part.end
-        return begin(ways, s.q, s.v, s.t, ways.events.with_modes(params, part.met.modes), h)
+    def anew(s, params):
+        return begin(ways, s.q, s.v, s.t, params, h)
 
-    end = lax.cond(part.divided & ~met.ended, anew, lambda part: part.end, part)
-    lost = jnp.where(met.code == FINE, 0, jnp.nan).astype(end.v.dtype)
-    return part._replace(end=end._replace(q=end.q + lost, v=end.v + lost, w=end.w + lost)), h
+    now = ways.events.with_modes(params, met.modes)
+    end = seldom(anew, part.divided & ~met.ended, part.end, now)
+    lost = {name: jnp.where(met.code == FINE, getattr(end, name), jnp.nan) for name in ("q", "v", "w")}
+    return part._replace(end=end._replace(**lost))
 
 
 def flag(part, bad, code, which):
@@ -166,7 +166,7 @@ def look(ways, part, params):
     return Found(hit, jnp.where(hit, place, jnp.inf), touches, stays, jnp.abs(g0) + jnp.abs(g1))
 
 
-def meet(ways, params, h, part, found):
+def meet(ways, part, found, h, params):
     """The part of the step behind its first event."""
     events, flat, met = ways.events, ways.flat, part.met
     numbers = jnp.arange(found.hit.size, dtype=met.event.dtype)
@@ -197,7 +197,7 @@ def meet(ways, params, h, part, found):
     end, more = go(ways, then, start, rest, size, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
     infos = join_info(join_info(choose(part.divided, part.info, ways.no_info), info), more)
-    new = Part(start, end, infos, rest, size, after, jnp.ones_like(part.divided))
+    new = Part(start, end, infos, rest, size, after, jnp.ones_like(part.divided), part.asked)
     return choose(missed & (pick(this, found.touches.astype(h.dtype)) > 0), part, new)
 
 
@@ -250,8 +250,3 @@ def told(flat, v):
 def pick(this, x):
     """The number of this event; others may be anything."""
     return jnp.sum(jnp.where(this > 0, x, 0))
-
-
-def choose(where, x, y):
-    """One of two trees."""
-    return jax.tree.map(partial(jnp.where, where), x, y)

@@ -12,6 +12,7 @@ from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.adaptive import Adaptive
+from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_chosen import sweep_chosen
@@ -38,6 +39,9 @@ def sweep(
     in_axes=None,
     mesh=None,
     progress=False,
+    events=None,
+    max_events=2,
+    keep_events=100,
 ) -> Solution:
     """Runs `system` once for each of `dts`, all from t0 on, sampled at common times.
 
@@ -63,6 +67,8 @@ def sweep(
             processes; each then holds all results, those of one device to rounding. They lie on all devices: take
             `jax.device_get` of them before mixing them with others.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
+        events, max_events, keep_events: those of `simulate`. A block looks for events in the steps in which one of its
+            members meets some, so that they cost a batch little; not with dts=adaptive(...).
 
     Returns:
         A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for
@@ -103,6 +109,7 @@ def sweep(
     """
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
+    inputs = inputs.with_events(events, max_events, keep_events)
     if isinstance(dts, Adaptive):
         if mesh is not None:
             raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
@@ -111,8 +118,8 @@ def sweep(
     return or_plain(partial(run_sweep, *arguments, **keywords))
 
 
-@partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress"))
-def run_sweep(system, data, dts, duration, t0, times, *, mapped, num_samples, lanes, mesh, progress):
+@partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
+def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
     """The sweep of `Inputs`, compiled."""
     dtype = jax.tree.leaves(data[1])[0].dtype
     dts, duration, t0, times = jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), (dts, duration, t0, times))
@@ -132,7 +139,8 @@ def run_sweep(system, data, dts, duration, t0, times, *, mapped, num_samples, la
     axes = [0 if flag else None for flag in mapped]
 
     def member(leaves, dt, substeps, longest):
-        return _run(system, jax.tree.unflatten(structure, leaves), dt, substeps, longest, t0, num_samples, times)
+        data = jax.tree.unflatten(structure, leaves)
+        return _run(system, data, dt, substeps, longest, t0, num_samples, times, events, room)
 
     def block(leaves, dts, substeps, numbered):
         number, members = numbered
@@ -151,6 +159,8 @@ def run_sweep(system, data, dts, duration, t0, times, *, mapped, num_samples, la
     runs = jax.tree.map(lambda x: x.reshape(dealt.size, *x.shape[2:])[back], runs)
     if times is None:
         times = t0 + H * jnp.arange(num_samples + 1).astype(dtype)
+    if events is not None and any(event.terminal for event in events):
+        return runs
     return runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))
 
 
@@ -162,7 +172,7 @@ def _by_many(hand, mesh):
     return lambda *args: lax.with_sharding_constraint(hands(*args), NamedSharding(mesh, shared))
 
 
-def _run(system, data, dt, substeps, longest, t0, num_samples, times):
+def _run(system, data, dt, substeps, longest, t0, num_samples, times, events, room):
     """One member; it rests from `substeps` to `longest`, where its block still works.
 
     With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval, and
@@ -173,26 +183,42 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
     resizes = times is not None and stepper.resizes
     whole = in_two_parts if resizes else lambda *intervals: intervals
     intervals = None if times is None else whole(times[:-1], dt, substeps, longest)
-    loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
-    form = on_scalars(loop.advance, loop.carry)
+    plain = loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
+    if events is not None:
+        loop = loop_with_events(plain, flat, stepper, events, params, *room)
+    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
     keep = form.of(loop.keep)
+
+    def stepped(bound, sizes):
+        """The step of a member, which looks for events as long as it does not rest."""
+        if events is not None:
+            return form.of(loop.past(bound, sizes))
+        step = form.of(bound(params))
+        return lambda run, here: step(run)
 
     def pace(run, interval):
         """The step, and how many of them this member takes, and its block."""
         if interval is None:
-            return form.of(loop.advance), substeps, longest
+            return stepped(loop.bound, loop.sizes), substeps, longest
         t, h, mine, most, *part = interval
         taken, last = part or (None, None)
         count = run[1] if taken is None else run[1] - taken
-        return form.of(advance_from(flat, stepper, q.dtype, params, t, h, count, last)), mine, most
+
+        def bound(params):
+            return advance_from(flat, stepper, q.dtype, params, t, h, count, last)
+
+        return stepped(bound, lambda _: (h, h if last is None else last)), mine, most
 
     def part(carry, here):
         advance, substeps, longest = pace(carry[0], here)
 
         def step(i, carry):
-            run, info = advance(carry[0])
-            new = run, join_info(carry[1], info)
-            return jax.tree.map(partial(jnp.where, i < substeps), new, carry)
+            run, info = carry
+            here = i < substeps
+            after, more = advance(run, here)
+            new, old = (after[:3], join_info(info, more)), (run[:3], info)
+            run, info = jax.tree.map(partial(jnp.where, here), new, old)
+            return (*run, *after[3:]), info  # what events made is of steps that were taken
 
         return repeat(step, carry, longest), None
 
@@ -205,9 +231,11 @@ def _run(system, data, dt, substeps, longest, t0, num_samples, times):
     def samples(carry):
         return lax.scan(interval, carry, intervals, num_samples)
 
-    (_, _, failure), (path, info) = one_kernel(samples, form.tree)
+    (_, _, failure, *met), (path, info) = one_kernel(samples, form.tree)
     start = loop.carry[0]
-    return as_solution(flat, start, form.joined(path), dt, info, failure, flaw_at_start(system, flat, start, params))
+    flaw = flaw_at_start(system, flat, start, params)
+    solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
+    return with_told_events(flat, solution, form.joined(met[0])) if met else solution
 
 
 def in_two_parts(t, dt, substeps, longest):

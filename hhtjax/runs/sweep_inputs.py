@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from hhtjax.checks import require_number, require_params
+from hhtjax.checks import require_integer, require_number, require_params
 from hhtjax.description import evaluated_now, is_array, is_concrete
 from hhtjax.runs.adaptive import Adaptive, lengths, require_controlled
+from hhtjax.runs.event_checks import require_events
+from hhtjax.runs.problem import Problem
 from hhtjax.runs.sweep_grid import (
     equal_times,
     require_one_grid,
@@ -39,6 +41,8 @@ class Inputs(NamedTuple):
     num_samples: int
     times: Any
     size: int
+    events: Any = None
+    room: tuple = ()
 
     @classmethod
     def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes, times=None, z0=None):
@@ -75,6 +79,20 @@ class Inputs(NamedTuple):
         duration, t0 = (x if x is None or not is_concrete(x) else float(x) for x in (duration, t0))
         return cls(system, data, dts, duration, t0, mapped, int(num_samples), times, size)
 
+    def with_events(self, events, max_events, keep_events):
+        """The same with events, looked at for each member."""
+        room = require_integer("sweep", "max_events", max_events), require_integer("sweep", "keep_events", keep_events)
+        if events is None:
+            return self
+        if isinstance(self.dts, Adaptive):
+            raise NotImplementedError("sweep: with dts=adaptive(...), leave `events` out.")
+        members = range(self.size) if any(self.mapped) and is_concrete(self.dts) else [0]
+        for i in members:
+            stepper, q0, v0, params, z0 = _member(self.data, self.mapped, i)
+            where = f"sweep: member {i}" if any(self.mapped) else "sweep"
+            events = require_events(where, Problem(self.system, stepper, q0, v0, params, self.t0, z0), events)
+        return self._replace(events=events, room=room)
+
     def chunk(self, members):
         """The same for the members of these numbers."""
         dts = self.dts[members]
@@ -90,8 +108,8 @@ class Inputs(NamedTuple):
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes_for(self.size)}
-        arguments = self.system, data, dts, self.duration, self.t0, self.times
-        return arguments, {**static, "mesh": mesh, "progress": progress}
+        arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
+        return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
 
 
 def lanes_for(size):

@@ -37,6 +37,9 @@ def sweep_to_disk(
     in_axes=None,
     chunk=4096,
     progress=False,
+    events=None,
+    max_events=2,
+    keep_events=100,
 ) -> Path:
     """The same as `sweep`, `chunk` members at a time, each chunk written to a file of its own in `folder`.
 
@@ -50,7 +53,8 @@ def sweep_to_disk(
         folder: made if it does not exist.
         chunk: members in a file, which bounds the memory.
         progress: one line on stderr for each file.
-        system, stepper, q0, v0, params, dts, duration, num_samples, times, t0, in_axes: those of `sweep`.
+        system, stepper, q0, v0, params, dts, duration, num_samples, times, t0, in_axes, events, max_events, keep_events:
+            those of `sweep`.
 
     Returns:
         The folder, to be read by `load_sweep`, or by `numpy.load` file by file.
@@ -75,6 +79,7 @@ def sweep_to_disk(
         raise NotImplementedError("sweep_to_disk: `dts` must be step sizes; adaptive(...) is for `sweep`.")
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
+    inputs = inputs.with_events(events, max_events, keep_events)
     if not all(map(is_concrete, jax.tree.leaves(inputs))):
         raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
     folder, size = Path(folder), inputs.dts.size

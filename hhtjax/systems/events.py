@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, require_number
 from hhtjax.description import Description, is_array
+from hhtjax.numerics.seldom import seldom
 from hhtjax.systems.constraints import factorize_constrained, pull_back, saddle_point
 
 
@@ -150,13 +150,18 @@ def flatten_events(system, events, params, redundant=None):
             leaves[i] = x
         return structure.unflatten(leaves)
 
-    def outcome_of(event, q, v, t, params):
+    def outcome_of(event, now, q, t, params):
+        v, old = now
         after = params if event.switch is None else event.switch(params)
-        new = _reset(system, event, redundant, q, v, t, params)
-        return new, [x.astype(y.dtype) for x, y in zip(modes(after), modes(params), strict=True)]
+        new = [x.astype(y.dtype) for x, y in zip(modes(after), old, strict=True)]
+        return _reset(system, event, redundant, q, v, t, params), new
 
-    def outcome(i, *at):
-        return lax.switch(i, [partial(outcome_of, event) for event in events], *at)
+    def outcome(i, q, v, t, params):
+        now = v, modes(params)
+        for number, event in enumerate(events):
+            if not event.is_noted:
+                now = seldom(partial(outcome_of, event), i == number, now, q, t, params)
+        return now
 
     noted, ends = tuple(event.is_noted for event in events), tuple(event.terminal for event in events)
     return FlatEvents(guards, outcome, noted, ends, modes, with_modes)

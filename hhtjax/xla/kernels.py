@@ -102,6 +102,28 @@ def structural(x):
     return structural_p.bind(x) if is_on() else jnp.asarray(x)
 
 
+def any_member(asked):
+    """Whether any member of a batch asks: the same for all of them, a single run's own answer.
+
+    A condition on it is one in a batch too, where vmap makes a choice of any other: what few members need in few steps
+    costs nothing in the others. The branch has to leave alone what members hold that have not asked.
+
+    Args:
+        asked: a boolean scalar.
+
+    Returns:
+        A boolean scalar, which vmap does not give an axis.
+
+    Raises:
+        TypeError: asked is no array.
+
+    >>> seldom = jax.vmap(lambda x: jax.lax.cond(any_member(x < 0), lambda x: jnp.maximum(x, 0), lambda x: x, x))
+    >>> print(seldom(jnp.array([1.0, -2.0])))
+    [1. 0.]
+    """
+    return any_member_p.bind(asked)
+
+
 def named(name, f):
     """f as a function of this name in the program."""
 
@@ -135,3 +157,12 @@ watch_p.def_impl(lambda x: x)
 watch_p.def_abstract_eval(lambda x: x)
 ad.deflinear2(watch_p, lambda cotangent, _: (watch_p.bind(cotangent),))
 batching.defvectorized(watch_p)
+
+
+any_member_p = Primitive("hhtjax_any_member")
+any_member_p.def_impl(jnp.asarray)
+any_member_p.def_abstract_eval(lambda x: x)
+batching.primitive_batchers[any_member_p] = lambda values, axes: (
+    any_member_p.bind(jnp.any(values[0], axis=axes[0])),
+    None,
+)
