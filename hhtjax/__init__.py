@@ -89,14 +89,14 @@ __all__ = [  # noqa: RUF022
     "__version__", "analysis", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
     "FirstOrderSystem", "LinearSystem", "System", "PrecisionWarning", "ConsistentInitial", "consistent_initial",
-    "Sampled", "band_limited", "band_limited_motion", "sampled", "spline_gain_error",
+    "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled", "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
     "bossak", "collocation", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
     "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
     # runs
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
-    "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
+    "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
     # out of Python
     "ExportedC", "ExportedFMU", "export_c", "export_fmu",
     # identification

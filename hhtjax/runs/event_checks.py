@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import describe, require_number
+from hhtjax.checks import describe, require_function, require_number
 from hhtjax.description import evaluated_now, freeze, is_concrete, thaw
 from hhtjax.systems import held, returned
 from hhtjax.systems.events import Event, Impact, flatten_events
@@ -38,6 +38,11 @@ def _require_shapes(caller, problem, event):
     params, first_order = thaw(problem.params), isinstance(problem.system, FirstOrderSystem)
     at = (problem.q0,) if first_order else (problem.q0, problem.v0) + (() if problem.z0 is None else (problem.z0,))
     at, dtype = (*at, problem.t0, params), jax.tree.leaves(problem.q0)[0].dtype
+    arguments = "y, t, params" if first_order else "q, v, t, params" if problem.z0 is None else "q, v, z, t, params"
+    for name in ("guard", "reset"):
+        function = getattr(event, name)
+        if function is not None and not isinstance(function, Impact):
+            require_function(caller, name, function, f"{name}({arguments})", count=len(at))
     g = returned.evaluate(caller, "guard", event.guard, *at)
     if not hasattr(g, "shape") or g.shape not in [(), (1,)]:
         raise TypeError(f"{caller}: `guard` must return a number; received {describe(g)}.")

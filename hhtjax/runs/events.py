@@ -10,7 +10,7 @@ from hhtjax.description.presentation import shown
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, seldom
 from hhtjax.runs.loop import first_failure
-from hhtjax.runs.meeting import FINE, Log, Met, Part, Ways, asks, pass_events, told
+from hhtjax.runs.meeting import FINE, Log, Met, Part, Ways, asks, pass_events
 from hhtjax.systems.events import flatten_events
 
 
@@ -22,7 +22,9 @@ class Events(NamedTuple):
         count: how many were met, also those beyond the entries.
         t: (keep_events,), when; differentiable.
         which: (keep_events,), the number of the event.
+        q: where, like q0 with a leading axis; None of a first-order system.
         before, after: v before and after each, like v0 with a leading axis; y of a first-order system.
+        z: internal states there, None without.
         rate: (keep_events,), dg/dt before. Where it is small beside the velocities the motion grazes the guard, and
             derivatives are huge, at last infinite.
     """
@@ -30,8 +32,10 @@ class Events(NamedTuple):
     count: Any
     t: Any
     which: Any
+    q: Any
     before: Any
     after: Any
+    z: Any
     rate: Any
 
 
@@ -76,14 +80,24 @@ def past_events(ways, params, bound, sizes):
 
 def before_any(ways, start, params, keep):
     """`Met` before the first event."""
-    none, nan = jnp.zeros((), jnp.int32), jnp.full(keep, jnp.nan, start.v.dtype)
-    rows = jnp.full((keep, told(ways.flat, start.v).size), jnp.nan, start.v.dtype)
-    log = Log(none, nan, jnp.full(keep, -1, jnp.int32), rows, rows, nan)
+    none, dtype = jnp.zeros((), jnp.int32), start.v.dtype
+
+    def empty(*shape):
+        return jnp.full((keep, *shape), jnp.nan, dtype)
+
+    N = start.v.size
+    log = Log(none, empty(), jnp.full(keep, -1, jnp.int32), empty(start.q.size), empty(N), empty(N), empty())
     return Met(ways.events.modes(params), jnp.array(False), none + FINE, none, log)
 
 
 def with_told_events(flat, solution, met):
     """The `Solution` with its `Events`, and what was wrong with one of them."""
-    rows, log = flat.unravel_rates if flat.positions else flat.unravel, met.log
-    events = Events(log.count, log.t, log.which, jax.vmap(rows)(log.before), jax.vmap(rows)(log.after), log.rate)
+    log, n, q, z = met.log, flat.positions, None, None
+    before, after, rows = log.before, log.after, flat.unravel
+    if n:
+        q, rows = jax.vmap(flat.unravel)(log.q), flat.unravel_rates
+        before, after = before[:, :n], after[:, :n]
+    if n not in (0, flat.size):
+        z = jax.vmap(flat.unravel_internal)(log.before[:, n:])
+    events = Events(log.count, log.t, log.which, q, jax.vmap(rows)(before), jax.vmap(rows)(after), z, log.rate)
     return solution._replace(events=events, failure=solution.failure._replace(event=met.code, guard=met.event))

@@ -41,7 +41,9 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
 
     Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
     through (z, zdot); for a rotation, of the rotation vector from the saved one before. Their error is O(H^4), H the
-    spacing of the saved times.
+    spacing of the saved times. Where events lie between two saved times, the polynomials end there: q with O(H^4), v
+    and z straight lines with O(H^2); at the event itself v is that behind it. NaN behind the last of `keep_events`, if
+    there were more.
 
     Args:
         solution: of one run (vmap this function for a batch).
@@ -81,11 +83,51 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
         H = jnp.full_like(times, t[1] - t[0])
     x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
 
-    known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
+    known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None, events=None)
     a, b = (jax.tree.map(lambda y: y[j], known) for j in (i, i + 1))  # noqa: B023 (called at once)
+    if solution.events is not None:
+        a, b, H, x = between_events(solution.events, a, b, H, x, times)
     found = between(a, b, H, x)
     v = None if solution.acceleration is None else found.v
     return Interpolant(found.q, v) if solution.z is None else InternalInterpolant(found.q, v, found.z)
+
+
+def between_events(events, a, b, H, x, times):
+    """What `between` takes, with the events that lie between a and b for ends."""
+
+    def on_axes(x, y):
+        return x.reshape(x.shape + (1,) * (y.ndim - x.ndim))
+
+    t = jnp.where(jnp.isnan(events.t), jnp.inf, events.t)
+    last = jnp.searchsorted(t, times, side="right") - 1
+    earlier, later = jnp.maximum(last, 0), jnp.minimum(last + 1, t.size - 1)
+    behind, ahead = (last >= 0) & (t[earlier] >= a.t), (last + 1 < t.size) & (t[later] <= b.t)
+    first_order = a.acceleration is None
+
+    def put(here, k, rates, state):
+        q = rates if first_order else events.q
+        new = {"t": events.t, "q": q} | ({} if first_order else {"v": rates, "z": events.z})
+        return state._replace(**{
+            name: jax.tree.map(lambda x, y: jnp.where(on_axes(here, y), x[k], y), value, getattr(state, name))
+            for name, value in new.items()
+        })  # fmt: skip
+
+    a, b = put(behind, earlier, events.after, a), put(ahead, later, events.before, b)
+    unknown = (events.count > t.size) & (last + 1 >= t.size)
+    inside, H = behind | ahead, jnp.where(behind | ahead, b.t - a.t, H)
+    x = jnp.where(unknown, jnp.nan, jnp.where(inside, (times - a.t) / jnp.where(H > 0, H, 1), x))
+
+    def secant(rate, y0, y1):
+        return jnp.where(on_axes(inside, rate), (y1 - y0) / on_axes(jnp.where(H > 0, H, 1), rate), rate)
+
+    pairs = {"v": "q"} if first_order else {"acceleration": "v", "zdot": "z"}
+    a, b = (
+        side._replace(**{
+            name: jax.tree.map(secant, getattr(side, name), getattr(a, of), getattr(b, of)) for name, of in pairs.items()
+        })
+        for side in (a, b)
+    )  # fmt: skip
+    return a, b, H, x
 
 
 def between(a, b, H, x):

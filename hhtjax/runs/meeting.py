@@ -39,6 +39,7 @@ class Log(NamedTuple):
     count: Any
     t: Any
     which: Any
+    q: Any
     before: Any
     after: Any
     rate: Any
@@ -181,7 +182,7 @@ def meet(ways, part, found, h, params):
     missed = ~(jnp.abs(pick(this, g)) <= 1e-3 * jnp.abs(rate) * h + noise * pick(this, found.size))
 
     v, modes = events.outcome(i, e.q, e.v, e.t, now)
-    log = met.log.added(e.t, i, told(flat, e.v), told(flat, v), rate)
+    log = met.log.added(e.t, i, e.q, e.v, v, rate)
     noted, ends = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, events.ends))
     beside = ~noted & jnp.any(is_corner(g, d, h, this, events.noted))
     code = jnp.where(beside, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
@@ -240,11 +241,6 @@ def drifted(flat, s, h):
     """The state a very short time h later."""
     s1 = s._replace(t=s.t + h, q=flat.move(s.q, h * (s.v + h / 2 * s.w)), v=s.v + h * s.w)
     return flat.tidy(s1)
-
-
-def told(flat, v):
-    """What a user knows as v; of a first-order system as y."""
-    return flat.located(v) if flat.positions else v
 
 
 def pick(this, x):

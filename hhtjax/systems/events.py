@@ -61,9 +61,9 @@ class Event(Description):
     terminal: bool = False
 
     def __post_init__(self):
-        require_function("Event", "guard", self.guard, "guard(q, v, t, params)")
+        require_function("Event", "guard", self.guard, "guard(...)")
         if self.reset is not None and not isinstance(self.reset, Impact):
-            require_function("Event", "reset", self.reset, "reset(q, v, t, params)")
+            require_function("Event", "reset", self.reset, "reset(...)")
         if self.switch is not None:
             require_function("Event", "switch", self.switch, "switch(params)", count=1)
         if not isinstance(self.terminal, bool):
