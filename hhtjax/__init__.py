@@ -96,7 +96,8 @@ __all__ = [  # noqa: RUF022
     "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
     # runs
     "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
-    "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep", "Explanation", "explain", "plain",
+    "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep",
+    "Explanation", "explain", "plain",
     # out of Python
     "ExportedC", "ExportedFMU", "export_c", "export_fmu",
     # identification

@@ -22,8 +22,8 @@ def require_events(caller, problem, events):
             raise TypeError(f"{caller}: `events[{i}]` must be an Event(...); received {event!r}.")
     if not problem.stepper.meets_events:
         raise NotImplementedError(
-            f"{caller}: {type(problem.stepper).__name__} cannot begin anew behind an event; use hht() or another of its "
-            "family, rosenbrock(), rowda(), rk4() or dopri5()."
+            f"{caller}: {type(problem.stepper).__name__} cannot begin anew behind an event; use hht() or another of "
+            "its family, rosenbrock(), rowda(), rk4() or dopri5()."
         )
     for i, event in enumerate(events):
         _require_shapes(f"{caller}: events[{i}]", problem, event)
@@ -79,8 +79,8 @@ def _require_same(caller, params, after):
     for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True):
         if jnp.shape(x) != y.shape or jnp.result_type(x) != y.dtype:
             raise TypeError(
-                f"{caller}: `switch` must keep shapes and dtypes; params{jax.tree_util.keystr(path)} was {describe(x)}, "
-                f"and became {describe(y)}."
+                f"{caller}: `switch` must keep shapes and dtypes; params{jax.tree_util.keystr(path)} was "
+                f"{describe(x)}, and became {describe(y)}."
             )
 
 
@@ -113,6 +113,6 @@ def _require_start(caller, events, g, rates, terms, on_velocity):
         at_guard = abs(g[i]) <= AT_GUARD * np.finfo(g.dtype).eps * max(terms[i], np.finfo(g.dtype).tiny)
         if not (at_guard and rates[i] > 0):
             raise ValueError(
-                f"{caller}: the start is beyond the guard of events[{i}]: it is {g[i]:.6g}, with the rate {rates[i]:.6g}; "
-                "it must be positive, or zero and rising."
+                f"{caller}: the start is beyond the guard of events[{i}]: it is {g[i]:.6g}, with the rate "
+                f"{rates[i]:.6g}; it must be positive, or zero and rising."
             )

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hhtjax import rotation
 from hhtjax.numerics.richardson import richardson, take_out
+from hhtjax.runs.solution import DIFFER
 from hhtjax.systems import kinematics
 
 MOST = 4  # levels; rounding and work grow with each
@@ -31,12 +32,32 @@ def _combine(solutions, order, join):
     turns = first.acceleration is not None  # a first-order system has no rotations
     q = value("q", partial(_positions, first.v) if turns else None)
     rest = {name: value(name) for name in ("v", "acceleration", "multipliers", "z", "zdot")}
-    return first._replace(
-        q=q,
-        **rest,
-        info=reduce(join, [solution.info for solution in solutions]),
-        failure=_first([solution.failure for solution in solutions]),
-    )
+    failure = _first([solution.failure for solution in solutions])
+    if first.events is not None:
+        rest["events"], same = _events([solution.events for solution in solutions], order)
+        failure = _told_apart(first, failure, same)
+    return first._replace(q=q, **rest, info=reduce(join, [solution.info for solution in solutions]), failure=failure)
+
+
+def _events(runs, order):
+    """The `Events` without their leading errors, places as in the finest run, and whether all runs met each."""
+    finest = runs[-1]
+    names = "t", "before", "after", "z", "rate"
+    better = {name: richardson([getattr(events, name) for events in runs], order) for name in names}
+    same = [(events.which == finest.which) & (events.count == finest.count) for events in runs]
+    return finest._replace(**better), reduce(jnp.logical_and, same)
+
+
+def _told_apart(first, failure, same):
+    """The failure, or that of runs that met other events."""
+    differ = ~jnp.all(same) & (failure.step == 0)
+    here = jnp.argmin(same)
+    ahead = jnp.maximum(first.events.t[here] - first.t[0], 0)
+    dt = first.dt
+    step = jnp.ceil(ahead / dt) if dt.ndim == 0 else 1 + jnp.sum(jnp.cumsum(dt) < ahead)
+    step = jnp.maximum(jnp.nan_to_num(step, nan=1), 1).astype(failure.step.dtype)
+    new = failure._replace(step=step, event=jnp.full_like(failure.event, DIFFER), guard=first.events.which[here])
+    return jax.tree.map(partial(jnp.where, differ), new, failure)
 
 
 def _positions(v, gain, coarse, fine):

@@ -120,10 +120,10 @@ def between_events(events, a, b, H, x, times):
     def secant(rate, y0, y1):
         return jnp.where(on_axes(inside, rate), (y1 - y0) / on_axes(jnp.where(H > 0, H, 1), rate), rate)
 
-    pairs = {"v": "q"} if first_order else {"acceleration": "v", "zdot": "z"}
+    pairs = {"v": "q"} if first_order else {"acceleration": "v", "zdot": "z"}  # the slope of each, where none is known
     a, b = (
         side._replace(**{
-            name: jax.tree.map(secant, getattr(side, name), getattr(a, of), getattr(b, of)) for name, of in pairs.items()
+            rate: jax.tree.map(secant, getattr(side, rate), getattr(a, x), getattr(b, x)) for rate, x in pairs.items()
         })
         for side in (a, b)
     )  # fmt: skip

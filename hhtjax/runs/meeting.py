@@ -1,6 +1,6 @@
 """A step across events: find the first, step to it, change the velocity or the params, begin anew, go on to the end.
 
-    0 = g(step(s, tau)),    e = step(s, tau),    v := reset(e),  params := switch(params),    s1 = step(begin(e), h - tau)
+    0 = g(step(s, tau)),   e = step(s, tau),   v := reset(e),  params := switch(params),   s1 = step(begin(e), h - tau)
 
 so that the grid stays what it was, and the order that of the stepper. tau is found on the cubic through g and its rate
 at both ends, and made exact by two Newton steps on steps of size tau; its derivative is that of the implicit function.
@@ -15,10 +15,10 @@ from jax import lax
 
 from hhtjax.numerics.seldom import choose, seldom
 from hhtjax.runs.loop import resized_step
+from hhtjax.runs.solution import ALONG, CORNER, FINE, MANY, STAYS
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
 
-FINE, MANY, STAYS, ALONG, CORNER = range(5)  # what may be wrong, see `solution.EVENTS`
 SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two events that are one
 HALVINGS, IMPROVEMENTS = 24, 2
 
@@ -63,7 +63,7 @@ class Met(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What is left of a step: from `start` to `end`, of the size `rest`; `last` is the size that start.a is made for."""
+    """What is left of a step: from `start` to `end`, of the size `rest`; `last` is the size start.a is made for."""
 
     start: Any
     end: Any

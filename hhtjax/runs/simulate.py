@@ -107,10 +107,9 @@ def simulate(
             "simulate: leave `extrapolate` out: with dry friction the error is no power series in dt; "
             f"received {extrapolate}."
         )
-    if events is not None and (isinstance(dt, Adaptive) or extrapolate > 1):
+    if events is not None and isinstance(dt, Adaptive):
         raise NotImplementedError(
-            "simulate: with `events`, give dt as numbers, and leave `extrapolate` out: error control, and extrapolation, "
-            "take motions without jumps."
+            "simulate: with `events`, give `dt` as numbers: error control takes motions without jumps."
         )
     if isinstance(dt, Adaptive) or times is not None:
         require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)

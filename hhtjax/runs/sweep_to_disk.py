@@ -53,8 +53,8 @@ def sweep_to_disk(
         folder: made if it does not exist.
         chunk: members in a file, which bounds the memory.
         progress: one line on stderr for each file.
-        system, stepper, q0, v0, params, dts, duration, num_samples, times, t0, in_axes, events, max_events, keep_events:
-            those of `sweep`.
+        system, stepper, q0, v0, params, dts, duration, num_samples, times, t0, in_axes, events, max_events,
+            keep_events: those of `sweep`.
 
     Returns:
         The folder, to be read by `load_sweep`, or by `numpy.load` file by file.

@@ -1,6 +1,6 @@
 """Events: a guard that falls to zero, and what becomes of the motion there.
 
-    g(q, v, t) > 0 where the motion is allowed;    at g = 0:  v := reset(q, v, t),  params := switch(params),  or the end
+    g(q, v, t) > 0 where the motion is allowed;   at g = 0:  v := reset(q, v, t),  params := switch(params),  or the end
 
 How a step finds the time is in hhtjax/runs/meeting.py.
 """
@@ -38,9 +38,9 @@ class Event(Description):
 
     An event with none of the three is noted, and changes nothing: sections of a Poincare map, times of passage.
 
-    Resting contact is no event: a ball that comes to rest on the floor bounces infinitely often in a finite time, and the
-    run fails by name when more than `max_events` fall into a step. Give contacts that last a stiff force, or a
-    constraint in a part of the run of its own.
+    Resting contact is no event: a ball that comes to rest on the floor bounces infinitely often in a finite time, and
+    the run fails by name when more than `max_events` fall into a step. Give contacts that last a stiff force, or a
+    constraint in a run of its own that begins there.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind.

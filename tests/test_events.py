@@ -1,0 +1,344 @@
+"""Events inside a step: order, exact derivatives, failures by name, and the same in sweeps."""
+
+import event_problems
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from event_problems import G
+from helpers import check_message
+
+import hhtjax
+from hhtjax import Event, FirstOrderSystem, LinearSystem, SimulationError, System, hht, impact, rowda, simulate, sweep
+
+BALL = System(jnp.ones(1), lambda q, v, t, p: 0 * q - p["g"])
+FLOOR = Event(lambda q, v, t, p: q[0] - p["floor"], impact("e"))
+
+
+def errors(problem, stepper, numbers):
+    """Of q and v at the end, for these numbers of steps, in one program."""
+    duration = problem.duration
+    runs = sweep(
+        problem.system, stepper, problem.q0, problem.v0, problem.params,
+        dts=duration / np.array(numbers), duration=duration, num_samples=1, events=problem.events or None,
+    )  # fmt: skip
+    runs.check()
+    ends = np.concatenate([runs.q[:, -1], runs.v[:, -1]], axis=1)
+    return np.max(np.abs(ends - problem.end), axis=1)
+
+
+def slope(error, numbers):
+    return -np.polyfit(np.log(numbers), np.log(error), 1)[0]
+
+
+NUMBERS = 83, 120, 177, 251, 367, 523, 823
+CASES = {
+    "ball, hht": (event_problems.dragged_ball, hht(-0.3), 2),
+    "ball, rowda": (event_problems.dragged_ball, rowda(), 3),
+    "double pendulum, hht": (event_problems.stopped_double_pendulum, hht(-0.05), 2),
+    "double pendulum, rowda": (event_problems.stopped_double_pendulum, rowda(), 3),
+    "pendulum at a wall, hht": (event_problems.walled_pendulum, hht(-0.1), 2),
+    "bump stop, hht": (event_problems.bump_stop, hht(-0.05), 2),
+    "bump stop, rowda": (event_problems.bump_stop, rowda(), 3),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_events_keep_the_order(case):
+    make, stepper, order = CASES[case]
+    found = slope(errors(make(), stepper, NUMBERS), NUMBERS)
+    assert found > order - (0.15 if order == 2 else 0.2), found
+
+
+def test_a_force_that_jumps_without_a_mode_loses_it():
+    assert slope(errors(event_problems.bump_stop(located=False), hht(-0.05), NUMBERS), NUMBERS) < 1.7
+
+
+def bounced(x):
+    """Where and how fast a ball is after a second, with one bounce, and when that was: by formulas."""
+    q0, v0, g, e, floor = x
+    fall = (v0 + jnp.sqrt(v0**2 + 2 * g * (q0 - floor))) / g
+    up, rest = e * (g * fall - v0), 1.0 - fall
+    return jnp.stack([floor + up * rest - g * rest**2 / 2, up - g * rest, fall])
+
+
+@pytest.mark.parametrize("numbers", [(2, 6, 30, 100)])
+def test_derivatives_of_an_impact_are_those_of_the_formula_at_any_dt(numbers):
+    x = jnp.array([1.0, 0.3, 9.81, 0.9, 0.1])
+
+    def by_steps(x):
+        q0, v0, g, e, floor = x
+        dts = 1.0 / np.array(numbers)
+        params = {"g": g, "e": e, "floor": floor}
+        runs = sweep(BALL, hht(), q0[None], v0[None], params, dts=dts, duration=1.0, num_samples=1, events=[FLOOR])
+        return jnp.stack([runs.q[:, -1, 0], runs.v[:, -1, 0], runs.events.t[:, 0]], axis=1)
+
+    assert abs(by_steps(x) - bounced(x)).max() < 1e-13
+    exact = jax.jacfwd(bounced)(x)
+    for derivative in (jax.jacfwd(by_steps)(x), jax.jacrev(by_steps)(x)):
+        assert abs(derivative - exact).max() < 1e-12
+
+
+@pytest.mark.parametrize("num_steps", [2, 10])
+def test_an_impact_on_a_grid_point(num_steps):
+    """Free flight from .5 with -1 m/s: the wall is met at half a second, the end of a step, or a rounding behind it."""
+
+    def end(x):
+        params = {"g": 0.0, "e": x[3], "floor": x[2]}
+        run = simulate(BALL, hht(), x[:1], x[1:2], params, dt=1 / num_steps, num_steps=num_steps, events=[FLOOR])
+        return jnp.stack([run.q[-1, 0], run.v[-1, 0]])
+
+    x = jnp.array([0.5, -1.0, 0.0, 1.0])
+    exact = np.array([[-1.0, -1.0, 2.0, 0.5], [0.0, -1.0, 0.0, 1.0]])
+    assert abs(jax.jacfwd(end)(x) - exact).max() < 1e-12
+    assert abs(jax.jacrev(end)(x) - exact).max() < 1e-12
+
+
+@pytest.mark.parametrize("num_steps", [7, 10])
+def test_two_balls_exchange_their_velocities(num_steps):
+    """The case in which physics engines gave .75, .25, .91, .08."""
+    balls = System(jnp.ones(2), lambda q, v, t, p: 0 * q)
+    contact = Event(lambda q, v, t, p: q[1] - q[0] - 0.1, impact(1.0))
+
+    def end(x):
+        run = simulate(balls, hht(), x[:2], x[2:], dt=1 / num_steps, num_steps=num_steps, events=[contact])
+        return run.q[-1, 1]
+
+    x = jnp.array([0.0, 0.6, 1.0, 0.0])
+    for derivative in (jax.jacfwd(end)(x), jax.jacrev(end)(x)):
+        assert abs(derivative - np.array([1.0, 0.0, 1.0, 0.0])).max() < 1e-12
+
+
+def test_gradients_agree_with_each_other_and_with_differences():
+    problem = event_problems.dragged_ball()
+
+    @jax.jit
+    def end(x):
+        params = {"c": x[2], "e": x[3], "floor": x[4]}
+        run = simulate(
+            problem.system, hht(-0.3), x[:1], x[1:2], params, dt=1.5 / 40, num_steps=40, save_every=40,
+            events=problem.events)  # fmt: skip
+        return jnp.sin(run.q[-1, 0]) + run.events.after[1, 0]
+
+    x = jnp.array([1.0, 0.0, 0.3, 0.8, 0.0])
+    forward, reverse = jax.jacfwd(end)(x), jax.grad(end)(x)
+    step = 1e-6
+    central = [(end(x.at[i].add(step)) - end(x.at[i].add(-step))) / (2 * step) for i in range(x.size)]
+    assert abs(forward - reverse).max() < 1e-13
+    assert abs(forward - jnp.stack(central)).max() < 1e-7
+
+
+def test_a_terminal_event_ends_the_run():
+    """A ball thrown up at v0 lands after 2 v0/g."""
+    landing = Event(lambda q, v, t, p: q[0], terminal=True)
+
+    def fly(v0):
+        run = simulate(BALL, hht(), jnp.zeros(1), v0[None], {"g": G}, dt=0.01, num_steps=250, events=[landing])
+        return run.events.t[0], run
+
+    v0 = jnp.array(10.0)
+    (t, run), forward = fly(v0), jax.jacfwd(lambda v0: fly(v0)[0])(v0)
+    run.check()
+    assert abs(t - 20 / G) < 1e-13
+    assert abs(forward - 2 / G) < 1e-12
+    assert abs(jax.grad(lambda v0: fly(v0)[0])(v0) - 2 / G) < 1e-12
+    assert run.t[-1] == t and abs(run.q[-1, 0]) < 1e-13 and abs(run.v[-1, 0] + 10) < 1e-12
+    assert run.events.count == 1
+
+
+def come_to_rest(e, num_steps):
+    return simulate(
+        BALL, hht(), jnp.ones(1), jnp.zeros(1), {"g": G, "floor": 0.0, "e": e}, dt=2.0 / num_steps,
+        num_steps=num_steps, events=[FLOOR])  # fmt: skip
+
+
+def test_a_motion_to_rest_fails_by_name():
+    """With e = .5 the bounces pile up at t = 3 sqrt(2/g); the run is right up to the last step before, and NaN after."""
+    run = come_to_rest(0.5, 200)
+    check_message(SimulationError, "step 136 (to t = 1.36) failed: more than max_events in a step", run.check)
+    assert np.isnan(run.q[136:]).all() and np.nanmin(run.q) > -1e-9
+    fall, up = np.sqrt(2 / G), 0.5 * np.sqrt(2 * G)
+    assert abs(run.q[60, 0] - (up * (0.6 - fall) - G / 2 * (0.6 - fall) ** 2)) < 1e-12
+
+
+def test_resting_contact_fails_by_name():
+    run = come_to_rest(0.0, 200)
+    check_message(
+        SimulationError, "step 46 (to t = 0.46) failed: the motion stays beyond the guard of event 0", run.check
+    )
+    assert np.isnan(run.q[46:]).all() and np.nanmin(run.q) > -1e-9
+
+
+def test_a_corner_fails_by_name():
+    walls = [Event(lambda q, v, t, p, i=i: q[i], impact(0.5)) for i in range(2)]
+    free = System(jnp.ones(2), lambda q, v, t, p: 0 * q)
+    run = simulate(free, hht(), jnp.full(2, 0.35), jnp.full(2, -1.0), dt=0.1, num_steps=10, events=walls)
+    with pytest.raises(SimulationError, match="step 4 .* failed: another event happens at the same time as event"):
+        run.check()
+    assert np.isnan(run.q[4:]).all()
+
+
+def test_an_impact_that_nothing_can_follow_fails_by_name():
+    clock = Event(lambda q, v, t, p: 0.25 - t + 0 * q[0], impact(0.5))
+    run = simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), {"g": 0.0}, dt=0.1, num_steps=5, events=[clock])
+    check_message(SimulationError, "step 3 (to t = 0.3) failed: no velocity changes the guard of event 0", run.check)
+
+
+def test_no_event_no_change():
+    scene = event_problems.double_pendulum.free()
+    far = Event(lambda q, v, t, p: q[0] - q[1] + 1e6, impact(0.5))
+    q0 = jnp.array([1.2, 0.4])
+    runs = [
+        simulate(scene.system, hht(), q0, jnp.zeros(2), scene.params, dt=1e-3, num_steps=500, **options)
+        for options in ({}, {"events": [far]})
+    ]
+    assert bool(jnp.all(runs[0].q == runs[1].q)) and runs[1].events.count == 0
+    assert runs[0].events is None and runs[0].failure.event is None
+
+
+def test_a_sweep_is_its_members():
+    problem = event_problems.dragged_ball()
+    e, q0 = np.linspace(0.7, 0.9, 5), np.linspace(0.6, 1.4, 5)[:, None]
+    dts = np.array([0.1, 0.02, 0.013, 0.05, 0.007])
+    params = {**problem.params, "e": e}
+    options = {"in_axes": (None, 0, None, {"c": None, "e": 0, "floor": None}), "events": problem.events}
+    runs = sweep(problem.system, hht(), q0, problem.v0, params, dts=dts, duration=1.5, num_samples=3, **options)
+    runs.check()
+    assert runs.events.t.shape == (5, 100)
+    for i in (0, 3):
+        one = {**problem.params, "e": e[i]}
+        steps = round(1.5 / float(runs.dt[i]))
+        run = simulate(
+            problem.system, hht(), q0[i], problem.v0, one, dt=1.5 / steps, num_steps=steps, save_every=steps // 3,
+            events=problem.events)  # fmt: skip
+        assert run.events.count == runs.events.count[i]
+        assert abs(run.q - runs.q[i]).max() < 1e-12 and abs(run.events.t[0] - runs.events.t[i, 0]) < 1e-12
+    at_times = sweep(problem.system, hht(), q0, problem.v0, params, dts=dts, times=[0.4, 0.45, 1.5], **options)
+    at_times.check()
+    assert abs(at_times.q[-1, -1] - runs.q[-1, -1]).max() < 1e-4
+
+
+def test_a_member_that_fails_leaves_the_others_alone():
+    e = np.array([0.5, 1.0, 0.9])
+    params = {"g": G, "floor": 0.0, "e": e}
+    runs = sweep(
+        BALL, hht(), np.ones(1), np.zeros(1), params, dts=np.full(3, 0.01), duration=1.6, num_samples=4,
+        in_axes=(None, None, None, {"g": None, "floor": None, "e": 0}), events=[FLOOR])  # fmt: skip
+    assert [int(x) > 0 for x in runs.failure.step] == [True, False, False]
+    check_message(SimulationError, "member 0 (1 of 3 failed)", runs.check)
+    assert bool(jnp.all(jnp.isfinite(runs.q[1:])))
+
+
+def test_the_same_numbers_on_plain_jax():
+    problem = event_problems.walled_pendulum()
+
+    def end(q0):
+        run = simulate(problem.system, hht(), q0, problem.v0, dt=0.03, num_steps=50, events=problem.events)
+        return jnp.concatenate([run.q[-1], run.v[-1], run.multipliers[-1], run.events.t[:1]])
+
+    found = end(problem.q0)
+    with hhtjax.plain():
+        plain = end(problem.q0)
+    assert abs(found - plain).max() < 1e-12
+
+
+def test_float32_stays_float32():
+    params = {"g": np.float32(9.81), "floor": np.float32(0), "e": np.float32(0.8)}
+    run = simulate(
+        BALL, hht(), np.ones(1, np.float32), np.zeros(1, np.float32), params, dt=0.01, num_steps=100, events=[FLOOR]
+    )
+    run.check()
+    assert {x.dtype for x in jax.tree.leaves((run.q, run.v, run.events.t, run.events.after))} == {np.dtype(np.float32)}
+    assert abs(run.events.t[0] - np.sqrt(2 / 9.81)) < 1e-6
+
+
+def test_a_second_call_compiles_nothing():
+    traced = []
+
+    def guard(q, v, t, p):
+        traced.append(1)
+        return q[0] - p["floor"]
+
+    floor = Event(guard, impact("e"))
+
+    def call(e):
+        params = {"g": G, "floor": 0.0, "e": e}
+        return simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=5, events=[floor])
+
+    call(0.5)
+    before = len(traced)
+    call(0.6)
+    assert len(traced) <= before + 1  # the shapes are looked at anew
+
+
+def test_what_is_between_the_saved_times():
+    params = {"g": G, "floor": 0.0, "e": 0.8}
+    run = simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=12, save_every=3, events=[FLOOR])
+    fall = np.sqrt(2 / G)
+    first, second = 0.8 * G * fall, 0.64 * G * fall
+    times = np.linspace(0, 1.2, 60)
+    again = fall + 2 * first / G
+    since, up = np.select([times < fall, times < again], [times, times - fall], times - again), 0.0
+    up = np.select([times < fall, times < again], [0.0, first], second)
+    q = np.where(times < fall, 1.0, 0.0) + up * since - G / 2 * since**2
+    found = hhtjax.interpolate(run, times)
+    assert abs(found.q[:, 0] - q).max() < 1e-12
+    assert abs(found.v[:, 0] - (up - G * since)).max() < 1e-12
+
+
+def test_extrapolation_across_impacts():
+    problem = event_problems.dragged_ball()
+    numbers = 20, 40
+
+    def error(n):
+        run = simulate(
+            problem.system, hht(-0.3), problem.q0, problem.v0, problem.params, dt=1.5 / n, num_steps=n,
+            extrapolate=2, events=problem.events)  # fmt: skip
+        run.check()
+        return abs(run.q[-1, 0] - problem.end[0])
+
+    assert slope([error(n) for n in numbers], numbers) > 2.85
+
+
+def test_runs_that_meet_other_events_cannot_be_joined():
+    """A throw that passes the ceiling by less than the coarse steps see."""
+    ceiling = Event(lambda q, v, t, p: 5.0 - q[0] + 4e-3 * jnp.sin(40 * t), impact(1.0))
+    params = {"g": G}
+    v0 = np.array([np.sqrt(2 * G * 5.0)])
+    run = simulate(BALL, hht(), np.zeros(1), v0, params, dt=0.4, num_steps=4, extrapolate=2, events=[ceiling])
+    check_message(SimulationError, "the runs that extrapolate joins do not meet the same events", run.check)
+
+
+def test_uneven_steps_and_modes_of_a_linear_system():
+    """A stop that is a spring, switched by a mode; a LinearSystem is factorised anew where its params change."""
+    system = LinearSystem(M=jnp.ones(1), K=lambda p: 4.0 * jnp.ones(1) + 96.0 * p["on"] * jnp.ones(1))
+    stop = Event(lambda q, v, t, p: q[0] * (2 * p["on"] - 1), switch=lambda p: p | {"on": 1.0 - p["on"]})
+    times = 2.0 * np.linspace(0, 1, 401) ** 1.3
+    run = simulate(system, hht(0.0), -np.ones(1), np.zeros(1), {"on": 0.0}, dt=np.diff(times), events=[stop])
+    run.check()
+    quarter = np.pi / 4  # with 2 rad/s up to 0, then half a swing with 10 rad/s, and so on
+    assert abs(run.events.t[:2] - np.array([quarter, quarter + np.pi / 10])).max() < 1e-4
+    assert abs(run.q[-1, 0] + np.sin(2 * (2.0 - quarter - np.pi / 10))) < 1e-3
+
+
+def test_events_of_a_first_order_system():
+    """A clock that is set back at 1; and one that is only noted."""
+    clock = FirstOrderSystem(lambda y, t, p: 1.0 + 0 * y)
+    back = Event(lambda y, t, p: 1.0 - y[0], lambda y, t, p: 0 * y)
+    run = simulate(clock, hht(), np.zeros(1), dt=0.3, num_steps=12, events=[back])
+    run.check()
+    assert abs(run.events.t[:3] - np.array([1.0, 2.0, 3.0])).max() < 1e-13 and run.events.count == 3
+    assert abs(run.q[:, 0] - run.t % 1).max() < 1e-12
+
+
+def test_an_event_that_is_noted_changes_nothing_and_is_met_once():
+    spring = System(jnp.ones(1), lambda q, v, t, p: -q)
+    section = Event(lambda q, v, t, p: q[0])
+    runs = [
+        simulate(spring, rowda(), np.ones(1), np.zeros(1), dt=0.05, num_steps=400, **options)
+        for options in ({}, {"events": [section]})
+    ]
+    runs[1].check()
+    t = np.asarray(runs[1].events.t[:4])
+    assert runs[1].events.count == 3 and abs(t[:3] - np.pi * np.array([0.5, 2.5, 4.5])).max() < 1e-3
+    assert abs(runs[0].q - runs[1].q).max() < 1e-5
