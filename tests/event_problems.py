@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -54,10 +55,10 @@ def stopped_double_pendulum():
     q0, v0 = np.array([1.2, 0.4]), np.zeros(2)
     stop = Event(lambda q, v, t, p: q[0] - q[1] + 0.6, impact(0.7))
 
+    @jax.jit
     def rates(t, y):
-        q, v = jnp.asarray(y[:2]), jnp.asarray(y[2:])
-        M = scene.system.mass(q, scene.params)
-        return np.concatenate([y[2:], np.linalg.solve(M, scene.system.force(q, v, t, scene.params))])
+        M, Q = scene.system.mass(y[:2], scene.params), scene.system.force(y[:2], y[2:], t, scene.params)
+        return jnp.concatenate([y[2:], jnp.linalg.solve(M, Q)])
 
     def jump(y):
         M, n = np.asarray(scene.system.mass(jnp.asarray(y[:2]), scene.params)), np.array([1.0, -1.0])

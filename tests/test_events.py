@@ -73,10 +73,10 @@ def test_derivatives_of_an_impact_are_those_of_the_formula_at_any_dt(numbers):
         runs = sweep(BALL, hht(), q0[None], v0[None], params, dts=dts, duration=1.0, num_samples=1, events=[FLOOR])
         return jnp.stack([runs.q[:, -1, 0], runs.v[:, -1, 0], runs.events.t[:, 0]], axis=1)
 
-    assert abs(by_steps(x) - bounced(x)).max() < 1e-13
+    assert abs(by_steps(x) - bounced(x)[None]).max() < 1e-13
     exact = jax.jacfwd(bounced)(x)
     for derivative in (jax.jacfwd(by_steps)(x), jax.jacrev(by_steps)(x)):
-        assert abs(derivative - exact).max() < 1e-12
+        assert abs(derivative - exact[None]).max() < 1e-12
 
 
 @pytest.mark.parametrize("num_steps", [2, 10])
@@ -142,7 +142,9 @@ def test_a_terminal_event_ends_the_run():
     assert abs(t - 20 / G) < 1e-13
     assert abs(forward - 2 / G) < 1e-12
     assert abs(jax.grad(lambda v0: fly(v0)[0])(v0) - 2 / G) < 1e-12
-    assert run.t[-1] == t and abs(run.q[-1, 0]) < 1e-13 and abs(run.v[-1, 0] + 10) < 1e-12
+    assert run.t[-1] == t
+    assert abs(run.q[-1, 0]) < 1e-13
+    assert abs(run.v[-1, 0] + 10) < 1e-12
     assert run.events.count == 1
 
 
@@ -156,7 +158,8 @@ def test_a_motion_to_rest_fails_by_name():
     """With e = .5 the bounces pile up at t = 3 sqrt(2/g); the run is right up to the last step before, and NaN after."""
     run = come_to_rest(0.5, 200)
     check_message(SimulationError, "step 136 (to t = 1.36) failed: more than max_events in a step", run.check)
-    assert np.isnan(run.q[136:]).all() and np.nanmin(run.q) > -1e-9
+    assert np.isnan(run.q[136:]).all()
+    assert np.nanmin(run.q) > -1e-9
     fall, up = np.sqrt(2 / G), 0.5 * np.sqrt(2 * G)
     assert abs(run.q[60, 0] - (up * (0.6 - fall) - G / 2 * (0.6 - fall) ** 2)) < 1e-12
 
@@ -166,7 +169,8 @@ def test_resting_contact_fails_by_name():
     check_message(
         SimulationError, "step 46 (to t = 0.46) failed: the motion stays beyond the guard of event 0", run.check
     )
-    assert np.isnan(run.q[46:]).all() and np.nanmin(run.q) > -1e-9
+    assert np.isnan(run.q[46:]).all()
+    assert np.nanmin(run.q) > -1e-9
 
 
 def test_a_corner_fails_by_name():
@@ -192,8 +196,10 @@ def test_no_event_no_change():
         simulate(scene.system, hht(), q0, jnp.zeros(2), scene.params, dt=1e-3, num_steps=500, **options)
         for options in ({}, {"events": [far]})
     ]
-    assert bool(jnp.all(runs[0].q == runs[1].q)) and runs[1].events.count == 0
-    assert runs[0].events is None and runs[0].failure.event is None
+    assert bool(jnp.all(runs[0].q == runs[1].q))
+    assert runs[1].events.count == 0
+    assert runs[0].events is None
+    assert runs[0].failure.event is None
 
 
 def test_a_sweep_is_its_members():
@@ -212,7 +218,8 @@ def test_a_sweep_is_its_members():
             problem.system, hht(), q0[i], problem.v0, one, dt=1.5 / steps, num_steps=steps, save_every=steps // 3,
             events=problem.events)  # fmt: skip
         assert run.events.count == runs.events.count[i]
-        assert abs(run.q - runs.q[i]).max() < 1e-12 and abs(run.events.t[0] - runs.events.t[i, 0]) < 1e-12
+        assert abs(run.q - runs.q[i]).max() < 1e-12
+        assert abs(run.events.t[0] - runs.events.t[i, 0]) < 1e-12
     at_times = sweep(problem.system, hht(), q0, problem.v0, params, dts=dts, times=[0.4, 0.45, 1.5], **options)
     at_times.check()
     assert abs(at_times.q[-1, -1] - runs.q[-1, -1]).max() < 1e-4
@@ -244,12 +251,13 @@ def test_the_same_numbers_on_plain_jax():
 
 def test_float32_stays_float32():
     params = {"g": np.float32(9.81), "floor": np.float32(0), "e": np.float32(0.8)}
-    run = simulate(
-        BALL, hht(), np.ones(1, np.float32), np.zeros(1, np.float32), params, dt=0.01, num_steps=100, events=[FLOOR]
-    )
+    with pytest.warns(hhtjax.PrecisionWarning):
+        run = simulate(
+            BALL, hht(), np.ones(1, np.float32), np.zeros(1, np.float32), params, dt=0.01, num_steps=100, events=[FLOOR]
+        )
     run.check()
     assert {x.dtype for x in jax.tree.leaves((run.q, run.v, run.events.t, run.events.after))} == {np.dtype(np.float32)}
-    assert abs(run.events.t[0] - np.sqrt(2 / 9.81)) < 1e-6
+    assert abs(float(run.events.t[0]) - np.sqrt(2 / 9.81)) < 1e-6
 
 
 def test_a_second_call_compiles_nothing():
@@ -287,25 +295,23 @@ def test_what_is_between_the_saved_times():
 
 
 def test_extrapolation_across_impacts():
+    """The part of dt^2 goes; what is left of order 3 depends on where in its step an event falls."""
     problem = event_problems.dragged_ball()
-    numbers = 20, 40
 
-    def error(n):
+    def error(levels):
         run = simulate(
-            problem.system, hht(-0.3), problem.q0, problem.v0, problem.params, dt=1.5 / n, num_steps=n,
-            extrapolate=2, events=problem.events)  # fmt: skip
+            problem.system, hht(0.0), problem.q0, problem.v0, problem.params, dt=1.5 / 40, num_steps=40,
+            extrapolate=levels, events=problem.events)  # fmt: skip
         run.check()
         return abs(run.q[-1, 0] - problem.end[0])
 
-    assert slope([error(n) for n in numbers], numbers) > 2.85
+    assert error(2) < error(1) / 100
 
 
 def test_runs_that_meet_other_events_cannot_be_joined():
-    """A throw that passes the ceiling by less than the coarse steps see."""
-    ceiling = Event(lambda q, v, t, p: 5.0 - q[0] + 4e-3 * jnp.sin(40 * t), impact(1.0))
-    params = {"g": G}
-    v0 = np.array([np.sqrt(2 * G * 5.0)])
-    run = simulate(BALL, hht(), np.zeros(1), v0, params, dt=0.4, num_steps=4, extrapolate=2, events=[ceiling])
+    """A guard that is below zero for so short a time that only the finer steps see it."""
+    short = Event(lambda q, v, t, p: 1.0 - 2.0 * jnp.exp(-(((t - 0.2) / 0.02) ** 2)) + 0 * q[0])
+    run = simulate(BALL, hht(), np.zeros(1), np.zeros(1), {"g": G}, dt=0.4, num_steps=4, extrapolate=2, events=[short])
     check_message(SimulationError, "the runs that extrapolate joins do not meet the same events", run.check)
 
 
@@ -327,8 +333,9 @@ def test_events_of_a_first_order_system():
     back = Event(lambda y, t, p: 1.0 - y[0], lambda y, t, p: 0 * y)
     run = simulate(clock, hht(), np.zeros(1), dt=0.3, num_steps=12, events=[back])
     run.check()
-    assert abs(run.events.t[:3] - np.array([1.0, 2.0, 3.0])).max() < 1e-13 and run.events.count == 3
-    assert abs(run.q[:, 0] - run.t % 1).max() < 1e-12
+    assert abs(run.events.t[:3] - np.array([1.0, 2.0, 3.0])).max() < 1e-13
+    assert run.events.count == 3
+    assert abs(jnp.sin(np.pi * (run.q[:, 0] - run.t))).max() < 1e-12  # at 3 s it is 0 or 1
 
 
 def test_an_event_that_is_noted_changes_nothing_and_is_met_once():
@@ -340,5 +347,6 @@ def test_an_event_that_is_noted_changes_nothing_and_is_met_once():
     ]
     runs[1].check()
     t = np.asarray(runs[1].events.t[:4])
-    assert runs[1].events.count == 3 and abs(t[:3] - np.pi * np.array([0.5, 2.5, 4.5])).max() < 1e-3
+    assert runs[1].events.count == 3
+    assert abs(t[:3] - np.pi * np.array([0.5, 2.5, 4.5])).max() < 1e-3
     assert abs(runs[0].q - runs[1].q).max() < 1e-5

@@ -99,7 +99,7 @@ def _guards_at_start(problem, events):
             (lambda v: flat_events.guards(q, v, t0, params), v),
         )
     )
-    terms = jnp.sum(jnp.abs(along_q.reshape(len(g), -1) * q.reshape(-1)), axis=1)
+    terms = jnp.sum(jnp.abs(along_q * q[None, :]), axis=1)
     return g, rates, terms, jnp.any(along_v != 0, axis=1)
 
 

@@ -3,7 +3,7 @@
     0 = g(step(s, tau)),   e = step(s, tau),   v := reset(e),  params := switch(params),   s1 = step(begin(e), h - tau)
 
 so that the grid stays what it was, and the order that of the stepper. tau is found on the cubic through g and its rate
-at both ends, and made exact by two Newton steps on steps of size tau; its derivative is that of the implicit function.
+at both ends, and made exact by Newton, on steps of size tau; its derivative is that of the implicit function.
 A rest of a millionth of the step is a Taylor polynomial: skipping it would lose the derivative of tau.
 """
 
@@ -20,7 +20,8 @@ from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
 
 SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two events that are one
-HALVINGS, IMPROVEMENTS = 24, 2
+HALVINGS, IMPROVEMENTS = 24, 40
+ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
 
 
 class Ways(NamedTuple):
@@ -46,8 +47,11 @@ class Log(NamedTuple):
 
     def added(self, *entry):
         """The log with one event more, as long as there is room."""
-        here = jnp.arange(self.t.size) == self.count
-        rows = [jnp.where(here if x.ndim == 1 else here[:, None], y, x) for x, y in zip(self[1:], entry, strict=True)]
+        here = jnp.arange(self.t.size, dtype=self.count.dtype) == self.count
+        rows = [
+            jnp.where(here if x.ndim == 1 else here[:, None], y if x.ndim == 1 else y[None, :], x)
+            for x, y in zip(self[1:], entry, strict=True)
+        ]
         return Log(self.count + 1, *rows)
 
 
@@ -76,11 +80,12 @@ class Part(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Of each event: whether it falls into the part of a step, where about (0 to 1), whether it only touches there, and
-    whether it lies beyond from start to end."""
+    """Of each event: whether it falls into the part of a step, where about (0 to 1), before where, whether it only touches
+    there, and whether it lies beyond from start to end."""
 
     hit: Any
     place: Any
+    limit: Any
     touches: Any
     stays: Any
     size: Any  # of the guard
@@ -164,7 +169,7 @@ def look(ways, part, params):
 
     _, place = lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(g0), lowest))
     stays = (g1 < 0) & ~hit & ~noted
-    return Found(hit, jnp.where(hit, place, jnp.inf), touches, stays, jnp.abs(g0) + jnp.abs(g1))
+    return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, jnp.abs(g0) + jnp.abs(g1))
 
 
 def meet(ways, part, found, h, params):
@@ -174,7 +179,7 @@ def meet(ways, part, found, h, params):
     i = jnp.min(jnp.where(found.place == jnp.min(found.place), numbers, numbers.size))
     this = (numbers == i).astype(h.dtype)
     now = events.with_modes(params, met.modes)
-    tau = locate(ways, now, part, this, lax.stop_gradient(jnp.min(found.place)), h)
+    tau = locate(ways, now, part, this, found, h)
     e, info = go(ways, now, part.start, tau, part.last, h)
     g, d = events.rates(flat, e, now)
     rate = pick(this, d)
@@ -209,8 +214,8 @@ def go(ways, params, s, tau, last, h):
     return choose(short, drifted(ways.flat, s, tau), s1), choose(short, ways.no_info, info)
 
 
-def locate(ways, params, part, this, place, h):
-    """tau, by Newton from where the cubic has its zero; differentiable as the implicit function of all else."""
+def locate(ways, params, part, this, found, h):
+    """tau, by Newton, kept between what is above and below, from where the cubic has its zero; differentiable."""
 
     def reached(tau):
         return go(ways, params, part.start, tau, part.last, h)[0]
@@ -220,15 +225,23 @@ def locate(ways, params, part, this, place, h):
         return pick(this, ways.events.guards(s.q, s.v, s.t, params))
 
     def search(_, tau):
-        def improve(_, tau):
-            g, d = ways.events.rates(ways.flat, reached(tau), params)
-            g, d = pick(this, g), pick(this, d)
-            return jnp.clip(tau - jnp.where(d < 0, g / d, 0), 0, part.rest)
+        def unfinished(carry):
+            _, _, _, change, k = carry
+            return (change > ENOUGH * h) & (k < IMPROVEMENTS)
 
-        return lax.fori_loop(0, IMPROVEMENTS, improve, tau)
+        def improve(carry):
+            low, high, tau, _, k = carry
+            g, d = (pick(this, x) for x in ways.events.rates(ways.flat, reached(tau), params))
+            low, high = jnp.where(g > 0, tau, low), jnp.where(g > 0, high, tau)
+            new = tau - g / jnp.where(d < 0, d, 1)
+            new = jnp.where((d < 0) & (new >= low) & (new <= high), new, (low + high) / 2)
+            return low, high, new, jnp.abs(new - tau), k + 1
 
-    start = jnp.clip(place, 0, 1) * lax.stop_gradient(part.rest)
-    return lax.custom_root(guard, start, search, lambda g, y: y / g(jnp.ones_like(y)))
+        begin = jnp.zeros_like(tau), pick(this, found.limit) * part.rest, tau, jnp.full_like(tau, jnp.inf), 0
+        return lax.while_loop(unfinished, improve, begin)[2]
+
+    start = jnp.clip(jnp.min(found.place), 0, 1) * part.rest
+    return lax.custom_root(guard, lax.stop_gradient(start), search, lambda g, y: y / g(jnp.ones_like(y)))
 
 
 def is_corner(g, d, h, this, noted):

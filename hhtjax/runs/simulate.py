@@ -66,7 +66,8 @@ def simulate(
             same saved times, 1 to 4. For a stepper of order p, 2 takes the error dt^p out, for three times the work, 3
             dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already; with
             uneven steps only alpha = 0, of order 3). For motions that dt resolves, elsewhere it makes errors larger;
-            and for smooth steps, such as linearize="predictor": where "auto" changes its choice, dt^3 is left.
+            and for smooth steps, such as linearize="predictor": where "auto" changes its choice, dt^3 is left, as it
+            is where an event falls into a step.
         t0: time of the start.
         events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
             happen; the grid stays what it is. Steps without one take as long as before, and a look at the guards. For
