@@ -62,30 +62,35 @@ def bounced(x):
     return jnp.stack([floor + up * rest - g * rest**2 / 2, up - g * rest, fall])
 
 
-@pytest.mark.parametrize("numbers", [(2, 6, 30, 100)])
-def test_derivatives_of_an_impact_are_those_of_the_formula_at_any_dt(numbers):
+def test_derivatives_of_an_impact_are_those_of_the_formula_at_any_dt():
     x = jnp.array([1.0, 0.3, 9.81, 0.9, 0.1])
 
-    def by_steps(x):
+    def by_sweep(x):
         q0, v0, g, e, floor = x
-        dts = 1.0 / np.array(numbers)
+        dts = 1.0 / np.array([2, 6, 30, 100])
         params = {"g": g, "e": e, "floor": floor}
         runs = sweep(BALL, hht(), q0[None], v0[None], params, dts=dts, duration=1.0, num_samples=1, events=[FLOOR])
         return jnp.stack([runs.q[:, -1, 0], runs.v[:, -1, 0], runs.events.t[:, 0]], axis=1)
 
-    assert abs(by_steps(x) - bounced(x)[None]).max() < 1e-13
+    def by_run(x):
+        q0, v0, g, e, floor = x
+        params = {"g": g, "e": e, "floor": floor}
+        run = simulate(BALL, hht(), q0[None], v0[None], params, dt=1 / 7, num_steps=7, events=[FLOOR])
+        return jnp.stack([run.q[-1, 0], run.v[-1, 0], run.events.t[0]])
+
     exact = jax.jacfwd(bounced)(x)
-    for derivative in (jax.jacfwd(by_steps)(x), jax.jacrev(by_steps)(x)):
-        assert abs(derivative - exact[None]).max() < 1e-12
+    values, forward = jax.jvp(jax.vmap(by_sweep, out_axes=2), (jnp.tile(x, (5, 1)),), (jnp.eye(5),))
+    assert abs(values - bounced(x)[None, :, None]).max() < 1e-13
+    assert abs(forward - exact[None]).max() < 1e-12
+    assert abs(jax.jacrev(by_run)(x) - exact).max() < 1e-12
 
 
-@pytest.mark.parametrize("num_steps", [2, 10])
-def test_an_impact_on_a_grid_point(num_steps):
+def test_an_impact_on_a_grid_point():
     """Free flight from .5 with -1 m/s: the wall is met at half a second, the end of a step, or a rounding behind it."""
 
     def end(x):
         params = {"g": 0.0, "e": x[3], "floor": x[2]}
-        run = simulate(BALL, hht(), x[:1], x[1:2], params, dt=1 / num_steps, num_steps=num_steps, events=[FLOOR])
+        run = simulate(BALL, hht(), x[:1], x[1:2], params, dt=0.1, num_steps=10, events=[FLOOR])
         return jnp.stack([run.q[-1, 0], run.v[-1, 0]])
 
     x = jnp.array([0.5, -1.0, 0.0, 1.0])
@@ -94,9 +99,9 @@ def test_an_impact_on_a_grid_point(num_steps):
     assert abs(jax.jacrev(end)(x) - exact).max() < 1e-12
 
 
-@pytest.mark.parametrize("num_steps", [7, 10])
-def test_two_balls_exchange_their_velocities(num_steps):
-    """The case in which physics engines gave .75, .25, .91, .08."""
+@pytest.mark.parametrize(("num_steps", "derivative"), [(7, jax.jacfwd), (10, jax.jacrev)])
+def test_two_balls_exchange_their_velocities(num_steps, derivative):
+    """The case in which physics engines gave .75, .25, .91, .08; with 10 steps the impact is on a grid point."""
     balls = System(jnp.ones(2), lambda q, v, t, p: 0 * q)
     contact = Event(lambda q, v, t, p: q[1] - q[0] - 0.1, impact(1.0))
 
@@ -104,9 +109,8 @@ def test_two_balls_exchange_their_velocities(num_steps):
         run = simulate(balls, hht(), x[:2], x[2:], dt=1 / num_steps, num_steps=num_steps, events=[contact])
         return run.q[-1, 1]
 
-    x = jnp.array([0.0, 0.6, 1.0, 0.0])
-    for derivative in (jax.jacfwd(end)(x), jax.jacrev(end)(x)):
-        assert abs(derivative - np.array([1.0, 0.0, 1.0, 0.0])).max() < 1e-12
+    found = derivative(end)(jnp.array([0.0, 0.6, 1.0, 0.0]))
+    assert abs(found - np.array([1.0, 0.0, 1.0, 0.0])).max() < 1e-12
 
 
 def test_gradients_agree_with_each_other_and_with_differences():
@@ -116,7 +120,7 @@ def test_gradients_agree_with_each_other_and_with_differences():
     def end(x):
         params = {"c": x[2], "e": x[3], "floor": x[4]}
         run = simulate(
-            problem.system, hht(-0.3), x[:1], x[1:2], params, dt=1.5 / 40, num_steps=40, save_every=40,
+            problem.system, hht(-0.3), x[:1], x[1:2], params, dt=1.5 / 30, num_steps=30, save_every=30,
             events=problem.events)  # fmt: skip
         return jnp.sin(run.q[-1, 0]) + run.events.after[1, 0]
 
@@ -133,14 +137,13 @@ def test_a_terminal_event_ends_the_run():
     landing = Event(lambda q, v, t, p: q[0], terminal=True)
 
     def fly(v0):
-        run = simulate(BALL, hht(), jnp.zeros(1), v0[None], {"g": G}, dt=0.01, num_steps=250, events=[landing])
+        run = simulate(BALL, hht(), jnp.zeros(1), v0[None], {"g": G}, dt=0.1, num_steps=25, events=[landing])
         return run.events.t[0], run
 
     v0 = jnp.array(10.0)
-    (t, run), forward = fly(v0), jax.jacfwd(lambda v0: fly(v0)[0])(v0)
+    t, run = fly(v0)
     run.check()
     assert abs(t - 20 / G) < 1e-13
-    assert abs(forward - 2 / G) < 1e-12
     assert abs(jax.grad(lambda v0: fly(v0)[0])(v0) - 2 / G) < 1e-12
     assert run.t[-1] == t
     assert abs(run.q[-1, 0]) < 1e-13
@@ -155,7 +158,7 @@ def come_to_rest(e, num_steps):
 
 
 def test_a_motion_to_rest_fails_by_name():
-    """With e = .5 the bounces pile up at t = 3 sqrt(2/g); the run is right up to the last step before, and NaN after."""
+    """With e = .5 the bounces pile up at t = 3 sqrt(2/g): the run is right before that step, and NaN after."""
     run = come_to_rest(0.5, 200)
     check_message(SimulationError, "step 136 (to t = 1.36) failed: more than max_events in a step", run.check)
     assert np.isnan(run.q[136:]).all()
@@ -177,7 +180,7 @@ def test_a_corner_fails_by_name():
     walls = [Event(lambda q, v, t, p, i=i: q[i], impact(0.5)) for i in range(2)]
     free = System(jnp.ones(2), lambda q, v, t, p: 0 * q)
     run = simulate(free, hht(), jnp.full(2, 0.35), jnp.full(2, -1.0), dt=0.1, num_steps=10, events=walls)
-    with pytest.raises(SimulationError, match="step 4 .* failed: another event happens at the same time as event"):
+    with pytest.raises(SimulationError, match=r"step 4 .* failed: another event happens at the same time as event"):
         run.check()
     assert np.isnan(run.q[4:]).all()
 

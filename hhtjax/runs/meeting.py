@@ -48,11 +48,9 @@ class Log(NamedTuple):
     def added(self, *entry):
         """The log with one event more, as long as there is room."""
         here = jnp.arange(self.t.size, dtype=self.count.dtype) == self.count
-        rows = [
-            jnp.where(here if x.ndim == 1 else here[:, None], y if x.ndim == 1 else y[None, :], x)
-            for x, y in zip(self[1:], entry, strict=True)
-        ]
-        return Log(self.count + 1, *rows)
+        places = [here if jnp.ndim(y) == 0 else here[:, None] for y in entry]
+        rows = [y if jnp.ndim(y) == 0 else y[None, :] for y in entry]
+        return Log(self.count + 1, *map(jnp.where, places, rows, self[1:]))
 
 
 class Met(NamedTuple):
@@ -80,15 +78,15 @@ class Part(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Of each event: whether it falls into the part of a step, where about (0 to 1), before where, whether it only touches
-    there, and whether it lies beyond from start to end."""
+    """Of each event: whether it falls into the part of a step, where about (0 to 1), before where, whether it only
+    touches there, whether the motion stays beyond it, and how large the guard is."""
 
     hit: Any
     place: Any
     limit: Any
     touches: Any
     stays: Any
-    size: Any  # of the guard
+    size: Any
 
 
 def asks(ways, s, s1, params, h):
@@ -109,7 +107,7 @@ def pass_events(ways, params, part, h):
         part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, params))
 
     def slot(part, number):
-        found = look(ways, part, params)
+        found = look(ways, part, params, h)
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
         part = flag(part, going & ~jnp.any(found.hit), STAYS, found.stays)
         found_any = going & jnp.any(found.hit)
@@ -143,12 +141,14 @@ def begin(ways, q, v, t, params, h):
     return ways.stepper.begin(ways.flat, q, v, t, params, h)
 
 
-def look(ways, part, params):
+def look(ways, part, params, h):
     """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
     part, params = lax.stop_gradient((part, params))
     now = ways.events.with_modes(params, part.met.modes)
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, s, now) for s in (part.start, part.end))
     noted = jnp.asarray(ways.events.noted)
+    rising = (d0 > 0) & (d1 > 0)
+    left = rising & (g1 > -nearness(g1) * h * d1)  # behind an event g is a rounding of either sign
     d0, d1 = d0 * part.rest, d1 * part.rest
     a, b = 3 * (g1 - g0) - 2 * d0 - d1, 2 * (g0 - g1) + d0 + d1
 
@@ -159,7 +159,7 @@ def look(ways, part, params):
     root = jnp.sqrt(jnp.maximum(a * a - 3 * b * d0, 0))
     lowest = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
     touches = turns & (cubic(lowest) < 0)
-    hit = touches | ((g1 <= 0) & ((g0 > 0) | ((d0 > 0) & ~noted)))
+    hit = touches | ((g1 <= 0) & ((g0 > 0) | ((d0 > 0) & ~rising & ~noted)))
 
     def halve(_, ends):
         low, high = ends
@@ -168,7 +168,7 @@ def look(ways, part, params):
         return jnp.where(above, middle, low), jnp.where(above, high, middle)
 
     _, place = lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(g0), lowest))
-    stays = (g1 < 0) & ~hit & ~noted
+    stays = (g1 < 0) & ~hit & ~left & ~noted
     return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, jnp.abs(g0) + jnp.abs(g1))
 
 
@@ -246,8 +246,12 @@ def locate(ways, params, part, this, found, h):
 
 def is_corner(g, d, h, this, noted):
     """Whether another event, of those that change something, is met at the same time."""
-    near = max(TOGETHER, 8 * float(jnp.finfo(h.dtype).eps))
-    return (this == 0) & ~jnp.asarray(noted) & (d < 0) & (jnp.abs(g) <= near * h * jnp.abs(d))
+    return (this == 0) & ~jnp.asarray(noted) & (d < 0) & (jnp.abs(g) <= nearness(g) * h * jnp.abs(d))
+
+
+def nearness(x):
+    """The part of a step within which two times are one."""
+    return max(TOGETHER, 1e3 * float(jnp.finfo(x.dtype).eps))
 
 
 def drifted(flat, s, h):
