@@ -4,6 +4,7 @@
     sweep             many runs at once, with step sizes, parameters, starts and coefficients of their own
     sweep_to_disk     the same in pieces, which survive being killed
     adaptive          a tolerance in the place of the step size; `choose_steps` gives the steps alone
+    Event, impact     what happens where a guard falls to zero: impacts, stops, switches, the end
     interpolate       what lies between the saved times
 
 Everything composes with `jit`, `vmap` and `grad`: dt, alpha, q0, v0 and params can all be differentiated.
@@ -100,6 +101,50 @@ In a sweep each member has steps of its own, and tolerances may be data: error a
 ...     pendulum, hhtjax.hht(), q0, v0, params, dts=hhtjax.adaptive(rtol, 1e-3 * rtol), times=[0.123, 4.56])
 >>> sweep.q.shape, bool(jnp.all(jnp.diff(sweep.steps.accepted) > 0))
 ((3, 3, 1), True)
+
+Events
+------
+
+`events=[Event(guard, reset=, switch=, terminal=)]`: impacts, end stops, backlash, switches, the end of the run. Where a
+guard falls to zero inside a step, the step is taken up to that time, the velocity or the params change, and the step is
+finished from there: the grid and the saved times stay, the method keeps its order, and derivatives are exact, that of
+the time among them. `run.events` tells what happened, when, and the velocities before and after.
+
+>>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: 0 * q - 9.81)
+>>> floor = hhtjax.Event(guard=lambda q, v, t, p: q[0] - p["floor"], reset=hhtjax.impact(restitution="e"))
+>>> def bounce(e):
+...     params = {"e": e, "floor": 0.0}
+...     return hhtjax.simulate(
+...         ball, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), params, dt=1e-2, num_steps=60, events=[floor])
+>>> run = bounce(0.8)
+>>> run.check()
+>>> [round(float(v[0, 0]), 4) for v in (run.events.before, run.events.after)]
+[-4.4294, 3.5435]
+>>> round(float(jax.grad(lambda e: bounce(e).q[-1, 0])(0.8)), 4)              # 4.4294 (0.6 - sqrt(2/9.81))
+0.6576
+
+Modes, numbers in params that `switch` changes, are how a force jumps: a stop with a damper, a clutch, a broken link.
+Here a spring that is only there beyond q = 1:
+
+>>> stop = hhtjax.Event(
+...     guard=lambda q, v, t, p: (1.0 - q[0]) * (1 - 2 * p["on"]), switch=lambda p: p | {"on": 1 - p["on"]})
+>>> wagon = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: -p["on"] * (100 * (q - 1.0) + 2 * v))
+>>> run = hhtjax.simulate(
+...     wagon, hhtjax.hht(), jnp.zeros(1), jnp.ones(1), {"on": 0.0}, dt=1e-2, num_steps=200, events=[stop])
+>>> run.check()
+>>> int(run.events.count), round(float(run.events.after[1, 0]), 3)
+(2, -0.729)
+
+What fails is named, and never ends behind the wall: more events in a step than `max_events`, as of a ball that comes to
+rest; a motion that stays beyond its guard; two impacts at one time; a start beyond a guard. Derivatives belong to the
+order in which events happen; where a motion only grazes a guard they grow without bound (`run.events.rate` tells), and a
+guard that falls and rises again within a step is seen where the cubic through its ends sees it.
+
+Events work with mass matrices, constraints (the impulse obeys them), rotations, internal states, dry friction, held
+inputs, uneven steps, `interpolate`, `sweep`, `fit` and `extrapolate` (of which the order is 3 then); not with error
+control. In a batch of one's own they cost what they cost in `sweep`: the batch looks for events where a member has one.
+In `vmap` of a reverse derivative they cost more. Figures, orders, derivatives and an impact oscillator are on a page,
+`experiments/events/README.md`.
 
 Extrapolation
 -------------
