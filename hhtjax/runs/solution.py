@@ -80,8 +80,8 @@ FINE, MANY, STAYS, ALONG, CORNER, DIFFER = range(6)  # what may go wrong at an e
 EVENTS = {  # and what to do about it
     MANY: (
         "more than max_events in a step, the first of them event",
-        "A motion that comes to rest on a guard gives infinitely many: let it rest by a stiff force, or a constraint in "
-        "a run of its own. Else take a smaller dt, or a larger max_events",
+        "A motion that comes to rest on a guard gives infinitely many: let it rest by a stiff force, or a constraint "
+        "in a run of its own. Else take a smaller dt, or a larger max_events",
     ),
     STAYS: (
         "the motion stays beyond the guard of event",
