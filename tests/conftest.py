@@ -12,7 +12,13 @@ import jax
 import pytest
 
 # Most of the time goes into compiling small programs, which need not run fast. `XLA_FLAGS=` of one's own comes first.
-QUICK = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": "false"}
+QUICK = {
+    "xla_backend_optimization_level": "0",
+    "xla_cpu_use_fusion_emitters": "false",
+    "xla_cpu_parallel_codegen_split_count": "1",  # two processes leave no core for more
+    "xla_llvm_enable_alias_scope_metadata": "false",  # which buffers are not one: a tenth of the time, to optimise by
+    "xla_llvm_enable_noalias_metadata": "false",
+}
 LARGE = 600_000_000  # bytes of a test process, above which it forgets its compiled programs
 
 
@@ -38,6 +44,12 @@ os.environ.setdefault("MPLBACKEND", "Agg")  # charts of doctests need no display
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_collection_finish(session):
+    """Tracing makes many objects and few circles of them: looking for these, in all there is, took a tenth of the time."""
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 def memory():
