@@ -47,7 +47,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
 def pytest_collection_finish(session):
-    """Tracing makes many objects and few circles of them: looking for these, in all there is, took a tenth of the time."""
+    """Tracing makes many objects and few circles; looking for these, in all there is, took a tenth of the time."""
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
 
