@@ -1,11 +1,14 @@
 """For every test and doctest: double precision, no silent promotion of ranks or dtypes, programs compiled quickly."""
 
+import atexit
 import ctypes
 import gc
 import importlib.util
 import mmap
 import os
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import jax
@@ -19,7 +22,7 @@ QUICK = {
     "xla_llvm_enable_alias_scope_metadata": "false",  # which buffers are not one: a tenth of the time, to optimise by
     "xla_llvm_enable_noalias_metadata": "false",
 }
-LARGE = 600_000_000  # bytes of a test process, above which it forgets its compiled programs
+LARGE = 900_000_000  # bytes of a test process, above which it forgets its compiled programs
 
 
 def is_known(flag):
@@ -39,7 +42,21 @@ def set_flags():
     os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
 
+def share_programs():
+    """What one process of this run has compiled, the small programs of array operations above all, the others load."""
+    if not {"PYTEST_XDIST_WORKER", "JAX_COMPILATION_CACHE_DIR"}.isdisjoint(os.environ):
+        return  # workers inherit what is set here
+    if jax.__version_info__ < (0, 10):
+        return  # this has not been tried with old ones
+    folder = tempfile.mkdtemp(prefix="hhtjax-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+
+
 set_flags()
+share_programs()
 os.environ.setdefault("MPLBACKEND", "Agg")  # charts of doctests need no display
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -25,6 +25,7 @@ def result():
     return hhtjax.fit(residuals, START, transforms=TRANSFORMS)
 
 
+@pytest.mark.slow
 def test_summary_and_json(result):
     lines = result.summary().splitlines()
     assert lines[0].startswith("converged: ")

@@ -92,6 +92,7 @@ def test_what_shows_itself():
     assert simulate(hhtjax.System(TWO, force)).friction is None
 
 
+@pytest.mark.slow
 def test_sweeps_files_and_dense_output(tmp_path):
     scene = belt.two_masses()
     arguments = scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params
@@ -119,6 +120,7 @@ def test_a_held_input_breaks_a_joint_away_at_its_jump():
     np.testing.assert_allclose(found.friction[1:8, 0], [0.5] * 4 + [0.9] * 3, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_limit_is_fitted():
     """With a start off by a factor of 1.5."""
 

@@ -19,6 +19,7 @@ DAMPING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", each(STEPPERS))
 def test_gradients_on_the_duffing_oscillator(name):
     """In one plain loop: more steps would be checkpointed, as they are on the double pendulum."""
@@ -35,6 +36,7 @@ def test_gradients_on_the_forced_double_pendulum(name):
     check_gradient(path_loss(problem, tight(STEPPERS[name]), 40, 40), arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("iterations", [1, None])
 @pytest.mark.parametrize(("name", "value"), [("hht", -0.1), ("bossak", -0.1), ("generalized_alpha", 0.7)])
 def test_gradient_with_respect_to_the_numerical_damping(name, value, iterations):

@@ -58,6 +58,7 @@ def orders(case, found, steps):
     return np.array(slopes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_order_two_in_all_of_the_state(name):
     """For each of FAMILY, with internal states as slow as the motion, and with one of a thousandth of the step."""
@@ -68,6 +69,7 @@ def test_order_two_in_all_of_the_state(name):
         assert np.all(np.abs(found - 2) < 0.15), (lag, found)
 
 
+@pytest.mark.slow
 def test_index_3_is_of_order_two_too():
     """But for the multipliers of the undamped rule, which grow with or without internal states."""
     case = CASES["a constraint"](LAG)
@@ -128,6 +130,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_scenes_are_the_same_with_the_machinery_and_without(name):
     system, params, q0, v0, duration, z0 = SCENES[name]
@@ -170,6 +173,7 @@ def test_own_loop_and_sweep_equal_simulate():
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9), found, expected)
 
 
+@pytest.mark.slow
 def test_gradients():
     """In z0, in the parameters of g and of the force, in q0, v0 and dt."""
 

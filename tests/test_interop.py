@@ -135,6 +135,7 @@ def test_internal_states_go_along():
     assert_near(rates, jax.tree.map(lambda x: x[-1], (ours.v, ours.acceleration, ours.zdot)), 1e-2)
 
 
+@pytest.mark.slow
 def test_internal_states_beside_a_constraint():
     """A point on a circle, pulled by z: w is what the constraint leaves, and z moves as it says."""
     system = hhtjax.System(
@@ -174,6 +175,7 @@ def test_the_field_of_equal_systems_is_equal():
     assert hash(a) == hash(b)
 
 
+@pytest.mark.slow
 def test_derivatives_through_diffrax():
     """Of the end in a parameter, against central differences through SciPy."""
     system = hhtjax.System(np.ones(1), lambda q, v, t, k: -k * jnp.sin(q))

@@ -84,6 +84,7 @@ def end(system, start):
     return run
 
 
+@pytest.mark.slow
 def test_all_modes_are_the_system_itself_and_few_are_near():
     """With damping that couples the modes, an initial shape, and a stiffness fitted through the reduced system."""
     K = jnp.asarray(chain(N).toarray())

@@ -58,6 +58,7 @@ def by_hand(scene, times, dt, t0):
     return spans / counts, jax.tree.map(lambda *x: np.stack(x), *((s.q, s.v, s.w, s.L) for s in found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["spring", *(pytest.param(x, marks=pytest.mark.slow) for x in ("linear", "constrained"))]
 )
@@ -102,6 +103,7 @@ def test_the_work_is_about_the_sum_over_the_members():
     assert steps <= iterations < 1.1 * steps
 
 
+@pytest.mark.slow
 def test_order_two_where_steps_change_at_each_time():
     problem = zoo.PROBLEMS["forced double pendulum"]
     dts = 0.01 / 2 ** np.arange(4)

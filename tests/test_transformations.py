@@ -13,6 +13,7 @@ import hhtjax
 every_stepper = pytest.mark.parametrize("name", each(STEPPERS))
 
 
+@pytest.mark.slow
 @every_stepper
 def test_jit_equals_eager(name):
     problem = PROBLEMS["forced double pendulum"]._replace(duration=0.2)
@@ -44,6 +45,7 @@ def test_vmap_equals_loop(name):
     np.testing.assert_allclose(batch, jnp.stack(loop), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_vmap_over_alpha_equals_loop():
     problem = PROBLEMS["forced Duffing"]
     alphas = jnp.array([0.0, -0.1, -0.3])
@@ -92,6 +94,7 @@ TREES = VECTORS._replace(
 )
 
 
+@pytest.mark.slow
 @every_stepper
 def test_trees_are_kept_and_rows_follow_the_sorted_keys(name):
     """A dict whose keys sort differently from their insertion, against the same system on a vector."""
@@ -115,6 +118,7 @@ COUPLED = [
 ]
 
 
+@pytest.mark.slow
 @every_stepper
 def test_a_diagonal_mass_equals_the_full_one(name):
     q0, v0, stepper = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), as_data(STEPPERS[name])

@@ -72,11 +72,13 @@ def slopes(scene, stepper):
     return -np.subtract(*errors) / np.log(COUNTS[0] / COUNTS[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILY)
 def test_unequal_steps_keep_order_two(name):
     assert np.all(abs(slopes("free", FAMILY[name]) - 2.0) < 0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILY)
 def test_with_constraints_the_multipliers_too(name):
     """Undamped, w and L keep the jump of h^2 that each change of the step gives them, which add up as square roots."""
@@ -93,6 +95,7 @@ def test_with_rotations(alpha, kinematics):
     assert np.all(slopes("rotation", hhtjax.hht(alpha, start="corrected", kinematics=kinematics)) > 1.85)
 
 
+@pytest.mark.slow
 def test_one_step_between_unequal_samples_keeps_order_two():
     system = hhtjax.System(ONE, lambda q, v, t, params: -4 * jnp.sin(q) + jnp.cos(3 * t))
     stepper, errors = FAMILY["rho = 0.0"], []
@@ -113,6 +116,7 @@ def rate(q, v, z, t, params):
     return -3.0 * z + v + jnp.sin(t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -165,6 +169,7 @@ def test_derivatives_in_the_steps_forward_and_reverse():
     check_gradient(loss, {"dt": jnp.asarray(jittered(40, 2.0)[:6]), "k": jnp.asarray(4.0)})
 
 
+@pytest.mark.slow
 def test_dense_output_and_extrapolation():
     """Between samples a motion of second degree is exact; Richardson's halved steps are of order 3."""
     ball = hhtjax.System(ONE, lambda q, v, t, params: 0 * q - 9.81)

@@ -85,6 +85,7 @@ def test_force_without_dampers_is_minus_the_gradient_of_the_potential():
     assert np.allclose(Q, -slope, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damped", [False, True])
 def test_energy_is_conserved_and_dampers_take_it_out(damped):
     scene = FLAT if damped else FLAT._replace(params={**FLAT.params, "c": jnp.zeros(4)})
