@@ -77,11 +77,18 @@ def memory():
         return 0
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_runtest_teardown(item, nextitem):
+class Forgetting:
     """Between two files, if need be, the programs compiled so far are forgotten."""
-    if (nextitem is None or nextitem.path != item.path) and memory() > LARGE:
-        jax.clear_caches()
-        gc.collect()
-        if sys.platform == "linux":  # what is free goes back to the system
-            getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_runtest_teardown(self, item, nextitem):
+        if (nextitem is None or nextitem.path != item.path) and memory() > LARGE:
+            jax.clear_caches()
+            gc.collect()
+            if sys.platform == "linux":  # what is free goes back to the system
+                getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
+
+
+def pytest_configure(config):
+    """As a plugin it sees the doctests too: a hook of this file would only see what lies beside it."""
+    config.pluginmanager.register(Forgetting())

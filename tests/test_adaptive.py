@@ -96,6 +96,7 @@ def test_contact_takes_small_steps_where_it_is_and_nowhere_else(name, most, refe
             assert found.steps.accepted + found.steps.rejected < most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "rtol", "most"), [("hht", 5e-4, 1400), ("rowda", 5e-4, 420)])
 def test_van_der_pol(name, rtol, most, references):
     found = controlled("van der Pol", METHODS[name], rtol)

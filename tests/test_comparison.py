@@ -128,6 +128,7 @@ def test_errors_on_segments_left_out_are_those_of_numpy():
     plt.close(ax.figure)
 
 
+@pytest.mark.slow
 def test_where_a_term_is_absent():
     """Against 0.3, not 0, a term of 0.3 is not significant; a smaller model that holds it fixed says so itself."""
     y = model({"rest": 0.5, "slow": 0.3}) + 0.1 * jax.random.normal(jax.random.key(2), (N,))

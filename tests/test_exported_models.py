@@ -74,6 +74,7 @@ def test_sensitivities_with_constraints_newton_and_rotations(scene, tmp_path):
     assert np.max(abs(ours - expected)) < 1e-10 * np.max(abs(expected))
 
 
+@pytest.mark.slow
 def test_states_are_independent_and_params_may_change(pendulum_library):
     """Steps of two states in turns are those of each alone; params are read at each step."""
     library, problem, dt = pendulum_library, PROBLEMS["forced double pendulum"], 1e-3

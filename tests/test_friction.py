@@ -43,6 +43,7 @@ def test_order_two_through_reversals(family):
     assert np.all(np.abs(order - 2) < 0.1), order
 
 
+@pytest.mark.slow
 def test_what_stopped_stays(family):
     """Exactly: no creep, and no acceleration that alternates, also for alpha = 0."""
     for found in family:
@@ -196,6 +197,7 @@ def test_batches_dtypes_and_single_steps():
         np.testing.assert_allclose(state.friction.tau, single.friction[i], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_newton_in_the_free_step():
     """Which is linear here: one solve or many."""
     case = of_scene(dry_oscillator.driven(0.0))._replace(duration=5.0)

@@ -70,6 +70,7 @@ def test_a_constrained_direction_is_named():
         simulate(system)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("worst", [-1.0, np.nan])
 def test_a_limit_that_is_none_is_named(worst):
     """At the step where it becomes so, and of a batch the member."""
@@ -85,6 +86,7 @@ def test_a_limit_that_is_none_is_named(worst):
     assert "the dry friction was not found" in repr(jax.tree.map(lambda x: x[1], batch.failure))
 
 
+@pytest.mark.slow
 def test_what_shows_itself():
     found = simulate(two())
     assert "friction" in repr(found)

@@ -96,6 +96,7 @@ def test_nested_checkpointing_changes_no_gradient():
         np.testing.assert_allclose(nested(1.0, num_steps), plain(1.0, num_steps), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_second_derivative_through_the_converged_step():
     problem = PROBLEMS["forced Duffing"]
     stepper = hhtjax.hht(alpha=-0.1, iterations=None, tolerance=1e-13)

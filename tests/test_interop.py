@@ -120,6 +120,7 @@ def test_implicit_solvers_of_scipy_take_the_jacobian():
     assert run.nfev < 2000
 
 
+@pytest.mark.slow
 def test_internal_states_go_along():
     system, params, q0, v0, _, z0 = motor_joint.tracking()
     rhs = interop.scipy_rhs(system, q0, v0, params, z0=z0)

@@ -102,6 +102,7 @@ def test_all_modes_are_the_system_itself_and_few_are_near():
             np.testing.assert_allclose(reduced.expand(run.acceleration), exact.acceleration, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_proportional_damping_stays_uncoupled_and_local_forces_stay():
     K = chain(N).toarray()
     at = [N - 1]

@@ -69,6 +69,7 @@ def test_too_few_iterations_leave_an_error_and_newton_reports_it(dense):
     np.testing.assert_allclose(banded, cg, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_memory_of_a_gradient_grows_with_the_number_of_unknowns():
     stepper = hhtjax.hht(linearize="predictor", solve=SOLVES["cg"])
 
@@ -129,6 +130,7 @@ def by_lu(A, b):
     return jnp.linalg.solve(A, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solve", [hhtjax.banded(2), hhtjax.conjugate_gradients(20), by_lu])
 def test_one_that_solves_reports_rounding_and_passes(solve):
     run = run_pairs(solve=solve)
@@ -141,6 +143,7 @@ def test_one_that_solves_reports_rounding_and_passes(solve):
     np.testing.assert_allclose(run.q, own.q, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_inexact_solves_are_accepted_to_a_tolerance():
     loose = run_pairs(solve=hhtjax.conjugate_gradients(3, tolerance=0.5), iterations=None)
     loose.check()

@@ -74,6 +74,7 @@ def test_each_member_takes_equal_steps_from_time_to_time(name):
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-11), found, expected)
 
 
+@pytest.mark.slow
 def test_equal_distances_give_what_duration_and_number_give():
     """Also where dt is their distance, or a part of it, to rounding."""
     dts = np.concatenate([[0.2, 0.1, 0.2 / 3, 0.02], DTS[:-4]])

@@ -27,6 +27,7 @@ def test_jit_equals_eager(name):
     assert float(compiled.t[-1]) == pytest.approx(float(state.t), rel=1e-14)
 
 
+@pytest.mark.slow
 @every_stepper
 def test_vmap_equals_loop(name):
     """Over the stiffness, the start, the step size, and the numerical damping where there is one."""

@@ -137,6 +137,7 @@ def test_all_kinds_of_systems(arguments):
     assert np.log2(errors[0] / errors[1]) / 3 > 1.85
 
 
+@pytest.mark.slow
 def test_held_inputs_jump_where_they_do():
     """With steps that end on all jumps nothing but the order of the method is left."""
     load = hhtjax.sampled(np.array([0.0, 5.0, -3.0, 2.0]), 0.25, order=0)
@@ -157,6 +158,7 @@ def test_equal_steps_are_those_of_a_number():
     np.testing.assert_array_equal(given.dt, np.full(12, 0.1))
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_steps_forward_and_reverse():
     stepper = hhtjax.generalized_alpha(0.5, linearize="predictor")
     force = lambda q, v, t, params: -params["k"] * jnp.sin(q) + jnp.cos(3 * t)  # noqa: E731
