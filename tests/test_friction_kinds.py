@@ -50,8 +50,7 @@ def check_order(name, **options):
     assert np.all(error[..., 1] < 5e-4), error
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", each(CASES, quick=("stick-slip, Stribeck", "an internal state")))
+@pytest.mark.parametrize("name", each(CASES, quick=("an internal state",)))
 def test_order_two_through_every_switch(name):
     check_order(name)
 
