@@ -1,19 +1,28 @@
 """For every test and doctest: double precision, no silent promotion of ranks or dtypes, programs compiled quickly."""
 
+import atexit
 import ctypes
 import gc
 import importlib.util
 import mmap
 import os
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import jax
 import pytest
 
 # Most of the time goes into compiling small programs, which need not run fast. `XLA_FLAGS=` of one's own comes first.
-QUICK = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": "false"}
-LARGE = 600_000_000  # bytes of a test process, above which it forgets its compiled programs
+QUICK = {
+    "xla_backend_optimization_level": "0",
+    "xla_cpu_use_fusion_emitters": "false",
+    "xla_cpu_parallel_codegen_split_count": "1",  # two processes leave no core for more
+    "xla_llvm_enable_alias_scope_metadata": "false",  # which buffers are not one: a tenth of the time, to optimise by
+    "xla_llvm_enable_noalias_metadata": "false",
+}
+LARGE = 900_000_000  # bytes of a test process, above which it forgets its compiled programs
 
 
 def is_known(flag):
@@ -33,11 +42,31 @@ def set_flags():
     os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
 
+def share_programs():
+    """What one process of this run has compiled, the small programs of array operations above all, the others load."""
+    if not {"PYTEST_XDIST_WORKER", "JAX_COMPILATION_CACHE_DIR"}.isdisjoint(os.environ):
+        return  # workers inherit what is set here
+    if jax.__version_info__ < (0, 10):
+        return  # this has not been tried with old ones
+    folder = tempfile.mkdtemp(prefix="hhtjax-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+
+
 set_flags()
+share_programs()
 os.environ.setdefault("MPLBACKEND", "Agg")  # charts of doctests need no display
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_collection_finish(session):
+    """Tracing makes many objects and few circles; looking for these, in all there is, took a tenth of the time."""
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 def memory():
@@ -48,11 +77,18 @@ def memory():
         return 0
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_runtest_teardown(item, nextitem):
+class Forgetting:
     """Between two files, if need be, the programs compiled so far are forgotten."""
-    if (nextitem is None or nextitem.path != item.path) and memory() > LARGE:
-        jax.clear_caches()
-        gc.collect()
-        if sys.platform == "linux":  # what is free goes back to the system
-            getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_runtest_teardown(self, item, nextitem):
+        if (nextitem is None or nextitem.path != item.path) and memory() > LARGE:
+            jax.clear_caches()
+            gc.collect()
+            if sys.platform == "linux":  # what is free goes back to the system
+                getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
+
+
+def pytest_configure(config):
+    """As a plugin it sees the doctests too: a hook of this file would only see what lies beside it."""
+    config.pluginmanager.register(Forgetting())

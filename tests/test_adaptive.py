@@ -70,6 +70,7 @@ def error_of(found, reference):
     return np.max(abs(found.q[1:] - reference)) / np.max(abs(reference))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", zoo.each(METHODS, quick=("hht", "rowda", "dopri5")))
 def test_the_error_follows_the_tolerance(name, references):
     for rtol in (1e-2, 1e-4, 1e-6):
@@ -81,6 +82,7 @@ def test_the_error_follows_the_tolerance(name, references):
         np.testing.assert_allclose(np.sum(found.dt), 3.0, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("hht", 351), ("rowda", 194), ("rosenbrock", 351)])
 def test_contact_takes_small_steps_where_it_is_and_nowhere_else(name, most, references):
     """For an error of 1e-3 equal steps take 3443, and 3345. Without the defect the ball goes through the floor."""
@@ -94,6 +96,7 @@ def test_contact_takes_small_steps_where_it_is_and_nowhere_else(name, most, refe
             assert found.steps.accepted + found.steps.rejected < most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "rtol", "most"), [("hht", 5e-4, 1400), ("rowda", 5e-4, 420)])
 def test_van_der_pol(name, rtol, most, references):
     found = controlled("van der Pol", METHODS[name], rtol)
@@ -101,6 +104,7 @@ def test_van_der_pol(name, rtol, most, references):
     assert found.steps.accepted + found.steps.rejected <= most
 
 
+@pytest.mark.slow
 def test_constraints(references):
     """In GGL form, against the angle."""
     flat, long = pendulum.minimal(), pendulum.cartesian()
@@ -129,6 +133,7 @@ def test_rotations():
     assert 0.02 < np.max(abs(found.q - fine.q)) / rtol < 10
 
 
+@pytest.mark.slow
 def test_first_order_systems_and_internal_states():
     """y'' = -4 y - z with z' = -3 z + v, as it is, and as a system of first order; scales are those of y and of z."""
 
@@ -150,6 +155,7 @@ def test_first_order_systems_and_internal_states():
                 assert 0.001 < np.max(abs(x[1:, 0] - y)) / rtol < 10
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_accepted_steps():
     """Forward, reverse, and by differences over the same steps."""
     stepper, times = hhtjax.hht(linearize="predictor"), np.array([0.7, 0.9, 2.0])
@@ -177,6 +183,7 @@ def test_derivatives_are_those_of_the_accepted_steps():
         assert float(forward[name]) == pytest.approx(float(reverse[name]), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_tolerances_and_all_else_are_data():
     def go(rtol, k, q0):
         dt = hhtjax.adaptive(rtol, 1e-6)
@@ -218,6 +225,7 @@ def test_order_of_the_pair_its_estimate_and_its_dense_output():
     assert order > 4.3
 
 
+@pytest.mark.slow
 def test_the_error_of_the_whole_run(references):
     """Of a resolved motion it is stated to a tenth; where no estimate of a step sees it, as here, `check` does."""
     found = controlled("double pendulum", METHODS["hht"], 1e-3, verify=True)
@@ -240,6 +248,7 @@ def test_the_error_of_the_whole_run(references):
         assert 0.1 < np.max(run.error) < 0.3
 
 
+@pytest.mark.slow
 def test_a_quarter_of_the_tolerance_gives_no_false_alarm(references):
     """Jumps move by more than a step: with halved steps the error is 1e4 times what it was."""
     found = controlled("van der Pol", METHODS["rowda"], 1e-3, verify="tolerance")

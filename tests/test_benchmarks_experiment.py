@@ -12,6 +12,7 @@ from experiments.work_precision.timing import time_to
 from hhtjax.scenes import double_pendulum
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_printed", [False, True])
 def test_c_steps_like_the_library(as_printed):
     if not native.libraries():

@@ -64,6 +64,7 @@ def test_only_numerical_damping_needs_a_third_level():
     assert [needed_levels(stepper) for stepper in (*undamped, *damped)] == [2, 2, 2, 3, 3, 3]
 
 
+@pytest.mark.slow
 def test_the_response_to_forces_is_corrected_too():
     """m, c, k of a driven oscillator at w h = 0.35: the closed forms, of k and c relative to m, and of the gain 1/m."""
     driven = hhtjax.System(

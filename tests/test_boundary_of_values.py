@@ -46,6 +46,7 @@ def test_masses_of_any_units_pass_and_with_constraints_massless_ones():
     jax.vmap(lambda m: System(m, pull).mass.sum())(-jnp.ones((3, 2)))  # a tracer
 
 
+@pytest.mark.slow
 def test_a_mass_that_is_a_function_is_looked_at_where_the_run_starts():
     masses = np.array([[[2, 0.5], [0.5, 2]], np.ones((2, 2)), -np.eye(2), [[1, 0.5], [0, 1]], np.full((2, 2), np.nan)])
     found = jax.vmap(lambda M: run(System(lambda q, params: M, pull)))(masses)

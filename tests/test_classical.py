@@ -101,6 +101,7 @@ def test_backward_differences_have_their_characteristic_roots(name):
     assert 0.99 < radii(1e-3)[-1] < 1
 
 
+@pytest.mark.slow
 def test_order_with_a_mass_that_changes():
     assert slope("forced double pendulum", hhtjax.park()) == pytest.approx(2, abs=0.15)
 

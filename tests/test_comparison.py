@@ -94,6 +94,7 @@ def test_correlated_noise(correlated):
     assert 50 < effective < 0.3 * N  # 84 for a constant, up to 16 times more for the others
 
 
+@pytest.mark.slow
 def test_errors_on_segments_left_out_are_those_of_numpy():
     """Rows left out of a linear least-squares problem, solved by NumPy; weights and missing samples with them."""
     y = model({"rest": 0.5, "slow": 0.3}) + 0.3 * coloured(jax.random.key(1), N)
@@ -127,6 +128,7 @@ def test_errors_on_segments_left_out_are_those_of_numpy():
     plt.close(ax.figure)
 
 
+@pytest.mark.slow
 def test_where_a_term_is_absent():
     """Against 0.3, not 0, a term of 0.3 is not significant; a smaller model that holds it fixed says so itself."""
     y = model({"rest": 0.5, "slow": 0.3}) + 0.1 * jax.random.normal(jax.random.key(2), (N,))
@@ -164,6 +166,7 @@ def test_white_noise_is_white_in_19_of_20_records():
     assert share["slow"] > 0.9
 
 
+@pytest.mark.slow
 def test_a_summary_says_what_the_residuals_are_worth():
     """Observations and missing ones, rms of what is there, correlation, and estimates that are known together only."""
     y = coloured(jax.random.key(3), N)

@@ -54,6 +54,7 @@ def test_bad_input(message, call):
         call()
 
 
+@pytest.mark.slow
 def test_initial_values_known_while_tracing_are_checked_there():
     good, bad, rest, system = jnp.ones(2), 2 * jnp.ones(2), jnp.zeros(2), constrained(level)
 

@@ -25,6 +25,7 @@ def test_what_is_no_mesh_is_named():
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_mesh_of_one_device_changes_nothing():
     def run(mesh):
         system = hhtjax.System(np.ones(1), lambda q, v, t, params: -q)

@@ -18,6 +18,7 @@ def test_harmonic_input():
     assert duffing.mass(jnp.array([Q]), PARAMS).tolist() == [2.0]
 
 
+@pytest.mark.slow
 def test_sampled_input():
     u = hhtjax.sampled(jnp.arange(5.0) ** 2, dt=0.5)  # 4 t^2
     found = duffing.sampled_force(jnp.array([Q]), jnp.array([V]), T, (PARAMS, u))

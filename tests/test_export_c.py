@@ -60,15 +60,13 @@ def with_inertia():
     return problem._replace(system=system)
 
 
-CASES = {
-    "auto": Case(zoo("forced double pendulum"), STEPPERS["hht auto"], 1e-4),
-    "converged": Case(zoo("forced double pendulum"), STEPPERS["hht converged"], 1e-4),
+CASES = {"auto": Case(zoo("forced double pendulum"), STEPPERS["hht auto"], 1e-4)}
+SLOW = {
     "rod": Case(pendulum.cartesian, hht(-0.1), 1e-4),
     "motor": Case(motor_joint.tracking, hht(-0.1), 1e-4),
-}
-SLOW = {
     **{f"{name}, {stepper}": Case(zoo(name), STEPPERS[stepper], PROBLEMS[name].duration / 10_000)
-       for name in PROBLEMS for stepper in STEPPERS},
+       for name in ("forced Duffing", "forced double pendulum") for stepper in STEPPERS
+       if (name, stepper) != ("forced double pendulum", "hht auto")},
     "rosenbrock": Case(zoo("forced Duffing"), hhtjax.rosenbrock(), 1e-4),
     "squeezer": Case(squeezer.squeezer, hht(-0.1), 1e-6, 2000),
     "top": Case(top.minimal, hht(-0.1), 1e-5),
@@ -143,7 +141,7 @@ int main(void)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["auto", "converged", "squeezer", "top", "bar", "motor"])
+@pytest.mark.parametrize("name", ["auto", "forced double pendulum, hht converged", "squeezer", "top", "bar", "motor"])
 def test_memory_and_arithmetic_are_clean(name, tmp_path):
     """Under the sanitizers of addresses and undefined behaviour, as a program of its own."""
     case = {**CASES, **SLOW}[name]

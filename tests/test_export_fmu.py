@@ -107,6 +107,7 @@ def run(slave, first=0, last=50):
         assert t == pytest.approx((k + 1) * DT, rel=1e-14)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_unit_is_simulate(slave, expected):
     assert slave.begin() == OK

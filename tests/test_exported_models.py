@@ -27,6 +27,7 @@ def pendulum_library(tmp_path_factory):
     return Library(model, tmp_path_factory.mktemp("two"), "-O2")
 
 
+@pytest.mark.slow
 def test_sensitivities_are_those_of_jax(pendulum_library):
     problem, dt, steps = PROBLEMS["forced double pendulum"], 1e-3, 1000
     stepper = hht(-0.1, linearize="predictor")
@@ -73,6 +74,7 @@ def test_sensitivities_with_constraints_newton_and_rotations(scene, tmp_path):
     assert np.max(abs(ours - expected)) < 1e-10 * np.max(abs(expected))
 
 
+@pytest.mark.slow
 def test_states_are_independent_and_params_may_change(pendulum_library):
     """Steps of two states in turns are those of each alone; params are read at each step."""
     library, problem, dt = pendulum_library, PROBLEMS["forced double pendulum"], 1e-3
@@ -115,6 +117,7 @@ def test_a_flag_is_up_for_what_is_no_number(pendulum_library):
     assert pendulum_library.run(state, 100, 1e300) == 1
 
 
+@pytest.mark.slow
 def test_flags_for_newton_and_for_constraints(tmp_path):
     """The step at which `simulate` names a failure, and its kind, are those of C."""
     rods = hhtjax.System(
@@ -137,6 +140,7 @@ def test_flags_for_newton_and_for_constraints(tmp_path):
         assert state.flags & bit, bit
 
 
+@pytest.mark.slow
 def test_inputs_are_held_over_the_step(tmp_path):
     """As one with `sampled(..., order=0)`, jumps of the acceleration included; two channels, and one alone."""
     pairs, single = np.random.default_rng(0).normal(size=(50, 2)), np.linspace(-1.0, 2.0, 50) ** 2

@@ -63,6 +63,7 @@ ORDERS["operator_splitting"] = 1  # y is its velocity, and f_y changes
 ORDERS["houbolt"] = 3  # its formula for the velocity alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [x for x in STEPPERS if x != "dopri5"])  # h^6.6 here; its order: test_adaptive.py
 def test_order_with_explicit_time(name):
     steps = (2000, 4000) if name == "implicit_euler" else (400, 800)  # it starts with errors that cancel

@@ -125,6 +125,7 @@ def test_many_starts_find_the_lowest_minimum():
     np.testing.assert_array_equal(np.flatnonzero(found.all.code == BAD_START), [4])
 
 
+@pytest.mark.slow
 def test_a_start_without_influence_is_no_best_one():
     """Its cost is the lowest, and no derivative leads away from it."""
 

@@ -25,6 +25,7 @@ def result():
     return hhtjax.fit(residuals, START, transforms=TRANSFORMS)
 
 
+@pytest.mark.slow
 def test_summary_and_json(result):
     lines = result.summary().splitlines()
     assert lines[0].startswith("converged: ")
@@ -39,6 +40,7 @@ def test_summary_and_json(result):
     assert again.summary() == result.summary()
 
 
+@pytest.mark.slow
 def test_profile_is_the_parabola_of_the_standard_error(result):
     """Naive errors, for which the white likelihood is right."""
     sigma = float(result.standard_errors["rate"])

@@ -45,6 +45,7 @@ def test_robust_losses_are_scipys(loss):
     assert float(Objective(jnp.ones(9), LOSSES[loss], 9).cost(z)) == pytest.approx(scipys, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("residuals", [line, spoilt_line])
 @pytest.mark.parametrize("loss", SOME)
 def test_converged_is_converged(residuals, loss):
@@ -63,6 +64,7 @@ def test_converged_is_converged(residuals, loss):
             np.testing.assert_allclose([found.params["a"], found.params["b"]], scipys.x, atol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", SOME)
 def test_standard_errors_are_the_scatter(loss):
     """With and without outliers; a linear problem, of which 300 noises are fitted at once."""
@@ -113,6 +115,7 @@ def test_robust_errors_with_eliminated_starts_are_those_of_the_dense_fit():
     np.testing.assert_allclose(found.uncertainty.inverse, expected.uncertainty.inverse[:1, :1], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_loss_without_curvature_has_no_standard_error():
     """Two clusters of residuals beyond the bend of the loss, at +-10: between them the cost is level."""
     data = jnp.where(jnp.arange(40) < 20, 10.0, -10.0)

@@ -33,6 +33,7 @@ def family():
     return [jax.vmap(lambda s, n=n: run(of_scene(dry_oscillator.free()), s, n))(STACKED) for n in NUM_STEPS]
 
 
+@pytest.mark.slow
 def test_order_two_through_reversals(family):
     errors = []
     for found in family:
@@ -42,6 +43,7 @@ def test_order_two_through_reversals(family):
     assert np.all(np.abs(order - 2) < 0.1), order
 
 
+@pytest.mark.slow
 def test_what_stopped_stays(family):
     """Exactly: no creep, and no acceleration that alternates, also for alpha = 0."""
     for found in family:
@@ -65,6 +67,7 @@ def test_a_load_below_the_limit_moves_nothing():
         assert found.sticking.all()
 
 
+@pytest.mark.slow
 def test_stuck_joints_of_a_mechanism_stay_to_the_order_of_the_step():
     """The relative velocity of two links, with M(q), is 0 to rounding while they stick, the angle exactly constant."""
     found = run(arm(), hhtjax.hht(0.0), 2000)
@@ -128,6 +131,7 @@ def check_derivatives(end, start):
 NAMES = "k", "c", "F", "m"
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_exact_motion():
     """Forward = reverse = central differences; and those of steps 16 times shorter."""
     case = of_scene(dry_oscillator.driven())._replace(duration=6.0)
@@ -149,6 +153,7 @@ def test_derivatives_are_those_of_the_exact_motion():
     check_derivatives(end, {name: case.params[name] for name in NAMES})
 
 
+@pytest.mark.slow
 def test_derivatives_through_coupled_switches():
     """Of two joints: the times of the events within a step are differentiated, their order is not."""
     case = arm()._replace(duration=2.0)
@@ -160,6 +165,7 @@ def test_derivatives_through_coupled_switches():
     check_derivatives(end, (2.5, case.q0))
 
 
+@pytest.mark.slow
 def test_the_plain_program_gives_the_same():
     case = of_scene(belt.two_masses())._replace(duration=0.5)
     fast = run(case, hhtjax.hht(), 100)
@@ -167,6 +173,7 @@ def test_the_plain_program_gives_the_same():
         np.testing.assert_allclose(run(case, hhtjax.hht(), 100).q, fast.q, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_batches_dtypes_and_single_steps():
     case = of_scene(dry_oscillator.driven())._replace(duration=1.0)
 
@@ -190,6 +197,7 @@ def test_batches_dtypes_and_single_steps():
         np.testing.assert_allclose(state.friction.tau, single.friction[i], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_newton_in_the_free_step():
     """Which is linear here: one solve or many."""
     case = of_scene(dry_oscillator.driven(0.0))._replace(duration=5.0)

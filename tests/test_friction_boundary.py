@@ -70,6 +70,7 @@ def test_a_constrained_direction_is_named():
         simulate(system)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("worst", [-1.0, np.nan])
 def test_a_limit_that_is_none_is_named(worst):
     """At the step where it becomes so, and of a batch the member."""
@@ -85,6 +86,7 @@ def test_a_limit_that_is_none_is_named(worst):
     assert "the dry friction was not found" in repr(jax.tree.map(lambda x: x[1], batch.failure))
 
 
+@pytest.mark.slow
 def test_what_shows_itself():
     found = simulate(two())
     assert "friction" in repr(found)
@@ -92,6 +94,7 @@ def test_what_shows_itself():
     assert simulate(hhtjax.System(TWO, force)).friction is None
 
 
+@pytest.mark.slow
 def test_sweeps_files_and_dense_output(tmp_path):
     scene = belt.two_masses()
     arguments = scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params
@@ -119,6 +122,7 @@ def test_a_held_input_breaks_a_joint_away_at_its_jump():
     np.testing.assert_allclose(found.friction[1:8, 0], [0.5] * 4 + [0.9] * 3, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_limit_is_fitted():
     """With a start off by a factor of 1.5."""
 

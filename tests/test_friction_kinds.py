@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from friction_problems import CASES
 from friction_reference import Motion
+from zoo import each
 
 import hhtjax
 
@@ -49,7 +50,7 @@ def check_order(name, **options):
     assert np.all(error[..., 1] < 5e-4), error
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", each(CASES, quick=("an internal state",)))
 def test_order_two_through_every_switch(name):
     check_order(name)
 

@@ -64,6 +64,7 @@ def test_derivatives_in_a_module():
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_module_is_fitted():
     """To a curve, so that nothing is compiled but the fit; weights are held by a weak prior."""
     net, x = network(2), jnp.linspace(-1.0, 1.0, 40)
@@ -90,6 +91,7 @@ def test_a_module_is_fitted():
     plt.close(ax.figure)
 
 
+@pytest.mark.slow
 def test_sweeps_and_initial_values_know_modules():
     """With a constraint, so that `consistent_initial` and the checks of `simulate` are asked too."""
     bead = hhtjax.System(

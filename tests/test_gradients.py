@@ -19,6 +19,7 @@ DAMPING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", each(STEPPERS))
 def test_gradients_on_the_duffing_oscillator(name):
     """In one plain loop: more steps would be checkpointed, as they are on the double pendulum."""
@@ -35,6 +36,7 @@ def test_gradients_on_the_forced_double_pendulum(name):
     check_gradient(path_loss(problem, tight(STEPPERS[name]), 40, 40), arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("iterations", [1, None])
 @pytest.mark.parametrize(("name", "value"), [("hht", -0.1), ("bossak", -0.1), ("generalized_alpha", 0.7)])
 def test_gradient_with_respect_to_the_numerical_damping(name, value, iterations):
@@ -94,6 +96,7 @@ def test_nested_checkpointing_changes_no_gradient():
         np.testing.assert_allclose(nested(1.0, num_steps), plain(1.0, num_steps), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_second_derivative_through_the_converged_step():
     problem = PROBLEMS["forced Duffing"]
     stepper = hhtjax.hht(alpha=-0.1, iterations=None, tolerance=1e-13)

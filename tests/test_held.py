@@ -44,6 +44,7 @@ def end(stepper, steps, values=VALUES, system=SYSTEM, q0=(0.4, -0.3), v0=(0.0, 1
     return jnp.concatenate([run.q[-1], run.v[-1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STEPPERS)
 def test_order_is_kept(name):
     stepper, steps = STEPPERS[name], (4, 8) if name == "rk4" else (16, 32)
@@ -66,6 +67,7 @@ def test_first_order_systems_too():
     assert abs(np.log2(coarse / fine) - 2) < 0.15
 
 
+@pytest.mark.slow
 def test_with_constraints_multipliers_jump_too():
     """A pendulum pushed by a held force: the position after each sample, of second order."""
     scene = pendulum.cartesian()
@@ -84,6 +86,7 @@ def test_with_constraints_multipliers_jump_too():
     assert abs(np.log2(coarse / fine) - 2) < 0.15
 
 
+@pytest.mark.slow
 def test_step_by_step_a_sweep_and_a_batch_are_the_run():
     stepper, start = STEPPERS["alpha = -.3"], (jnp.array([0.4, -0.3]), jnp.array([0.0, 1.0]))
     params = {"u": hhtjax.sampled(jnp.asarray(VALUES), 0.1, order=0)}
@@ -100,6 +103,7 @@ def test_step_by_step_a_sweep_and_a_batch_are_the_run():
     np.testing.assert_allclose(batch[1], end(stepper, 2, 0.5 * VALUES), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_values():
     def f(values):
         return jnp.sum(end(STEPPERS["alpha = -.05"], 2, values))

@@ -42,6 +42,7 @@ def run(system, stepper, m=2.0):
     return hhtjax.simulate(system, stepper, Q0, V0, {"m": m}, dt=0.01, num_steps=20).q["q"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", each(STEPPERS, quick=["auto"]))
 def test_the_motion_is_the_same(name):
     stepper = STEPPERS[name]

@@ -58,6 +58,7 @@ def orders(case, found, steps):
     return np.array(slopes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_order_two_in_all_of_the_state(name):
     """For each of FAMILY, with internal states as slow as the motion, and with one of a thousandth of the step."""
@@ -68,6 +69,7 @@ def test_order_two_in_all_of_the_state(name):
         assert np.all(np.abs(found - 2) < 0.15), (lag, found)
 
 
+@pytest.mark.slow
 def test_index_3_is_of_order_two_too():
     """But for the multipliers of the undamped rule, which grow with or without internal states."""
     case = CASES["a constraint"](LAG)
@@ -87,6 +89,7 @@ def test_the_start_is_corrected_for_positions_alone():
     assert np.all(state.a != state.w)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", [hhtjax.rk4(), hhtjax.rowda()], ids=["rk4", "rowda"])
 def test_steppers_of_other_orders(stepper):
     case, steps = arm(0.1), (50, 100)
@@ -98,6 +101,7 @@ def decoupled_rate(y, t, params):
     return {"x": jnp.cos(3 * t) - params["a"] * y["x"] ** 3, "y": y["x"][:1] - y["y"]}
 
 
+@pytest.mark.slow
 def test_system_and_first_order_system_are_the_two_ends():
     """A system whose force leaves z alone moves as without it, and its z as a FirstOrderSystem, to rounding."""
     q0, v0, z0 = jnp.array([0.3, -0.2]), jnp.array([0.5, -1.0]), {"x": jnp.array([1.0, 2.0]), "y": jnp.ones(1)}
@@ -128,6 +132,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_scenes_are_the_same_with_the_machinery_and_without(name):
     system, params, q0, v0, duration, z0 = SCENES[name]
@@ -145,6 +150,7 @@ def test_scenes_are_the_same_with_the_machinery_and_without(name):
     np.testing.assert_allclose(fast, slow, rtol=1e-8, atol=1e-11 * np.max(np.abs(fast)))
 
 
+@pytest.mark.slow
 def test_own_loop_and_sweep_equal_simulate():
     """Of a scene whose z0 differs between members."""
     system, params, q0, v0, _, z0 = SCENES["motor"]
@@ -170,6 +176,7 @@ def test_own_loop_and_sweep_equal_simulate():
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9), found, expected)
 
 
+@pytest.mark.slow
 def test_gradients():
     """In z0, in the parameters of g and of the force, in q0, v0 and dt."""
 

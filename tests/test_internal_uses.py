@@ -47,6 +47,7 @@ def test_suggested_step_size_sees_the_modes_of_internal_states():
     assert [mode.resolved for mode in found.modes] == [True, True, False]
 
 
+@pytest.mark.slow
 def test_dense_and_extrapolated_output_of_z():
     """A z (3, 3) is nine numbers: zdot = cos(t + i), interpolated to fourth order, extrapolated beyond the second."""
     phase = np.arange(9.0).reshape(3, 3)
@@ -83,6 +84,7 @@ def test_held_inputs_restart_internal_states(stepper):
     assert np.log2(changes[0] / changes[1]) == pytest.approx(2, abs=0.15)
 
 
+@pytest.mark.slow
 def test_z0_of_several_records_is_fitted_along():
     """As a start that each record has of its own, with a parameter of g that they share."""
     system = hhtjax.System(

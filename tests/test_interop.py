@@ -120,6 +120,7 @@ def test_implicit_solvers_of_scipy_take_the_jacobian():
     assert run.nfev < 2000
 
 
+@pytest.mark.slow
 def test_internal_states_go_along():
     system, params, q0, v0, _, z0 = motor_joint.tracking()
     rhs = interop.scipy_rhs(system, q0, v0, params, z0=z0)
@@ -135,6 +136,7 @@ def test_internal_states_go_along():
     assert_near(rates, jax.tree.map(lambda x: x[-1], (ours.v, ours.acceleration, ours.zdot)), 1e-2)
 
 
+@pytest.mark.slow
 def test_internal_states_beside_a_constraint():
     """A point on a circle, pulled by z: w is what the constraint leaves, and z moves as it says."""
     system = hhtjax.System(
@@ -174,6 +176,7 @@ def test_the_field_of_equal_systems_is_equal():
     assert hash(a) == hash(b)
 
 
+@pytest.mark.slow
 def test_derivatives_through_diffrax():
     """Of the end in a parameter, against central differences through SciPy."""
     system = hhtjax.System(np.ones(1), lambda q, v, t, k: -k * jnp.sin(q))

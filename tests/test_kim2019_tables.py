@@ -73,6 +73,7 @@ def test_entry_of_the_tables(scene, method, index):
         assert ours[angle] == pytest.approx(theirs, rel=1e-4 if theirs >= 1e-6 else 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stepper", "expected"),
     [

@@ -146,6 +146,7 @@ def test_linear_system_has_the_gradient_of_the_general_one(derivative):
         np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-7, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_diagonal_and_missing_matrices_equal_the_full_ones():
     n = 3
     K = jnp.array([4.0, 9.0, 16.0])

@@ -73,6 +73,7 @@ def test_derivatives_are_those_of_the_general_system():
     np.testing.assert_allclose(jax.jit(jax.grad(lambda p: end(everywhere, p)))(300.0), exact, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_order_two():
     n = 3
     system, start = three(n)[0], (jnp.linspace(0.0, 1.0, n), jnp.ones(n))
@@ -83,6 +84,7 @@ def test_order_two():
     assert abs(np.log2(coarse / fine) - 2) < 0.15
 
 
+@pytest.mark.slow
 def test_other_steppers_take_the_force_along():
     system, _, general = three(3)
     for stepper in (hhtjax.rk4(), hhtjax.rosenbrock()):
@@ -91,6 +93,7 @@ def test_other_steppers_take_the_force_along():
         np.testing.assert_allclose(ours.q, theirs.q, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_force_at_few_coordinates_leaves_one_factorisation_outside_the_loop():
     """In the program of the run; of the force on all coordinates it stands inside."""
     n = 20

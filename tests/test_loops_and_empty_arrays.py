@@ -24,7 +24,7 @@ def nothing(q, v, t, params):
     return -params * (q + jnp.sum(jnp.sin(empty)) + jnp.concatenate([empty, q]) + jnp.zeros((3, 0)) @ empty)
 
 
-@pytest.mark.parametrize("force", [counted, until, nothing])
+@pytest.mark.parametrize("force", [until, *(pytest.param(f, marks=pytest.mark.slow) for f in (counted, nothing))])
 def test_they_give_what_plain_jax_gives(force):
     system = hhtjax.System(jnp.ones(3), force)
     q0 = jnp.array([0.1, 0.5, 1.0])
@@ -42,6 +42,7 @@ def test_they_give_what_plain_jax_gives(force):
         assert np.allclose(x, y, rtol=1e-12, atol=0)
 
 
+@pytest.mark.slow
 def test_a_leaf_of_no_coordinates():
     """In a long run, in its gradient, and in a sweep; alone it would be no system."""
     system = hhtjax.System(jnp.ones(2), lambda q, v, t, params: {"a": -params * q["a"], "none": q["none"]})

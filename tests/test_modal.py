@@ -84,6 +84,7 @@ def end(system, start):
     return run
 
 
+@pytest.mark.slow
 def test_all_modes_are_the_system_itself_and_few_are_near():
     """With damping that couples the modes, an initial shape, and a stiffness fitted through the reduced system."""
     K = jnp.asarray(chain(N).toarray())
@@ -101,6 +102,7 @@ def test_all_modes_are_the_system_itself_and_few_are_near():
             np.testing.assert_allclose(reduced.expand(run.acceleration), exact.acceleration, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_proportional_damping_stays_uncoupled_and_local_forces_stay():
     K = chain(N).toarray()
     at = [N - 1]

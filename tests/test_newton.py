@@ -71,6 +71,7 @@ def test_noise_of_terms_that_cancel_is_no_failure():
     assert run.info.iterations.mean() < 4
 
 
+@pytest.mark.slow
 def test_a_batch_takes_the_steps_of_its_members():
     mass, force, q0, v0, dt, _ = CASES["far and near"]
     system = hhtjax.System(mass, force)

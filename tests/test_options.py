@@ -23,6 +23,7 @@ def test_each_constructor_shows_the_options_by_name(make):
     assert all(x.kind is not inspect.Parameter.VAR_KEYWORD for x in shown.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", FAMILY)
 def test_an_editor_that_runs_nothing_finds_them(make):
     """jedi, as in editors; a kernel's completion asks `inspect.signature`, which is tested above."""

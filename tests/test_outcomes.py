@@ -137,6 +137,7 @@ def first_unbalanced(path, params):
     return int(np.argmax(unbalanced)), int(unbalanced.sum())
 
 
+@pytest.mark.slow
 def test_check_names_the_first_failed_newton_iteration():
     path = run(KICKED, TWO_ITERATIONS, params=1e3, num_steps=16)
     step, failures = first_unbalanced(path, 1e3)

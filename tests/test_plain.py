@@ -22,6 +22,7 @@ def of_all_kinds(params):
     )(params)
 
 
+@pytest.mark.slow
 @on_cpu
 def test_plain_leaves_nothing_of_the_machinery():
     fast = jax.jit(of_all_kinds)
@@ -49,6 +50,7 @@ def test_plain_holds_for_its_own_thread():
         assert other.submit(gate.is_on).result()
 
 
+@pytest.mark.slow
 @on_cpu
 def test_a_sweep_gives_the_same_without_the_machinery():
     system = hhtjax.System(jnp.arange(1.0, N + 1), links)

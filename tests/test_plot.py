@@ -201,6 +201,7 @@ def test_stability_region():
     assert ax.get_legend().get_texts()[0].get_text() == "rk4"
 
 
+@pytest.mark.slow
 def test_animation_moves_in_the_plane_and_in_space(swing, tmp_path):
     film = plot.animation(swing, lambda q: jnp.stack([jnp.zeros(2), q]), fps=10, trace=1)
     film.save(tmp_path / "film.gif", writer="pillow")
@@ -214,6 +215,7 @@ def test_animation_moves_in_the_plane_and_in_space(swing, tmp_path):
     assert labels(bars) == ["t = 0", "t = 0.4"]
 
 
+@pytest.mark.slow
 def test_text_is_legible_and_files_are_written_without_a_warning(run, sweep, tmp_path):
     result = plotted_runs.fit()
     t = np.arange(64.0)
@@ -244,6 +246,7 @@ def test_legends_stand_above_the_curves(run):
     assert legend.x1 <= ax.figure.bbox.x1
 
 
+@pytest.mark.slow
 def test_the_library_works_without_matplotlib():
     """`import hhtjax` leaves matplotlib alone; where there is none, asking for charts says what to install."""
     program = """

@@ -41,6 +41,7 @@ def test_fit_against_data_shows_residual_and_spectrum():
     assert [line.get_label() for line in axes[0].lines] == ["a", "b"]
 
 
+@pytest.mark.slow
 def test_estimates_are_relative_to_estimate_or_truth(result):
     ax = plot.estimates(result)
     assert [text.get_text() for text in ax.get_yticklabels()] == [f"{n} = {result.params[n]:.4g}" for n in "ab"]

@@ -122,6 +122,7 @@ def count(jaxpr, primitive, within=None):
     return total
 
 
+@pytest.mark.slow
 def test_gradient_with_respect_to_rho():
     problem = PROBLEMS["forced Duffing"]
 

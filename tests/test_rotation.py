@@ -121,6 +121,7 @@ def test_log_at_pi():
     assert_close(batched(exp)(batched(log)(rounded)), rounded, 4e-15)
 
 
+@pytest.mark.slow
 def test_rates_along_a_motion():
     """Rdot = R hat(T psidot), and T psiddot + Tdot psidot is the rate of Om = vee(R^T Rdot)."""
 

@@ -97,6 +97,7 @@ def test_derivatives_of_log(order):
     assert_close(reverse(identity, weights)(psi), contract(exact, weights), 1e-14 * 10 ** (order - 1))
 
 
+@pytest.mark.slow
 def test_derivative_of_log_is_the_inverse_tangent():
     """d log(R exp(eps)) = T^-1(psi) d eps at eps = 0; at pi too, where psi is what log returns."""
     R = batched(exp)(np.concatenate([VECTORS, NEAR_PI, pi * AXES]))

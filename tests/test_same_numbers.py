@@ -52,6 +52,7 @@ PROGRAMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_a_run_is_the_same_with_and_without(name):
     force, q0, stepper = PROGRAMS[name]

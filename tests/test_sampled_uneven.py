@@ -53,6 +53,7 @@ def test_equal_distances_are_the_uniform_case(order):
     )
 
 
+@pytest.mark.slow
 def test_derivatives_in_values_times_and_t():
     """Forward = reverse = central differences; in t those of SciPy's spline."""
 
@@ -73,6 +74,7 @@ def test_derivatives_in_values_times_and_t():
     np.testing.assert_allclose(jax.vmap(jax.grad(u))(t), CubicSpline(KNOTS, VALUES[:, 0])(t, 1), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_as_data():
     """New samples and times are no new program; batches; float32 stays."""
     traces = []
@@ -105,6 +107,7 @@ def end(stepper, steps):
     return np.concatenate([run.q[0, -1], run.v[0, -1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", [hhtjax.hht(0.0), hhtjax.hht(-0.3), hhtjax.hht(-0.3, iterations=None)], ids=str)
 def test_held_inputs_keep_the_order_between_uneven_jumps(stepper):
     exact = end(hhtjax.rk4(), 640)

@@ -73,6 +73,7 @@ def through_scalars(f):
     return lambda x: join(by_scalars(f)(split(x)))
 
 
+@pytest.mark.slow
 @old
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_same_values_and_derivatives(name):
@@ -207,6 +208,7 @@ def test_runs_are_the_same(stepper, monkeypatch):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 @old
 def test_simulate_takes_scalars_where_they_pay():
     """In the loop of the double pendulum there is no small array; in that of the slider-crank there are."""

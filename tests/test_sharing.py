@@ -43,6 +43,7 @@ def names(jaxpr):
     return [eqn.primitive.name for eqn in zoo.everywhere(jaxpr)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_same_values_and_derivatives(name):
     f, point = FUNCTIONS[name], (0.7, 0.4)

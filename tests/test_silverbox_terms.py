@@ -11,6 +11,7 @@ from experiments.identification import silverbox_terms as terms
 from experiments.identification.data import SAMPLING_RATE, WASHOUT
 
 
+@pytest.mark.slow
 def test_the_terms_as_by_scipy():
     """Forces, internal states and the reading."""
     u = hhtjax.sampled(0.1 * np.sin(0.6 * np.arange(40.0)), 1 / SAMPLING_RATE)

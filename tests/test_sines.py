@@ -58,6 +58,7 @@ def test_every_number_has_its_sine_alone_and_among_others(x):
         np.testing.assert_array_equal(np.signbit(found), np.signbit(f(batch)))
 
 
+@pytest.mark.slow
 def test_values_and_derivatives_alone_and_in_batches():
     xs = np.linspace(-3, 3, 7)
     with gate.plain():

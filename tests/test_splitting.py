@@ -60,6 +60,7 @@ def slopes(problem, modified=False):
     return np.log2(fine / finer)
 
 
+@pytest.mark.slow
 @every_form
 @pytest.mark.parametrize("name", ORDERS)
 def test_order(name, modified):
@@ -224,6 +225,7 @@ def test_vmap_equals_loop(modified):
     np.testing.assert_allclose(jax.vmap(end)(alphas, starts, dts), jnp.stack(loop), rtol=1e-11)
 
 
+@pytest.mark.slow
 @every_form
 def test_float32_is_kept(modified):
     problem = PROBLEMS["forced Duffing"]

@@ -28,6 +28,7 @@ CHECKED = [  # all would take minutes to compile: the default where it fails fir
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scene", "method"), CHECKED)
 def test_a_step_that_was_survived_still_is(scene, method):
     pinned = PINNED[scene]

@@ -95,6 +95,7 @@ def test_the_dry_motion_is_exact():
     assert switches == COMMITTED["dry"]["motions"]["stick-slip"]["switches"]
 
 
+@pytest.mark.slow
 def test_the_committed_cells_of_the_set_valued_step_are_what_it_does():
     """And its order is 2."""
     case, committed = DRY["stick-slip"], COMMITTED["dry"]["scenes"]["stick-slip"]

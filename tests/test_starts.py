@@ -35,6 +35,7 @@ def test_the_equation_of_motion_gives_stiffness_and_damping_without_a_guess():
     np.testing.assert_allclose(found.params["c"], joints["c"], rtol=0.1)
 
 
+@pytest.mark.slow
 def test_the_equation_of_motion_from_samples_at_any_times():
     """A decaying oscillation, its samples 2 to 18 ms apart: as good as from equal distances."""
     spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -54,6 +55,7 @@ def test_the_equation_of_motion_from_samples_at_any_times():
         hhtjax.equation_error(spring, times[:, None], times=times)
 
 
+@pytest.mark.slow
 def test_sensors_show_a_delayed_signal():
     ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: {"x": 0 * q["x"] + 2.0})
     zero = {"x": 0.0}

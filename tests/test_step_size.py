@@ -61,6 +61,7 @@ def test_suggested_step_of_an_explicit_method_is_a_stable_one():
     assert stable <= 1 < unstable
 
 
+@pytest.mark.slow
 def test_a_duration_asks_for_the_error_of_the_motion():
     """The step at which the motion of a hardening spring is off by 2 %, whatever its mode at the start."""
     scene = duffing.hardening_spring()

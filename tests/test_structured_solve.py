@@ -29,6 +29,7 @@ def energy(k, n, stepper):
     return jnp.sum(run.q[-1] ** 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("p", [1, 3])
 def test_banded_solves_the_matrix_and_its_transpose(p):
     n, i, rng = 11, np.arange(11), np.random.default_rng(p)
@@ -51,12 +52,14 @@ def value_and_derivatives(stepper):
     return jax.jit(lambda k: (*jax.value_and_grad(f)(k), jax.jvp(f, (k,), (1.0,))[1]))(30.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tridiagonal", "blocks"])
 def test_steps_and_derivatives_are_those_of_the_dense_solve(name, dense):
     found = value_and_derivatives(hhtjax.hht(linearize="predictor", solve=SOLVES[name]))
     np.testing.assert_allclose(found, dense, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_too_few_iterations_leave_an_error_and_newton_reports_it(dense):
     left = energy(30.0, 9, hhtjax.hht(linearize="predictor", solve=hhtjax.conjugate_gradients(2)))
     assert 1e-8 < abs(left / dense[0] - 1) < 1e-2
@@ -66,6 +69,7 @@ def test_too_few_iterations_leave_an_error_and_newton_reports_it(dense):
     np.testing.assert_allclose(banded, cg, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_memory_of_a_gradient_grows_with_the_number_of_unknowns():
     stepper = hhtjax.hht(linearize="predictor", solve=SOLVES["cg"])
 
@@ -126,6 +130,7 @@ def by_lu(A, b):
     return jnp.linalg.solve(A, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solve", [hhtjax.banded(2), hhtjax.conjugate_gradients(20), by_lu])
 def test_one_that_solves_reports_rounding_and_passes(solve):
     run = run_pairs(solve=solve)
@@ -138,6 +143,7 @@ def test_one_that_solves_reports_rounding_and_passes(solve):
     np.testing.assert_allclose(run.q, own.q, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_inexact_solves_are_accepted_to_a_tolerance():
     loose = run_pairs(solve=hhtjax.conjugate_gradients(3, tolerance=0.5), iterations=None)
     loose.check()
@@ -148,6 +154,7 @@ def test_inexact_solves_are_accepted_to_a_tolerance():
             make(1, tolerance=0.0)
 
 
+@pytest.mark.slow
 def test_of_a_linear_system_a_batch_and_a_sweep():
     n = 8
     system = hhtjax.LinearSystem(np.ones(n), None, PAIRS)

@@ -68,6 +68,7 @@ def test_the_work_is_about_the_sum_over_the_members():
     assert steps <= iterations < 1.05 * steps
 
 
+@pytest.mark.slow
 def test_derivatives_forward_and_reverse_are_those_of_the_runs():
     def loss(params, t0):
         return jnp.sum(sweep(params, t0=t0, dts=DTS[:3]).q[:, 1:] ** 2)
@@ -113,6 +114,7 @@ def test_a_member_that_blows_up_is_flagged_and_leaves_the_others_alone():
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[others], y[others]), bad, fine)
 
 
+@pytest.mark.slow
 def test_coefficients_starts_and_parameters_are_data():
     alphas, starts, k = np.array([-0.3, 0.0, -0.1]), np.array([[1.0], [0.5], [0.2]]), np.array([4.0, 1.0, 9.0])
     steppers = jax.vmap(lambda alpha: hhtjax.hht(alpha, linearize="predictor"))(alphas)
@@ -138,6 +140,7 @@ def test_under_jit_and_vmap_and_what_a_traced_step_size_may_be():
     np.testing.assert_allclose(runs.q[1, :3], sweep({"k": 5.0, "c": 0.1}, dts=DTS).q[:3], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_constrained_members_and_those_that_violate_their_constraint():
     scene = pendulum.cartesian()
     starts = np.asarray(scene.q0) * np.array([[1.0], [1.0], [-1.0]])

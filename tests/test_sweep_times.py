@@ -58,6 +58,7 @@ def by_hand(scene, times, dt, t0):
     return spans / counts, jax.tree.map(lambda *x: np.stack(x), *((s.q, s.v, s.w, s.L) for s in found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["spring", *(pytest.param(x, marks=pytest.mark.slow) for x in ("linear", "constrained"))]
 )
@@ -73,6 +74,7 @@ def test_each_member_takes_equal_steps_from_time_to_time(name):
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-11), found, expected)
 
 
+@pytest.mark.slow
 def test_equal_distances_give_what_duration_and_number_give():
     """Also where dt is their distance, or a part of it, to rounding."""
     dts = np.concatenate([[0.2, 0.1, 0.2 / 3, 0.02], DTS[:-4]])
@@ -102,6 +104,7 @@ def test_the_work_is_about_the_sum_over_the_members():
     assert steps <= iterations < 1.1 * steps
 
 
+@pytest.mark.slow
 def test_order_two_where_steps_change_at_each_time():
     problem = zoo.PROBLEMS["forced double pendulum"]
     dts = 0.01 / 2 ** np.arange(4)

@@ -9,6 +9,7 @@ from experiments.identification import tanks_data as data
 HEADER = "uEst,uVal,yEst,yVal,Ts\n"
 
 
+@pytest.mark.slow
 def test_a_held_input_through_both_tanks_as_by_scipy():
     """Restarted at each jump of u there too; overflow of both tanks, with rims as smooth."""
     u = np.repeat([3.0, 7.0, 6.0, 0.5], 10)

@@ -13,6 +13,7 @@ import hhtjax
 every_stepper = pytest.mark.parametrize("name", each(STEPPERS))
 
 
+@pytest.mark.slow
 @every_stepper
 def test_jit_equals_eager(name):
     problem = PROBLEMS["forced double pendulum"]._replace(duration=0.2)
@@ -26,6 +27,7 @@ def test_jit_equals_eager(name):
     assert float(compiled.t[-1]) == pytest.approx(float(state.t), rel=1e-14)
 
 
+@pytest.mark.slow
 @every_stepper
 def test_vmap_equals_loop(name):
     """Over the stiffness, the start, the step size, and the numerical damping where there is one."""
@@ -44,6 +46,7 @@ def test_vmap_equals_loop(name):
     np.testing.assert_allclose(batch, jnp.stack(loop), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_vmap_over_alpha_equals_loop():
     problem = PROBLEMS["forced Duffing"]
     alphas = jnp.array([0.0, -0.1, -0.3])
@@ -92,6 +95,7 @@ TREES = VECTORS._replace(
 )
 
 
+@pytest.mark.slow
 @every_stepper
 def test_trees_are_kept_and_rows_follow_the_sorted_keys(name):
     """A dict whose keys sort differently from their insertion, against the same system on a vector."""
@@ -115,6 +119,7 @@ COUPLED = [
 ]
 
 
+@pytest.mark.slow
 @every_stepper
 def test_a_diagonal_mass_equals_the_full_one(name):
     q0, v0, stepper = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), as_data(STEPPERS[name])

@@ -65,6 +65,7 @@ def test_other_dtypes():
         trigonometry.sincos(jnp.array(1j))
 
 
+@pytest.mark.slow
 def test_the_double_pendulum_moves_alike_with_both():
     ends = []
     for module in (jnp, trigonometry):

@@ -72,11 +72,13 @@ def slopes(scene, stepper):
     return -np.subtract(*errors) / np.log(COUNTS[0] / COUNTS[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILY)
 def test_unequal_steps_keep_order_two(name):
     assert np.all(abs(slopes("free", FAMILY[name]) - 2.0) < 0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILY)
 def test_with_constraints_the_multipliers_too(name):
     """Undamped, w and L keep the jump of h^2 that each change of the step gives them, which add up as square roots."""
@@ -93,6 +95,7 @@ def test_with_rotations(alpha, kinematics):
     assert np.all(slopes("rotation", hhtjax.hht(alpha, start="corrected", kinematics=kinematics)) > 1.85)
 
 
+@pytest.mark.slow
 def test_one_step_between_unequal_samples_keeps_order_two():
     system = hhtjax.System(ONE, lambda q, v, t, params: -4 * jnp.sin(q) + jnp.cos(3 * t))
     stepper, errors = FAMILY["rho = 0.0"], []
@@ -113,6 +116,7 @@ def rate(q, v, z, t, params):
     return -3.0 * z + v + jnp.sin(t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -133,6 +137,7 @@ def test_all_kinds_of_systems(arguments):
     assert np.log2(errors[0] / errors[1]) / 3 > 1.85
 
 
+@pytest.mark.slow
 def test_held_inputs_jump_where_they_do():
     """With steps that end on all jumps nothing but the order of the method is left."""
     load = hhtjax.sampled(np.array([0.0, 5.0, -3.0, 2.0]), 0.25, order=0)
@@ -153,6 +158,7 @@ def test_equal_steps_are_those_of_a_number():
     np.testing.assert_array_equal(given.dt, np.full(12, 0.1))
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_steps_forward_and_reverse():
     stepper = hhtjax.generalized_alpha(0.5, linearize="predictor")
     force = lambda q, v, t, params: -params["k"] * jnp.sin(q) + jnp.cos(3 * t)  # noqa: E731
@@ -165,6 +171,7 @@ def test_derivatives_in_the_steps_forward_and_reverse():
     check_gradient(loss, {"dt": jnp.asarray(jittered(40, 2.0)[:6]), "k": jnp.asarray(4.0)})
 
 
+@pytest.mark.slow
 def test_dense_output_and_extrapolation():
     """Between samples a motion of second degree is exact; Richardson's halved steps are of order 3."""
     ball = hhtjax.System(ONE, lambda q, v, t, params: 0 * q - 9.81)

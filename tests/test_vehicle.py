@@ -85,6 +85,7 @@ def test_force_without_dampers_is_minus_the_gradient_of_the_potential():
     assert np.allclose(Q, -slope, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damped", [False, True])
 def test_energy_is_conserved_and_dampers_take_it_out(damped):
     scene = FLAT if damped else FLAT._replace(params={**FLAT.params, "c": jnp.zeros(4)})
@@ -126,6 +127,7 @@ def test_a_raised_left_side_is_positive_roll():
     assert np.allclose(end, [0.01, 0.0, 0.02 / 1.5, 0.02, 0.0, 0.02, 0.0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_ride_converges_to_scipy():
     """To the equations written in NumPy, road included."""
     p = {name: np.asarray(x) for name, x in ROUGH.params.items() if name != "road"}
