@@ -17,7 +17,9 @@ from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.result import FitResult
+from hhtjax.identification.rounds import in_rounds
 from hhtjax.identification.sandwich import count_segments, uncertainty, variance_inflation
+from hhtjax.runs.freezing import chooses_steps, with_steps_for
 
 
 class Data(NamedTuple):
@@ -40,6 +42,7 @@ class _Solved(NamedTuple):
     history: Any
     iterations: Any
     code: Any
+    choices: Any
     residual: Any
     starts: Any
     J: Any
@@ -99,7 +102,7 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
         tau = variance_inflation(found.leaves)
         believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau)
     ended = found.residual, found.cost, found.history, found.iterations, found.code
-    params, last = freeze(coordinates.params(found.x)), (found.starts, data.weights)
+    params, last = freeze(coordinates.params(found.x)), (found.starts, data.weights, found.choices)
     return FitResult(params, *ended, options.transforms, believed, segments, *last)
 
 
@@ -120,11 +123,17 @@ def _solve_dense(residuals, options, coordinates, data, limits):
         away = [p - mean for p, mean in zip(coordinates.free_leaves(x), means, strict=True)]
         return jnp.concatenate([r, ravel_pytree(away)[0]])
 
-    objective = Objective(w, options.loss, m)
+    objective, choices = Objective(w, options.loss, m), None
     if options.optimizer == LEVENBERG_MARQUARDT:
-        best, history, iterations, code = levenberg_marquardt(
-            Dense(f, objective), coordinates.x0, coordinates.longest, *limits
-        )
+
+        def problem_for(y, fresh):
+            return Dense(lambda x: with_steps_for(f, x, jnp.where(fresh, x, y)), objective)
+
+        start = coordinates.x0, coordinates.longest, *limits
+        if chooses_steps(f, coordinates.x0):
+            best, history, iterations, code, choices = in_rounds(problem_for, *start)
+        else:
+            best, history, iterations, code = levenberg_marquardt(Dense(f, objective), *start)
         x, r, J = best.x, best.r, best.J
     else:
         x, history, iterations, code = descend(f, coordinates.x0, objective, options.optimizer, *limits)
@@ -133,7 +142,7 @@ def _solve_dense(residuals, options, coordinates, data, limits):
     if J is not None:
         J, pull, bend = objective.estimating(r, J)
     sizes, of_pull = [math.prod(leaf.shape) for leaf in leaves], jax.tree.leaves(unravel(pull[:m]))
-    ended = x, cost, history, iterations, code, residual, None
+    ended = x, cost, history, iterations, code, choices, residual, None
     return _Solved(*ended, J, pull, bend, of_pull, sizes, jnp.sum(w != 0))
 
 
@@ -152,18 +161,35 @@ def _solve_records(residuals, options, coordinates, data, limits):
     w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)
     _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], weights))
 
-    def f(x, own, record):
+    p = coordinates.x0.size
+
+    def f(record, both):
+        x, own = both[:p], both[p:]
         return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
 
     objective = Objective(w.ravel(), options.loss, w.size)
-    problem = Arrow(f, objective, data.records, coordinates.x0.size)
+    problem = Arrow(lambda x, own, record: f(record, jnp.concatenate([x, own])), objective, data.records, p)
+
+    def problem_for(y, fresh):
+        y, own_y = problem.split(y)
+
+        def frozen(x, own, record):
+            (record, own_y), both = record, jnp.concatenate([x, own])
+            return with_steps_for(partial(f, record), both, jnp.where(fresh, both, jnp.concatenate([y, own_y])))
+
+        return Arrow(frozen, objective, (data.records, own_y), p)
+
     x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
     longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
-    best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
+    if chooses_steps(every, params0, data.starts, data.records):
+        best, history, iterations, code, choices = in_rounds(problem_for, x0, longest, *limits)
+    else:
+        best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
+        choices = None
     x, own = problem.split(best.x)
     residual, starts, cost = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own), objective.cost(best.r.ravel())
     J, pull, bend = problem.free_of_own(best)
     of_pull = jax.tree.leaves(jax.vmap(unravel)(pull.reshape(w.shape)))
     present = jnp.sum(w != 0) - own0.size  # each start has used up as many residuals as it has entries
-    ended = x, cost, history, iterations, code, residual, starts
+    ended = x, cost, history, iterations, code, choices, residual, starts
     return _Solved(*ended, J, pull, bend, of_pull, [w.size], present)

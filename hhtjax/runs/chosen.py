@@ -12,6 +12,7 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
 from hhtjax.runs.choose import Steps, choose, trimmed
+from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.interpolate import between
 from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, saved
 from hhtjax.runs.problem import Problem
@@ -190,18 +191,21 @@ def choose_steps(
 def run_controlled(problem, times, control, progress) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
-    steps, ends = or_plain(partial(chosen_steps, problem, times, control, progress))
+    (problem, times), choice = run_and_choice((problem, times))
+    steps, ends = or_plain(partial(chosen_steps, *choice, control, progress))
     run = or_plain(partial(run_over, problem, times, ends, steps.accepted))
     if control.verify:
-        run = run._replace(**verified(run, finer(problem, times, control, steps, ends), control, problem.stepper.order))
+        run = run._replace(
+            **verified(run, finer(problem, times, control, steps, ends, choice), control, problem.stepper.order)
+        )
     steps = trimmed(steps)
     return run._replace(dt=steps.dt, steps=steps)
 
 
-def finer(problem, times, control, steps, ends):
+def finer(problem, times, control, steps, ends, choice):
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
     if control.verify == "tolerance":
-        steps, ends = or_plain(partial(chosen_steps, problem, times, quarter(control)))
+        steps, ends = or_plain(partial(chosen_steps, *choice, quarter(control)))
     halved = control.verify != "tolerance"
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, halved=halved))
 
