@@ -29,13 +29,15 @@ def with_steps_for(f, x, y):
 
 
 def run_and_choice(data):
-    """What a run starts from, and what its steps are chosen for: twice the same, but inside `with_steps_for`."""
+    """What a run starts from, and what its steps are chosen for, constant to derivatives: the same, but inside
+    `with_steps_for`."""
     if _inside(PROBE):
         raise ThereAre
     if not _inside(PAIR):
-        return data, data
+        return data, lax.stop_gradient(data)
     both = jax.tree.map(lambda x: lax.all_gather(x, PAIR) if is_array(x) else (x, x), data)
-    return tuple(jax.tree.map(lambda x, two, i=i: two[i], data, both) for i in (0, 1))
+    run, choice = (jax.tree.map(lambda x, two, i=i: two[i], data, both) for i in (0, 1))
+    return run, lax.stop_gradient(choice)
 
 
 def chooses_steps(f, *args):

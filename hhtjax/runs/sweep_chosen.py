@@ -37,7 +37,7 @@ def run_chosen(system, start, choice, *, mapped, size, lanes, progress):
 
     control = start[1]
     axes = [0 if flag else None for flag in mapped] + [0 if jnp.ndim(x) else None for x in jax.tree.leaves(control)]
-    members, frozen = members_of(*start), members_of(*lax.stop_gradient(choice))
+    members, frozen = members_of(*start), members_of(*choice)
 
     def error(arrays, run, finer):
         return verified(run, finer, members.control(arrays), members.problem(arrays).stepper.order)
@@ -60,15 +60,15 @@ def run_many(members, steps, ends, progress, halved=False):
     def grid(ends, accepted):
         return Grid.of(t0, times, ends, accepted, halved)
 
-    def member(arrays, grid, longest):
-        return follow(members.problem(arrays), times, grid, longest)
+    def member(arrays, grid):
+        return follow(members.problem(arrays), times, grid)
 
     def block(numbered):
         number, those = numbered
         if progress:
             show_progress(number + 1, len(blocks), "block")
         grids = jax.vmap(grid)(ends[those], steps.accepted[those])
-        return jax.vmap(member, (members.axes, 0, None))(members.of(those), grids, jnp.max(grids.counts, axis=0))
+        return jax.vmap(member, (members.axes, 0))(members.of(those), grids)
 
     order = jnp.argsort(-steps.accepted)
     blocks = np.minimum(np.arange(-(-size // lanes) * lanes), size - 1).reshape(-1, lanes)  # the last one fills up
