@@ -165,11 +165,7 @@ batching.defvectorized(structural_p)
 largest_p = Primitive("hhtjax_largest_in_batch")
 largest_p.def_impl(lambda x: x)
 largest_p.def_abstract_eval(lambda x: x)
-ad.defjvp_zero(largest_p)
-batching.primitive_batchers[largest_p] = lambda values, axes: (
-    largest_p.bind(jnp.max(values[0], axis=axes[0])),
-    batching.not_mapped,
-)
+batching.primitive_batchers[largest_p] = lambda values, axes: (largest_p.bind(jnp.max(values[0], axis=axes[0])), None)
 
 
 watch_p = Primitive("hhtjax_watch")
