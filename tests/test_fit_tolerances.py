@@ -1,5 +1,7 @@
 """Fits through runs under error control: steps frozen at one point, chosen again, until the estimates stay."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +19,7 @@ TRUE, GUESS = {"k": 4.0, "k3": 2.0}, {"k": 5.0, "k3": 1.5}
 STEPPER = hhtjax.dopri5()
 
 
-def position(params, q0, rtol=1e-4, stepper=STEPPER):
+def position(params, q0, rtol=1e-4, stepper: Any = STEPPER):
     dt = hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=1000)
     return hhtjax.simulate(DUFFING, stepper, q0, ZERO, params, dt=dt, times=TIMES).q[1:]
 
@@ -25,7 +27,7 @@ def position(params, q0, rtol=1e-4, stepper=STEPPER):
 MEASURED = position(TRUE, ONE, 1e-9) + 1e-3 * np.random.default_rng(0).standard_normal((TIMES.size, 1))
 
 
-def by_array(x, q0=ONE, rtol=1e-3):
+def by_array(x, q0: Any = ONE, rtol=1e-3):
     return position({"k": x[0], "k3": x[1]}, q0, rtol, hhtjax.hht(linearize="predictor"))
 
 

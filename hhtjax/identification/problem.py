@@ -163,33 +163,38 @@ def _solve_records(residuals, options, coordinates, data, limits):
 
     p = coordinates.x0.size
 
-    def f(record, both):
-        x, own = both[:p], both[p:]
+    def f(x, own, record):
         return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
 
-    objective = Objective(w.ravel(), options.loss, w.size)
-    problem = Arrow(lambda x, own, record: f(record, jnp.concatenate([x, own])), objective, data.records, p)
-
-    def problem_for(y, fresh):
-        y, own_y = problem.split(y)
-
-        def frozen(x, own, record):
-            (record, own_y), both = record, jnp.concatenate([x, own])
-            return with_steps_for(partial(f, record), both, jnp.where(fresh, both, jnp.concatenate([y, own_y])))
-
-        return Arrow(frozen, objective, (data.records, own_y), p)
-
+    problem = Arrow(f, Objective(w.ravel(), options.loss, w.size), data.records, p)
     x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
     longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
     if chooses_steps(every, params0, data.starts, data.records):
-        best, history, iterations, code, choices = in_rounds(problem_for, x0, longest, *limits)
+        found = in_rounds(partial(_with_frozen_steps, problem), x0, longest, *limits)
     else:
-        best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
-        choices = None
+        found = *levenberg_marquardt(problem, x0, longest, *limits), None
+    best, history, iterations, code, choices = found
     x, own = problem.split(best.x)
-    residual, starts, cost = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own), objective.cost(best.r.ravel())
+    residual, starts = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own)
+    cost = problem.objective.cost(best.r.ravel())
     J, pull, bend = problem.free_of_own(best)
     of_pull = jax.tree.leaves(jax.vmap(unravel)(pull.reshape(w.shape)))
     present = jnp.sum(w != 0) - own0.size  # each start has used up as many residuals as it has entries
     ended = x, cost, history, iterations, code, choices, residual, starts
     return _Solved(*ended, J, pull, bend, of_pull, [w.size], present)
+
+
+def _with_frozen_steps(problem, y, fresh):
+    """An `Arrow` problem with steps of its runs as for y, unless they are chosen anew."""
+    y, own_y = problem.split(y)
+
+    def f(x, own, record):
+        record, own_y = record
+        here, there = jnp.concatenate([x, own]), jnp.concatenate([y, own_y])
+
+        def residuals(both):
+            return problem.f(both[: problem.p], both[problem.p :], record)
+
+        return with_steps_for(residuals, here, jnp.where(fresh, here, there))
+
+    return problem._replace(f=f, records=(problem.records, own_y))
