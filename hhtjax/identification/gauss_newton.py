@@ -89,6 +89,14 @@ class Dense(NamedTuple):
         dx = -(trial.V @ (weight * trial.z)) / _or_one(trial.D)
         return dx, jnp.sum(trial.z**2 * (1 - (1 - trial.s * weight) ** 2)) / 2
 
+    def length(self, trial, dx):
+        """Of J dx."""
+        return jnp.linalg.norm(trial.s * (trial.V.T @ (trial.D * dx)))
+
+    def deviation(self, trial):
+        """Standard deviation of the residuals."""
+        return _deviation(jnp.hypot(trial.length, jnp.linalg.norm(trial.z)), trial.r.size, trial.x.size)
+
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
         return _cosine(trial.V @ (trial.s * trial.z), trial)
@@ -175,6 +183,16 @@ class Arrow(NamedTuple):
         predicted = (jnp.sum(trial.z**2) - jnp.sum(left**2)) / 2
         return jnp.concatenate([shared, own.ravel()]) / _or_one(trial.D), predicted
 
+    def length(self, trial, dx):
+        """Of J dx."""
+        shared, own = self.split(_or_one(trial.D) * dx)
+        Jdx = jnp.einsum("bip,p->bi", trial.R, shared) + jnp.einsum("bik,bk->bi", trial.R_own, own)
+        return jnp.linalg.norm(Jdx)
+
+    def deviation(self, trial):
+        """Standard deviation of the residuals."""
+        return _deviation(trial.length, trial.r.size, trial.x.size)
+
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
         shared = jnp.einsum("bip,bi->p", trial.R, trial.z)
@@ -198,6 +216,10 @@ class Arrow(NamedTuple):
         bends = None if bend is None else bend.reshape(count, m)
         rest = jax.vmap(project, in_axes=(0, None if bend is None else 0))(both.reshape(count, m, -1), bends)
         return rest.reshape(count * m, -1), pull, bend
+
+
+def _deviation(length, m, p):
+    return length / max(m - p, 1) ** 0.5
 
 
 def _or_one(x):

@@ -22,12 +22,13 @@ from hhtjax.identification.progress import (
 )
 
 
-def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress):
+def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress, room=None, enough=None):
     """Damped Gauss-Newton on a `Dense` or an `Arrow` problem; returns the best trial, the history, and why it ended.
 
     dx = -(J^T J + lam D^2)^-1 J^T r. With rho the decrease of the cost over that predicted, lam changes by the factor
     max(1/8, 1 - (2 rho - 1)^3) when a step lowers the cost (Nielsen 1999), and grows by 6 when it does not. Before that
-    it grows until no entry of dx is longer than that of `longest`.
+    it grows until no entry of dx is longer than that of `longest`. room: for how many iterations the history has
+    room, where max_iterations is a tracer. enough: trial, step -> whether to end with a step like that, for STEP.
     """
     eps = float(jnp.finfo(x.dtype).eps)
     running = jnp.asarray(RUNNING, jnp.int32)
@@ -49,6 +50,8 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
         code = jnp.where(iteration == max_iterations, LIMIT, running)
         code = jnp.where(~lower & (lam > 1 / eps), STUCK, code)
         code = jnp.where(small == RUNNING, code, small)
+        if enough is not None:
+            code = jnp.where((code == RUNNING) & enough(now, step), STEP, code)
         code = jnp.where(first, running, code)
         code = jnp.where(problem.cosine(best) <= tolerance, GRADIENT, code)
         code = jnp.where(first & jnp.all(best.column == 0), NO_INFLUENCE, code)
@@ -62,7 +65,7 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
     # nothing is known before the first evaluation, which is that of the loop: f is compiled once
     nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(problem.look, x, x))
     nothing = nothing._replace(x=x, cost=jnp.asarray(jnp.inf, x.dtype))
-    empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
+    empty = jnp.full((max_iterations if room is None else room) + 1, jnp.nan, x.dtype)
     carry = nothing, jnp.asarray(1e-3, x.dtype), jnp.asarray(-1, jnp.int32), History(empty, empty, empty), running
     best, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
     return best, history, iterations, code

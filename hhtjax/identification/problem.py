@@ -17,7 +17,9 @@ from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.result import FitResult
+from hhtjax.identification.rounds import in_rounds
 from hhtjax.identification.sandwich import count_segments, uncertainty, variance_inflation
+from hhtjax.runs.freezing import chooses_steps, with_steps_for
 
 
 class Data(NamedTuple):
@@ -40,6 +42,7 @@ class _Solved(NamedTuple):
     history: Any
     iterations: Any
     code: Any
+    choices: Any
     residual: Any
     starts: Any
     J: Any
@@ -99,7 +102,7 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
         tau = variance_inflation(found.leaves)
         believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau)
     ended = found.residual, found.cost, found.history, found.iterations, found.code
-    params, last = freeze(coordinates.params(found.x)), (found.starts, data.weights)
+    params, last = freeze(coordinates.params(found.x)), (found.starts, data.weights, found.choices)
     return FitResult(params, *ended, options.transforms, believed, segments, *last)
 
 
@@ -120,11 +123,17 @@ def _solve_dense(residuals, options, coordinates, data, limits):
         away = [p - mean for p, mean in zip(coordinates.free_leaves(x), means, strict=True)]
         return jnp.concatenate([r, ravel_pytree(away)[0]])
 
-    objective = Objective(w, options.loss, m)
+    objective, choices = Objective(w, options.loss, m), None
     if options.optimizer == LEVENBERG_MARQUARDT:
-        best, history, iterations, code = levenberg_marquardt(
-            Dense(f, objective), coordinates.x0, coordinates.longest, *limits
-        )
+
+        def problem_for(y, fresh):
+            return Dense(lambda x: with_steps_for(f, x, jnp.where(fresh, x, y)), objective)
+
+        start = coordinates.x0, coordinates.longest, *limits
+        if chooses_steps(f, coordinates.x0):
+            best, history, iterations, code, choices = in_rounds(problem_for, *start)
+        else:
+            best, history, iterations, code = levenberg_marquardt(Dense(f, objective), *start)
         x, r, J = best.x, best.r, best.J
     else:
         x, history, iterations, code = descend(f, coordinates.x0, objective, options.optimizer, *limits)
@@ -133,7 +142,7 @@ def _solve_dense(residuals, options, coordinates, data, limits):
     if J is not None:
         J, pull, bend = objective.estimating(r, J)
     sizes, of_pull = [math.prod(leaf.shape) for leaf in leaves], jax.tree.leaves(unravel(pull[:m]))
-    ended = x, cost, history, iterations, code, residual, None
+    ended = x, cost, history, iterations, code, choices, residual, None
     return _Solved(*ended, J, pull, bend, of_pull, sizes, jnp.sum(w != 0))
 
 
@@ -152,18 +161,40 @@ def _solve_records(residuals, options, coordinates, data, limits):
     w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)
     _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], weights))
 
+    p = coordinates.x0.size
+
     def f(x, own, record):
         return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
 
-    objective = Objective(w.ravel(), options.loss, w.size)
-    problem = Arrow(f, objective, data.records, coordinates.x0.size)
+    problem = Arrow(f, Objective(w.ravel(), options.loss, w.size), data.records, p)
     x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
     longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
-    best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
+    if chooses_steps(every, params0, data.starts, data.records):
+        found = in_rounds(partial(_with_frozen_steps, problem), x0, longest, *limits)
+    else:
+        found = *levenberg_marquardt(problem, x0, longest, *limits), None
+    best, history, iterations, code, choices = found
     x, own = problem.split(best.x)
-    residual, starts, cost = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own), objective.cost(best.r.ravel())
+    residual, starts = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own)
+    cost = problem.objective.cost(best.r.ravel())
     J, pull, bend = problem.free_of_own(best)
     of_pull = jax.tree.leaves(jax.vmap(unravel)(pull.reshape(w.shape)))
     present = jnp.sum(w != 0) - own0.size  # each start has used up as many residuals as it has entries
-    ended = x, cost, history, iterations, code, residual, starts
+    ended = x, cost, history, iterations, code, choices, residual, starts
     return _Solved(*ended, J, pull, bend, of_pull, [w.size], present)
+
+
+def _with_frozen_steps(problem, y, fresh):
+    """An `Arrow` problem with steps of its runs as for y, unless they are chosen anew."""
+    y, own_y = problem.split(y)
+
+    def f(x, own, record):
+        record, own_y = record
+        here, there = jnp.concatenate([x, own]), jnp.concatenate([y, own_y])
+
+        def residuals(both):
+            return problem.f(both[: problem.p], both[problem.p :], record)
+
+        return with_steps_for(residuals, here, jnp.where(fresh, here, there))
+
+    return problem._replace(f=f, records=(problem.records, own_y))

@@ -6,7 +6,7 @@ import jax
 
 from hhtjax.description.presentation import overwrite, shown
 
-RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE = range(8)
+RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE, UNSETTLED = range(9)
 CONVERGED = COST, STEP, GRADIENT
 REASONS = {
     RUNNING: "still running",
@@ -17,6 +17,7 @@ REASONS = {
     STUCK: "stopped: no step lowers the cost",
     BAD_START: "failed: the residual is not finite at params0",
     NO_INFLUENCE: "failed: no parameter changes the residual at params0",
+    UNSETTLED: "stopped: the estimates change whenever steps are chosen anew; take a smaller rtol",
 }
 
 

@@ -20,7 +20,8 @@ MOST_PAIRS = 3
 def summary(result) -> str:
     """The text of `FitResult.summary`."""
     cost = f"cost {float(result.cost):.6g}, {float(result.history.cost[0]):.6g} at the start"
-    lines = [f"{result.reason}; {int(result.iterations)} iterations, {cost}"]
+    chosen = "" if result.choices is None else f"; steps chosen {int(result.choices)} times, and frozen"
+    lines = [f"{result.reason}; {int(result.iterations)} iterations, {cost}{chosen}"]
     names, values = parameter_names(result.params), parameter_values(result.params)
     rows = [["parameter", "estimate"]]
     columns = []

@@ -34,6 +34,8 @@ class FitResult(NamedTuple):
         segments: how many parts of the record the covariance rests on.
         starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
         weights: as given to `fit`.
+        choices: of residuals with runs under error control (`adaptive`), how often their steps were chosen, and
+            frozen, for estimates, until these stayed; None without.
 
     `covariance` (p, p), whose rows follow ravel_pytree(params), and `standard_errors`, the root of its diagonal,
     structured like params, come from how much segments of the record disagree (a cluster-robust covariance:
@@ -52,6 +54,7 @@ class FitResult(NamedTuple):
     segments: int
     starts: Any = None
     weights: Any = True
+    choices: Any = None
 
     @property
     def converged(self) -> Any:

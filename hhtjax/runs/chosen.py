@@ -12,6 +12,7 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
 from hhtjax.runs.choose import Steps, choose, trimmed
+from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.interpolate import between
 from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, saved
 from hhtjax.runs.problem import Problem
@@ -19,15 +20,14 @@ from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import State, Stepper, join_info, public
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import on_scalars, one_kernel, or_plain
+from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_plain
 
 ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
 @partial(jax.jit, static_argnames=("progress",))
 def chosen_steps(problem, times, control, progress=False):
-    """`Steps` to the last of the times, and the times at which they end."""
-    problem, times, control = lax.stop_gradient((problem, times, control))
+    """`Steps` to the last of the times, and the times at which they end; no tracer of autodiff may come in."""
     flat, q, v, t0, params = problem.flat()
     end = jnp.asarray(times).astype(q.dtype)[-1]
     return choose(flat, problem.stepper, q, v, t0, end, params, control, progress)
@@ -45,7 +45,6 @@ class Grid(NamedTuple):
     @classmethod
     def of(cls, t0, times, ends, accepted, halved=False):
         """Those with these ends, of which so many were accepted; each halved or not."""
-        ends = lax.stop_gradient(ends)
         behind = jnp.arange(ends.size, dtype=jnp.int32) >= accepted
         # the last accepted end, behind it: steps that nothing takes
         reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
@@ -68,13 +67,10 @@ def run_over(problem, times, ends, accepted, halved=False):
     return follow(problem, times, Grid.of(t0, times, ends, accepted, halved))
 
 
-def follow(problem, times, grid, longest=None):
-    """The `Solution` at `times` over the steps of a grid.
-
-    longest: (K,), how many steps are taken between the times by the members of a block, among which this one rests.
-    """
+def follow(problem, times, grid):
+    """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
     flat, q, v, t0, params = problem.flat()
-    dt, rests = grid.dt, longest is not None
+    dt, longest = grid.dt, largest_in_batch(grid.counts)
     loop = loop_over(flat, problem.stepper, q, v, t0, params, dt, ends=grid.ends)
     form = on_scalars(loop.advance, loop.carry)
     advance, keep = form.of(loop.advance), form.of(partial(kept, flat, problem.stepper))
@@ -87,13 +83,13 @@ def follow(problem, times, grid, longest=None):
             _, run, info = carry
             after, now = advance(run)
             new = run[0], after, join_info(info, now)
-            return jax.tree.map(partial(jnp.where, i < count), new, carry) if rests else new
+            return jax.tree.map(partial(jnp.where, i < count), new, carry)
 
         last, run, info = repeat(step, (*carry, loop.no_info), most)
         return (last, run), (keep(last), keep(run[0]), info)
 
     def samples(carry):
-        return lax.scan(interval, (carry[0], carry), (grid.counts, longest if rests else grid.counts))
+        return lax.scan(interval, (carry[0], carry), (grid.counts, longest))
 
     (_, (_, _, failure)), (first, second, info) = one_kernel(samples, form.tree)
     (first, _), (second, extra) = form.joined(first), form.joined(second)
@@ -183,25 +179,28 @@ def choose_steps(
     problem = Problem.checked("choose_steps", system, stepper, q0, v0, params, t0, z0)
     control = adaptive(**tolerances)
     times = checked_times("choose_steps", problem, times, control)
-    arguments = problem, times, control, progress
+    arguments = *lax.stop_gradient((problem, times, control)), progress
     return trimmed(or_plain(partial(chosen_steps, *arguments))[0])
 
 
 def run_controlled(problem, times, control, progress) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
-    steps, ends = or_plain(partial(chosen_steps, problem, times, control, progress))
+    (problem, times, control), choice = run_and_choice((problem, times, control))
+    steps, ends = or_plain(partial(chosen_steps, *choice, progress))
     run = or_plain(partial(run_over, problem, times, ends, steps.accepted))
     if control.verify:
-        run = run._replace(**verified(run, finer(problem, times, control, steps, ends), control, problem.stepper.order))
+        run = run._replace(
+            **verified(run, finer(problem, times, control, steps, ends, choice), control, problem.stepper.order)
+        )
     steps = trimmed(steps)
     return run._replace(dt=steps.dt, steps=steps)
 
 
-def finer(problem, times, control, steps, ends):
+def finer(problem, times, control, steps, ends, choice):
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
     if control.verify == "tolerance":
-        steps, ends = or_plain(partial(chosen_steps, problem, times, quarter(control)))
+        steps, ends = or_plain(partial(chosen_steps, *choice[:2], quarter(choice[2])))
     halved = control.verify != "tolerance"
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, halved=halved))
 

@@ -10,6 +10,7 @@ from jax import lax
 from hhtjax.runs.choose import trimmed
 from hhtjax.runs.choose_many import Members, choose_many
 from hhtjax.runs.chosen import Grid, follow, quarter, verified
+from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.loop import show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
 from hhtjax.xla import or_plain
@@ -18,21 +19,25 @@ from hhtjax.xla import or_plain
 def sweep_chosen(inputs, progress):
     """The `Solution` of a sweep whose `dts` are an `Adaptive`."""
     static = {"mapped": inputs.mapped, "size": inputs.size, "lanes": lanes_for(inputs.size), "progress": progress}
-    arguments = inputs.system, inputs.data, inputs.dts, inputs.t0, inputs.times
-    runs = or_plain(partial(run_chosen, *arguments, **static))
+    starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times))
+    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static))
     steps = trimmed(runs.steps)
     return runs._replace(dt=steps.dt, steps=steps)
 
 
 @partial(jax.jit, static_argnames=("mapped", "size", "lanes", "progress"))
-def run_chosen(system, data, control, t0, times, *, mapped, size, lanes, progress):
-    """The same, compiled, with all max_steps."""
-    dtype = jax.tree.leaves(data[1])[0].dtype
-    times, t0 = (jnp.asarray(x).astype(dtype) for x in (times, t0))
-    arrays, structure = jax.tree.flatten((data, control))
+def run_chosen(system, start, choice, *, mapped, size, lanes, progress):
+    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0 and times, of runs and of steps."""
+
+    def members_of(data, control, t0, times):
+        dtype = jax.tree.leaves(data[1])[0].dtype
+        times, t0 = (jnp.asarray(x).astype(dtype) for x in (times, t0))
+        arrays, structure = jax.tree.flatten((data, control))
+        return Members(system, arrays, structure, axes, t0, times, size, lanes)
+
+    control = start[1]
     axes = [0 if flag else None for flag in mapped] + [0 if jnp.ndim(x) else None for x in jax.tree.leaves(control)]
-    members = Members(system, arrays, structure, axes, t0, times, size, lanes)
-    frozen = members._replace(**lax.stop_gradient({"arrays": arrays, "t0": t0, "times": times}))
+    members, frozen = members_of(*start), members_of(*choice)
 
     def error(arrays, run, finer):
         return verified(run, finer, members.control(arrays), members.problem(arrays).stepper.order)
@@ -41,10 +46,10 @@ def run_chosen(system, data, control, t0, times, *, mapped, size, lanes, progres
     runs = run_many(members, steps, ends, progress)
     if control.verify == "tolerance":
         finer = run_many(members, *choose_many(frozen, lambda arrays: quarter(frozen.control(arrays))), progress)
-        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(arrays, runs, finer))
+        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(members.arrays, runs, finer))
     elif control.verify:
         finer = run_many(members, steps, ends, progress, halved=True)
-        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(arrays, runs, finer))
+        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(members.arrays, runs, finer))
     return runs._replace(dt=steps.dt, steps=steps)
 
 
@@ -55,15 +60,15 @@ def run_many(members, steps, ends, progress, halved=False):
     def grid(ends, accepted):
         return Grid.of(t0, times, ends, accepted, halved)
 
-    def member(arrays, grid, longest):
-        return follow(members.problem(arrays), times, grid, longest)
+    def member(arrays, grid):
+        return follow(members.problem(arrays), times, grid)
 
     def block(numbered):
         number, those = numbered
         if progress:
             show_progress(number + 1, len(blocks), "block")
         grids = jax.vmap(grid)(ends[those], steps.accepted[those])
-        return jax.vmap(member, (members.axes, 0, None))(members.of(those), grids, jnp.max(grids.counts, axis=0))
+        return jax.vmap(member, (members.axes, 0))(members.of(those), grids)
 
     order = jnp.argsort(-steps.accepted)
     blocks = np.minimum(np.arange(-(-size // lanes) * lanes), size - 1).reshape(-1, lanes)  # the last one fills up

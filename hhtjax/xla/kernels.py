@@ -145,11 +145,27 @@ inside_p.def_abstract_eval(lambda x: x.update(shape=(), dtype=np.dtype(bool), we
 batching.primitive_batchers[inside_p] = lambda values, axes: (inside_p.bind(*values), None)
 
 
+def largest_in_batch(x):
+    """The array x; under vmap the largest over the members, the same for all: a bound of a loop that they share.
+
+    >>> import jax
+    >>> print(jax.vmap(lambda x: largest_in_batch(x))(jnp.array([2, 5, 3])))
+    [5 5 5]
+    """
+    return largest_p.bind(x)
+
+
 structural_p = Primitive("hhtjax_structural")
 structural_p.def_impl(jnp.asarray)
 structural_p.def_abstract_eval(lambda x: x)
 ad.deflinear2(structural_p, lambda cotangent, _: (cotangent,))
 batching.defvectorized(structural_p)
+
+
+largest_p = Primitive("hhtjax_largest_in_batch")
+largest_p.def_impl(lambda x: x)
+largest_p.def_abstract_eval(lambda x: x)
+batching.primitive_batchers[largest_p] = lambda values, axes: (largest_p.bind(jnp.max(values[0], axis=axes[0])), None)
 
 
 watch_p = Primitive("hhtjax_watch")

@@ -1,0 +1,57 @@
+"""Steps that are chosen for one point, while the run over them is of another: how a fit freezes the steps of its runs.
+
+The residuals are evaluated for two points at once, as a batch whose axis has a name. Wherever they simulate under error
+control, inside whatever of jit, vmap and scan, the run takes the first point, and the choice of its steps the second.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.description import is_array
+
+PAIR = "hhtjax: a run, and the choice of its steps"
+PROBE = "hhtjax: are there steps to choose"
+
+
+class ThereAre(Exception):
+    """The answer to the probe."""
+
+
+def with_steps_for(f, x, y):
+    """f(x) of an array x, with the steps of all runs under error control as for y.
+
+    >>> bool(with_steps_for(jnp.sin, jnp.ones(2), jnp.zeros(2))[0] == jnp.sin(1.0))
+    True
+    """
+    pair = jnp.stack([x, lax.stop_gradient(y)])
+    return jax.tree.map(lambda found: found[0], jax.vmap(f, axis_name=PAIR)(pair))
+
+
+def run_and_choice(data):
+    """What a run starts from, and what its steps are chosen for, constant to derivatives: the same, but inside
+    `with_steps_for`."""
+    if _inside(PROBE):
+        raise ThereAre
+    if not _inside(PAIR):
+        return data, lax.stop_gradient(data)
+    both = jax.tree.map(lambda x: lax.all_gather(x, PAIR) if is_array(x) else (x, x), data)
+    run, choice = (jax.tree.map(lambda x, two, i=i: two[i], data, both) for i in (0, 1))
+    return run, lax.stop_gradient(choice)
+
+
+def chooses_steps(f, *args):
+    """Whether there are runs under error control in f(*args)."""
+    try:
+        jax.eval_shape(jax.vmap(lambda _: f(*args), axis_name=PROBE), jnp.zeros(1))
+    except ThereAre:
+        return True
+    return False
+
+
+def _inside(axis):
+    try:
+        lax.axis_size(axis)
+    except NameError:
+        return False
+    return True

@@ -1,0 +1,144 @@
+"""Fits through runs under error control: steps frozen at one point, chosen again, until the estimates stay."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import zoo
+from helpers import ONE, ZERO
+
+import hhtjax
+from hhtjax.identification.problem import solve
+from hhtjax.runs.freezing import with_steps_for
+
+DUFFING = hhtjax.System(ONE, lambda q, v, t, p: -p["k"] * q - p["k3"] * q**3 - 0.2 * v + 3 * jnp.cos(2 * t))
+TIMES = np.linspace(0, 5, 101)[1:]
+TRUE, GUESS = {"k": 4.0, "k3": 2.0}, {"k": 5.0, "k3": 1.5}
+STEPPER = hhtjax.dopri5()
+
+
+def position(params, q0, rtol=1e-4, stepper: Any = STEPPER):
+    dt = hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=1000)
+    return hhtjax.simulate(DUFFING, stepper, q0, ZERO, params, dt=dt, times=TIMES).q[1:]
+
+
+MEASURED = position(TRUE, ONE, 1e-9) + 1e-3 * np.random.default_rng(0).standard_normal((TIMES.size, 1))
+
+
+def by_array(x, q0: Any = ONE, rtol=1e-3):
+    return position({"k": x[0], "k3": x[1]}, q0, rtol, hhtjax.hht(linearize="predictor"))
+
+
+def in_sweep(x):
+    rtol = np.array([1e-2, 1e-3])
+    dts, params = hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=1000), {"k": x[0], "k3": x[1]}
+    return hhtjax.sweep(
+        DUFFING, hhtjax.hht(linearize="predictor"), ONE, ZERO, params, dts=dts, times=TIMES
+    ).q[:, 1:]  # fmt: skip
+
+
+FORMS = {  # of residuals, and the tolerances of their runs
+    "alone": (by_array, [1e-3]),
+    "jit": (jax.jit(by_array), [1e-3]),
+    "vmap": (lambda x: jax.vmap(lambda s: by_array(x, s * ONE))(jnp.array([1.0, 1.0])), [1e-3, 1e-3]),
+    "scan": (lambda x: jax.lax.scan(lambda c, s: (c, by_array(x, s * ONE)), 0, jnp.array([1.0]))[1], [1e-3]),
+    "sweep": (in_sweep, [1e-2, 1e-3]),
+}
+
+
+@pytest.mark.parametrize("name", zoo.each(FORMS, quick=("alone", "vmap")))
+def test_the_steps_are_those_of_the_other_point(name):
+    """Values and derivatives against steps that are chosen by hand, whatever stands between."""
+    f, tolerances = FORMS[name]
+    x, y = jnp.array([4.0, 2.0]), jnp.array([5.0, 1.5])
+
+    def by_hand(x, rtol):
+        start = DUFFING, hhtjax.hht(linearize="predictor"), ONE, ZERO
+        chosen = hhtjax.choose_steps(*start, {"k": y[0], "k3": y[1]}, times=TIMES, rtol=rtol, atol=1e-3 * rtol)
+        path = hhtjax.simulate(*start, {"k": x[0], "k3": x[1]}, dt=chosen.dt)
+        return hhtjax.interpolate(path, TIMES).q
+
+    f(x)  # so that jit knows the other form, too
+    for transform in (lambda f: f, jax.jacfwd):
+        found = transform(lambda x: with_steps_for(f, x, y))(x)
+        expected = jnp.stack([transform(lambda x, rtol=rtol: by_hand(x, rtol))(x) for rtol in tolerances])
+        np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=1e-9, atol=1e-10)
+    reverse = jax.grad(lambda x: jnp.sum(with_steps_for(f, x, y)))(x)
+    np.testing.assert_allclose(reverse, jnp.sum(found.reshape(-1, 2), axis=0), rtol=1e-9)
+
+
+CASES = [("hht", 0.001), pytest.param("dopri5", 0.3, marks=pytest.mark.slow)]  # choices change its rejected steps
+
+
+@pytest.mark.parametrize(("name", "most"), CASES)
+def test_a_fit_freezes_the_steps_and_chooses_again(name, most):
+    """The estimates are those of a fit by hand on the steps that are chosen for them, to a part of a standard error."""
+    stepper = {"hht": hhtjax.hht(), "dopri5": STEPPER}[name]
+    fitted = hhtjax.fit(lambda p: position(p, ONE, stepper=stepper) - MEASURED, GUESS)
+    assert fitted.converged
+    assert 1 <= fitted.choices <= 3
+    assert f"; steps chosen {fitted.choices} times, and frozen" in fitted.summary()
+    assert hhtjax.FitResult.from_json(fitted.to_json()).choices == fitted.choices
+    start = DUFFING, stepper, ONE, ZERO
+    chosen = hhtjax.choose_steps(*start, fitted.params, times=TIMES, rtol=1e-4, atol=1e-7, max_steps=1000)
+
+    def frozen(params):
+        path = hhtjax.simulate(*start, params, dt=chosen.dt)
+        return hhtjax.interpolate(path, TIMES).q - MEASURED
+
+    again = hhtjax.fit(frozen, fitted.params)
+    assert again.choices is None
+    for name, error in fitted.standard_errors.items():
+        assert abs(again.params[name] - fitted.params[name]) < most * error
+        assert abs(fitted.params[name] - TRUE[name]) < 4 * error
+    assert fitted.history.cost[0] > 100 * fitted.cost
+    assert fitted.history.cost.shape == (fitted.iterations + 1,)
+    assert np.all(np.isfinite(fitted.history.cost))
+    assert fitted.history.cost[-1] == fitted.cost
+
+
+def test_tolerances_above_the_noise_are_named():
+    def residuals(p):
+        return position(p, ONE, 1e-2) - MEASURED
+
+    found = hhtjax.fit(residuals, GUESS)
+    assert not found.converged
+    assert found.reason == "stopped: the estimates change whenever steps are chosen anew; take a smaller rtol"
+    assert found.choices == 5
+    compiled = solve._cache_size()
+    assert hhtjax.fit(residuals, TRUE).choices is not None
+    assert solve._cache_size() == compiled
+
+
+@pytest.mark.slow
+def test_records_and_starts():
+    """The start of each record is fitted with its own frozen steps."""
+    starts = jnp.array([[1.0], [0.5]])
+    data = jax.vmap(lambda q0: position(TRUE, q0, 1e-8))(starts)
+    data += 1e-3 * np.random.default_rng(1).standard_normal(data.shape)
+
+    def residuals(params, q0, record):
+        return position(params, q0, 1e-5) - record
+
+    found = hhtjax.fit(residuals, GUESS, records=data, starts=starts + 0.05)
+    assert found.converged
+    assert 1 <= found.choices <= 3
+    np.testing.assert_allclose(found.starts, starts, atol=3e-3)
+    for name, error in found.standard_errors.items():
+        assert abs(found.params[name] - TRUE[name]) < 4 * error
+
+
+@pytest.mark.slow
+def test_inside_jit_and_from_several_starts():
+    def residuals(p):
+        return position(p, ONE) - MEASURED
+
+    alone = hhtjax.fit(residuals, GUESS)
+    inside = jax.jit(lambda p: hhtjax.fit(residuals, p).params)(jax.tree.map(jnp.asarray, GUESS))
+    many = hhtjax.multistart(residuals, jax.tree.map(lambda x: jnp.array([x, 1.1 * x]), GUESS))
+    for name in GUESS:
+        assert float(inside[name]) == pytest.approx(float(alone.params[name]), rel=1e-8)
+        assert float(many.all.params[name][0]) == pytest.approx(float(alone.params[name]), rel=1e-8)
+    assert many.all.choices[0] == alone.choices
