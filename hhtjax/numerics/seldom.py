@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.xla import any_member
+from hhtjax.xla import largest_in_batch
 
 
 def choose(where, x, y):
@@ -31,4 +31,4 @@ def seldom(f, asked, carry, *more):
         known = choose(asked, (carry, more), lax.stop_gradient((carry, more)))
         return choose(asked, f(known[0], *known[1]), carry)
 
-    return lax.cond(any_member(asked), branch, lambda carry, *_: carry, carry, *more)
+    return lax.cond(largest_in_batch(asked), branch, lambda carry, *_: carry, carry, *more)

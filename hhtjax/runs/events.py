@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, seldom
+from hhtjax.runs.event_failures import FINE
 from hhtjax.runs.loop import first_failure
 from hhtjax.runs.meeting import Log, Met, Part, Ways, asks, pass_events
-from hhtjax.runs.solution import FINE
 from hhtjax.systems.events import flatten_events
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from hhtjax import rotation
 from hhtjax.numerics.richardson import richardson, take_out
-from hhtjax.runs.solution import DIFFER
+from hhtjax.runs.event_failures import DIFFER
 from hhtjax.systems import kinematics
 
 MOST = 4  # levels; rounding and work grow with each

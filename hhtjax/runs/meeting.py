@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.seldom import choose, seldom
+from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, STAYS
 from hhtjax.runs.loop import resized_step
-from hhtjax.runs.solution import ALONG, CORNER, FINE, MANY, STAYS
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
 

@@ -8,6 +8,7 @@ import numpy as np
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
 from hhtjax.description.presentation import Table, all_known, between, brief, known, leaf_rows, shown
+from hhtjax.runs.event_failures import EVENTS
 from hhtjax.steppers.stepper import Info
 
 
@@ -76,31 +77,6 @@ QUANTITIES = (
 )  # fmt: skip
 MASS = (None, "symmetric", "positive definite")
 INTERNAL_STATE = 4  # among them
-FINE, MANY, STAYS, ALONG, CORNER, DIFFER = range(6)  # what may go wrong at an event
-EVENTS = {  # and what to do about it
-    MANY: (
-        "more than max_events in a step, the first of them event",
-        "A motion that comes to rest on a guard gives infinitely many: let it rest by a stiff force, or a constraint "
-        "in a run of its own. Else take a smaller dt, or a larger max_events",
-    ),
-    STAYS: (
-        "the motion stays beyond the guard of event",
-        "A body that rests there needs a stiff force, or a constraint in a run of its own. An event that turns nothing "
-        "back needs a guard that depends on the mode its switch changes. A force that jumps there needs a mode, too",
-    ),
-    ALONG: (
-        "no velocity changes the guard of event",
-        "An impact needs a guard that depends on q, and a motion that may follow it",
-    ),
-    CORNER: (
-        "another event happens at the same time as event",
-        "Impacts one after the other are not the same as at once: say what happens by one event with its own reset",
-    ),
-    DIFFER: (
-        "the runs that extrapolate joins do not meet the same events, the first of them event",
-        "Take a smaller dt, or leave extrapolate out",
-    ),
-}
 
 
 @shown

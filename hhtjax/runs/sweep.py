@@ -8,19 +8,14 @@ import numpy as np
 from jax import lax
 from jax.sharding import NamedSharding, PartitionSpec
 
-from hhtjax.description import thaw
-from hhtjax.numerics.checkpointed_scan import checkpoint
-from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.adaptive import Adaptive
-from hhtjax.runs.events import loop_with_events, with_told_events
-from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, show_progress
+from hhtjax.runs.loop import show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
-from hhtjax.steppers.stepper import join_info
-from hhtjax.systems.flat_system import flatten
-from hhtjax.xla import on_scalars, one_kernel, or_plain
+from hhtjax.runs.sweep_member import run_member
+from hhtjax.xla import or_plain
 
 
 def sweep(
@@ -139,8 +134,8 @@ def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_sam
     axes = [0 if flag else None for flag in mapped]
 
     def member(leaves, dt, substeps, longest):
-        data = jax.tree.unflatten(structure, leaves)
-        return _run(system, data, dt, substeps, longest, t0, num_samples, times, events, room)
+        grid = dt, substeps, longest, t0, num_samples, times
+        return run_member(system, jax.tree.unflatten(structure, leaves), *grid, events, room)
 
     def block(leaves, dts, substeps, numbered):
         number, members = numbered
@@ -159,9 +154,8 @@ def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_sam
     runs = jax.tree.map(lambda x: x.reshape(dealt.size, *x.shape[2:])[back], runs)
     if times is None:
         times = t0 + H * jnp.arange(num_samples + 1).astype(dtype)
-    if events is not None and any(event.terminal for event in events):
-        return runs
-    return runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))
+    ends = any(event.terminal for event in events or ())  # then each has times of its own
+    return runs if ends else runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))
 
 
 def _by_many(hand, mesh):
@@ -170,77 +164,3 @@ def _by_many(hand, mesh):
     hands = jax.shard_map(hand, mesh=mesh, in_specs=(spread, shared, shared, shared), out_specs=spread, check_vma=False)
     # gathered before they are put in order: a sum over devices would lose the sign of zeros
     return lambda *args: lax.with_sharding_constraint(hands(*args), NamedSharding(mesh, shared))
-
-
-def _run(system, data, dt, substeps, longest, t0, num_samples, times, events, room):
-    """One member; it rests from `substeps` to `longest`, where its block still works.
-
-    With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval, and
-    after the first step there, where that is to know of the steps before.
-    """
-    stepper, q0, v0, params, z0 = *data[:3], thaw(data[3]), data[4]
-    flat, q, v = flatten("sweep", system, q0, v0, t0, params, z0)
-    resizes = times is not None and stepper.resizes
-    whole = in_two_parts if resizes else lambda *intervals: intervals
-    intervals = None if times is None else whole(times[:-1], dt, substeps, longest)
-    plain = loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
-    if events is not None:
-        loop = loop_with_events(plain, flat, stepper, events, params, *room)
-    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
-    keep = form.of(loop.keep)
-
-    def stepped(bound, sizes):
-        """The step of a member, which looks for events as long as it does not rest."""
-        if events is not None:
-            return form.of(loop.past(bound, sizes))
-        step = form.of(bound(params))
-        return lambda run, here: step(run)
-
-    def pace(run, interval):
-        """The step, and how many of them this member takes, and its block."""
-        if interval is None:
-            return stepped(loop.bound, loop.sizes), substeps, longest
-        t, h, mine, most, *part = interval
-        taken, last = part or (None, None)
-        count = run[1] if taken is None else run[1] - taken
-
-        def bound(params):
-            return advance_from(flat, stepper, q.dtype, params, t, h, count, last)
-
-        return stepped(bound, lambda _: (h, h if last is None else last)), mine, most
-
-    def part(carry, here):
-        advance, substeps, longest = pace(carry[0], here)
-
-        def step(i, carry):
-            run, info = carry
-            here = i < substeps
-            after, more = advance(run, here)
-            new, old = (after[:3], join_info(info, more)), (run[:3], info)
-            run, info = jax.tree.map(partial(jnp.where, here), new, old)
-            return (*run, *after[3:]), info  # what events made is of steps that were taken
-
-        return repeat(step, carry, longest), None
-
-    @checkpoint
-    def interval(run, here):
-        carry = run, loop.no_info
-        (run, info), _ = lax.scan(part, carry, here) if resizes else part(carry, here)
-        return run, (keep(run[0]), info)
-
-    def samples(carry):
-        return lax.scan(interval, carry, intervals, num_samples)
-
-    (_, _, failure, *met), (path, info) = one_kernel(samples, form.tree)
-    start = loop.carry[0]
-    flaw = flaw_at_start(system, flat, start, params)
-    solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
-    return with_told_events(flat, solution, form.joined(met[0])) if met else solution
-
-
-def in_two_parts(t, dt, substeps, longest):
-    """The intervals (K, 2), the first step of each apart; behind them the steps before it, and the size of the last."""
-    last = jnp.concatenate([dt[:1], dt[:-1]])
-    firsts = t, dt, jnp.ones_like(substeps), jnp.ones_like(longest), jnp.zeros_like(substeps), last
-    others = t, dt, substeps - 1, longest - 1, jnp.ones_like(substeps), dt
-    return tuple(map(partial(jnp.stack, axis=1), zip(firsts, others, strict=True)))

@@ -35,15 +35,14 @@ True
 The door
 --------
 
-The rest of the library knows thirteen functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows twelve functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
-    any_member(asked)         a condition that a batch has as a whole
     structural(x)             x, whose zeros are such by structure
-    largest_in_batch(x)       x, but under vmap the largest over the members
+    largest_in_batch(x)       x, of which a batch has the largest, as a whole
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     explain(f, *args)         what became of the loops of a program
@@ -77,7 +76,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 
 from hhtjax.xla.explanation import Explanation, explain
 from hhtjax.xla.gate import or_plain, plain
-from hhtjax.xla.kernels import any_member, choose, largest_in_batch, one_kernel, staged, structural
+from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
 from hhtjax.xla.recording import NotListed, listed
@@ -90,7 +89,6 @@ __all__ = [
     "Listing",
     "NotListed",
     "Scalar",
-    "any_member",
     "choose",
     "explain",
     "largest_in_batch",

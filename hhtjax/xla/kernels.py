@@ -102,26 +102,27 @@ def structural(x):
     return structural_p.bind(x) if is_on() else jnp.asarray(x)
 
 
-def any_member(asked):
-    """Whether any member of a batch asks: the same for all of them, a single run's own answer.
+def largest_in_batch(x):
+    """The scalar x; under vmap the largest over the members, the same for all of them.
 
-    A condition on it is one in a batch too, where vmap makes a choice of any other: what few members need in few steps
-    costs nothing in the others. The branch has to leave alone what members hold that have not asked.
+    A bound of a loop that is the same for all, or a condition: of a condition of their own vmap makes a choice, and
+    every member takes both ways in every step. Here what few members need in few steps costs nothing in the others; the
+    branch has to leave alone what members hold that have not asked for it.
 
     Args:
-        asked: a boolean scalar.
+        x: an integer or boolean scalar.
 
     Returns:
-        A boolean scalar, which vmap does not give an axis.
+        A scalar, which vmap gives no axis.
 
     Raises:
-        TypeError: asked is no array.
+        TypeError: x is no array.
 
-    >>> seldom = jax.vmap(lambda x: jax.lax.cond(any_member(x < 0), lambda x: jnp.maximum(x, 0), lambda x: x, x))
+    >>> seldom = jax.vmap(lambda x: lax.cond(largest_in_batch(x < 0), lambda x: jnp.maximum(x, 0), lambda x: x, x))
     >>> print(seldom(jnp.array([1.0, -2.0])))
     [1. 0.]
     """
-    return any_member_p.bind(asked)
+    return largest_p.bind(x)
 
 
 def named(name, f):
@@ -145,16 +146,6 @@ inside_p.def_abstract_eval(lambda x: x.update(shape=(), dtype=np.dtype(bool), we
 batching.primitive_batchers[inside_p] = lambda values, axes: (inside_p.bind(*values), None)
 
 
-def largest_in_batch(x):
-    """The array x; under vmap the largest over the members, the same for all: a bound of a loop that they share.
-
-    >>> import jax
-    >>> print(jax.vmap(lambda x: largest_in_batch(x))(jnp.array([2, 5, 3])))
-    [5 5 5]
-    """
-    return largest_p.bind(x)
-
-
 structural_p = Primitive("hhtjax_structural")
 structural_p.def_impl(jnp.asarray)
 structural_p.def_abstract_eval(lambda x: x)
@@ -173,12 +164,3 @@ watch_p.def_impl(lambda x: x)
 watch_p.def_abstract_eval(lambda x: x)
 ad.deflinear2(watch_p, lambda cotangent, _: (watch_p.bind(cotangent),))
 batching.defvectorized(watch_p)
-
-
-any_member_p = Primitive("hhtjax_any_member")
-any_member_p.def_impl(jnp.asarray)
-any_member_p.def_abstract_eval(lambda x: x)
-batching.primitive_batchers[any_member_p] = lambda values, axes: (
-    any_member_p.bind(jnp.any(values[0], axis=axes[0])),
-    None,
-)

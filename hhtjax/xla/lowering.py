@@ -19,7 +19,7 @@ from jaxlib.mlir.dialects import func, stablehlo
 
 from hhtjax.xla.gate import is_possible
 from hhtjax.xla.inspection import ATTRIBUTES, Inspection, callee, directly_in, form_inside
-from hhtjax.xla.kernels import KERNEL, any_member_p, inside_p, largest_p, structural_p, watch_p
+from hhtjax.xla.kernels import KERNEL, inside_p, largest_p, structural_p, watch_p
 from hhtjax.xla.products import size, written_out
 from hhtjax.xla.sines import write_sines
 from hhtjax.xla.trial import Module
@@ -204,5 +204,4 @@ uncached: Any = {"cacheable": False} if is_possible else {}
 mlir.register_lowering(watch_p, _lower, **uncached)
 mlir.register_lowering(inside_p, _lower_inside, **uncached)
 mlir.register_lowering(structural_p, lambda ctx, x: [x])
-mlir.register_lowering(any_member_p, lambda ctx, x: [x])
 mlir.register_lowering(largest_p, lambda ctx, x: [x])

@@ -1,0 +1,219 @@
+"""Runs with events: failures by name, sweeps, dense output, extrapolation, uneven steps; and what does not change."""
+
+import event_problems
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from event_problems import G
+from helpers import check_message
+
+import hhtjax
+from hhtjax import Event, FirstOrderSystem, LinearSystem, SimulationError, System, hht, impact, rowda, simulate, sweep
+
+BALL = System(jnp.ones(1), lambda q, v, t, p: 0 * q - p["g"])
+FLOOR = Event(lambda q, v, t, p: q[0] - p["floor"], impact("e"))
+
+
+def come_to_rest(e, num_steps):
+    return simulate(
+        BALL, hht(), jnp.ones(1), jnp.zeros(1), {"g": G, "floor": 0.0, "e": e}, dt=2.0 / num_steps,
+        num_steps=num_steps, events=[FLOOR])  # fmt: skip
+
+
+def test_a_motion_to_rest_fails_by_name():
+    """With e = .5 the bounces pile up at t = 3 sqrt(2/g): the run is right before that step, and NaN after."""
+    run = come_to_rest(0.5, 200)
+    check_message(SimulationError, "step 136 (to t = 1.36) failed: more than max_events in a step", run.check)
+    assert np.isnan(run.q[136:]).all()
+    assert np.nanmin(run.q) > -1e-9
+    fall, up = np.sqrt(2 / G), 0.5 * np.sqrt(2 * G)
+    assert abs(run.q[60, 0] - (up * (0.6 - fall) - G / 2 * (0.6 - fall) ** 2)) < 1e-12
+
+
+def test_resting_contact_fails_by_name():
+    run = come_to_rest(0.0, 200)
+    check_message(
+        SimulationError, "step 46 (to t = 0.46) failed: the motion stays beyond the guard of event 0", run.check
+    )
+    assert np.isnan(run.q[46:]).all()
+    assert np.nanmin(run.q) > -1e-9
+
+
+def test_a_corner_fails_by_name():
+    walls = [Event(lambda q, v, t, p, i=i: q[i], impact(0.5)) for i in range(2)]
+    free = System(jnp.ones(2), lambda q, v, t, p: 0 * q)
+    run = simulate(free, hht(), jnp.full(2, 0.35), jnp.full(2, -1.0), dt=0.1, num_steps=10, events=walls)
+    with pytest.raises(SimulationError, match=r"step 4 .* failed: another event happens at the same time as event"):
+        run.check()
+    assert np.isnan(run.q[4:]).all()
+
+
+def test_an_impact_that_nothing_can_follow_fails_by_name():
+    clock = Event(lambda q, v, t, p: 0.25 - t + 0 * q[0], impact(0.5))
+    run = simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), {"g": 0.0}, dt=0.1, num_steps=5, events=[clock])
+    check_message(SimulationError, "step 3 (to t = 0.3) failed: no velocity changes the guard of event 0", run.check)
+
+
+def test_no_event_no_change():
+    scene = event_problems.double_pendulum.free()
+    far = Event(lambda q, v, t, p: q[0] - q[1] + 1e6, impact(0.5))
+    q0 = jnp.array([1.2, 0.4])
+    runs = [
+        simulate(scene.system, hht(), q0, jnp.zeros(2), scene.params, dt=1e-3, num_steps=500, **options)
+        for options in ({}, {"events": [far]})
+    ]
+    assert bool(jnp.all(runs[0].q == runs[1].q))
+    assert runs[1].events.count == 0
+    assert runs[0].events is None
+    assert runs[0].failure.event is None
+
+
+def test_a_sweep_is_its_members():
+    problem = event_problems.dragged_ball()
+    e, q0 = np.linspace(0.7, 0.9, 5), np.linspace(0.6, 1.4, 5)[:, None]
+    dts = np.array([0.1, 0.02, 0.013, 0.05, 0.007])
+    params = {**problem.params, "e": e}
+    options = {"in_axes": (None, 0, None, {"c": None, "e": 0, "floor": None}), "events": problem.events}
+    runs = sweep(problem.system, hht(), q0, problem.v0, params, dts=dts, duration=1.5, num_samples=3, **options)
+    runs.check()
+    assert runs.events.t.shape == (5, 100)
+    for i in (0, 3):
+        one = {**problem.params, "e": e[i]}
+        steps = round(1.5 / float(runs.dt[i]))
+        run = simulate(
+            problem.system, hht(), q0[i], problem.v0, one, dt=1.5 / steps, num_steps=steps, save_every=steps // 3,
+            events=problem.events)  # fmt: skip
+        assert run.events.count == runs.events.count[i]
+        assert abs(run.q - runs.q[i]).max() < 1e-12
+        assert abs(run.events.t[0] - runs.events.t[i, 0]) < 1e-12
+    at_times = sweep(problem.system, hht(), q0, problem.v0, params, dts=dts, times=[0.4, 0.45, 1.5], **options)
+    at_times.check()
+    assert abs(at_times.q[-1, -1] - runs.q[-1, -1]).max() < 1e-4
+
+
+def test_a_member_that_fails_leaves_the_others_alone():
+    e = np.array([0.5, 1.0, 0.9])
+    params = {"g": G, "floor": 0.0, "e": e}
+    runs = sweep(
+        BALL, hht(), np.ones(1), np.zeros(1), params, dts=np.full(3, 0.01), duration=1.6, num_samples=4,
+        in_axes=(None, None, None, {"g": None, "floor": None, "e": 0}), events=[FLOOR])  # fmt: skip
+    assert [int(x) > 0 for x in runs.failure.step] == [True, False, False]
+    check_message(SimulationError, "member 0 (1 of 3 failed)", runs.check)
+    assert bool(jnp.all(jnp.isfinite(runs.q[1:])))
+
+
+def test_the_same_numbers_on_plain_jax():
+    problem = event_problems.walled_pendulum()
+
+    def end(q0):
+        run = simulate(problem.system, hht(), q0, problem.v0, dt=0.03, num_steps=50, events=problem.events)
+        return jnp.concatenate([run.q[-1], run.v[-1], run.multipliers[-1], run.events.t[:1]])
+
+    found = end(problem.q0)
+    with hhtjax.plain():
+        plain = end(problem.q0)
+    assert abs(found - plain).max() < 1e-12
+
+
+def test_float32_stays_float32():
+    params = {"g": np.float32(9.81), "floor": np.float32(0), "e": np.float32(0.8)}
+    with pytest.warns(hhtjax.PrecisionWarning):
+        run = simulate(
+            BALL, hht(), np.ones(1, np.float32), np.zeros(1, np.float32), params, dt=0.01, num_steps=100, events=[FLOOR]
+        )
+    run.check()
+    assert {x.dtype for x in jax.tree.leaves((run.q, run.v, run.events.t, run.events.after))} == {np.dtype(np.float32)}
+    assert abs(float(run.events.t[0]) - np.sqrt(2 / 9.81)) < 1e-6
+
+
+def test_a_second_call_compiles_nothing():
+    traced = []
+
+    def guard(q, v, t, p):
+        traced.append(1)
+        return q[0] - p["floor"]
+
+    floor = Event(guard, impact("e"))
+
+    def call(e):
+        params = {"g": G, "floor": 0.0, "e": e}
+        return simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=5, events=[floor])
+
+    call(0.5)
+    before = len(traced)
+    call(0.6)
+    assert len(traced) <= before + 1  # the shapes are looked at anew
+
+
+def test_what_is_between_the_saved_times():
+    params = {"g": G, "floor": 0.0, "e": 0.8}
+    run = simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=12, save_every=3, events=[FLOOR])
+    fall = np.sqrt(2 / G)
+    first, second = 0.8 * G * fall, 0.64 * G * fall
+    times = np.linspace(0, 1.2, 60)
+    again = fall + 2 * first / G
+    since, up = np.select([times < fall, times < again], [times, times - fall], times - again), 0.0
+    up = np.select([times < fall, times < again], [0.0, first], second)
+    q = np.where(times < fall, 1.0, 0.0) + up * since - G / 2 * since**2
+    found = hhtjax.interpolate(run, times)
+    assert abs(found.q[:, 0] - q).max() < 1e-12
+    assert abs(found.v[:, 0] - (up - G * since)).max() < 1e-12
+
+
+def test_extrapolation_across_impacts():
+    """The part of dt^2 goes; what is left of order 3 depends on where in its step an event falls."""
+    problem = event_problems.dragged_ball()
+
+    def error(levels):
+        run = simulate(
+            problem.system, hht(0.0), problem.q0, problem.v0, problem.params, dt=1.5 / 40, num_steps=40,
+            extrapolate=levels, events=problem.events)  # fmt: skip
+        run.check()
+        return abs(run.q[-1, 0] - problem.end[0])
+
+    assert error(2) < error(1) / 100
+
+
+def test_runs_that_meet_other_events_cannot_be_joined():
+    """A guard that is below zero for so short a time that only the finer steps see it."""
+    short = Event(lambda q, v, t, p: 1.0 - 2.0 * jnp.exp(-(((t - 0.2) / 0.02) ** 2)) + 0 * q[0])
+    run = simulate(BALL, hht(), np.zeros(1), np.zeros(1), {"g": G}, dt=0.4, num_steps=4, extrapolate=2, events=[short])
+    check_message(SimulationError, "the runs that extrapolate joins do not meet the same events", run.check)
+
+
+def test_uneven_steps_and_modes_of_a_linear_system():
+    """A stop that is a spring, switched by a mode; a LinearSystem is factorised anew where its params change."""
+    system = LinearSystem(M=jnp.ones(1), K=lambda p: 4.0 * jnp.ones(1) + 96.0 * p["on"] * jnp.ones(1))
+    stop = Event(lambda q, v, t, p: q[0] * (2 * p["on"] - 1), switch=lambda p: p | {"on": 1.0 - p["on"]})
+    times = 2.0 * np.linspace(0, 1, 401) ** 1.3
+    run = simulate(system, hht(0.0), -np.ones(1), np.zeros(1), {"on": 0.0}, dt=np.diff(times), events=[stop])
+    run.check()
+    quarter = np.pi / 4  # with 2 rad/s up to 0, then half a swing with 10 rad/s, and so on
+    assert abs(run.events.t[:2] - np.array([quarter, quarter + np.pi / 10])).max() < 1e-4
+    assert abs(run.q[-1, 0] + np.sin(2 * (2.0 - quarter - np.pi / 10))) < 1e-3
+
+
+def test_events_of_a_first_order_system():
+    """A clock that is set back at 1; and one that is only noted."""
+    clock = FirstOrderSystem(lambda y, t, p: 1.0 + 0 * y)
+    back = Event(lambda y, t, p: 1.0 - y[0], lambda y, t, p: 0 * y)
+    run = simulate(clock, hht(), np.zeros(1), dt=0.3, num_steps=12, events=[back])
+    run.check()
+    assert abs(run.events.t[:3] - np.array([1.0, 2.0, 3.0])).max() < 1e-13
+    assert run.events.count == 3
+    assert abs(jnp.sin(np.pi * (run.q[:, 0] - run.t))).max() < 1e-12  # at 3 s it is 0 or 1
+
+
+def test_an_event_that_is_noted_changes_nothing_and_is_met_once():
+    spring = System(jnp.ones(1), lambda q, v, t, p: -q)
+    section = Event(lambda q, v, t, p: q[0])
+    runs = [
+        simulate(spring, rowda(), np.ones(1), np.zeros(1), dt=0.05, num_steps=400, **options)
+        for options in ({}, {"events": [section]})
+    ]
+    runs[1].check()
+    t = np.asarray(runs[1].events.t[:4])
+    assert runs[1].events.count == 3
+    assert abs(t[:3] - np.pi * np.array([0.5, 2.5, 4.5])).max() < 1e-3
+    assert abs(runs[0].q - runs[1].q).max() < 1e-5
