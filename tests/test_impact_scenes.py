@@ -60,8 +60,8 @@ def of_double_pendulum(p):
 
     def rate(t, y, on):
         s = 1.5 * np.sin(y[0] - y[1])
-        weight = -p["g"] * np.cos(y[:2]) * [2.0, 1.5]
-        return np.append(y[2:], np.linalg.solve(mass(y), weight + [-s * y[3] ** 2, s * y[2] ** 2]))
+        weight = -p["g"] * np.cos(y[:2]) * np.array([2.0, 1.5])
+        return np.append(y[2:], np.linalg.solve(mass(y), weight + s * np.array([-(y[3] ** 2), y[2] ** 2])))
 
     def outcome(i, t, y, on):
         n = np.array([1.0, -1.0])
@@ -94,7 +94,8 @@ def reference(name, times):
     """q and v at the times, and the times of events."""
     scene, (build, y0) = SCENES[name], SOLVED[name]
     p = {key: np.asarray(x).tolist() for key, x in scene.params.items()}
-    path, found = motion_with_events(*build(p), y0, times, (0.0, 0.0))
+    rate, guards, outcome = build(p)
+    path, found = motion_with_events(rate, guards, outcome, y0, times, (0.0, 0.0))
     n = len(y0) // 2
     q, v = path[:, :n], path[:, n:]
     if name == "pendulum":

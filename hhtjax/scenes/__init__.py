@@ -9,9 +9,9 @@
 (1001, 2)
 
 A scene of your own is a file with plain functions, `mass(q, params)` and `force(q, v, t, params)`, and at its end a
-function that returns a `Scene` of them with numbers in SI units, or an `InternalScene`, which has a z0 too,
-or an `EventScene`, which has events. The docstring gives the equations and their source; the test compares with something that was not computed by this library:
-a closed form, a table in print, or SciPy.
+function that returns a `Scene` of them with numbers in SI units, an `InternalScene`, which has a z0 too, or an
+`EventScene`, which has events. The docstring gives the equations and their source; the test compares with something
+that was not computed by this library: a closed form, a table in print, or SciPy.
 """
 
 from hhtjax.scenes import arm as arm

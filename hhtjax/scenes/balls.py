@@ -2,7 +2,7 @@
 
     m w = -m g - c |v| v,   v+ = -e v  at q = floor
 
-Without drag (c = 0), from rest at q = h over the floor, impact k = 1, 2, ... is at t_k = T (1/2 + e + ... + e^(k-1)) with
+Without drag (c = 0), from rest at q = h over the floor, impact k = 1, 2, ... is at t_k = T (1/2 + e + ... + e^(k-1)),
 T = sqrt(8 h/g), and the ball is at rest from T (1/2 + e/(1 - e)) on: infinitely many impacts in a finite time (Zeno).
 """
 

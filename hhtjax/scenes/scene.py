@@ -35,7 +35,7 @@ class EventScene(NamedTuple):
         events: what happens on the way, a tuple of `Event`.
     """
 
-    system: System
+    system: System | LinearSystem
     params: Any
     q0: Any
     v0: Any
