@@ -11,6 +11,7 @@ TOLERANCES: dict = {"rtol": 2.3e-14, "atol": 1e-14, "max_step": 0.01}
 SCENES = {
     "ball": balls.bouncing(),
     "bump stop": bump_stop.bump_stop(),
+    "bump stop without damper": bump_stop.bump_stop(),
     "backlash": bump_stop.backlash(),
     "impact oscillator": impact_oscillator.driven(),
     "double pendulum": double_pendulum.stopped(),
@@ -104,6 +105,7 @@ def of_pendulum(p):
 SOLVED = {
     "ball": (of_ball, [1.0, 0.0]),
     "bump stop": (of_stops, [0.0, 3.0]),
+    "bump stop without damper": (of_stops, [0.0, 3.0]),
     "backlash": (of_stops, [0.0, 0.0]),
     "impact oscillator": (of_oscillator, [-0.5, 0.0]),
     "double pendulum": (of_double_pendulum, [0.0] * 4),

@@ -1,0 +1,161 @@
+"""Error against the step in five scenes with events, beside the same with events that are not located.
+
+One program for all steps of a scene and method: so many steps as the finest run has, of which the coarser ones, whose
+steps are longer, are looked at up to the end of the scene.
+"""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hhtjax
+from experiments.events.reference import SCENES, reference
+from experiments.report import COLOURS, MARKERS
+from hhtjax.plot import legend, subplots
+from hhtjax.scenes import bump_stop
+
+METHODS = {"hht": hhtjax.hht(), "rowda": hhtjax.rowda()}
+ORDERS = {"hht": 2, "rowda": 3}
+COARSEST = {
+    "ball": 50, "double pendulum": 100, "pendulum": 50, "bump stop": 100, "bump stop without damper": 100,
+}  # fmt: skip
+DOUBLINGS = 6
+QUANTITIES = {"q": "m", "v": "m/s", "multipliers": "N/m"}
+
+
+def by_position(q, v, t, params):
+    """The bump stop with its mode decided by q: no event."""
+    return bump_stop.with_upper(q, v, t, params | {"upper": jnp.where(q > params["gap"], 1.0, 0.0)})
+
+
+def bounced_after(scene, stepper, dt, num_steps):
+    """q and v of the ball, turned back at the end of the step in which it got below the floor."""
+
+    def step(state, _):
+        state, _ = stepper.step(scene.system, state, scene.params, dt)
+        turned = stepper.init(scene.system, state.q, -scene.params["e"] * state.v, scene.params, dt)
+        hit = (state.q[0] < 0) & (state.v[0] < 0)
+        state = jax.tree.map(lambda x, y: jnp.where(hit, x, y), turned._replace(t=state.t), state)
+        return state, (state.q, state.v)
+
+    start = stepper.init(scene.system, scene.q0, scene.v0, scene.params, dt)
+    return jax.lax.scan(step, start, length=num_steps)[1]
+
+
+@cache
+def located(name, method, num_steps):
+    """A function of dt: t, q, v, multipliers and the number of events in the scene's time."""
+    scene = SCENES[name]
+    params = scene.params | ({"C": 0.0} if "without" in name else {})
+
+    def run(dt):
+        found = hhtjax.simulate(
+            scene.system, METHODS[method], scene.q0, scene.v0, params, dt=dt, num_steps=num_steps, events=scene.events
+        )
+        paths = {"q": found.q, "v": found.v}
+        if found.multipliers is not None:
+            paths["multipliers"] = found.multipliers
+        return paths, jnp.sum(found.events.t <= scene.duration)
+
+    return jax.jit(run)
+
+
+@cache
+def not_located(name, method, num_steps):
+    """The same with the mode by position, or with the ball turned back at the end of a step."""
+    scene, stepper = SCENES[name], METHODS[method]
+    system = hhtjax.System(bump_stop.mass, by_position)
+
+    def run(dt):
+        if name == "ball":
+            q, v = bounced_after(scene, stepper, dt, num_steps)
+            q, v = (jnp.concatenate([x[None], y]) for x, y in ((scene.q0, q), (scene.v0, v)))
+        else:
+            found = hhtjax.simulate(system, stepper, scene.q0, scene.v0, scene.params, dt=dt, num_steps=num_steps)
+            q, v = found.q, found.v
+        return {"q": q, "v": v}, 0
+
+    return jax.jit(run)
+
+
+def exact(name, times):
+    """Paths by quantity, and the times of events."""
+    changed = {"C": 0.0} if "without" in name else {}
+    q, v, found = reference(name, times, **changed)
+    paths = {"q": q, "v": v}
+    if name == "pendulum":
+        p = SCENES[name].params
+        paths["multipliers"] = (p["m"] * (p["g"] * q[:, 1:] - np.sum(v**2, axis=1, keepdims=True))) / p["l"] ** 2
+    return paths, found
+
+
+def errors(paths, wanted, times, events):
+    """The largest by quantity, at times farther than a step from all events, where v jumps."""
+    away = np.min(np.abs(times[:, None] - np.array(events)), axis=1) > times[1]
+    return {key: float(np.max(np.abs(np.asarray(paths[key])[: len(times)] - x)[away])) for key, x in wanted.items()}
+
+
+def run(report, fast):
+    """All scenes and methods, and a figure."""
+    rows = []
+    for name, fewest in COARSEST.items():
+        sizes = [fewest * 2**i for i in range(3 if fast else DOUBLINGS)]
+        times = np.linspace(0, SCENES[name].duration, sizes[-1] + 1)
+        paths, events = exact(name, times)
+        for way, make in (("located", located), ("not located", not_located)):
+            for method in METHODS:
+                if (name == "pendulum" and method == "rowda") or (
+                    way != "located" and name not in ("ball", "bump stop")
+                ):
+                    continue
+                row = {"scene": name, "method": method, "way": way, "h_s": [], "events": len(events), "errors": {}}
+                march = make(name, method, sizes[-1])
+                for size in sizes:
+                    every = sizes[-1] // size
+                    dt = SCENES[name].duration / size
+                    found, count = march(dt)
+                    row["h_s"].append(dt)
+                    row["right_number_of_events"] = row.get("right_number_of_events", True) and (
+                        way != "located" or int(count) == len(events)
+                    )
+                    wanted = {key: x[::every] for key, x in paths.items()}
+                    for key, error in errors(found, wanted, times[::every], events).items():
+                        row["errors"].setdefault(key, []).append(error)
+                row["slopes"] = {key: slope(row["h_s"], x) for key, x in row["errors"].items()}
+                rows.append(row)
+                report.progress(f"{name}, {method}, {way}: {row['slopes']}")
+    figure(report, rows)
+    return rows
+
+
+def slope(h, error):
+    """Of the line through the logarithms."""
+    return float(np.polyfit(np.log(h), np.log(error), 1)[0])
+
+
+def figure(report, rows):
+    """A panel for each quantity."""
+    drawn, axes = subplots(1, 3, width=180, height=95)
+    names = list(COARSEST)
+    for panel, (key, unit) in zip(axes, QUANTITIES.items(), strict=True):
+        for row in rows:
+            if key not in row["errors"]:
+                continue
+            i = names.index(row["scene"])
+            style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 3, "lw": 1}
+            style |= {"ls": {"hht": "-", "rowda": "--"}[row["method"]]}
+            if row["way"] != "located":
+                style |= {"ls": {"hht": "-", "rowda": "--"}[row["method"]], "mfc": "white", "alpha": 0.6}
+            label = row["scene"] if (row["method"], row["way"]) == ("hht", "located") else None
+            panel.loglog(row["h_s"], row["errors"][key], label=label, **style)
+        symbol = "multiplier" if key == "multipliers" else key
+        panel.set(
+            xlabel="step (s)",
+            ylabel=f"largest error of {symbol} ({unit}; angles: rad)"
+            if key == "q"
+            else f"largest error of {symbol} ({unit})",
+        )
+    legend(axes[0])
+    report.figure("events_order", drawn)
