@@ -1,7 +1,7 @@
 """The periodic orbit of the impact oscillator with one impact in n periods of its drive, by closed forms.
 
-Between impacts w + c v + k q = A cos(W t) (m = 1). With d = c/2, w_d = sqrt(k - d^2), T = 2 pi n/W, counted from behind an
-impact, q = exp(-d t) (a cos w_d t + b sin w_d t) + C cos W t - S sin W t. That q is at the wall at 0 and T, with the
+Between impacts w + c v + k q = A cos(W t), m = 1. With d = c/2, w_d = sqrt(k - d^2), T = 2 pi n/W, and t from behind an
+impact on, q = exp(-d t) (a cos w_d t + b sin w_d t) + C cos W t - S sin W t. That q is at the wall at 0 and T, with the
 velocities -e V and V, is linear in a, b, S and V over a; C^2 + S^2 is the square of the response: a quadratic for a.
 
 The Jacobian of the map from one impact to the next (of a period) is S exp(F T), with the saltation matrix
@@ -43,11 +43,8 @@ def orbits(p, W, n=1):
     end = E * (start * cos - (d * r + w_d) * sin)
     V, S = (end - start) / (1 + e), (start + e * (end - start) / (1 + e)) / W
     response = p["A"] ** 2 / ((p["k"] - W**2) ** 2 + (p["c"] * W) ** 2)
-    found = []
-    for a in np.roots([1 + S**2, -2 * wall, wall**2 - response]):
-        if np.isreal(a) and a.real * V > 0:
-            found.append(_orbit(p, W, T, (a.real, r, V, S, w_d)))
-    return found
+    roots = np.roots([1 + S**2, -2 * wall, wall**2 - response])
+    return [_orbit(p, W, T, (a.real, r, V, S, w_d)) for a in roots if np.isreal(a) and a.real * V > 0]
 
 
 def _orbit(p, W, T, numbers):
