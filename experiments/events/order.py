@@ -13,16 +13,16 @@ import numpy as np
 import hhtjax
 from experiments.events.reference import SCENES, reference
 from experiments.report import COLOURS, MARKERS
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import subplots
 from hhtjax.scenes import bump_stop
 
 METHODS = {"hht": hhtjax.hht(), "rowda": hhtjax.rowda()}
-ORDERS = {"hht": 2, "rowda": 3}
 COARSEST = {
     "ball": 50, "double pendulum": 100, "pendulum": 50, "bump stop": 100, "bump stop without damper": 100,
 }  # fmt: skip
 DOUBLINGS = 6
-QUANTITIES = {"q": "m", "v": "m/s", "multipliers": "N/m"}
+QUANTITIES = {"q": "q (m, rad)", "v": "v (m/s, rad/s)", "multipliers": "the multiplier (N/m)"}
+LINES = {"hht": "-", "rowda": "--"}
 
 
 def by_position(q, v, t, params):
@@ -136,26 +136,29 @@ def slope(h, error):
 
 
 def figure(report, rows):
-    """A panel for each quantity."""
-    drawn, axes = subplots(1, 3, width=180, height=95)
+    """A panel for each quantity, and one for what is not located."""
+    drawn, axes = subplots(2, 2, width=180, height=150)
     names = list(COARSEST)
-    for panel, (key, unit) in zip(axes, QUANTITIES.items(), strict=True):
+
+    def draw(panel, row, key, label, **more):
+        i = names.index(row["scene"])
+        style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 3.5, "lw": 1, "ls": LINES[row["method"]]}
+        panel.loglog(row["h_s"], row["errors"][key], label=label, **(style | more))
+
+    for panel, (key, unit) in zip(axes.flat, QUANTITIES.items(), strict=False):
         for row in rows:
-            if key not in row["errors"]:
-                continue
-            i = names.index(row["scene"])
-            style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 3, "lw": 1}
-            style |= {"ls": {"hht": "-", "rowda": "--"}[row["method"]]}
-            if row["way"] != "located":
-                style |= {"ls": {"hht": "-", "rowda": "--"}[row["method"]], "mfc": "white", "alpha": 0.6}
-            label = row["scene"] if (row["method"], row["way"]) == ("hht", "located") else None
-            panel.loglog(row["h_s"], row["errors"][key], label=label, **style)
-        symbol = "multiplier" if key == "multipliers" else key
-        panel.set(
-            xlabel="step (s)",
-            ylabel=f"largest error of {symbol} ({unit}; angles: rad)"
-            if key == "q"
-            else f"largest error of {symbol} ({unit})",
-        )
-    legend(axes[0])
+            if key in row["errors"] and row["way"] == "located":
+                draw(panel, row, key, row["scene"] if row["method"] == "hht" else None)
+        panel.set_ylabel(f"error of {unit}")
+    compared = [name for name in names if any((r["scene"], r["way"]) == (name, "not located") for r in rows)]
+    for row in rows:
+        if row["scene"] in compared:
+            found = row["way"] == "located"
+            draw(axes[1, 1], row, "q", None, **({} if found else {"mfc": "white", "alpha": 0.7}))
+    axes[1, 1].set_ylabel("error of q (m), hollow: not located")
+    for panel in axes.flat:
+        panel.set_xlabel("step (s)")
+    lines = [axes[0, 0].plot([], [], color="black", ls=line, lw=1, label=method)[0] for method, line in LINES.items()]
+    handles = [line for line in axes[0, 0].lines if line not in lines and line.get_label()[0] != "_"]
+    drawn.legend(handles=[*handles, *lines], loc="outside lower center", ncols=4)
     report.figure("events_order", drawn)

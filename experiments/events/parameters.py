@@ -1,6 +1,6 @@
 """Restitution and wall, and stiffness, damping and gap of a bump stop, from noisy records through the impacts.
 
-The records are DOP853's motions, solved from one event to the next, with noise of 1 % of their RMS: each has a noise and
+The records are DOP853's motions, solved from event to event, with noise of 1 % of their RMS: each has a noise and
 a guess of its own, in which every parameter is a third too large or too small (the wall and the restitution a tenth).
 They are fitted with a step and with half of it, and with a mode that is decided by the position instead of an event.
 """
@@ -19,10 +19,10 @@ from experiments.report import COLOURS, MARKERS
 from hhtjax.plot import legend, subplots
 from hhtjax.scenes import bump_stop
 
-NOISE, SAMPLES = 0.01, 200
-WALL = {"wall": 0.2}  # so that it has a logarithm
+NOISE, SAMPLES, STEPS = 0.01, 200, (2, 4)
+DRIVE = {"wall": 0.2, "W": 2.2}  # a wall with a logarithm; steady impacts
 PROBLEMS = {  # scene, changes of its params, what is fitted, guess over truth or its inverse
-    "impact oscillator": ("impact oscillator", WALL, ("e", "wall"), 1.1),
+    "impact oscillator": ("impact oscillator", DRIVE, ("e", "wall"), 1.1),
     "bump stop": ("bump stop", {}, ("K", "C", "gap"), 1.3),
     "bump stop, not located": ("bump stop", {}, ("K", "C", "gap"), 1.3),
 }
@@ -65,7 +65,7 @@ def run(report, fast):
         truth, guesses, measured, deviation = records(problem, number)
         off = {key: jnp.log(guess / truth[key]) for key, guess in guesses.items()}
         fits = []
-        for steps_per_sample in (1, 2):
+        for steps_per_sample in STEPS:
             each = [
                 fit_record(problem, {key: x[i] for key, x in guesses.items()}, measured[i], deviation, steps_per_sample)
                 for i in range(number)
@@ -75,7 +75,7 @@ def run(report, fast):
         found[problem] = judge(*fits, off) | {
             "truth": truth,
             "noise_m": deviation,
-            "h_s": SCENES[PROBLEMS[problem][0]].duration / SAMPLES,
+            "h_s": SCENES[PROBLEMS[problem][0]].duration / SAMPLES / STEPS[0],
             "cost_per_residual": float(jnp.median(fits[1].cost)) / SAMPLES,
         }
         print(problem)

@@ -68,16 +68,15 @@ def doubled(method, x, steps):
 
 
 @jax.jit
-def long_run(W):
-    """Speeds before the impacts behind the transient, NaN beyond, and whether it failed."""
-    x, dt = jnp.array([-0.3, 0.3]), 2 * jnp.pi / W / STEPS_OF_DIAGRAM
+def long_run(x, W):
+    """The end of a run from x, speeds before the impacts in each of its parts, NaN beyond."""
+    dt = 2 * jnp.pi / W / STEPS_OF_DIAGRAM
 
     def periods(x, _):
         run = over_periods(METHODS["hht"], x, W, dt, KEPT * STEPS_OF_DIAGRAM, 8 * KEPT)
-        return jnp.append(run.q[-1], run.v[-1]), (run.events.before[:, 0], run.failure.step > 0)
+        return jnp.append(run.q[-1], run.v[-1]), run.events.before[:, 0]
 
-    _, (speeds, failed) = jax.lax.scan(periods, x, length=REPEATS)
-    return speeds[-1], jnp.any(failed)
+    return jax.lax.scan(periods, x, length=REPEATS)
 
 
 def run(report, fast):
@@ -126,12 +125,15 @@ def start_of(orbit, p, W):
 
 
 def bifurcations(report, number):
-    """Speeds of impacts for each frequency, all from the same start."""
+    """Speeds of impacts for each frequency, started from where the one before ended; of failed runs the last ones."""
     frequencies, points, failed = np.linspace(FROM, TO, number), [], 0
+    x = start = jnp.array([-0.3, 0.3])
     for W in frequencies:
-        speeds, bad = long_run(W)
-        failed += bool(bad)
-        points.append(np.asarray(speeds)[np.isfinite(speeds)])
+        x, speeds = long_run(x, W)
+        if not np.all(np.isfinite(x)):
+            x, failed = start, failed + 1
+        met = [part[np.isfinite(part)] for part in np.asarray(speeds)]
+        points.append([part for part in met if len(part)][-1])
     report.progress(f"{number} frequencies, {failed} failed")
     return {"frequencies": number, "failed": failed, "W": frequencies, "speeds": points}
 

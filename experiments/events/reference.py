@@ -53,7 +53,7 @@ def of_ball(p):
     def rate(t, y, on):
         return [y[1], -p["g"] - p["c"] * abs(y[1]) * y[1]]
 
-    return rate, lambda t, y, on: [y[0]], lambda i, t, y, on: (np.array([0, -p["e"] * y[1]]), on)
+    return rate, lambda t, y, on: [y[0] - p["floor"]], lambda i, t, y, on: (np.array([p["floor"], -p["e"] * y[1]]), on)
 
 
 def of_stops(p):
@@ -72,7 +72,7 @@ def of_oscillator(p):
     def rate(t, y, on):
         return [y[1], p["A"] * np.cos(p["W"] * t) - p["k"] * y[0] - p["c"] * y[1]]
 
-    return rate, lambda t, y, on: [-y[0]], lambda i, t, y, on: (np.array([0, -p["e"] * y[1]]), on)
+    return rate, lambda t, y, on: [p["wall"] - y[0]], lambda i, t, y, on: (np.array([p["wall"], -p["e"] * y[1]]), on)
 
 
 def of_double_pendulum(p):
