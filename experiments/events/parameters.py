@@ -19,7 +19,7 @@ from experiments.report import COLOURS, MARKERS
 from hhtjax.plot import legend, subplots
 from hhtjax.scenes import bump_stop
 
-NOISE, SAMPLES, STEPS = 0.01, 200, (2, 4)
+NOISE, SAMPLES, STEPS = 0.01, 200, (4, 8)
 DRIVE = {"wall": 0.2, "W": 2.2}  # a wall with a logarithm; steady impacts
 PROBLEMS = {  # scene, changes of its params, what is fitted, guess over truth or its inverse
     "impact oscillator": ("impact oscillator", DRIVE, ("e", "wall"), 1.1),
@@ -85,30 +85,25 @@ def run(report, fast):
 
 
 def figure(report, found):
-    """Errors in units of the intervals' half-width, and how many intervals hold the truth."""
-    drawn, axes = subplots(1, 2, width=180, height=85)
-    labels, place = [], 0
+    """Errors of Richardson's values, and how many intervals hold the truth."""
+    drawn, axes = subplots(1, 2, width=180, height=90)
+    labels = []
     for i, (problem, numbers) in enumerate(found.items()):
-        for name, values in numbers["over_truth_with_interval"].items():
-            value, lower, upper = np.log(values)
-            error = 100 * value
-            axes[0].errorbar(
-                place + np.linspace(-0.3, 0.3, error.size), error, 50 * (upper - lower), fmt="none", lw=0.5,
-                color=COLOURS[i], label=problem if name == next(iter(numbers["truth"])) else None,
-            )  # fmt: skip
+        for name, (value, _, _) in numbers["over_truth_with_interval"].items():
+            error = 100 * np.abs(np.log(value))
+            spread = len(labels) + np.linspace(-0.3, 0.3, error.size)
+            label = problem if name == next(iter(numbers["truth"])) else None
+            axes[0].semilogy(spread, error, ".", ms=3, color=COLOURS[i], label=label)
             for j, (kind, by) in enumerate(numbers["covered"].items()):
-                style = {"color": COLOURS[i], "marker": MARKERS[j], "ms": 5, "ls": "none"}
-                axes[1].plot(place + 0.15 * (j - 1), 100 * by[name] / numbers["records"], **style)
-                if place == 0:
-                    axes[1].plot([], [], color="black", marker=MARKERS[j], ls="none", ms=5, label=f"steps: {kind}")
+                style = {"color": COLOURS[i], "marker": MARKERS[j], "ms": 4, "ls": "none"}
+                label = f"steps: {kind}" if not labels else None
+                axes[1].plot(len(labels) + 0.27 * (j - 1), 100 * by[name] / numbers["records"], label=label, **style)
             labels.append(name)
-            place += 1
     for panel in axes:
         panel.set_xticks(range(len(labels)), labels)
-    axes[0].axhline(0, color="black", lw=0.8)
-    axes[0].set_ylabel("error of Richardson's value,\nwith its 95 % interval (%)")
+    axes[0].set_ylabel("error of Richardson's value (%)")
     axes[1].axhline(95, color="black", lw=0.8)
-    axes[1].set(ylabel="truth inside the 95 % interval (%)", ylim=(0, 102))
+    axes[1].set(ylabel="truth inside the 95 % interval (%)", ylim=(0, 104))
     legend(axes[0])
     legend(axes[1])
     report.figure("events_parameters", drawn)
