@@ -1,4 +1,4 @@
-"""The ball beside others: MuJoCo's soft limit, and diffrax, whose events end a run, so that it is begun anew by hand."""
+"""The ball beside others: MuJoCo's soft limit, and diffrax, whose events end a run that is begun anew by hand."""
 
 import importlib.util
 
