@@ -1,7 +1,8 @@
 """Contacts with the stop as an event: the gallery's three scenes of them, located, and as impacts, beside the force.
 
-located: the same force with a mode in params that an event switches at the beginning and the end of a contact. impact:
-an event with a reset in the place of the force. All columns are graded by the motion of the force.
+located: the same force, with a mode in params that an event switches at the beginning and at the end of a contact,
+graded by the motion of the force. impact: an event with a reset, which the stiff force stands for, graded by the motion
+of a rigid stop, solved from impact to impact.
 """
 
 from typing import Any, NamedTuple
@@ -11,25 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
-from experiments.cells import FARTHEST, SAMPLES, relative_error, solve_reference
-from experiments.stability.dry import fewest_accurate
+from experiments.cells import FARTHEST, SAMPLES, Reference, relative_error, rms, solve_reference
+from experiments.events.reference import motion_with_events
 from experiments.stability.gallery import HALVINGS, METHODS, assess
-from experiments.stability.grades import ALPHAS, Outcome, cells, page, plain
+from experiments.stability.grades import ALPHAS, BLOWN_UP, GOOD, LETTERS, Outcome, cells, page, plain
 from experiments.stability.scenes import all_cases
 
 SHOWN = ("HHT\nauto", "Rosenbrock", "ROWDA")
-WAYS = ("located", "impact")
 MAX_EVENTS = 4
 CAUSES = {
-    "Hertz contact": "A contact takes 11 ms. Located, it still has to be resolved; an impact has no time of contact.",
-    "hard stop": "A contact takes 10 ms, and gives back all energy.",
-    "dissipative contact": "The impact has the restitution of the law of Hunt and Crossley at its own speed.",
+    "Hertz contact": "A contact of 11 ms has to be resolved, located or not; an impact takes no time.",
+    "hard stop": "The same, of 10 ms; beside the impacts only the slow oscillation is left to resolve.",
+    "dissipative contact": "The impact has the restitution of Hunt and Crossley's law at its speed.",
 }
 
 
 class Stop(NamedTuple):
-    """wall: allowed is q > wall. free: the force without contact; push: of the contact, of its depth and v; rebound: the
-    speed behind an impact of speed v."""
+    """wall: allowed is q > wall. free: the force without contact; push: of the contact, of its depth, v and params;
+    rebound: the speed behind an impact of speed v."""
 
     wall: float
     free: Any
@@ -75,55 +75,78 @@ def with_stop(stop, way, case):
     return hhtjax.System(jnp.ones(1), force), case.scene.params | {"on": 0.0}, event
 
 
+def rigid_reference(stop, case):
+    """The motion with impacts."""
+    scene = case.scene
+    path, _ = motion_with_events(
+        lambda t, y, _: [y[1], stop.free(y[0])],
+        lambda t, y, _: [y[0] - stop.wall],
+        lambda i, t, y, _: (np.array([stop.wall, float(stop.rebound(-y[1]))]), _),
+        [scene.q0[0], scene.v0[0]],
+        np.linspace(0, scene.duration, SAMPLES + 1),
+        (0.0,),
+    )
+    q = path[:, :1]
+    return Reference(q[1:], rms(q - q.mean(axis=0), (0, 1)), np.abs(q - q[0]).max())
+
+
 def program(stop, way, method, case, longest):
-    """q, of alpha and dt: one program for all sizes, whose further steps are unused."""
+    """q and the failed step, of alpha and dt: one program for all sizes, whose further steps are unused."""
     system, params, event = with_stop(stop, way, case)
 
     def run(alpha, dt):
-        return hhtjax.simulate(
+        found = hhtjax.simulate(
             system, METHODS[method].make(alpha), case.scene.q0, case.scene.v0, params, dt=dt, num_steps=longest,
             events=[event], max_events=MAX_EVENTS, keep_events=1,
-        ).q  # fmt: skip
+        )  # fmt: skip
+        return found.q, found.failure.step
 
     return jax.jit(run)
 
 
 def assess_events(case, sizes, reference, method, way):
-    """`gallery.assess` with events."""
+    """`gallery.assess` with events, and how many runs ended in a failure that is named."""
     march = program(STOPS[case.name], way, method, case, sizes[-1])
-    errors, bounded = [], []
+    errors, bounded, named = [], [], 0
+    alphas = ALPHAS if METHODS[method].damped else ALPHAS[:1]
     for size in sizes:
         every = max(1, size // SAMPLES)
-        paths = [np.asarray(march(a, case.scene.duration / size)) for a in ALPHAS[: 3 if METHODS[method].damped else 1]]
-        paths = np.stack(paths)[:, : size + 1]
+        runs = [march(alpha, case.scene.duration / size) for alpha in alphas]
+        paths = np.stack([q[: size + 1] for q, _ in runs])
+        named += sum(0 < int(step) <= size for _, step in runs)
         errors.append(relative_error(paths[:, every::every], size, reference))
         bounded.append(np.max(np.abs(paths - paths[:, :1]), axis=(1, 2)) <= FARTHEST * reference.reach)
-    return Outcome(np.array(errors), np.array(bounded))
+    return Outcome(np.array(errors), np.array(bounded)), named
 
 
 def run(report, fast):
     """All three scenes; the smoke run has one of them, and one method."""
-    outcomes, sizes = {}, {}
+    outcomes, sizes, apart, named = {}, {}, {}, {}
     for case in all_cases():
         if case.name not in (list(STOPS)[:1] if fast else STOPS):
             continue
         steps = [case.fewest * 2**i for i in range(HALVINGS)][:: 3 if fast else 1]
-        reference = solve_reference(case)
+        soft, rigid = solve_reference(case), rigid_reference(STOPS[case.name], case)
+        apart[case.name] = float(relative_error(rigid.q, SAMPLES, soft))
         found = {}
         for method in SHOWN[:1] if fast else SHOWN:
-            found[method] = assess(case, steps, reference, method)
-            for way in WAYS:
-                found[f"{method}\n{way}"] = assess_events(case, steps, reference, method, way)
+            found[method] = assess(case, steps, soft, method)
+            for way, reference in (("located", soft), ("impact", rigid)):
+                column = f"{method}\n{way}"
+                found[column], count = assess_events(case, steps, reference, method, way)
+                named.setdefault(case.name, {})[plain(column)] = count
             report.progress(f"stops: {case.name}, {plain(method)}")
         outcomes[case.name], sizes[case.name] = found, steps
     scenes = cells(outcomes, sizes)
     report.figure("stability_stops", page(scenes, CAUSES))
-    accurate = {
-        name: {method: sum(row.count("A") for row in rows) for method, rows in scene["grades"].items()}
-        for name, scene in scenes.items()
-    }
+    letters = {name: {m: "".join(rows) for m, rows in scene["grades"].items()} for name, scene in scenes.items()}
+    counts = {"accurate": LETTERS[GOOD], "blown_up": LETTERS[BLOWN_UP]}
     return {
-        "accurate_cells": accurate,
-        "fewest_accurate_steps": {name: fewest_accurate(scene) for name, scene in scenes.items()},
+        "rigid_motion_error": apart,
+        "cells": {
+            name: {m: {key: x.count(letter) for key, letter in counts.items()} | {"all": len(x)} for m, x in by.items()}
+            for name, by in letters.items()
+        },
+        "named_by_check": named,
         "scenes": scenes,
     }
