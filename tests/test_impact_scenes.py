@@ -11,7 +11,7 @@ EVENTS = {  # in the whole time, and in its first half
     "ball": (2, 1), "bump stop": (6, 4), "backlash": (11, 4), "impact oscillator": (8, 4), "double pendulum": (3, 2),
     "pendulum": (1, 1),
 }  # fmt: skip
-STEPS = dict.fromkeys(SCENES, 400) | {"ball": 256, "pendulum": 200}
+STEPS = dict.fromkeys(EVENTS, 400) | {"ball": 256, "pendulum": 200}
 
 
 def run(scene, stepper, steps, part=1.0):
@@ -32,7 +32,7 @@ def errors(found, q, v, events):
     return np.array([np.max(np.abs(np.asarray(x) - y)[away]) for x, y in ((found.q, q), (found.v, v))])
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", EVENTS)
 def test_the_motion_of_a_scene(name):
     """Order 2 through all events, from one program: steps of h and h/2 over the first half of the time."""
     steps = STEPS[name]
