@@ -1,6 +1,6 @@
-"""What events cost: a step with one declared and none met, a run with impacts, their derivatives, and compilation.
+"""What events cost: a step with one declared and none met, an impact, derivatives, and compilation.
 
-Times are medians of ratios, each of two runs one after the other, since others use the machine.
+Times are the least of runs in turn, since others use the machine.
 """
 
 import time
@@ -19,7 +19,7 @@ DT = {"ball": 1e-4, "double pendulum": 1e-3, "pendulum": 1e-3}
 GRADIENT_STEPS = 1000
 
 
-def program(name, events, num_steps=STEPS):
+def run_of(name, events, num_steps=STEPS):
     """The run's last q, of params and dt."""
     scene = SCENES[name]
 
@@ -35,7 +35,7 @@ def program(name, events, num_steps=STEPS):
 
 def gradient(name, events):
     """Of the sum of the last q in the params, by reverse mode."""
-    last = program(name, events, GRADIENT_STEPS)
+    last = run_of(name, events, GRADIENT_STEPS)
     return lambda params, dt: jax.grad(lambda params: jnp.sum(last(params, dt)[0]))(params)
 
 
@@ -53,41 +53,59 @@ def seconds(function):
     return time.perf_counter() - begun
 
 
-def ratio(function, plain, pairs):
-    """The median of the ratios of their times, and of the plain one's."""
-    function(), plain()
-    times = np.array([(seconds(function), seconds(plain)) for _ in range(pairs)])
-    return float(np.median(times[:, 0] / times[:, 1])), float(np.median(times[:, 1]))
+WAYS = (  # what is compiled, in the order of the times
+    ("plain", run_of, False),
+    ("events", run_of, True),
+    ("plain gradient", gradient, False),
+    ("gradient with events", gradient, True),
+)
+
+
+def least(functions, pairs):
+    """The least time of each, all of them in turn."""
+    for function in functions:
+        function()
+    return np.min([[seconds(function) for function in functions] for _ in range(pairs)], axis=0)
 
 
 def run(report, fast):
-    """A row for each scene."""
+    """A row for each scene, and what an impact takes."""
     rows, pairs = [], 3 if fast else PAIRS
     for name in list(FAR)[:1] if fast else FAR:
-        params = jax.tree.map(jnp.asarray, SCENES[name].params)
-        params |= {key: jnp.asarray(value) for key, value in FAR[name].items()}
-        near = jax.tree.map(jnp.asarray, SCENES[name].params)
-        dt, long = jnp.asarray(DT[name]), jnp.asarray(10 * DT[name])
-        plain, plain_compile = compiled(program(name, False), params, dt)
-        with_events, events_compile = compiled(program(name, True), params, dt)
-        backward, backward_compile = compiled(gradient(name, True), params, dt)
-        plain_backward, plain_backward_compile = compiled(gradient(name, False), params, dt)
-        none_met, own = ratio(partial(with_events, params, dt), partial(plain, params, dt), pairs)
-        size = SCENES[name].duration / STEPS
-        impacts = int(with_events(near, jnp.asarray(size))[1])
-        some, _ = ratio(partial(with_events, near, jnp.asarray(size)), partial(plain, near, jnp.asarray(size)), pairs)
-        back, _ = ratio(partial(backward, params, dt), partial(plain_backward, params, dt), pairs)
-        apart = float(jnp.max(jnp.abs(with_events(params, long)[0] - plain(params, long)[0])))
+        params, dt = at(name, FAR[name]), jnp.asarray(DT[name])
+        programs, compiling = {}, {}
+        for key, make, events in WAYS:
+            programs[key], compiling[key] = compiled(make(name, events), params, dt)
+        runs = least([partial(x, params, dt) for x in programs.values()], pairs)
+        plain, with_events, plain_gradient, gradient_with_events = map(float, runs)
+        apart = jnp.abs(programs["events"](params, dt)[0] - programs["plain"](params, dt)[0])
         rows.append(
             {
-                "scene": name, "plain_ns_per_step": 1e9 * own / STEPS, "none_met_over_plain_time": none_met,
-                "impacts": impacts, "with_impacts_over_plain_time": some, "gradient_over_plain_time": back,
-                "difference_none_met": apart,
-                "compile_time_s": {
-                    "plain": plain_compile, "events": events_compile, "plain gradient": plain_backward_compile,
-                    "gradient with events": backward_compile,
-                },
+                "scene": name, "plain_ns_per_step": 1e9 * plain / STEPS, "none_met_over_plain_time": with_events / plain,
+                "gradient_over_plain_time": gradient_with_events / plain_gradient,
+                "difference_none_met": float(jnp.max(apart)), "compile_time_s": compiling,
             }
         )  # fmt: skip
         report.progress(str(rows[-1]))
-    return {"steps": STEPS, "rows": rows}
+    return {"steps": STEPS, "rows": rows, "impacts": impacts(report, pairs)}
+
+
+def impacts(report, pairs):
+    """The impact oscillator, 50 steps of a period, beside the same without its stop."""
+    name = "impact oscillator"
+    met, none = at(name, {"W": 2.2}), at(name, {"W": 2.2, "wall": 1e6})
+    dt = jnp.asarray(2 * np.pi / 2.2 / 50)
+    program, _ = compiled(run_of(name, True), met, dt)
+    count = int(program(met, dt)[1])
+    with_impacts, without = map(float, least([partial(program, x, dt) for x in (met, none)], pairs))
+    found = {
+        "scene": name, "impacts": count, "ns_per_step": 1e9 * without / STEPS,
+        "ns_per_impact": 1e9 * (with_impacts - without) / count, "run_over_none_met_time": with_impacts / without,
+    }  # fmt: skip
+    report.progress(str(found))
+    return found
+
+
+def at(name, changed):
+    """Params of a scene."""
+    return jax.tree.map(jnp.asarray, SCENES[name].params | changed)
