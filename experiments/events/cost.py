@@ -81,7 +81,8 @@ def run(report, fast):
         apart = jnp.abs(programs["events"](params, dt)[0] - programs["plain"](params, dt)[0])
         rows.append(
             {
-                "scene": name, "plain_ns_per_step": 1e9 * plain / STEPS, "none_met_over_plain_time": with_events / plain,
+                "scene": name, "plain_ns_per_step": 1e9 * plain / STEPS,
+                "none_met_over_plain_time": with_events / plain,
                 "gradient_over_plain_time": gradient_with_events / plain_gradient,
                 "difference_none_met": float(jnp.max(apart)), "compile_time_s": compiling,
             }
