@@ -15,7 +15,7 @@ The period doubles where an eigenvalue is -1: 1 + tr + det = 0. (Shaw, Holmes 19
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 
 class Orbit(NamedTuple):
@@ -68,4 +68,4 @@ def doubling(p, lower, upper, n=1):
         (orbit,) = orbits(p, W, n)
         return 1 + orbit.trace + orbit.determinant
 
-    return brentq(condition, lower, upper, xtol=1e-15, rtol=1e-15)
+    return float(root_scalar(condition, bracket=(lower, upper), xtol=1e-15).root)

@@ -20,6 +20,7 @@ METHODS = {"hht": hhtjax.hht(), "rowda": hhtjax.rowda()}
 COARSEST = {
     "ball": 50, "double pendulum": 100, "pendulum": 50, "bump stop": 100, "bump stop without damper": 100,
 }  # fmt: skip
+NOT_LOCATED = "ball", "bump stop"
 DOUBLINGS = 6
 QUANTITIES = {"q": "q (m, rad)", "v": "v (m/s, rad/s)", "multipliers": "the multiplier (N/m)"}
 LINES = {"hht": "-", "rowda": "--"}
@@ -97,35 +98,34 @@ def errors(paths, wanted, times, events):
     return {key: float(np.max(np.abs(np.asarray(paths[key])[: len(times)] - x)[away])) for key, x in wanted.items()}
 
 
+def measure(name, method, way, sizes, paths, events):
+    """A row: errors by quantity for each of the numbers of steps, and their slopes."""
+    march = (located if way == "located" else not_located)(name, method, sizes[-1])
+    h, counts, each = [SCENES[name].duration / size for size in sizes], [], []
+    times = np.linspace(0, SCENES[name].duration, sizes[-1] + 1)
+    for size, dt in zip(sizes, h, strict=True):
+        every = sizes[-1] // size
+        found, count = march(dt)
+        counts.append(int(count))
+        each.append(errors(found, {key: x[::every] for key, x in paths.items()}, times[::every], events))
+    by_quantity = {key: [error[key] for error in each] for key in each[0]}
+    return {
+        "scene": name, "method": method, "way": way, "h_s": h, "errors": by_quantity, "events": len(events),
+        "right_number_of_events": way != "located" or counts == [len(events)] * len(sizes),
+        "slopes": {key: slope(h, x) for key, x in by_quantity.items()},
+    }  # fmt: skip
+
+
 def run(report, fast):
     """All scenes and methods, and a figure."""
     rows = []
     for name, fewest in COARSEST.items():
         sizes = [fewest * 2**i for i in range(3 if fast else DOUBLINGS)]
-        times = np.linspace(0, SCENES[name].duration, sizes[-1] + 1)
-        paths, events = exact(name, times)
-        for way, make in (("located", located), ("not located", not_located)):
-            for method in METHODS:
-                if (name == "pendulum" and method == "rowda") or (
-                    way != "located" and name not in ("ball", "bump stop")
-                ):
-                    continue
-                row = {"scene": name, "method": method, "way": way, "h_s": [], "events": len(events), "errors": {}}
-                march = make(name, method, sizes[-1])
-                for size in sizes:
-                    every = sizes[-1] // size
-                    dt = SCENES[name].duration / size
-                    found, count = march(dt)
-                    row["h_s"].append(dt)
-                    row["right_number_of_events"] = row.get("right_number_of_events", True) and (
-                        way != "located" or int(count) == len(events)
-                    )
-                    wanted = {key: x[::every] for key, x in paths.items()}
-                    for key, error in errors(found, wanted, times[::every], events).items():
-                        row["errors"].setdefault(key, []).append(error)
-                row["slopes"] = {key: slope(row["h_s"], x) for key, x in row["errors"].items()}
-                rows.append(row)
-                report.progress(f"{name}, {method}, {way}: {row['slopes']}")
+        paths, events = exact(name, np.linspace(0, SCENES[name].duration, sizes[-1] + 1))
+        for way in ("located", "not located") if name in NOT_LOCATED else ("located",):
+            for method in list(METHODS)[:1] if name == "pendulum" else METHODS:  # rowda takes no constraints
+                rows.append(measure(name, method, way, sizes, paths, events))
+                report.progress(f"{name}, {method}, {way}: {rows[-1]['slopes']}")
     figure(report, rows)
     return rows
 
@@ -150,9 +150,8 @@ def figure(report, rows):
             if key in row["errors"] and row["way"] == "located":
                 draw(panel, row, key, row["scene"] if row["method"] == "hht" else None)
         panel.set_ylabel(f"error of {unit}")
-    compared = [name for name in names if any((r["scene"], r["way"]) == (name, "not located") for r in rows)]
     for row in rows:
-        if row["scene"] in compared:
+        if row["scene"] in NOT_LOCATED:
             found = row["way"] == "located"
             draw(axes[1, 1], row, "q", None, **({} if found else {"mfc": "white", "alpha": 0.7}))
     axes[1, 1].set_ylabel("error of q (m), hollow: not located")

@@ -72,7 +72,7 @@ def run(report, fast):
             ]
             fits.append(jax.tree.map(lambda *x: jnp.stack(x), *each))
             report.progress(f"{problem}, {steps_per_sample} steps of a sample")
-        found[problem] = judge(*fits, off) | {
+        found[problem] = judge(fits[0], fits[1], off) | {
             "truth": truth,
             "noise_m": deviation,
             "h_s": SCENES[PROBLEMS[problem][0]].duration / SAMPLES / STEPS[0],

@@ -1,6 +1,7 @@
 """The ball beside others: MuJoCo's soft limit, and diffrax, whose events end a run that is begun anew by hand."""
 
 import importlib.util
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +68,7 @@ def by_diffrax(x, tolerance):
     event = diffrax.Event(lambda t, y, args, **_: y[0], optimistix.Newton(1e-13, 1e-13), direction=False)
     y, t = x[:2], jnp.zeros(())
     for flight in range(BOUNCES + 1):
-        solution = diffrax.diffeqsolve(
+        solution: Any = diffrax.diffeqsolve(
             diffrax.ODETerm(rate), diffrax.Tsit5(), t, DURATION, 1e-2, y, args=x[3],
             event=event if flight < BOUNCES else None, stepsize_controller=diffrax.PIDController(tolerance, tolerance),
             adjoint=diffrax.RecursiveCheckpointAdjoint(),

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import expm
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 import hhtjax
 from experiments.events.impact_orbit import doubling, orbits
@@ -63,7 +63,7 @@ def doubled(method, x, steps):
         _, J = fixed_point(method, x, W, steps)
         return 1 + np.trace(J) + np.linalg.det(J)
 
-    W = brentq(condition, *BETWEEN, xtol=1e-14, rtol=1e-14)
+    W = float(root_scalar(condition, bracket=BETWEEN, xtol=1e-14).root)
     return W, np.linalg.eigvals(fixed_point(method, x, W, steps)[1])
 
 
