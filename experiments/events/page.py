@@ -65,6 +65,7 @@ def page(numbers):
     """The text of README.md."""
     found, doubling, zeno = numbers["parameters"], numbers["poincare"], numbers["zeno"]
     balls = numbers["gradients"]["two_balls"]
+    apart = max(row["difference_none_met"] for row in numbers["cost"]["rows"])
     after = [[n, *(f"{y:.3g}" for y in x)] for n, x in balls["after_the_step_by_steps"].items()]
     doublings = [
         [row["method"], n, f"{error:.1e}"]
@@ -94,7 +95,7 @@ def page(numbers):
             zeno=table(["steps to rest", *(x.replace("_", " ") for x in kept[1:]), "error (m)", "lowest q (m)"], rests),
             steps=numbers["cost"]["steps"],
             gradient_steps=cost.GRADIENT_STEPS,
-            apart=max(row["difference_none_met"] for row in numbers["cost"]["rows"]),
+            apart=f"within {apart:.0e} of" if apart else "bit for bit",
             cost=times(numbers["cost"]["rows"]),
             impact_in_steps=numbers["cost"]["impacts"]["ns_per_impact"] / numbers["cost"]["impacts"]["ns_per_step"],
             **{f"impact_{key}": x for key, x in numbers["cost"]["impacts"].items()},
