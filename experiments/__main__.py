@@ -25,6 +25,7 @@ EXPERIMENTS = {
     "emps": "identification.emps",
     "tanks": "identification.tanks",
     "friction": "friction.friction",
+    "events": "events.events",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",
     "squeezer": "identification.squeezer",

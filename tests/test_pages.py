@@ -12,7 +12,17 @@ LARGEST = {".png": 200_000, ".gif": 400_000}  # bytes
 
 @pytest.mark.parametrize(
     "name",
-    ["benchmarks", "cardona_geradin1989", "export", "friction", "kim2019", "stability", "sweeps", "work_precision"],
+    [
+        "benchmarks",
+        "cardona_geradin1989",
+        "events",
+        "export",
+        "friction",
+        "kim2019",
+        "stability",
+        "sweeps",
+        "work_precision",
+    ],
 )
 def test_the_page_is_made_from_the_committed_numbers(name):
     here = ROOT / "experiments" / name

@@ -75,6 +75,22 @@ def test_trajectory_names_entries_and_units(run):
     assert len({style for _, style in looks}) == 2
 
 
+def test_trajectory_marks_events():
+    """At their times, those that were met alone, over the whole height, and without a place in the legend."""
+    scene = hhtjax.scenes.balls.bouncing(drag=0.0)
+    options = {"dt": 0.05, "num_steps": 20, "events": scene.events, "keep_events": 4}
+    run = hhtjax.simulate(scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params, **options)
+    ax = plot.trajectory(run, "v", units="m/s")
+    (marks,) = ax.collections
+    (segment,) = marks.get_segments()
+    np.testing.assert_allclose(segment, [[np.sqrt(2 / 9.81), 0], [np.sqrt(2 / 9.81), 1]], rtol=1e-6)
+    assert ax.get_ylim()[0] < -4  # not from 0 to 1
+    assert labels(ax) == ["v[0]"]
+    plain = plot.trajectory(run._replace(events=None), "v", units="m/s")
+    assert not plain.collections
+    np.testing.assert_allclose(ax.get_ylim(), plain.get_ylim())
+
+
 def test_trajectory_draws_into_axes_given_run_after_run(run, swing):
     figure, ax = plt.subplots()
     assert plot.trajectory(run, "acceleration", entries="phi", units="rad/s^2", label="one", ax=ax) is ax

@@ -57,6 +57,13 @@ def dry_table(dry, gallery):
     return table(header, rows)
 
 
+def stops_table(found):
+    """Accurate cells by scene and method."""
+    methods = next(iter(found.values()))
+    rows = [[m, *(f"{by[m]['accurate']} of {by[m]['all']}" for by in found.values())] for m in methods]
+    return table(["method", *found], rows)
+
+
 def drift_table(entries):
     """One row per scene and method."""
     names = list(dict.fromkeys(key for e in entries for key in e["last"]))
@@ -85,7 +92,7 @@ def dampers_table(rows):
 def page(numbers):
     """The text of README.md."""
     gallery, reported, advice, peers = (numbers[part] for part in ("gallery", "reported", "advice", "peers"))
-    dry = numbers["dry"]
+    dry, stops = numbers["dry"], numbers["stops"]
     fewest, motions = dry["fewest_accurate_steps"].values(), dry["motions"].values()
     drift, spin = numbers["drift"], numbers["rotating"]["spin_error"]
     scenes = gallery["scenes"]
@@ -110,6 +117,12 @@ def page(numbers):
             dry_default=both(x["HHT auto"] for x in fewest),
             dry_predictor=both(x["HHT predictor"] for x in fewest),
             dry=dry_table(dry, gallery),
+            stops_away=", ".join(f"{100 * x:.0f} %" for x in stops["rigid_motion_error"].values()),
+            stops=stops_table(stops["cells"]),
+            stops_named=sum(sum(by.values()) for by in stops["named_by_check"].values()),
+            stops_blown_up=sum(
+                x["blown_up"] for by in stops["cells"].values() for m, x in by.items() if m.endswith("located")
+            ),
             blown_up=reported["cells"]["again"],
             once=reported["cells"]["blown_up"],
             named=reported["cells"]["named_by_check"],

@@ -2,9 +2,9 @@
 
 from experiments.parts import run_experiment
 from experiments.report import Report
-from experiments.stability import advice, constrained, drift, dry, gallery, peers, reported, rotating
+from experiments.stability import advice, constrained, drift, dry, gallery, peers, reported, rotating, stops
 
-GROUPS = [gallery, reported, advice], [dry, constrained, rotating, drift, peers]  # two processes if fast
+GROUPS = [gallery, reported, advice], [dry, stops, constrained, rotating, drift, peers]  # two processes if fast
 
 
 def run(report: Report, fast: bool):

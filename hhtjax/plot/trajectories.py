@@ -25,6 +25,8 @@ def trajectory(
 ) -> Any:
     """q, v, acceleration, multipliers or internal states over time, a curve for each entry.
 
+    Events of the run are thin vertical lines.
+
     Args:
         solution: of one run, of a batch its member by `jax.tree.map(lambda x: x[i], solution)`.
         quantities: "q", "v", "acceleration", "multipliers" or "z"; several as a tuple, one panel above the other.
@@ -61,6 +63,8 @@ def trajectory(
         for panel, name, found in zip(axes, names, curves, strict=True):
             by_quantity = isinstance(units, dict) and set(units) <= set(SYMBOLS)
             _draw(panel, solution.t, name, found, units.get(name) if by_quantity else units, label, line)
+            if solution.events is not None:
+                _mark(panel, np.asarray(solution.events.t))
             if key:
                 legend(panel)
         axes[-1].set_xlabel(with_unit("t", time_unit))
@@ -79,6 +83,12 @@ def _draw(ax, t, quantity, found, units, label, line):
         ax.plot(np.asarray(t), values, label=label if alone else prefixed(label, shown), **(look(start + i) | line))
     name = shown_name(quantity, next(iter(found))) if len(found) == 1 else quantity
     ax.set_ylabel(with_unit(name, shared))
+
+
+def _mark(ax, times):
+    """Vertical lines behind the curves; they count as none of them."""
+    style = {"colors": "0.6", "lw": 0.6, "ls": ":", "zorder": 0, "label": "_event"}
+    ax.vlines(times[np.isfinite(times)], 0, 1, transform=ax.get_xaxis_transform(), **style)
 
 
 def phase_plane(

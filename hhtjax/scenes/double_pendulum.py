@@ -9,7 +9,8 @@ from functools import cache, partial
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import EventScene, Scene
+from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
@@ -78,3 +79,23 @@ def stiff(as_printed=False, trigonometry=jnp) -> Scene:
     torques = force_as_printed if as_printed else force
     system = System(_using(trigonometry, mass), _using(trigonometry, torques))
     return Scene(system, params, jnp.zeros(2), jnp.zeros(2), 8.0)
+
+
+def left_of_stop(q, v, t, params):
+    """The angle of joint 2 that is left before its stop, rad."""
+    return params["stop"] - (q[1] - q[0])
+
+
+def stopped(restitution=0.7) -> EventScene:
+    """Free, with a stop at the angle of joint 2, as an elbow has: the links meet it three times.
+
+    Args:
+        restitution: e of the stop, in [0, 1].
+
+    >>> len(stopped(restitution=0.5).events)
+    1
+    """
+    scene = free()
+    params = scene.params | {"stop": 0.2, "e": restitution}
+    events = (Event(left_of_stop, reset=impact("e")),)
+    return EventScene(scene.system, params, scene.q0, scene.v0, 3.0, events)

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import EventScene, Scene
+from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
 
 GRAVITY = 9.81
@@ -94,6 +95,28 @@ def minimal(speed=2.505, length=0.5) -> Scene:
     """
     params = _params("minimal", speed, length)
     return Scene(System(inertia, moment_of_weight), params, jnp.zeros(1), jnp.array([speed / length]), DURATION)
+
+
+def room_before_wall(q, v, t, params):
+    """How far the mass is from the wall, m."""
+    return params["wall"] - q[0]
+
+
+def walled(wall=0.3, restitution=0.7) -> EventScene:
+    """`cartesian` with a vertical wall on its way: the impulse keeps the length of the rod.
+
+    Args:
+        wall: where, in m; less than the length of the rod, 0.5 m. restitution: e, in [0, 1].
+
+    Raises:
+        TypeError, ValueError: a wall that the mass does not reach.
+    """
+    scene = cartesian()
+    length = scene.params["l"]
+    require_number("walled", "wall", wall, lambda x: 0 < x < length, "be positive and less than the rod's 0.5")
+    params = scene.params | {"wall": wall, "e": restitution}
+    events = (Event(room_before_wall, reset=impact("e")),)
+    return EventScene(scene.system, params, scene.q0, scene.v0, DURATION, events)
 
 
 def _params(caller, speed, length):

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 from hhtjax.description.presentation import shown
+from hhtjax.systems.events import Event
 from hhtjax.systems.system import LinearSystem, System
 
 
@@ -21,6 +22,25 @@ class Scene(NamedTuple):
     q0: Any
     v0: Any
     duration: float
+
+
+@shown
+class EventScene(NamedTuple):
+    """A system with events, and what a run needs besides a stepper and a step size.
+
+    Attributes:
+        system, params: what moves.
+        q0, v0: initial position and velocity.
+        duration: s.
+        events: what happens on the way, a tuple of `Event`.
+    """
+
+    system: System | LinearSystem
+    params: Any
+    q0: Any
+    v0: Any
+    duration: float
+    events: tuple[Event, ...]
 
 
 @shown

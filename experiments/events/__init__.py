@@ -1,0 +1,1 @@
+"""Events and impacts inside a step."""

@@ -1,0 +1,103 @@
+"""The ball beside others: MuJoCo's soft limit, and diffrax, whose events end a run that is begun anew by hand."""
+
+import importlib.util
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hhtjax
+from hhtjax.scenes import balls
+
+DURATION, BOUNCES = 1.4, 2
+STEPS = tuple(50 * 2**i for i in range(9))
+E = 0.8
+CONTACT = 0.3  # sqrt(k) dt of the soft limit: a contact of ten steps
+
+
+def by_formula(x):
+    """q at the end of x = (q0, v0, e, g) without drag, two bounces."""
+    q0, v0, e, g = x
+    speed = jnp.sqrt(v0**2 + 2 * g * q0)
+    left = DURATION - (v0 + speed) / g
+    for _ in range(BOUNCES - 1):
+        speed = e * speed
+        left = left - 2 * speed / g
+    speed = e * speed
+    return speed * left - g * left**2 / 2
+
+
+def ours(x, steps):
+    """The same by a run."""
+    scene = balls.bouncing(drag=0.0)
+    params = scene.params | {"e": x[2], "g": x[3]}
+    run = hhtjax.simulate(
+        scene.system, hhtjax.hht(), x[:1], x[1:2], params, dt=DURATION / steps, num_steps=steps, events=scene.events
+    )
+    return run.q[-1, 0]
+
+
+def by_mujoco(steps):
+    """A slide joint with a limit at zero: a stiff spring and the damper that gives e, as stiff as the step allows."""
+    import mujoco  # pyright: ignore[reportMissingImports]  # of an extra of its own
+
+    dt = DURATION / steps
+    k, ratio = (CONTACT / dt) ** 2, -np.log(E) / np.hypot(np.pi, np.log(E))
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><compiler autolimits="false"/><option gravity="0 0 -{balls.GRAVITY}" timestep="{dt:.17g}" '
+        'integrator="implicitfast" tolerance="1e-12"/><worldbody><body><joint type="slide" axis="0 0 1" limited="true" '
+        f'range="0 10" solreflimit="{-k:.17g} {-2 * ratio * np.sqrt(k):.17g}" solimplimit="0.9999 0.9999 0.001"/>'
+        '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    data.qpos[0] = 1.0
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+    return float(data.qpos[0])
+
+
+def by_diffrax(x, tolerance):
+    """Three runs by Tsit5, each from the event of the one before, that the caller turns back and counts."""
+    import diffrax
+    import optimistix
+
+    def rate(t, y, args):
+        return jnp.stack([y[1], -args])
+
+    event = diffrax.Event(lambda t, y, args, **_: y[0], optimistix.Newton(1e-13, 1e-13), direction=False)
+    y, t = x[:2], jnp.zeros(())
+    for flight in range(BOUNCES + 1):
+        solution: Any = diffrax.diffeqsolve(
+            diffrax.ODETerm(rate), diffrax.Tsit5(), t, DURATION, 1e-2, y, args=x[3],
+            event=event if flight < BOUNCES else None, stepsize_controller=diffrax.PIDController(tolerance, tolerance),
+            adjoint=diffrax.RecursiveCheckpointAdjoint(),
+        )  # fmt: skip
+        t, y = solution.ts[-1], solution.ys[-1]
+        if flight < BOUNCES:
+            y = jnp.stack([jnp.zeros(()), -x[2] * y[1]])
+    return y[0]
+
+
+def run(report, fast):
+    """Errors of q, and of its derivatives in the start, the restitution and gravity."""
+    x = jnp.array([1.0, 0.0, E, balls.GRAVITY])
+    wanted, slopes = by_formula(x), jax.grad(by_formula)(x)
+    found = {"wanted_q_m": float(wanted), "rows": {}}
+    value, gradient = jax.jit(jax.value_and_grad(lambda x: ours(x, STEPS[0])))(x)
+    found["hhtjax"] = told(value - wanted, gradient - slopes) | {"steps": STEPS[0]}
+    if importlib.util.find_spec("diffrax"):
+        value, gradient = jax.jit(jax.value_and_grad(lambda x: by_diffrax(x, 1e-9)))(x)
+        found["diffrax, begun anew by hand"] = told(value - wanted, gradient - slopes)
+    if importlib.util.find_spec("mujoco"):
+        sizes = STEPS[:3] if fast else STEPS
+        found["rows"]["MuJoCo, soft limit"] = {
+            "steps": list(sizes), "error_m": [abs(by_mujoco(steps) - float(wanted)) for steps in sizes]
+        }  # fmt: skip
+    report.progress(str(found))
+    return found
+
+
+def told(error, errors):
+    """Of q, and the largest of its derivatives."""
+    return {"error_m": abs(float(error)), "derivative_difference": float(jnp.max(jnp.abs(errors)))}

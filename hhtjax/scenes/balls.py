@@ -1,0 +1,65 @@
+"""Balls in one dimension: one that bounces on a floor, with and without drag, and two that meet.
+
+    m w = -m g - c |v| v,   v+ = -e v  at q = floor
+
+Without drag (c = 0), from rest at q = h over the floor, impact k = 1, 2, ... is at t_k = T (1/2 + e + ... + e^(k-1)),
+T = sqrt(8 h/g), and the ball is at rest from T (1/2 + e/(1 - e)) on: infinitely many impacts in a finite time (Zeno).
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import EventScene
+from hhtjax.systems.events import Event, impact
+from hhtjax.systems.system import System
+
+GRAVITY = 9.81
+
+
+def mass(q, params):
+    """M, a diagonal."""
+    return params["m"] * jnp.ones(q.size, q.dtype)
+
+
+def weight_and_drag(q, v, t, params):
+    """Q of a ball."""
+    return -params["m"] * params["g"] - params["c"] * jnp.abs(v) * v
+
+
+def no_force(q, v, t, params):
+    """Q of balls on a level line."""
+    return jnp.zeros(q.size, q.dtype)
+
+
+def height(q, v, t, params):
+    """Over the floor, m."""
+    return q[0] - params["floor"]
+
+
+def distance(q, v, t, params):
+    """Between two balls, m."""
+    return q[1] - q[0] - params["diameter"]
+
+
+def bouncing(restitution=0.8, drag=0.1) -> EventScene:
+    """Dropped from 1 m: two impacts in 1.5 s (SI units).
+
+    Args:
+        restitution: e, in [0, 1]. drag: c, kg/m.
+
+    >>> float(bouncing(drag=0.0).params["c"])
+    0.0
+    """
+    params = {"m": 1.0, "g": GRAVITY, "c": drag, "floor": 0.0, "e": restitution}
+    events = (Event(height, reset=impact("e")),)
+    return EventScene(System(mass, weight_and_drag), params, jnp.array([1.0]), jnp.zeros(1), 1.5, events)
+
+
+def two(restitution=1.0) -> EventScene:
+    """One runs into another of the same mass, which is at rest; elastic, they change their velocities (SI units).
+
+    Args:
+        restitution: e, in [0, 1].
+    """
+    params = {"m": 1.0, "diameter": 0.1, "e": restitution}
+    events = (Event(distance, reset=impact("e")),)
+    return EventScene(System(mass, no_force), params, jnp.array([0.0, 0.5]), jnp.array([1.0, 0.0]), 1.0, events)

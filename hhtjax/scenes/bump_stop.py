@@ -1,0 +1,72 @@
+"""A mass that runs into stops with a spring and a damper: a bump stop on one side, backlash between two.
+
+    m w = -k q + A cos(W t) - on K (q - gap) - on C v,    on = 1 beyond the gap, 0 before
+
+The damper makes the force jump at the gap, so `on` is a mode in params, which an event switches: no step crosses the
+jump. A stop holds on to the mass until it is back at the gap, as one whose own mass and preload are left out does.
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import EventScene
+from hhtjax.systems.events import Event
+from hhtjax.systems.system import System
+
+
+def mass(q, params):
+    """M = [m]."""
+    return params["m"] * jnp.ones(1, q.dtype)
+
+
+def spring_and_drive(q, v, t, params):
+    """Q without stops."""
+    return params["A"] * jnp.cos(params["W"] * t) - params["k"] * q
+
+
+def with_upper(q, v, t, params):
+    """Q with a stop at q = gap."""
+    push = params["K"] * (q - params["gap"]) + params["C"] * v
+    return spring_and_drive(q, v, t, params) - params["upper"] * push
+
+
+def with_both(q, v, t, params):
+    """Q with stops at q = gap and q = -gap."""
+    push = params["K"] * (q + params["gap"]) + params["C"] * v
+    return with_upper(q, v, t, params) - params["lower"] * push
+
+
+def before_upper(q, v, t, params):
+    """Falls to zero at q = gap, on the way there and on the way back."""
+    return (params["gap"] - q[0]) * (1 - 2 * params["upper"])
+
+
+def before_lower(q, v, t, params):
+    """The same at q = -gap."""
+    return (params["gap"] + q[0]) * (1 - 2 * params["lower"])
+
+
+def turn_upper(params):
+    """The upper stop on or off."""
+    return params | {"upper": 1 - params["upper"]}
+
+
+def turn_lower(params):
+    """The lower one."""
+    return params | {"lower": 1 - params["lower"]}
+
+
+UPPER, LOWER = Event(before_upper, switch=turn_upper), Event(before_lower, switch=turn_lower)
+
+
+def bump_stop() -> EventScene:
+    """Three strokes into a stop 0.3 m away, from 3 m/s, without a drive (SI units)."""
+    params = {"m": 1.0, "k": 20.0, "A": 0.0, "W": 0.0, "K": 400.0, "C": 5.0, "gap": 0.3, "upper": 0.0}
+    return EventScene(System(mass, with_upper), params, jnp.zeros(1), jnp.array([3.0]), 3.0, (UPPER,))
+
+
+def backlash() -> EventScene:
+    """A mass driven to and fro between two flanks 10 mm apart: 11 crossings of their surfaces (SI units)."""
+    params = {
+        "m": 1.0, "k": 0.0, "A": 20.0, "W": 20.0, "K": 1e4, "C": 20.0, "gap": 0.005, "upper": 0.0, "lower": 0.0,
+    }  # fmt: skip
+    return EventScene(System(mass, with_both), params, jnp.zeros(1), jnp.zeros(1), 0.5, (UPPER, LOWER))

@@ -1,0 +1,40 @@
+"""A driven oscillator with a rigid stop on one side: periodic impacts, period doubling, chaos.
+
+    m w + c v + k q = A cos(W t)  for q < wall,    v+ = -e v  at q = wall
+
+References: S. W. Shaw, P. J. Holmes, A periodically forced piecewise linear oscillator, J. Sound Vib. 90 (1983);
+J. M. T. Thompson, R. Ghaffari, Chaos after period-doubling bifurcations in the resonance of an impact oscillator,
+Phys. Lett. A 91 (1982).
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import EventScene
+from hhtjax.systems.events import Event, impact
+from hhtjax.systems.system import System
+
+
+def mass(q, params):
+    """M = [m]."""
+    return params["m"] * jnp.ones(1, q.dtype)
+
+
+def force(q, v, t, params):
+    """Q before the stop."""
+    return params["A"] * jnp.cos(params["W"] * t) - params["k"] * q - params["c"] * v
+
+
+def room(q, v, t, params):
+    """How far the stop is, m."""
+    return params["wall"] - q[0]
+
+
+def driven(restitution=0.8) -> EventScene:
+    """Stop at the middle of the oscillation, driven at 2.6 times the frequency without it (SI units).
+
+    Args:
+        restitution: e, in [0, 1].
+    """
+    params = {"m": 1.0, "c": 0.05, "k": 1.0, "A": 1.0, "W": 2.6, "wall": 0.0, "e": restitution}
+    events = (Event(room, reset=impact("e")),)
+    return EventScene(System(mass, force), params, jnp.array([-0.5]), jnp.zeros(1), 20.0, events)
