@@ -75,6 +75,7 @@ def test_trajectory_names_entries_and_units(run):
     assert len({style for _, style in looks}) == 2
 
 
+@pytest.mark.slow
 def test_trajectory_draws_into_axes_given_run_after_run(run, swing):
     figure, ax = plt.subplots()
     assert plot.trajectory(run, "acceleration", entries="phi", units="rad/s^2", label="one", ax=ax) is ax
@@ -102,6 +103,7 @@ def test_phase_plane(run):
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), run.v["phi"])
 
 
+@pytest.mark.slow
 def test_energy_balance_finds_the_potential_of_a_lagrangian():
     def lagrangian(q, v, t, p):
         return 0.5 * jnp.sum(v**2) - 0.5 * p["k"] * jnp.sum(q**2)
