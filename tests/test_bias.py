@@ -85,6 +85,7 @@ def test_the_response_to_forces_is_corrected_too():
     assert float(held.params["k"]) == pytest.approx(3.0 * (x / np.tan(x)) ** 2, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_bias_of_the_trapezoidal_rule_in_every_mode():
     """Two masses, w = 1 and w = sqrt(3): (tan x/x)^2 and, for damping proportional to K, 1/cos(x)^2."""
     K = jnp.array([[2.0, -1.0], [-1.0, 2.0]])

@@ -125,6 +125,7 @@ def test_four_bars_have_one_degree_of_freedom(name, loops):
     assert np.max(np.abs(path(name, times(name))[0] - exact)) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "loops"), [("one four-bar", 1), ("four bars", 2), ("five four-bars", 5)])
 def test_four_bars_lose_rank_where_all_bars_align(name, loops):
     """From 2 N + 1 to N + 1."""

@@ -46,6 +46,7 @@ def test_the_balance_of_a_driven_and_damped_double_pendulum_closes_with_the_orde
     np.testing.assert_allclose(found.kinetic, np.einsum("ni,nij,nj->n", path.v, M, path.v) / 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_error_is_what_a_method_loses():
     """An undamped spring: all that HHT damps; with V that moves in time, the work of whoever moves it."""
     spring = hhtjax.LinearSystem(M=jnp.array([2.0]), K=jnp.array([50.0]))

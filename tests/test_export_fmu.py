@@ -118,6 +118,7 @@ def test_a_unit_is_simulate(slave, expected):
     assert np.all(abs(slave.get("dq_x_dk[1]", "dq_x_dk[2]")) > 1e-4)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_one_long_step_is_many_short_ones(slave):
     """With the input held, to the last bit; and of a step that is no multiple, steps a little shorter."""

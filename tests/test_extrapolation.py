@@ -20,6 +20,7 @@ def smooth(alpha):
     return as_data(hhtjax.hht(alpha, linearize="predictor"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("alpha", "levels", "order"), [(-0.3, 2, 3), (-0.3, 3, 4), (0.0, 2, 4)])
 def test_each_level_adds_an_order_and_the_trapezoidal_rule_two(alpha, levels, order):
     errors = [
@@ -29,6 +30,7 @@ def test_each_level_adds_an_order_and_the_trapezoidal_rule_two(alpha, levels, or
     assert float(np.log2(errors[0] / errors[1])[0]) == pytest.approx(order, abs=0.2)
 
 
+@pytest.mark.slow
 def test_all_quantities_at_the_saved_times_of_the_first_run():
     stepper = hhtjax.hht(iterations=None)
     found = run(DUFFING, stepper, 20, save_every=4, extrapolate=2)

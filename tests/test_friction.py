@@ -57,6 +57,7 @@ def test_what_stopped_stays(family):
             np.testing.assert_allclose(tau[1:], -100 * q[1:], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_load_below_the_limit_moves_nothing():
     """For 10 s, however long the steps; tanh(v/vt) would creep."""
     system = hhtjax.System(jnp.ones(1), lambda q, v, t, F: 0.9 * F + 0 * q, friction=lambda q, v, t, F: F + 0 * q)
@@ -101,6 +102,7 @@ def chain(n, **more):
     )
 
 
+@pytest.mark.slow
 def test_one_factorisation_per_step():
     """Of the step's matrix, whatever switches; with constraints too."""
     n, zero = 20, jnp.zeros(20)

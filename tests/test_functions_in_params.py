@@ -45,6 +45,7 @@ def run_by_hand(layers, k=2.0):
     return hhtjax.simulate(PLAIN, STEPPER, *START, {"layers": layers, "k": k}, dt=0.05, num_steps=20).q
 
 
+@pytest.mark.slow
 def test_a_run_with_a_module_and_another_of_its_structure_without_tracing_again():
     first, second = network(0), network(1)
     np.testing.assert_allclose(run(first), run_by_hand(numbers(first)), rtol=1e-12)

@@ -53,6 +53,7 @@ def test_order_is_kept(name):
     assert abs(np.log2(coarse / fine) - stepper.order) < 0.15
 
 
+@pytest.mark.slow
 def test_first_order_systems_too():
     system = hhtjax.FirstOrderSystem(lambda y, t, params: params["u"](t) - y - y**3)
     params = {"u": hhtjax.sampled(jnp.asarray(VALUES), 0.1, order=0)}

@@ -201,6 +201,7 @@ def test_gradients():
     assert np.all(found != 0)
 
 
+@pytest.mark.slow
 def test_one_factorisation_of_all_rates_in_a_step():
     n, k = 20, 7
     system = hhtjax.System(

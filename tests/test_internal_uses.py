@@ -115,6 +115,7 @@ def test_sweeps_on_disk(tmp_path):
     np.testing.assert_allclose(found["zdot"][0, 0], (A @ np.concatenate(STATES))[2:])
 
 
+@pytest.mark.slow
 def test_energy_that_an_internal_state_takes():
     """A Maxwell branch: the spring's force takes what it stores and what its damper makes heat."""
     system, params, q0, v0, _, z0 = maxwell.vibration()
@@ -140,6 +141,7 @@ def test_consistent_initial_values_with_z():
     np.testing.assert_allclose(start.acceleration, [0.0, 1.0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_lagrangians_take_internal_states():
     def force(q, v, z, t, params):
         return z - 0.1 * v

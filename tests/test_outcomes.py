@@ -86,6 +86,7 @@ def test_check_names_the_first_of_several_bad_members_in_two_axes():
     check_message(SimulationError, f"simulate: member 0, 2 (2 of 6 failed), step {step} (to t = ", batch.check)
 
 
+@pytest.mark.slow
 def test_check_names_where_a_run_that_stays_finite_gets_too_far():
     """exp(t) of w = q, from 1: beyond 1 + reach at the saved time after log(1 + reach). Of a batch, the first."""
 

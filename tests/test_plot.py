@@ -91,6 +91,7 @@ def test_trajectory_marks_events():
     np.testing.assert_allclose(ax.get_ylim(), plain.get_ylim())
 
 
+@pytest.mark.slow
 def test_trajectory_draws_into_axes_given_run_after_run(run, swing):
     figure, ax = plt.subplots()
     assert plot.trajectory(run, "acceleration", entries="phi", units="rad/s^2", label="one", ax=ax) is ax
@@ -118,6 +119,7 @@ def test_phase_plane(run):
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), run.v["phi"])
 
 
+@pytest.mark.slow
 def test_energy_balance_finds_the_potential_of_a_lagrangian():
     def lagrangian(q, v, t, p):
         return 0.5 * jnp.sum(v**2) - 0.5 * p["k"] * jnp.sum(q**2)

@@ -33,6 +33,7 @@ def stability_function(method):
     return (denominator * exponential).coef[: method.order + 1], denominator.coef
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_an_oscillator_takes_the_stability_function_of_its_matrix(name):
     """Position and velocity after a step are R(h A) (q, v), for (q, v)' = A (q, v)."""
@@ -52,6 +53,7 @@ def test_an_oscillator_takes_the_stability_function_of_its_matrix(name):
     np.testing.assert_allclose(jax.jacfwd(step)(jnp.array([0.3, -0.2])), exact, rtol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_radius_at_infinity_and_stability(name):
     """Of the undamped oscillator; eigenvalues by autodiff of the step, from a hundredth of a period to 1e8 of them."""

@@ -181,6 +181,7 @@ def test_is_rotation(check):
         assert not check(wrong, 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("f", FUNCTIONS)
 def test_dtype_is_kept(f):
     of_vector = f in VECTOR_FUNCTIONS

@@ -48,6 +48,7 @@ def whole(tmp_path_factory):
     return write(tmp_path_factory.mktemp("whole") / "sweep")
 
 
+@pytest.mark.slow
 def test_what_is_read_is_what_sweep_returns(whole):
     system = hhtjax.System(ONE, force)
     runs = hhtjax.sweep(system, hhtjax.rk4(), ONE, ZERO, {"k": 4.0}, dts=DTS, duration=1.0, num_samples=2)

@@ -44,6 +44,7 @@ def test_each_member_is_its_own_run_sampled_at_common_times():
             np.testing.assert_allclose(getattr(runs, name)[i], getattr(alone, name), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_members_of_one_block_rest_when_they_are_done():
     """70 members run 4 at a time, 5 one by one."""
     many = sweep(PARAMS, dts=np.logspace(-2, -1, 70))
@@ -59,6 +60,7 @@ def test_new_values_are_not_compiled_anew():
     assert run_sweep._cache_size() == compiled
 
 
+@pytest.mark.slow
 def test_the_work_is_about_the_sum_over_the_members():
     system, counted = zoo.counting_oscillator()
     dts = np.logspace(-3, -1, 31)
@@ -98,6 +100,7 @@ def test_the_loop_and_its_nested_form_agree(count):
         assert np.isnan(value(0.0, LONGEST + 1)[1])
 
 
+@pytest.mark.slow
 def test_a_member_that_blows_up_is_flagged_and_leaves_the_others_alone():
     system = hhtjax.System(ONE, lambda q, v, t, k: k * q**3)
     runs = partial(

@@ -36,6 +36,7 @@ def test_cluster_errors_are_the_scatter_where_residuals_are_correlated():
     assert autocorrelated[0] == pytest.approx(1, abs=0.2)
 
 
+@pytest.mark.slow
 def test_what_a_single_segment_determines_has_an_error_too():
     """A jump seen by the first segment alone: its score vanishes there, and the white variance stands in."""
     first = jnp.where(k < 40, 1.0, 0.0)

@@ -54,6 +54,7 @@ def potential(q, params):
     return jnp.sum(params["k"] * d**2 / 2 + params["k3"] * d**4 / 4 + params["k_tyre"] * q[3:] ** 2 / 2)
 
 
+@pytest.mark.slow
 def test_at_rest_on_flat_road_it_stays():
     path = drive(FLAT)
     assert np.all(np.asarray(path.q) == 0)
