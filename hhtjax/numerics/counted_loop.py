@@ -66,9 +66,10 @@ def _repeat_in_levels(body, count, carry, constants):
         """(first, carry) -> the carry after SLOTS**depth iterations from `first`."""
         if depth == 0:
             return lambda i, carry: body(i, carry, *constants)
-        inner = checkpoint(level(depth - 1))
+        inner = level(depth - 1)
 
         def run(first, carry):
+            @checkpoint
             def visit(carry, j):
                 i = first + j * SLOTS ** (depth - 1)
                 return lax.cond(i < count, inner, lambda i, carry: carry, i, carry), None
