@@ -8,6 +8,7 @@ import pytest
 import hhtjax
 from experiments.benchmarks import native
 from experiments.benchmarks.chain import FORMULATIONS, chain
+from experiments.work_precision import gradients, ours
 from experiments.work_precision.timing import time_to
 from hhtjax.scenes import double_pendulum
 
@@ -50,3 +51,18 @@ def test_time_to_an_error_is_read_off_the_line_between_runs():
     assert time_to(rows, 1e-4) == pytest.approx(10**1.5)
     assert time_to(rows, 0.5) == 1.0
     assert time_to(rows, 1e-6) is None
+
+
+def test_errors_of_controlled_runs_follow_their_tolerances():
+    rows = ours.controlled_entries("forced Duffing", (1e-3, 1e-5), ("dopri5, adaptive",))
+    assert [row["tolerance"] for row in rows] == [1e-3, 1e-5]
+    for row in rows:
+        assert 0.01 < row["rms_error"] / row["tolerance"] < 30
+
+
+@pytest.mark.slow
+def test_errors_of_controlled_gradients_follow_their_tolerances():
+    rows = gradients.controlled_rows("forced Duffing", (1e-3, 1e-5))
+    assert len(rows) == 8
+    for row in rows:
+        assert row["rms_error"] / row["setting"] < 100

@@ -10,7 +10,10 @@ from hhtjax.plot import subplots, work_precision
 WORST = 10  # error beyond which a run is not drawn
 PACKAGES = "ours", "diffrax", "SciPy", "MuJoCo", "exudyn"
 SHOWN = {  # of a package: the methods that are drawn, where the page has all of them
-    "ours": ("hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rk4"),
+    "ours": (
+        *("hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rk4"),
+        *("hht, adaptive", "rowda, adaptive", "dopri5, adaptive"),
+    ),
     "diffrax": ("diffrax Tsit5, PID", "diffrax Kvaerno3, PID", "diffrax Kvaerno5, PID"),
     "SciPy": (
         "SciPy LSODA, C rhs",
@@ -25,7 +28,7 @@ SHOWN = {  # of a package: the methods that are drawn, where the page has all of
 }
 
 
-OURS = COLOURS[0], COLOURS[0], COLOURS[6], COLOURS[6], COLOURS[5], COLOURS[5]
+OURS = COLOURS[0], COLOURS[0], COLOURS[6], COLOURS[6], COLOURS[5], COLOURS[5], COLOURS[7], COLOURS[7], COLOURS[7]
 
 
 def style(package, number):

@@ -116,6 +116,22 @@ def our_rows(name, sizes, reverse_sizes, only=FORWARD):
     return rows
 
 
+def controlled_rows(name, tolerances):
+    """Both modes under error control, through the steps that were chosen."""
+    s, rows = start(name), []
+    for method in ("rowda, adaptive", "dopri5, adaptive"):
+        solution = ours.controlled(name, method, lambda s: scaled(cases()[name].scene.params, s))
+
+        def loss(s, tolerance, solution=solution):
+            found = solution(tolerance, s)
+            value = jnp.mean(jax.vmap(flat)(found.q)[1:, : cases()[name].size] ** 2)
+            return jnp.where(found.steps.stop == 0, value, jnp.nan)
+
+        for mode, derivative in (("forward", jax.jacfwd(loss)), ("reverse", jax.grad(loss))):
+            rows += sweep(name, f"{method}, {mode}", "ours", tolerances, partial(jax.jit(derivative), s))
+    return rows
+
+
 def diffrax_rows(name, tolerances):
     """Both modes, with step-size control."""
     import diffrax  # pyright: ignore[reportMissingImports]  # of an extra of its own
@@ -182,6 +198,7 @@ def entries(names, fast, installed):
             rows += our_rows(name, (1, 4), (), FORWARD[:1])
             continue
         rows += our_rows(name, tuple(2**i for i in range(11)), REVERSE_SIZES)
+        rows += controlled_rows(name, ours.TOLERANCES)
         rows += scipy_rows(name, scipy_peers.TOLERANCES[2::2])
         if "diffrax" in installed:
             rows += diffrax_rows(name, diffrax_peers.TOLERANCES[1:])

@@ -1,4 +1,4 @@
-"""Our steppers, as compiled loops."""
+"""Our steppers, as compiled loops, and under error control."""
 
 from functools import partial
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 import hhtjax
-from experiments.work_precision.cases import SAMPLES, cases, march
+from experiments.work_precision.cases import SAMPLES, cases, flat, march
 from experiments.work_precision.timing import sweep
 from hhtjax.numerics.richardson import richardson
 from hhtjax.xla import one_kernel
@@ -24,6 +24,13 @@ METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a 
     "rowda, extrapolate=2": (hhtjax.rowda(), 2, 1),
     "rk4": (hhtjax.rk4(), 1, 4),
 }
+CONTROLLED = {  # by `adaptive`; those but the first take the system without constraints and rotations
+    "hht, adaptive": SMOOTH,
+    "rowda, adaptive": hhtjax.rowda(),
+    "dopri5, adaptive": hhtjax.dopri5(),
+}
+TOLERANCES = tuple(10.0**-n for n in range(2, 12))
+MOST_STEPS = 100_000
 PLAIN = "rosenbrock", "rowda", "rowda, extrapolate=2", "rk4"  # take the system without constraints and rotations
 
 
@@ -61,4 +68,38 @@ def entries(name, sizes, only=None):
             return path, count if solves is None else solves * SAMPLES * substeps * (2**levels - 1)
 
         rows += sweep(name, method, "ours", solve, sizes, lambda n: {"h_s": duration / (SAMPLES * n)})
+    return rows
+
+
+def controlled(name, method, unravel):
+    """A function of the tolerance and the parameters, as a vector: the `Solution` at the sample times."""
+    case = cases()[name]
+    system, q0, v0 = (case.scene.system, case.scene.q0, case.scene.v0) if method.startswith("hht") else case.ode
+
+    def solve(tolerance, vector):
+        dt = hhtjax.adaptive(tolerance, 1e-2 * tolerance, max_steps=MOST_STEPS)
+        return hhtjax.simulate(system, CONTROLLED[method], q0, v0, unravel(vector), dt=dt, times=case.times)
+
+    return solve
+
+
+def controlled_entries(name, tolerances=TOLERANCES, only=tuple(CONTROLLED)):
+    """Rows of the methods under error control; their tolerances are as those of the others."""
+    case = cases()[name]
+    vector, unravel = ravel_pytree(case.scene.params)
+    numbers = {x: jnp.asarray(x) for x in tolerances}
+    rows = []
+    for method in only:
+        solution = controlled(name, method, unravel)
+
+        @jax.jit
+        def program(tolerance, vector, solution=solution):
+            found = solution(tolerance, vector)
+            return jax.vmap(flat)(found.q)[1:, : case.size], found.steps.stop
+
+        def solve(tolerance, program=program):
+            positions, stop = program(numbers[tolerance], vector)
+            return None if stop else positions, None
+
+        rows += sweep(name, method, "ours", solve, tolerances, lambda x: {"tolerance": x})
     return rows

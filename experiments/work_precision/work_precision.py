@@ -23,6 +23,7 @@ UNLIKE = {  # what compiles for long is left out
     "stiff chain of 8": ("hht", "hht, converged", "hht, extrapolate=2", "rowda", "rk4"),
     "squeezer": ("hht", "hht, converged", "hht, extrapolate=2", "rk4"),
 }
+UNCONTROLLED = {"squeezer": ("hht, adaptive",)}  # others compile for minutes there
 SIZES = tuple(2**n for n in range(12))
 LEVELS = 1e-2, 1e-3, 1e-4, 1e-6, 1e-8
 
@@ -31,9 +32,11 @@ def measure(report, name, fast, installed):
     """Rows of all methods on a case."""
     if fast:
         rows = ours.entries(name, (1, 4), ("hht", "rk4"))
+        rows += ours.controlled_entries(name, ours.TOLERANCES[:2], ("dopri5, adaptive",))
         return rows + scipy_peers.entries(name, scipy_peers.TOLERANCES[:2], ("LSODA",))
     primary = name == PRIMARY
     rows = ours.entries(name, SIZES, None if primary else UNLIKE.get(name, ELSEWHERE))
+    rows += ours.controlled_entries(name, only=UNCONTROLLED.get(name, tuple(ours.CONTROLLED)))
     report.progress(f"{name}: ours")
     rows += scipy_peers.entries(name)
     if "diffrax" in installed:

@@ -4,8 +4,10 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.core import eval_jaxpr
+from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
 
@@ -34,9 +36,29 @@ def _repeat(body, count, carry, constants):
     return lax.fori_loop(0, count, lambda i, carry: body(i, carry, *constants), carry)
 
 
-@_repeat.defjvp
+@partial(_repeat.defjvp, symbolic_zeros=True)
 def _(body, primals, tangents):
-    return jax.jvp(partial(_repeat_in_levels, body), primals, tangents)
+    """Constants without a tangent stay so: a long array of them would cost its length in every reverse iteration."""
+    count, carry, constants = primals
+    moves = [not isinstance(x, SymbolicZero) for x in tangents[2]]
+    moving = [x for x, moved in zip(constants, moves, strict=True) if moved]
+
+    def run(carry, moving):
+        moving = iter(moving)
+        mixed = [next(moving) if moved else x for x, moved in zip(constants, moves, strict=True)]
+        return _repeat_in_levels(body, count, carry, mixed)
+
+    carry_dot = jax.tree.map(_instantiate, tangents[1], is_leaf=lambda x: isinstance(x, SymbolicZero))
+    moving_dot = [x for x in tangents[2] if not isinstance(x, SymbolicZero)]
+    return jax.jvp(run, (carry, moving), (carry_dot, moving_dot))
+
+
+def _instantiate(tangent):
+    if not isinstance(tangent, SymbolicZero):
+        return tangent
+    if tangent.dtype == jax.dtypes.float0:
+        return np.zeros(tangent.shape, jax.dtypes.float0)
+    return jnp.zeros(tangent.shape, tangent.dtype)
 
 
 def _repeat_in_levels(body, count, carry, constants):
@@ -44,9 +66,10 @@ def _repeat_in_levels(body, count, carry, constants):
         """(first, carry) -> the carry after SLOTS**depth iterations from `first`."""
         if depth == 0:
             return lambda i, carry: body(i, carry, *constants)
-        inner = checkpoint(level(depth - 1))
+        inner = level(depth - 1)
 
         def run(first, carry):
+            @checkpoint
             def visit(carry, j):
                 i = first + j * SLOTS ** (depth - 1)
                 return lax.cond(i < count, inner, lambda i, carry: carry, i, carry), None
