@@ -61,8 +61,8 @@ def test_errors_of_controlled_runs_follow_their_tolerances():
 
 
 @pytest.mark.slow
-def test_errors_of_controlled_gradients_follow_their_tolerances():
-    rows = gradients.controlled_rows("forced Duffing", (1e-3, 1e-5))
-    assert len(rows) == 8
+def test_errors_of_controlled_gradients_are_within_their_tolerance():
+    rows = gradients.controlled_rows("forced Duffing", (1e-3,))
+    assert len(rows) == 4
     for row in rows:
         assert row["rms_error"] / row["setting"] < 100
