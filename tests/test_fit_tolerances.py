@@ -48,6 +48,7 @@ FORMS = {  # of residuals, and the tolerances of their runs
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", zoo.each(FORMS, quick=("alone", "vmap")))
 def test_the_steps_are_those_of_the_other_point(name):
     """Values and derivatives against steps that are chosen by hand, whatever stands between."""
@@ -72,6 +73,7 @@ def test_the_steps_are_those_of_the_other_point(name):
 CASES = [("hht", 0.001), pytest.param("dopri5", 0.3, marks=pytest.mark.slow)]  # choices change its rejected steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), CASES)
 def test_a_fit_freezes_the_steps_and_chooses_again(name, most):
     """The estimates are those of a fit by hand on the steps that are chosen for them, to a part of a standard error."""
@@ -99,6 +101,7 @@ def test_a_fit_freezes_the_steps_and_chooses_again(name, most):
     assert fitted.history.cost[-1] == fitted.cost
 
 
+@pytest.mark.slow
 def test_tolerances_above_the_noise_are_named():
     def residuals(p):
         return position(p, ONE, 1e-2) - MEASURED

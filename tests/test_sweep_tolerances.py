@@ -39,6 +39,7 @@ def sweep(params=PARAMS, rtol=RTOL, scene="spring", in_axes=None, **options):
     return hhtjax.sweep(system, stepper, q0, v0, params, dts=dts, times=TIMES, t0=2.0, in_axes=in_axes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", zoo.each(SCENES, quick=("spring",)))
 @pytest.mark.parametrize("verify", [False, True, pytest.param("tolerance", marks=pytest.mark.slow)])
 def test_each_member_is_its_own_run(name, verify):
@@ -62,6 +63,7 @@ def test_each_member_is_its_own_run(name, verify):
         np.testing.assert_allclose(runs.allowed, 10 * RTOL * (np.max(abs(runs.q), (1, 2)) + 1e-3), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_work_is_about_the_sum_over_the_members():
     """Of members that take very different numbers of steps, which are known only when they are done."""
     system, counted = zoo.counting_oscillator()
@@ -75,6 +77,7 @@ def test_the_work_is_about_the_sum_over_the_members():
     assert least <= tries < 1.1 * least
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_accepted_steps():
     """Forward, reverse, and by differences over the same steps."""
     at = jax.tree.map(jnp.asarray, PARAMS)
@@ -98,6 +101,7 @@ def test_derivatives_are_those_of_the_accepted_steps():
         assert float(forward[name]) == pytest.approx(float(reverse[name]), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_what_differs_is_data_and_failures_are_alone():
     """Stiffness per member, one tolerance; one member has too few steps, one is not finite from t = 3 on."""
     stiffness = {"k": jnp.array([1.0, 4e4, 4.0, 9.0, 1.0]), "c": jnp.array([0.1, 0.1, jnp.nan, 0.1, 0.2])}
