@@ -119,6 +119,14 @@ def assess_events(case, sizes, reference, method, way):
     return Outcome(np.array(errors), np.array(bounded)), named
 
 
+def shown(scenes):
+    """The page of the methods with alpha: more would not fit."""
+    with_alpha = {
+        name: {"grades": {m: rows for m, rows in x["grades"].items() if len(rows) > 1}} for name, x in scenes.items()
+    }
+    return page(with_alpha, CAUSES)
+
+
 def run(report, fast):
     """All three scenes; the smoke run has one of them, and one method."""
     outcomes, sizes, apart, named = {}, {}, {}, {}
@@ -138,7 +146,7 @@ def run(report, fast):
             report.progress(f"stops: {case.name}, {plain(method)}")
         outcomes[case.name], sizes[case.name] = found, steps
     scenes = cells(outcomes, sizes)
-    report.figure("stability_stops", page(scenes, CAUSES))
+    report.figure("stability_stops", shown(scenes))
     letters = {name: {m: "".join(rows) for m, rows in scene["grades"].items()} for name, scene in scenes.items()}
     counts = {"accurate": LETTERS[GOOD], "blown_up": LETTERS[BLOWN_UP]}
     return {
