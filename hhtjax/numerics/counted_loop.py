@@ -1,6 +1,7 @@
 """A loop whose number of iterations is data, with derivatives forward and reverse."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +54,7 @@ def _(body, primals, tangents):
     return jax.jvp(run, (carry, moving), (carry_dot, moving_dot))
 
 
-def _instantiate(tangent):
+def _instantiate(tangent: Any):
     if not isinstance(tangent, SymbolicZero):
         return tangent
     if tangent.dtype == jax.dtypes.float0:
