@@ -13,6 +13,7 @@ from hhtjax import Event, FirstOrderSystem, System, hht, impact, rk4, rotation, 
 FREE = System(jnp.ones(1), lambda q, v, t, p: 0 * q)
 
 
+@pytest.mark.slow
 def test_a_rotation_meets_a_stop():
     """A body that turns about z, up to an angle of 1 with e = .5."""
     inertia = jnp.array([1.0, 2.0, 3.0])
@@ -26,6 +27,7 @@ def test_a_rotation_meets_a_stop():
     assert abs(run.v[-1] - np.array([0.0, 0.0, -1.0])).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_internal_states_go_on_through_an_impact():
     """An arm on a motor, against a stop; z, the current, is seen by the reset, and stays."""
     arm = System(
@@ -52,6 +54,7 @@ def test_internal_states_go_on_through_an_impact():
     assert 1.7 < np.log2(error[0] / error[1]) < 2.3
 
 
+@pytest.mark.slow
 def test_dry_friction_and_an_impact():
     """A block slides with 1 m/s^2 of friction against a wall half a metre away, and back: v^2 loses 2 F s."""
     block = System(jnp.ones(1), lambda q, v, t, p: 0 * q, friction=lambda q, v, t, p: 1.0 + 0 * q)
@@ -65,6 +68,7 @@ def test_dry_friction_and_an_impact():
     assert bool(run.sticking[-1, 0])
 
 
+@pytest.mark.slow
 def test_a_held_input_jumps_between_the_steps():
     """An impact with an input that is held over steps: free flight with 1, then -1, from sample to sample."""
     u = hhtjax.sampled(np.array([1.0, -1.0, 1.0, -1.0]), 0.25, order=0)

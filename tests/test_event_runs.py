@@ -55,6 +55,7 @@ def test_an_impact_that_nothing_can_follow_fails_by_name():
     check_message(SimulationError, "step 3 (to t = 0.3) failed: no velocity changes the guard of event 0", run.check)
 
 
+@pytest.mark.slow
 def test_no_event_no_change():
     scene = event_problems.double_pendulum.free()
     far = Event(lambda q, v, t, p: q[0] - q[1] + 1e6, impact(0.5))
@@ -69,6 +70,7 @@ def test_no_event_no_change():
     assert runs[0].failure.event is None
 
 
+@pytest.mark.slow
 def test_a_sweep_is_its_members():
     problem = event_problems.dragged_ball()
     e, q0 = np.linspace(0.7, 0.9, 5), np.linspace(0.6, 1.4, 5)[:, None]
@@ -92,6 +94,7 @@ def test_a_sweep_is_its_members():
     assert abs(at_times.q[-1, -1] - runs.q[-1, -1]).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_member_that_fails_leaves_the_others_alone():
     e = np.array([0.5, 1.0, 0.9])
     params = {"g": G, "floor": 0.0, "e": e}
@@ -103,6 +106,7 @@ def test_a_member_that_fails_leaves_the_others_alone():
     assert bool(jnp.all(jnp.isfinite(runs.q[1:])))
 
 
+@pytest.mark.slow
 def test_the_same_numbers_on_plain_jax():
     problem = event_problems.walled_pendulum()
 
@@ -161,6 +165,7 @@ def test_what_is_between_the_saved_times():
     assert abs(found.v[:, 0] - (up - G * since)).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_extrapolation_across_impacts():
     """The part of dt^2 goes; what is left of order 3 depends on where in its step an event falls."""
     problem = event_problems.dragged_ball()
@@ -175,6 +180,7 @@ def test_extrapolation_across_impacts():
     assert error(2) < error(1) / 100
 
 
+@pytest.mark.slow
 def test_runs_that_meet_other_events_cannot_be_joined():
     """A guard that is below zero for so short a time that only the finer steps see it."""
     short = Event(lambda q, v, t, p: 1.0 - 2.0 * jnp.exp(-(((t - 0.2) / 0.02) ** 2)) + 0 * q[0])
@@ -182,6 +188,7 @@ def test_runs_that_meet_other_events_cannot_be_joined():
     check_message(SimulationError, "the runs that extrapolate joins do not meet the same events", run.check)
 
 
+@pytest.mark.slow
 def test_uneven_steps_and_modes_of_a_linear_system():
     """A stop that is a spring, switched by a mode; a LinearSystem is factorised anew where its params change."""
     system = LinearSystem(M=jnp.ones(1), K=lambda p: 4.0 * jnp.ones(1) + 96.0 * p["on"] * jnp.ones(1))
@@ -205,6 +212,7 @@ def test_events_of_a_first_order_system():
     assert abs(jnp.sin(np.pi * (run.q[:, 0] - run.t))).max() < 1e-12  # at 3 s it is 0 or 1
 
 
+@pytest.mark.slow
 def test_an_event_that_is_noted_changes_nothing_and_is_met_once():
     spring = System(jnp.ones(1), lambda q, v, t, p: -q)
     section = Event(lambda q, v, t, p: q[0])

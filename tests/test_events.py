@@ -41,6 +41,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_events_keep_the_order(case):
     make, stepper, order = CASES[case]
@@ -48,6 +49,7 @@ def test_events_keep_the_order(case):
     assert found > order - (0.15 if order == 2 else 0.2), found
 
 
+@pytest.mark.slow
 def test_a_force_that_jumps_without_a_mode_loses_it():
     assert slope(errors(event_problems.bump_stop(located=False), hht(-0.05), NUMBERS), NUMBERS) < 1.7
 
@@ -60,6 +62,7 @@ def bounced(x):
     return jnp.stack([floor + up * rest - g * rest**2 / 2, up - g * rest, fall])
 
 
+@pytest.mark.slow
 def test_derivatives_of_an_impact_are_those_of_the_formula_at_any_dt():
     x = jnp.array([1.0, 0.3, 9.81, 0.9, 0.1])
 
@@ -83,6 +86,7 @@ def test_derivatives_of_an_impact_are_those_of_the_formula_at_any_dt():
     assert abs(jax.jacrev(by_run)(x) - exact).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_an_impact_on_a_grid_point():
     """Free flight from .5 with -1 m/s: the wall is met at half a second, the end of a step, or a rounding behind it."""
 
@@ -97,6 +101,7 @@ def test_an_impact_on_a_grid_point():
     assert abs(jax.jacrev(end)(x) - exact).max() < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("num_steps", "derivative"), [(7, jax.jacfwd), (10, jax.jacrev)])
 def test_two_balls_exchange_their_velocities(num_steps, derivative):
     """The case in which physics engines gave .75, .25, .91, .08; with 10 steps the impact is on a grid point."""
@@ -111,6 +116,7 @@ def test_two_balls_exchange_their_velocities(num_steps, derivative):
     assert abs(found - np.array([1.0, 0.0, 1.0, 0.0])).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_gradients_agree_with_each_other_and_with_differences():
     problem = event_problems.dragged_ball()
 
@@ -130,6 +136,7 @@ def test_gradients_agree_with_each_other_and_with_differences():
     assert abs(forward - jnp.stack(central)).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_a_terminal_event_ends_the_run():
     """A ball thrown up at v0 lands after 2 v0/g."""
     landing = Event(lambda q, v, t, p: q[0], terminal=True)

@@ -54,12 +54,13 @@ def _(body, primals, tangents):
     return jax.jvp(run, (carry, moving), (carry_dot, moving_dot))
 
 
-def _instantiate(tangent: Any):
+def _instantiate(tangent):
     if not isinstance(tangent, SymbolicZero):
         return tangent
-    if tangent.dtype == jax.dtypes.float0:
-        return np.zeros(tangent.shape, jax.dtypes.float0)
-    return jnp.zeros(tangent.shape, tangent.dtype)
+    like: Any = tangent.aval
+    if like.dtype == jax.dtypes.float0:
+        return np.zeros(like.shape, jax.dtypes.float0)
+    return jnp.zeros(like.shape, like.dtype)
 
 
 def _repeat_in_levels(body, count, carry, constants):
