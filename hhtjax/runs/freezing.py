@@ -51,7 +51,7 @@ def chooses_steps(f, *args):
 
 def _inside(axis):
     try:
-        lax.axis_size(axis)
+        lax.axis_index(axis)
     except NameError:
         return False
     return True
