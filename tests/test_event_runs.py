@@ -225,3 +225,22 @@ def test_an_event_that_is_noted_changes_nothing_and_is_met_once():
     assert runs[1].events.count == 3
     assert abs(t[:3] - np.pi * np.array([0.5, 2.5, 4.5])).max() < 1e-3
     assert abs(runs[0].q - runs[1].q).max() < 1e-5
+
+
+def test_every_member_of_a_sweep_is_looked_at():
+    """A start beyond the floor, and a restitution above 1: named by the member."""
+    params = {"g": G, "floor": 0.0, "e": np.array([0.5, 0.6, 0.7])}
+    axes = {"g": None, "floor": None, "e": 0}
+
+    def runs(q0, params):
+        options = {"in_axes": (None, 0, None, axes), "events": [FLOOR]}
+        return sweep(BALL, hht(), q0, np.zeros(1), params, dts=np.full(3, 0.1), duration=0.2, num_samples=1, **options)
+
+    heights = np.array([[1.0], [1.0], [-1.0]])
+    check_message(
+        ValueError, "sweep: member 2: the start is beyond the guard of events[0]", lambda: runs(heights, params)
+    )
+    steep = {**params, "e": np.array([0.5, 1.5, 0.7])}
+    check_message(
+        ValueError, "sweep: member 1: events[0]: `restitution` must lie in [0, 1]", lambda: runs(abs(heights), steep)
+    )

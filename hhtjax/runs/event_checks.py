@@ -29,8 +29,21 @@ def require_events(caller, problem, events):
         _require_shapes(f"{caller}: events[{i}]", problem, event)
     if all(map(is_concrete, jax.tree.leaves((problem, events)))):
         with evaluated_now():
-            _require_start(caller, events, *map(np.asarray, _guards_at_start(problem, tuple(events))))
+            _require_start(caller, events, *map(np.asarray, _guards_at_start(problem, tuple(events))[:4]))
     return tuple(events)
+
+
+def refused_members(problem_of, arrays, axes, events):
+    """Numbers of those members of a batch that `require_events` refuses for their values.
+
+    problem_of: arrays -> a member's `Problem`; axes: of the arrays, as for `jax.vmap`.
+    """
+    with evaluated_now():
+        found = jax.vmap(lambda arrays: _guards_at_start(problem_of(arrays), events), (axes,))(arrays)
+    g, rates, terms, on_velocity, e = map(np.asarray, found)
+    impacts = np.array([isinstance(event.reset, Impact) for event in events])
+    bad = _is_beyond(events, g, rates, terms) | (impacts & (on_velocity | ~((e >= 0) & (e <= 1))))
+    return np.flatnonzero(bad.any(axis=1))
 
 
 def _require_shapes(caller, problem, event):
@@ -86,7 +99,7 @@ def _require_same(caller, params, after):
 
 @jax.jit
 def _guards_at_start(problem, events):
-    """g and dg/dt of all events, what g is the sum of, and whether it depends on v."""
+    """g and dg/dt of all events, what g is the sum of, whether it depends on v, and the restitution, 0 without."""
     flat, q, v, t0, params = problem.flat()
     flat_events = flatten_events(flat, events, params, problem.stepper.redundant)
     size = jnp.ones_like(t0)
@@ -100,18 +113,25 @@ def _guards_at_start(problem, events):
         )
     )
     terms = jnp.sum(jnp.abs(along_q * q[None, :]), axis=1)
-    return g, rates, terms, jnp.any(along_v != 0, axis=1)
+    laws = [event.reset if isinstance(event.reset, Impact) else Impact(0.0) for event in events]
+    e = jnp.stack([jnp.asarray(law.coefficient(params)).astype(q.dtype) for law in laws])
+    return g, rates, terms, jnp.any(along_v != 0, axis=1), e
+
+
+def _is_beyond(events, g, rates, terms):
+    """Of each event, whether the start is beyond its guard, or at it without rising: (..., E)."""
+    noted, numbers = np.array([event.is_noted for event in events]), np.finfo(g.dtype)
+    at_guard = np.abs(g) <= AT_GUARD * numbers.eps * np.maximum(terms, numbers.tiny)
+    return ~noted & ~(g > 0) & ~(at_guard & (rates > 0))
 
 
 def _require_start(caller, events, g, rates, terms, on_velocity):
     """An error for a start beyond a guard, and an impact along a velocity."""
+    beyond = _is_beyond(events, g, rates, terms)
     for i, event in enumerate(events):
         if isinstance(event.reset, Impact) and on_velocity[i]:
             raise ValueError(f"{caller}: events[{i}]: the `guard` of an impact must depend on q and t only, not on v.")
-        if event.is_noted or g[i] > 0:
-            continue
-        at_guard = abs(g[i]) <= AT_GUARD * np.finfo(g.dtype).eps * max(terms[i], np.finfo(g.dtype).tiny)
-        if not (at_guard and rates[i] > 0):
+        if beyond[i]:
             raise ValueError(
                 f"{caller}: the start is beyond the guard of events[{i}]: it is {g[i]:.6g}, with the rate "
                 f"{rates[i]:.6g}; it must be positive, or zero and rising."

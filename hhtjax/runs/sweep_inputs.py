@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 from hhtjax.checks import require_integer, require_number, require_params
 from hhtjax.description import evaluated_now, is_array, is_concrete
 from hhtjax.runs.adaptive import Adaptive, lengths, require_controlled
-from hhtjax.runs.event_checks import require_events
+from hhtjax.runs.event_checks import refused_members, require_events
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.sweep_grid import (
     equal_times,
@@ -86,11 +86,21 @@ class Inputs(NamedTuple):
             return self
         if isinstance(self.dts, Adaptive):
             raise NotImplementedError("sweep: with dts=adaptive(...), leave `events` out.")
-        members = range(self.size) if any(self.mapped) and is_concrete(self.dts) else [0]
-        for i in members:
-            stepper, q0, v0, params, z0 = _member(self.data, self.mapped, i)
+
+        def problem_of(data):
+            stepper, q0, v0, params, z0 = data
+            return Problem(self.system, stepper, q0, v0, params, self.t0, z0)
+
+        def require(i):
             where = f"sweep: member {i}" if any(self.mapped) else "sweep"
-            events = require_events(where, Problem(self.system, stepper, q0, v0, params, self.t0, z0), events)
+            return require_events(where, problem_of(_member(self.data, self.mapped, i)), events)
+
+        events = require(0)
+        leaves, structure = jax.tree.flatten(self.data)
+        if any(self.mapped) and all(map(is_concrete, jax.tree.leaves((self.system, leaves, self.t0, events)))):
+            axes = [0 if flag else None for flag in self.mapped]
+            for i in refused_members(lambda x: problem_of(structure.unflatten(x)), leaves, axes, events)[:1]:
+                require(i)
         return self._replace(events=events, room=room)
 
     def chunk(self, members):
