@@ -60,7 +60,7 @@ from hhtjax.numerics.structured_solve import banded, conjugate_gradients
 from hhtjax.runs.adaptive import adaptive
 from hhtjax.runs.choose import Steps
 from hhtjax.runs.chosen import choose_steps
-from hhtjax.runs.events import Events
+from hhtjax.runs.event_log import Events
 from hhtjax.runs.interpolate import InternalInterpolant, Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import Failure, SimulationError, Solution

@@ -1,43 +1,17 @@
 """Runs with events: what they carry along, and what they tell."""
 
 from functools import partial
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description.presentation import shown
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, seldom
 from hhtjax.runs.event_failures import FINE
+from hhtjax.runs.event_log import Events
 from hhtjax.runs.loop import first_failure
-from hhtjax.runs.meeting import Log, Met, Part, Ways, asks, pass_events
+from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events
 from hhtjax.systems.events import flatten_events
-
-
-@shown
-class Events(NamedTuple):
-    """The events of a run, in their order; with `keep_events` entries, NaN (of `which` -1) beyond those that were met.
-
-    Attributes:
-        count: how many were met, also those beyond the entries.
-        t: (keep_events,), when; differentiable.
-        which: (keep_events,), the number of the event.
-        q: where, like q0 with a leading axis; None of a first-order system.
-        before, after: v before and after each, like v0 with a leading axis; y of a first-order system.
-        z: internal states there, None without.
-        rate: (keep_events,), dg/dt before. Where it is small beside the velocities the motion grazes the guard, and
-            derivatives are huge, at last infinite.
-    """
-
-    count: Any
-    t: Any
-    which: Any
-    q: Any
-    before: Any
-    after: Any
-    z: Any
-    rate: Any
 
 
 def loop_with_events(loop, flat, stepper, events, params, max_events, keep):
@@ -87,18 +61,16 @@ def before_any(ways, start, params, keep):
         return jnp.full((keep, *shape), jnp.nan, dtype)
 
     N = start.v.size
-    log = Log(none, empty(), jnp.full(keep, -1, jnp.int32), empty(start.q.size), empty(N), empty(N), empty())
+    which, q = jnp.full(keep, -1, jnp.int32), empty(start.q.size)
+    log = Events(none, empty(), which, q, empty(N), empty(N), None, empty())
     return Met(ways.events.modes(params), jnp.array(False), none + FINE, none, log)
 
 
 def with_told_events(flat, solution, met):
     """The `Solution` with its `Events`, and what was wrong with one of them."""
-    log, n, q, z = met.log, flat.positions, None, None
-    before, after, rows = log.before, log.after, flat.unravel
-    if n:
-        q, rows = jax.vmap(flat.unravel)(log.q), flat.unravel_rates
-        before, after = before[:, :n], after[:, :n]
-    if n not in (0, flat.size):
-        z = jax.vmap(flat.unravel_internal)(log.before[:, n:])
-    events = Events(log.count, log.t, log.which, q, jax.vmap(rows)(before), jax.vmap(rows)(after), z, log.rate)
+    log, n = met.log, flat.positions
+    z = None if n in (0, flat.size) else jax.vmap(flat.unravel_internal)(log.before[:, n:])
+    q, rows = (jax.vmap(flat.unravel)(log.q), flat.unravel_rates) if n else (None, flat.unravel)
+    before, after = (jax.vmap(lambda v: rows(flat.located(v) if n else v))(v) for v in (log.before, log.after))
+    events = log._replace(q=q, before=before, after=after, z=z)
     return solution._replace(events=events, failure=solution.failure._replace(event=met.code, guard=met.event))

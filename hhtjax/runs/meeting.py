@@ -15,6 +15,7 @@ from jax import lax
 
 from hhtjax.numerics.seldom import choose, seldom
 from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, STAYS
+from hhtjax.runs.event_log import Events, noted_down
 from hhtjax.runs.loop import resized_step
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
@@ -34,25 +35,6 @@ class Ways(NamedTuple):
     no_info: Any
 
 
-class Log(NamedTuple):
-    """The first events of a run, on vectors; see `Events`."""
-
-    count: Any
-    t: Any
-    which: Any
-    q: Any
-    before: Any
-    after: Any
-    rate: Any
-
-    def added(self, *entry):
-        """The log with one event more, as long as there is room."""
-        here = jnp.arange(self.t.size, dtype=self.count.dtype) == self.count
-        places = [here if jnp.ndim(y) == 0 else here[:, None] for y in entry]
-        rows = [y if jnp.ndim(y) == 0 else y[None, :] for y in entry]
-        return Log(self.count + 1, *map(jnp.where, places, rows, self[1:]))
-
-
 class Met(NamedTuple):
     """What a run with events carries along: numbers that switches changed, whether it has ended, what went wrong (code
     and event), and the log."""
@@ -61,7 +43,7 @@ class Met(NamedTuple):
     ended: Any
     code: Any
     event: Any
-    log: Log
+    log: Events  # on vectors
 
 
 class Part(NamedTuple):
@@ -187,7 +169,7 @@ def meet(ways, part, found, h, params):
     missed = ~(jnp.abs(pick(this, g)) <= 1e-3 * jnp.abs(rate) * h + noise * pick(this, found.size))
 
     v, modes = events.outcome(i, e.q, e.v, e.t, now)
-    log = met.log.added(e.t, i, e.q, e.v, v, rate)
+    log = noted_down(met.log, e.t, i, e.q, e.v, v, rate)
     noted, ends = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, events.ends))
     beside = ~noted & jnp.any(is_corner(g, d, h, this, events.noted))
     code = jnp.where(beside, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
