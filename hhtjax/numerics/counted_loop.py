@@ -1,6 +1,7 @@
 """A loop whose number of iterations is data, with derivatives forward and reverse."""
 
 from functools import partial
+from itertools import compress
 from typing import Any
 
 import jax
@@ -11,75 +12,198 @@ from jax.core import eval_jaxpr
 from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.xla import TwoWays, derivative, staged
 
 SLOTS, LEVELS = 64, 3
-LONGEST = SLOTS**LEVELS  # iterations that can be differentiated
+LONGEST = SLOTS**LEVELS  # iterations that reverse mode can go back
 
 
 def repeat(body, carry, count):
     """carry -> body(i, carry) for i = 0, ..., count - 1, count a traced integer.
 
-    A plain while loop, so that another count costs no compilation. Its derivatives run through nested loops of fixed
-    length that skip what is beyond count and keep the carry of `SLOTS` iterations on each of `LEVELS` levels, computing
-    the levels below again: one more evaluation for each. Up to LONGEST iterations; beyond it they are NaN.
+    A while loop, so that another count costs no compilation; its derivatives are such loops too, and cost as many
+    iterations. Reverse mode keeps the carry before each of up to SLOTS blocks of iterations on each of LEVELS levels,
+    and computes what a block holds again when it comes to it: up to SLOTS iterations twice, up to SLOTS^2 three times.
+    Beyond LONGEST iterations its derivatives are NaN.
     """
     trace = jax.make_jaxpr(body)(jnp.zeros((), jnp.int32), carry)  # tells what body closes over, integers too
-    structure = jax.tree.structure(carry)
+    leaves, structure = jax.tree.flatten(carry)
 
-    def traced(i, carry, *constants):
-        return jax.tree.unflatten(structure, eval_jaxpr(trace.jaxpr, constants, i, *jax.tree.leaves(carry)))
+    def traced(i, leaves, constants):
+        return eval_jaxpr(trace.jaxpr, constants, i, *leaves)
 
-    return _repeat(traced, count, carry, trace.consts)
+    return jax.tree.unflatten(structure, _repeat(traced, count, [jnp.asarray(x) for x in leaves], trace.consts))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _repeat(body, count, carry, constants):
-    return lax.fori_loop(0, count, lambda i, carry: body(i, carry, *constants), carry)
+    return lax.fori_loop(0, count, lambda i, carry: body(i, carry, constants), carry)
 
 
 @partial(_repeat.defjvp, symbolic_zeros=True)
 def _(body, primals, tangents):
     """Constants without a tangent stay so: a long array of them would cost its length in every reverse iteration."""
     count, carry, constants = primals
-    moves = [not isinstance(x, SymbolicZero) for x in tangents[2]]
-    moving = [x for x, moved in zip(constants, moves, strict=True) if moved]
+    floats = tuple(jnp.issubdtype(x.dtype, jnp.inexact) for x in carry)
+    moves = tuple(not isinstance(x, SymbolicZero) for x in tangents[2])
+    dots = [*map(_instantiate, compress(tangents[1], floats)), *compress(tangents[2], moves)]
+    if not dots:
+        out = _repeat(body, count, carry, constants)
+        return out, [_none(x) for x in out]
+    out, dots = derivative(Loop(body, floats, moves).ways(), [count, *carry, *constants], dots)
+    return out, merged(floats, dots, [_none(x) for x in out])
 
-    def run(carry, moving):
-        moving = iter(moving)
-        mixed = [next(moving) if moved else x for x, moved in zip(constants, moves, strict=True)]
-        return _repeat_in_levels(body, count, carry, mixed)
 
-    carry_dot = jax.tree.map(_instantiate, tangents[1], is_leaf=lambda x: isinstance(x, SymbolicZero))
-    moving_dot = [x for x in tangents[2] if not isinstance(x, SymbolicZero)]
-    return jax.jvp(run, (carry, moving), (carry_dot, moving_dot))
+def _none(x):
+    return np.zeros(x.shape, jax.dtypes.float0)
 
 
 def _instantiate(tangent):
-    if not isinstance(tangent, SymbolicZero):
-        return tangent
-    like: Any = tangent.aval
-    if like.dtype == jax.dtypes.float0:
-        return np.zeros(like.shape, jax.dtypes.float0)
-    return jnp.zeros(like.shape, like.dtype)
+    like: Any = tangent.aval if isinstance(tangent, SymbolicZero) else None
+    return tangent if like is None else jnp.zeros(like.shape, like.dtype)
 
 
-def _repeat_in_levels(body, count, carry, constants):
-    def level(depth):
-        """(first, carry) -> the carry after SLOTS**depth iterations from `first`."""
-        if depth == 0:
-            return lambda i, carry: body(i, carry, *constants)
-        inner = level(depth - 1)
+def merged(choices, new, old):
+    """The next of `new` wherever the choice is true, what was there elsewhere."""
+    new = iter(new)
+    return [next(new) if chosen else x for chosen, x in zip(choices, old, strict=True)]
 
-        def run(first, carry):
+
+def row_written(axis):
+    """(array, row, number) -> the array with the row along an axis. What vmap makes of this in JAX is a scatter, even
+    for one number, and no part of a kernel."""
+
+    @jax.custom_batching.custom_vmap
+    def write(array, row, number):
+        return lax.dynamic_update_index_in_dim(array, row, number, axis)
+
+    @write.def_vmap
+    def _(size, batched, array, row, number):
+        if batched[2]:
+            in_axes = tuple(0 if x else None for x in batched)
+            plain = partial(lax.dynamic_update_index_in_dim, axis=axis)
+            return jax.vmap(plain, in_axes)(array, row, number), True
+        array, row = (
+            x if there else jnp.broadcast_to(x, (size, *x.shape))
+            for x, there in zip((array, row), batched[:2], strict=True)
+        )
+        return row_written(axis + 1)(array, row, number), True
+
+    return write
+
+
+class Loop:
+    """Floats: which parts of the carry are floating numbers; moves: which of the constants have tangents."""
+
+    def __init__(self, body, floats, moves):
+        self.body, self.floats, self.moves = body, floats, moves
+
+    def ways(self):
+        """Its derivative in both modes, of [count, *carry, *constants]."""
+        slow = self.forward_by_scans, self.reverse_by_scans
+        return TwoWays(len(self.floats), self.values, self.forward, self.reverse, *slow)
+
+    def split(self, x):
+        """The count, the carry, the constants."""
+        return x[0], x[1 : 1 + len(self.floats)], x[1 + len(self.floats) :]
+
+    def parts(self, dx):
+        """Tangents of the carry, and of the constants."""
+        number = sum(self.floats)
+        return dx[:number], dx[number:]
+
+    def step(self, i, carry, constants):
+        """An iteration as a function of what moves, which also gives the whole carry."""
+
+        def step(x, moving):
+            after = self.body(i, merged(self.floats, x, carry), merged(self.moves, moving, constants))
+            return list(compress(after, self.floats)), after
+
+        return step, list(compress(carry, self.floats)), list(compress(constants, self.moves))
+
+    def values(self, x):
+        return _repeat(self.body, *self.split(x))
+
+    def forward(self, x, dx):
+        count, carry, constants = self.split(x)
+        dots, moving_dots = self.parts(dx)
+
+        def body(i, now):
+            carry, dots = now
+            step, *at = self.step(i, carry, constants)
+            _, dots, carry = jax.jvp(step, tuple(at), (dots, moving_dots), has_aux=True)
+            return carry, dots
+
+        return lax.fori_loop(0, count, body, (carry, dots))
+
+    def reverse(self, x, cotangents):
+        count, carry, constants = self.split(x)
+
+        def run(first, number, carry):
+            return lax.fori_loop(first, first + number, lambda i, carry: self.body(i, carry, constants), carry)
+
+        def back(level, first, number, carry, found):
+            """Cotangents of the carry, and sums of those of constants, before `number` iterations from `first`."""
+            if level == 0:
+                step, *at = self.step(first, carry, constants)
+                pull_back = staged(lambda *at: jax.vjp(step, *at, has_aux=True)[1])(*at)
+                cotangents, more = staged(pull_back)(found[0])
+                return cotangents, [x + y for x, y in zip(found[1], more, strict=True)]
+            size = SLOTS ** (level - 1)
+            blocks = (number + size - 1) // size
+
+            def keep(j, kept, carry):
+                return [row_written(0)(k, x, j) for k, x in zip(kept, carry, strict=True)]
+
+            def block(j, now):
+                carry, kept = now
+                return run(first + j * size, size, carry), keep(j, kept, carry)
+
+            def turn(j, found):
+                j = blocks - 1 - j
+                start = [lax.dynamic_index_in_dim(x, j, 0, keepdims=False) for x in kept]
+                return back(level - 1, first + j * size, jnp.minimum(size, number - j * size), start, found)
+
+            kept = [jnp.zeros((SLOTS, *x.shape), x.dtype) for x in carry]
+            carry, kept = lax.fori_loop(0, blocks - 1, block, (carry, kept))
+            kept = keep(blocks - 1, kept, carry)
+            return lax.fori_loop(0, blocks, turn, found)
+
+        sums = [jnp.zeros_like(x) for x in compress(constants, self.moves)]
+        cotangents, sums = back(LEVELS, jnp.zeros_like(count), count, carry, (cotangents, sums))
+        return [jnp.where(count <= LONGEST, x, jnp.nan) for x in (*cotangents, *sums)]
+
+    def by_scans(self, x):
+        """The loop as a nest of scans that skip what is beyond count, a function of what moves, and where it is."""
+        count, carry, constants = self.split(x)
+
+        def level(depth, first, carry, constants):
+            """The carry after SLOTS**depth iterations."""
+            if depth == 0:
+                return self.body(first, carry, constants)
+
             @checkpoint
             def visit(carry, j):
                 i = first + j * SLOTS ** (depth - 1)
-                return lax.cond(i < count, inner, lambda i, carry: carry, i, carry), None
+                inner = partial(level, depth - 1)
+                return lax.cond(i < count, inner, lambda i, carry, constants: carry, i, carry, constants), None
 
             return lax.scan(visit, carry, jnp.arange(SLOTS, dtype=jnp.int32))[0]
 
-        return run
+        def run(x, moving):
+            given = merged(self.floats, x, carry), merged(self.moves, moving, constants)
+            after = level(LEVELS, jnp.zeros((), jnp.int32), *given)
+            known = [jnp.where(count <= LONGEST, x, jnp.nan) for x in compress(after, self.floats)]
+            return known, merged(self.floats, known, after)
 
-    carry = level(LEVELS)(jnp.zeros((), jnp.int32), carry)
-    known = jnp.where(count <= LONGEST, 1.0, jnp.nan)  # a factor, so that derivatives are NaN too
-    return jax.tree.map(lambda x: x * known.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, carry)
+        return run, list(compress(carry, self.floats)), list(compress(constants, self.moves))
+
+    def forward_by_scans(self, x, dx):
+        run, *at = self.by_scans(x)
+        _, dots, values = jax.jvp(run, tuple(at), self.parts(dx), has_aux=True)
+        return values, dots
+
+    def reverse_by_scans(self, x, cotangents):
+        run, *at = self.by_scans(x)
+        found, moving = jax.vjp(run, *at, has_aux=True)[1](cotangents)
+        return [*found, *moving]

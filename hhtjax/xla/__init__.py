@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows twelve functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows thirteen functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -45,6 +45,7 @@ The rest of the library knows twelve functions of this room, and works as well o
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
+    derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
     explain(f, *args)         what became of the loops of a program
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
@@ -82,6 +83,7 @@ from hhtjax.xla.listing import Listing, Scalar
 from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
+from hhtjax.xla.two_ways import TwoWays, derivative
 
 __all__ = [
     "RANGE",
@@ -89,7 +91,9 @@ __all__ = [
     "Listing",
     "NotListed",
     "Scalar",
+    "TwoWays",
     "choose",
+    "derivative",
     "explain",
     "largest_in_batch",
     "linear_map",
