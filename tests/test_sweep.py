@@ -9,7 +9,6 @@ import pytest
 import zoo
 
 import hhtjax
-from hhtjax.numerics.counted_loop import LONGEST, SLOTS, repeat
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.scenes import pendulum
 
@@ -82,22 +81,6 @@ def test_derivatives_forward_and_reverse_are_those_of_the_runs():
         np.testing.assert_allclose(reverse[key], forward[key], rtol=1e-10)
         up, down = (loss(at[0] | {key: at[0][key] + d}, 0.0) for d in (h, -h))
         np.testing.assert_allclose(reverse[key], (up - down) / (2 * h), rtol=1e-7)
-
-
-@pytest.mark.parametrize("count", [0, 1, SLOTS - 1, SLOTS, SLOTS**2 + 5])
-def test_the_loop_and_its_nested_form_agree(count):
-    """x -> (1 + a) x, count times: derivatives by hand, beside an integer the loop closes over."""
-    every = jnp.asarray(3)
-
-    def value(a, n):
-        return repeat(lambda i, x: jnp.where(i % every.astype(i.dtype) == 0, (1 + a) * x, x), 1.0 + 0 * a, n)
-
-    value = jax.jit(jax.value_and_grad(value))
-    power = -(-count // 3)
-    found, slope = value(1e-4, count)
-    np.testing.assert_allclose([found, slope], [1.0001**power, power * 1.0001 ** (power - 1)], rtol=1e-10)
-    if count == 0:
-        assert np.isnan(value(0.0, LONGEST + 1)[1])
 
 
 @pytest.mark.slow

@@ -26,9 +26,11 @@ def repeat(body, carry, count):
     and computes what a block holds again when it comes to it: up to SLOTS iterations twice, up to SLOTS^2 three times.
     Beyond LONGEST iterations its derivatives are NaN.
     """
-    trace = jax.make_jaxpr(body)(jnp.zeros((), jnp.int32), carry)  # tells what body closes over, integers too
+    count = jnp.asarray(count)
+    trace = jax.make_jaxpr(body)(jnp.zeros_like(count), carry)  # tells what body closes over, integers too
     leaves, structure = jax.tree.flatten(carry)
 
+    @jax.jit
     def traced(i, leaves, constants):
         return eval_jaxpr(trace.jaxpr, constants, i, *leaves)
 
@@ -188,11 +190,11 @@ class Loop:
                 inner = partial(level, depth - 1)
                 return lax.cond(i < count, inner, lambda i, carry, constants: carry, i, carry, constants), None
 
-            return lax.scan(visit, carry, jnp.arange(SLOTS, dtype=jnp.int32))[0]
+            return lax.scan(visit, carry, jnp.arange(SLOTS, dtype=count.dtype))[0]
 
         def run(x, moving):
             given = merged(self.floats, x, carry), merged(self.moves, moving, constants)
-            after = level(LEVELS, jnp.zeros((), jnp.int32), *given)
+            after = level(LEVELS, jnp.zeros_like(count), *given)
             known = [jnp.where(count <= LONGEST, x, jnp.nan) for x in compress(after, self.floats)]
             return known, merged(self.floats, known, after)
 

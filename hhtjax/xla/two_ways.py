@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import Primitive, Var
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
@@ -21,9 +22,12 @@ class TwoWays(NamedTuple):
     """A function of a list of arrays, x, and its derivative for a list of floating tangents dx, one or more, of some of
     them; none of these closes over a tracer.
 
-    values: x -> list of values. forward: x, dx -> (values, list of tangents dy, of the floating ones). reverse:
-    x, cotangents of dy -> those of dx. slow, slow_reverse: as the last two, in forms that autodiff can differentiate.
-    number: of values.
+    Attributes:
+        number: of values.
+        values: x -> list of values.
+        forward: x, dx -> values, and the list of tangents dy of the floating ones.
+        reverse: x, cotangents of dy -> those of dx.
+        slow, slow_reverse: as the last two, in forms that autodiff can differentiate.
     """
 
     number: int
@@ -58,7 +62,7 @@ def derivative(ways, x, dx):
 
     >>> ways = TwoWays(1, lambda x: [x[0] ** 2], lambda x, dx: ([x[0] ** 2], [2 * x[0] * dx[0]]),
     ...                lambda x, dy: [7 * dy[0]], None, None)  # a wrong one, to see it used
-    >>> float(jax.grad(lambda dx: derivative(ways, [3.0], [dx])[1][0])(1.0))
+    >>> float(jax.grad(lambda dx: derivative(ways, [jnp.array(3.0)], [dx])[1][0])(1.0))
     7.0
     """
     found = both_p.bind(*x, *dx, ways=ways, count=len(x))
@@ -86,14 +90,23 @@ def _values(*x, ways):
 def _jvp_by(function, args, dots, **params):
     """Found by autodiff."""
     found = jax.jvp(partial(function, **params), args, tuple(map(_instantiated, args, dots)))
-    zeros = (ad.Zero(jax.core.ShapedArray(dot.shape, dot.dtype)) for dot in found[1])
-    return found[0], [x if x.aval.dtype == jax.dtypes.float0 else dot for x, dot in zip(zeros, found[1], strict=True)]
+    return found[0], [_no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found[1]]
+
+
+def _no_tangent(x):
+    """Zero, of a value or of a tangent."""
+    dtype = x.dtype if jnp.issubdtype(x.dtype, jnp.inexact) else jax.dtypes.float0
+    return ad.Zero(ShapedArray(x.shape, dtype))
 
 
 def _jvp_of_both(args, dots, ways, count):
-    """Second derivatives."""
-    slow = ways._replace(forward=ways.slow)
-    return both_p.bind(*args, ways=ways, count=count), _jvp_by(_both, args, dots, ways=slow, count=count)[1]
+    """Of tangents, the same; of x, second derivatives."""
+    out = both_p.bind(*args, ways=ways, count=count)
+    if all(type(dot) is ad.Zero for dot in dots[:count]):
+        moves = map(ad.instantiate_zeros, dots[count:])
+        changes = linear_p.bind(*args[:count], *moves, ways=ways, count=count, backwards=False)
+        return out, [*(_no_tangent(x) for x in out[: ways.number]), *changes]
+    return out, _jvp_by(_both, args, dots, ways=ways._replace(forward=ways.slow), count=count)[1]
 
 
 def _jvp_of_linear(args, dots, ways, count, backwards):
@@ -177,7 +190,7 @@ def _primitive(name, run, batch):
 
 
 def _shapes(run, *args, **params):
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(partial(run, **params), *args)]
+    return [ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(partial(run, **params), *args)]
 
 
 values_p = _primitive("hhtjax_values", _values, _batch_values)
