@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from hhtjax.analysis.friction_between import friction_between
 from hhtjax.checks import require_function
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import shown
@@ -13,7 +14,8 @@ from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.system import LinearSystem, System, require_smooth
+from hhtjax.systems.friction import reaction
+from hhtjax.systems.system import LinearSystem, System
 
 
 @shown
@@ -38,11 +40,12 @@ class EnergyBalance(NamedTuple):
 def energy_balance(system, solution, params=None, potential=None) -> EnergyBalance:
     """The energy balance along a run: a diagnostic, whose `error` is the energy that the method itself made or lost.
 
-        d/dt (T + V) = v' Q + v' Mdot v/2 + L' B v + dV/dt = P,    T = v' M(q) v/2
-        work(t) = integral of P:  dampers, inputs, forces without a potential, constraints that move
+        d/dt (T + V) = v' Q + v' Mdot v/2 + L' B v - tau' H v + dV/dt = P,    T = v' M(q) v/2
+        work(t) = integral of P:  dampers, inputs, forces without a potential, constraints that move, dry friction
 
     The integral is Simpson's over each interval between saved times, on dense output: of order 4. Save every step, or
-    some within the shortest period. Where nothing damps or drives, and V is given, work is 0 and the error is the
+    some within the shortest period. Dry friction tau jumps where a joint switches: its integral is of order 2 there.
+    It takes tau s where a joint slides, nothing where it sticks to what rests, and what a moving belt gives or takes. Where nothing damps or drives, and V is given, work is 0 and the error is the
     drift of the total energy; without V, work counts every force, and the error is another, of the same order.
 
     Args:
@@ -70,7 +73,6 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
     caller = "energy_balance"
     if not isinstance(system, (System, LinearSystem)):
         raise TypeError(f"{caller}: `system` must be a System or LinearSystem; received {system!r}.")
-    require_smooth(caller, system)
     if not isinstance(solution, Solution) or solution.t.ndim != 1:
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
     if potential is not None:
@@ -92,30 +94,35 @@ def _energy_balance(system, solution, params, potential):
         V = jnp.zeros_like(t) if potential is None else potential(flat.unravel(q), t, params)
         return along(v, flat.inertia(q, v, params)) / 2, jnp.asarray(V).astype(t.dtype)
 
-    def power(q, v, t, L, params):
+    def power(q, v, t, L, tau, params):
         """P; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
         motion = flat.rate(q, v), jnp.ones_like(t)
         _, (T_q, V_dot) = jax.jvp(lambda q, t: energies(q, v, t), (q, t), motion)
         P = along(v, flat.force(q, v, t, params)) + T_q + V_dot
+        if tau is not None:
+            P = P - along(v, reaction(flat, q, t, params, tau))
         if not flat.num_constraints:
             return P
         _, stretching = jax.jvp(lambda q: flat.constraint(q, t, params), (q,), motion[:1])
         return P + jnp.dot(L, stretching)
 
-    t, L = solution.t, solution.multipliers
+    t, L, tau = solution.t, solution.multipliers, solution.friction
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
     at_ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
     q_middle, v_middle = _between(solution, H, middle, held.holds(params) and not flat.blocks)
     at_middle = q_middle, v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
-    first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L)) for part in (slice(-1), slice(1, None)))
+    inside = jax.vmap(partial(held.held_at, params))(middle)  # a held input has there the value that it has inside
+    first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L, tau)) for part in (slice(-1), slice(1, None)))
+    if tau is not None:
+        accelerations = _vectors((solution.acceleration, solution.zdot))
+        tau = friction_between(flat, solution, at_ends[1], accelerations, at_middle, inside)
 
-    def over_interval(first, between, last, H):
-        """Simpson's rule; a held input has the value that it has inside."""
-        inside = held.held_at(params, between[2])
-        P, P_middle, P_end = (power(q, v, t, L, inside) for q, v, t, L in (first, between, last))
+    def over_interval(first, between, last, H, inside):
+        """Simpson's rule."""
+        P, P_middle, P_end = (power(*x, inside) for x in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
 
-    work = jnp.cumsum(jax.vmap(over_interval)(first, at_middle, last, H))
+    work = jnp.cumsum(jax.vmap(over_interval)(first, (*at_middle, tau), last, H, inside))
     work = jnp.concatenate([jnp.zeros_like(t[:1]), work])
     T, V = jax.vmap(energies)(*at_ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
