@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.analysis.friction_between import friction_between
+from hhtjax.analysis.friction_work import friction_work, switches
 from hhtjax.checks import require_function
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import shown
@@ -14,7 +14,6 @@ from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.friction import reaction
 from hhtjax.systems.system import LinearSystem, System
 
 
@@ -94,48 +93,48 @@ def _energy_balance(system, solution, params, potential):
         V = jnp.zeros_like(t) if potential is None else potential(flat.unravel(q), t, params)
         return along(v, flat.inertia(q, v, params)) / 2, jnp.asarray(V).astype(t.dtype)
 
-    def power(q, v, t, L, tau, params):
-        """P; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
+    def power(q, v, t, L, params):
+        """P, without dry friction; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
         motion = flat.rate(q, v), jnp.ones_like(t)
         _, (T_q, V_dot) = jax.jvp(lambda q, t: energies(q, v, t), (q, t), motion)
         P = along(v, flat.force(q, v, t, params)) + T_q + V_dot
-        if tau is not None:
-            P = P - along(v, reaction(flat, q, t, params, tau))
         if not flat.num_constraints:
             return P
         _, stretching = jax.jvp(lambda q: flat.constraint(q, t, params), (q,), motion[:1])
         return P + jnp.dot(L, stretching)
 
-    t, L, tau = solution.t, solution.multipliers, solution.friction
+    t, L = solution.t, solution.multipliers
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
     at_ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
-    q_middle, v_middle = _between(solution, H, middle, held.holds(params) and not flat.blocks)
+    jumps = held.holds(params) or (switches(solution) if flat.friction else False)
+    q_middle, v_middle = _between(solution, H, middle, jumps if not flat.blocks else False)
     at_middle = q_middle, v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
-    inside = jax.vmap(partial(held.held_at, params))(middle)  # a held input has there the value that it has inside
-    first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L, tau)) for part in (slice(-1), slice(1, None)))
-    if tau is not None:
-        accelerations = _vectors((solution.acceleration, solution.zdot))
-        tau = friction_between(flat, solution, at_ends[1], accelerations, at_middle, inside)
+    first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L)) for part in (slice(-1), slice(1, None)))
+    inside = jax.vmap(partial(held.held_at, params))(middle)  # where a held input has one value
 
-    def over_interval(first, between, last, H, inside):
+    def over_interval(first, between, last, H, params):
         """Simpson's rule."""
-        P, P_middle, P_end = (power(*x, inside) for x in (first, between, last))
+        P, P_middle, P_end = (power(*x, params) for x in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
 
-    work = jnp.cumsum(jax.vmap(over_interval)(first, (*at_middle, tau), last, H, inside))
-    work = jnp.concatenate([jnp.zeros_like(t[:1]), work])
+    work = jax.vmap(over_interval)(first, at_middle, last, H, inside)
+    if flat.friction:
+        w = _vectors((solution.acceleration, solution.zdot))
+        work = work + friction_work(flat, solution, at_ends, at_middle, w, inside)
+    work = jnp.concatenate([jnp.zeros_like(t[:1]), jnp.cumsum(work)])
     T, V = jax.vmap(energies)(*at_ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
 
 
 def _between(solution, H, middle, jumps):
-    """Positions and rates in the middle of each interval, of length H; jumps: whether accelerations do at its ends."""
+    """Positions and rates in the middle of each interval, of length H; jumps: whether, or where, accelerations do."""
     found = interpolate(solution, middle)
     rates = _vectors(found[1:])
-    if jumps:  # of the cubic through q and v the slope
+    if jumps is not False:  # of the cubic through q and v the slope
         q, v = _vectors(solution.q), _vectors(solution.v)
         slope = 1.5 * jnp.diff(q, axis=0) / H[:, None] - (v[1:] + v[:-1]) / 4
-        rates = jnp.concatenate([slope, rates[:, v.shape[1] :]], axis=1)
+        n = v.shape[1]
+        rates = jnp.concatenate([jnp.where(jumps, slope, rates[:, :n]), rates[:, n:]], axis=1)
     return _vectors(found.q), rates
 
 
