@@ -44,8 +44,9 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
 
     The integral is Simpson's over each interval between saved times, on dense output: of order 4. Save every step, or
     some within the shortest period. Dry friction tau jumps where a joint switches: its integral is of order 2 there.
-    It takes tau s where a joint slides, nothing where it sticks to what rests, and what a moving belt gives or takes. Where nothing damps or drives, and V is given, work is 0 and the error is the
-    drift of the total energy; without V, work counts every force, and the error is another, of the same order.
+    It takes tau s where a joint slides, nothing where it sticks to what rests, and what a moving belt gives or takes.
+    Where nothing damps or drives, and V is given, work is 0 and the error is the drift of the total energy; without V,
+    work counts every force, and the error is another, of the same order.
 
     Args:
         system, params: as in `simulate`; no `FirstOrderSystem`.

@@ -148,7 +148,8 @@ On a belt with the speed u, `sliding=lambda q, v, t, params: v - params["u"]`; b
 of their velocities. s must be affine in v, and its rows independent of each other and of constraints. A limit in a
 system with internal states is called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F is
 to be continuous: a jump from stiction to sliding is written as a steep Stribeck curve. Between saved times
-`interpolate` is of order 2 only where a joint switches. `energy_balance` knows what friction takes, and what a belt gives.
+`interpolate` is of order 2 only where a joint switches. `energy_balance` knows what friction takes, and what a belt
+gives.
 
 Rotations
 ---------
