@@ -104,27 +104,33 @@ def _energy_balance(system, solution, params, potential):
         _, stretching = jax.jvp(lambda q: flat.constraint(q, t, params), (q,), motion[:1])
         return P + jnp.dot(L, stretching)
 
-    t, L = solution.t, solution.multipliers
-    H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
-    at_ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
-    jumps = held.holds(params) or (switches(solution) if flat.friction else False)
-    q_middle, v_middle = _between(solution, H, middle, jumps if not flat.blocks else False)
-    at_middle = q_middle, v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
-    first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L)) for part in (slice(-1), slice(1, None)))
-    inside = jax.vmap(partial(held.held_at, params))(middle)  # where a held input has one value
+    ends, middles, inside = _points(flat, solution, params)
 
     def over_interval(first, between, last, H, params):
         """Simpson's rule."""
         P, P_middle, P_end = (power(*x, params) for x in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
 
-    work = jax.vmap(over_interval)(first, at_middle, last, H, inside)
+    t, with_L = solution.t, (*ends, solution.multipliers)
+    first, last = (jax.tree.map(lambda x, part=part: x[part], with_L) for part in (slice(-1), slice(1, None)))
+    work = jax.vmap(over_interval)(first, middles, last, jnp.diff(t), inside)
     if flat.friction:
         w = _vectors((solution.acceleration, solution.zdot))
-        work = work + friction_work(flat, solution, at_ends, at_middle, w, inside)
+        work = work + friction_work(flat, solution, ends, middles, w, inside)
     work = jnp.concatenate([jnp.zeros_like(t[:1]), jnp.cumsum(work)])
-    T, V = jax.vmap(energies)(*at_ends)
+    T, V = jax.vmap(energies)(*ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
+
+
+def _points(flat, solution, params):
+    """q, v and t at the saved times, q, v, t and L between them, and the params there, where held inputs are one."""
+    t, L = solution.t, solution.multipliers
+    H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
+    jumps = held.holds(params) or (switches(solution) if flat.friction else False)
+    q, v = _between(solution, H, middle, jumps if not flat.blocks else False)
+    ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
+    between = q, v, middle, None if L is None else (L[1:] + L[:-1]) / 2
+    return ends, between, jax.vmap(partial(held.held_at, params))(middle)
 
 
 def _between(solution, H, middle, jumps):
