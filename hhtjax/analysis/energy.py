@@ -108,7 +108,7 @@ def _energy_balance(system, solution, params, potential):
 
     def over_interval(first, between, last, H, params):
         """Simpson's rule."""
-        P, P_middle, P_end = (power(*x, params) for x in (first, between, last))
+        P, P_middle, P_end = (power(q, v, t, L, params) for q, v, t, L in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
 
     t, with_L = solution.t, (*ends, solution.multipliers)

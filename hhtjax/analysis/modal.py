@@ -129,11 +129,11 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
     >>> print(hhtjax.analysis.suggest_step_size(reduced.system, hhtjax.hht(), rest, rest, highest=1.0).reason)
     resolves the mode at 0.6159 rad/s to 0.01
     """
-    nonlinear, at, friction, sliding = None, None, None, None
+    nonlinear, at, friction, sliding = None, None, None, _velocities
     if isinstance(system, LinearSystem):
         M, C, K, load = system.M, system.C, system.K, system.load
         nonlinear, at, friction = system.nonlinear, system.at, system.friction
-        sliding = system.sliding or _velocities
+        sliding = system.sliding or sliding
     elif isinstance(system, tuple) and len(system) in (3, 4):
         M, C, K, load = (*system, None)[:4]
     else:
