@@ -70,6 +70,23 @@ def test_a_constrained_direction_is_named():
 
 
 @pytest.mark.slow
+def test_friction_beside_redundant_constraints():
+    """They take one direction, not two; and what friction does is known to the energy balance too."""
+    system = hhtjax.System(
+        TWO,
+        force,
+        lambda q, t, p: jnp.stack([q[1], 2 * q[1]]),
+        friction=lambda q, v, L, t, p: 0.2 * ONE,
+        sliding=lambda q, v, t, p: v[:1] - 0.1,
+    )
+    stepper, zero = hhtjax.hht(redundant="least_squares"), 0 * TWO
+    found = hhtjax.simulate(system, stepper, zero, zero, dt=0.01, num_steps=400)
+    found.check()
+    assert 0.1 < np.mean(found.sticking) < 0.9
+    assert np.max(np.abs(hhtjax.analysis.energy_balance(system, found).error)) < 1e-3
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("worst", [-1.0, np.nan])
 def test_a_limit_that_is_none_is_named(worst):
     """At the step where it becomes so, and of a batch the member."""

@@ -38,7 +38,10 @@ def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
         raise ValueError(
             f"{caller}: `sliding` of a LinearSystem must have the same derivative in v for all q: else take a System."
         )
-    basis = np.linalg.svd(B, full_matrices=False)[2] if B.size else np.zeros((0, H.shape[1]))
+    basis = np.zeros((0, H.shape[1]))
+    if B.size:
+        _, sizes, basis = np.linalg.svd(B, full_matrices=False)
+        basis = basis[sizes > DEPENDENT * sizes[0]]  # constraints may be redundant
     for i, row in enumerate(H):
         left = row
         for _ in range(2):  # once more, for what rounding leaves
