@@ -62,17 +62,29 @@ def listing() -> str:
     return "\n".join(["Experiments:", *lines, "", USAGE])
 
 
-def run_side_by_side(options: list[str]) -> int:
-    """Every experiment in a process of its own, as many at a time as cores; for smoke runs, whose times are void."""
+def run_alone(arguments: list[str]) -> int:
+    """The exit code of the runner in a process of its own."""
+    command = [sys.executable, "-m", "experiments", *arguments]
+    result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    print(result.stdout, end="", flush=True)
+    return result.returncode
+
+
+def run_every_one(options) -> int:
+    """All experiments, each in a process of its own: none changes the times of another, or ends the others if it fails.
+
+    One after the other; in smoke runs, whose times are void, as many at a time as cores.
+    """
 
     def run(name: str) -> int:
-        command = [sys.executable, "-m", "experiments", name, *options]
-        result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-        print(result.stdout, end="", flush=True)
-        return result.returncode
+        size = ["--fast"] if options.fast else ["--full"] if name in IN_PART else []
+        return run_alone([name, *size, "--out", str(options.out), "--formats", options.formats])
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return int(any(list(pool.map(run, EXPERIMENTS))))
+    with ThreadPoolExecutor(os.cpu_count() if options.fast else 1) as pool:
+        failed = [name for name, code in zip(EXPERIMENTS, pool.map(run, EXPERIMENTS), strict=True) if code]
+    if failed:
+        print(f"Failed: {', '.join(failed)}.", file=sys.stderr)
+    return int(bool(failed))
 
 
 USAGE = "python -m experiments NAME [--fast | --full | --parts A,B] [--out DIR] [--formats png,pdf,svg]"
@@ -100,10 +112,9 @@ def run(name: str, options) -> None:
     """One experiment, in this process."""
     from experiments.report import Report
 
-    full = options.full or options.name == "all"
-    part = name in IN_PART and not full and not options.fast
+    part = name in IN_PART and not options.full and not options.fast
     parts = tuple(filter(None, options.parts.split(",")))
-    flag = " --fast" if options.fast else " --full" if name in IN_PART and full else ""
+    flag = " --fast" if options.fast else " --full" if options.full else ""
     flag += f" --parts {options.parts}" if parts else ""
     mode = "fast" if options.fast else "part" if part else "full"
     report = Report(name, options.out, mode, f"python -m experiments {name}{flag}", options.formats.split(","), parts)
@@ -111,7 +122,7 @@ def run(name: str, options) -> None:
     known = [part.__name__.rpartition(".")[2] for group in getattr(module, "GROUPS", []) for part in group]
     if unknown := [part for part in parts if part not in known]:
         sys.exit(f"{name} has {'the parts ' + ', '.join(known) if known else 'no parts'}; received {unknown[0]!r}.")
-    module.run(report, options.fast, *([full] if name in IN_PART else []))
+    module.run(report, options.fast, *([options.full] if name in IN_PART else []))
     report.close()
 
 
@@ -140,11 +151,10 @@ def main(arguments: list[str]) -> int:
 
         return check(EXPERIMENTS, options.out)
     failed = 0
-    if options.name == "all" and options.fast:
-        failed = run_side_by_side(["--fast", "--out", str(options.out), "--formats", options.formats])
+    if options.name == "all":
+        failed = run_every_one(options)
     elif options.name != "page":
-        for name in EXPERIMENTS if options.name == "all" else [options.name]:
-            run(name, options)
+        run(options.name, options)
     if options.name in ("all", "page"):
         write_page(options.out, committed=options.name == "page")
     return failed

@@ -108,13 +108,14 @@ def test_errors_on_segments_left_out_are_those_of_numpy():
         name: hhtjax.fit(residuals, dict.fromkeys(names, 0.1), weights=jnp.asarray(weights))
         for name, names in terms.items()
     }
-    found = hhtjax.compare(results, residuals, folds=5)
+    always = np.arange(N) < 100
+    found = hhtjax.compare(results, residuals, folds=5, always=always)
     assert found.observations == np.sum(weights > 0)
     assert found.converged.all()
     for i, names in enumerate(terms.values()):
         X = np.stack([COLUMNS[name] for name in names], axis=1)
         for fold in range(5):
-            out = np.arange(N) // 320 == fold
+            out = (np.arange(N) // 320 == fold) & ~always
             kept = ~out & (weights > 0)
             p, *_ = np.linalg.lstsq(X[kept], np.asarray(y)[kept], rcond=None)
             left = 2 * (X @ p - np.asarray(y))[out & (weights > 0)]
@@ -209,6 +210,8 @@ def test_what_cannot_be_compared_is_named():
         hhtjax.compare({"a": one, "b": one}, {"a": residuals})
     with pytest.raises(ValueError, match="compare: `folds` must be an integer, 2 or more; received 1"):
         hhtjax.compare({"a": one, "b": one}, residuals, folds=1)
+    with pytest.raises(ValueError, match=r"compare: `always` must have the leading axes .* \(1600,\); received \(3,\)"):
+        hhtjax.compare({"a": one, "b": one}, residuals, always=np.ones(3, bool))
     with pytest.raises(NotImplementedError, match=r"compare: `fits\['a'\]` has records"):
         hhtjax.compare({"a": one._replace(starts=jnp.ones((4, 1))), "b": one}, residuals)
     with pytest.raises(ValueError, match="held_out: `found` has no errors on segments"):

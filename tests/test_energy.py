@@ -4,12 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from friction_problems import free_vibration_exact
 from scipy.integrate import simpson
 from zoo import PROBLEMS, run
 
 import hhtjax
 from hhtjax.analysis import energy_balance
-from hhtjax.scenes import pendulum, top
+from hhtjax.scenes import belt, dry_oscillator, pendulum, top
 
 
 def springs_and_weight(q, t, params):
@@ -96,6 +97,39 @@ def test_a_top_keeps_its_energy():
     assert np.ptp(found.potential) > 1
     np.testing.assert_allclose(found.work, 0, atol=1e-6)
     assert np.max(np.abs(found.error)) < 1e-3 * found.kinetic[0]
+
+
+def dry_balances(scene, numbers, potential=None):
+    for n in numbers:
+        path = hhtjax.simulate(
+            scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params, dt=scene.duration / n, num_steps=n
+        )
+        yield path, energy_balance(scene.system, path, scene.params, potential)
+
+
+@pytest.mark.slow
+def test_dry_friction_takes_what_a_spring_loses_at_each_reversal():
+    """In closed form: F times the way; nothing once it sticks; of order 2."""
+    scene, errors = dry_oscillator.free(), []
+    for path, found in dry_balances(scene, (400, 3200), lambda q, t, params: params["k"] * jnp.sum(q**2) / 2):
+        q, v = free_vibration_exact(np.asarray(path.t))
+        exact = (v**2 + 100 * (q**2 - 0.25)) / 2
+        errors.append([np.max(np.abs(found.work - exact)), np.max(np.abs(found.error))])
+        stuck = np.asarray(path.sticking[:, 0])
+        assert np.sum(stuck) > 50
+        np.testing.assert_allclose(np.asarray(found.work)[stuck], found.work[-1], rtol=1e-14)
+    np.testing.assert_allclose(np.log2(np.divide(*errors)) / 3, 2, atol=0.15)
+    assert found.work[-1] == pytest.approx(-12.48, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_belt_drives_what_sticks_to_it():
+    """Friction jumps where a mass gets caught by the belt, which moves on: the jump is found inside the interval."""
+    (_, coarse), (path, fine) = dry_balances(belt.two_masses(), (1600, 6400))
+    assert np.ptp(np.asarray(path.sticking, int), axis=0).all()
+    order = np.log2(np.max(np.abs(coarse.error)) / np.max(np.abs(fine.error))) / 2
+    assert order > 1.85
+    assert np.max(np.abs(fine.error)) < 1e-3 * np.max(fine.kinetic)
 
 
 SPRING = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)

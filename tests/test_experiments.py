@@ -52,6 +52,7 @@ def test_how_much_is_run_and_what_the_numbers_say_of_it(monkeypatch, tmp_path):
     """Silverbox by default in part, `all` in full, with a page; experiments without --full take two arguments."""
     runner = importlib.import_module("experiments.__main__")
     monkeypatch.setattr(runner, "EXPERIMENTS", {name: EXPERIMENTS[name] for name in ("silverbox", "vehicle")})
+    monkeypatch.setattr(runner, "run_alone", runner.main)  # in this process, where the stubs are
     for module in runner.EXPERIMENTS.values():
         stub = SimpleNamespace(run=lambda report, *options: report.numbers({"options": options}))
         monkeypatch.setitem(sys.modules, f"experiments.{module}", stub)

@@ -44,6 +44,23 @@ def test_order_two_through_reversals(family):
 
 
 @pytest.mark.slow
+def test_extrapolation_takes_the_leading_error_out():
+    """That of the switches too; dt^3 is left. Forces, which jump, are those of the finer run."""
+    scene = dry_oscillator.free()
+    arguments = scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params
+    fine, better = (
+        hhtjax.simulate(*arguments, dt=2.2 / n, num_steps=n, save_every=n // 50, extrapolate=k)
+        for n, k in ((800, 1), (400, 2))
+    )
+    exact = free_vibration_exact(np.asarray(better.t))
+    for name, x in zip("qv", exact, strict=True):
+        fine_error, error = (np.max(np.abs(getattr(run, name)[:, 0] - x)) for run in (fine, better))
+        assert error < fine_error / 20
+    np.testing.assert_array_equal(better.friction, fine.friction)
+    np.testing.assert_array_equal(better.sticking, fine.sticking)
+
+
+@pytest.mark.slow
 def test_what_stopped_stays(family):
     """Exactly: no creep, and no acceleration that alternates, also for alpha = 0."""
     for found in family:

@@ -43,7 +43,6 @@ def simulate(system, stepper=hhtjax.hht(), q0=TWO, **options):  # noqa: B008 (fr
         (ValueError, "leave `linearize` out", lambda: simulate(two(), hhtjax.hht(linearize="held"))),
         (NotImplementedError, "RK4 cannot solve dry `friction`; use hht", lambda: simulate(two(), hhtjax.rk4())),
         (NotImplementedError, "Rosenbrock cannot solve dry", lambda: simulate(two(), hhtjax.rowda())),
-        (NotImplementedError, "leave `extrapolate` out", lambda: simulate(two(), extrapolate=2)),
         (NotImplementedError, "ode: `system` has dry", lambda: hhtjax.interop.ode(two())(0.0, (TWO, TWO), None)),
     ],
 )
@@ -68,6 +67,23 @@ def test_a_constrained_direction_is_named():
     )
     with pytest.raises(ValueError, match="row 1 of `sliding` depends on those before it, or on constraints"):
         simulate(system)
+
+
+@pytest.mark.slow
+def test_friction_beside_redundant_constraints():
+    """They take one direction, not two; and what friction does is known to the energy balance too."""
+    system = hhtjax.System(
+        TWO,
+        force,
+        lambda q, t, p: jnp.stack([q[1], 2 * q[1]]),
+        friction=lambda q, v, L, t, p: 0.2 * ONE,
+        sliding=lambda q, v, t, p: v[:1] - 0.1,
+    )
+    stepper, zero = hhtjax.hht(redundant="least_squares"), 0 * TWO
+    found = hhtjax.simulate(system, stepper, zero, zero, dt=0.01, num_steps=400)
+    found.check()
+    assert 0.1 < np.mean(found.sticking) < 0.9
+    assert np.max(np.abs(hhtjax.analysis.energy_balance(system, found).error)) < 1e-3
 
 
 @pytest.mark.slow

@@ -38,13 +38,16 @@ def simulated(problem, stepper, q0):
 @partial(jax.jit, static_argnums=(0, 1))
 def everything(way, name, stepper):
     """Positions, and their derivatives in q0, of a batch of two; steppers of one family are compiled once."""
-    problem = zoo.PROBLEMS[name]
+    problem = (zoo.PROBLEMS | zoo.DRY)[name]
     q0 = jnp.stack([problem.q0, 0.7 * problem.q0])
     return jax.vmap(lambda q0: jax.jvp(partial(way, problem, stepper), (q0,), (jnp.cos(q0),)))(q0)
 
 
-@pytest.mark.parametrize("name", ["forced double pendulum", "forced Duffing"])
-@pytest.mark.parametrize("stepper", zoo.STEPPERS)
+SMOOTH = [(stepper, name) for stepper in zoo.STEPPERS for name in ("forced double pendulum", "forced Duffing")]
+RUBBING = [("hht predictor", name) for name in zoo.DRY]
+
+
+@pytest.mark.parametrize(("stepper", "name"), [*SMOOTH, *RUBBING])
 def test_same_three_ways(name, stepper):
     stepper = zoo.as_data(zoo.STEPPERS[stepper])
     fast = everything(simulated, name, stepper)

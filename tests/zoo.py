@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hhtjax
-from hhtjax.scenes import double_pendulum, duffing
+from hhtjax.scenes import belt, double_pendulum, duffing
 
 
 class Problem(NamedTuple):
@@ -70,6 +70,9 @@ PROBLEMS = {
     "forced Duffing": _forced_duffing(),
     "forced double pendulum": _forced_double_pendulum(),
 }
+
+# set-valued forces: for the hht family alone, with references of their own (friction_reference.py)
+DRY = {"two masses on a belt": Problem(*belt.two_masses())}
 
 STEPPERS = {
     "hht auto": hhtjax.hht(alpha=-0.05),

@@ -48,7 +48,7 @@ HOW_TO_GET_IT = how_to_get("SNLS80mV.csv of the Silverbox benchmark", "silverbox
 
 
 class Record(NamedTuple):
-    """Uniform samples of input u and output y, in V."""
+    """Uniform samples of input u and output y; of Silverbox in V."""
 
     u: Any
     y: Any

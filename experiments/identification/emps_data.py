@@ -5,14 +5,14 @@ Benchmarks, Eindhoven 2019. A motor moves a carriage by a ball screw, and a cont
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
-from experiments.identification.data import columns, data_folder, downloaded, how_to_get
+from experiments.identification.data import Record, columns, data_folder, downloaded, how_to_get
 
 DT = 1e-3  # s, sampling period
 GAIN = 35.1507  # N/V, force on the carriage over the voltage
@@ -28,15 +28,11 @@ OTHER_RUN = 1.04  # Fc of the generated test record over that of the training re
 NOISE = 2e-6  # m, standard deviation
 
 
-class Record(NamedTuple):
-    """Samples of the voltage u, V, and of the position y, m."""
-
-    u: Any
-    y: Any
-
-
 class Records(NamedTuple):
-    """A training and a test record; hold: by how much the input is late, s; measured: where they come from."""
+    """A training and a test record, u the voltage, V, y the position, m; hold: by how much u is late, s.
+
+    measured: where they come from.
+    """
 
     train: Record
     test: Record

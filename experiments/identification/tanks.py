@@ -8,7 +8,6 @@ initial state of the training record, as the benchmark has it, and also with the
 
 import time
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,6 +19,7 @@ from hhtjax.plot import estimates, fit_against_data, legend, subplots
 
 SUBSTEPS = 2
 QUARTERS = 4
+ITERATIONS = 100
 HEAD = 25  # samples at the start that every fold keeps: they alone tell the initial state
 FIRST = 400  # samples of the part that the first model is fitted to before the whole
 UNITS = {"k1": "V^0.5/s", "k2": "V^0.5/s", "k3": "V^0.5/s", "k4": "1/s", "u0": "V", "x1": "V", "x2": "V"}
@@ -47,14 +47,13 @@ def run(report: Report, fast: bool):
         print("Cascaded tanks, the measured records (Schoukens et al. 2016)." + " Parts of them only." * fast)
     else:
         print(f"GENERATED records: the measured ones were not found. To use them, {data.HOW_TO_GET_IT}.")
-    names = list(MODELS)[:2] if fast else list(MODELS)
-    results, rows = {}, []
-    for name in names:
+    results = {}
+    for name in list(MODELS)[:2] if fast else MODELS:
         before, terms = MODELS[name]
         start = dict(terms if before is None else results[before].params | terms)
         start = {key: value for key, value in start.items() if value is not None}
-        results[name], row = compare(report, name, sets, start)
-        rows.append(row)
+        results[name] = fit_record(report, name, sets.train, start)
+    rows = compare(report, sets, results)
     report.table(list(rows[0]), [list(row.values()) for row in rows])
     chosen = min(rows, key=lambda row: row["left_out_V"])["model"]
     print(f"Chosen by the parts left out of the training record: {chosen}.\n")
@@ -67,23 +66,29 @@ def run(report: Report, fast: bool):
     report.numbers(rounded(numbers))
 
 
-def compare(report: Report, name, sets, start):
-    """One model's fit to the training record, and its row: errors in V."""
-    record = sets.train
-    begun = time.perf_counter()
-    result = fit_record(record, start, growing=name == next(iter(MODELS)))
-    out = left_out(record, result.params)
-    row = {
-        "model": name,
-        "parameters": len(result.params),
-        "train_V": rmse(result.residual),
-        "left_out_V": float(np.sqrt(np.mean(out**2))),
-        "test_V": rmse(simulated(result.params, sets.test) - sets.test.y),
-        "fit_converged": bool(result.converged),
-    }
-    seconds = time.perf_counter() - begun
-    report.progress(f"{name}: {row['left_out_V']:.3f} V left out, {seconds:.0f} s with compiling; {result.reason}")
-    return result, row
+def compare(report: Report, sets, results):
+    """Rows of the models: errors in V, of each quarter, too, as simulated by the fit to all the rest.
+
+    Simulations run through the quarter left out, whose outputs have no weight; the fits start from the estimates.
+    """
+    report.progress("each model again, with a quarter of the training record left out")
+    keep = np.arange(len(sets.train.y)) < HEAD
+    compared = hhtjax.compare(
+        results, residuals_of(sets.train), folds=QUARTERS, always=keep, max_iterations=ITERATIONS, progress=True
+    )
+    print(f"{compared.summary()}\n")
+    return [
+        {
+            "model": name,
+            "parameters": len(result.params),
+            "train_V": rmse(result.residual),
+            "left_out_V": float(compared.cross_validated[i]),
+            "behind_the_best": float(compared.behind[i, 0] / (compared.behind[i, 1] or 1.0)),
+            "test_V": rmse(simulated(result.params, sets.test) - sets.test.y),
+            "fit_converged": bool(result.converged),
+        }
+        for i, (name, result) in enumerate(results.items())
+    ]
 
 
 def residuals_of(record, samples=None):
@@ -92,35 +97,20 @@ def residuals_of(record, samples=None):
     return lambda own: data.simulate(own, u, SUBSTEPS) - y
 
 
-def options(start):
-    """What all fits have in common."""
-    return {"scale": {name: SCALE[name] for name in start}, "max_iterations": 100}
-
-
-def fit_record(record, start, growing):
-    """The least squares of the simulated reading; growing: by a part of the record first."""
-    parts = sorted({min(part, len(record.y)) for part in (FIRST, len(record.y))}) if growing else [len(record.y)]
-    return hhtjax.fit_progressively(lambda n, _: {"residuals": residuals_of(record, n)}, start, parts, **options(start))
-
-
-def left_out(record, params):
-    """Errors, in V, of each quarter but for the first samples, simulated by the fit to all the rest.
-
-    Simulations run through the quarter left out, whose outputs have no weight; the fits start from `params`.
-    """
-    samples = len(record.y)
-    fold = np.arange(samples) * QUARTERS // samples
-    fold[:HEAD] = -1
-    residuals = residuals_of(record)
-    masks = np.stack([fold != i for i in range(QUARTERS)]).astype(float)
-
-    @jax.jit
-    @jax.vmap
-    def residual(mask):
-        found = hhtjax.fit(residuals, params, weights=mask, covariance=False, **options(params))
-        return found.residual
-
-    return np.asarray(residual(jnp.asarray(masks)))[masks == 0]
+def fit_record(report: Report, name, record, start):
+    """The least squares of the simulated reading; the first model is fitted to a part of the record before."""
+    begun = time.perf_counter()
+    parts = sorted({min(FIRST, len(record.y)), len(record.y)} if name == next(iter(MODELS)) else {len(record.y)})
+    result = hhtjax.fit_progressively(
+        lambda n, _: {"residuals": residuals_of(record, n)},
+        start,
+        parts,
+        scale={name: SCALE[name] for name in start},
+        max_iterations=ITERATIONS,
+    )
+    seconds = time.perf_counter() - begun
+    report.progress(f"{name}: {rmse(result.residual):.3f} V, {seconds:.0f} s with compiling; {result.reason}")
+    return result
 
 
 def simulated(params, record, start=None):

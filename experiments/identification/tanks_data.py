@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
-from experiments.identification.data import columns, data_folder, downloaded, how_to_get
+from experiments.identification.data import Record, columns, data_folder, downloaded, how_to_get
 
 DT = 4.0  # s, sampling period
 SAMPLES = 1024
@@ -29,15 +29,11 @@ GENERATED = {"k1": 0.037, "k2": 0.054, "k3": 0.087, "k4": 0.028, "u0": -1.0, "x1
 GENERATED |= {"over": 1.2, "rim": 10.2, "caught": 0.06}
 
 
-class Record(NamedTuple):
-    """Samples of the pump's voltage u, held over each period, and of the reading y of the lower level, in V."""
-
-    u: Any
-    y: Any
-
-
 class Records(NamedTuple):
-    """A training and a test record; measured says where they come from."""
+    """A training and a test record: u the pump's voltage, held over each period, y the lower level's reading, in V.
+
+    measured: where they come from.
+    """
 
     train: Record
     test: Record

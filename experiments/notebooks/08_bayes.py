@@ -90,12 +90,9 @@ print(f"\nnoise: {1e3 * sigma:.2f} mm estimated, {1e3 * 0.05 * clean.std():.2f} 
 # $$\ell(x) = -\frac{1}{2\sigma^2}\sum_i \left(q_i(\theta(x)) - y_i\right)^2, \qquad
 # \log\theta = \log\hat\theta + L x, \qquad L L^T = \text{covariance of the fit, in logarithms.}$$
 #
-# In the coordinates $x$ the posterior is nearly a standard normal distribution: so the sampler needs no warm-up. (The
-# same as coordinates $\log\theta$ with that covariance as inverse mass matrix.) Its gradient is $-J^T r$. With four
-# parameters, four forward derivatives along with the run cost less than one pass backwards through it. NUTS asks for
-# a gradient in reverse mode, so we hand it over by `jax.custom_vjp`.
-#
-# A time is the least of many calls, so that what else the machine does counts little.
+# In the coordinates $x$ the posterior is nearly a standard normal distribution: so the sampler needs no warm-up. Its
+# gradient is $-J^T r$. With four parameters, four forward derivatives along with the run cost less than one pass
+# backwards through it. NUTS asks for a gradient in reverse mode, so we hand it over by `jax.custom_vjp`.
 
 # %%
 estimate, unravel = ravel_pytree(result.params)
@@ -185,7 +182,7 @@ assert rhat.max() < 1.02
 # **Look at** the curves: the normal distributions that `fit` promises, over histograms of the samples. The noise is
 # white here, and there are many data, so both must agree, to within chance. `fit`'s errors come from the scatter
 # between 32 segments of the record, with no assumption of whiteness, so they scatter themselves. The textbook ones
-# assume it, as the posterior does. The last lines repeat the fit on 50 other records of noise, to see both at work.
+# assume it, as the posterior does.
 
 # %%
 samples = estimate * jnp.exp(x.reshape(-1, 4) @ L.T)
@@ -202,23 +199,6 @@ chance = {"textbook": 1 / (2 * ess), "fit": 1 / (2 * ess) + 1 / (2 * (result.seg
 for kind, variance in chance.items():
     assert jnp.all(jnp.abs(spread / errors[kind] - 1) < 4 * jnp.sqrt(variance)), kind
 assert jnp.all(jnp.abs(samples.mean(axis=0) - estimate) < 4 * spread / jnp.sqrt(ess))
-
-
-def another(key):
-    """Estimate, errors of fit, textbook errors, from another record of noise."""
-    record = clean + 0.05 * clean.std() * jax.random.normal(key, (N,))
-    again = hhtjax.fit(lambda params: ours(params) - record, result.params, transforms=hhtjax.positive)
-    found = ravel_pytree(again.params)[0], again.covariance, again.uncertainty.naive
-    return found[0], *(jnp.sqrt(jnp.diagonal(covariance)) for covariance in found[1:])
-
-
-found, *believed = jax.jit(lambda keys: jax.lax.map(another, keys))(jax.random.split(jax.random.key(3), 50))
-scatter = found.std(axis=0, ddof=1)
-print("\n50 records, scatter of the estimates:", *(f"{name} {x:.2g}" for name, x in zip(names, scatter, strict=True)))
-for kind, error in zip(errors, believed, strict=True):
-    ratio, own = error.mean(axis=0) / scatter, jnp.max(error.std(axis=0) / error.mean(axis=0))
-    print(f"errors of {kind:<9} over it, on average {np.round(ratio, 2)}; they scatter by {100 * own:.0f} % themselves")
-    assert jnp.all(jnp.abs(ratio - 1) < 0.4)  # four times the scatter of a standard deviation of 50
 
 figure, panels = hhtjax.plot.subplots(1, 4, width=175, height=55)
 for i, (name, ax) in enumerate(zip(names, panels, strict=True)):
@@ -240,10 +220,8 @@ plt.show()
 # The same posterior and the same sampler, with the simulation by diffrax. A force that jumps 1000 times a second makes
 # every solver stop at each jump, so steps of constant length, one a sample, are its best choice here. The midpoint rule
 # is of the same order as `hht`, and evaluates the force inside the step only. It is differentiated forwards, as ours
-# is; backwards, by its checkpoints, takes several times longer (below, "What to try next").
-#
-# Accurate enough: its error of the solution moves the estimate by less than a tenth of a standard error, computed from
-# the derivatives $J$ as $(J J^T)^{-1} J e$.
+# is; backwards, by its checkpoints, takes several times longer (below, "What to try next"). It is accurate enough: its
+# error $e$ moves the estimate by $(J J^T)^{-1} J e$, less than a tenth of a standard error.
 
 # %%
 values = jnp.asarray(force_values)
@@ -293,7 +271,8 @@ print(f"\ndiffrax: {diffrax_time / forward_time:.0f} times the time of a gradien
 # %% [markdown]
 # In the sampler: both posteriors are the same to a few hundredths of a standard error, so NUTS needs as many gradients
 # for an effective sample with either, and the speeds compare as the times of a gradient within the sampler do.
-# diffrax draws a few samples only, from the same random numbers, or this would take minutes.
+# diffrax draws a few samples only, from the same random numbers, or this would take minutes. (Where a force is smooth,
+# steps under error control are the better choice for both: error against time is on the page of `work_precision`.)
 
 # %%
 few = 2
@@ -308,54 +287,6 @@ for name, count in (("hhtjax", gradients), ("diffrax", theirs)):
 print(f"hhtjax makes {ratio:.0f} times as many")
 assert per_second["hhtjax"] > 20
 assert ratio > 20
-
-# %% [markdown]
-# ## If the force may be smoothed
-#
-# The held force can be replaced by a line through the means of neighbouring values (the same force, half a sample late,
-# without the jumps). Then both libraries may step over many samples, and interpolate: diffrax with Tsit5 and step-size
-# control, hhtjax with RK4 and a constant step of 10 samples. Both get several times faster.
-
-# %%
-means = np.append(force_values[0], (force_values[1:] + force_values[:-1]) / 2)
-line = hhtjax.sampled(means, dt=DT, order=1)
-times = DT * jnp.arange(1, N + 1)
-
-
-def ours_smooth(params):
-    run = hhtjax.simulate(oscillator, hhtjax.rk4(), rest, rest, params | {"u": line}, dt=10 * DT, num_steps=N // 10)
-    return hhtjax.interpolate(run, times).q[:, 0]
-
-
-def rate_smooth(t, state, params):
-    q, v = state
-    return v, (line(t) - params["c"] * v - params["k"] * q - params["k3"] * q**3) / params["m"]
-
-
-def diffrax_smooth(params):
-    return diffrax.diffeqsolve(
-        diffrax.ODETerm(rate_smooth), diffrax.Tsit5(), 0.0, N * DT, DT, (0.0, 0.0), params, max_steps=N,
-        saveat=diffrax.SaveAt(ts=times), adjoint=diffrax.ForwardMode(),
-        stepsize_controller=diffrax.PIDController(rtol=1e-5, atol=1e-7),
-    ).ys[0]  # fmt: skip
-
-
-smooth_ours = row("hhtjax, RK4", ours_smooth)
-smooth_theirs = row("diffrax, Tsit5, step-size control", diffrax_smooth)
-assert max(smooth_ours[1], smooth_theirs[1]) < 0.1
-print(f"{smooth_theirs[0] / smooth_ours[0]:.0f} times the time; diffrax smoothed against hhtjax as posed:", end=" ")
-print(f"{smooth_theirs[0] / forward_time:.0f} times")
-
-# %% [markdown]
-# ## Where the time goes
-#
-# The sampler calls the simulation in loops of its own, compiled with it. Each loop over steps stays what it is without:
-
-# %%
-print(hhtjax.explain(lambda *a: sample(log_density(ours), *a), keys, starts))
-print(f"a step with its four derivatives: {1e9 * forward_time / N:.0f} ns (the step alone {1e9 * run_time / N:.0f} ns)")
-inside = 1e3 * t_gradient["hhtjax"]
-print(f"a gradient: {1e3 * forward_time:.2f} ms by itself, {inside:.2f} ms with the sampler's own work")
 
 # %% [markdown]
 # ## What to try next

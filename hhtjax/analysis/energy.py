@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from hhtjax.analysis.friction_work import friction_work, switches
 from hhtjax.checks import require_function
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import shown
@@ -13,7 +14,7 @@ from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.system import LinearSystem, System, require_smooth
+from hhtjax.systems.system import LinearSystem, System
 
 
 @shown
@@ -38,12 +39,14 @@ class EnergyBalance(NamedTuple):
 def energy_balance(system, solution, params=None, potential=None) -> EnergyBalance:
     """The energy balance along a run: a diagnostic, whose `error` is the energy that the method itself made or lost.
 
-        d/dt (T + V) = v' Q + v' Mdot v/2 + L' B v + dV/dt = P,    T = v' M(q) v/2
-        work(t) = integral of P:  dampers, inputs, forces without a potential, constraints that move
+        d/dt (T + V) = v' Q + v' Mdot v/2 + L' B v - tau' H v + dV/dt = P,    T = v' M(q) v/2
+        work(t) = integral of P:  dampers, inputs, forces without a potential, constraints that move, dry friction
 
     The integral is Simpson's over each interval between saved times, on dense output: of order 4. Save every step, or
-    some within the shortest period. Where nothing damps or drives, and V is given, work is 0 and the error is the
-    drift of the total energy; without V, work counts every force, and the error is another, of the same order.
+    some within the shortest period. Dry friction tau jumps where a joint switches: its integral is of order 2 there.
+    It takes tau s where a joint slides, nothing where it sticks to what rests, and what a moving belt gives or takes.
+    Where nothing damps or drives, and V is given, work is 0 and the error is the drift of the total energy; without V,
+    work counts every force, and the error is another, of the same order.
 
     Args:
         system, params: as in `simulate`; no `FirstOrderSystem`.
@@ -70,7 +73,6 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
     caller = "energy_balance"
     if not isinstance(system, (System, LinearSystem)):
         raise TypeError(f"{caller}: `system` must be a System or LinearSystem; received {system!r}.")
-    require_smooth(caller, system)
     if not isinstance(solution, Solution) or solution.t.ndim != 1:
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
     if potential is not None:
@@ -93,7 +95,7 @@ def _energy_balance(system, solution, params, potential):
         return along(v, flat.inertia(q, v, params)) / 2, jnp.asarray(V).astype(t.dtype)
 
     def power(q, v, t, L, params):
-        """P; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
+        """P, without dry friction; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
         motion = flat.rate(q, v), jnp.ones_like(t)
         _, (T_q, V_dot) = jax.jvp(lambda q, t: energies(q, v, t), (q, t), motion)
         P = along(v, flat.force(q, v, t, params)) + T_q + V_dot
@@ -102,33 +104,44 @@ def _energy_balance(system, solution, params, potential):
         _, stretching = jax.jvp(lambda q: flat.constraint(q, t, params), (q,), motion[:1])
         return P + jnp.dot(L, stretching)
 
-    t, L = solution.t, solution.multipliers
-    H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
-    at_ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
-    q_middle, v_middle = _between(solution, H, middle, held.holds(params) and not flat.blocks)
-    at_middle = q_middle, v_middle, middle, None if L is None else (L[1:] + L[:-1]) / 2
-    first, last = (jax.tree.map(lambda x, part=part: x[part], (*at_ends, L)) for part in (slice(-1), slice(1, None)))
+    ends, middles, inside = _points(flat, solution, params)
 
-    def over_interval(first, between, last, H):
-        """Simpson's rule; a held input has the value that it has inside."""
-        inside = held.held_at(params, between[2])
-        P, P_middle, P_end = (power(q, v, t, L, inside) for q, v, t, L in (first, between, last))
+    def over_interval(first, between, last, H, params):
+        """Simpson's rule."""
+        P, P_middle, P_end = (power(q, v, t, L, params) for q, v, t, L in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
 
-    work = jnp.cumsum(jax.vmap(over_interval)(first, at_middle, last, H))
-    work = jnp.concatenate([jnp.zeros_like(t[:1]), work])
-    T, V = jax.vmap(energies)(*at_ends)
+    t, with_L = solution.t, (*ends, solution.multipliers)
+    first, last = (jax.tree.map(lambda x, part=part: x[part], with_L) for part in (slice(-1), slice(1, None)))
+    work = jax.vmap(over_interval)(first, middles, last, jnp.diff(t), inside)
+    if flat.friction:
+        w = _vectors((solution.acceleration, solution.zdot))
+        work = work + friction_work(flat, solution, ends, middles, w, inside)
+    work = jnp.concatenate([jnp.zeros_like(t[:1]), jnp.cumsum(work)])
+    T, V = jax.vmap(energies)(*ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
 
 
+def _points(flat, solution, params):
+    """q, v and t at the saved times, q, v, t and L between them, and the params there, where held inputs are one."""
+    t, L = solution.t, solution.multipliers
+    H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
+    jumps = held.holds(params) or (switches(solution) if flat.friction else False)
+    q, v = _between(solution, H, middle, jumps if not flat.blocks else False)
+    ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
+    between = q, v, middle, None if L is None else (L[1:] + L[:-1]) / 2
+    return ends, between, jax.vmap(partial(held.held_at, params))(middle)
+
+
 def _between(solution, H, middle, jumps):
-    """Positions and rates in the middle of each interval, of length H; jumps: whether accelerations do at its ends."""
+    """Positions and rates in the middle of each interval, of length H; jumps: whether, or where, accelerations do."""
     found = interpolate(solution, middle)
     rates = _vectors(found[1:])
-    if jumps:  # of the cubic through q and v the slope
+    if jumps is not False:  # of the cubic through q and v the slope
         q, v = _vectors(solution.q), _vectors(solution.v)
         slope = 1.5 * jnp.diff(q, axis=0) / H[:, None] - (v[1:] + v[:-1]) / 4
-        rates = jnp.concatenate([slope, rates[:, v.shape[1] :]], axis=1)
+        n = v.shape[1]
+        rates = jnp.concatenate([jnp.where(jumps, slope, rates[:, :n]), rates[:, n:]], axis=1)
     return _vectors(found.q), rates
 
 

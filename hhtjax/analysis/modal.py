@@ -107,7 +107,7 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
         system: a `LinearSystem`, or (M, C, K), or (M, C, K, force), as it takes them, C may be None; matrices of
             scipy.sparse may have any size. Matrices that are functions of params stay such, with T from the given
             params: so parameters can be fitted through the reduced system. Its q and v are vectors x; a `nonlinear`
-            force without `at` gets vectors too.
+            force without `at` gets vectors too, as do `friction` and `sliding`.
         count: number of modes.
         params: for functions of params.
 
@@ -129,10 +129,11 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
     >>> print(hhtjax.analysis.suggest_step_size(reduced.system, hhtjax.hht(), rest, rest, highest=1.0).reason)
     resolves the mode at 0.6159 rad/s to 0.01
     """
-    nonlinear, at = None, None
+    nonlinear, at, friction, sliding = None, None, None, _velocities
     if isinstance(system, LinearSystem):
         M, C, K, load = system.M, system.C, system.K, system.load
-        nonlinear, at = system.nonlinear, system.at
+        nonlinear, at, friction = system.nonlinear, system.at, system.friction
+        sliding = system.sliding or sliding
     elif isinstance(system, tuple) and len(system) in (3, 4):
         M, C, K, load = (*system, None)[:4]
     else:
@@ -149,6 +150,8 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
         _Projected(T, K) if callable(K) else frequencies**2,
         None if load is None else _ProjectedLoad(T, load),
         None if nonlinear is None else _ProjectedForce(T if at is None else T[list(at)], nonlinear),
+        friction=None if friction is None else _Expanded(T, friction),
+        sliding=None if friction is None else _Expanded(T, sliding),
     )
     return ModalReduction(reduced, frequencies, T, _times(mass, T).T)
 
@@ -186,6 +189,22 @@ class _ProjectedForce(Description):
     def __call__(self, q, v, t, params):
         T = jnp.asarray(self.T, q.dtype)
         return T.T @ ravel_pytree(self.force(T @ q, T @ v, t, params))[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Expanded(Description):
+    """f(T x, T v, t): of dry friction, whose numbers belong to joints."""
+
+    T: Any
+    function: Callable
+
+    def __call__(self, q, v, t, params):
+        T = jnp.asarray(self.T, q.dtype)
+        return ravel_pytree(self.function(T @ q, T @ v, t, params))[0]
+
+
+def _velocities(q, v, t, params):
+    return v
 
 
 def _times(A, T):

@@ -179,8 +179,8 @@ def check_residuals(caller, residuals, p, *args):
     return shapes
 
 
-def spread_weights(caller, weights, shapes):
-    """The weight of every entry of the raveled residuals."""
+def spread_weights(caller, weights, shapes, name="weights"):
+    """The weight of every entry of the raveled residuals; name: of the argument."""
 
     def spread(weight, branch):
         weight = jnp.asarray(weight)
@@ -188,7 +188,7 @@ def spread_weights(caller, weights, shapes):
         def one(leaf):
             if weight.shape != leaf.shape[: weight.ndim]:
                 raise ValueError(
-                    f"{caller}: `weights` must have the leading axes of their residuals, {leaf.shape}; "
+                    f"{caller}: `{name}` must have the leading axes of their residuals, {leaf.shape}; "
                     f"received {weight.shape}."
                 )
             return jnp.broadcast_to(weight.reshape(weight.shape + (1,) * (leaf.ndim - weight.ndim)), leaf.shape)

@@ -8,12 +8,11 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_function, require_integer, require_number
-from hhtjax.description import freeze, is_concrete, thaw
-from hhtjax.description.presentation import Table, as_text, overwrite, shown
-from hhtjax.identification.arguments import spread_weights
+from hhtjax.description import is_concrete
+from hhtjax.description.presentation import Table, as_text, shown
 from hhtjax.identification.evidence import count, effective_observations, f_tail, residuals_of
 from hhtjax.identification.identifiability import parameter_names, parameter_values
-from hhtjax.identification.identify import fit
+from hhtjax.identification.left_out import leave_out
 from hhtjax.identification.result import FitResult
 
 
@@ -121,6 +120,7 @@ def compare(
     *,
     folds: int = 8,
     absent: float | dict[str, float] = 0.0,
+    always: Any = None,
     progress: bool = False,
     **options: Any,
 ) -> Comparison:
@@ -150,6 +150,8 @@ def compare(
         folds: how many segments, cut as those of the covariance; each long against the correlation time.
         absent: the value at which a parameter of nested models has no effect, or {parameter: value}, by the names in
             `FitResult.summary()`, 0 for others. Where the smaller model holds it fixed, that value is taken.
+        always: Booleans, as `weights` of `fit`: True for residuals that no fit leaves out, and by which none is judged,
+            such as the first samples, where they alone tell the initial state.
         progress: show in one line on stderr which fit is running.
         options: loss, prior, scale, max_iterations, tolerance, as they were given to `fit`.
 
@@ -197,7 +199,7 @@ def compare(
         return found
     functions = _check_functions(residuals, fits)
     folds = require_integer("compare", "folds", folds, 2)
-    left = [_leave_out(name, fits[name], functions[name], folds, options, progress) for name in names]
+    left = [leave_out(name, fits[name], functions[name], folds, always, options, progress) for name in names]
     held_out, converged = (np.array(x) for x in zip(*left, strict=True))
     return found._replace(held_out=held_out, converged=converged)
 
@@ -261,30 +263,3 @@ def _same_constants(smaller, larger, fitted):
 def _absent(absent, name):
     value = absent.get(name, 0.0) if isinstance(absent, dict) else absent
     return float(require_number("compare", "absent", value, math.isfinite, "be finite"))
-
-
-def _leave_out(name, result, function, folds, options, progress):
-    """rms of each segment by the parameters fitted to the others, and whether these fits converged."""
-    weights = spread_weights("compare", result.weights, result.residual)
-    sizes = [w.size for w in weights]
-    structure = jax.tree.structure(freeze(result.params))
-    structured, errors, converged = jax.tree.structure(result.residual), [], []
-    for fold in range(folds):
-        if progress:
-            overwrite(f"compare: {name}, segment {fold + 1} of {folds} left out", last=fold + 1 == folds)
-        out = [(np.arange(n) // -(-n // folds) == fold).reshape(w.shape) for n, w in zip(sizes, weights, strict=True)]
-        kept = [np.where(x, 0, w) for x, w in zip(out, weights, strict=True)]
-        again = fit(
-            function,
-            thaw(result.params),
-            transforms=structure.unflatten(result.transforms),
-            weights=structured.unflatten(kept),
-            covariance=False,
-            **options,
-        )
-        left = [np.where(x, w, 0) for x, w in zip(out, weights, strict=True)]
-        judged = residuals_of(again._replace(weights=structured.unflatten(left)))
-        square = sum(np.sum(r**2) for r in judged.weighted)
-        errors.append(math.sqrt(square / max(count(judged), 1)))
-        converged.append(bool(again.converged))
-    return errors, converged

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.elimination import factorize, matvec
-from hhtjax.numerics.low_rank import Known
+from hhtjax.numerics.low_rank import AtState
 from hhtjax.xla import linear_map, staged
 
 RANK_TOLERANCE = (
@@ -34,7 +34,7 @@ def factorize_map(f, like, factorize):
 
 def invert(f, like, factorize):
     """The function (b, trans=0) -> A^-1 b, or A^-T b, of the matrix A of f; it may be constant to autodiff."""
-    if isinstance(factorize, (Structured, Known)):
+    if isinstance(factorize, (Structured, AtState)):
         return factorize.of_map(f, like)
     return factorize(staged(partial(linear_map, f), like.size)(like))
 
@@ -43,7 +43,7 @@ def invert_and_bound(f, like, factorize):
     """`invert`, and the function x -> |A| |x|, what the rows of A x are sums of; where no A is formed, |A x|."""
     if isinstance(factorize, Structured):
         return factorize.of_map(f, like), lambda x: jnp.abs(f(x))
-    if isinstance(factorize, Known):
+    if isinstance(factorize, AtState):
         return factorize.of_map(f, like), factorize.bound
     A = staged(partial(linear_map, f), like.size)(like)
     return factorize(A), lambda x: matvec(jnp.abs(A), jnp.abs(x))

@@ -1,8 +1,10 @@
-"""Linear solves with a constant matrix and a part that changes: A = A0 - E J E^T, or A0 - J.
+"""Linear solves with a constant matrix and a part that changes: A = A0 - E J E^T, or A0 - J, or A0 + H^T D.
 
 The inverse of the first is that of A0, and a solve with as many unknowns as E has columns (Woodbury 1950):
 
     A^-1 b = y + Z J (1 - S J)^-1 E^T y,    y = A0^-1 b,  Z = A0^-1 E,  S = E^T Z
+
+That of the last, with few rows D and A0 as above, is y - Z (1 + D Z)^-1 D y with Z = A0^-1 H^T.
 """
 
 from dataclasses import dataclass
@@ -14,6 +16,18 @@ from jax import lax
 
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.xla import linear_map
+
+
+class AtState:
+    """A `factorize` at a state, where it knows the matrix; `Changing.around` gives it."""
+
+    def of_map(self, f, like) -> Any:
+        """The function (b, trans=0) -> A^-1 b, or A^-T b; f and like say nothing new."""
+        raise NotImplementedError
+
+    def bound(self, x) -> Any:
+        """What the rows of A x are sums of: |A| |x|."""
+        raise NotImplementedError
 
 
 class Changing:
@@ -45,7 +59,7 @@ class Changing:
 
 
 @dataclass(frozen=True)
-class Known:
+class Known(AtState):
     """`Changing` at a state."""
 
     matrices: Changing
@@ -56,7 +70,6 @@ class Known:
         return self.matrices(A)
 
     def of_map(self, f, like):
-        """The function (b, trans=0) -> A^-1 b, or A^-T b; f and like say nothing new."""
         known, J = self.matrices, self.J
         if known.size is None:
             return factorize(known.A0 - J)
@@ -73,11 +86,70 @@ class Known:
         return apply
 
     def bound(self, x):
-        """What the rows of A x are sums of: |A| |x|."""
         known, x = self.matrices, jnp.abs(x)
         if known.size is None:
             return matvec(jnp.abs(known.A0 - self.J), x)
         return matvec(jnp.abs(known.A0), x) + known.columns.T @ (jnp.abs(self.J) @ (known.columns @ x))
+
+
+class Constant(Changing, AtState):
+    """A `factorize` for A0 alone."""
+
+    def __init__(self, A0):
+        self.A0 = lax.stop_gradient(A0)
+        self.inverse = factorize(self.A0)
+
+    def around(self, state, along):
+        """Itself, at every state."""
+        return self
+
+    def of_map(self, f, like):
+        return self.inverse
+
+    def bound(self, x):
+        return matvec(jnp.abs(self.A0), jnp.abs(x))
+
+
+class Updated(Changing):
+    """A `factorize` for A0 + H^T D with that of A0, a `Changing`.
+
+    H: (m, n). slope: state -> the linear function of a change of state that gives (m,), of a change w: D w.
+    """
+
+    def __init__(self, base, H, slope):
+        self.base, self.H, self.slope = base, lax.stop_gradient(H), slope
+
+    def around(self, state, along):
+        """The `factorize` for the matrix at a state."""
+        change, (m, n) = self.slope(state), self.H.shape
+        pull = jax.linear_transpose(lambda w: change(along(w)), jnp.zeros(n, self.H.dtype))
+        D = jnp.stack([pull(e)[0] for e in jnp.eye(m, dtype=self.H.dtype)])
+        return KnownUpdate(self.base.around(state, along), self.H, lax.stop_gradient(D))
+
+
+@dataclass(frozen=True)
+class KnownUpdate(AtState):
+    """`Updated` at a state."""
+
+    base: Any
+    H: Any
+    D: Any
+
+    def of_map(self, f, like):
+        inverse, D = self.base.of_map(f, like), self.D
+        Z = jnp.stack([inverse(h, trans=0) for h in self.H])  # transposed
+        small = factorize(jnp.eye(len(D), dtype=D.dtype) + jnp.stack([matvec(D, z) for z in Z], axis=1))
+
+        def apply(b, trans=0):
+            if trans:
+                return inverse(b - matvec(D.T, small(matvec(Z, b), trans=1)), trans=1)
+            y = inverse(b, trans=0)
+            return y - matvec(Z.T, small(matvec(D, y), trans=0))
+
+        return apply
+
+    def bound(self, x):
+        return self.base.bound(x) + matvec(jnp.abs(self.H.T), matvec(jnp.abs(self.D), jnp.abs(x)))
 
 
 def around(factorize, expand):

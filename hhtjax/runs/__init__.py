@@ -150,5 +150,5 @@ Extrapolation
 -------------
 
 `simulate(..., extrapolate=2)`, or 3, takes the leading errors in dt out of two, or three, runs with steps of dt, dt/2
-(and dt/4): order 3 and 4 where the motion is smooth and dt resolves it.
+(and dt/4): order 3 and 4 where the motion is smooth and dt resolves it, 3 with switches of dry friction.
 """

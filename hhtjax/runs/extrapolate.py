@@ -32,6 +32,8 @@ def _combine(solutions, order, join):
     turns = first.acceleration is not None  # a first-order system has no rotations
     q = value("q", partial(_positions, first.v) if turns else None)
     rest = {name: value(name) for name in ("v", "acceleration", "multipliers", "z", "zdot")}
+    if first.friction is not None:  # which jump, at times that each run has for itself
+        rest |= {name: getattr(solutions[-1], name) for name in ("friction", "sticking")}
     failure = _first([solution.failure for solution in solutions])
     if first.events is not None:
         rest["events"], same = _events([solution.events for solution in solutions], order)

@@ -67,7 +67,8 @@ def simulate(
             dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already; with
             uneven steps only alpha = 0, of order 3). For motions that dt resolves, elsewhere it makes errors larger;
             and for smooth steps, such as linearize="predictor": where "auto" changes its choice, dt^3 is left, as it
-            is where an event falls into a step.
+            is where an event, or a switch of dry friction, falls into a step; `friction` and `sticking` are then those
+            of the run with the shortest steps.
         t0: time of the start.
         events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
             happen; the grid stays what it is. Steps without one take as long as before, and a look at the guards. For
@@ -103,11 +104,6 @@ def simulate(
     save_every = require_integer("simulate", "save_every", save_every)
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
-    if system.friction is not None and extrapolate > 1:
-        raise NotImplementedError(
-            "simulate: leave `extrapolate` out: with dry friction the error is no power series in dt; "
-            f"received {extrapolate}."
-        )
     if events is not None and isinstance(dt, Adaptive):
         raise NotImplementedError(
             "simulate: with `events`, give `dt` as numbers: error control takes motions without jumps."

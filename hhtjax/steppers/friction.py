@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.elimination import diagonal, matvec
+from hhtjax.numerics.low_rank import Updated
 from hhtjax.steppers.constrained import equations, report_constraints
 from hhtjax.steppers.friction_events import run_events
 from hhtjax.steppers.friction_law import is_settled, switch
@@ -81,8 +82,11 @@ def _settle(system, at, factorize, H, K, own, L):
     return jnp.where(rests, slides, sig), jnp.where(rests, tau, sig * f)
 
 
-def bind_friction(method, system, params, dt):
-    """The step: the free one, the switches within it, and what becomes of the state behind them."""
+def bind_friction(method, system, params, dt, kept=None):
+    """The step: the free one, the switches within it, and what becomes of the state behind them.
+
+    kept: a `Changing` that knows the matrix without the slopes of limits, which H^T, then constant, spreads.
+    """
     law, size = system.friction, system.size
 
     def step(s):
@@ -94,7 +98,10 @@ def bind_friction(method, system, params, dt):
             return r(s1) + jnp.pad(force, (0, z.size - size))
 
         at = path(z)
-        z, info, inverse, along = _free_step(method, system, rubbing, path, z, s)
+        factorize = method.factorize_for(system) if system.num_constraints else method.factorize
+        if kept is not None:
+            factorize = _with_slope(kept, system, s, at, params)
+        z, info, inverse, along = _free_step(method.options, system, rubbing, path, z, s, factorize)
         H = directions(system, at.q, at.t, params)
         G = _each(inverse, jnp.pad(H, ((0, 0), (0, z.size - size))))
         free, W = path(z), across(H, _each(along, G).v)
@@ -128,10 +135,18 @@ def _equations(method, system, params, dt, s):
     return lambda s: residual(system, params, s), lambda w: method.arrive(system, s, dt, w), s.w, None, None
 
 
-def _free_step(method, system, r, path, z, s):
+def _with_slope(kept, system, s, at, params):
+    """`kept`, with the slopes of limits where joints slide."""
+    limit = partial(system.friction.limit, params=params)
+
+    def slope(x):
+        return jax.linearize(lambda x: s.friction.sig * limit(x.q, x.v, x.L, x.t), x)[1]
+
+    return Updated(kept, directions(system, at.q, at.t, params), slope)
+
+
+def _free_step(options, system, r, path, z, s, factorize):
     """The step in which every joint keeps its friction, and those that stuck have none; its factors are kept."""
-    options = method.options
-    factorize = method.factorize_for(system) if system.num_constraints else method.factorize
     if options.iterations is None:
         z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
         z, _, inverse, along = solve_and_keep(r, path, z, factorize)

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
 from hhtjax.numerics.elimination import factorize
-from hhtjax.numerics.linear_solve import Structured, factorize_with, reuse
-from hhtjax.numerics.low_rank import Changing
+from hhtjax.numerics.linear_solve import Structured, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.estimate import Controlled
 from hhtjax.steppers.friction import begin_friction, bind_friction
+from hhtjax.steppers.linear_part import factorized_once, linear_part
 from hhtjax.steppers.linearization import linearization_point, refresh
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
@@ -121,37 +121,14 @@ class GeneralizedAlpha(Controlled, Stepper):
 
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""
+        known = linear_part(self, system, params, dt)
         if system.friction is not None:
-            return bind_friction(self, system, params, dt)
+            return bind_friction(self, system, params, dt, known)
         if system.num_constraints:
             return bind_constrained(self, system, params, dt)
-        if system.local is not None and self.options.solve is None:
-            changing = self.factorize_linear_part(system, params, dt)
-            return partial(step, self, system, params, changing, self.options.linearize, dt)
-        if not system.linear:
-            return partial(step, self, system, params, self.factorize, self.options.linearize, dt)
-        # all points of linearisation are one
-        return partial(step, self, system, params, self.factorize_once(system, params, dt), "predictor", dt)
-
-    def factorize_once(self, system, params, dt):
-        """The factorised matrix of a linear system, in the place of `factorize`."""
-        return reuse(self.factorize, self.factorize(self.step_matrix(system, params, dt)))
-
-    def factorize_linear_part(self, system, params, dt):
-        """The same of a linear system with a nonlinear force beside it, whose Jacobian it adds at each state."""
-        local = system.local
-
-        def slope(s):
-            return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
-
-        return Changing(self.step_matrix(local.linear, params, dt), slope, local.spread, local.size)
-
-    def step_matrix(self, system, params, dt):
-        """The matrix of the step of a linear system."""
-        zero = jnp.zeros(system.size, dt.dtype)
-        rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
-        path = partial(self.arrive, system, rest, dt)
-        return jax.jacfwd(lambda w: residual(system, params, path(w)))(zero)
+        if system.linear:  # all points of linearisation are one
+            return partial(step, self, system, params, factorized_once(self, system, params, dt), "predictor", dt)
+        return partial(step, self, system, params, known or self.factorize, self.options.linearize, dt)
 
 
 @takes_options

@@ -38,8 +38,9 @@ Linear systems, and others with few nonlinear forces
 ----------------------------------------------------
 
 `LinearSystem(M, C, K, force)` is factorised once for the whole run, also with a nonlinear force at a few coordinates
-beside it: an end stop, a joint, a damper. Matrices may be SciPy's sparse ones, as `scipy.io.mmread` reads them;
-`hhtjax.analysis.modal_reduction` reduces large ones to their lowest modes, and knows their frequencies.
+beside it, an end stop, a joint, a damper, or with dry friction. Matrices may be SciPy's sparse ones, as
+`scipy.io.mmread` reads them; `hhtjax.analysis.modal_reduction` reduces large ones to their lowest modes, and knows
+their frequencies.
 
 >>> n = 100
 >>> K = 1e4 * (2 * jnp.eye(n) - jnp.eye(n, k=1) - jnp.eye(n, k=-1))
@@ -148,7 +149,8 @@ On a belt with the speed u, `sliding=lambda q, v, t, params: v - params["u"]`; b
 of their velocities. s must be affine in v, and its rows independent of each other and of constraints. A limit in a
 system with internal states is called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F is
 to be continuous: a jump from stiction to sliding is written as a steep Stribeck curve. Between saved times
-`interpolate` is of order 2 only where a joint switches. `extrapolate` and `energy_balance` are not for dry friction.
+`interpolate` is of order 2 only where a joint switches. `energy_balance` knows what friction takes, and what a belt
+gives.
 
 Rotations
 ---------

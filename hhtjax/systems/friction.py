@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.checks import describe
+from hhtjax.checks import describe, require_function
 from hhtjax.numerics.balance import balance
 from hhtjax.numerics.elimination import diagonal, factorize, matvec
 from hhtjax.numerics.linear_solve import solve
@@ -31,6 +31,17 @@ class FrictionLaw(NamedTuple):
     limit: Callable  # q, v, L, t, params -> F (m,)
     sliding: Callable  # q, v, t, params -> s (m,), affine in v
     size: int  # m
+
+
+def require_friction(caller, friction, sliding, *more):
+    """An error for what are no functions of dry friction. more: what `friction` takes between v and t."""
+    if friction is None:
+        if sliding is not None:
+            raise ValueError(f"{caller}: `sliding` must go with `friction`, the limits of the forces there.")
+        return
+    require_function(caller, "friction", friction, f"friction({', '.join(('q, v', *more))}, t, params)", 4 + len(more))
+    if sliding is not None:
+        require_function(caller, "sliding", sliding, "sliding(q, v, t, params)", count=4)
 
 
 def flat_friction(caller, system, flat, q0, v0, z0, t0, params):

@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_function, require_integer
 from hhtjax.description import Description, is_array
 from hhtjax.numerics.elimination import matvec
+from hhtjax.systems.friction import require_friction
 from hhtjax.systems.matrices import as_matrix, constant_matrix, require_mass
 
 
@@ -29,10 +30,12 @@ class LinearSystem(Description):
         nonlinear: g, `nonlinear(q, v, t, params)`, a pytree structured like v. With `at`: of the coordinates q[at] and
             v[at], (k,) each, the forces (k,) on these.
         at: k different numbers of coordinates, in the order of `ravel_pytree(v)`.
+        friction, sliding: dry friction, as for `System`: `friction(q, v, t, params)`, `sliding(q, v, t, params)`. The
+            derivative of `sliding` in v is to be the same for all q; slopes of limits update the inverse, too.
 
     Raises:
         TypeError, ValueError: an argument that is neither, or an array of a wrong shape or not finite; numbers `at`
-            that are none of coordinates, or without a force.
+            that are none of coordinates, or without a force; `sliding` without `friction`.
 
     Example: a mass of 2 kg on a spring of 200 N/m, started from 0.1 m. One period is 0.628 s.
 
@@ -62,8 +65,10 @@ class LinearSystem(Description):
     load: Callable | None
     nonlinear: Callable | None
     at: tuple[int, ...] | None
+    friction: Callable | None
+    sliding: Callable | None
 
-    def __init__(self, M, C=None, K=None, force=None, nonlinear=None, at=None):
+    def __init__(self, M, C=None, K=None, force=None, nonlinear=None, at=None, friction=None, sliding=None):
         for name, matrix in (("M", M), ("C", C), ("K", K)):
             if matrix is None and name != "M":
                 pass
@@ -86,6 +91,9 @@ class LinearSystem(Description):
             require_function("LinearSystem", "force", force, "force(t, params)")
         if nonlinear is not None:
             require_function("LinearSystem", "nonlinear", nonlinear, "nonlinear(q, v, t, params)")
+        require_friction("LinearSystem", friction, sliding)
+        object.__setattr__(self, "friction", friction)
+        object.__setattr__(self, "sliding", sliding)
         object.__setattr__(self, "load", force)
         object.__setattr__(self, "nonlinear", nonlinear)
         size = len(getattr(self, known[0])) if known else None
@@ -93,7 +101,6 @@ class LinearSystem(Description):
 
     constraint = None
     internal = None
-    friction = None
 
     def mass(self, q, params):
         """M, whatever q."""

@@ -14,12 +14,16 @@ DEPENDENT = 1e-6  # relative size of what is left of a row, below which it is ro
 
 @jax.jit
 def _rows(system, q0, v0, t0, params, z0):
-    """B and H at the start."""
+    """B and H at the start, and how much H changes elsewhere."""
     params = thaw(params)
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     B = jacobian(flat, q, t, params) if flat.num_constraints else jnp.zeros((0, flat.size), q.dtype)
-    return B, directions(flat, q, t, params)
+    H = directions(flat, q, t, params)
+    if not (flat.linear or flat.local):
+        return B, H, jnp.zeros_like(H)
+    elsewhere = q + 1 + jnp.arange(q.size, dtype=q.dtype) / q.size
+    return B, H, directions(flat, elsewhere, t, params) - H
 
 
 def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
@@ -27,10 +31,17 @@ def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
     with evaluated_now():
-        B, H = map(np.asarray, _rows(system, q0, v0, t0, params, z0))
+        B, H, change = map(np.asarray, _rows(system, q0, v0, t0, params, z0))
     if not np.all(np.isfinite(H)):
         raise ValueError(f"{caller}: `sliding` has no finite derivative in v at the start.")
-    basis = np.linalg.svd(B, full_matrices=False)[2] if B.size else np.zeros((0, H.shape[1]))
+    if np.max(np.abs(change)) > DEPENDENT * np.max(np.abs(H)):
+        raise ValueError(
+            f"{caller}: `sliding` of a LinearSystem must have the same derivative in v for all q: else take a System."
+        )
+    basis = np.zeros((0, H.shape[1]))
+    if B.size:
+        _, sizes, basis = np.linalg.svd(B, full_matrices=False)
+        basis = basis[sizes > DEPENDENT * sizes[0]]  # constraints may be redundant
     for i, row in enumerate(H):
         left = row
         for _ in range(2):  # once more, for what rounding leaves

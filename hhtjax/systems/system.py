@@ -6,6 +6,7 @@ from typing import Any
 
 from hhtjax.checks import require_function
 from hhtjax.description import Description
+from hhtjax.systems.friction import require_friction
 from hhtjax.systems.lagrangian import InternalLagrangianForce, LagrangianForce, LagrangianInertia, LagrangianMass
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass
@@ -114,23 +115,14 @@ class System(Description):
             require_function("System", "inertia", self.inertia, "inertia(q, w, params)")
         if self.constraint is not None:
             require_function("System", "constraint", self.constraint, "constraint(q, t, params)")
-        if self.friction is not None:
-            self._require_friction()
-        elif self.sliding is not None:
-            raise ValueError("System: `sliding` must go with `friction`, the limits of the forces there.")
+        more = (self.internal is not None) * ("z",) + (self.constraint is not None) * ("L",)
+        require_friction("System", self.friction, self.sliding, *more)
         if callable(self.mass):
             require_function("System", "mass", self.mass, "mass(q, params)")
         else:
             mass = constant_matrix("System", "mass", self.mass)
             require_mass("System", "mass", mass, self.constraint is not None)
             object.__setattr__(self, "mass", mass)
-
-    def _require_friction(self):
-        z, L = "z, " * (self.internal is not None), "L, " * (self.constraint is not None)
-        signature = f"friction(q, v, {z}{L}t, params)"
-        require_function("System", "friction", self.friction, signature, count=4 + bool(z) + bool(L))
-        if self.sliding is not None:
-            require_function("System", "sliding", self.sliding, "sliding(q, v, t, params)", count=4)
 
     @classmethod
     def from_lagrangian(cls, lagrangian, force=None, internal=None, friction=None, sliding=None):

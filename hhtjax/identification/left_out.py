@@ -1,0 +1,41 @@
+"""Fits with one segment of the residuals left out after the other, and their errors there."""
+
+import math
+
+import jax
+import numpy as np
+
+from hhtjax.description import freeze, thaw
+from hhtjax.description.presentation import overwrite
+from hhtjax.identification.arguments import spread_weights
+from hhtjax.identification.evidence import count, residuals_of
+from hhtjax.identification.identify import fit
+
+
+def leave_out(name, result, function, folds, always, options, progress):
+    """rms of each segment by the parameters fitted to the others, and whether these fits converged."""
+    weights = spread_weights("compare", result.weights, result.residual)
+    always = spread_weights("compare", False if always is None else always, result.residual, "always")
+    sizes = [w.size for w in weights]
+    structure = jax.tree.structure(freeze(result.params))
+    structured, errors, converged = jax.tree.structure(result.residual), [], []
+    for fold in range(folds):
+        if progress:
+            overwrite(f"compare: {name}, segment {fold + 1} of {folds} left out", last=fold + 1 == folds)
+        out = [(np.arange(n) // -(-n // folds) == fold).reshape(w.shape) for n, w in zip(sizes, weights, strict=True)]
+        out = [x & ~np.asarray(y, bool) for x, y in zip(out, always, strict=True)]
+        kept = [np.where(x, 0, w) for x, w in zip(out, weights, strict=True)]
+        again = fit(
+            function,
+            thaw(result.params),
+            transforms=structure.unflatten(result.transforms),
+            weights=structured.unflatten(kept),
+            covariance=False,
+            **options,
+        )
+        left = [np.where(x, w, 0) for x, w in zip(out, weights, strict=True)]
+        judged = residuals_of(again._replace(weights=structured.unflatten(left)))
+        square = sum(np.sum(r**2) for r in judged.weighted)
+        errors.append(math.sqrt(square / max(count(judged), 1)))
+        converged.append(bool(again.converged))
+    return errors, converged

@@ -1,0 +1,42 @@
+"""The matrix of the step of a linear system, or of the linear part of one, factorised once for a whole run."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.numerics.linear_solve import reuse
+from hhtjax.numerics.low_rank import Changing, Constant
+from hhtjax.steppers.residual import residual
+from hhtjax.steppers.stepper import State
+
+
+def factorized_once(method, system, params, dt):
+    """The factorised matrix of a linear system, in the place of `factorize`."""
+    return reuse(method.factorize, method.factorize(step_matrix(method, system, params, dt)))
+
+
+def linear_part(method, system, params, dt):
+    """A `Changing` that knows the linear part, and adds the Jacobian of a force beside it at each state.
+
+    None where there is no such part to be kept; also of a linear system without friction, for which it is all.
+    """
+    local = system.local
+    if method.options.solve is not None:
+        return None
+    if local is None:
+        kept = system.linear and system.friction is not None
+        return Constant(step_matrix(method, system, params, dt)) if kept else None
+
+    def slope(s):
+        return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
+
+    return Changing(step_matrix(method, local.linear, params, dt), slope, local.spread, local.size)
+
+
+def step_matrix(method, system, params, dt):
+    """The matrix of the step of a linear system."""
+    zero = jnp.zeros(system.size, dt.dtype)
+    rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
+    path = partial(method.arrive, system, rest, dt)
+    return jax.jacfwd(lambda w: residual(system, params, path(w)))(zero)
