@@ -63,9 +63,12 @@ def export_c(
 
     The same operations as `stepper.step`, each on a number: C and `simulate` agree to rounding. Nothing is allocated,
     nothing is global, all sizes are fixed; steps of several states may run at once. Both functions return flags, 0
-    where all is well, which the state keeps: NAME_NOT_FINITE, NAME_NOT_CONVERGED, NAME_DEPENDENT, NAME_NOT_SOLVED. A
-    non-iterative step without contacts has no loop, so that its worst case is its case; Newton's iteration is bounded
-    by its `max_iterations`.
+    where all is well, which the state keeps: NAME_NOT_FINITE, NAME_NOT_CONVERGED, NAME_DEPENDENT, NAME_NOT_SOLVED,
+    NAME_FRICTION. A non-iterative step has no loop, so that its worst case is its case, but for dry friction of several
+    joints, two rounds for each; Newton's iteration is bounded by its `max_iterations`.
+
+    With dry friction the state has friction_sig, the directions in which joints slide (0 where they stick), and
+    friction_tau, the forces. Events are for `simulate` alone.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`. What is constant in it is written out.
