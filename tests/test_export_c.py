@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -80,6 +81,15 @@ def rubbing(name):
     return lambda: RUBBING[name]
 
 
+def twice():
+    """The constraint of the rod, and again."""
+    scene = pendulum.cartesian()
+    own = scene.system
+    system = hhtjax.System(own.mass, own.force, lambda q, t, params: jnp.tile(own.constraint(q, t, params), 2))
+    return scene._replace(system=system)
+
+
+LEAST_SQUARES = hht(-0.1, redundant="least_squares")
 CASES = {
     "auto": Case(zoo("forced double pendulum"), STEPPERS["hht auto"], 1e-4),
     "an internal state": Case(rubbing("an internal state"), hht(-0.1), 5e-4),
@@ -104,6 +114,8 @@ SLOW = {
     "bar, converged": Case(Bar, hht(-0.1, iterations=None), 1e-4, 1000),
     "first order": Case(decay, hht(-0.1), 1e-4),
     "inertia": Case(with_inertia, hht(-0.1, linearize="predictor"), 1e-4),
+    "twice the same constraint": Case(twice, LEAST_SQUARES, 1e-3, 2000),
+    "bars through singular positions": Case(partial(four_bars.four_bars, loops=2), LEAST_SQUARES, 2e-3, 500),
     **{name: Case(rubbing(name), hht(-0.1), case.duration / 10_000) for name, case in RUBBING.items()
        if name != "an internal state"},
     "M(q), two joints, converged": Case(rubbing("M(q), two joints"), hht(-0.1, iterations=None), 4e-4),
@@ -114,7 +126,7 @@ SLOW = {
 
 CLEAN = (
     *("auto", "forced double pendulum, hht converged", "squeezer", "top", "bar", "motor", "two masses on a belt"),
-    "a constraint, H(q), a load",
+    *("a constraint, H(q), a load", "twice the same constraint"),
 )
 
 

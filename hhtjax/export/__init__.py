@@ -33,9 +33,10 @@ What is written
 ---------------
 
 The step is evaluated on numbers instead of arrays, each operation once, and printed, one constant for each. Branches
-("auto", Newton's iteration, `jnp.where` is none) stay branches, loops with a fixed count are written out, eliminations
-of more than eight unknowns are a loop over a static array. So C and `simulate` agree to rounding. The time of a step,
-and deadlines kept and missed, are measured on a page, `experiments/export/README.md`.
+("auto", Newton's iteration, `jnp.where` is none) stay branches, short loops with a fixed count are written out,
+eliminations of more than eight unknowns are a loop over a static array, and singular values, of
+`redundant="least_squares"`, are found by rotations. So C and `simulate` agree to rounding. The time of a step, and
+deadlines kept and missed, are measured on a page, `experiments/export/README.md`.
 
 A step reads params and dt anew, so a `LinearSystem` is factorised at each step, where `simulate` does it once: up to
 some ten unknowns that takes as long as XLA's step, beyond it longer.

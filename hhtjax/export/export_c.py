@@ -88,8 +88,8 @@ def export_c(
         An `ExportedC`; its `write(folder)` writes both files.
 
     Raises:
-        NotImplementedError: an operation that cannot be written in C (a callback, sort, random numbers, a singular
-            value decomposition as of `redundant="least_squares"`): with its name, and the line where it is used.
+        NotImplementedError: an operation that cannot be written in C (a callback, sort, random numbers, eigenvalues):
+            with its name, and the line where it is used.
         ValueError, TypeError: as `simulate`; a name that is none in C, sensitivities that are no fields, tracers.
 
     >>> import jax.numpy as jnp, hhtjax

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hhtjax.description import VERSION
-from hhtjax.export.expressions import TYPES, helper, number
+from hhtjax.export.expressions import TYPES, number
 from hhtjax.export.fields import Field
+from hhtjax.export.helpers import helper
 from hhtjax.export.model import FLAGS, Given, Numbers
 from hhtjax.xla import Listing, Scalar
 

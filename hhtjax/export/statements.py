@@ -79,6 +79,12 @@ class Statements:
         self.line(f"{self._helper('lu', LU.dtype)}({n}, {names});")
         assert dtype
 
+    def _svd(self, x):
+        (A,), dtype = x.operands, x.results[0].dtype
+        names = [self._name(y) for y in x.results]
+        self.line(f"{self.type(dtype)} {', '.join(f'{n}[{y.size}]' for n, y in zip(names, x.results, strict=True))};")
+        self.line(f"{self._helper('svd', dtype)}({x.params['n']}, {self.text(A)}, {', '.join(names)});")
+
     def _triangular_solve(self, x):
         (A, b), (found,), params = x.operands, x.results, x.params
         self._copy(b, found)

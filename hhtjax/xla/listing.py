@@ -2,7 +2,7 @@
 
 An operand is a `Scalar`, or a known number. Three operations hold lists of their own: `cond` one for each branch,
 `while` its condition and its body, whose carried variables are its results. Others make and read small arrays, whose
-name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu` and `triangular_solve`.
+name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu`, `svd` and `triangular_solve`.
 """
 
 from dataclasses import dataclass, field, replace

@@ -151,6 +151,14 @@ def _lu(recorder, eqn, A):
     return [_elements(recorder, x, v.aval.shape) for x, v in zip(found, eqn.outvars, strict=True)]
 
 
+def _svd(recorder, eqn, A):
+    n, dtype = A.shape[-1], eqn.outvars[0].aval.dtype
+    if A.shape != (n, n) or np.dtype(dtype).kind != "f" or eqn.params["subset_by_index"] is not None:
+        return None
+    found = recorder.arrays("svd", [recorder.array(A.flat, dtype)], [(dtype, n), *[(dtype, n * n)] * 2], n=n)
+    return [_elements(recorder, x, v.aval.shape) for x, v in zip(found, eqn.outvars, strict=False)]
+
+
 def _permutation(recorder, eqn, pivots):
     """The order of the rows, which the elimination has told."""
     place = recorder.places.get(pivots.flat[0])
@@ -201,6 +209,7 @@ ARRAYS = {
     "lu": _lu,
     "lu_pivots_to_permutation": _permutation,
     "scatter-add": _scatter_add,
+    "svd": _svd,
     "tile": _moved,
     "triangular_solve": _triangular_solve,
     "unstack": _moved,
