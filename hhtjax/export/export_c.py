@@ -126,8 +126,9 @@ def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities):
     except NotWritten as error:
         raise NotImplementedError(f"{caller}: `{error}` cannot be written in C.") from None
     require_different(caller, code.fields)
-    helpers = sorted({x for text in texts for x in text.helpers}, key=str)
-    parts = files.Parts(name, made, stepper, code.fields, numbers, names, texts, helpers, code.counts)
+    told = [*texts, code.factors] if code.factors else texts
+    helpers = sorted({x for text in told for x in text.helpers}, key=str)
+    parts = files.Parts(name, made, stepper, code.fields, numbers, names, texts, code.factors, helpers, code.counts)
     return ExportedC(
         name, files.header(parts), files.source(parts), tuple(code.fields), tuple(numbers.fields),
         tuple(numbers.inputs), _numbers(numbers.values), _numbers(numbers.first_inputs()), *code.counts,
@@ -162,7 +163,7 @@ class _Code:
         ]
         own = [field for leaf in layout.leaves[1:] for field in leaf]
         self.fields = own + [field for rows in self.derivatives for row in rows for field in row]
-        self.counts = 0, 0
+        self.counts, self.factors = (0, 0), None
 
     def begin(self, f, args):
         """Of NAME_init."""
@@ -182,9 +183,7 @@ class _Code:
             tangents = [jax.ShapeDtypeStruct((len(self.rows), *x.shape), x.dtype) for x in leaves]
             f, args = with_derivatives(f, self.rows), (tangents, *args)
             names = [*self._derivative_places(), *names]
-        text = self._text(f, args, names)
-        self.counts = self.listing.count()
-        return text
+        return self._text(f, args, names, kept=True)
 
     def _values(self):
         return [place for field in self.numbers.fields for place in field.places("p->")]
@@ -195,31 +194,50 @@ class _Code:
     def _derivative_places(self):
         return [place for rows in self.derivatives for row in rows for field in row for place in field.places("s->")]
 
-    def _text(self, f, args, names):
-        """Statements that read arguments, compute, and write the state and the flags."""
+    def _text(self, f, args, names, kept=False):
+        """Statements that read arguments, compute, and write the state and the flags. kept: what follows from params
+        and dt alone, at some cost, is in the state."""
 
         def numbers_of(*args):
             state, *change, flags = f(*args)
             return [*jax.tree.leaves(state)[1:], *change], flags
 
-        self.listing: Listing = listed(numbers_of, *args)
-        operands, flags = self.listing.results
+        listing: Listing = listed(numbers_of, *args)
+        places = dict(zip(listing.arguments, names, strict=True))
+        if kept:
+            constant = [scalar for scalar, place in places.items() if place == "dt" or place.startswith("p->")]
+            factors, operations, listing = listing.apart(constant)
+            self.factors = self._factors(factors, operations, places)
+            places |= {scalar: f"s->factors_{i}" for i, scalar in enumerate(factors)}
+        operands, flags = listing.results
         targets = [place for leaf in self.layout.places("s->")[1:] for place in leaf]
         targets += self._derivative_places() if self.rows else []
-        real = np.dtype(self.made.dtype), f"{self.name}_real"
-        text = Statements({}, self.name, real)
-        used = files.used(self.listing)
-        for scalar, place in zip(self.listing.arguments, names, strict=True):
-            if scalar in used:
-                text.names[scalar] = files.local(place)
-                if files.local(place) != place:
-                    text.line(f"const {text.type(scalar.dtype)} {files.local(place)} = {place};")
-        text.write(self.listing.operations)
+        text, reads = self._begun(listing, places)
+        self.counts = listing.count()
         values = [x for array in jax.tree.leaves(operands) for x in np.ravel(array)]
         for place, value in zip(targets, values, strict=True):
             text.line(f"{place} = {text.text(value)};")
-        reads = {place for scalar, place in zip(self.listing.arguments, names, strict=True) if scalar in used}
         return files.Body(text.lines, text.text(flags.item()), reads, text.helpers)
+
+    def _begun(self, listing, places):
+        """All operations, behind constants for what they read; and the places of that."""
+        text = Statements({}, self.name, (np.dtype(self.made.dtype), f"{self.name}_real"))
+        found = {scalar: place for scalar, place in places.items() if scalar in files.used(listing)}
+        for scalar, place in found.items():
+            text.names[scalar] = place if scalar.size else files.local(place)
+            if text.names[scalar] != place:
+                text.line(f"const {text.type(scalar.dtype)} {files.local(place)} = {place};")
+        text.write(listing.operations)
+        return text, set(found.values())
+
+    def _factors(self, factors, operations, places):
+        """What makes them, or None without."""
+        if not factors:
+            return None
+        text, reads = self._begun(Listing([*places], operations, [np.array(factors, object)]), places)
+        for i, scalar in enumerate(factors):
+            text.line(f"memcpy(s->factors_{i}, {text.text(scalar)}, sizeof s->factors_{i});")
+        return files.Factors(text.lines, sorted(reads), [(text.type(x.dtype), x.size) for x in factors], text.helpers)
 
 
 def _numbers(values):

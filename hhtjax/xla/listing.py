@@ -13,6 +13,8 @@ FUNCTIONS = {  # operations of which each takes as long as ten or more sums
     *("expm1", "log", "log1p", "logistic", "pow", "sin", "sinh", "tan", "tanh"),
 }
 
+COSTLY = {"lu", "svd", "triangular_solve"}
+
 
 @dataclass(eq=False)
 class Scalar:
@@ -50,6 +52,20 @@ class Listing:
     operations: list
     results: Any
 
+    def apart(self, constant):
+        """Factors of matrices that follow from the arguments `constant` alone, for who computes them once: the names of
+        their arrays, the operations that give them, and the listing that has them as arguments too."""
+        known, found = set(constant), []
+        for x in self.operations:
+            if not x.blocks and known.issuperset(_scalars(x.operands)):
+                known.update(x.results)
+                found.append(x)
+        costly = {id(x): x for x in found if x.name in COSTLY}
+        wanted = {x for array in _arrays(self.results) for x in array.flat if isinstance(x, Scalar)}
+        rest = pruned([x for x in self.operations if id(x) not in costly], wanted)
+        factors = [y for x in costly.values() for y in x.results if y in wanted]
+        return factors, pruned(found, set(factors)), Listing(self.arguments + factors, rest, self.results)
+
     def count(self):
         """Numbers of operations, and of those that are sines and the like; of a loop, its body counts once."""
         names = [x.name for x in everywhere(self.operations)]
@@ -75,6 +91,10 @@ def pruned(operations, wanted):
         kept.append(x)
         wanted.update(_scalars(x.operands))
     return kept[::-1]
+
+
+def _arrays(tree):
+    return [tree] if hasattr(tree, "flat") else [x for y in tree for x in _arrays(y)]
 
 
 def _scalars(operands):
