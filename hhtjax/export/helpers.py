@@ -62,8 +62,8 @@ static void #_triangular(const int n, const @ *const a, @ *const x, const int lo
         }
     }
 }""",
-    "svd": """/* s, u and the transpose of v with a = u diag(s) v^T, s falling: by rotations of columns in pairs until they
-   are orthogonal (Hestenes 1958), or nothing but rounding; what is not after so many sweeps is no number */
+    "svd": """/* s, u and the transpose of v with a = u diag(s) v^T, s falling: by rotations of columns in pairs until
+   they are orthogonal (Hestenes 1958), or nothing but rounding; what is not after so many sweeps is no number */
 static void #_svd(const int n, const @ *const a, @ *const s, @ *const u, @ *const vt)
 {
     int i, j, k, sweep, turned = 1;

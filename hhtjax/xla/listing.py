@@ -2,7 +2,8 @@
 
 An operand is a `Scalar`, or a known number. Three operations hold lists of their own: `cond` one for each branch,
 `while` its condition and its body, whose carried variables are its results. Others make and read small arrays, whose
-name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu`, `svd` and `triangular_solve`.
+name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu`, `svd` and `triangular_solve`;
+`map` does one operation on all elements, and `product` multiplies matrices.
 """
 
 from dataclasses import dataclass, field, replace
@@ -68,9 +69,15 @@ class Listing:
 
     def count(self):
         """Numbers of operations, and of those that are sines and the like; of a loop, its body counts once."""
-        names = [x.name for x in everywhere(self.operations)]
-        names = [x for x in names if x not in ("array", "element", "cond", "while")]
-        return len(names), sum(x in FUNCTIONS for x in names)
+        found = [x for x in everywhere(self.operations) if x.name not in ("array", "element", "cond", "while")]
+        return sum(map(_weight, found)), sum(x.name in FUNCTIONS for x in found)
+
+
+def _weight(x):
+    """How many operations on numbers it is; of an elimination, which is few times as many as it has numbers, one."""
+    if x.name == "product":
+        return 2 * x.params["count"] * x.params["rows"] * x.params["columns"]
+    return x.results[0].size if x.name == "map" else 1
 
 
 def everywhere(operations):

@@ -14,6 +14,7 @@ from hhtjax.xla.parameters import UNDERSTOOD, is_understood
 from hhtjax.xla.pieces import arranged, each, is_known
 from hhtjax.xla.recorder import Recorder, as_operand
 from hhtjax.xla.recording_arrays import ARRAYS
+from hhtjax.xla.recording_loops import in_loops
 from hhtjax.xla.scalar_rules import FOLDS, RULES
 from hhtjax.xla.source_lines import line_of
 
@@ -118,6 +119,8 @@ class _Listing:
         if name == "hhtjax_inside":  # functions come in two forms: outside of a kernel LAPACK's
             return [known_pieces(np.bool_(False))]
         known = all(is_known(x) for value in values for x in value.flat)
+        if is_understood(eqn) and not known and (found := in_loops(self.recorder, eqn, values)) is not None:
+            return found
         if (name not in UNDERSTOOD or is_understood(eqn)) and not (known and any(not x.size for x in values)):
             rule = FOLDS.get(name) or RULES.get(name)
             results = None if rule is None else rule(eqn, *values)
