@@ -1,5 +1,7 @@
 """Exported linear systems of more than ten unknowns: factors kept in the state, matrices as loops."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,7 +54,7 @@ def test_factors_are_kept_until_what_they_are_made_of_changes(library):
         factors.append(bytes(state.factors_0))
     for field, value in (("q", expected.q), ("v", expected.v), ("w", expected.w)):
         assert np.max(abs(numbers(state, field) - value)) < 1e-12 * np.max(abs(value)), field
-    assert [a == b for a, b in zip(factors, factors[1:], strict=False)] == [True, True, False, False]
+    assert [a == b for a, b in itertools.pairwise(factors)] == [True, True, False, False]
 
 
 def test_matrices_are_loops(library):

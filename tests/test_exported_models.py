@@ -216,6 +216,8 @@ def test_wrong_arguments_are_named():
         ({"name": "2nd"}, "`name` must be one that C allows"),
         ({"sensitivities": ("stiffness",)}, "`sensitivities` must be different names among"),
         ({"z0": 1.0}, "leave `z0` out"),
+        ({"units": {"stiffness": "N/m"}}, "`units` must name fields among q, v, w, a, "),
+        ({"units": {"q": "m */"}}, "`units` must fit into a comment of C"),
     ):
         check_message(ValueError, f"export_c: {message}", lambda options=options: export_c(*start, **options))
     same = {"a": {"b": 1.0}, "a_b": 2.0}

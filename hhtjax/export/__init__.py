@@ -38,8 +38,9 @@ eliminations of more than eight unknowns are a loop over a static array, and sin
 `redundant="least_squares"`, are found by rotations. So C and `simulate` agree to rounding. The time of a step, and
 deadlines kept and missed, are measured on a page, `experiments/export/README.md`.
 
-A step reads params and dt anew, so a `LinearSystem` is factorised at each step, where `simulate` does it once: up to
-some ten unknowns that takes as long as XLA's step, beyond it longer.
+A step reads params and dt anew. What `simulate` does once, the factors of a `LinearSystem` of more than eight unknowns,
+the state keeps, until the params that they are made of, or dt, change: that step takes longer. Large constant matrices
+are loops.
 
 C compilers take long over very large functions: three rigid bodies on joints are 35000 operations, and half a minute.
 More than 100000 are refused.

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.export import files
-from hhtjax.export.fields import require_different
+from hhtjax.export.fields import require_different, units_of
 from hhtjax.export.model import Given, Layout, Numbers, begin, derivative_field, given, step, with_derivatives
 from hhtjax.export.statements import NotWritten, Statements
 from hhtjax.xla import Listing, NotListed, listed
@@ -26,6 +26,7 @@ class ExportedC:
         state, params, inputs: fields of the structs `name_state` and `name_params`, and the arrays that `u` holds one
             after the other: (name, shape) of each.
         values, input_values: of the params, one for each of their numbers, and of the inputs at the start.
+        units: {name of a field of these: its unit}, of those that were told.
         operations, functions: how many operations on numbers a step has, and how many of them are sines, roots and the
             like. Of a loop, its body counts once.
     """
@@ -38,6 +39,7 @@ class ExportedC:
     inputs: tuple
     values: tuple
     input_values: tuple
+    units: dict
     operations: int
     functions: int
 
@@ -53,7 +55,7 @@ class ExportedC:
 
 def export_c(
     system: Any, stepper: Any, q0: Any, v0: Any = None, params: Any = None, *,
-    z0: Any = None, name: str = "model", sensitivities: tuple = (),
+    z0: Any = None, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
 ) -> ExportedC:  # fmt: skip
     """The step of a system as C99 without dependencies: for hard real time, where Python cannot go.
 
@@ -84,13 +86,16 @@ def export_c(
         sensitivities: names of fields of `NAME_params` in which derivatives are stepped along: with "k", the state has
             dq_dk, dv_dk, ... They are those of a run whose q0 and v0 do not depend on the params.
 
+        units: of fields, for comments in the header: {"q": "rad", "k": "N m/rad"}. A name tells for all fields of which
+            it is the first word, as "q" for q_arm, but for those that are named themselves.
+
     Returns:
         An `ExportedC`; its `write(folder)` writes both files.
 
     Raises:
         NotImplementedError: an operation that cannot be written in C (a callback, sort, random numbers, eigenvalues):
             with its name, and the line where it is used.
-        ValueError, TypeError: as `simulate`; a name that is none in C, sensitivities that are no fields, tracers.
+        ValueError, TypeError: as `simulate`; a name that is none in C, sensitivities or units of no fields, tracers.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: {"x": -p["k"] * q["x"]})
@@ -101,10 +106,10 @@ def export_c(
     >>> print(model.header.splitlines()[-7])
     spring_API int spring_step(spring_state *s, const spring_params *p, const spring_real *u, spring_real dt);
     """
-    return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities)
+    return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities, units)
 
 
-def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities):
+def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities, units):
     """`export_c`, under the name of its caller."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(f"{caller}: `name` must be one that C allows, such as 'pendulum'; received {name!r}.")
@@ -126,12 +131,13 @@ def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities):
     except NotWritten as error:
         raise NotImplementedError(f"{caller}: `{error}` cannot be written in C.") from None
     require_different(caller, code.fields)
+    units = units_of(caller, units, [*code.fields, *numbers.fields, *numbers.inputs])
     told = [*texts, code.factors] if code.factors else texts
     helpers = sorted({x for text in told for x in text.helpers}, key=str)
-    parts = files.Parts(name, made, stepper, code.fields, numbers, names, texts, code.factors, helpers, code.counts)
+    parts = files.Parts(name, made, stepper, code.fields, numbers, units, texts, code.factors, helpers, code.counts)
     return ExportedC(
         name, files.header(parts), files.source(parts), tuple(code.fields), tuple(numbers.fields),
-        tuple(numbers.inputs), _numbers(numbers.values), _numbers(numbers.first_inputs()), *code.counts,
+        tuple(numbers.inputs), _numbers(numbers.values), _numbers(numbers.first_inputs()), units, *code.counts,
     )  # fmt: skip
 
 

@@ -136,7 +136,7 @@ class Parts(NamedTuple):
     stepper: Any
     fields: list[Field]
     numbers: Numbers
-    sensitivities: list[str]
+    units: dict
     texts: list[Body]
     factors: Factors | None
     helpers: list
@@ -176,19 +176,23 @@ def header(parts: Parts):
     if parts.factors:
         rest += [f"    {kind} factors_{i}[{size}];" for i, (kind, size) in enumerate(parts.factors.arrays)]
         rest.append(Field("factors_of", (len(parts.factors.reads),)).declaration(real))
-    layout = ", ".join(f"{field.name}{f'[{field.size}]' * bool(field.shape)}" for field in parts.numbers.inputs)
-    params = [field.declaration(real) for field in parts.numbers.fields]
+    layout = ", ".join(_input(field, parts.units.get(field.name)) for field in parts.numbers.inputs)
+    params = [field.declaration(real, parts.units.get(field.name)) for field in parts.numbers.fields]
     return HEADER.format(
         name=name, guard=f"{name.upper()}_H", version=VERSION, real=TYPES[np.dtype(parts.made.dtype)],
         stepper=_comment(parts.stepper),
         work=f"A step takes {operations} operations on numbers, {functions} of them functions such as sines.{again}",
         flags=",\n".join(f"    {name.upper()}_{x} = {2**i} /* {text} */" for i, (x, text) in enumerate(FLAGS.items())),
-        state="\n".join(field.declaration(real) for field in parts.fields),
+        state="\n".join(field.declaration(real, parts.units.get(field.name)) for field in parts.fields),
         rest="\n".join(rest), params="\n".join(params or ["    int none;"]),
         starts=" and ".join(sorted(parts.made.starts)), init_inputs=" and the inputs before" if num_inputs else "",
         step_inputs=f", u = {layout} held over it" if num_inputs else "; u is not read, and may be NULL",
         **_signatures(parts, ""),
     )  # fmt: skip
+
+
+def _input(field, unit):
+    return f"{field.name}{f'[{field.size}]' * bool(field.shape)}{f' ({unit})' if unit else ''}"
 
 
 def source(parts: Parts):
