@@ -172,6 +172,42 @@ def test_c_is_simulate(name, tmp_path):
             assert any(np.max(np.ptp(x, axis=0)) > 0 for x in jax.tree.leaves(tree))  # it moved
 
 
+SINGLE = (
+    *("an internal state", "rod", "motor", "forced Duffing, rk4", "top", "two masses on a belt", "slider-crank"),
+    *("maxwell, rk4", "twice the same constraint"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::hhtjax.PrecisionWarning")
+@pytest.mark.parametrize("name", SINGLE)
+def test_in_single_precision_too(name, tmp_path):
+    """As many roundings apart as in double precision: the bound of 1e-12 there is 4500 of them."""
+    case = {**CASES, **SLOW}[name]
+    scene, dt = case.scene(), max(case.dt, 1e-4)
+    given = {key: getattr(scene, key, None) for key in ("q0", "v0", "z0", "params")}
+    scene = scene._replace(**{key: single(x) for key, x in given.items() if x is not None})
+    model = exported(case._replace(scene=lambda: scene))
+    assert "double" not in model.source
+    library = Library(model, tmp_path)
+    state, _ = library.begin(*starts(scene), dt=dt)
+    flags = library.run(state, 1000, dt)
+    run = hhtjax.simulate(
+        scene.system, case.stepper, scene.q0, scene.v0, scene.params, z0=getattr(scene, "z0", None),
+        dt=dt, num_steps=1000, save_every=1000,
+    )  # fmt: skip
+    assert flags == int(run.failure.step) == 0
+    expected = np.concatenate([np.ravel(leaf[-1]) for leaf in jax.tree.leaves(run.q)])
+    bound = case.rtol * np.finfo(np.float32).eps / np.finfo(float).eps
+    assert np.max(abs(group(state, model, "q") - expected)) < bound * np.max(abs(expected))
+
+
+def single(tree):
+    """Its floating numbers in single precision."""
+    floats = partial(jnp.asarray, dtype=jnp.float32)
+    return jax.tree.map(lambda x: floats(x) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x, tree)
+
+
 MAIN = """#include <stdio.h>
 #include "{name}.h"
 int main(void)

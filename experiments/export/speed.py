@@ -3,6 +3,7 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
@@ -10,8 +11,11 @@ from experiments.benchmarks import native
 from experiments.benchmarks.measure import least_seconds
 from experiments.export.native_model import Run
 from hhtjax.scenes import (
+    Scene,
+    belt,
     bouc_wen,
     double_pendulum,
+    dry_oscillator,
     duffing,
     four_bars,
     lugre,
@@ -30,6 +34,19 @@ PREDICTOR, AUTO, NEWTON = (
     hhtjax.hht(ALPHA),
     hhtjax.hht(ALPHA, iterations=None),
 )
+
+
+def chain(count):
+    """A linear one: masses between springs, a load on all of them (SI units)."""
+    K = 1e3 * (2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
+
+    def load(t, params):
+        return params["load"] * jnp.sin(t) * jnp.ones(count)
+
+    system = hhtjax.LinearSystem(np.ones(count), 1e-3 * K, K, load)
+    return Scene(system, {"load": 3.0}, jnp.zeros(count), jnp.ones(count), 1.0)
+
+
 SCENES = {  # scene, stepper, step size in s
     "double pendulum, predictor": (double_pendulum.stiff, PREDICTOR, 1e-3),
     "double pendulum, auto": (double_pendulum.stiff, AUTO, 1e-3),
@@ -47,6 +64,10 @@ SCENES = {  # scene, stepper, step size in s
     "squeezer": (squeezer.squeezer, AUTO, 1e-5),
     "top": (top.minimal, AUTO, 1e-4),
     "top with constraints": (top.constrained, AUTO, 1e-4),
+    "dry friction": (dry_oscillator.driven, AUTO, 1e-3),
+    "dry friction of two joints": (belt.two_masses, AUTO, 1e-3),
+    "linear chain of 30": (partial(chain, 30), AUTO, 1e-3),
+    "linear chain of 100": (partial(chain, 100), AUTO, 1e-3),
 }
 
 
