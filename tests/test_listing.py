@@ -109,6 +109,17 @@ def test_each_operation_stands_once():
     assert [x.name for x in found.operations] == ["sin", "mul", "mul"]
 
 
+def test_long_loops_stay_loops():
+    def repeated(count):
+        return listed(lambda x: jax.lax.fori_loop(0, count, lambda i, x: jnp.sin(x) + jnp.cos(x[0]), x), jnp.ones(8))
+
+    long, short = repeated(200), repeated(3)
+    assert [x.name for x in long.operations] == ["while"]
+    assert long.count()[1] == 9
+    assert "while" not in {x.name for x in short.operations}
+    assert short.count()[1] == 27
+
+
 def test_what_nobody_needs_is_left_out():
     def loop(x):
         return jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * x, jnp.sin(c[2])), (0, x, x))[1]

@@ -1,5 +1,6 @@
 """Time of an exported step against C written by hand, and against the kernel that XLA makes, scene by scene."""
 
+import os
 from functools import partial
 
 import jax
@@ -99,6 +100,7 @@ def run(report, fast):
     if native.compiler() is None:
         print("No C compiler: no times.", flush=True)
         return {}
+    load = os.getloadavg()[0]
     hand = by_hand(2000 if fast else 50_000, 3 if fast else 40)
     ratio = hand["exported"] / hand["by hand"]
     report.table(["double pendulum, plain sines", "ns per step"], list(hand.items()))
@@ -121,4 +123,10 @@ def run(report, fast):
         report.progress(f"{name}: {c:.0f} ns, XLA {xla:.0f} ns")
     header = ["scene", "operations", "sines and the like", "C (ns)", "XLA (ns)", "ratio", "difference"]
     report.table(header, [list(row.values()) for row in rows])
-    return {"by_hand_ns": hand, "time_over_by_hand": ratio, "scenes": rows, "flags": " ".join(("-O3", "-march=native"))}
+    return {
+        "load_at_start": load,
+        "by_hand_ns": hand,
+        "time_over_by_hand": ratio,
+        "scenes": rows,
+        "flags": " ".join(("-O3", "-march=native")),
+    }

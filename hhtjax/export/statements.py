@@ -72,6 +72,15 @@ class Statements:
         self.line(f"const {self.type(x.results[0].dtype)} {self._name(x.results[0])} = "
                   f"{self.text(array)}[{self.text(index)}];")  # fmt: skip
 
+    def _taken(self, x):
+        (result,), source, count = x.results, self.text(x.operands[0]), x.results[0].size
+        name = self._name(result)
+        self.line(f"static const int32_t {name}_at[{count}] = {{{', '.join(map(str, x.params['at']))}}};")
+        self.line(f"{self.type(result.dtype)} {name}[{count}];")
+        self.line(f"for (int i = 0; i < {count}; i++) {{")
+        self.line(f"    {name}[i] = {source}[{name}_at[i]];")
+        self.line("}")
+
     def _map(self, x):
         (result,) = x.results
         operands = [f"{self.text(y)}{'[i]' * (isinstance(y, Scalar) and y.size > 0)}" for y in x.operands]

@@ -3,7 +3,7 @@
 An operand is a `Scalar`, or a known number. Three operations hold lists of their own: `cond` one for each branch,
 `while` its condition and its body, whose carried variables are its results. Others make and read small arrays, whose
 name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu`, `svd` and `triangular_solve`;
-`map` does one operation on all elements, and `product` multiplies matrices.
+`taken` has elements of an array in another order, `map` does one operation on all, and `product` multiplies matrices.
 """
 
 from dataclasses import dataclass, field, replace
@@ -14,6 +14,7 @@ FUNCTIONS = {  # operations of which each takes as long as ten or more sums
     *("expm1", "log", "log1p", "logistic", "pow", "sin", "sinh", "tan", "tanh"),
 }
 
+MOVES = {"array", "cond", "element", "taken", "while"}  # which compute nothing themselves
 COSTLY = {"lu", "svd", "triangular_solve"}
 
 
@@ -69,7 +70,7 @@ class Listing:
 
     def count(self):
         """Numbers of operations, and of those that are sines and the like; of a loop, its body counts once."""
-        found = [x for x in everywhere(self.operations) if x.name not in ("array", "element", "cond", "while")]
+        found = [x for x in everywhere(self.operations) if x.name not in MOVES]
         return sum(map(_weight, found)), sum(x.name in FUNCTIONS for x in found)
 
 

@@ -7,6 +7,7 @@ from hhtjax.xla.listing import Block, Operation, Scalar
 from hhtjax.xla.pieces import is_known, unmarked
 
 COMMUTES = {"add", "mul", "and", "or", "xor", "eq", "ne"}
+LARGE = 400  # numbers, or operations on them, from which on they are a loop
 SAME = {"add_any": "add", "stop_gradient": "copy"}
 
 
@@ -37,6 +38,10 @@ class Recorder:
         name = self.name_of(elements)
         if name is not None:
             return name
+        found = [self.places.get(x) if isinstance(x, Scalar) else None for x in elements]
+        if len(found) >= LARGE and found[0] and all(x and x[0] is found[0][0] for x in found):
+            at = tuple(x[1] for x in found if x)
+            return self._once(("taken", id(found[0][0]), at), "taken", [found[0][0]], {"at": at}, dtype, len(at))
         return self._once(("array", *map(_key, elements)), "array", elements, {}, dtype, len(elements))
 
     def name_of(self, elements, known=False):

@@ -8,10 +8,9 @@ import numpy as np
 
 from hhtjax.xla.listing import Scalar
 from hhtjax.xla.pieces import is_known, is_structural
-from hhtjax.xla.recorder import as_operand
+from hhtjax.xla.recorder import LARGE, as_operand
 from hhtjax.xla.recording_arrays import elements_of
 
-LARGE = 400  # operations, from which on they are a loop
 MAPPED = {"add": "add", "add_any": "add", "div": "div", "mul": "mul", "neg": "neg", "sub": "sub"}
 
 
