@@ -116,8 +116,8 @@ SLOW = {
     "inertia": Case(with_inertia, hht(-0.1, linearize="predictor"), 1e-4),
     "twice the same constraint": Case(twice, LEAST_SQUARES, 1e-3, 2000),
     "bars through singular positions": Case(partial(four_bars.four_bars, loops=2), LEAST_SQUARES, 2e-3, 500),
-    **{name: Case(rubbing(name), hht(-0.1), case.duration / 10_000) for name, case in RUBBING.items()
-       if name != "an internal state"},
+    **{name: Case(rubbing(name), hht(-0.1), RUBBING[name].duration / 10_000)
+       for name in ("stick-slip, Stribeck", "two masses on a belt", "a constraint, H(q), a load", "a rotation, H(q)")},
     "M(q), two joints, converged": Case(rubbing("M(q), two joints"), hht(-0.1, iterations=None), 4e-4),
     "eight joints": Case(joints, hht(-0.1), 5e-4),
     "conjugate gradients": Case(Bar, hht(-0.1, solve=hhtjax.conjugate_gradients(20)), 1e-4, 1000),
@@ -172,10 +172,7 @@ def test_c_is_simulate(name, tmp_path):
             assert any(np.max(np.ptp(x, axis=0)) > 0 for x in jax.tree.leaves(tree))  # it moved
 
 
-SINGLE = (
-    *("an internal state", "rod", "motor", "forced Duffing, rk4", "top", "two masses on a belt", "slider-crank"),
-    *("maxwell, rk4", "twice the same constraint"),
-)
+SINGLE = "an internal state", "motor", "top", "two masses on a belt", "twice the same constraint"
 
 
 @pytest.mark.slow

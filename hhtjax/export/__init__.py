@@ -39,8 +39,10 @@ eliminations of more than eight unknowns are a loop over a static array, and sin
 deadlines kept and missed, are measured on a page, `experiments/export/README.md`.
 
 A step reads params and dt anew. What `simulate` does once, the factors of a `LinearSystem` of more than eight unknowns,
-the state keeps, until the params that they are made of, or dt, change: that step takes longer. Large constant matrices
-are loops.
+the state keeps, until the params that they are made of, or dt, change: that step takes longer, and on the stack several
+times the size of the matrix. Large constant matrices are loops.
+
+Steps under error control, and events, are for `simulate` alone.
 
 C compilers take long over very large functions: three rigid bodies on joints are 35000 operations, and half a minute.
 More than 100000 are refused.

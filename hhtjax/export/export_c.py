@@ -70,7 +70,7 @@ def export_c(
     joints, two rounds for each; Newton's iteration is bounded by its `max_iterations`.
 
     With dry friction the state has friction_sig, the directions in which joints slide (0 where they stick), and
-    friction_tau, the forces. Events are for `simulate` alone.
+    friction_tau, the forces.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`. What is constant in it is written out.
