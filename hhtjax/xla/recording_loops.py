@@ -22,7 +22,8 @@ def in_loops(recorder, eqn, values):
     if name == "dot_general" and all(v.aval.dtype == out.dtype for v in eqn.invars):
         over, batch = eqn.params["dimension_numbers"]
         if not any(batch) and len(over[0]) == 1:
-            return _product(recorder, out, *values, over[0][0], over[1][0])
+            a, b = values
+            return _product(recorder, out, a, b, over[0][0], over[1][0])
     return None
 
 
