@@ -2,6 +2,7 @@
 
 import ctypes
 import itertools
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -43,6 +44,9 @@ class Library:
         members = [("t", self.real), *map(self._member, model.state), ("flags", ctypes.c_int)]
         members += [("u", self.real * num_inputs)] * bool(num_inputs)
         members += [("t0", self.real), ("dt", self.real), ("steps", ctypes.c_int64)]
+        kinds = {f"{model.name}_real": self.real, "int32_t": ctypes.c_int32}
+        for kind, field, size in re.findall(r"(\w+) (factors_\w+)\[(\d+)\];", model.header):
+            members.append((field, kinds[kind] * int(size)))
         self.State = type("State", (ctypes.Structure,), {"_fields_": members})
         params = [self._member(field) for field in model.params] or [("none", ctypes.c_int)]
         self.Params = type("Params", (ctypes.Structure,), {"_fields_": params})

@@ -25,13 +25,15 @@ SYSTEM = hhtjax.System(
 )
 Q0, V0 = {"x": jnp.array([0.1, 0.2])}, {"x": jnp.zeros(2)}
 STEPPER = hht(-0.1)
+UNITS = {"q": "m", "v": "m/s", "k": "N/m", "u": "N & more"}
+NAMES: dict = {"dt": DT, "name": "driven", "sensitivities": ("k",), "units": UNITS}
 OK, ERROR = 0, 3
 LOGGER = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
 
 
 @pytest.fixture(scope="module")
 def unit():
-    return export_fmu(SYSTEM, STEPPER, Q0, V0, PARAMS, dt=DT, name="driven", sensitivities=("k",))
+    return export_fmu(SYSTEM, STEPPER, Q0, V0, PARAMS, **NAMES)
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +122,20 @@ def test_a_unit_is_simulate(slave, expected):
 
 @pytest.mark.slow
 @needs_compiler
+def test_variables_have_units(unit):
+    root = ET.fromstring(unit.description)
+    assert [x.tag for x in root][:2] == ["CoSimulation", "UnitDefinitions"]
+    assert {x.attrib["name"] for x in root.iterfind("UnitDefinitions/Unit")} == set(UNITS.values())
+    variables = root.find("ModelVariables")
+    assert variables is not None
+    found = {x.attrib["name"]: x.attrib.get("unit") for x in variables}
+    expected = {"q_x[1]": "m", "q0_x[2]": "m", "v0_x[1]": "m/s", "k": "N/m", "u[2]": "N & more", "w_x[1]": None}
+    assert {name: found[name] for name in expected} == expected
+    assert "driven_real q_x[2]; /* m */" in unit.c.header
+    assert "driven_real k; /* N/m */" in unit.c.header
+    assert "u = u[2] (N & more) held over it" in unit.c.header
+
+
 def test_one_long_step_is_many_short_ones(slave):
     """With the input held, to the last bit; and of a step that is no multiple, steps a little shorter."""
     slave.begin()
@@ -191,7 +207,7 @@ def test_the_sources_compile_without_a_warning(unit, tmp_path):
 
 
 def test_the_same_model_is_the_same_unit(unit):
-    again = export_fmu(SYSTEM, STEPPER, Q0, V0, PARAMS, dt=DT, name="driven", sensitivities=("k",))
+    again = export_fmu(SYSTEM, STEPPER, Q0, V0, PARAMS, **NAMES)
     assert again == unit
     other = export_fmu(SYSTEM, STEPPER, Q0, V0, PARAMS | {"k": 5.0}, dt=DT, name="driven", sensitivities=("k",))
     token = re.compile('instantiationToken="([^"]*)"')

@@ -13,7 +13,7 @@ from operations_table import TABLE
 from program_writer import usual_promotion
 from test_conformance import expression
 
-from hhtjax.export.expressions import helper
+from hhtjax.export.helpers import helper
 from hhtjax.export.statements import NotWritten, Statements
 from hhtjax.xla import NotListed, Scalar, listed
 
@@ -85,9 +85,39 @@ def test_c_computes_what_numpy_does(group, tmp_path):
     assert len(found) > 2 * len(refused)
 
 
+def test_singular_values_in_c(tmp_path):
+    """Of full rank and not, up to 25: what they multiply to, orthogonal, falling, and NumPy's."""
+    text = helper("svd", "m", np.float64).replace("static ", "")
+    text = text.replace("{", ";\n" + text[text.index("void") : text.index("{")] + "{", 1)  # declared before
+    (tmp_path / "svd.c").write_text(f"#include <math.h>\n{text}\n")
+    library = ctypes.CDLL(str(compiled([tmp_path / "svd.c"], tmp_path / "svd.so", "-O1", "-fPIC", "-shared")))
+    rng = np.random.default_rng(0)
+    for n, rank in ((1, 1), (2, 1), (4, 2), (5, 5), (8, 0), (12, 9), (25, 25)):
+        A = rng.standard_normal((n, rank)) @ rng.standard_normal((rank, n))
+        for k in range(3):
+            if k and n > 2:
+                A[:, 1] = A[:, 0] if k == 1 else 0
+            S, U, V = np.zeros(n), np.zeros((n, n)), np.zeros((n, n))
+            library.m_svd(n, *(x.ctypes.data_as(ctypes.c_void_p) for x in (A, S, U, V)))
+            for ours, expected in ((U * S @ V, A), (U.T @ U, np.eye(n)), (V @ V.T, np.eye(n))):
+                np.testing.assert_allclose(ours, expected, atol=1e-13 * n)
+            np.testing.assert_allclose(S, np.linalg.svd(A)[1], atol=1e-13 * n)
+
+
 def test_each_operation_stands_once():
     found = listed(lambda x: (jnp.sin(x) * 2, 2 * jnp.sin(x), x * x, x**2, x + 0.0), jnp.ones(()))
     assert [x.name for x in found.operations] == ["sin", "mul", "mul"]
+
+
+def test_long_loops_stay_loops():
+    def repeated(count):
+        return listed(lambda x: jax.lax.fori_loop(0, count, lambda i, x: jnp.sin(x) + jnp.cos(x[0]), x), jnp.ones(8))
+
+    long, short = repeated(200), repeated(3)
+    assert [x.name for x in long.operations] == ["while"]
+    assert long.count()[1] == 9
+    assert "while" not in {x.name for x in short.operations}
+    assert short.count()[1] == 27
 
 
 def test_what_nobody_needs_is_left_out():

@@ -78,6 +78,7 @@ def page(numbers):
             functions=fitted["functions"],
             steps=fitted["num_steps"],
             difference=fitted["difference_rad"],
+            load=speed["load_at_start"],
             flags=f"`{speed['flags']}`",
             by_hand=table(["form", "ns per step"], [[k, f"{x:.1f}"] for k, x in speed["by_hand_ns"].items()]),
             scenes=table(

@@ -1,8 +1,10 @@
 """Time of an exported step against C written by hand, and against the kernel that XLA makes, scene by scene."""
 
+import os
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
@@ -10,8 +12,11 @@ from experiments.benchmarks import native
 from experiments.benchmarks.measure import least_seconds
 from experiments.export.native_model import Run
 from hhtjax.scenes import (
+    Scene,
+    belt,
     bouc_wen,
     double_pendulum,
+    dry_oscillator,
     duffing,
     four_bars,
     lugre,
@@ -30,6 +35,19 @@ PREDICTOR, AUTO, NEWTON = (
     hhtjax.hht(ALPHA),
     hhtjax.hht(ALPHA, iterations=None),
 )
+
+
+def chain(count):
+    """A linear one: masses between springs, a load on all of them (SI units)."""
+    K = 1e3 * (2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
+
+    def load(t, params):
+        return params["load"] * jnp.sin(t) * jnp.ones(count)
+
+    system = hhtjax.LinearSystem(np.ones(count), 1e-3 * K, K, load)
+    return Scene(system, {"load": 3.0}, jnp.zeros(count), jnp.ones(count), 1.0)
+
+
 SCENES = {  # scene, stepper, step size in s
     "double pendulum, predictor": (double_pendulum.stiff, PREDICTOR, 1e-3),
     "double pendulum, auto": (double_pendulum.stiff, AUTO, 1e-3),
@@ -47,6 +65,10 @@ SCENES = {  # scene, stepper, step size in s
     "squeezer": (squeezer.squeezer, AUTO, 1e-5),
     "top": (top.minimal, AUTO, 1e-4),
     "top with constraints": (top.constrained, AUTO, 1e-4),
+    "dry friction": (dry_oscillator.driven, AUTO, 1e-3),
+    "dry friction of two joints": (belt.two_masses, AUTO, 1e-3),
+    "linear chain of 30": (partial(chain, 30), AUTO, 1e-3),
+    "linear chain of 100": (partial(chain, 100), AUTO, 1e-3),
 }
 
 
@@ -78,6 +100,7 @@ def run(report, fast):
     if native.compiler() is None:
         print("No C compiler: no times.", flush=True)
         return {}
+    load = os.getloadavg()[0]
     hand = by_hand(2000 if fast else 50_000, 3 if fast else 40)
     ratio = hand["exported"] / hand["by hand"]
     report.table(["double pendulum, plain sines", "ns per step"], list(hand.items()))
@@ -100,4 +123,10 @@ def run(report, fast):
         report.progress(f"{name}: {c:.0f} ns, XLA {xla:.0f} ns")
     header = ["scene", "operations", "sines and the like", "C (ns)", "XLA (ns)", "ratio", "difference"]
     report.table(header, [list(row.values()) for row in rows])
-    return {"by_hand_ns": hand, "time_over_by_hand": ratio, "scenes": rows, "flags": " ".join(("-O3", "-march=native"))}
+    return {
+        "load_at_start": load,
+        "by_hand_ns": hand,
+        "time_over_by_hand": ratio,
+        "scenes": rows,
+        "flags": " ".join(("-O3", "-march=native")),
+    }

@@ -33,12 +33,16 @@ What is written
 ---------------
 
 The step is evaluated on numbers instead of arrays, each operation once, and printed, one constant for each. Branches
-("auto", Newton's iteration, `jnp.where` is none) stay branches, loops with a fixed count are written out, eliminations
-of more than eight unknowns are a loop over a static array. So C and `simulate` agree to rounding. The time of a step,
-and deadlines kept and missed, are measured on a page, `experiments/export/README.md`.
+("auto", Newton's iteration, `jnp.where` is none) stay branches, short loops with a fixed count are written out,
+eliminations of more than eight unknowns are a loop over a static array, and singular values, of
+`redundant="least_squares"`, are found by rotations. So C and `simulate` agree to rounding. The time of a step, and
+deadlines kept and missed, are measured on a page, `experiments/export/README.md`.
 
-A step reads params and dt anew, so a `LinearSystem` is factorised at each step, where `simulate` does it once: up to
-some ten unknowns that takes as long as XLA's step, beyond it longer.
+A step reads params and dt anew. What `simulate` does once, the factors of a `LinearSystem` of more than eight unknowns,
+the state keeps, until the params that they are made of, or dt, change: that step takes longer, and on the stack several
+times the size of the matrix. Large constant matrices are loops.
+
+Steps under error control, and events, are for `simulate` alone.
 
 C compilers take long over very large functions: three rigid bodies on joints are 35000 operations, and half a minute.
 More than 100000 are refused.

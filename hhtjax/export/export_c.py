@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.export import files
-from hhtjax.export.fields import require_different
+from hhtjax.export.fields import require_different, units_of
 from hhtjax.export.model import Given, Layout, Numbers, begin, derivative_field, given, step, with_derivatives
 from hhtjax.export.statements import NotWritten, Statements
 from hhtjax.xla import Listing, NotListed, listed
@@ -26,6 +26,7 @@ class ExportedC:
         state, params, inputs: fields of the structs `name_state` and `name_params`, and the arrays that `u` holds one
             after the other: (name, shape) of each.
         values, input_values: of the params, one for each of their numbers, and of the inputs at the start.
+        units: {name of a field of these: its unit}, of those that were told.
         operations, functions: how many operations on numbers a step has, and how many of them are sines, roots and the
             like. Of a loop, its body counts once.
     """
@@ -38,6 +39,7 @@ class ExportedC:
     inputs: tuple
     values: tuple
     input_values: tuple
+    units: dict
     operations: int
     functions: int
 
@@ -53,7 +55,7 @@ class ExportedC:
 
 def export_c(
     system: Any, stepper: Any, q0: Any, v0: Any = None, params: Any = None, *,
-    z0: Any = None, name: str = "model", sensitivities: tuple = (),
+    z0: Any = None, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
 ) -> ExportedC:  # fmt: skip
     """The step of a system as C99 without dependencies: for hard real time, where Python cannot go.
 
@@ -63,9 +65,12 @@ def export_c(
 
     The same operations as `stepper.step`, each on a number: C and `simulate` agree to rounding. Nothing is allocated,
     nothing is global, all sizes are fixed; steps of several states may run at once. Both functions return flags, 0
-    where all is well, which the state keeps: NAME_NOT_FINITE, NAME_NOT_CONVERGED, NAME_DEPENDENT, NAME_NOT_SOLVED. A
-    non-iterative step without contacts has no loop, so that its worst case is its case; Newton's iteration is bounded
-    by its `max_iterations`.
+    where all is well, which the state keeps: NAME_NOT_FINITE, NAME_NOT_CONVERGED, NAME_DEPENDENT, NAME_NOT_SOLVED,
+    NAME_FRICTION. A non-iterative step has no loop, so that its worst case is its case, but for dry friction of several
+    joints, two rounds for each; Newton's iteration is bounded by its `max_iterations`.
+
+    With dry friction the state has friction_sig, the directions in which joints slide (0 where they stick), and
+    friction_tau, the forces.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`. What is constant in it is written out.
@@ -81,13 +86,16 @@ def export_c(
         sensitivities: names of fields of `NAME_params` in which derivatives are stepped along: with "k", the state has
             dq_dk, dv_dk, ... They are those of a run whose q0 and v0 do not depend on the params.
 
+        units: of fields, for comments in the header: {"q": "rad", "k": "N m/rad"}. A name tells for all fields of which
+            it is the first word, as "q" for q_arm, but for those that are named themselves.
+
     Returns:
         An `ExportedC`; its `write(folder)` writes both files.
 
     Raises:
-        NotImplementedError: an operation that cannot be written in C (a callback, sort, random numbers, a singular
-            value decomposition as of `redundant="least_squares"`): with its name, and the line where it is used.
-        ValueError, TypeError: as `simulate`; a name that is none in C, sensitivities that are no fields, tracers.
+        NotImplementedError: an operation that cannot be written in C (a callback, sort, random numbers, eigenvalues):
+            with its name, and the line where it is used.
+        ValueError, TypeError: as `simulate`; a name that is none in C, sensitivities or units of no fields, tracers.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: {"x": -p["k"] * q["x"]})
@@ -98,10 +106,10 @@ def export_c(
     >>> print(model.header.splitlines()[-7])
     spring_API int spring_step(spring_state *s, const spring_params *p, const spring_real *u, spring_real dt);
     """
-    return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities)
+    return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities, units)
 
 
-def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities):
+def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities, units):
     """`export_c`, under the name of its caller."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(f"{caller}: `name` must be one that C allows, such as 'pendulum'; received {name!r}.")
@@ -123,11 +131,13 @@ def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities):
     except NotWritten as error:
         raise NotImplementedError(f"{caller}: `{error}` cannot be written in C.") from None
     require_different(caller, code.fields)
-    helpers = sorted({x for text in texts for x in text.helpers}, key=str)
-    parts = files.Parts(name, made, stepper, code.fields, numbers, names, texts, helpers, code.counts)
+    units = units_of(caller, units, [*code.fields, *numbers.fields, *numbers.inputs])
+    told = [*texts, code.factors] if code.factors else texts
+    helpers = sorted({x for text in told for x in text.helpers}, key=str)
+    parts = files.Parts(name, made, stepper, code.fields, numbers, units, texts, code.factors, helpers, code.counts)
     return ExportedC(
         name, files.header(parts), files.source(parts), tuple(code.fields), tuple(numbers.fields),
-        tuple(numbers.inputs), _numbers(numbers.values), _numbers(numbers.first_inputs()), *code.counts,
+        tuple(numbers.inputs), _numbers(numbers.values), _numbers(numbers.first_inputs()), units, *code.counts,
     )  # fmt: skip
 
 
@@ -159,7 +169,7 @@ class _Code:
         ]
         own = [field for leaf in layout.leaves[1:] for field in leaf]
         self.fields = own + [field for rows in self.derivatives for row in rows for field in row]
-        self.counts = 0, 0
+        self.counts, self.factors = (0, 0), None
 
     def begin(self, f, args):
         """Of NAME_init."""
@@ -179,9 +189,7 @@ class _Code:
             tangents = [jax.ShapeDtypeStruct((len(self.rows), *x.shape), x.dtype) for x in leaves]
             f, args = with_derivatives(f, self.rows), (tangents, *args)
             names = [*self._derivative_places(), *names]
-        text = self._text(f, args, names)
-        self.counts = self.listing.count()
-        return text
+        return self._text(f, args, names, kept=True)
 
     def _values(self):
         return [place for field in self.numbers.fields for place in field.places("p->")]
@@ -192,31 +200,50 @@ class _Code:
     def _derivative_places(self):
         return [place for rows in self.derivatives for row in rows for field in row for place in field.places("s->")]
 
-    def _text(self, f, args, names):
-        """Statements that read arguments, compute, and write the state and the flags."""
+    def _text(self, f, args, names, kept=False):
+        """Statements that read arguments, compute, and write the state and the flags. kept: what follows from params
+        and dt alone, at some cost, is in the state."""
 
         def numbers_of(*args):
             state, *change, flags = f(*args)
             return [*jax.tree.leaves(state)[1:], *change], flags
 
-        self.listing: Listing = listed(numbers_of, *args)
-        operands, flags = self.listing.results
+        listing: Listing = listed(numbers_of, *args)
+        places = dict(zip(listing.arguments, names, strict=True))
+        if kept:
+            constant = [scalar for scalar, place in places.items() if place == "dt" or place.startswith("p->")]
+            factors, operations, listing = listing.apart(constant)
+            self.factors = self._factors(factors, operations, places)
+            places |= {scalar: f"s->factors_{i}" for i, scalar in enumerate(factors)}
+        operands, flags = listing.results
         targets = [place for leaf in self.layout.places("s->")[1:] for place in leaf]
         targets += self._derivative_places() if self.rows else []
-        real = np.dtype(self.made.dtype), f"{self.name}_real"
-        text = Statements({}, self.name, real)
-        used = files.used(self.listing)
-        for scalar, place in zip(self.listing.arguments, names, strict=True):
-            if scalar in used:
-                text.names[scalar] = files.local(place)
-                if files.local(place) != place:
-                    text.line(f"const {text.type(scalar.dtype)} {files.local(place)} = {place};")
-        text.write(self.listing.operations)
+        text, reads = self._begun(listing, places)
+        self.counts = listing.count()
         values = [x for array in jax.tree.leaves(operands) for x in np.ravel(array)]
         for place, value in zip(targets, values, strict=True):
             text.line(f"{place} = {text.text(value)};")
-        reads = {place for scalar, place in zip(self.listing.arguments, names, strict=True) if scalar in used}
         return files.Body(text.lines, text.text(flags.item()), reads, text.helpers)
+
+    def _begun(self, listing, places):
+        """All operations, behind constants for what they read; and the places of that."""
+        text = Statements({}, self.name, (np.dtype(self.made.dtype), f"{self.name}_real"))
+        found = {scalar: place for scalar, place in places.items() if scalar in files.used(listing)}
+        for scalar, place in found.items():
+            text.names[scalar] = place if scalar.size else files.local(place)
+            if text.names[scalar] != place:
+                text.line(f"const {text.type(scalar.dtype)} {files.local(place)} = {place};")
+        text.write(listing.operations)
+        return text, set(found.values())
+
+    def _factors(self, factors, operations, places):
+        """What makes them, or None without."""
+        if not factors:
+            return None
+        text, reads = self._begun(Listing([*places], operations, [np.array(factors, object)]), places)
+        for i, scalar in enumerate(factors):
+            text.line(f"memcpy(s->factors_{i}, {text.text(scalar)}, sizeof s->factors_{i});")
+        return files.Factors(text.lines, sorted(reads), [(text.type(x.dtype), x.size) for x in factors], text.helpers)
 
 
 def _numbers(values):

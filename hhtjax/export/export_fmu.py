@@ -2,6 +2,7 @@
 
 import hashlib
 import platform
+import re
 import shutil
 import subprocess
 import tempfile
@@ -28,7 +29,7 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="3.0" modelName={model} instantiationToken="{token}" generationTool="hhtjax {version}"
     variableNamingConvention="structured">
   <CoSimulation modelIdentifier={model} canHandleVariableCommunicationStepSize="true" canGetAndSetFMUState="true"
-      canSerializeFMUState="true" fixedInternalStepSize="{dt}"/>
+      canSerializeFMUState="true" fixedInternalStepSize="{dt}"/>{units}
   <LogCategories>
     <Category name="logStatusError"/>
   </LogCategories>
@@ -111,7 +112,7 @@ def _binary(name, files):
 
 def export_fmu(
     system: Any, stepper: Any, q0: Any, v0: Any = None, params: Any = None, *,
-    z0: Any = None, dt: Any, name: str = "model", sensitivities: tuple = (),
+    z0: Any = None, dt: Any, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
 ) -> ExportedFMU:  # fmt: skip
     """A system as a functional mock-up unit (FMI 3.0, Co-Simulation), for Simulink, OpenModelica, Dymola and others.
 
@@ -121,7 +122,7 @@ def export_fmu(
     steps a little shorter. A flag of the step is fmi3Error, from which `fmi3Reset` or an earlier state leads back.
 
     Args:
-        system, stepper, q0, v0, params, z0, name, sensitivities: as in `export_c`.
+        system, stepper, q0, v0, params, z0, name, sensitivities, units: as in `export_c`.
         dt: step size, s.
 
     Returns:
@@ -140,18 +141,19 @@ def export_fmu(
     <Float64 name="k" valueReference="7" causality="parameter" variability="tunable" start="4.0"/>
     """
     require_number("export_fmu", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    c = exported("export_fmu", system, stepper, q0, v0, params, z0, name, sensitivities)
+    c = exported("export_fmu", system, stepper, q0, v0, params, z0, name, sensitivities, units)
     starts = [(key, x) for key, x in (("q0", q0), ("v0", v0), ("z0", z0)) if x is not None]
     begin = [field for key, x in starts for field in fields(x, key, key)]
+    begin_units = {field.name: c.units.get(re.sub("^([qvz])0", r"\1", field.name)) for field in begin}
     values = [float(x) for _, tree in starts for leaf in jax.tree.leaves(tree) for x in np.ravel(leaf)]
     single = f"typedef float {name}_real;" in c.header
     kind, dtype = ("Float32", np.float32) if single else ("Float64", np.float64)
     step = repr(float(dt))
     groups = [
-        _variables(kind, c.state, "m->s.", 'causality="output" variability="continuous"', None),
-        _variables(kind, begin, None, 'causality="parameter" variability="fixed"', values, "m->start"),
-        _variables(kind, c.params, "m->p.", 'causality="parameter" variability="tunable"', c.values),
-        _variables(kind, c.inputs, None, 'causality="input" variability="discrete"', c.input_values, "m->u"),
+        _variables(kind, c.state, "m->s.", 'causality="output" variability="continuous"', None, c.units),
+        _variables(kind, begin, None, 'causality="parameter" variability="fixed"', values, begin_units, "m->start"),
+        _variables(kind, c.params, "m->p.", 'causality="parameter" variability="tunable"', c.values, c.units),
+        _variables(kind, c.inputs, None, 'causality="input" variability="discrete"', c.input_values, c.units, "m->u"),
     ]
     first, places, lines = 1, ["m->s.t"], []
     ranges = []
@@ -166,7 +168,7 @@ def export_fmu(
     token = hashlib.sha256("\n".join([c.header, c.source, *lines, step]).encode()).hexdigest()[:32]
     description = DESCRIPTION.format(
         model=quoteattr(name), token=token, version=VERSION, dt=step, variables="\n".join([time, *lines]),
-        structure="\n".join(structure),
+        structure="\n".join(structure), units=_unit_definitions(c.units),
     )  # fmt: skip
     text = wrapper(
         name, kind, token, dt=step, ranges=", ".join(ranges), num_starts=len(values), num_inputs=len(c.input_values),
@@ -178,7 +180,13 @@ def export_fmu(
     return ExportedFMU(c, description, text)
 
 
-def _variables(kind, found, struct, attributes, values, array=None):
+def _unit_definitions(units):
+    """Of all units that variables have."""
+    names = "".join(f"\n    <Unit name={quoteattr(text)}/>" for text in sorted(set(units.values())))
+    return f"\n  <UnitDefinitions>{names}\n  </UnitDefinitions>" if names else ""
+
+
+def _variables(kind, found, struct, attributes, values, units, array=None):
     """(element of the description, place in C) of each number. array: that holds them all, in the place of a struct."""
     rows = []
     for field in found:
@@ -186,6 +194,8 @@ def _variables(kind, found, struct, attributes, values, array=None):
             index = f"[{','.join(str(j + 1) for j in np.unravel_index(i, field.shape))}]" if field.shape else ""
             start = "" if values is None else f' start="{float(values[len(rows)])!r}"'
             label = quoteattr(f"{field.name}{index}")
+            if unit := units.get(field.name):
+                start += f" unit={quoteattr(unit).replace('{', '{{').replace('}', '}}')}"
             text = f'    <{kind} name={label} valueReference="{{reference}}" {attributes}{start}/>'
             rows.append((text, place if array is None else f"{array}[{len(rows)}]"))
     return rows

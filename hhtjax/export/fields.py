@@ -29,11 +29,12 @@ class Field(NamedTuple):
         """C for each of them, given that of the struct with its dot or arrow."""
         return [f"{struct}{self.name}" if self.shape == () else f"{struct}{self.name}[{i}]" for i in range(self.size)]
 
-    def declaration(self, real):
-        """In the struct, its shape told where it has more than one axis."""
+    def declaration(self, real, unit=None):
+        """In the struct, with its unit, and its shape where it has more than one axis."""
         size = f"[{self.size}]" if self.shape else ""
-        shape = f"  /* {' x '.join(map(str, self.shape))}, row by row */" if len(self.shape) > 1 else ""
-        return f"    {real} {self.name}{size};{shape}"
+        shape = f"{' x '.join(map(str, self.shape))}, row by row" if len(self.shape) > 1 else None
+        told = "; ".join(filter(None, (shape, unit)))
+        return f"    {real} {self.name}{size};{f' /* {told} */' if told else ''}"
 
 
 def fields(tree, prefix, alone):
@@ -49,6 +50,26 @@ def identifier(words):
     text = re.sub(r"\W", "_", "_".join(filter(None, words)), flags=re.ASCII)
     text = f"p{text}" if text[:1].isdigit() else text
     return f"{text}_" if text in KEYWORDS else text
+
+
+def units_of(caller, units, found):
+    """{name of a field: its unit}, from those of fields, or of all whose names begin with such a word."""
+    units = {} if units is None else units
+    if not isinstance(units, dict) or not all(isinstance(x, str) for pair in units.items() for x in pair):
+        raise TypeError(f"{caller}: `units` must be a dict of names and texts, as {{'q': 'rad'}}; received {units!r}.")
+    if wrong := [text for text in units.values() if re.search(r"[*]/|/[*]|[^ -~\u00a1-\uffff]", text)]:
+        raise ValueError(f"{caller}: `units` must fit into a comment of C; received {wrong[0]!r}.")
+    told, read = {}, set()
+    for name in (field.name for field in found):
+        keys = [key for key in units if name == key or name.startswith(f"{key}_")]
+        if keys:
+            key = max(keys, key=len)
+            told[name] = units[key]
+            read.update(keys)
+    if unknown := [key for key in units if key not in read]:
+        names = ", ".join(field.name for field in found)
+        raise ValueError(f"{caller}: `units` must name fields among {names}; received {unknown[0]!r}.")
+    return told
 
 
 def require_different(caller, found):

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hhtjax.description import VERSION
-from hhtjax.export.expressions import TYPES, helper, number
+from hhtjax.export.expressions import TYPES, number
 from hhtjax.export.fields import Field
+from hhtjax.export.helpers import helper
 from hhtjax.export.model import FLAGS, Given, Numbers
 from hhtjax.xla import Listing, Scalar
 
@@ -72,7 +73,7 @@ SOURCE = """/* {name}: see {name}.h */
 const {name}_params {name}_defaults = {{
 {values}
 }};
-{helpers}
+{helpers}{factorize}
 {name}_API int {name}_init({init})
 {{
 {begin_unused}{begin}
@@ -80,13 +81,13 @@ const {name}_params {name}_defaults = {{
     s->t0 = t0;
     s->dt = dt;
     s->steps = 0;
-{begin_inputs}    s->flags = {begin_flags};
+{begin_factors}{begin_inputs}    s->flags = {begin_flags};
     return s->flags;
 }}
 
 {name}_API int {name}_step({step})
 {{
-{step_unused}{body}
+{step_unused}{step_factors}{body}
 {step_inputs}    if (s->dt != dt) {{
         s->t0 = s->t;
         s->dt = dt;
@@ -98,6 +99,24 @@ const {name}_params {name}_defaults = {{
     return s->flags;
 }}
 """
+
+
+FACTORIZE = """
+/* Factors of matrices that these params and this dt give, for all steps with them. */
+static void {name}_factorize({name}_state *s, const {name}_params *p, const {name}_real dt)
+{{
+{unused}{lines}
+}}
+"""
+
+
+class Factors(NamedTuple):
+    """Statements that make the arrays `name_state.factors_i`, the places that they read, types and sizes of these."""
+
+    lines: list[str]
+    reads: list[str]
+    arrays: list[tuple]
+    helpers: set
 
 
 class Body(NamedTuple):
@@ -117,8 +136,9 @@ class Parts(NamedTuple):
     stepper: Any
     fields: list[Field]
     numbers: Numbers
-    sensitivities: list[str]
+    units: dict
     texts: list[Body]
+    factors: Factors | None
     helpers: list
     counts: tuple
 
@@ -149,22 +169,30 @@ def header(parts: Parts):
     """Of name.h."""
     name, real = parts.name, f"{parts.name}_real"
     operations, functions = parts.counts
+    again = " Beyond them, factors are made anew where dt or params differ from the step before." * bool(parts.factors)
     num_inputs = sum(field.size for field in parts.numbers.inputs)
     rest = [Field("u", (num_inputs,)).declaration(real)] if num_inputs else []
     rest += [Field("t0", ()).declaration(real), Field("dt", ()).declaration(real), "    int64_t steps;"]
-    layout = ", ".join(f"{field.name}{f'[{field.size}]' * bool(field.shape)}" for field in parts.numbers.inputs)
-    params = [field.declaration(real) for field in parts.numbers.fields]
+    if parts.factors:
+        rest += [f"    {kind} factors_{i}[{size}];" for i, (kind, size) in enumerate(parts.factors.arrays)]
+        rest.append(Field("factors_of", (len(parts.factors.reads),)).declaration(real))
+    layout = ", ".join(_input(field, parts.units.get(field.name)) for field in parts.numbers.inputs)
+    params = [field.declaration(real, parts.units.get(field.name)) for field in parts.numbers.fields]
     return HEADER.format(
         name=name, guard=f"{name.upper()}_H", version=VERSION, real=TYPES[np.dtype(parts.made.dtype)],
         stepper=_comment(parts.stepper),
-        work=f"A step takes {operations} operations on numbers, {functions} of them functions such as sines.",
+        work=f"A step takes {operations} operations on numbers, {functions} of them functions such as sines.{again}",
         flags=",\n".join(f"    {name.upper()}_{x} = {2**i} /* {text} */" for i, (x, text) in enumerate(FLAGS.items())),
-        state="\n".join(field.declaration(real) for field in parts.fields),
+        state="\n".join(field.declaration(real, parts.units.get(field.name)) for field in parts.fields),
         rest="\n".join(rest), params="\n".join(params or ["    int none;"]),
         starts=" and ".join(sorted(parts.made.starts)), init_inputs=" and the inputs before" if num_inputs else "",
         step_inputs=f", u = {layout} held over it" if num_inputs else "; u is not read, and may be NULL",
         **_signatures(parts, ""),
     )  # fmt: skip
+
+
+def _input(field, unit):
+    return f"{field.name}{f'[{field.size}]' * bool(field.shape)}{f' ({unit})' if unit else ''}"
 
 
 def source(parts: Parts):
@@ -174,13 +202,29 @@ def source(parts: Parts):
     keep = f"    memcpy(s->u, u, {num_inputs} * sizeof *u);\n" if num_inputs else ""
     helpers = [helper(name, parts.name, dtype) for name, dtype in parts.helpers]
     arguments = [*sorted(parts.made.starts), "p", *["u"] * bool(num_inputs)]
+    factorize, changed = _factorize(parts)
+    call = f"{parts.name}_factorize(s, p, dt);"
     return SOURCE.format(
         name=parts.name, values=_values(parts), helpers="".join(f"\n{text}\n" for text in helpers),
         begin="\n".join(begin.lines), begin_unused=_unused(begin, arguments), begin_inputs=keep,
+        factorize=factorize, begin_factors=f"    {call}\n" * bool(factorize),
+        step_factors=f"    if ({changed}) {{\n        {call}\n    }}\n" * bool(factorize),
         begin_flags=begin.flags, body="\n".join(body.lines),
         step_unused=_unused(body, ["p", *["u"] * (not num_inputs)]),
         step_inputs=keep, step_flags=body.flags, **_signatures(parts, "restrict "),
     )  # fmt: skip
+
+
+def _factorize(parts):
+    """The function, and whether it is to be called again."""
+    factors, name = parts.factors, parts.name
+    if factors is None:
+        return "", ""
+    of = [(f"s->factors_of[{i}]", place) for i, place in enumerate(factors.reads)]
+    lines = [*factors.lines, *(f"    {kept} = {place};" for kept, place in of)]
+    unused = "" if any(place != "dt" for place in factors.reads) else "    (void)p;\n"
+    text = FACTORIZE.format(name=name, lines="\n".join(lines), unused=unused)
+    return text, " || ".join(f"{kept} != {place}" for kept, place in of)
 
 
 def _signatures(parts, restrict):

@@ -5,6 +5,7 @@ all other types there are none, and who asks for one gets fmi3Error.
 """
 
 from hhtjax.export.fmi3_absent import absent
+from hhtjax.export.model import FLAGS
 
 PLATFORM = """/* {name}, {token}: functions of FMI 3.0 (Co-Simulation); see {name}.h for the model itself */
 
@@ -84,10 +85,7 @@ static fmi3Status verdict(Instance *i)
     if (flags == 0) {{
         return OK;
     }}
-    return fails(i, (flags & {NAME}_NOT_FINITE) ? "a number of the state is infinite or none"
-                    : (flags & {NAME}_NOT_CONVERGED) ? "Newton's iteration did not converge"
-                    : (flags & {NAME}_DEPENDENT) ? "a constraint depends on those before it"
-                    : "the linear solve left more than its tolerance");
+    return fails(i, {verdict});
 }}
 """
 
@@ -265,7 +263,9 @@ API fmi3Status fmi3DeserializeFMUState(fmi3Instance i, const unsigned char bytes
 
 def wrapper(name, kind, token, **parts):
     """The text of fmi3.c. kind: Float64 or Float32; parts: what PLATFORM names besides."""
-    text = PLATFORM.format(name=name, NAME=name.upper(), token=token, **parts)
+    *flags, (_, last) = FLAGS.items()
+    verdict = "".join(f'(flags & {name.upper()}_{flag}) ? "{text}"\n        : ' for flag, text in flags)
+    text = PLATFORM.format(name=name, token=token, verdict=f'{verdict}"{last}"', **parts)
     text += f'\n#define TOKEN "{token}"\n#define DT {parts["dt"]}\n'
     text += FUNCTIONS.replace("@", kind).replace("#_", f"{name}_")
     return text + absent("Float32" if kind == "Float64" else "Float64")

@@ -9,10 +9,12 @@ import numpy as np
 from hhtjax.checks import require_params
 from hhtjax.description import is_concrete, thaw
 from hhtjax.export.fields import Field, fields, require_different
+from hhtjax.steppers.friction_law import is_settled
 from hhtjax.steppers.stepper import INTERNAL, require_capable, require_stepper, require_system
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.rubbing import require_independent_friction
 from hhtjax.systems.sampled import Sampled
 from hhtjax.systems.system import FirstOrderSystem
 from hhtjax.xla import structural
@@ -22,6 +24,7 @@ FLAGS = {  # what failed, in bits
     "NOT_CONVERGED": "Newton's iteration did not converge",
     "DEPENDENT": "a constraint depends on those before it",
     "NOT_SOLVED": "the linear solve left more than its tolerance",
+    "FRICTION": "a limit of the dry friction is negative or no number, or joints switch too often in a step",
 }
 
 
@@ -48,6 +51,8 @@ def given(caller, system, stepper, q0, v0, params, z0):
     q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
     require_capable(caller, system, stepper, q0, v0)
     params = require_params(caller, params)
+    if system.friction is not None:
+        require_independent_friction(caller, system, q0, v0, 0.0, params, z0)
     if not all(map(is_concrete, jax.tree.leaves((system, stepper, q0, v0, params, z0)))):
         raise TypeError(f"{caller}: all arguments must be numbers, because they are written out; received tracers.")
     starts = {name: x for name, x in (("q0", q0), ("v0", v0), ("z0", z0)) if x is not None}
@@ -125,10 +130,12 @@ def step(made: Given, numbers: Numbers):
 def _flags(state, info):
     """FLAGS as an integer."""
     found = [~jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in _floats(state)]))]
-    told = (info.converged, info.dependent_row, info.solved) if info is not None else (None,) * 3
-    converged, row, solved = told
-    found += [None if converged is None else ~converged, None if row is None else row > 0]
-    found += [None if solved is None else ~solved]
+    converged, row, solved, friction = (None,) * 4
+    if info is not None:
+        converged, row, solved, friction = info.converged, info.dependent_row, info.solved, info.friction
+    rubs = None if friction is None else ~is_settled(friction)  # which `converged` tells too
+    stalls = None if converged is None else ~converged if rubs is None else ~converged & ~rubs
+    found += [stalls, None if row is None else row > 0, None if solved is None else ~solved, rubs]
     bits = [jnp.where(x, jnp.int32(2**i), jnp.int32(0)) for i, x in enumerate(found) if x is not None]
     return sum(bits[1:], bits[0])
 

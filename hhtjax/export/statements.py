@@ -1,5 +1,7 @@
 """A list of operations as statements of C99: a constant for each result, braces for branches and loops."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from hhtjax.export.expressions import TYPES, expression, number
@@ -70,6 +72,41 @@ class Statements:
         self.line(f"const {self.type(x.results[0].dtype)} {self._name(x.results[0])} = "
                   f"{self.text(array)}[{self.text(index)}];")  # fmt: skip
 
+    def _taken(self, x):
+        (result,), source, count = x.results, self.text(x.operands[0]), x.results[0].size
+        name = self._name(result)
+        self.line(f"static const int32_t {name}_at[{count}] = {{{', '.join(map(str, x.params['at']))}}};")
+        self.line(f"{self.type(result.dtype)} {name}[{count}];")
+        self.line(f"for (int i = 0; i < {count}; i++) {{")
+        self.line(f"    {name}[i] = {source}[{name}_at[i]];")
+        self.line("}")
+
+    def _map(self, x):
+        (result,) = x.results
+        operands = [f"{self.text(y)}{'[i]' * (isinstance(y, Scalar) and y.size > 0)}" for y in x.operands]
+        self.line(f"{self.type(result.dtype)} {self._name(result)}[{result.size}];")
+        self.line(f"for (int i = 0; i < {result.size}; i++) {{")
+        self.line(f"    {self.text(result)}[i] = {expression(replace(x, name=x.params['of']), operands, self.prefix)};")
+        self.line("}")
+
+    def _product(self, x):
+        """Column by column for a vector, so that sums of all rows go on side by side."""
+        (a, b), (result,), params = map(self.text, x.operands), x.results, x.params
+        (row, along), (down, column) = params["strides"]
+        count, rows, columns = (params[name] for name in ("count", "rows", "columns"))
+        loops = [("i", rows), ("l", count), ("j", columns)] if columns > 1 else [("l", count), ("i", rows)]
+        places = [f"i * {columns}", f"i * {row} + l * {along}", f"l * {down}"]
+        places = [f"{places[0]} + j", places[1], f"{places[2]} + j * {column}"] if columns > 1 else ["i", *places[1:]]
+        name = self._name(result)
+        self.line(f"{self.type(result.dtype)} {name}[{result.size}];")
+        self.line(f"memset({name}, 0, sizeof {name});")
+        for depth, (index, end) in enumerate(loops):
+            self.line(f"{'    ' * depth}for (int {index} = 0; {index} < {end}; {index}++) {{")
+        y, a, b = (f"{array}[{place}]" for array, place in zip((name, a, b), places, strict=True))
+        self.line(f"{'    ' * len(loops)}{y} += {a} * {b};")
+        for depth in reversed(range(len(loops))):
+            self.line(f"{'    ' * depth}}}")
+
     def _lu(self, x):
         (A,), (LU, pivots, order), n = x.operands, x.results, x.params["n"]
         dtype = self.type(LU.dtype)
@@ -78,6 +115,12 @@ class Statements:
         names = ", ".join(self.text(y) for y in x.results)
         self.line(f"{self._helper('lu', LU.dtype)}({n}, {names});")
         assert dtype
+
+    def _svd(self, x):
+        (A,), dtype = x.operands, x.results[0].dtype
+        names = [self._name(y) for y in x.results]
+        self.line(f"{self.type(dtype)} {', '.join(f'{n}[{y.size}]' for n, y in zip(names, x.results, strict=True))};")
+        self.line(f"{self._helper('svd', dtype)}({x.params['n']}, {self.text(A)}, {', '.join(names)});")
 
     def _triangular_solve(self, x):
         (A, b), (found,), params = x.operands, x.results, x.params

@@ -2,7 +2,8 @@
 
 An operand is a `Scalar`, or a known number. Three operations hold lists of their own: `cond` one for each branch,
 `while` its condition and its body, whose carried variables are its results. Others make and read small arrays, whose
-name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu` and `triangular_solve`.
+name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu`, `svd` and `triangular_solve`;
+`taken` has elements of an array in another order, `map` does one operation on all, and `product` multiplies matrices.
 """
 
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,9 @@ FUNCTIONS = {  # operations of which each takes as long as ten or more sums
     *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "erf", "exp", "exp2"),
     *("expm1", "log", "log1p", "logistic", "pow", "sin", "sinh", "tan", "tanh"),
 }
+
+MOVES = {"array", "cond", "element", "taken", "while"}  # which compute nothing themselves
+COSTLY = {"lu", "svd", "triangular_solve"}
 
 
 @dataclass(eq=False)
@@ -50,11 +54,31 @@ class Listing:
     operations: list
     results: Any
 
+    def apart(self, constant):
+        """Factors of matrices that follow from the arguments `constant` alone, for who computes them once: the names of
+        their arrays, the operations that give them, and the listing that has them as arguments too."""
+        known, found = set(constant), []
+        for x in self.operations:
+            if not x.blocks and known.issuperset(_scalars(x.operands)):
+                known.update(x.results)
+                found.append(x)
+        costly = {id(x): x for x in found if x.name in COSTLY}
+        wanted = {x for array in _arrays(self.results) for x in array.flat if isinstance(x, Scalar)}
+        rest = pruned([x for x in self.operations if id(x) not in costly], wanted)
+        factors = [y for x in costly.values() for y in x.results if y in wanted]
+        return factors, pruned(found, set(factors)), Listing(self.arguments + factors, rest, self.results)
+
     def count(self):
         """Numbers of operations, and of those that are sines and the like; of a loop, its body counts once."""
-        names = [x.name for x in everywhere(self.operations)]
-        names = [x for x in names if x not in ("array", "element", "cond", "while")]
-        return len(names), sum(x in FUNCTIONS for x in names)
+        found = [x for x in everywhere(self.operations) if x.name not in MOVES]
+        return sum(map(_weight, found)), sum(x.name in FUNCTIONS for x in found)
+
+
+def _weight(x):
+    """How many operations on numbers it is; of an elimination, which is few times as many as it has numbers, one."""
+    if x.name == "product":
+        return 2 * x.params["count"] * x.params["rows"] * x.params["columns"]
+    return x.results[0].size if x.name == "map" else 1
 
 
 def everywhere(operations):
@@ -75,6 +99,10 @@ def pruned(operations, wanted):
         kept.append(x)
         wanted.update(_scalars(x.operands))
     return kept[::-1]
+
+
+def _arrays(tree):
+    return [tree] if hasattr(tree, "flat") else [x for y in tree for x in _arrays(y)]
 
 
 def _scalars(operands):

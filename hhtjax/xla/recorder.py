@@ -7,6 +7,7 @@ from hhtjax.xla.listing import Block, Operation, Scalar
 from hhtjax.xla.pieces import is_known, unmarked
 
 COMMUTES = {"add", "mul", "and", "or", "xor", "eq", "ne"}
+LARGE = 400  # numbers, or operations on them, from which on they are a loop
 SAME = {"add_any": "add", "stop_gradient": "copy"}
 
 
@@ -34,11 +35,25 @@ class Recorder:
     def array(self, elements, dtype):
         """The name of an array of these elements; of all that were read from one array, in their order, its own."""
         elements = [as_operand(x) for x in elements]
+        name = self.name_of(elements)
+        if name is not None:
+            return name
+        found = [self.places.get(x) if isinstance(x, Scalar) else None for x in elements]
+        if len(found) >= LARGE and found[0] and all(x and x[0] is found[0][0] for x in found):
+            at = tuple(x[1] for x in found if x)
+            return self._once(("taken", id(found[0][0]), at), "taken", [found[0][0]], {"at": at}, dtype, len(at))
+        return self._once(("array", *map(_key, elements)), "array", elements, {}, dtype, len(elements))
+
+    def name_of(self, elements, known=False):
+        """The name of the array whose elements these are, in their order; of one that is known too; or None."""
+        elements = [as_operand(x) for x in elements]
+        if known and all(map(is_known, elements)):
+            return self.array(elements, elements[0].dtype)
         places = [self.places.get(x) if isinstance(x, Scalar) else None for x in elements]
         name = places[0][0] if places[0] else None
         if name is not None and name.size == len(elements) and places == [(name, i) for i in range(name.size)]:
             return name
-        return self._once(("array", *map(_key, elements)), "array", elements, {}, dtype, len(elements))
+        return None
 
     def element(self, array, index):
         """array[index], for an index that is inside."""

@@ -9,16 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.xla.interpreter import alone, evaluate
-from hhtjax.xla.listing import Listing, Operation, Scalar, everywhere, pruned
+from hhtjax.xla.listing import Block, Listing, Operation, Scalar, everywhere, pruned
 from hhtjax.xla.parameters import UNDERSTOOD, is_understood
 from hhtjax.xla.pieces import arranged, each, is_known
 from hhtjax.xla.recorder import Recorder, as_operand
 from hhtjax.xla.recording_arrays import ARRAYS
+from hhtjax.xla.recording_loops import in_loops
 from hhtjax.xla.scalar_rules import FOLDS, RULES
 from hhtjax.xla.source_lines import line_of
 
 UNKNOWN = "unknown"
 MOST = 100_000  # operations: of more, a compiler takes minutes
+WRITTEN_OUT = 1000  # operations more than those of a loop
 INLINED = {  # a function called: the parameter that holds it
     **{"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr"},
     **{"remat2": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"},
@@ -117,6 +119,8 @@ class _Listing:
         if name == "hhtjax_inside":  # functions come in two forms: outside of a kernel LAPACK's
             return [known_pieces(np.bool_(False))]
         known = all(is_known(x) for value in values for x in value.flat)
+        if is_understood(eqn) and not known and (found := in_loops(self.recorder, eqn, values)) is not None:
+            return found
         if (name not in UNDERSTOOD or is_understood(eqn)) and not (known and any(not x.size for x in values)):
             rule = FOLDS.get(name) or RULES.get(name)
             results = None if rule is None else rule(eqn, *values)
@@ -167,10 +171,14 @@ def _while(listing, eqn, *values):
 
 
 def _scan(listing, eqn, *values):
-    """Written out."""
+    """Written out, or a loop, where that is long and reads and makes no rows."""
     params = eqn.params
     first = params["num_consts"]
     second = first + params["num_carry"]
+    if second == len(values) and params["num_carry"] == len(eqn.outvars):
+        loop = _counted(listing, params, values[:first], values[first:], [x.aval for x in eqn.outvars])
+        if loop is not None:
+            return loop
     carry, rows = list(values[first:second]), []
     steps = range(params["length"])
     for i in reversed(steps) if params["reverse"] else steps:
@@ -180,6 +188,21 @@ def _scan(listing, eqn, *values):
         rows.append(row)
     columns = zip(*(rows[::-1] if params["reverse"] else rows), strict=True)
     return [*carry, *_back(_flat(x for column in columns for x in column), [x.aval for x in eqn.outvars[len(carry) :]])]
+
+
+def _counted(listing, params, constants, start, avals):
+    """The same steps again and again as a `while` that counts them; None where that spares little."""
+    recorder, carry = listing.recorder, [_fresh(listing.recorder, x) for x in avals]
+    body = recorder.inside(lambda: _flat(listing.run(params["jaxpr"], [*constants, *carry])))
+    if (params["length"] - 1) * sum(1 for _ in everywhere(body.operations)) <= WRITTEN_OUT:
+        return None
+    i, one = Scalar(np.dtype(np.int32), recorder), np.int32(1)
+    unfinished = recorder.inside(lambda: [recorder.record("lt", bool, i, np.int32(params["length"]))])
+    counted = recorder.inside(lambda: [recorder.record("add", np.int32, i, one)])
+    body = Block(body.operations + counted.operations, body.results + counted.results)
+    operands = [as_operand(x) for x in _flat(start)] + [np.int32(0)]
+    recorder.append(Operation("while", operands, [*_flat(carry), i], blocks=[unfinished, body]))
+    return carry
 
 
 def _custom_linear_solve(listing, eqn, *values):

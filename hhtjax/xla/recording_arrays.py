@@ -136,7 +136,8 @@ def _scatter_add(recorder, eqn, x, indices, updates):
     return [arranged(found, x.shape)]
 
 
-def _elements(recorder, array, shape):
+def elements_of(recorder, array, shape):
+    """Those of an array, in this shape."""
     return arranged([recorder.element(array, np.int32(i)) for i in range(array.size)], shape)
 
 
@@ -148,14 +149,22 @@ def _lu(recorder, eqn, A):
     likes = (dtype, n * n), (np.int32, n), (np.int32, n)
     found = recorder.arrays("lu", [recorder.array(A.flat, dtype)], likes, n=n)
     recorder.orders[found[1]] = found[2]
-    return [_elements(recorder, x, v.aval.shape) for x, v in zip(found, eqn.outvars, strict=True)]
+    return [elements_of(recorder, x, v.aval.shape) for x, v in zip(found, eqn.outvars, strict=True)]
+
+
+def _svd(recorder, eqn, A):
+    n, dtype = A.shape[-1], eqn.outvars[0].aval.dtype
+    if A.shape != (n, n) or np.dtype(dtype).kind != "f" or eqn.params["subset_by_index"] is not None:
+        return None
+    found = recorder.arrays("svd", [recorder.array(A.flat, dtype)], [(dtype, n), *[(dtype, n * n)] * 2], n=n)
+    return [elements_of(recorder, x, v.aval.shape) for x, v in zip(found, eqn.outvars, strict=False)]
 
 
 def _permutation(recorder, eqn, pivots):
     """The order of the rows, which the elimination has told."""
     place = recorder.places.get(pivots.flat[0])
     order = None if place is None else recorder.orders.get(recorder.array(pivots.flat, np.int32))
-    return None if order is None else [_elements(recorder, order, pivots.shape)]
+    return None if order is None else [elements_of(recorder, order, pivots.shape)]
 
 
 def _moved(recorder, eqn, *values):
@@ -179,7 +188,7 @@ def _triangular_solve(recorder, eqn, A, b):
     for column in columns:
         right = recorder.array(column, dtype)
         (x,) = recorder.arrays("triangular_solve", [matrix, right], [(dtype, len(column))], n=len(A), **flags)
-        solved.append(_elements(recorder, x, (len(column),)))
+        solved.append(elements_of(recorder, x, (len(column),)))
     rows = np.stack(solved)
     return [(rows if flips else rows.T).reshape(shape)]
 
@@ -201,6 +210,7 @@ ARRAYS = {
     "lu": _lu,
     "lu_pivots_to_permutation": _permutation,
     "scatter-add": _scatter_add,
+    "svd": _svd,
     "tile": _moved,
     "triangular_solve": _triangular_solve,
     "unstack": _moved,
