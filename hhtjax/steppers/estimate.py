@@ -13,9 +13,11 @@ A linearisation may have missed what is there, a contact say; so the residual at
 
 for one more residual and substitution. Where dry friction switches, w jumps: the jump is taken off w1 first, which so
 belongs to the branch of w, and r has the friction that the step found. What stays is the change of the other forces
-over the step: it must be resolved on both sides of the switch, whose time is found by lines. At a jump of a held
-input w jumps between two steps, and its slope, which w'' is made of, does not. Methods of several stages have an embedded one of lower order instead, and those
-with a matrix g h d and g^2 h^2 d besides.
+over the step: it must be resolved on both sides of the switch, whose time is found by lines. At a jump of a held input
+w jumps between two steps; its slope, of which w'' is made, does not, but for dampers.
+
+Methods of several stages have an embedded one of lower order instead, and those with a matrix g h d and g^2 h^2 d
+besides.
 """
 
 from dataclasses import replace
