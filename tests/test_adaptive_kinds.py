@@ -46,7 +46,7 @@ def pushed_exactly(name):
             return np.concatenate([y[2:], np.linalg.solve([[2, c], [c, 1]], load)])
 
         run = solve_ivp(rate, (a, b), y, "DOP853", dense_output=True, rtol=1e-11, atol=1e-12)
-        here = np.searchsorted([a + 1e-12, b - 1e-12], TIMES) == 1
+        here = np.searchsorted([a + 1e-12, b + 1e-12], TIMES) == 1
         found.append(run.sol(np.append(TIMES[here], b)).T[:-1])
         y = run.y[:, -1]
     return np.split(np.concatenate(found), 2, axis=1)
@@ -102,7 +102,8 @@ def test_held_inputs_in_other_runs():
     spring = hhtjax.System(ONE, lambda q, v, t, u: u(t) - 4 * q)
     dt = hhtjax.adaptive(1e-3, 1e-6)
     with pytest.warns(hhtjax.PrecisionWarning):
-        found = hhtjax.simulate(spring, stepper, *single, held("even")["u"], dt=dt, times=[0.55])
+        single += [held("even", VALUES.astype(np.float32))["u"]]
+        found = hhtjax.simulate(spring, stepper, *single, dt=dt, times=[0.55])
     found.check()
     assert found.q.dtype == np.float32
     double = hhtjax.simulate(spring, stepper, ONE, ZERO, held("even")["u"], dt=dt, times=[0.55])
