@@ -100,9 +100,8 @@ def test_held_inputs_in_other_runs():
         assert (frozen(start + e) - frozen(start - e)) / 2e-4 == pytest.approx(float(forward[i]), rel=1e-6)
     single = [x.astype(np.float32) for x in (ONE, ZERO)]
     spring = hhtjax.System(ONE, lambda q, v, t, u: u(t) - 4 * q)
-    dt = hhtjax.adaptive(1e-3, 1e-6)
+    dt, single = hhtjax.adaptive(1e-3, 1e-6), [*single, held("even", VALUES.astype(np.float32))["u"]]
     with pytest.warns(hhtjax.PrecisionWarning):
-        single += [held("even", VALUES.astype(np.float32))["u"]]
         found = hhtjax.simulate(spring, stepper, *single, dt=dt, times=[0.55])
     found.check()
     assert found.q.dtype == np.float32
