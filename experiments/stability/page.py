@@ -76,9 +76,9 @@ def once_wrong(gallery, adaptive, way):
     letters = Counter()
     for name, scene in gallery["scenes"].items():
         found = adaptive["scenes"][name]["grades"]
-        for method, rows in scene["grades"].items():
-            if method in found:  # that can be controlled
-                letters.update({now[way]: row.count("w") for row, now in zip(rows, found[method], strict=True)})
+        for method in (m for m in scene["grades"] if m in found):
+            for row, now in zip(scene["grades"][method], found[method], strict=True):
+                letters[now[way]] += row.count("w")
     return letters
 
 
@@ -112,7 +112,8 @@ def page(numbers):
     gallery, reported, advice, peers = (numbers[part] for part in ("gallery", "reported", "advice", "peers"))
     dry, stops, adaptive = numbers["dry"], numbers["stops"], numbers["adaptive"]
     alone, verified = (once_wrong(gallery, adaptive, way) for way in (0, 1))
-    drifting = [name for name, x in adaptive["scenes"].items() if any("w" in y[0] for z in x["grades"].values() for y in z)]
+    runs = {name: [row for rows in x["grades"].values() for row in rows] for name, x in adaptive["scenes"].items()}
+    drifting = [name for name, rows in runs.items() if any(row[0] == "w" for row in rows)]
     fewest, motions = dry["fewest_accurate_steps"].values(), dry["motions"].values()
     drift, spin = numbers["drift"], numbers["rotating"]["spin_error"]
     scenes = gallery["scenes"]
