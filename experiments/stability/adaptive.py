@@ -39,7 +39,7 @@ WRONG, BEYOND, NAMED, GOOD = range(4)
 CAUSES = {
     "hardening spring": "An undamped phase drifts, which no estimate of a step sees: named by the error of the run.",
     "van der Pol, mu = 1000": "Halved steps miss the jumps, a false alarm; explicit steps would be millions.",
-    "elastic pendulum, k = 1e8": "dopri5 uses its 10 000 steps up, which is named.",
+    "elastic pendulum, k = 1e8": "Linearised at the state, or explicit, 10 000 steps are used up, which is named.",
 }
 
 
