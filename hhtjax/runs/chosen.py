@@ -104,7 +104,10 @@ def follow(problem, times, grid):
 def begun_with(flat, stepper, params, loop, run):
     """The state with which the next step of a run begins: behind a jump of held inputs."""
     state, count, _ = run
-    return held.entered(stepper, flat, params, *loop.sizes(count), state)[1] if held.holds(params) else state
+    if not held.holds(params):
+        return state
+    dt, last = loop.sizes(count)
+    return held.entered(stepper, flat, params, dt, last, state)[1]
 
 
 def kept(flat, stepper, state):
