@@ -226,6 +226,28 @@ def test_order_of_the_pair_its_estimate_and_its_dense_output():
 
 
 @pytest.mark.slow
+def test_the_stages_of_many_unknowns_are_a_loop():
+    """With the numbers and derivatives that each unknown has alone, where they are written out."""
+    k = np.linspace(1.0, 4.0, 6)
+    system = hhtjax.System(np.ones(1), lambda q, v, t, k: -k * jnp.sin(q) - 0.1 * v**3 + jnp.cos(3 * t))
+    decay = hhtjax.FirstOrderSystem(lambda y, t, k: -k * y**3 + jnp.sin(t))
+    row = hhtjax.System(np.ones(6), system.force)
+
+    def end(system, k):
+        start = jnp.ones_like(k), *([] if system is decay else [jnp.zeros_like(k)])
+        return hhtjax.simulate(system, hhtjax.dopri5(), *start, params=k, dt=0.2, num_steps=5).q[-1]
+
+    def total(system, k):
+        return jnp.sum(end(system, k) ** 2)
+
+    for many, one in ((row, system), (decay, decay)):
+        alone = jax.vmap(lambda k, one=one: end(one, k[None])[0])(k)
+        np.testing.assert_allclose(end(many, k), alone, rtol=1e-13)
+        slopes = jax.vmap(lambda k, one=one: jax.grad(lambda k: total(one, k[None]))(k))(k)
+        np.testing.assert_allclose(jax.grad(lambda k, many=many: total(many, k))(jnp.asarray(k)), slopes, rtol=1e-11)
+
+
+@pytest.mark.slow
 def test_the_error_of_the_whole_run(references):
     """Of a resolved motion it is stated to a tenth; where no estimate of a step sees it, as here, `check` does."""
     found = controlled("double pendulum", METHODS["hht"], 1e-3, verify=True)

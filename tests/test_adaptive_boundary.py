@@ -37,7 +37,6 @@ def test_failures_are_named_with_their_time(name):
         found.steps.check()
 
 
-HELD = hhtjax.sampled(np.ones(4), 0.5, order=0)
 WRONG = {
     "no times": ({}, {"times": None}, "simulate: with dt=adaptive(...), give `times`"),
     "times back": ({}, {"times": [1.0, 0.5]}, "simulate: `times` must be strictly increasing"),
@@ -46,7 +45,6 @@ WRONG = {
     "times alone": ({}, {"dt": 0.1}, "simulate: `times` is for dt=adaptive(...)"),
     "no estimate": ({}, {"stepper": hhtjax.kim_hht()}, "as a number, or take hht, newmark (gamma = 1/2), bossak, "),
     "gamma": ({}, {"stepper": hhtjax.newmark(0.3025, 0.6)}, "simulate: GeneralizedAlpha has no estimate of its error"),
-    "held": ({}, {"params": HELD}, "simulate: error control does not know when held inputs, sampled(order=0), jump"),
     "rtol": ({"rtol": 0.0}, {}, "adaptive: `rtol` must be positive and finite; received 0.0."),
     "atol": ({"atol": -1.0}, {}, "adaptive: `atol` must be positive and finite; received -1.0."),
     "verify": ({"verify": "yes"}, {}, 'adaptive: `verify` must be True, False or "tolerance"; received \'yes\'.'),

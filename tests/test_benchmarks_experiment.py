@@ -1,5 +1,7 @@
 """The C that the library is measured against does the same arithmetic, the charts are read rightly, and the pages."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,9 @@ import pytest
 import hhtjax
 from experiments.benchmarks import native
 from experiments.benchmarks.chain import FORMULATIONS, chain
+from experiments.cardona_geradin1989.index_1 import unconstrained
 from experiments.work_precision import gradients, ours
+from experiments.work_precision.cases import linkage
 from experiments.work_precision.timing import time_to
 from hhtjax.scenes import double_pendulum
 
@@ -42,6 +46,22 @@ def test_both_formulations_of_the_chain_are_one():
     np.testing.assert_allclose(second.mass(q, scene.params), M, atol=1e-14)
     np.testing.assert_allclose(second.force(q, v, 0.0, scene.params), Q, atol=1e-13)
     np.testing.assert_allclose(second.inertia(q, v, scene.params), M @ v, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_both_eliminations_of_the_squeezer_are_one():
+    """In values and derivatives, far from its start."""
+    case = linkage()
+    params, rng = case.scene.params, np.random.default_rng(0)
+    q, v = case.scene.q0 + 0.01 * rng.normal(size=7), 50 * jnp.asarray(rng.normal(size=7))
+
+    @partial(jax.jit, static_argnums=0)
+    def both(force, q, v):
+        return jax.jvp(partial(force, t=jnp.zeros(()), params=params), (q, v), (v, q))
+
+    forms = unconstrained(case.scene.system, 7), case.ode[0]
+    for one, other in zip(*(both(form.force, q, v) for form in forms), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-10 * np.max(np.abs(one)))
 
 
 def test_time_to_an_error_is_read_off_the_line_between_runs():

@@ -12,7 +12,7 @@ from friction_reference import Motion
 from experiments.cells import SAMPLES
 from experiments.dry_motion import dry_motion
 from experiments.page import find
-from experiments.stability import dry
+from experiments.stability import adaptive, dry
 from experiments.stability.grades import cells
 from experiments.stability.scenes import all_cases
 
@@ -48,6 +48,21 @@ def test_the_committed_numbers_hold_what_is_claimed():
     assert totals["silently_wrong"] > 500
     # no step resolves its jumps, so where a run goes is chance, and two of them may agree
     assert [(e["scene"], e["cells"]) for e in unflagged] in ([], [("van der Pol, mu = 1000", 1)])
+
+
+def test_under_error_control_nothing_is_silently_wrong():
+    """With `verify`; the counts are those of the cells."""
+    found = COMMITTED["adaptive"]
+    rows = [row for scene in found["scenes"].values() for x in scene["grades"].values() for row in x]
+    for i, counts in enumerate(found["cells"].values()):
+        letters = "".join(row[i] for row in rows)
+        assert [counts[x] for x in ("silently_wrong", "beyond", "named", "accurate")] == [
+            letters.count(x) for x in adaptive.LETTERS
+        ]
+    assert len(rows) == 21 * (6 * 3 + 3)
+    assert found["cells"]["halved"]["silently_wrong"] == found["cells"]["tolerance"]["silently_wrong"] == 0
+    assert found["cells"]["halved"]["beyond"] == 0
+    assert found["cells"]["no"]["accurate"] > 0.75 * len(rows)
 
 
 def test_the_boundaries_are_those_pinned():

@@ -61,14 +61,14 @@ def cells(outcomes, sizes):
     }
 
 
-def page(scenes, causes):
+def page(scenes, causes, grades=GRADES, letters=LETTERS, columns_are="step size halved from column to column"):
     """Cells as of `cells`: scenes down, with why methods fail; methods across; the step shrinks to the right."""
     methods = list(next(iter(scenes.values()))["grades"])
     columns = max(len(row) for by_method in scenes.values() for rows in by_method["grades"].values() for row in rows)
     pitch = 4 + 1.5 * max((len(wrap(why, 95)) for why in causes.values()), default=0)
     figure, axes = subplots(width=175, height=30 + 2 * pitch * len(scenes))
     style = {
-        "cmap": ListedColormap(list(GRADES.values())),
+        "cmap": ListedColormap(list(grades.values())),
         "vmin": 0,
         "vmax": 3,
         "edgecolor": "white",
@@ -76,9 +76,9 @@ def page(scenes, causes):
     }
     for row, (name, scene) in enumerate(scenes.items()):
         for column, method in enumerate(methods):
-            grades = np.array([[LETTERS.index(letter) for letter in line] for line in scene["grades"][method]])
-            x = (columns + 1) * column + np.arange(grades.shape[1] + 1)
-            axes.pcolormesh(x, pitch * row + np.linspace(0, 3, len(grades) + 1), grades, **style)
+            found = np.array([[letters.index(letter) for letter in line] for line in scene["grades"][method]])
+            x = (columns + 1) * column + np.arange(found.shape[1] + 1)
+            axes.pcolormesh(x, pitch * row + np.linspace(0, 3, len(found) + 1), found, **style)
         if causes:
             why = "\n".join(wrap(causes.get(name, ""), 95))
             line = axes.text(0, pitch * row + 3.2, why, va="top", style="italic", color="#444444")
@@ -94,7 +94,7 @@ def page(scenes, causes):
     axes.grid(False)
     axes.spines[:].set_visible(False)
     alphas = f"rows: alpha = {', '.join(map(str, ALPHAS))}, or one without alpha"
-    axes.set_xlabel(f"In each block: step size halved from column to column\n{alphas}")
-    handles = [Patch(color=colour, label=label) for label, colour in GRADES.items()]
+    axes.set_xlabel(f"In each block: {columns_are}\n{alphas}")
+    handles = [Patch(color=colour, label=label) for label, colour in grades.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure

@@ -4,6 +4,7 @@
 """
 
 import json
+from collections import Counter
 from pathlib import Path
 
 from experiments.page import table
@@ -64,6 +65,23 @@ def stops_table(found):
     return table(["method", *found], rows)
 
 
+def adaptive_table(cells):
+    """Cells by how runs are verified."""
+    header = ["verify", *(name.replace("_", " ") for name in next(iter(cells.values())))]
+    return table(header, [[way, *found.values()] for way, found in cells.items()])
+
+
+def once_wrong(gallery, adaptive, way):
+    """Silently wrong cells of the gallery by a letter: that of their scene, method and alpha, verified in a way."""
+    letters = Counter()
+    for name, scene in gallery["scenes"].items():
+        found = adaptive["scenes"][name]["grades"]
+        for method in (m for m in scene["grades"] if m in found):
+            for row, now in zip(scene["grades"][method], found[method], strict=True):
+                letters[now[way]] += row.count("w")
+    return letters
+
+
 def drift_table(entries):
     """One row per scene and method."""
     names = list(dict.fromkeys(key for e in entries for key in e["last"]))
@@ -92,7 +110,10 @@ def dampers_table(rows):
 def page(numbers):
     """The text of README.md."""
     gallery, reported, advice, peers = (numbers[part] for part in ("gallery", "reported", "advice", "peers"))
-    dry, stops = numbers["dry"], numbers["stops"]
+    dry, stops, adaptive = numbers["dry"], numbers["stops"], numbers["adaptive"]
+    alone, verified = (once_wrong(gallery, adaptive, way) for way in (0, 1))
+    runs = {name: [row for rows in x["grades"].values() for row in rows] for name, x in adaptive["scenes"].items()}
+    drifting = [name for name, rows in runs.items() if any(row[0] == "w" for row in rows)]
     fewest, motions = dry["fewest_accurate_steps"].values(), dry["motions"].values()
     drift, spin = numbers["drift"], numbers["rotating"]["spin_error"]
     scenes = gallery["scenes"]
@@ -123,6 +144,15 @@ def page(numbers):
             stops_blown_up=sum(
                 x["blown_up"] for by in stops["cells"].values() for m, x in by.items() if m.endswith("located")
             ),
+            adaptive_rtol=adaptive["rtol"],
+            adaptive_atol=adaptive["atol"],
+            not_controlled=" and ".join(", ".join(adaptive["not_controlled"]).rsplit(", ", 1)),
+            adaptive=adaptive_table(adaptive["cells"]),
+            adaptive_before=sum(alone.values()),
+            adaptive_now=alone["A"],
+            adaptive_verified=verified["A"] + verified["n"],
+            adaptive_wrong=adaptive["cells"]["no"]["silently_wrong"],
+            adaptive_scenes=f"all of them of: {', '.join(drifting)}",
             blown_up=reported["cells"]["again"],
             once=reported["cells"]["blown_up"],
             named=reported["cells"]["named_by_check"],

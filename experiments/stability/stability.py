@@ -2,9 +2,12 @@
 
 from experiments.parts import run_experiment
 from experiments.report import Report
-from experiments.stability import advice, constrained, drift, dry, gallery, peers, reported, rotating, stops
+from experiments.stability import adaptive, advice, constrained, drift, dry, gallery, peers, reported, rotating, stops
 
-GROUPS = [gallery, reported, advice], [dry, stops, constrained, rotating, drift, peers]  # two processes if fast
+GROUPS = (
+    [gallery, reported, advice],
+    [adaptive, dry, stops, constrained, rotating, drift, peers],
+)  # two processes if fast
 
 
 def run(report: Report, fast: bool):

@@ -8,7 +8,6 @@ import numpy as np
 
 from hhtjax.checks import require_integer, require_number
 from hhtjax.description import Description, is_array, is_concrete, is_real
-from hhtjax.systems import held
 
 WITH_ESTIMATES = "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda or dopri5"
 
@@ -42,7 +41,8 @@ def adaptive(
     largest values so far; rtol^(1/2) because errors of steps add up, and only for the `hht` family. So errors of the
     run follow rtol, but nothing is promised: an error that grows, the phase of an undamped vibration or chaos, is seen
     by no estimate of one step, and what happens and is over within a step neither (give dt_max). `verify` sees the
-    first.
+    first. Steps end where held inputs, `sampled(order=0)`, jump. With dry friction the error is that of the motion on
+    either side of a switch: the jump of the acceleration is no reason to reject.
 
     In `sweep(..., dts=adaptive(...))` each of the numbers may be an array (B,), one for each member.
 
@@ -113,19 +113,10 @@ def require_single(caller, control):
         raise ValueError(f"{caller}: tolerances must be numbers; arrays (B,), one for each member, are for `sweep`.")
 
 
-def require_controlled(caller, system, stepper, params):
-    """An error for a stepper without an estimate, for inputs that jump, and for dry friction."""
+def require_controlled(caller, stepper):
+    """An error for a stepper without an estimate."""
     if stepper.estimate_order is None:
         raise NotImplementedError(
             f"{caller}: {type(stepper).__name__} has no estimate of its error: give `dt` as a number, or take "
             f"{WITH_ESTIMATES}."
-        )
-    if held.holds(params):
-        raise NotImplementedError(
-            f"{caller}: error control does not know when held inputs, sampled(order=0), jump: give `dt` as an array "
-            "whose steps end there, or take order=1."
-        )
-    if system.friction is not None:
-        raise NotImplementedError(
-            f"{caller}: error control takes a switch of dry `friction` for an error: give `dt` as a number or an array."
         )

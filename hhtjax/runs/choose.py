@@ -11,7 +11,7 @@ from jax import lax
 from hhtjax.description import is_concrete
 from hhtjax.description.presentation import overwrite, shown
 from hhtjax.runs.solution import SimulationError, first_bad
-from hhtjax.systems import kinematics
+from hhtjax.systems import held, kinematics
 from hhtjax.xla import on_scalars, one_kernel
 
 SAFETY, LEAST, MOST = 0.9, 0.2, 2.0  # of the factors by which steps change; more than 2 is unstable for some methods
@@ -147,14 +147,23 @@ def is_walking(walk, end):
     return (walk.state.t < end) & (walk.stop == DONE)
 
 
+def next_end(params, end, walk):
+    """The next step, and the time at which it ends: that of the walk, or one or two halves, to the end, or a jump."""
+    t, h = walk.state.t, walk.h
+    due = jnp.minimum(end, held.jump_after(params, t)) if held.holds(params) else end
+    left = due - t
+    lands = left <= h
+    h = jnp.where(lands, left, jnp.where(left < 2 * h, left / 2, h))
+    return h, jnp.where(lands, due, t + h)
+
+
 def attempt(flat, stepper, params, end, bounds, max_steps, walk):
     """Walk -> Walk after one try, and the time at which it would have ended."""
-    left = end - walk.state.t
-    lands = left <= walk.h
-    h = jnp.where(lands, left, jnp.where(left < 2 * walk.h, left / 2, walk.h))
+    h, t1 = next_end(params, end, walk)
     resized, state = stepper.resized(walk.state, h / walk.last)
-    s1, info, errors, past = resized.bind_estimated(flat, params, h, walk.past)(state)
-    s1 = s1._replace(t=jnp.where(lands, end, walk.state.t + h))
+    now, state = held.entered(resized, flat, params, h, walk.last, state)
+    s1, info, errors, past = resized.bind_estimated(flat, now, h, walk.past)(state)
+    s1 = s1._replace(t=t1)
     q_size, v_size = map(jnp.maximum, (walk.q_size, walk.v_size), sizes(flat, s1))
     error = bounds.relative(flat, errors, q_size, v_size)
     fine = succeeded(s1, info, error)
@@ -174,7 +183,7 @@ def attempt(flat, stepper, params, end, bounds, max_steps, walk):
 def begin(flat, stepper, q, v, t0, end, params, bounds):
     """The walk before its first step. The method starts with the longest of these, of which others are parts."""
     longest = jnp.minimum((end - t0) / 100, bounds.most)
-    state = stepper.begin(flat, q, v, t0, params, longest)
+    state = stepper.begin(flat, q, v, t0, held.before(params, t0, longest), longest)
     q_size, v_size = sizes(flat, state)
     h = bounds.first(state, v_size, end - t0)
     one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)

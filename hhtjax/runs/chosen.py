@@ -19,6 +19,7 @@ from hhtjax.runs.problem import Problem
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import State, Stepper, join_info, public
+from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_plain
 
@@ -74,6 +75,7 @@ def follow(problem, times, grid):
     loop = loop_over(flat, problem.stepper, q, v, t0, params, dt, ends=grid.ends)
     form = on_scalars(loop.advance, loop.carry)
     advance, keep = form.of(loop.advance), form.of(partial(kept, flat, problem.stepper))
+    begun = form.of(partial(begun_with, flat, problem.stepper, params, loop))
 
     @checkpoint
     def interval(carry, counts):
@@ -82,7 +84,7 @@ def follow(problem, times, grid):
         def step(i, carry):
             _, run, info = carry
             after, now = advance(run)
-            new = run[0], after, join_info(info, now)
+            new = begun(run), after, join_info(info, now)
             return jax.tree.map(partial(jnp.where, i < count), new, carry)
 
         last, run, info = repeat(step, (*carry, loop.no_info), most)
@@ -97,6 +99,15 @@ def follow(problem, times, grid):
     flaw = flaw_at_start(problem.system, flat, start, params)
     pair = [as_solution(flat, start, path, dt, info, failure, flaw) for path in (first, second)]
     return read_off(flat, pair, extra, times, grid.reached)
+
+
+def begun_with(flat, stepper, params, loop, run):
+    """The state with which the next step of a run begins: behind a jump of held inputs."""
+    state, count, _ = run
+    if not held.holds(params):
+        return state
+    dt, last = loop.sizes(count)
+    return held.entered(stepper, flat, params, dt, last, state)[1]
 
 
 def kept(flat, stepper, state):
@@ -225,6 +236,6 @@ def verified(run, finer, control, order):
 
 def checked_times(caller, problem, times, control):
     """times, for a stepper that can be controlled."""
-    require_controlled(caller, problem.system, problem.stepper, problem.params)
+    require_controlled(caller, problem.stepper)
     require_single(caller, control)
     return require_times(times, problem.t0, jax.tree.leaves(problem.q0)[0].dtype, caller)

@@ -53,7 +53,7 @@ class Inputs(NamedTuple):
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
         if isinstance(dts, Adaptive):
-            require_controlled("sweep", system, stepper, params)
+            require_controlled("sweep", stepper)
             size = _members(dts, dict(zip(NAMES, (stepper, q0, v0, params, z0), strict=True)), in_axes)
         else:
             dts = require_step_sizes(dts)

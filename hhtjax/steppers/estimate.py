@@ -11,8 +11,13 @@ A linearisation may have missed what is there, a contact say; so the residual at
     d = -S^-1 r(q1, v1, w1, t1),    e_q := |e_q| + beta k h^2 |d|,  e_v := |e_v| + gamma k h |d|,
     k = (1 - alpha_f)/(1 - alpha_m)
 
-for one more residual and substitution. Methods of several stages have an embedded one of lower order instead, and those
-with a matrix g h d and g^2 h^2 d besides.
+for one more residual and substitution. Where dry friction switches, w jumps: the jump is taken off w1 first, which so
+belongs to the branch of w, and r has the friction that the step found. What stays is the change of the other forces
+over the step: it must be resolved on both sides of the switch, whose time is found by lines. At a jump of a held input
+w jumps between two steps; its slope, of which w'' is made, does not, but for dampers.
+
+Methods of several stages have an embedded one of lower order instead, and those with a matrix g h d and g^2 h^2 d
+besides.
 """
 
 from dataclasses import replace
@@ -57,12 +62,14 @@ class Controlled(Resizing):
     def bind_estimated(self, system, params, dt, past):
         """State -> State, Info, Errors, Past, by the formulas above."""
         asks = not system.linear and self.options.iterations is not None  # else nothing is left at the end
+        asks = asks or system.friction is not None  # what switched
         step = replace(self, estimating=asks).bind(system, params, dt)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
         def estimated(s):
             s1, info = step(s)
-            errors, now = family_errors(self.coefficients, dt, s.w, s1.w, past, info.defect)
-            return s1, info._replace(defect=None), errors, now
+            w1 = s1.w if info.switched is None else s1.w - info.switched
+            errors, now = family_errors(self.coefficients, dt, s.w, w1, past, info.defect)
+            return s1, info._replace(defect=None, switched=None), errors, now
 
         return estimated
 

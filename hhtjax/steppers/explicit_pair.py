@@ -7,6 +7,12 @@ Equations I, Sec. II.6, which is the cubic Hermite polynomial and one more term,
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from hhtjax.description import is_concrete
+from hhtjax.numerics.elimination import SCALAR
 from hhtjax.steppers.estimate import Embedded, Errors
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.xla import staged
@@ -26,6 +32,7 @@ A = (
         11 / 84,
     ),  # the end of the step, and the next one's first stage
 )
+STAGES = 7
 ERROR = 71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40  # order 5 minus order 4
 DENSE = (
     *(-12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072),
@@ -61,12 +68,14 @@ class DormandPrince(Embedded, Stepper):
         """Six stages; the first is the acceleration that the step before ended with."""
         acceleration = staged(system.acceleration, system.size)
 
+        def stage(s, node, weights, V, W):
+            """q, v and w of a stage, from the v and w of those before it."""
+            q, v = s.q + system.located(dt * mean(weights, V)), s.v + dt * mean(weights, W)
+            return q, v, acceleration(q, v, s.t + node * dt, params)
+
         def step(s):
-            V, W = [s.v], [s.w]
-            for row in A:
-                q, v = s.q + system.located(dt * mean(row, V)), s.v + dt * mean(row, W)
-                V.append(v)
-                W.append(acceleration(q, v, s.t + sum(row) * dt, params))
+            q, V, W = (in_a_loop if system.size > SCALAR else written_out)(stage, s)
+            v = V[-1]
             dense = Errors(system.located(dt * mean(DENSE, V)), dt * mean(DENSE, W))
             end = State(s.t + dt, q, v, W[-1], memory=dense)
             return end, Info(), Errors(dt * mean(ERROR, V), dt * mean(ERROR, W))
@@ -74,9 +83,36 @@ class DormandPrince(Embedded, Stepper):
         return step
 
 
+def written_out(stage, s):
+    """q at the end of a step, and the rates v and w of all stages."""
+    V, W = [s.v], [s.w]
+    for row in A:
+        q, v, w = stage(s, sum(row), row, V, W)
+        V.append(v)
+        W.append(w)
+    return q, V, W
+
+
+def in_a_loop(stage, s):
+    """The same, with one acceleration to compile in the place of six, which may take minutes."""
+    rows = jnp.asarray(np.array([(*row, *(STAGES - len(row)) * (0.0,)) for row in A]), s.v.dtype)
+    nodes = jnp.asarray(np.array([sum(row) for row in A]), s.v.dtype)
+
+    def body(i, carry):
+        _, V, W = carry
+        row, node = (lax.dynamic_index_in_dim(x, i, keepdims=False) for x in (rows, nodes))
+        q, v, w = stage(s, node, row, V, W)
+        return q, *(lax.dynamic_update_index_in_dim(X, x, i + 1, 0) for X, x in ((V, v), (W, w)))
+
+    V, W = (jnp.pad(x[None], ((0, STAGES - 1), (0, 0))) for x in (s.v, s.w))
+    q, V, W = lax.fori_loop(0, STAGES - 1, body, (s.q, V, W))
+    return q, list(V), list(W)
+
+
 def mean(weights, rates):
-    """Their weighted sum, without those of weight 0."""
-    return sum(weight * k for weight, k in zip(weights, rates, strict=True) if weight)
+    """Their weighted sum, without those that are known to be 0."""
+    known = [(weight, k) for weight, k in zip(weights, rates, strict=True) if not is_concrete(weight) or weight]
+    return sum(weight * k for weight, k in known)
 
 
 def dopri5() -> DormandPrince:

@@ -117,11 +117,15 @@ def bind_friction(method, system, params, dt, kept=None):
             end, left = run_events(sf, s0, sig, tau, f, W, dt * K)
         dtau = end.tau
         z = z - matvec(G.T, dtau)
+        if method.estimating:
+            info = info._replace(defect=_defect(method, system, params, rubbing, path(z), dtau, inverse))
         x = method.advance(s, dt, z[:size])[0]
         taken = None if shift is None else shift(z[size + system.num_constraints :])
         x = x if taken is None else x - taken
         s1 = _behind(system, params, s, path(z), x, end, dtau, f, G, K)
         s1 = system.tidy(s1)
+        if method.estimating:
+            info = info._replace(switched=_switched(system, s, s1, end, G))
         info = _told(info, left, _is_limit(law, at, params) & ~jnp.any(f < 0))
         return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
 
@@ -183,6 +187,22 @@ def _behind(system, params, s, s1, x, end, dtau, f, G, K):
         s1 = s1._replace(L=s1.L - matvec(G[:, size : size + system.num_constraints].T, onto + y))
     tau = jnp.where(sticks, sig * f + dtau + y, end.sig * f)
     return s1._replace(w=w, a=a, friction=Rubbing(end.sig, tau))
+
+
+def _defect(method, system, params, rubbing, s1, dtau, inverse):
+    """`Info.defect` at the end s1 of the step, with its changes dtau of friction; None of the converged method."""
+    if method.options.iterations is None:
+        return None
+    left = rubbing(s1)
+    force = reaction(system, s1.q, s1.t, params, dtau)
+    return inverse(left + jnp.pad(force, (0, left.size - force.size)))
+
+
+def _switched(system, s, s1, end, G):
+    """`Info.switched`: by how much friction that switched from s to s1 has changed the accelerations."""
+    same = end.kept | ((s.friction.sig == 0) & (end.sig == 0))
+    change = jnp.where(same, 0, s.friction.tau - s1.friction.tau)
+    return matvec(system.widened(G[:, : system.positions]).T, change)
 
 
 def _taken_off(x, y, G):

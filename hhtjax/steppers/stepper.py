@@ -79,6 +79,7 @@ class Info(NamedTuple):
             where a limit is negative or not a number.
         defect: S^-1 r, what a linearised step has left of its residual at its end, as a correction of the unknowns
             (under error control only).
+        switched: by how much dry friction that switched has changed the accelerations (alike).
     """
 
     residual: Any = None
@@ -91,6 +92,7 @@ class Info(NamedTuple):
     solved: Any = None
     friction: Any = None
     defect: Any = None
+    switched: Any = None
 
     def _verdict(self):
         """Of several steps."""
@@ -107,6 +109,7 @@ def join_info(info, new):
         "converged": jnp.logical_and,
         "solved": jnp.logical_and,
         "defect": lambda _, new: new,
+        "switched": lambda _, new: new,
     }
     pairs = {name: (x, getattr(new, name)) for name, x in info._asdict().items() if x is not None}
     return info._replace(**{name: join.get(name, jnp.maximum)(*pair) for name, pair in pairs.items()})

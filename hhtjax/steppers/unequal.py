@@ -14,6 +14,12 @@ Where r = 1 the rules meet: a derivative in the step sizes is there that of one 
 For s = 0 (Newmark, the trapezoidal rule) there is nothing to mend. Steps that grow by more than 2 at once can make
 strongly damping methods (rho near 0) unstable. In index-3 form multipliers are of order 1.4 only where steps change;
 in GGL form, the default, of order 2.
+
+Without damping (alpha = 0, rho_inf = 1) constraints leave w and the multipliers one weakly stable mode: a step from
+known v has w1 = -w + 2 (v1 - v)/h, errors e1 = -e - h^2 w''/6. Equal steps keep e near -h^2 w''/12; each change of
+h^2 adds to what alternates, for ever. Of random steps that is a random walk: with 80 % of jitter (a pendulum in GGL
+form, 100 to 6400 steps) w is of order 1.47 and L of 1.43; q and v are of order 2.03, as are the means of w and L over
+both ends of a step (2.01, 2.02). With alpha = -0.05 w and L are of order 1.98 and 1.97: damp, where they matter.
 """
 
 from dataclasses import replace

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from hhtjax.systems.constraints import factorize_constrained, saddle_point
 from hhtjax.systems.friction import held_back
-from hhtjax.systems.sampled import Sampled
+from hhtjax.systems.sampled import SLOP, Sampled
 
 
 def holds(params):
@@ -35,11 +35,26 @@ def bind(stepper, system, params, dt, last=None):
         return stepper.bind(system, params, dt)
 
     def step(s):
-        now = held_at(params, s.t + dt / 2)
-        s = jump(stepper, system, s, before(params, s.t, dt if last is None else last), now)
+        now, s = entered(stepper, system, params, dt, dt if last is None else last, s)
         return stepper.bind(system, now, dt)(s)
 
     return step
+
+
+def entered(stepper, system, params, dt, last, s):
+    """The params of a step dt, and the state that it starts from; last: the step before."""
+    if not holds(params):
+        return params, s
+    now = held_at(params, s.t + dt / 2)
+    return now, jump(stepper, system, s, before(params, s.t, last), now)
+
+
+def jump_after(params, t):
+    """The time of the first jump after t; inf where there is none."""
+    leaves = jax.tree.leaves(params, is_leaf=_is_held)
+    t = t + SLOP * float(jnp.finfo(t.dtype).eps) * jnp.abs(t)  # a jump that t is, in its dtype, is over
+    times = [x.jump_after(t).astype(t.dtype) for x in leaves if _is_held(x)]
+    return jnp.min(jnp.stack([*times, jnp.full_like(t, jnp.inf)]))
 
 
 def jump(stepper, system, s, old, new):

@@ -74,6 +74,15 @@ class Sampled:
         now, before = (self._last_before(x, len(self.times)) for x in (t + self._rounding(t), t - self._rounding(t)))
         return jnp.where(now > before, self.polynomials[before, 0], self(t - dt / 2))  # steps may differ at a sample
 
+    def jump_after(self, t):
+        """Of a held input the time of its first jump after t; inf where there is none."""
+        intervals = len(self.polynomials)
+        if self.times is None:
+            i = 1 + self._uniform(t, intervals, 1)[0]
+            return jnp.where(i < intervals, self.t0 + i.astype(self.dt.dtype) * self.dt, jnp.inf)
+        i = 1 + self._find(t, intervals, 1)[0]
+        return jnp.where(i < intervals, self.times[jnp.minimum(i, intervals - 1)], jnp.inf)
+
     def constant(self, value):
         """The held input that always has this value."""
         one = jnp.ones((), self.polynomials.dtype)
@@ -97,9 +106,9 @@ def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
     A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order
-    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). For jumps at any distances,
-    `sweep(..., times=)` ends steps there. What is saved at a jump is the acceleration before it; `interpolate` uses it
-    for v after it too.
+    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). `sweep(..., times=)` ends steps
+    at jumps at any distances, and `adaptive` finds them by itself. What is saved at a jump is the acceleration before
+    it; `interpolate` uses it for v after it too.
 
     Outside the samples the nearest end value is held. Differentiable in values, times and t.
     An input enters a simulation only through its values at the steps: with a step shorter than dt the

@@ -1,0 +1,174 @@
+"""Error control of motions whose acceleration jumps: held inputs, and dry friction."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import zoo
+from friction_problems import arm, free_vibration_exact, of_scene
+from friction_reference import Motion
+from helpers import ONE, ZERO
+from scipy.integrate import solve_ivp
+from test_held import SYSTEM, VALUES
+
+import hhtjax
+from hhtjax.scenes import belt, dry_oscillator
+
+START = np.array([0.4, -0.3]), np.array([0.0, 1.0])
+DURATION = 0.6
+UNEVEN = np.array([0.0, 0.07, 0.08, 0.25, 0.31, 0.5])
+BEHIND = np.concatenate([UNEVEN[1:], [0.1, 0.2, 0.3, 0.4]]) + 1e-3
+TIMES = np.sort(np.concatenate([DURATION * np.arange(1, 26) / 25, BEHIND]))  # some in the first step behind a jump
+HELD = {"even": {"dt": 0.1}, "uneven": {"times": UNEVEN}}
+METHODS = {"hht": hhtjax.hht(-0.3), "rowda": hhtjax.rowda(), "dopri5": hhtjax.dopri5()}
+
+
+def held(name, values: Any = VALUES):
+    return {"u": hhtjax.sampled(jnp.asarray(values), **HELD[name], order=0)}
+
+
+def jumps_of(name):
+    return UNEVEN[1:] if name == "uneven" else 0.1 * np.arange(1, 6)
+
+
+def pushed(name, stepper, rtol, values=VALUES, **options):
+    dt = hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=4000, **options)
+    return hhtjax.simulate(SYSTEM, stepper, *START, held(name, values), dt=dt, times=TIMES)
+
+
+def pushed_exactly(name):
+    """q and v from jump to jump, by SciPy."""
+    y, found, ends = np.concatenate(START), [], [0.0, *jumps_of(name), DURATION]
+    for u, a, b in zip(VALUES, ends, ends[1:], strict=False):
+
+        def rate(t, y, u=u):
+            c = np.cos(y[0] - y[1])
+            load = np.array([u - 9 * np.sin(y[0]) - 0.3 * y[2], -20 * y[1] - y[1] ** 3])
+            return np.concatenate([y[2:], np.linalg.solve([[2, c], [c, 1]], load)])
+
+        run = solve_ivp(rate, (a, b), y, "DOP853", dense_output=True, rtol=1e-11, atol=1e-12)
+        here = np.searchsorted([a + 1e-12, b + 1e-12], TIMES) == 1
+        found.append(run.sol(np.append(TIMES[here], b)).T[:-1])
+        y = run.y[:, -1]
+    return np.split(np.concatenate(found), 2, axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HELD)
+@pytest.mark.parametrize("method", zoo.each(METHODS, quick=("hht", "dopri5")))
+def test_steps_end_where_held_inputs_jump(name, method):
+    """So errors of q, and of v between the steps, follow the tolerance."""
+    exact = pushed_exactly(name)
+    for rtol in (1e-2, 1e-3, 1e-5):
+        found = pushed(name, METHODS[method], rtol)
+        found.check()
+        ends = np.cumsum(np.asarray(found.dt))
+        assert all(np.min(np.abs(ends - t)) < 1e-13 for t in jumps_of(name))
+        for x, y in zip((found.q, found.v), exact, strict=True):
+            assert np.max(np.abs(x[1:] - y)) / np.max(np.abs(y)) < 10 * rtol
+        if method == "hht":
+            assert np.max(np.abs(found.q[1:] - exact[0])) / np.max(np.abs(exact[0])) > 0.02 * rtol
+        assert int(found.steps.rejected) < 0.1 * int(found.steps.accepted)
+
+
+@pytest.mark.slow
+def test_held_inputs_in_other_runs():
+    """In a sweep, whose members have inputs of their own; for derivatives in the values; in single precision."""
+    stepper, rtol = METHODS["hht"], np.array([1e-2, 1e-4])
+    members = jnp.stack([VALUES, -VALUES])
+    runs = hhtjax.sweep(
+        SYSTEM, stepper, *START, jax.vmap(lambda x: held("even", x))(members),
+        dts=hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=4000), times=TIMES,
+        in_axes=(None, None, None, 0),
+    )  # fmt: skip
+    for i, one in enumerate(members):
+        np.testing.assert_allclose(runs.q[i], pushed("even", stepper, rtol[i], one).q, rtol=1e-7, atol=1e-9)
+
+    def end(values):
+        return jnp.sum(pushed("uneven", stepper, 1e-3, values).q[-1])
+
+    start = jnp.asarray(VALUES)
+    reverse, forward = jax.jit(lambda x: (jax.grad(end)(x), jax.jacfwd(end)(x)))(start)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    steps = pushed("uneven", stepper, 1e-3).dt
+
+    def frozen(values):
+        run = hhtjax.simulate(SYSTEM, stepper, *START, held("uneven", values), dt=steps)
+        return float(jnp.sum(run.q[-1]))
+
+    for i in (0, 3):
+        e = 1e-4 * np.eye(6)[i]
+        assert (frozen(start + e) - frozen(start - e)) / 2e-4 == pytest.approx(float(forward[i]), rel=1e-6)
+    spring = hhtjax.System(ONE, lambda q, v, t, u: u(t) - 4 * q)
+    dt, u = hhtjax.adaptive(1e-3, 1e-6), held("even", VALUES.astype(np.float32))["u"]
+    single = ONE.astype(np.float32), ZERO.astype(np.float32), u
+    with pytest.warns(hhtjax.PrecisionWarning):
+        found = hhtjax.simulate(spring, stepper, *single, dt=dt, times=[0.55])
+    found.check()
+    assert found.q.dtype == np.float32
+    double = hhtjax.simulate(spring, stepper, ONE, ZERO, held("even")["u"], dt=dt, times=[0.55])
+    np.testing.assert_allclose(found.q, double.q, atol=1e-3)
+
+
+RUBBING = {
+    "free": of_scene(dry_oscillator.free()),
+    "stick-slip": of_scene(dry_oscillator.driven()),
+    "belt": of_scene(belt.two_masses()),
+    "arm": arm(),
+}
+
+
+def rubbed(name, rtol, **options):
+    system, params, q0, v0, duration, *_ = RUBBING[name]
+    times = duration * np.arange(1, 65) / 64
+    return hhtjax.simulate(
+        system, hhtjax.hht(), q0, v0, params, dt=hhtjax.adaptive(rtol, 1e-3 * rtol, **options), times=times
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", zoo.each(RUBBING, quick=("free",)))
+def test_the_error_of_dry_friction_follows_the_tolerance(name):
+    """Through all switches, 6 to 25; those of the free vibration, which end no sticking, reject nothing."""
+    system, params, q0, v0, duration, *_ = RUBBING[name]
+    times = duration * np.arange(65) / 64
+    if name == "free":
+        exact = free_vibration_exact(times)[0][:, None]
+    else:
+        exact = Motion(system, params, np.array(q0), np.array(v0)).at(times)[0]
+    for rtol in (1e-2, 1e-4):
+        found = rubbed(name, rtol)
+        found.check()
+        assert 0.02 < np.max(np.abs(found.q - exact)) / np.max(np.abs(exact)) / rtol < 10
+        assert int(found.steps.rejected) <= (0 if name == "free" else 0.15 * int(found.steps.accepted))
+
+
+@pytest.mark.slow
+def test_controlled_steps_of_stick_slip_are_fewer_than_equal_ones():
+    """For the same error."""
+    system, params, q0, v0, duration, *_ = RUBBING["stick-slip"]
+    found = rubbed("stick-slip", 1e-4)
+    fine = rubbed("stick-slip", 1e-6, max_steps=100_000)
+    tries = int(found.steps.accepted + found.steps.rejected)
+    equal = hhtjax.sweep(system, hhtjax.hht(), q0, v0, params, dts=[duration / tries], times=found.t[1:])
+    errors = [np.max(np.abs(x - fine.q)) for x in (found.q, equal.q[0])]
+    assert errors[1] > 1.5 * errors[0]
+
+
+@pytest.mark.slow
+def test_derivatives_through_switches():
+    """Forward = reverse = differences over the same steps."""
+    system, params, q0, v0, *_ = RUBBING["free"]
+
+    def end(F, dt=None):
+        options = {"dt": hhtjax.adaptive(1e-3, 1e-6, max_steps=1000), "times": [0.5]} if dt is None else {"dt": dt}
+        return hhtjax.simulate(system, hhtjax.hht(), q0, v0, params | {"F": F}, **options)
+
+    steps, F = end(4.0).dt, jnp.asarray(4.0)
+    ways = jax.jit(lambda F: (jax.grad(lambda F: end(F).q[-1, 0])(F), jax.jacfwd(lambda F: end(F).q[-1, 0])(F)))
+    reverse, forward = ways(F)
+    assert float(reverse) == pytest.approx(float(forward), rel=1e-10)
+    high, low = (float(hhtjax.interpolate(end(F + h, steps), 0.5).q[0]) for h in (1e-6, -1e-6))
+    assert (high - low) / 2e-6 == pytest.approx(float(forward), rel=1e-6)
