@@ -108,23 +108,18 @@ def simulate(
             "simulate: leave `extrapolate` out: with dry friction the error is no power series in dt; "
             f"received {extrapolate}."
         )
-    if events is not None and isinstance(dt, Adaptive):
-        raise NotImplementedError(
-            "simulate: with `events`, give `dt` as numbers: error control takes motions without jumps."
-        )
-    if isinstance(dt, Adaptive) or times is not None:
-        require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
-        return run_controlled(problem, times, dt, progress)
-    dt, num_steps = require_steps("simulate", stepper, dt, num_steps)
-    if num_steps % save_every:
-        raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
-
     room = (
         require_integer("simulate", "max_events", max_events),
         require_integer("simulate", "keep_events", keep_events),
     )
     if events is not None:
         events = require_events("simulate", problem, events)
+    if isinstance(dt, Adaptive) or times is not None:
+        require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
+        return run_controlled(problem, times, dt, progress, events, room)
+    dt, num_steps = require_steps("simulate", stepper, dt, num_steps)
+    if num_steps % save_every:
+        raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room}
