@@ -44,6 +44,10 @@ def adaptive(
     by no estimate of one step, and what happens and is over within a step neither (give dt_max). `verify` sees the
     first.
 
+    With `events` steps pass them as steps of given sizes do, and what is left of a step behind an event has an error of
+    its own. Where there is none, as in free flight, steps grow without bound, and a guard that falls and rises again
+    within one of them may be missed: give dt_max.
+
     In `sweep(..., dts=adaptive(...))` each of the numbers may be an array (B,), one for each member.
 
     Args:

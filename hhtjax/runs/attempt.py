@@ -172,4 +172,8 @@ def begin(trial, q, v, t0):
     one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)
     past = stepper.begin_estimates(flat, state)
     walk = Walk(state, h, longest, past, one, one, q_size, v_size, none, none, none)
-    return walk if trial.ways is None else walk._replace(met=before_any(trial.ways, state, trial.params, 1))
+    return (
+        walk
+        if trial.ways is None
+        else walk._replace(met=before_any(trial.ways, state, trial.params, trial.ways.max_events))
+    )

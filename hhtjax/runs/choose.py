@@ -102,7 +102,9 @@ def as_steps(walk, times, t0, least):
     numbers = jnp.arange(times.size, dtype=jnp.int32)
     dt = jnp.where(numbers < walk.accepted, jnp.diff(times, prepend=t0), jnp.nan)
     steps = Steps(dt, walk.accepted, walk.rejected, walk.state.t, walk.stop, walk.error, least)
-    return steps if walk.met is None else steps._replace(event=walk.met.code, guard=walk.met.event)
+    if walk.met is None:
+        return steps
+    return steps._replace(event=jnp.where(walk.stop == AT_EVENT, walk.met.code, 0), guard=walk.met.event)
 
 
 def show(before, now, t0, end):
