@@ -27,7 +27,7 @@ def sweep_chosen(inputs, progress):
 
 @partial(jax.jit, static_argnames=("mapped", "size", "lanes", "progress", "room"))
 def run_chosen(system, start, choice, *, mapped, size, lanes, progress, room):
-    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times and events, of runs and steps."""
+    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, of runs, of steps."""
 
     def members_of(data, control, t0, times, events):
         dtype = jax.tree.leaves(data[1])[0].dtype

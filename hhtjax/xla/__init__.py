@@ -74,6 +74,7 @@ NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule w
 all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
 """
 
+from hhtjax.xla.branches import let_branches_be_transposed
 from hhtjax.xla.explanation import Explanation, explain
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, staged, structural
@@ -102,6 +103,8 @@ __all__ = [
     "staged",
     "structural",
 ]
+
+let_branches_be_transposed()
 
 
 def __dir__():
