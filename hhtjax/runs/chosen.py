@@ -79,32 +79,10 @@ def follow(problem, times, grid, events=None, room=()):
     if events is not None:
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, in_pieces=True)
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
-    advance, keep = form.of(loop.advance), form.of(partial(kept, flat, problem.stepper))
-
-    @checkpoint
-    def interval(carry, now):
-        count, most, time = now
-
-        def step(i, carry):
-            last, run, info = carry
-            here = i < count
-            after, more = advance(run) if events is None else advance(run, here)
-            old = last, run[:3], info
-            new = before(run), after[:3], join_info(info, more)
-            last, run, info = jax.tree.map(partial(jnp.where, here), new, old)
-            return last, (*run, *after[3:]), info  # what events made is of steps that were taken
-
-        last, run, info = repeat(step, (*carry, loop.no_info), most)
-        return (last, run), (*(map(keep, pair(last, run, time))), info)
-
-    def before(run):
-        return run[0] if events is None else ()
-
-    def pair(last, run, time):
-        return (last, run[0]) if events is None else form.of(Pieces.around)(run[3].pieces, time)
+    interval = to_next_sample(loop, form, partial(kept, flat, problem.stepper), in_pieces=events is not None)
 
     def samples(carry):
-        return lax.scan(interval, (before(carry), carry), (grid.counts, longest, times))
+        return lax.scan(interval, (carry[0] if events is None else (), carry), (grid.counts, longest, times))
 
     (_, (state, _, failure, *met)), (first, second, info) = one_kernel(samples, form.tree)
     (first, _), (second, extra) = form.joined(first), form.joined(second)
@@ -116,6 +94,33 @@ def follow(problem, times, grid, events=None, room=()):
     met = form.joined(met[0])
     times = jnp.where(met.ended, jnp.minimum(times, state.t), times)
     return with_told_events(flat, read_off(flat, ends, extra, times, grid.reached), met)
+
+
+def to_next_sample(loop, form, keep, in_pieces):
+    """The body of the scan over the times: steps until one of them ends at the time or beyond, and both ends of that.
+
+    in_pieces: of the part of it between events, of which its `Pieces` tell; else the state before is carried along.
+    """
+    advance, keep = form.of(loop.advance), form.of(keep)
+
+    @checkpoint
+    def interval(carry, now):
+        count, most, time = now
+
+        def step(i, carry):
+            last, run, info = carry
+            here = i < count
+            after, more = advance(run, here) if in_pieces else advance(run)
+            old = last, run[:3], info
+            new = () if in_pieces else run[0], after[:3], join_info(info, more)
+            last, run, info = jax.tree.map(partial(jnp.where, here), new, old)
+            return last, (*run, *after[3:]), info  # what events made is of steps that were taken
+
+        last, run, info = repeat(step, (*carry, loop.no_info), most)
+        pair = form.of(Pieces.around)(run[3].pieces, time) if in_pieces else (last, run[0])
+        return (last, run), (*map(keep, pair), info)
+
+    return interval
 
 
 def kept(flat, stepper, state):
