@@ -33,8 +33,7 @@ ALARM = 10  # times what was asked for, above which the error of a whole run is 
 @partial(jax.jit, static_argnames=("progress", "room"))
 def chosen_steps(problem, times, control, events=None, progress=False, room=()):
     """`Steps` to the last of the times, and the times at which they end; no tracer of autodiff may come in."""
-    end = jnp.asarray(times).astype(problem.flat()[1].dtype)[-1]
-    return choose(problem, end, control, progress, events, room)
+    return choose(problem, problem.times(times)[-1], control, progress, events, room)
 
 
 class Grid(NamedTuple):
@@ -66,8 +65,7 @@ class Grid(NamedTuple):
 @partial(jax.jit, static_argnames=("halved", "room"))
 def run_over(problem, times, ends, accepted, events=None, halved=False, room=()):
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
-    _, q, _, t0, _ = problem.flat()
-    times = jnp.asarray(times).astype(q.dtype)
+    t0, times = problem.times(problem.t0), problem.times(times)
     return follow(problem, times, Grid.of(t0, times, ends, accepted, halved), events, room)
 
 

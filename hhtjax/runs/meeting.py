@@ -77,9 +77,14 @@ def asks(ways, s, s1, params, h):
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in lax.stop_gradient((s, s1)))
     noted = jnp.asarray(ways.events.noted)
     below = (g1 <= 0) & (~noted | (g0 > 0))
-    turns = (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
+    turns = falls_and_rises(g0, d0, g1, d1)
     crossing = (g1 - g0 - d1 * h) / jnp.where(turns, d0 - d1, 1)  # of the tangents at both ends
     return jnp.any(below | (turns & (g0 + d0 * crossing <= 0)))
+
+
+def falls_and_rises(g0, d0, g1, d1):
+    """Whether a guard that is positive at both ends may be zero between them."""
+    return (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
 
 
 def pass_events(ways, params, part, h):
@@ -144,7 +149,7 @@ def look(ways, part, params, h):
     def cubic(x):
         return g0 + x * (d0 + x * (a + x * b))
 
-    turns = (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
+    turns = falls_and_rises(g0, d0, g1, d1)
     root = jnp.sqrt(jnp.maximum(a * a - 3 * b * d0, 0))
     lowest = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
     touches = turns & (cubic(lowest) < 0)
