@@ -131,8 +131,6 @@ ERRORS = {
     "an impact of y": (TypeError, "an impact needs velocities",
                        lambda: call([Event(lambda y, t, p: y[0], impact(0.5))], v0=None,
                                     system=FirstOrderSystem(lambda y, t, p: -y))),
-    "adaptive": (NotImplementedError, "with `events`, give `dt` as numbers",
-                 lambda: simulate(FREE, hht(), ONE, ZERO, dt=hhtjax.adaptive(1e-3, 1e-6), times=[1], events=[HEIGHT])),
 }  # fmt: skip
 
 

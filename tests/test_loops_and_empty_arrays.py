@@ -1,11 +1,13 @@
-"""Batched loops and empty arrays in what a user writes: as on plain JAX."""
+"""Batched loops, branches and empty arrays in what a user writes: as on plain JAX, or how they are counted."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from linked_pendulums import on_cpu, paths
 
 import hhtjax
+from hhtjax.xla import inspection, kernels
 
 
 def counted(q, v, t, params):
@@ -57,3 +59,28 @@ def test_a_leaf_of_no_coordinates():
     sweep = hhtjax.sweep(system, hhtjax.hht(), q0, v0, 1.0, dts=jnp.array([0.01, 0.02]), duration=0.8, num_samples=40)
     assert sweep.q["none"].shape == (2, 41, 0)
     assert np.allclose(sweep.q["a"][0], run(1.0).q["a"][::2], rtol=1e-12)
+
+
+@on_cpu
+def test_branches_are_counted_by_themselves(monkeypatch):
+    """As many operations as a kernel may have: in a branch, but not beside it, and not in all branches together."""
+
+    def waves(x):
+        for _ in range(30):
+            x = jnp.sin(x) + 1.0
+        return x
+
+    def loop(f):
+        return lambda x: kernels.one_kernel(lambda x: jax.lax.fori_loop(0, 3, lambda i, x: f(x), x), x)
+
+    def seldom(x):
+        return jax.lax.cond(x > 1, waves, lambda x: waves(x * 2), x)
+
+    def told(f):
+        return paths(loop(f), jnp.float32(0.5))[0]
+
+    monkeypatch.setattr(inspection, "MOST_OPERATIONS", 100)
+    assert "more than 100 operations" in told(lambda x: waves(waves(x)))
+    assert told(seldom) == "one kernel"
+    monkeypatch.setattr(inspection, "MOST_IN_BRANCHES", 100)
+    assert "more than 100 operations in branches" in told(seldom)

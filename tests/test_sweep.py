@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import zoo
+from jax import lax
 
 import hhtjax
+from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.scenes import pendulum
 
@@ -81,6 +83,38 @@ def test_derivatives_forward_and_reverse_are_those_of_the_runs():
         np.testing.assert_allclose(reverse[key], forward[key], rtol=1e-10)
         up, down = (loss(at[0] | {key: at[0][key] + d}, 0.0) for d in (h, -h))
         np.testing.assert_allclose(reverse[key], (up - down) / (2 * h), rtol=1e-7)
+
+
+def test_branches_of_members_have_derivatives():
+    """One member takes x k in the first step, the other x + k; a branch that is not taken is kept from derivatives."""
+
+    def end(k, x):
+        def step(i, x):
+            return lax.cond(x > 0.3, lambda x: x * k, lambda x: x + k, x)
+
+        return repeat(step, x, jnp.array(3))
+
+    def both(k):
+        return jax.vmap(end, (None, 0))(k, jnp.array([0.1, 0.5]))
+
+    expected = np.array([1.1 + 2 * 0.3, 3 * 0.3])  # of (.1 + k) k + k and (.5 k + k) k
+    np.testing.assert_allclose(jax.jacfwd(both)(0.3), expected, rtol=1e-14)
+    np.testing.assert_allclose(jax.jacrev(both)(0.3), expected, rtol=1e-14)
+
+
+@pytest.mark.slow
+def test_a_sweep_with_a_branch_in_its_force():
+    def force(q, v, t, k):
+        return lax.cond(q[0] > 0.3, lambda q: -k * (q - 0.3) - q, lambda q: -q, q)
+
+    def end(k):
+        dts = np.array([0.1, 0.05])
+        system = hhtjax.System(ONE, force)
+        return jnp.sum(hhtjax.sweep(system, STEPPER, ONE, ZERO, k, dts=dts, duration=1.5, num_samples=1).q)
+
+    found = jax.grad(end)(2.0)
+    assert abs(found - jax.jacfwd(end)(2.0)) < 1e-13
+    assert abs(found - (end(2.0 + 1e-6) - end(2.0 - 1e-6)) / 2e-6) < 1e-8
 
 
 @pytest.mark.slow

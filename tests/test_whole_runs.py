@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import event_problems
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,6 +58,37 @@ def test_same_three_ways(name, stepper):
     for x, y, z in zip(fast, plain, by_steps, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(z, y, rtol=1e-10, atol=1e-12)
+
+
+EVENTS = {
+    "impact": (event_problems.dragged_ball, hhtjax.hht(-0.3)),
+    "switch": (event_problems.bump_stop, hhtjax.rowda()),
+}
+
+
+@pytest.mark.parametrize("name", EVENTS)
+def test_events_the_same_on_plain_jax(name):
+    """Values and forward derivatives of a batch, of which one member meets its events elsewhere."""
+    make, stepper = EVENTS[name]
+    problem = make()
+
+    def run(q0):
+        found = hhtjax.simulate(
+            problem.system, stepper, q0, problem.v0, problem.params, dt=0.05, num_steps=24, events=problem.events
+        )
+        return found.q, found.v, found.events.t[:2], found.events.count
+
+    def everything(q0):
+        return jax.vmap(lambda q0: jax.jvp(run, (q0,), (jnp.cos(q0),)))(q0)
+
+    q0 = jnp.stack([problem.q0, problem.q0 - 0.1])
+    fast = jax.jit(everything)(q0)
+    with hhtjax.plain():
+        plain = jax.jit(everything)(q0)
+    assert np.all(np.asarray(fast[0][-1]) > 0)
+    for x, y in zip(jax.tree.leaves(fast), jax.tree.leaves(plain), strict=True):
+        if x.dtype != jax.dtypes.float0:
+            np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.filterwarnings("ignore")

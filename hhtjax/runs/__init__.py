@@ -141,8 +141,9 @@ order in which events happen; where a motion only grazes a guard they grow witho
 a guard that falls and rises again within a step is seen where the cubic through its ends sees it.
 
 Events work with mass matrices, constraints (the impulse obeys them), rotations, internal states, dry friction, held
-inputs, uneven steps, `interpolate`, `sweep`, `fit` and `extrapolate` (of which the order is 3 then); not with error
-control. In a batch of one's own they cost what they cost in `sweep`: the batch looks for events where a member has one.
+inputs, uneven steps, `interpolate`, `sweep`, `fit`, `extrapolate` (of which the order is 3 then), and with error
+control, where samples lie on the motion before or behind an event, and steps that meet more events than one are made
+shorter. In a batch of one's own they cost what they cost in `sweep`: the batch looks for events where a member has one.
 In `vmap` of a reverse derivative they cost more. Figures, orders, derivatives and an impact oscillator are on a page,
 `experiments/events/README.md`.
 

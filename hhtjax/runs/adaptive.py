@@ -44,6 +44,10 @@ def adaptive(
     first. Steps end where held inputs, `sampled(order=0)`, jump. With dry friction the error is that of the motion on
     either side of a switch: the jump of the acceleration is no reason to reject.
 
+    With `events` steps pass them as steps of given sizes do, and what is left of a step behind an event has an error of
+    its own. Where there is none, as in free flight, steps grow without bound, and a guard that falls and rises again
+    within one of them may be missed: give dt_max.
+
     In `sweep(..., dts=adaptive(...))` each of the numbers may be an array (B,), one for each member.
 
     Args:

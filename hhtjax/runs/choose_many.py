@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.runs.choose import Bounds, as_steps, attempt, begin, is_walking
+from hhtjax.runs.attempt import Bounds, attempt, begin, is_walking
+from hhtjax.runs.attempt_events import trial_of
+from hhtjax.runs.choose import as_steps
 from hhtjax.runs.problem import Problem
 from hhtjax.xla import on_scalars, one_kernel
 
@@ -30,6 +32,8 @@ class Members(NamedTuple):
     times: Any
     size: int
     lanes: int  # members in a block
+    events: Any = None
+    room: tuple = ()
 
     def problem(self, arrays):
         """One member's."""
@@ -93,27 +97,26 @@ class Search(NamedTuple):
         one = members.of(0)
         search = cls(members, control_of, members.times[-1], control_of(one).max_steps, None)
         bounds, walk = search.start(one)
-        search = search._replace(form=on_scalars(search.one_try(one, bounds), walk))
+        plain = search.trial(one, bounds)._replace(ways=None)
+        search = search._replace(form=on_scalars(partial(attempt, plain), walk))
         bounds, walks = jax.vmap(search.start, (members.axes,))(members.arrays)
         return search, bounds, jax.vmap(search.form.like)(walks)
 
     def start(self, arrays):
         """A member's `Bounds` and walk."""
         problem = self.members.problem(arrays)
-        flat, q, v, t0, params = problem.flat()
-        stepper = problem.stepper.astype(q.dtype)
-        bounds = Bounds.of(flat, stepper, self.control_of(arrays), t0, self.end)
-        return bounds, begin(flat, stepper, q, v, t0, self.end, params, bounds)
+        flat, q, v, t0, _ = problem.flat()
+        bounds = Bounds.of(flat, problem.stepper, self.control_of(arrays), t0, self.end)
+        return bounds, begin(self.trial(arrays, bounds), q, v, t0)
 
-    def one_try(self, arrays, bounds):
-        """Walk -> Walk, and the time at which it would have ended."""
-        problem = self.members.problem(arrays)
-        flat, q, _, _, params = problem.flat()
-        return partial(attempt, flat, problem.stepper.astype(q.dtype), params, self.end, bounds, self.max_steps)
+    def trial(self, arrays, bounds):
+        """How a member's steps are tried."""
+        members = self.members
+        return trial_of(members.problem(arrays), self.end, bounds, self.max_steps, members.events, members.room)
 
     def next(self, arrays, bounds, walk):
         """The walk after one try, the same if it is over, and the end of the step; NaN where none was accepted."""
-        new, t = self.form.of(self.one_try(arrays, bounds))(walk)
+        new, t = self.form.of(partial(attempt, self.trial(arrays, bounds)))(walk)
         new = jax.tree.map(partial(jnp.where, is_walking(walk, self.end)), new, walk)
         return new, jnp.where(new.accepted > walk.accepted, t, jnp.nan)
 

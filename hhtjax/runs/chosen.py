@@ -8,10 +8,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
 from hhtjax.runs.choose import Steps, choose, trimmed
+from hhtjax.runs.event_checks import require_events
+from hhtjax.runs.event_pieces import Pieces
+from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.interpolate import between
 from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, saved
@@ -23,15 +27,14 @@ from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_plain
 
+TINY = 1e-9  # part of a run
 ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
-@partial(jax.jit, static_argnames=("progress",))
-def chosen_steps(problem, times, control, progress=False):
+@partial(jax.jit, static_argnames=("progress", "room"))
+def chosen_steps(problem, times, control, events=None, progress=False, room=()):
     """`Steps` to the last of the times, and the times at which they end; no tracer of autodiff may come in."""
-    flat, q, v, t0, params = problem.flat()
-    end = jnp.asarray(times).astype(q.dtype)[-1]
-    return choose(flat, problem.stepper, q, v, t0, end, params, control, progress)
+    return choose(problem, problem.times(times)[-1], control, progress, events, room)
 
 
 class Grid(NamedTuple):
@@ -60,45 +63,64 @@ class Grid(NamedTuple):
         return cls(grid[1:], jnp.where(jnp.isfinite(dt), dt, 1), counts, reached)
 
 
-@partial(jax.jit, static_argnames=("halved",))
-def run_over(problem, times, ends, accepted, halved=False):
+@partial(jax.jit, static_argnames=("halved", "room"))
+def run_over(problem, times, ends, accepted, events=None, halved=False, room=()):
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
-    _, q, _, t0, _ = problem.flat()
-    times = jnp.asarray(times).astype(q.dtype)
-    return follow(problem, times, Grid.of(t0, times, ends, accepted, halved))
+    t0, times = problem.times(problem.t0), problem.times(times)
+    return follow(problem, times, Grid.of(t0, times, ends, accepted, halved), events, room)
 
 
-def follow(problem, times, grid):
+def follow(problem, times, grid, events=None, room=()):
     """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
     flat, q, v, t0, params = problem.flat()
     dt, longest = grid.dt, largest_in_batch(grid.counts)
-    loop = loop_over(flat, problem.stepper, q, v, t0, params, dt, ends=grid.ends)
-    form = on_scalars(loop.advance, loop.carry)
-    advance, keep = form.of(loop.advance), form.of(partial(kept, flat, problem.stepper))
-    begun = form.of(partial(begun_with, flat, problem.stepper, params, loop))
-
-    @checkpoint
-    def interval(carry, counts):
-        count, most = counts
-
-        def step(i, carry):
-            _, run, info = carry
-            after, now = advance(run)
-            new = begun(run), after, join_info(info, now)
-            return jax.tree.map(partial(jnp.where, i < count), new, carry)
-
-        last, run, info = repeat(step, (*carry, loop.no_info), most)
-        return (last, run), (keep(last), keep(run[0]), info)
+    plain = loop = loop_over(flat, problem.stepper, q, v, t0, params, dt, ends=grid.ends)
+    if events is not None:
+        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, in_pieces=True)
+    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
+    begun = partial(begun_with, flat, problem.stepper, params, loop)
+    interval = to_next_sample(loop, form, begun, partial(kept, flat, problem.stepper), in_pieces=events is not None)
 
     def samples(carry):
-        return lax.scan(interval, (carry[0], carry), (grid.counts, longest))
+        return lax.scan(interval, (carry[0] if events is None else (), carry), (grid.counts, longest, times))
 
-    (_, (_, _, failure)), (first, second, info) = one_kernel(samples, form.tree)
+    (_, (state, _, failure, *met)), (first, second, info) = one_kernel(samples, form.tree)
     (first, _), (second, extra) = form.joined(first), form.joined(second)
     start = loop.carry[0]
     flaw = flaw_at_start(problem.system, flat, start, params)
-    pair = [as_solution(flat, start, path, dt, info, failure, flaw) for path in (first, second)]
-    return read_off(flat, pair, extra, times, grid.reached)
+    ends = [as_solution(flat, start, path, dt, info, failure, flaw) for path in (first, second)]
+    if events is None:
+        return read_off(flat, ends, extra, times, grid.reached)
+    met = form.joined(met[0])
+    times = jnp.where(met.ended, jnp.minimum(times, state.t), times)
+    return with_told_events(flat, read_off(flat, ends, extra, times, grid.reached), met)
+
+
+def to_next_sample(loop, form, begun, keep, in_pieces):
+    """The body of the scan over the times: steps until one of them ends at the time or beyond, and both ends of that.
+
+    in_pieces: of the part of it between events, of which its `Pieces` tell; else the state before is carried along.
+    """
+    advance, begun, keep = form.of(loop.advance), form.of(begun), form.of(keep)
+
+    @checkpoint
+    def interval(carry, now):
+        count, most, time = now
+
+        def step(i, carry):
+            last, run, info = carry
+            here = i < count
+            after, more = advance(run, here) if in_pieces else advance(run)
+            old = last, run[:3], info
+            new = () if in_pieces else begun(run), after[:3], join_info(info, more)
+            last, run, info = jax.tree.map(partial(jnp.where, here), new, old)
+            return last, (*run, *after[3:]), info  # what events made is of steps that were taken
+
+        last, run, info = repeat(step, (*carry, loop.no_info), most)
+        pair = form.of(Pieces.around)(run[3].pieces, time) if in_pieces else (last, run[0])
+        return (last, run), (*map(keep, pair), info)
+
+    return interval
 
 
 def begun_with(flat, stepper, params, loop, run):
@@ -123,11 +145,14 @@ def kept(flat, stepper, state):
 def read_off(flat, pair, extra, times, reached):
     """The `Solution` at the times, each between the two of a pair; NaN beyond what was reached."""
     a, b = (jax.tree.map(lambda x: x[1:], run._replace(dt=None, info=None, failure=None)) for run in pair)
-    s = jnp.where(times <= reached, (times - a.t) / (b.t - a.t), jnp.nan)
-    found = between(a, b, b.t - a.t, s)
-    if extra is not None:
-        found = with_dense_term(flat, found, extra, s, b.t - a.t)
     start = jax.tree.map(lambda x: x[:1], pair[0]._replace(dt=None, info=None, failure=None))
+    # a part of a step that is a rounding, behind an event, is the beginning of a long one
+    long = times[-1] - start.t[0]
+    H = jnp.where(b.t - a.t > TINY * long, b.t - a.t, long)
+    s = jnp.where(times <= reached, (times - a.t) / H, jnp.nan)
+    found = between(a, b, H, s)
+    if extra is not None:
+        found = with_dense_term(flat, found, extra, s, H)
     path = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), start, found._replace(t=times))
     return path._replace(info=pair[1].info, failure=pair[1].failure)
 
@@ -160,6 +185,8 @@ def choose_steps(
     z0: Any = None,
     t0: Any = 0.0,
     progress: bool = False,
+    events: Any = None,
+    max_events: int = 2,
     **tolerances: Any,
 ) -> Steps:
     """The steps that error control takes: `simulate(..., dt=adaptive(...))` without the run.
@@ -168,7 +195,7 @@ def choose_steps(
     for the motion that the steps were chosen for, and others near by.
 
     Args:
-        system, stepper, q0, v0, params, z0, t0, progress: those of `simulate`.
+        system, stepper, q0, v0, params, z0, t0, progress, events, max_events: those of `simulate`.
         times: (K,); steps go to the last, and end at no other.
         **tolerances: those of `adaptive`: rtol, atol, and others; not `verify`.
 
@@ -190,30 +217,33 @@ def choose_steps(
     problem = Problem.checked("choose_steps", system, stepper, q0, v0, params, t0, z0)
     control = adaptive(**tolerances)
     times = checked_times("choose_steps", problem, times, control)
-    arguments = *lax.stop_gradient((problem, times, control)), progress
-    return trimmed(or_plain(partial(chosen_steps, *arguments))[0])
+    room = require_integer("choose_steps", "max_events", max_events), 1
+    if events is not None:
+        events = require_events("choose_steps", problem, events)
+    arguments = lax.stop_gradient((problem, times, control, events))
+    return trimmed(or_plain(partial(chosen_steps, *arguments, progress=progress, room=room))[0])
 
 
-def run_controlled(problem, times, control, progress) -> Solution:
+def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
-    (problem, times, control), choice = run_and_choice((problem, times, control))
-    steps, ends = or_plain(partial(chosen_steps, *choice, progress))
-    run = or_plain(partial(run_over, problem, times, ends, steps.accepted))
+    (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
+    steps, ends = or_plain(partial(chosen_steps, *choice, progress=progress, room=room))
+    run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, room=room))
     if control.verify:
-        run = run._replace(
-            **verified(run, finer(problem, times, control, steps, ends, choice), control, problem.stepper.order)
-        )
+        better = finer(problem, times, control, steps, ends, choice, events, room)
+        run = run._replace(**verified(run, better, control, problem.stepper.order))
     steps = trimmed(steps)
     return run._replace(dt=steps.dt, steps=steps)
 
 
-def finer(problem, times, control, steps, ends, choice):
+def finer(problem, times, control, steps, ends, choice, events, room):
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
     if control.verify == "tolerance":
-        steps, ends = or_plain(partial(chosen_steps, *choice[:2], quarter(choice[2])))
+        *start, looser, theirs = choice
+        steps, ends = or_plain(partial(chosen_steps, *start, quarter(looser), theirs, room=room))
     halved = control.verify != "tolerance"
-    return or_plain(partial(run_over, problem, times, ends, steps.accepted, halved=halved))
+    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, halved=halved, room=room))
 
 
 def quarter(control):

@@ -9,17 +9,24 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, seldom
 from hhtjax.runs.event_failures import FINE
 from hhtjax.runs.event_log import Events
+from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.loop import first_failure
 from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events
+from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 
 
-def loop_with_events(loop, flat, stepper, events, params, max_events, keep):
-    """The `Loop` with events: its carry has `Met` behind (state, number of steps, first failure)."""
+def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False):
+    """The `Loop` with events: its carry has `Met` behind (state, number of steps, first failure).
+
+    in_pieces: whether that has the `Pieces` of the last step.
+    """
     start = loop.carry[0]
     stepper = stepper.astype(start.v.dtype)
     ways = Ways(flat, stepper, flatten_events(flat, events, params, stepper.redundant), max_events, loop.no_info)
     met = before_any(ways, start, params, keep)
+    if in_pieces:
+        met = met._replace(pieces=Pieces.none(start, max_events + 1))
     step = past_events(ways, params, loop.bound, loop.sizes)
     return loop._replace(carry=(*loop.carry, met), advance=step, past=partial(past_events, ways, params))
 
@@ -45,6 +52,9 @@ def past_events(ways, params, bound, sizes):
         if any(events.ends):
             new, info = choose(met.ended, state, new), choose(met.ended, ways.no_info, info)
         asked = asks(ways, state, new, now, h) & ~met.ended & here
+        if met.pieces is not None:
+            begun = held.entered(ways.stepper, ways.flat, now, h, last, state)[1]
+            met = met._replace(pieces=choose(here, met.pieces.whole(begun, new), met.pieces))
         part = Part(state, new, info, h, last, met, jnp.zeros_like(met.ended), asked)
         part = seldom(across, asked, part, h, params)
         failure = first_failure(ways.flat, failure, count, part.end, part.info)

@@ -37,13 +37,14 @@ class Ways(NamedTuple):
 
 class Met(NamedTuple):
     """What a run with events carries along: numbers that switches changed, whether it has ended, what went wrong (code
-    and event), and the log."""
+    and event), the log, and, where it is read off between its steps, the pieces of the last."""
 
     modes: list
     ended: Any
     code: Any
     event: Any
     log: Events  # on vectors
+    pieces: Any = None
 
 
 class Part(NamedTuple):
@@ -76,9 +77,14 @@ def asks(ways, s, s1, params, h):
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in lax.stop_gradient((s, s1)))
     noted = jnp.asarray(ways.events.noted)
     below = (g1 <= 0) & (~noted | (g0 > 0))
-    turns = (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
+    turns = falls_and_rises(g0, d0, g1, d1)
     crossing = (g1 - g0 - d1 * h) / jnp.where(turns, d0 - d1, 1)  # of the tangents at both ends
     return jnp.any(below | (turns & (g0 + d0 * crossing <= 0)))
+
+
+def falls_and_rises(g0, d0, g1, d1):
+    """Whether a guard that is positive at both ends may be zero between them."""
+    return (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
 
 
 def pass_events(ways, params, part, h):
@@ -105,8 +111,14 @@ def pass_events(ways, params, part, h):
 
     now = ways.events.with_modes(params, met.modes)
     end = seldom(anew, part.divided & ~met.ended, part.end, now)
-    lost = {name: jnp.where(met.code == FINE, getattr(end, name), jnp.nan) for name in ("q", "v", "w")}
-    return part._replace(end=end._replace(**lost))
+
+    def known(s):
+        lost = {name: jnp.where(met.code == FINE, getattr(s, name), jnp.nan) for name in ("q", "v", "w")}
+        return s._replace(**lost)
+
+    if met.pieces is not None:
+        met = met._replace(pieces=met.pieces._replace(end=known(met.pieces.end)))
+    return part._replace(end=known(end), met=met)
 
 
 def flag(part, bad, code, which):
@@ -137,7 +149,7 @@ def look(ways, part, params, h):
     def cubic(x):
         return g0 + x * (d0 + x * (a + x * b))
 
-    turns = (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
+    turns = falls_and_rises(g0, d0, g1, d1)
     root = jnp.sqrt(jnp.maximum(a * a - 3 * b * d0, 0))
     lowest = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
     touches = turns & (cubic(lowest) < 0)
@@ -163,6 +175,7 @@ def meet(ways, part, found, h, params):
     now = events.with_modes(params, met.modes)
     tau = locate(ways, now, part, this, found, h)
     e, info = go(ways, now, part.start, tau, part.last, h)
+    before = e
     g, d = events.rates(flat, e, now)
     rate = pick(this, d)
     noise = 1e3 * float(jnp.finfo(h.dtype).eps)
@@ -174,7 +187,6 @@ def meet(ways, part, found, h, params):
     beside = ~noted & jnp.any(is_corner(g, d, h, this, events.noted))
     code = jnp.where(beside, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
     code = jnp.where(missed, STAYS, jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE)).astype(met.code.dtype)
-    after = Met(modes, ends, code, i, log)
 
     then = events.with_modes(params, modes)
     beyond = jnp.where(noted, float(jnp.finfo(h.dtype).eps) ** 0.5 * h, 0)  # so that it is not met again
@@ -184,6 +196,8 @@ def meet(ways, part, found, h, params):
     start = begin(ways, e.q, e.v, e.t, then, size)
     end, more = go(ways, then, start, rest, size, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
+    pieces = None if met.pieces is None else met.pieces.divided(before, start, end)
+    after = Met(modes, ends, code, i, log, pieces)
     infos = join_info(join_info(choose(part.divided, part.info, ways.no_info), info), more)
     new = Part(start, end, infos, rest, size, after, jnp.ones_like(part.divided), part.asked)
     return choose(missed & (pick(this, found.touches.astype(h.dtype)) > 0), part, new)

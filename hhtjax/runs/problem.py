@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -41,8 +42,12 @@ class Problem(NamedTuple):
         t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew
         return cls(system, stepper, q0, v0, params, t0, z0)
 
+    def times(self, t):
+        """Times in the dtype of the state."""
+        return jnp.asarray(t).astype(jax.tree.leaves(self.q0)[0].dtype)
+
     def flat(self):
         """The system on vectors, q, v, t0 and the params."""
         params = thaw(self.params)
         flat, q, v = flatten("simulate", self.system, self.q0, self.v0, self.t0, params, self.z0)
-        return flat, q, v, jnp.asarray(self.t0).astype(q.dtype), params
+        return flat, q, v, self.times(self.t0), params

@@ -73,7 +73,8 @@ def simulate(
         events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
             happen; the grid stays what it is. Steps without one take as long as before, and a look at the guards. For
             the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`.
-        max_events: how many may fall into one step; more are a failure.
+        max_events: how many may fall into one step; more are a failure. With `adaptive` steps become shorter first, and
+            what lies behind an event has an error of its own.
         keep_events: how many `run.events` has room for.
 
     Returns:
@@ -104,23 +105,18 @@ def simulate(
     save_every = require_integer("simulate", "save_every", save_every)
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
-    if events is not None and isinstance(dt, Adaptive):
-        raise NotImplementedError(
-            "simulate: with `events`, give `dt` as numbers: error control takes motions without jumps."
-        )
-    if isinstance(dt, Adaptive) or times is not None:
-        require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
-        return run_controlled(problem, times, dt, progress)
-    dt, num_steps = require_steps("simulate", stepper, dt, num_steps)
-    if num_steps % save_every:
-        raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
-
     room = (
         require_integer("simulate", "max_events", max_events),
         require_integer("simulate", "keep_events", keep_events),
     )
     if events is not None:
         events = require_events("simulate", problem, events)
+    if isinstance(dt, Adaptive) or times is not None:
+        require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
+        return run_controlled(problem, times, dt, progress, events, room)
+    dt, num_steps = require_steps("simulate", stepper, dt, num_steps)
+    if num_steps % save_every:
+        raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room}

@@ -63,7 +63,7 @@ def sweep(
             `jax.device_get` of them before mixing them with others.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
         events, max_events, keep_events: those of `simulate`. A block looks for events in the steps in which one of its
-            members meets some, so that they cost a batch little; not with dts=adaptive(...).
+            members meets some, so that they cost a batch little.
 
     Returns:
         A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for

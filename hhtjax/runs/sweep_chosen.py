@@ -19,21 +19,21 @@ from hhtjax.xla import or_plain
 def sweep_chosen(inputs, progress):
     """The `Solution` of a sweep whose `dts` are an `Adaptive`."""
     static = {"mapped": inputs.mapped, "size": inputs.size, "lanes": lanes_for(inputs.size), "progress": progress}
-    starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times))
-    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static))
+    starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times, inputs.events))
+    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, room=inputs.room))
     steps = trimmed(runs.steps)
     return runs._replace(dt=steps.dt, steps=steps)
 
 
-@partial(jax.jit, static_argnames=("mapped", "size", "lanes", "progress"))
-def run_chosen(system, start, choice, *, mapped, size, lanes, progress):
-    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0 and times, of runs and of steps."""
+@partial(jax.jit, static_argnames=("mapped", "size", "lanes", "progress", "room"))
+def run_chosen(system, start, choice, *, mapped, size, lanes, progress, room):
+    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, of runs, of steps."""
 
-    def members_of(data, control, t0, times):
+    def members_of(data, control, t0, times, events):
         dtype = jax.tree.leaves(data[1])[0].dtype
         times, t0 = (jnp.asarray(x).astype(dtype) for x in (times, t0))
         arrays, structure = jax.tree.flatten((data, control))
-        return Members(system, arrays, structure, axes, t0, times, size, lanes)
+        return Members(system, arrays, structure, axes, t0, times, size, lanes, events, room)
 
     control = start[1]
     axes = [0 if flag else None for flag in mapped] + [0 if jnp.ndim(x) else None for x in jax.tree.leaves(control)]
@@ -61,7 +61,7 @@ def run_many(members, steps, ends, progress, halved=False):
         return Grid.of(t0, times, ends, accepted, halved)
 
     def member(arrays, grid):
-        return follow(members.problem(arrays), times, grid)
+        return follow(members.problem(arrays), times, grid, members.events, members.room)
 
     def block(numbered):
         number, those = numbered

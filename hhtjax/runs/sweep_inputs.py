@@ -84,8 +84,6 @@ class Inputs(NamedTuple):
         room = require_integer("sweep", "max_events", max_events), require_integer("sweep", "keep_events", keep_events)
         if events is None:
             return self
-        if isinstance(self.dts, Adaptive):
-            raise NotImplementedError("sweep: with dts=adaptive(...), leave `events` out.")
 
         def problem_of(data):
             stepper, q0, v0, params, z0 = data

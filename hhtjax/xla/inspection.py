@@ -25,6 +25,7 @@ KNOWN = {
 CHECKS = {"dot_general": is_small_product, "reduce": is_small_sum, "reduce_window": is_small_sum}
 PROVEN_TYPES = {"f32", "f64", "i1", "i32", "i64", "ui32", "ui64"}
 MOST_OPERATIONS = 5000  # of more, compiling takes long, or fails: gradients of a chain of bodies
+MOST_IN_BRANCHES = 20_000  # the same, of all branches together
 
 
 class Inspection:
@@ -38,7 +39,7 @@ class Inspection:
     def __init__(self, functions, call, is_partitioned=False):
         self.functions = functions
         self.seen, self.finished = set(), []
-        self.operations = 0
+        self.operations = self.in_branches = 0
         self.stages, self.products, self.choices = {}, [], []
         self.is_proven = True
         self.objection = "partitioned over devices; shard_map leaves each its own kernel" if is_partitioned else None
@@ -65,7 +66,10 @@ class Inspection:
             self.is_proven &= _types(op) <= PROVEN_TYPES
         elif (dialect == "stablehlo" and name in PROVEN | KNOWN) or dialect in ("chlo", "func"):
             self.is_proven &= name not in KNOWN and _types(op) <= PROVEN_TYPES
-            self._look_at_all(directly_in(op))
+            if name in ("case", "if"):
+                self._look_into_branches(op)
+            else:
+                self._look_at_all(directly_in(op))
         else:
             self.object(op.name)
 
@@ -79,6 +83,17 @@ class Inspection:
 
     def look_into_custom_call(self, op):
         self.object(ir.StringAttr(op.attributes["call_target_name"]).value)
+
+    def _look_into_branches(self, op):
+        """Each counted by itself: what is seldom taken, as at events, may have as many operations as all the rest."""
+        around = self.operations
+        for region in op.regions:
+            self.operations = 0
+            self._look_at_all(x.operation for block in region for x in block)
+            self.in_branches += self.operations
+        self.operations = around
+        if self.in_branches > MOST_IN_BRANCHES:
+            self.object(f"more than {MOST_IN_BRANCHES} operations in branches")
 
     def _look_at_all(self, operations):
         for op in operations:

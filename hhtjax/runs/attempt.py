@@ -1,0 +1,186 @@
+"""One step under error control: tried, judged by the estimate of its error, taken or not; and how long the next is."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.runs.events import before_any
+from hhtjax.systems import held, kinematics
+
+SAFETY, LEAST, MOST = 0.9, 0.2, 2.0  # of the factors by which steps change; more than 2 is unstable for some methods
+PROPORTIONAL, INTEGRAL = 0.7, 0.4  # of the PI controller, divided by the order of the estimate
+NOT_FINITE = 1e6  # the error of a step that is not finite
+LOWEST = 1e-4  # error of the step before, as the controller sees it
+ROUNDINGS = 16  # of t, of which a step is at least
+DONE, TOO_SHORT, TOO_MANY, BROKEN, AT_EVENT = range(5)
+
+
+class Walk(NamedTuple):
+    """What the loop carries."""
+
+    state: Any
+    h: Any
+    last: Any
+    past: Any
+    before: Any  # error of the last accepted step
+    error: Any
+    q_size: Any
+    v_size: Any
+    accepted: Any
+    rejected: Any
+    stop: Any
+    met: Any = None  # of events
+
+
+class Trial(NamedTuple):
+    """How steps are tried, to the time `end`. ways, past_events: how to pass events, and what a try becomes by it."""
+
+    flat: Any
+    stepper: Any
+    params: Any
+    end: Any
+    bounds: Any
+    max_steps: int
+    ways: Any = None
+    past_events: Any = None
+
+    def params_of(self, walk):
+        """The params of the next step."""
+        return self.params if self.ways is None else self.ways.events.with_modes(self.params, walk.met.modes)
+
+
+class Try(NamedTuple):
+    """A step that was tried: the walk if it is accepted, its error, the step to try next, what of it must not fall
+    below the least step, and why there are no more steps if it does."""
+
+    walk: Walk
+    error: Any
+    h: Any
+    shortest: Any
+    why: Any
+
+
+class Bounds(NamedTuple):
+    """Tolerances and bounds in the dtype of the state. scale: the tolerance of a step, relative to that of the run."""
+
+    rtol: Any
+    atol: Any  # of positions
+    atol_v: Any  # (N,), of velocities and of internal states
+    scale: Any
+    least: Any
+    most: Any
+
+    @classmethod
+    def of(cls, flat, stepper, control, t0, end):
+        """Those of an `Adaptive`."""
+        names = "rtol", "atol", "atol_v", "dt_min", "dt_max"
+        rtol, atol, atol_v, least, most = (jnp.asarray(getattr(control, name)).astype(t0.dtype) for name in names)
+        n, N = flat.positions, flat.size
+        rounding = ROUNDINGS * float(jnp.finfo(t0.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(end))
+        each = jnp.concatenate([jnp.full(n, atol_v), jnp.full(N - n, atol)])
+        power = stepper.estimate_order / stepper.order - 1
+        return cls(rtol, atol, each, rtol**power, jnp.maximum(least, rounding), most)
+
+    def relative(self, flat, errors, q_size, v_size):
+        """The largest error, 1 where it is the tolerance."""
+        error = jnp.max(jnp.abs(errors.v) / (self.atol_v + self.rtol * v_size))
+        if flat.positions:
+            e_q = jnp.abs(flat.located(errors.q)) / (self.atol + self.rtol * q_size)
+            error = jnp.maximum(error, jnp.max(e_q))
+        return error / self.scale
+
+    def first(self, state, v_size, span):
+        """A step that changes v by about its tolerance, and not more than a hundredth of all."""
+        tiny = float(jnp.finfo(span.dtype).tiny)
+        slow = (self.atol_v + self.rtol * v_size) * self.scale / jnp.maximum(jnp.abs(state.w), tiny)
+        h = jnp.minimum(jnp.min(jnp.sqrt(slow)), jnp.minimum(span / 100, self.most))
+        return jnp.where(h > self.least, h, jnp.minimum(span / 100, self.most))
+
+
+def sizes(flat, state):
+    """Of positions and rates."""
+    return kinematics.sizes(flat.blocks, state.q), jnp.abs(state.v)
+
+
+def next_step(h, error, before, accept, order):
+    """The PI controller: Gustafsson's, in the form of Hairer and Wanner, Sec. IV.2."""
+    small = jnp.maximum(error, 1e-10)
+    grown = SAFETY * small ** (-PROPORTIONAL / order) * before ** (INTEGRAL / order)
+    shrunk = jnp.clip(SAFETY * small ** (-1 / order), 0.1, 0.9)
+    return h * jnp.where(accept, jnp.clip(grown, LEAST, MOST), shrunk)
+
+
+def succeeded(state, info, error):
+    """Whether all that a step tells is fine."""
+    fine = jnp.isfinite(error) & jnp.all(jnp.isfinite(state.w)) & jnp.all(jnp.isfinite(state.q))
+    independent = None if info.dependent_row is None else info.dependent_row == 0
+    for told in (info.converged, info.solved, independent):
+        fine = fine if told is None else fine & told
+    return fine
+
+
+def is_walking(walk, end):
+    """Whether there is more to try."""
+    going = (walk.state.t < end) & (walk.stop == DONE)
+    return going if walk.met is None else going & ~walk.met.ended
+
+
+def next_end(params, end, walk):
+    """The next step, and the time at which it ends: that of the walk, or one or two halves, to the end, or a jump."""
+    t, h = walk.state.t, walk.h
+    due = jnp.minimum(end, held.jump_after(params, t)) if held.holds(params) else end
+    left = due - t
+    lands = left <= h
+    h = jnp.where(lands, left, jnp.where(left < 2 * h, left / 2, h))
+    return h, jnp.where(lands, due, t + h)
+
+
+def attempt(trial, walk):
+    """Walk -> Walk after one try, and the time at which it would have ended."""
+    bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
+    h, t1 = next_end(params, trial.end, walk)
+    resized, state = trial.stepper.resized(walk.state, h / walk.last)
+    now, state = held.entered(resized, trial.flat, params, h, walk.last, state)
+    s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, walk.past)(state)
+    s1 = s1._replace(t=t1)
+    q_size, v_size = map(jnp.maximum, (walk.q_size, walk.v_size), sizes(trial.flat, s1))
+    error = bounds.relative(trial.flat, errors, q_size, v_size)
+    fine = succeeded(s1, info, error)
+    error = jnp.where(fine, error, NOT_FINITE)
+    h1 = jnp.minimum(next_step(h, error, walk.before, error <= 1, order), bounds.most)
+    floor = jnp.maximum(error, LOWEST)
+    new = walk._replace(state=s1, last=h, past=past, before=floor, q_size=q_size, v_size=v_size)
+    tried = Try(new._replace(accepted=walk.accepted + 1), error, h1, h1, jnp.where(fine, TOO_SHORT, BROKEN))
+    if trial.ways is not None:
+        tried = trial.past_events(trial, tried, walk, h)
+    return taken(trial, walk, tried), s1.t
+
+
+def taken(trial, walk, tried):
+    """The walk after a try: taken, or to be taken again."""
+    accept = tried.error <= 1
+    again = walk._replace(rejected=walk.rejected + 1)
+    if walk.met is not None:  # what is wrong there
+        again = again._replace(met=walk.met._replace(code=tried.walk.met.code, event=tried.walk.met.event))
+    walk = jax.tree.map(partial(jnp.where, accept), tried.walk, again)._replace(h=tried.h, error=tried.error)
+    stop = jnp.where(accept | (tried.shortest >= trial.bounds.least), DONE, tried.why).astype(jnp.int32)
+    walk = walk._replace(stop=stop)
+    spent = is_walking(walk, trial.end) & (walk.accepted + walk.rejected >= trial.max_steps)
+    return walk._replace(stop=jnp.where(spent, TOO_MANY, stop))
+
+
+def begin(trial, q, v, t0):
+    """The walk before its first step. The method starts with the longest of these, of which others are parts."""
+    flat, stepper, bounds = trial.flat, trial.stepper, trial.bounds
+    longest = jnp.minimum((trial.end - t0) / 100, bounds.most)
+    state = stepper.begin(flat, q, v, t0, held.before(trial.params, t0, longest), longest)
+    q_size, v_size = sizes(flat, state)
+    h = bounds.first(state, v_size, trial.end - t0)
+    one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)
+    past = stepper.begin_estimates(flat, state)
+    walk = Walk(state, h, longest, past, one, one, q_size, v_size, none, none, none)
+    if trial.ways is None:
+        return walk
+    return walk._replace(met=before_any(trial.ways, state, trial.params, trial.ways.max_events))

@@ -1,0 +1,80 @@
+"""Events under error control: a step that is accepted passes them, and what is left of it behind them is judged anew.
+
+The estimate of a step knows nothing of what comes behind an event, where the force may be another: so the rest has one
+of its own, as of a first step. If it is too large the whole step is tried again, with a shorter rest. And if there is
+another event in the rest, the step is tried again up to the middle between both, for what is between has no estimate.
+Where an event cannot be passed, shorter steps are tried too.
+"""
+
+from functools import partial, reduce
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.numerics.seldom import choose, seldom
+from hhtjax.runs.attempt import AT_EVENT, BROKEN, NOT_FINITE, SAFETY, TOO_SHORT, Trial, Try, sizes, succeeded
+from hhtjax.runs.event_failures import FINE, MANY
+from hhtjax.runs.loop import neutral_info, resized_step
+from hhtjax.runs.meeting import SHORT, Part, Ways, asks, pass_events
+from hhtjax.systems import held
+from hhtjax.systems.events import flatten_events
+
+
+def trial_of(problem, end, bounds, max_steps, events=None, room=()):
+    """How the steps of a problem are tried, with events or without."""
+    flat, q, v, t0, params = problem.flat()
+    stepper = problem.stepper.astype(q.dtype)
+    trial = Trial(flat, stepper, params, end, bounds, max_steps)
+    if events is None:
+        return trial
+
+    def one(h):
+        return resized_step(flat, stepper, params, h, h)(stepper.begin(flat, q, v, t0, params, h))
+
+    no_info = neutral_info(jax.eval_shape(one, end)[1])
+    flat_events = flatten_events(flat, events, params, stepper.redundant)
+    return trial._replace(ways=Ways(flat, stepper, flat_events, room[0], no_info), past_events=past_events)
+
+
+def past_events(trial, tried, walk, h):
+    """The try, past the events in its step."""
+    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, trial.params_of(walk), h)
+    return seldom(partial(passed, trial), asked, tried, walk, h)
+
+
+def passed(trial, tried, walk, h):
+    """The same where there may be one."""
+    ways, log = trial.ways, walk.met.log
+    met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE), log=log._replace(count=0 * log.count))
+    part = Part(walk.state, tried.walk.state, ways.no_info, h, walk.last, met, met.ended, ~met.ended)
+    part = pass_events(ways, trial.params, part, h)
+    later = jnp.arange(log.t.size, dtype=log.count.dtype) < part.met.log.count
+    later &= part.met.log.t > part.met.log.t[0] + SHORT * h
+    second = jnp.min(jnp.where(later, part.met.log.t, jnp.inf))
+    middle = jnp.where(jnp.any(later), (part.met.log.t[0] + second) / 2 - walk.state.t, h / 2)
+    code = jnp.where((part.met.code == FINE) & jnp.any(later), MANY, part.met.code).astype(met.code.dtype)
+    part = part._replace(met=part.met._replace(code=code))
+    lost = tried._replace(
+        walk=tried.walk._replace(met=part.met), error=jnp.full_like(tried.error, NOT_FINITE), h=middle, shortest=middle,
+        why=jnp.full_like(tried.why, AT_EVENT),
+    )  # fmt: skip
+    judged = choose(part.divided, behind(trial, tried, walk, part, h), tried)
+    return choose(code == FINE, judged, lost)
+
+
+def behind(trial, tried, walk, part, h):
+    """The try with the error of the rest behind an event; so long as that is too large, the rest becomes shorter."""
+    past, met = trial.stepper.begin_estimates(trial.flat, part.end), part.met
+    reached = [(walk.q_size, walk.v_size), *(sizes(trial.flat, s) for s in (part.start, part.end))]  # and no farther
+    q_size, v_size = (reduce(jnp.maximum, x) for x in zip(*reached, strict=True))
+    new = tried.walk._replace(state=part.end, past=past, before=jnp.ones_like(h), q_size=q_size, v_size=v_size, met=met)
+    rest = jnp.maximum(part.rest, SHORT * h)
+    params = held.held_at(trial.params_of(new), part.start.t + rest / 2)
+    errors = trial.stepper.bind_estimated(trial.flat, params, rest, past)(part.start)[2]
+    error = jnp.where(met.ended, 0, trial.bounds.relative(trial.flat, errors, q_size, v_size))
+    fine = succeeded(part.end, part.info, error)
+    error = jnp.where(fine, error, NOT_FINITE)
+    best = SAFETY * jnp.maximum(error, float(jnp.finfo(h.dtype).tiny)) ** (-1 / trial.stepper.estimate_order)
+    shorter = rest * jnp.clip(best, 0.1, 0.9)
+    h = jnp.where(error <= 1, jnp.minimum(h, rest * best), h - rest + shorter)
+    return Try(new, error, h, shorter, jnp.where(fine, TOO_SHORT, BROKEN))
