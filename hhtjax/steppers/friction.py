@@ -118,8 +118,7 @@ def bind_friction(method, system, params, dt, kept=None):
         dtau = end.tau
         z = z - matvec(G.T, dtau)
         x = method.advance(s, dt, z[:size])[0]
-        taken = None if shift is None else shift(z[size + system.num_constraints :])
-        x = x if taken is None else x - taken
+        x = x if shift is None else x - shift(z[size + system.num_constraints :])
         s1 = system.tidy(_behind(system, params, s, path(z), x, end, dtau, f, G, K))
         if method.estimating:
             defect = _defect(method, system, params, rubbing, path(z), dtau, inverse)
