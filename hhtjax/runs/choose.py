@@ -72,7 +72,8 @@ class Steps(NamedTuple):
 
 
 def choose(problem, end, control, progress=False, events=None, room=()):
-    """`Steps` from t0 to end, and (max_steps,) the times at which they end; no tracer of autodiff may come in."""
+    """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf behind them; no tracer of autodiff may
+    come in."""
     flat, q, v, t0, _ = problem.flat()
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
     trial = trial_of(problem, end, bounds, control.max_steps, events, room)
@@ -88,10 +89,11 @@ def choose(problem, end, control, progress=False, events=None, room=()):
         new, t = one_try(walk)
         if progress:
             show(walk.state.t, new.state.t, t0, end)
+        t = jnp.where(new.accepted > walk.accepted, t, jnp.inf)
         return new, lax.dynamic_update_index_in_dim(times, t, walk.accepted, 0)
 
     def run(walk):
-        return lax.while_loop(unfinished, body, (walk, jnp.zeros(control.max_steps, t0.dtype)))
+        return lax.while_loop(unfinished, body, (walk, jnp.full(control.max_steps, jnp.inf, t0.dtype)))
 
     walk, times = one_kernel(run, form.tree)
     return as_steps(form.joined(walk), times, t0, bounds.least), times

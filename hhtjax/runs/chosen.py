@@ -38,29 +38,39 @@ def chosen_steps(problem, times, control, events=None, progress=False, room=()):
 
 
 class Grid(NamedTuple):
-    """Frozen steps. ends: (N,), inf behind the last; dt: (N,), 1 behind it; counts: (K,), how many there are from one
-    of the times to the next, the last of them ending at it or beyond; reached: the end of the last."""
+    """Frozen steps from t0 on. ends: (N,), inf behind the last; counts: (K,), how many there are from one of the times
+    to the next, the last of them ending at it or beyond; reached: the end of the last."""
 
+    t0: Any
     ends: Any
-    dt: Any
     counts: Any
     reached: Any
 
     @classmethod
     def of(cls, t0, times, ends, accepted, halved=False):
         """Those with these ends, of which so many were accepted; each halved or not."""
-        behind = jnp.arange(ends.size, dtype=jnp.int32) >= accepted
-        # the last accepted end, behind it: steps that nothing takes
         reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
-        grid = jnp.concatenate([t0[None], jnp.where(behind, jnp.inf, ends)])
-        needed = jnp.searchsorted(grid, jnp.minimum(times, reached))
+        wanted = jnp.minimum(times, reached)
+        needed = jnp.searchsorted(ends, wanted) + (t0 < wanted)
         if halved:
-            middles = (grid[:-1] + jnp.where(behind, grid[:-1], grid[1:])) / 2
-            grid = jnp.concatenate([grid[:1], jnp.stack([middles, grid[1:]], 1).ravel()])
-            needed = 2 * needed - (grid[2 * needed - 1] >= times).astype(needed.dtype)
-        dt = jnp.diff(grid)
-        counts = jnp.diff(needed, prepend=0).astype(jnp.int32)
-        return cls(grid[1:], jnp.where(jnp.isfinite(dt), dt, 1), counts, reached)
+            starts = jnp.concatenate([t0[None], ends[:-1]])
+            middles = (starts + jnp.where(jnp.isfinite(ends), ends, starts)) / 2
+            ends = jnp.stack([middles, ends], 1).ravel()
+            needed = 2 * needed - ((needed > 0) & (ends[2 * needed - 2] >= times)).astype(needed.dtype)
+        return cls(t0, ends, jnp.diff(needed, prepend=0).astype(jnp.int32), reached)
+
+    def sizes(self, number):
+        """Of a step its size, that of the one before, and where it ends; behind the last 1, and inf."""
+
+        def time(taken):
+            end = lax.dynamic_index_in_dim(self.ends, jnp.maximum(taken - 1, 0), keepdims=False)
+            return jnp.where(taken > 0, end, self.t0)
+
+        before, start, end = (time(number + i) for i in (-1, 0, 1))
+        is_there = jnp.isfinite(end) & (number < self.ends.size)
+        h = jnp.where(is_there, end - start, 1)
+        last = jnp.where(jnp.isfinite(start) & (number > 0), start - before, h)
+        return h, last, jnp.where(is_there, end, jnp.inf)
 
 
 @partial(jax.jit, static_argnames=("halved", "room"))
@@ -73,8 +83,8 @@ def run_over(problem, times, ends, accepted, events=None, halved=False, room=())
 def follow(problem, times, grid, events=None, room=()):
     """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
     flat, q, v, t0, params = problem.flat()
-    dt, longest = grid.dt, largest_in_batch(grid.counts)
-    plain = loop = loop_over(flat, problem.stepper, q, v, t0, params, dt, ends=grid.ends)
+    longest = largest_in_batch(grid.counts)
+    plain = loop = loop_over(flat, problem.stepper, q, v, t0, params, grid.sizes)
     if events is not None:
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, in_pieces=True)
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
@@ -88,7 +98,7 @@ def follow(problem, times, grid, events=None, room=()):
     (first, _), (second, extra) = form.joined(first), form.joined(second)
     start = loop.carry[0]
     flaw = flaw_at_start(problem.system, flat, start, params)
-    ends = [as_solution(flat, start, path, dt, info, failure, flaw) for path in (first, second)]
+    ends = [as_solution(flat, start, path, None, info, failure, flaw) for path in (first, second)]
     if events is None:
         return read_off(flat, ends, extra, times, grid.reached)
     met = form.joined(met[0])

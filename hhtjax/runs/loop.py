@@ -47,20 +47,22 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     return Loop(carry, counted(step, flat, t0, dt), partial(saved, flat), no_info, advance, lambda count: (dt, dt))
 
 
-def loop_over(flat, stepper, q, v, t0, params, dt, ends=None):
-    """The same with steps dt (N,), of any sizes; NaN where one is not positive. ends: where they end, if known."""
-    stepper = stepper.astype(q.dtype)
+def given_sizes(t0, dt):
+    """`sizes` of `loop_over` for steps dt (N,); NaN where one is not positive."""
     dt = jnp.where((dt > 0) & jnp.isfinite(dt), dt, jnp.nan)
-    steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt) if ends is None else ends
-    first = dt[0]
+    steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt)
+    return lambda number: [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
 
-    def here(number):
-        return [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
+
+def loop_over(flat, stepper, q, v, t0, params, sizes):
+    """The same with steps of any sizes: number of steps taken -> the next, the one before, and where it ends."""
+    stepper = stepper.astype(q.dtype)
+    first = sizes(jnp.zeros((), jnp.int32))[0]
 
     def advance(params):
         @partial(jax.jit, inline=True)  # traced once, wherever it is called
         def take_step(state, number):
-            h, last, end = here(number)
+            h, last, end = sizes(number)
             state, info = resized_step(flat, stepper, params, h, last)(state)
             return state._replace(t=end), info
 
@@ -75,7 +77,7 @@ def loop_over(flat, stepper, q, v, t0, params, dt, ends=None):
     one = jax.eval_shape(resized_step(flat, stepper, params, first, first), start)
     no_info = neutral_info(one[1])
     carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    return Loop(carry, advance(params), partial(saved, flat), no_info, advance, lambda count: tuple(here(count)[:2]))
+    return Loop(carry, advance(params), partial(saved, flat), no_info, advance, lambda count: tuple(sizes(count)[:2]))
 
 
 def resized_step(flat, stepper, params, dt, last):

@@ -14,7 +14,7 @@ from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
 from hhtjax.runs.given_steps import refined, require_control_alone, require_steps
-from hhtjax.runs.loop import as_solution, flaw_at_start, loop_of, loop_over, show_progress
+from hhtjax.runs.loop import as_solution, flaw_at_start, given_sizes, loop_of, loop_over, show_progress
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, join_info
@@ -129,7 +129,8 @@ def simulate(
 def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
     flat, q, v, t0, params = problem.flat()
     dt = jnp.asarray(dt).astype(q.dtype)
-    plain = loop = (loop_over if dt.ndim else loop_of)(flat, problem.stepper, q, v, t0, params, dt)
+    loop_by, sizes = (loop_over, given_sizes(t0, dt)) if dt.ndim else (loop_of, dt)
+    plain = loop = loop_by(flat, problem.stepper, q, v, t0, params, sizes)
     if events is not None:
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room)
 
