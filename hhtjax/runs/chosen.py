@@ -54,8 +54,7 @@ class Grid(NamedTuple):
         needed = jnp.searchsorted(ends, wanted) + (t0 < wanted)
         if halved:
             starts = jnp.concatenate([t0[None], ends[:-1]])
-            middles = (starts + jnp.where(jnp.isfinite(ends), ends, starts)) / 2
-            ends = jnp.stack([middles, ends], 1).ravel()
+            ends = jnp.stack([(starts + ends) / 2, ends], 1).ravel()
             needed = 2 * needed - ((needed > 0) & (ends[2 * needed - 2] >= times)).astype(needed.dtype)
         return cls(t0, ends, jnp.diff(needed, prepend=0).astype(jnp.int32), reached)
 
