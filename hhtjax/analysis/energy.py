@@ -104,33 +104,34 @@ def _energy_balance(system, solution, params, potential):
         _, stretching = jax.jvp(lambda q: flat.constraint(q, t, params), (q,), motion[:1])
         return P + jnp.dot(L, stretching)
 
-    ends, middles, inside = _points(flat, solution, params)
+    ends, middles = _points(flat, solution, params)
 
-    def over_interval(first, between, last, H, params):
-        """Simpson's rule."""
-        P, P_middle, P_end = (power(q, v, t, L, params) for q, v, t, L in (first, between, last))
+    def over_interval(first, between, last, H):
+        """Simpson's rule; a held input has the value that it has inside."""
+        inside = held.held_at(params, between[2])
+        P, P_middle, P_end = (power(q, v, t, L, inside) for q, v, t, L in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
 
     t, with_L = solution.t, (*ends, solution.multipliers)
     first, last = (jax.tree.map(lambda x, part=part: x[part], with_L) for part in (slice(-1), slice(1, None)))
-    work = jax.vmap(over_interval)(first, middles, last, jnp.diff(t), inside)
+    work = jax.vmap(over_interval)(first, middles, last, jnp.diff(t))
     if flat.friction:
         w = _vectors((solution.acceleration, solution.zdot))
-        work = work + friction_work(flat, solution, ends, middles, w, inside)
+        work = work + friction_work(flat, solution, ends, middles, w, params)
     work = jnp.concatenate([jnp.zeros_like(t[:1]), jnp.cumsum(work)])
     T, V = jax.vmap(energies)(*ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
 
 
 def _points(flat, solution, params):
-    """q, v and t at the saved times, q, v, t and L between them, and the params there, where held inputs are one."""
+    """q, v and t at the saved times, and q, v, t and L between them."""
     t, L = solution.t, solution.multipliers
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
     jumps = held.holds(params) or (switches(solution) if flat.friction else False)
     q, v = _between(solution, H, middle, jumps if not flat.blocks else False)
     ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
     between = q, v, middle, None if L is None else (L[1:] + L[:-1]) / 2
-    return ends, between, jax.vmap(partial(held.held_at, params))(middle)
+    return ends, between
 
 
 def _between(solution, H, middle, jumps):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hhtjax.numerics.elimination import matvec
 from hhtjax.numerics.linear_solve import solve
+from hhtjax.systems import held
 from hhtjax.systems.constraints import factorize_constrained
 from hhtjax.systems.friction import across, directions, responses
 
@@ -32,18 +33,19 @@ def friction_work(flat, solution, ends, middles, w, params):
         integral tau s = h (theta tau0 s0 + (1 - theta) tau1 s1)/2,    d = h (theta s0 + (1 - theta) s1)/2
         mean tau = (tau0 + tau1)/2 + K^-1 H [(w0 + w1)/2 - (v1 - v0)/h],    K = H G
 
-    ends: q, v, t at the saved times, middles: q, v, t, L between; w: (K + 1, N). params: of each interval.
+    ends: q, v, t at the saved times, middles: q, v, t, L between; w: (K + 1, N).
     """
     h, v = jnp.diff(solution.t), ends[1]
     unseen = (w[1:] + w[:-1]) / 2 - jnp.diff(v, axis=0) / h[:, None]
     saved = (*ends, solution.friction, directions_of(solution))
     first, last = (jax.tree.map(lambda x, part=part: x[part], saved) for part in (slice(-1), slice(1, None)))
-    return -h * jax.vmap(partial(_power, flat))(first, middles, last, unseen, params)
+    return -h * jax.vmap(partial(_power, flat, params))(first, middles, last, unseen)
 
 
-def _power(flat, first, middle, last, unseen, params):
-    """The mean of tau' H v over an interval."""
+def _power(flat, params, first, middle, last, unseen):
+    """The mean of tau' H v over an interval; a held input has the value that it has inside."""
     (*_, tau0, sig0), (q, v, t, L), (*_, tau1, sig1) = first, middle, last
+    params = held.held_at(params, t)
     places = first[:3], (q, v, t), last[:3]
     s = [flat.friction.sliding(*at, params) for at in places]
     c = [-flat.friction.sliding(q, 0 * v, t, params) for q, v, t in places]

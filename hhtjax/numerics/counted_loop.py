@@ -12,7 +12,7 @@ from jax.core import eval_jaxpr
 from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
-from hhtjax.xla import TwoWays, derivative, staged
+from hhtjax.xla import TwoWays, derivative, staged, together
 
 SLOTS, LEVELS = 64, 3
 LONGEST = SLOTS**LEVELS  # iterations that reverse mode can go back
@@ -39,7 +39,12 @@ def repeat(body, carry, count):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _repeat(body, count, carry, constants):
-    return lax.fori_loop(0, count, lambda i, carry: body(i, carry, constants), carry)
+    def loop(x):
+        count, carry, constants = x[0], x[1 : 1 + number], x[1 + number :]
+        return lax.fori_loop(0, count, lambda i, carry: body(i, carry, constants), carry)
+
+    number = len(carry)
+    return together(loop, [count, *carry, *constants])
 
 
 @partial(_repeat.defjvp, symbolic_zeros=True)

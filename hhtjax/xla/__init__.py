@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows thirteen functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows fourteen functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -46,6 +46,7 @@ The rest of the library knows thirteen functions of this room, and works as well
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
+    together(f, x)            f(x), of which a batch has all values or none
     explain(f, *args)         what became of the loops of a program
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
@@ -83,7 +84,7 @@ from hhtjax.xla.listing import Listing, Scalar
 from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
-from hhtjax.xla.two_ways import TwoWays, derivative
+from hhtjax.xla.two_ways import TwoWays, derivative, together
 
 __all__ = [
     "RANGE",
@@ -105,6 +106,7 @@ __all__ = [
     "polynomial_sines",
     "staged",
     "structural",
+    "together",
 ]
 
 

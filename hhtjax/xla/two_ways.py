@@ -69,6 +69,26 @@ def derivative(ways, x, dx):
     return found[: ways.number], found[ways.number :]
 
 
+def together(f, x):
+    """f(x), lists of arrays; all of the values have a batch if part of x has it, as those of `derivative` do.
+
+    Args:
+        f: a function that closes over no tracer.
+        x: a list of arrays.
+
+    Returns:
+        The list of values.
+
+    Raises:
+        whatever f raises.
+
+    >>> values = jax.vmap(lambda x: together(lambda x: [x[0], jnp.ones(2)], [x]))(jnp.zeros(3))
+    >>> [value.shape for value in values]
+    [(3,), (3, 2)]
+    """
+    return values_p.bind(*x, f=f)
+
+
 def _divided(args, count):
     return list(args[:count]), list(args[count:])
 
@@ -83,8 +103,8 @@ def _linear(*args, ways, count, backwards):
     return ways.reverse(x, given) if backwards else ways.forward(x, given)[1]
 
 
-def _values(*x, ways):
-    return ways.values(list(x))
+def _values(*x, f):
+    return f(list(x))
 
 
 def _jvp_by(function, args, dots, **params):
@@ -148,8 +168,8 @@ def _batch(primitive, args, axes, ways, count, **params):
     return found, [None] * alone + [0] * (len(found) - alone)
 
 
-def _batch_values(x, axes, ways):
-    found = values_p.bind(*x, ways=ways.batched(list(axes)))
+def _batch_values(x, axes, f):
+    found = values_p.bind(*x, f=jax.vmap(f, (list(axes),)))
     return found, [0] * len(found)
 
 
@@ -158,7 +178,7 @@ def _divide(trace, *args, ways, count):
     known = [arg.pval.get_known() for arg in args]
     if all(x is not None for x in known) or any(x is None for x in known[:count]):
         return trace.default_process_primitive(both_p, args, {"ways": ways, "count": count})
-    values = values_p.bind(*known[:count], ways=ways)
+    values = values_p.bind(*known[:count], f=ways.values)
     params = {"ways": ways, "count": count, "backwards": False}
     return [*values, *trace.default_process_primitive(linear_p, args, params)]
 
@@ -173,7 +193,7 @@ def _divide_equation(saveable, unknown, instantiated, eqn):
         return None, eqn, [True] * results, [True] * results, needed
     ways, number = eqn.params["ways"], eqn.params["ways"].number
     x, values = eqn.invars[:count], eqn.outvars[:number]
-    first = eqn.replace(primitive=values_p, invars=x, outvars=values, params={"ways": ways})
+    first = eqn.replace(primitive=values_p, invars=x, outvars=values, params={"f": ways.values})
     second = eqn.replace(primitive=linear_p, outvars=eqn.outvars[number:], params=eqn.params | {"backwards": False})
     told = [False] * number + [True] * (results - number)
     return first, second, told, told, needed
