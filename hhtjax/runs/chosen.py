@@ -51,7 +51,8 @@ class Grid(NamedTuple):
         """Those with these ends, of which so many were accepted; each halved or not."""
         reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
         wanted = jnp.minimum(times, reached)
-        needed = jnp.searchsorted(ends, wanted) + (t0 < wanted)
+        needed = jnp.searchsorted(ends, wanted)
+        needed = needed + (t0 < wanted).astype(needed.dtype)
         if halved:
             starts = jnp.concatenate([t0[None], ends[:-1]])
             ends = jnp.stack([(starts + ends) / 2, ends], 1).ravel()
