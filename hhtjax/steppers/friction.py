@@ -115,13 +115,13 @@ def bind_friction(method, system, params, dt, kept=None):
             end, left = switch(sf, s0, sig, tau, f, diagonal(W), dt * diagonal(K)), jnp.zeros((), sf.dtype)
         else:
             end, left = run_events(sf, s0, sig, tau, f, W, dt * K)
-        dtau = end.tau
-        z = z - matvec(G.T, dtau)
+        z = z - matvec(G.T, end.tau)
         x = method.advance(s, dt, z[:size])[0]
-        x = x if shift is None else x - shift(z[size + system.num_constraints :])
-        s1 = system.tidy(_behind(system, params, s, path(z), x, end, dtau, f, G, K))
+        taken = None if shift is None else shift(z[size + system.num_constraints :])
+        x = x if taken is None else x - taken
+        s1 = system.tidy(_behind(system, params, s, path(z), x, end, end.tau, f, G, K))
         if method.estimating:
-            defect = _defect(method, system, params, rubbing, path(z), dtau, inverse)
+            defect = _defect(method, system, params, rubbing, path(z), end.tau, inverse)
             info = info._replace(defect=defect, switched=_switched(system, s, s1, end, G))
         info = _told(info, left, _is_limit(law, at, params) & ~jnp.any(f < 0))
         return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
