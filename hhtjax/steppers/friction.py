@@ -119,7 +119,7 @@ def bind_friction(method, system, params, dt, kept=None):
         x = method.advance(s, dt, z[:size])[0]
         taken = None if shift is None else shift(z[size + system.num_constraints :])
         x = x if taken is None else x - taken
-        s1 = system.tidy(_behind(system, params, s, path(z), x, end, end.tau, f, G, K))
+        s1 = system.tidy(_behind(system, params, s, path(z), x, end, f, G, K))
         if method.estimating:
             defect = _defect(method, system, params, rubbing, path(z), end.tau, inverse)
             info = info._replace(defect=defect, switched=_switched(system, s, s1, end, G))
@@ -159,7 +159,7 @@ def _free_step(options, system, r, path, z, s, factorize):
     return z, info, inverse, along
 
 
-def _behind(system, params, s, s1, x, end, dtau, f, G, K):
+def _behind(system, params, s, s1, x, end, f, G, K):
     """The state s1 at the end of the step, displaced by x, moved onto the branches on which its joints end."""
     h, sig = s1.t - s.t, s.friction.sig
     size, sliding = system.size, system.friction.sliding
@@ -175,14 +175,14 @@ def _behind(system, params, s, s1, x, end, dtau, f, G, K):
 
     H = directions(system, s1.q, s1.t, params)
     own = own_rate(system, s1.q, s1.v, s1.t, params)
-    onto = jnp.where(moves, (end.sig - sig) * f - dtau, 0)
+    onto = jnp.where(moves, (end.sig - sig) * f - end.tau, 0)
     w = s1.w - matvec(Gv.T, onto)
     y = solve_some(K, sticks, matvec(H, w) + own)
     w = _taken_off(w, y, Gv)
     a = _taken_off(s1.a, solve_some(K, ~end.kept, matvec(H, s1.a - w)), Gv)
     if s1.L is not None:
         s1 = s1._replace(L=s1.L - matvec(G[:, size : size + system.num_constraints].T, onto + y))
-    tau = jnp.where(sticks, sig * f + dtau + y, end.sig * f)
+    tau = jnp.where(sticks, sig * f + end.tau + y, end.sig * f)
     return s1._replace(w=w, a=a, friction=Rubbing(end.sig, tau))
 
 
