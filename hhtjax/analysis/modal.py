@@ -180,20 +180,8 @@ class _ProjectedLoad(Description):
 
 
 @dataclass(frozen=True, eq=False)
-class _ProjectedForce(Description):
-    """T^T g(T x, T v, t), with the rows of T where g acts."""
-
-    T: Any
-    force: Callable
-
-    def __call__(self, q, v, t, params):
-        T = jnp.asarray(self.T, q.dtype)
-        return T.T @ ravel_pytree(self.force(T @ q, T @ v, t, params))[0]
-
-
-@dataclass(frozen=True, eq=False)
 class _Expanded(Description):
-    """f(T x, T v, t): of dry friction, whose numbers belong to joints."""
+    """f(T x, T v, t), a vector: of dry friction, whose numbers belong to joints."""
 
     T: Any
     function: Callable
@@ -201,6 +189,14 @@ class _Expanded(Description):
     def __call__(self, q, v, t, params):
         T = jnp.asarray(self.T, q.dtype)
         return ravel_pytree(self.function(T @ q, T @ v, t, params))[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _ProjectedForce(_Expanded):
+    """T^T g(T x, T v, t), with the rows of T where g acts."""
+
+    def __call__(self, q, v, t, params):
+        return jnp.asarray(self.T, q.dtype).T @ super().__call__(q, v, t, params)
 
 
 def _velocities(q, v, t, params):
