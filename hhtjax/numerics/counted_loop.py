@@ -39,11 +39,12 @@ def repeat(body, carry, count):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _repeat(body, count, carry, constants):
+    number = len(carry)
+
     def loop(x):
-        count, carry, constants = x[0], x[1 : 1 + number], x[1 + number :]
+        count, carry, constants = split(x, number)
         return lax.fori_loop(0, count, lambda i, carry: body(i, carry, constants), carry)
 
-    number = len(carry)
     return together(loop, [count, *carry, *constants])
 
 
@@ -68,6 +69,11 @@ def _none(x):
 def _instantiate(tangent):
     like: Any = tangent.aval if isinstance(tangent, SymbolicZero) else None
     return tangent if like is None else jnp.zeros(like.shape, like.dtype)
+
+
+def split(x, number):
+    """The count, the carry of so many parts, the constants."""
+    return x[0], x[1 : 1 + number], x[1 + number :]
 
 
 def merged(choices, new, old):
@@ -110,10 +116,6 @@ class Loop:
         slow = self.forward_by_scans, self.reverse_by_scans
         return TwoWays(len(self.floats), self.values, self.forward, self.reverse, *slow)
 
-    def split(self, x):
-        """The count, the carry, the constants."""
-        return x[0], x[1 : 1 + len(self.floats)], x[1 + len(self.floats) :]
-
     def parts(self, dx):
         """Tangents of the carry, and of the constants."""
         number = sum(self.floats)
@@ -129,10 +131,10 @@ class Loop:
         return step, list(compress(carry, self.floats)), list(compress(constants, self.moves))
 
     def values(self, x):
-        return _repeat(self.body, *self.split(x))
+        return _repeat(self.body, *split(x, len(self.floats)))
 
     def forward(self, x, dx):
-        count, carry, constants = self.split(x)
+        count, carry, constants = split(x, len(self.floats))
         dots, moving_dots = self.parts(dx)
 
         def body(i, now):
@@ -144,7 +146,7 @@ class Loop:
         return lax.fori_loop(0, count, body, (carry, dots))
 
     def reverse(self, x, cotangents):
-        count, carry, constants = self.split(x)
+        count, carry, constants = split(x, len(self.floats))
 
         def run(first, number, carry):
             return lax.fori_loop(first, first + number, lambda i, carry: self.body(i, carry, constants), carry)
@@ -182,7 +184,7 @@ class Loop:
 
     def by_scans(self, x):
         """The loop as a nest of scans that skip what is beyond count, a function of what moves, and where it is."""
-        count, carry, constants = self.split(x)
+        count, carry, constants = split(x, len(self.floats))
 
         def level(depth, first, carry, constants):
             """The carry after SLOTS**depth iterations."""

@@ -178,7 +178,7 @@ def _divide(trace, *args, ways, count):
     known = [arg.pval.get_known() for arg in args]
     if all(x is not None for x in known) or any(x is None for x in known[:count]):
         return trace.default_process_primitive(both_p, args, {"ways": ways, "count": count})
-    values = values_p.bind(*known[:count], f=ways.values)
+    values = together(ways.values, known[:count])
     params = {"ways": ways, "count": count, "backwards": False}
     return [*values, *trace.default_process_primitive(linear_p, args, params)]
 
