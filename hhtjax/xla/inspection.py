@@ -24,8 +24,10 @@ KNOWN = {
 # those it knows if they are small
 CHECKS = {"dot_general": is_small_product, "reduce": is_small_sum, "reduce_window": is_small_sum}
 PROVEN_TYPES = {"f32", "f64", "i1", "i32", "i64", "ui32", "ui64"}
-MOST_OPERATIONS = 5000  # of more, compiling takes long, or fails: gradients of a chain of bodies
-MOST_IN_BRANCHES = 20_000  # the same, of all branches together
+# of more, compiling takes long, or fails: LLVM takes 20 s for a gradient of 12,500, as long as for its list of kernels
+MOST_OPERATIONS = 15_000
+MOST_IN_BRANCH = 5000  # of more in one branch, minutes
+MOST_IN_BRANCHES = 20_000  # of all together
 
 
 class Inspection:
@@ -40,6 +42,7 @@ class Inspection:
         self.functions = functions
         self.seen, self.finished = set(), []
         self.operations = self.in_branches = 0
+        self.most = MOST_OPERATIONS
         self.stages, self.products, self.choices = {}, [], []
         self.is_proven = True
         self.objection = "partitioned over devices; shard_map leaves each its own kernel" if is_partitioned else None
@@ -48,8 +51,8 @@ class Inspection:
     def look(self, op):
         """Notes what `op` is, and looks into it."""
         self.operations += 1
-        if self.operations > MOST_OPERATIONS:
-            self.object(f"more than {MOST_OPERATIONS} operations")
+        if self.operations > self.most:
+            self.object(f"more than {self.most} operations")
         dialect, _, name = op.name.partition(".")
         if op.name == "func.call":
             self._look_into_call(op)
@@ -86,12 +89,12 @@ class Inspection:
 
     def _look_into_branches(self, op):
         """Each counted by itself: what is seldom taken, as at events, may have as many operations as all the rest."""
-        around = self.operations
+        around, self.most = (self.operations, self.most), min(self.most, MOST_IN_BRANCH)
         for region in op.regions:
             self.operations = 0
             self._look_at_all(x.operation for block in region for x in block)
             self.in_branches += self.operations
-        self.operations = around
+        self.operations, self.most = around
         if self.in_branches > MOST_IN_BRANCHES:
             self.object(f"more than {MOST_IN_BRANCHES} operations in branches")
 
