@@ -15,6 +15,7 @@ from experiments.page import find
 from experiments.stability import adaptive, dry
 from experiments.stability.grades import cells
 from experiments.stability.scenes import all_cases
+from hhtjax.runs.attempt import PI
 
 ROOT = Path(__file__).parents[1]
 
@@ -63,6 +64,20 @@ def test_under_error_control_nothing_is_silently_wrong():
     assert found["cells"]["halved"]["silently_wrong"] == found["cells"]["tolerance"]["silently_wrong"] == 0
     assert found["cells"]["halved"]["beyond"] == 0
     assert found["cells"]["no"]["accurate"] > 0.75 * len(rows)
+
+
+def test_no_constants_of_the_controller_gain_on_both_halves():
+    """Five per cent of the steps for equal errors; today's are in each scan."""
+    found, work = COMMITTED["controller"], []
+    assert found["today"] == PI._asdict()
+    for half in ("tuned", "held_out"):
+        rows = found[half]["table"]
+        work.append([row["work"] for row in rows])
+        today = {(name, f"{getattr(PI, name):g}") for name in ("safety", "most", "least")}
+        assert all(row["work"] == row["steps"] == 1 for row in rows if (row["parameter"], row["value"]) in today)
+        assert all(row["runs"] > 100 for row in rows)
+    assert not set(found["tuned"]["scenes"]) & set(found["held_out"]["scenes"])
+    assert not any(a < 0.95 and b < 0.95 for a, b in zip(*work, strict=True))
 
 
 def test_the_boundaries_are_those_pinned():

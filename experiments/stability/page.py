@@ -71,6 +71,22 @@ def adaptive_table(cells):
     return table(header, [[way, *found.values()] for way, found in cells.items()])
 
 
+def controller_table(found):
+    """Both halves side by side."""
+    tuned, held = (found[half]["table"] for half in ("tuned", "held_out"))
+    kinds = "work", "steps", "median_error", "outside", "alarms"
+    header = ["", "", *(f"{kind.replace('_', ' ')}, {half}" for kind in kinds for half in ("tuned", "held out"))]
+
+    def shown(x):
+        return f"{x:.2f}" if isinstance(x, float) else x
+
+    rows = [
+        [a["parameter"], a["value"], *(shown(x[kind]) for kind in kinds for x in (a, b))]
+        for a, b in zip(tuned, held, strict=True)
+    ]
+    return table(header, rows)
+
+
 def once_wrong(gallery, adaptive, way):
     """Silently wrong cells of the gallery by a letter: that of their scene, method and alpha, verified in a way."""
     letters = Counter()
@@ -110,7 +126,7 @@ def dampers_table(rows):
 def page(numbers):
     """The text of README.md."""
     gallery, reported, advice, peers = (numbers[part] for part in ("gallery", "reported", "advice", "peers"))
-    dry, stops, adaptive = numbers["dry"], numbers["stops"], numbers["adaptive"]
+    dry, stops, adaptive, controller = (numbers[part] for part in ("dry", "stops", "adaptive", "controller"))
     alone, verified = (once_wrong(gallery, adaptive, way) for way in (0, 1))
     runs = {name: [row for rows in x["grades"].values() for row in rows] for name, x in adaptive["scenes"].items()}
     drifting = [name for name, rows in runs.items() if any(row[0] == "w" for row in rows)]
@@ -153,6 +169,11 @@ def page(numbers):
             adaptive_verified=verified["A"] + verified["n"],
             adaptive_wrong=adaptive["cells"]["no"]["silently_wrong"],
             adaptive_scenes=f"all of them of: {', '.join(drifting)}",
+            controller=controller_table(controller),
+            controller_tuned="; ".join(controller["tuned"]["scenes"]),
+            controller_held="; ".join(controller["held_out"]["scenes"]),
+            controller_runs=both(controller[half]["table"][0]["runs"] for half in ("tuned", "held_out")),
+            controller_best=f"{100 * (1 - min(row['work'] for row in controller['held_out']['table'])):.1f}",
             blown_up=reported["cells"]["again"],
             once=reported["cells"]["blown_up"],
             named=reported["cells"]["named_by_check"],

@@ -2,11 +2,23 @@
 
 from experiments.parts import run_experiment
 from experiments.report import Report
-from experiments.stability import adaptive, advice, constrained, drift, dry, gallery, peers, reported, rotating, stops
+from experiments.stability import (
+    adaptive,
+    advice,
+    constrained,
+    controller,
+    drift,
+    dry,
+    gallery,
+    peers,
+    reported,
+    rotating,
+    stops,
+)
 
 GROUPS = (
     [gallery, reported, advice],
-    [adaptive, dry, stops, constrained, rotating, drift, peers],
+    [adaptive, controller, dry, stops, constrained, rotating, drift, peers],
 )  # two processes if fast
 
 

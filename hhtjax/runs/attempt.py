@@ -5,16 +5,30 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.runs.events import before_any
 from hhtjax.systems import held, kinematics
 
-SAFETY, LEAST, MOST = 0.9, 0.2, 2.0  # of the factors by which steps change; more than 2 is unstable for some methods
-PROPORTIONAL, INTEGRAL = 0.7, 0.4  # of the PI controller, divided by the order of the estimate
+SAFETY = 0.9
 NOT_FINITE = 1e6  # the error of a step that is not finite
 LOWEST = 1e-4  # error of the step before, as the controller sees it
 ROUNDINGS = 16  # of t, of which a step is at least
 DONE, TOO_SHORT, TOO_MANY, BROKEN, AT_EVENT = range(5)
+
+
+class Controller(NamedTuple):
+    """Of the factors by which steps change: the PI controller's exponents, divided by the order of the estimate, and
+    bounds behind a step that was accepted. Growth by more than 2 is unstable for some methods."""
+
+    safety: Any = SAFETY
+    proportional: Any = 0.7
+    integral: Any = 0.4
+    least: Any = 0.2
+    most: Any = 2.0
+
+
+PI = Controller()
 
 
 class Walk(NamedTuple):
@@ -24,7 +38,7 @@ class Walk(NamedTuple):
     h: Any
     last: Any
     past: Any
-    before: Any  # error of the last accepted step
+    before: Any  # logarithm of the error of the last accepted step
     error: Any
     q_size: Any
     v_size: Any
@@ -45,6 +59,7 @@ class Trial(NamedTuple):
     max_steps: int
     ways: Any = None
     past_events: Any = None
+    controller: Controller = PI
 
     def params_of(self, walk):
         """The params of the next step."""
@@ -104,12 +119,13 @@ def sizes(flat, state):
     return kinematics.sizes(flat.blocks, state.q), jnp.abs(state.v)
 
 
-def next_step(h, error, before, accept, order):
-    """The PI controller: Gustafsson's, in the form of Hairer and Wanner, Sec. IV.2."""
-    small = jnp.maximum(error, 1e-10)
-    grown = SAFETY * small ** (-PROPORTIONAL / order) * before ** (INTEGRAL / order)
-    shrunk = jnp.clip(SAFETY * small ** (-1 / order), 0.1, 0.9)
-    return h * jnp.where(accept, jnp.clip(grown, LEAST, MOST), shrunk)
+def next_step(h, error, before, accept, order, pi=PI):
+    """The PI controller: Gustafsson's, in the form of Hairer and Wanner, Sec. IV.2; before, and what is returned beside
+    the step, are logarithms of errors."""
+    now = jnp.log(jnp.maximum(error, 1e-10))
+    exponent = jnp.where(accept, pi.integral * before - pi.proportional * now, -now) / order
+    least, most = jnp.where(accept, pi.least, 0.1), jnp.where(accept, pi.most, 0.9)
+    return h * jnp.clip(pi.safety * jnp.exp(exponent), least, most), jnp.maximum(now, float(np.log(LOWEST)))
 
 
 def succeeded(state, info, error):
@@ -149,9 +165,9 @@ def attempt(trial, walk):
     error = bounds.relative(trial.flat, errors, q_size, v_size)
     fine = succeeded(s1, info, error)
     error = jnp.where(fine, error, NOT_FINITE)
-    h1 = jnp.minimum(next_step(h, error, walk.before, error <= 1, order), bounds.most)
-    floor = jnp.maximum(error, LOWEST)
-    new = walk._replace(state=s1, last=h, past=past, before=floor, q_size=q_size, v_size=v_size)
+    h1, before = next_step(h, error, walk.before, error <= 1, order, trial.controller)
+    h1 = jnp.minimum(h1, bounds.most)
+    new = walk._replace(state=s1, last=h, past=past, before=before, q_size=q_size, v_size=v_size)
     tried = Try(new._replace(accepted=walk.accepted + 1), error, h1, h1, jnp.where(fine, TOO_SHORT, BROKEN))
     if trial.ways is not None:
         tried = trial.past_events(trial, tried, walk, h)
@@ -180,7 +196,7 @@ def begin(trial, q, v, t0):
     h = bounds.first(state, v_size, trial.end - t0)
     one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)
     past = stepper.begin_estimates(flat, state)
-    walk = Walk(state, h, longest, past, one, one, q_size, v_size, none, none, none)
+    walk = Walk(state, h, longest, past, 0 * one, one, q_size, v_size, none, none, none)
     if trial.ways is None:
         return walk
     return walk._replace(met=before_any(trial.ways, state, trial.params, trial.ways.max_events))

@@ -67,7 +67,9 @@ def behind(trial, tried, walk, part, h):
     past, met = trial.stepper.begin_estimates(trial.flat, part.end), part.met
     reached = [(walk.q_size, walk.v_size), *(sizes(trial.flat, s) for s in (part.start, part.end))]  # and no farther
     q_size, v_size = (reduce(jnp.maximum, x) for x in zip(*reached, strict=True))
-    new = tried.walk._replace(state=part.end, past=past, before=jnp.ones_like(h), q_size=q_size, v_size=v_size, met=met)
+    new = tried.walk._replace(
+        state=part.end, past=past, before=jnp.zeros_like(h), q_size=q_size, v_size=v_size, met=met
+    )
     rest = jnp.maximum(part.rest, SHORT * h)
     params = held.held_at(trial.params_of(new), part.start.t + rest / 2)
     errors = trial.stepper.bind_estimated(trial.flat, params, rest, past)(part.start)[2]

@@ -10,7 +10,7 @@ from jax import lax
 
 from hhtjax.description import is_concrete
 from hhtjax.description.presentation import overwrite, shown
-from hhtjax.runs.attempt import AT_EVENT, BROKEN, TOO_MANY, TOO_SHORT, Bounds, attempt, begin, is_walking
+from hhtjax.runs.attempt import AT_EVENT, BROKEN, PI, TOO_MANY, TOO_SHORT, Bounds, attempt, begin, is_walking
 from hhtjax.runs.attempt_events import trial_of
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.solution import SimulationError, first_bad
@@ -71,12 +71,12 @@ class Steps(NamedTuple):
         return "" if not is_concrete(self.stop) else self._fault() or "all accepted"
 
 
-def choose(problem, end, control, progress=False, events=None, room=()):
+def choose(problem, end, control, progress=False, events=None, room=(), controller=PI):
     """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf behind them; no tracer of autodiff may
     come in."""
     flat, q, v, t0, _ = problem.flat()
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
-    trial = trial_of(problem, end, bounds, control.max_steps, events, room)
+    trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
     walk = begin(trial, q, v, t0)
     form = on_scalars(partial(attempt, trial._replace(ways=None)), walk)  # as in a run: events are seldom
     one_try = form.of(partial(attempt, trial))
