@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import zoo
-from friction_problems import arm, free_vibration_exact, of_scene
+from friction_problems import CASES, Case, arm, free_vibration_exact, of_scene
 from friction_reference import Motion
 from helpers import ONE, ZERO
 from scipy.integrate import solve_ivp
@@ -143,6 +143,54 @@ def test_the_error_of_dry_friction_follows_the_tolerance(name):
         found.check()
         assert 0.02 < np.max(np.abs(found.q - exact)) / np.max(np.abs(exact)) / rtol < 10
         assert int(found.steps.rejected) <= (0 if name == "free" else 0.15 * int(found.steps.accepted))
+
+
+def push(q, v, t, params):
+    """A spring, and a force that jumps."""
+    return params["u"](t) - 100 * q
+
+
+def own_axis(R, Om, t, params):
+    """The rate about it."""
+    return Om[2:]
+
+
+def constant_limit(q, v, t, params):
+    """F."""
+    return jnp.full(1, params["F"])
+
+
+FORCES = hhtjax.sampled(30 * np.random.default_rng(0).uniform(-1, 1, (11, 1)), dt=0.2, order=0)
+TOP = CASES["a rotation, H(q)"]
+BEARING = hhtjax.System(TOP.system.mass, TOP.system.force, friction=constant_limit, sliding=own_axis)
+PUSHED = hhtjax.System(ONE, push, friction=constant_limit)
+KINDS = {
+    "an internal state": CASES["an internal state"],
+    "a constraint": CASES["a constraint, H(q), a load"],
+    "a rotation": TOP._replace(system=BEARING),
+    "held inputs": Case(PUSHED, {"F": 4.0, "u": FORCES}, ONE, ZERO, 2.0),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", zoo.each(KINDS, quick=()))
+def test_dry_friction_with_more_than_coordinates(name):
+    """Against the same at 1e-5, whose order is tested elsewhere; through all switches."""
+    system, params, q0, v0, duration, z0, *_ = KINDS[name]
+    times = duration * np.arange(1, 65) / 64
+
+    @jax.jit
+    def go(rtol):
+        dt = hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=20_000)
+        return hhtjax.simulate(system, hhtjax.hht(), q0, v0, params, z0=z0, dt=dt, times=times)
+
+    fine = go(1e-5)
+    assert np.sum(np.diff(np.sign(fine.friction), axis=0) != 0) >= 2
+    for rtol in (1e-2, 1e-3):
+        found = go(rtol)
+        found.check()
+        assert 0.02 < np.max(np.abs(found.q - fine.q)) / np.max(np.abs(fine.q)) / rtol < 10
+        assert int(found.steps.rejected) <= 0.1 * int(found.steps.accepted)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from friction_reference import Motion
 from experiments.cells import SAMPLES
 from experiments.dry_motion import dry_motion
 from experiments.page import find
-from experiments.stability import adaptive, dry
+from experiments.stability import adaptive, dry, tolerances
 from experiments.stability.grades import cells
 from experiments.stability.scenes import all_cases
 from hhtjax.runs.attempt import PI
@@ -64,6 +64,19 @@ def test_under_error_control_nothing_is_silently_wrong():
     assert found["cells"]["halved"]["silently_wrong"] == found["cells"]["tolerance"]["silently_wrong"] == 0
     assert found["cells"]["halved"]["beyond"] == 0
     assert found["cells"]["no"]["accurate"] > 0.75 * len(rows)
+
+
+def test_errors_follow_the_tolerance_on_scenes_of_their_own():
+    """But for the orbit, whose period drifts, and beads that come to rest."""
+    found = COMMITTED["tolerances"]
+    assert found["rtol"] == list(tolerances.RTOLS)
+    for scene, by in found["scenes"].items():
+        assert set(by) == set(tolerances.METHODS)
+        for x in by.values():
+            errors = [e for e in x["error"] if e is not None]
+            assert len(errors) >= len(found["rtol"]) - 1
+            low, high = {"Kepler, e = 0.5": (0.02, 50), "charged beads": (0.005, 10)}.get(scene, (0.02, 10))
+            assert all(low < e < high for e in errors)
 
 
 def test_no_constants_of_the_controller_gain_on_both_halves():

@@ -10,6 +10,8 @@ from pathlib import Path
 from experiments.page import table
 from experiments.stability.dry import SET_VALUED, fewest_accurate
 from experiments.stability.peers import MAX_STEPS
+from experiments.stability.tolerances import HIGH, LOW
+from experiments.stability.tolerances import MAX_STEPS as TRIES
 
 HERE = Path(__file__).parent
 
@@ -87,6 +89,23 @@ def controller_table(found):
     return table(header, rows)
 
 
+def tolerances_table(found):
+    """Errors by scene, method and tolerance."""
+    shown = [[s, m, *("-" if e is None else f"{e:.2g}" for e in x["error"])] for s, x, m in _rows(found)]
+    return table(["scene", "method", *(f"{rtol:g}" for rtol in found["rtol"])], shown)
+
+
+def outside(found):
+    """Runs, those whose error is not within the bounds by scene and method, and those that ended too early."""
+    everything = [(f"{s} with {m}", e) for s, x, m in _rows(found) for e in x["error"]]
+    beyond = Counter(name for name, e in everything if e is not None and not LOW <= e <= HIGH)
+    return len(everything), beyond, sum(e is None for _, e in everything)
+
+
+def _rows(found):
+    return [(scene, x, method) for scene, by in found["scenes"].items() for method, x in by.items()]
+
+
 def once_wrong(gallery, adaptive, way):
     """Silently wrong cells of the gallery by a letter: that of their scene, method and alpha, verified in a way."""
     letters = Counter()
@@ -127,6 +146,8 @@ def page(numbers):
     """The text of README.md."""
     gallery, reported, advice, peers = (numbers[part] for part in ("gallery", "reported", "advice", "peers"))
     dry, stops, adaptive, controller = (numbers[part] for part in ("dry", "stops", "adaptive", "controller"))
+    tolerances = numbers["tolerances"]
+    runs_at_all, beyond, too_early = outside(tolerances)
     alone, verified = (once_wrong(gallery, adaptive, way) for way in (0, 1))
     runs = {name: [row for rows in x["grades"].values() for row in rows] for name, x in adaptive["scenes"].items()}
     drifting = [name for name, rows in runs.items() if any(row[0] == "w" for row in rows)]
@@ -174,6 +195,12 @@ def page(numbers):
             controller_held="; ".join(controller["held_out"]["scenes"]),
             controller_runs=both(controller[half]["table"][0]["runs"] for half in ("tuned", "held_out")),
             controller_best=f"{100 * (1 - min(row['work'] for row in controller['held_out']['table'])):.1f}",
+            tolerances=tolerances_table(tolerances),
+            tolerances_runs=runs_at_all,
+            tolerances_within=runs_at_all - sum(beyond.values()) - too_early,
+            tolerances_beyond="; ".join(f"{n} of {name}" for name, n in beyond.items()),
+            tolerances_early=too_early,
+            tolerances_most=f"{TRIES:,}".replace(",", " "),
             blown_up=reported["cells"]["again"],
             once=reported["cells"]["blown_up"],
             named=reported["cells"]["named_by_check"],

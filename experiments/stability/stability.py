@@ -14,11 +14,12 @@ from experiments.stability import (
     reported,
     rotating,
     stops,
+    tolerances,
 )
 
 GROUPS = (
     [gallery, reported, advice],
-    [adaptive, controller, dry, stops, constrained, rotating, drift, peers],
+    [adaptive, tolerances, controller, dry, stops, constrained, rotating, drift, peers],
 )  # two processes if fast
 
 

@@ -78,7 +78,7 @@ class Try(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Tolerances and bounds in the dtype of the state. scale: the tolerance of a step, relative to that of the run."""
+    """Tolerances and bounds in the dtype of the state. scale: the tolerance of the run, relative to that of a step."""
 
     rtol: Any
     atol: Any  # of positions
@@ -95,7 +95,7 @@ class Bounds(NamedTuple):
         n, N = flat.positions, flat.size
         rounding = ROUNDINGS * float(jnp.finfo(t0.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(end))
         each = jnp.concatenate([jnp.full(n, atol_v), jnp.full(N - n, atol)])
-        power = stepper.estimate_order / stepper.order - 1
+        power = 1 - stepper.estimate_order / stepper.order
         return cls(rtol, atol, each, rtol**power, jnp.maximum(least, rounding), most)
 
     def relative(self, flat, errors, q_size, v_size):
@@ -104,12 +104,12 @@ class Bounds(NamedTuple):
         if flat.positions:
             e_q = jnp.abs(flat.located(errors.q)) / (self.atol + self.rtol * q_size)
             error = jnp.maximum(error, jnp.max(e_q))
-        return error / self.scale
+        return error * self.scale
 
     def first(self, state, v_size, span):
         """A step that changes v by about its tolerance, and not more than a hundredth of all."""
         tiny = float(jnp.finfo(span.dtype).tiny)
-        slow = (self.atol_v + self.rtol * v_size) * self.scale / jnp.maximum(jnp.abs(state.w), tiny)
+        slow = (self.atol_v + self.rtol * v_size) / self.scale / jnp.maximum(jnp.abs(state.w), tiny)
         h = jnp.minimum(jnp.min(jnp.sqrt(slow)), jnp.minimum(span / 100, self.most))
         return jnp.where(h > self.least, h, jnp.minimum(span / 100, self.most))
 

@@ -77,8 +77,9 @@ class Controlled(Resizing):
 def family_errors(c, h, w, w1, past, d):
     """The errors of a step from the accelerations w to w1, and what is to be remembered; d: S^-1 r, or None."""
     s = c.alpha_m - c.alpha_f
-    slope = (w1 - w) / h
-    jerk = jnp.where(past.h > 0, 2 * (slope - past.slope) / (h + past.h), slope / (2 * h))
+    rate = 1 / h
+    slope = (w1 - w) * rate
+    jerk = jnp.where(past.h > 0, 2 / (h + past.h), rate / 2) * (slope - past.slope)  # which is 0 before the first
     e_q = jnp.abs((c.beta + s / 2 - 1 / 6) * h**2 * (w1 - w))
     e_v = jnp.abs((1 / 12 - s**2 / 2 + s * (c.alpha_m + c.alpha_f - 1) / 2) * h**3 * jerk)
     if d is not None:

@@ -65,9 +65,8 @@ def adapted(c, r):
     """The coefficients of a step r times as long as the one before, for r > 1."""
     s = c.alpha_m - c.alpha_f
     grown = jnp.maximum(r, 1)
-    sigma = s / grown
-    gamma = (0.5 - sigma) / (1 + s - sigma)
-    new = Coefficients(c.alpha_m, c.alpha_f + weighted(c.alpha_m, s - sigma), (gamma + 0.5) ** 2 / 4, gamma)
+    gamma = (grown / 2 - s) / (grown * (1 + s) - s)  # not through sigma, a division to wait for
+    new = Coefficients(c.alpha_m, c.alpha_f + weighted(c.alpha_m, s - s / grown), (gamma + 0.5) ** 2 / 4, gamma)
     return c._replace(**{
         name: jnp.where(grown > 1, getattr(new, name), getattr(c, name)) for name in ("alpha_f", "beta", "gamma")
     })  # fmt: skip
