@@ -102,7 +102,8 @@ def in_a_loop(stage, s):
         _, V, W = carry
         row, node = (lax.dynamic_index_in_dim(x, i, keepdims=False) for x in (rows, nodes))
         q, v, w = stage(s, node, row, V, W)
-        return q, *(lax.dynamic_update_index_in_dim(X, x, i + 1, 0) for X, x in ((V, v), (W, w)))
+        here = (jnp.arange(STAGES) == i + 1)[:, None]  # an update at i is a scatter, and no kernel, in a derivative
+        return q, *(jnp.where(here, x, X) for X, x in ((V, v), (W, w)))
 
     V, W = (jnp.pad(x[None], ((0, STAGES - 1), (0, 0))) for x in (s.v, s.w))
     q, V, W = lax.fori_loop(0, STAGES - 1, body, (s.q, V, W))
