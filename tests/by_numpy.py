@@ -204,7 +204,7 @@ MOVES = {
     "concatenate": lambda eqn, *x: [np.concatenate(x, eqn.params["dimension"])],
     "stack": lambda eqn, *x: [np.stack(x, eqn.params["axis"])],
     "rev": lambda eqn, x: [np.flip(x, eqn.params["dimensions"])],
-    "hhtjax_watch": lambda eqn, x: [x],
+    **dict.fromkeys(("hhtjax_watch", "hhtjax_largest_in_batch"), lambda eqn, x: [x]),
 }
 
 

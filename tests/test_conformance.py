@@ -13,7 +13,7 @@ from operations_table import ARGUMENTS, TABLE
 from program_writer import HEADER, usual_promotion
 
 from hhtjax.xla import gate, linear_maps, parameters, scalar_calls, scalar_rules
-from hhtjax.xla.kernels import staged, structural
+from hhtjax.xla.kernels import largest_in_batch, staged, structural
 
 pytestmark = [
     pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX"),
@@ -26,6 +26,7 @@ SIGNS_OF_XLA = ("z + 0.0", "0.0 + z", "z - -0.0", "fill_value=-0.0")
 
 def scope():
     known = {"lax": lax, "jnp": jnp, "np": np, "jax": jax, "staged": staged, "structural": structural}
+    known |= {"largest_in_batch": largest_in_batch}
     exec(HEADER, known)
     return known
 

@@ -1,41 +1,60 @@
 """The state about which the non-iterative step expands its residual: where it is worth the most."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.elimination import diagonal
-from hhtjax.steppers.newton import left_by, told
-from hhtjax.steppers.residual import residual
+from hhtjax.numerics.seldom import choose, derivative_of, seldom
+from hhtjax.steppers.newton import left_by, solve_and_keep, told
 from hhtjax.xla import staged
 
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
 
 
-def linearization_point(system, params, s, predicted, where):
-    """The state at t1 about which the non-iterative step expands r; None for the predictor itself."""
+def linearized_step(system, params, r, path, s, dt, factorize, where, again=False):
+    """w at t + dt by one linearisation of r, about the state that `where` says, and its `Info`."""
+
+    def about(at):
+        w, info, *_, here = solve_and_keep(r, path, s.w, factorize, at, again)
+        return w, info, here
+
     if where == "predictor":
-        return None
+        return about(None)[:2]
     if where == "state":
-        return s._replace(t=predicted.t)
-    held = s._replace(t=predicted.t, q=system.move(s.q, (predicted.t - s.t) * s.v))
+        return about(s._replace(t=s.t + dt))[:2]
+    held = s._replace(t=s.t + dt, q=system.move(s.q, dt * s.v))
     if where == "held":
-        return held
+        return about(held)[:2]
     D = system.with_ones(diagonal(system.mass(s.q, params)))
+    limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
+    ways = path(s.w), held, lambda r: jnp.sum(r**2 / D), limit
+    other = jax.jit(about)  # traced once
+    # derivatives by one expansion about the state that was chosen: through both they would take longer to compile
+    return derivative_of(lambda: other(better_state(r, *ways))[:2], lambda: better_solve(about, other, *ways))
 
-    @staged
-    def size(s):
-        return jnp.sum(residual(system, params, s) ** 2 / D)
 
+def better_state(r, predicted, held, size, limit):
+    """The predicted state; or the held one, where the residual at the predicted is large, and the larger one."""
+    size = staged(lambda s, size=size: size(r(s)))
     predicted_size = size(predicted)
-    use_predictor = lax.cond(
-        predicted_size <= HELD_THRESHOLD**2 * jnp.sum(D * s.w**2),
-        lambda: jnp.array(True),
-        lambda: predicted_size <= size(held),
-    )
-    return jax.tree.map(partial(jnp.where, use_predictor), predicted, held)
+    use_predictor = lax.cond(predicted_size <= limit, lambda: jnp.array(True), lambda: predicted_size <= size(held))
+    return choose(use_predictor, predicted, held)
+
+
+def better_solve(about, other, _, held, size, limit):
+    """The solution about that state, with a second evaluation of r only where the first residual is large.
+
+    A branch around it all, and no choice of a state before it: the processor goes on while it waits for the residual.
+    """
+    w, info, here = about(None)
+    predicted_size = size(here)
+
+    def better(found):
+        w, info, here = other(held)
+        return choose(predicted_size <= size(here), found, (w, info))
+
+    return seldom(better, ~(predicted_size <= limit), (w, info))
 
 
 def refresh(system, params, c, s, factorize):

@@ -23,22 +23,22 @@ def linearized_solve(r, path, w, factorize, at=None, again=False):
     One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's. again: one solve
     more, of the residual at the end, which becomes `Info.defect`.
     """
-    w, info, _, _ = solve_and_keep(r, path, w, factorize, at, again)
+    w, info, *_ = solve_and_keep(r, path, w, factorize, at, again)
     return w, info
 
 
 def solve_and_keep(r, path, w, factorize, at=None, again=False):
-    """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
+    """The same, the solve b -> x for more right-hand sides, the linear function from x to the change of state, and the
+    residual at the state about which r was expanded."""
 
     def expand(w, at):
         start, along = jax.linearize(path, w)
-        point = start if at is None else at
-        value, tangent = jax.linearize(r, point)
-        if at is not None:
-            value = value + tangent(jax.tree.map(jnp.subtract, start, point))
-        return value, along, tangent
+        if at is None:
+            return *jax.linearize(r, start), along, None
+        here, tangent = jax.linearize(r, at)
+        return here + tangent(jax.tree.map(jnp.subtract, start, at)), tangent, along, here
 
-    value, along, tangent = staged(expand, w.size)(w, at)
+    value, tangent, along, here = staged(expand, w.size)(w, at)
 
     def f(dw):
         return tangent(along(dw))
@@ -47,7 +47,13 @@ def solve_and_keep(r, path, w, factorize, at=None, again=False):
     inverse = factorize_map(f, value, factorize)
     dw = inverse(value)
     info = told(factorize, left_by(factorize, f, value, dw))
-    return w - dw, info._replace(defect=inverse(r(path(w - dw)))) if again else info, inverse, along
+    return (
+        w - dw,
+        info._replace(defect=inverse(r(path(w - dw)))) if again else info,
+        inverse,
+        along,
+        value if at is None else here,
+    )
 
 
 def left_by(factorize, f, b, x):

@@ -97,6 +97,7 @@ UNDERSTOOD = {
         **{"ctx_mesh": lambda mesh: mesh.empty, "compiler_options_kvs": _empty},
     },
     "hhtjax_structural": {},
+    "hhtjax_largest_in_batch": {},
 }
 
 

@@ -223,6 +223,11 @@ def _structural(eqn, x):
     return [each(lambda x: ZEROS.get(dtype, x) if is_known(x) and x == 0 else x, x)]
 
 
+def _largest(eqn, x):
+    """In a list there is no batch."""
+    return [x] if recorder_of(x.flat) is not None else _elementwise(eqn, x)
+
+
 def _moved(*moves):
     """Of what moves elements to places that are known: asked where it takes the numbers of the elements.
 
@@ -276,6 +281,7 @@ RULES = {
     **{f"reduce_{kind}": _choice(kind) for kind in ("max", "min")},
     **{"reduce_sum": _reduction("add"), "reduce_prod": _reduction("mul")},
     "hhtjax_structural": _structural,
+    "hhtjax_largest_in_batch": _largest,
 }
 # of known numbers; without "max" and "min", which may choose between zeros of different signs
 NUMPY = {
