@@ -12,7 +12,7 @@ import pytest
 from compiled_c import SANITIZERS, Library, compiled, needs_compiler, numbers, printed
 from friction_problems import CASES as RUBBING
 from jax.flatten_util import ravel_pytree
-from zoo import PROBLEMS, STEPPERS
+from zoo import PROBLEMS, STEPPERS, covering
 
 import hhtjax
 from hhtjax import export_c, hht
@@ -124,12 +124,6 @@ SLOW = {
 }  # fmt: skip
 
 
-CLEAN = (
-    *("auto", "forced double pendulum, hht converged", "squeezer", "top", "bar", "motor", "two masses on a belt"),
-    *("a constraint, H(q), a load", "twice the same constraint"),
-)
-
-
 def exported(case, **options):
     scene = case.scene()
     z0 = getattr(scene, "z0", None)
@@ -146,7 +140,15 @@ def group(state, model, prefix):
     return np.concatenate([numbers(state, name) for name in names])
 
 
-@pytest.mark.parametrize("name", [*CASES, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+PAIRS = covering(STEPPERS, ("forced Duffing", "forced double pendulum"))  # what whole runs leave out
+MARKS = {f"{problem}, {stepper}": marks for (stepper, problem), marks, *_ in PAIRS}
+
+
+def with_marks(names):
+    return [pytest.param(name, marks=MARKS.get(name) or pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", [*CASES, *with_marks(SLOW)])
 def test_c_is_simulate(name, tmp_path):
     case = {**CASES, **SLOW}[name]
     scene, model = case.scene(), exported(case)
