@@ -12,6 +12,7 @@ from columns import RTOL, Case, differences, everywhere, traced, value
 from jax import lax
 from operations_table import ARGUMENTS, TABLE
 from program_writer import HEADER, usual_promotion
+from zoo import each
 
 from hhtjax.xla import gate, linear_maps, parameters, scalar_calls, scalar_rules
 from hhtjax.xla.kernels import staged, structural
@@ -48,22 +49,22 @@ def of_plain_jax(text):
         return Case(*expression(text))
 
 
-# the whole for each expression, and in turn the machinery in parts
-IN_TURN = (
-    {"derivatives": ("whole", "on scalars"), "vmap": ("whole",), "matrix": ("alone",)},
-    {"derivatives": ("whole", "in stages"), "vmap": ("whole",), "matrix": ("whole",)},
+IN_TURN = (  # from one expression to the next
+    {"derivatives": ["whole"], "vmap": ["whole"], "matrix": ["alone"]},
+    {"derivatives": ["on scalars"], "vmap": ["whole"], "matrix": ["whole"]},
+    {"derivatives": ["in stages"], "vmap": ["whole"], "matrix": ["whole"]},
 )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("turn", [0, pytest.param(1, marks=pytest.mark.every)])
+@pytest.mark.parametrize("turn", each(range(3), quick=[0], rest=[1, 2]))
 @pytest.mark.parametrize("group", TABLE)
 def test_same_numbers(group, turn):
     with usual_promotion():
         failures = [
             f"{text}: {x.mode} {x.column}\n found {x.found}\n expected {x.expected}"
             for i, text in enumerate(TABLE[group], turn)
-            for x in differences(of_plain_jax(text), IN_TURN[i % 2])
+            for x in differences(of_plain_jax(text), IN_TURN[i % 3])
         ]
     assert not failures, f"{len(failures)}:\n" + "\n".join(failures)
 
