@@ -221,17 +221,22 @@ class Case:
         return trace, self.args, expected, ahead, behind
 
 
-def compare(f, args, rng=None, count=None, batched=tuple(COLUMNS)):
-    """The differences of a function.
+EVERY = {"derivatives": tuple(COLUMNS), "vmap": tuple(COLUMNS), "matrix": ("alone", "whole")}
 
-    rng: by which one column is taken for each mode, else all; count: of verdicts, updated; batched: columns under vmap.
-    """
+
+def compare(f, args, rng=None, count=None):
+    """The differences of a function; rng: by which one column is taken for each mode, else all."""
+    columns = EVERY if rng is None else {mode: [rng.choice(names)] for mode, names in EVERY.items()}
+    yield from differences(Case(f, args), columns, count)
+
+
+def differences(case, columns, count=None):
+    """Those of a case; columns: for each mode; count: of verdicts, updated."""
     count = Counter() if count is None else count
-    case = Case(f, args)
-    todo = {("derivatives", case.derivatives): tuple(COLUMNS), ("vmap", case.batch): batched}
+    todo = {"derivatives": case.derivatives, "vmap": case.batch}
     if case.mode is both:
-        todo["matrix", case.jacobian] = "alone", "whole"
-    for (mode, make), name in [(key, x) for key, xs in todo.items() for x in (xs if rng is None else [rng.choice(xs)])]:
+        todo["matrix"] = case.jacobian
+    for (mode, make), name in [(item, name) for item in todo.items() for name in columns[item[0]]]:
         column = COLUMNS.get(name, lambda f: f)
         try:
             trace, at, reference, *directions = make(column)

@@ -138,7 +138,9 @@ def body_limit(R, Om, t, params):
 def body():
     """A top in two bearings that rub: one turns with it, one stays in space."""
     system = hhtjax.System(jnp.array([0.8, 0.5, 0.9]), body_torque, friction=body_limit, sliding=body_sliding)
-    return Case(system, {"F": 1.5}, hhtjax.rotation.exp(jnp.array([0.8, 0.0, 0.0])), jnp.array([0.0, 0.5, 2.0]), 3.0)
+    c, s = np.cos(0.8), np.sin(0.8)
+    tilted = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    return Case(system, {"F": 1.5}, tilted, np.array([0.0, 0.5, 2.0]), 3.0)
 
 
 def of_scene(scene):

@@ -62,6 +62,7 @@ TABLE = {
         *("lax.round(np.array([0.5, 1.5, -0.5]) + 0 * x, lax.RoundingMethod.TO_NEAREST_EVEN)", "jnp.copy(x)", "-x", "~b"),
         *("lax.abs(j)", "lax.neg(j)", "lax.sign(j)", "lax.sign(z) / 0.0", "~j", "lax.reduce_precision(x, 11, 52)"),
         *(f"lax.integer_pow({a}, {n})" for a in "xzj" for n in (0, 1, 2, 3, 5)),
+        *("x**2 - x**3", "x.astype(jnp.float32) - x.astype(int).astype(jnp.float32)"),  # one operation, two options
         *("lax.integer_pow(z, -1)", "lax.integer_pow(x, -3)", "lax.population_count(j)", "lax.clz(j)", "lax.sin(g)"),
         *("lax.exp(x, accuracy=lax.Tolerance(1e-3))", "lax.sin(x, accuracy=lax.AccuracyMode.HIGHEST)"),
     ],

@@ -1,16 +1,18 @@
 """Every operation with a rule, with its options: the same with the machinery as without, in every column and mode."""
 
 import re
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from by_numpy import Numbers, is_close, signs
-from columns import RTOL, Case, compare, everywhere, traced, value
+from columns import RTOL, Case, differences, everywhere, traced, value
 from jax import lax
 from operations_table import ARGUMENTS, TABLE
 from program_writer import HEADER, usual_promotion
+from zoo import each
 
 from hhtjax.xla import gate, linear_maps, parameters, scalar_calls, scalar_rules
 from hhtjax.xla.kernels import largest_in_batch, staged, structural
@@ -41,38 +43,46 @@ def expression(text):
     return eval(f"lambda {', '.join(names)}: {text}", SCOPE), [ARGUMENTS[n] for n in names]
 
 
+@cache
+def of_plain_jax(text):
+    """What plain JAX makes of an expression."""
+    with usual_promotion(), np.errstate(all="ignore"):
+        return Case(*expression(text))
+
+
+IN_TURN = (  # from one expression to the next
+    {"derivatives": ["whole"], "vmap": ["whole"], "matrix": ["alone"]},
+    {"derivatives": ["on scalars"], "vmap": ["whole"], "matrix": ["whole"]},
+    {"derivatives": ["in stages"], "vmap": ["whole"], "matrix": ["whole"]},
+)
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("turn", each(range(3), quick=[0], rest=[1, 2]))
 @pytest.mark.parametrize("group", TABLE)
-def test_same_numbers(group):
+def test_same_numbers(group, turn):
     with usual_promotion():
         failures = [
             f"{text}: {x.mode} {x.column}\n found {x.found}\n expected {x.expected}"
-            for text in TABLE[group]
-            for x in compare(*expression(text), batched=("whole",))
+            for i, text in enumerate(TABLE[group], turn)
+            for x in differences(of_plain_jax(text), IN_TURN[i % 3])
         ]
     assert not failures, f"{len(failures)}:\n" + "\n".join(failures)
 
 
-@pytest.fixture(scope="module")
-def cases():
-    """What plain JAX makes of the table: group -> list."""
-    with usual_promotion(), np.errstate(all="ignore"):
-        return {group: [Case(*expression(text)) for text in texts] for group, texts in TABLE.items()}
-
-
 @pytest.mark.slow
-def test_every_rule_has_its_rows(cases):
+def test_every_rule_has_its_rows():
     """Every operation that some rule is for occurs in the table or its derivatives, so a new rule comes with rows."""
     rules = {*scalar_rules.RULES, *scalar_rules.NUMPY, *scalar_rules.SHORT, *scalar_calls.CALLS, *linear_maps.RULES}
-    programs = [case.plain.jaxpr for group in cases.values() for case in group]
+    programs = [of_plain_jax(text).plain.jaxpr for texts in TABLE.values() for text in texts]
     assert rules | set(parameters.UNDERSTOOD) <= {eqn.primitive.name for x in programs for eqn in everywhere(x)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("group", TABLE)
-def test_the_witness_evaluates_as_xla_does(group, cases):
+def test_the_witness_evaluates_as_xla_does(group):
     """Values by NumPy, on which the table rests, are those of plain JAX, compiled."""
-    known = cases[group]
+    known = [of_plain_jax(text) for text in TABLE[group]]
     results = jax.jit(lambda args: [jax.tree.leaves(case.f(*x)) for case, x in zip(known, args, strict=True)])
     expected = results([case.args for case in known])
     for text, case, ys in zip(TABLE[group], known, expected, strict=True):

@@ -32,8 +32,10 @@ def test_the_balance_of_a_driven_and_damped_double_pendulum_closes_with_the_orde
         return np.stack([3 * np.sin(5 * t) - c1 * v[:, 0] + second, 2 * np.cos(3 * t) - second], axis=1)
 
     largest = []
-    for num_steps in (200, 400):
-        path = run(problem, hhtjax.hht(-0.05), num_steps)
+    for part in (2.0, 1.0):  # one program: the run with long steps goes on
+        path = run(problem._replace(duration=part * problem.duration), hhtjax.hht(-0.05), 400)
+        kept = slice(None, int(400 / part) + 1)
+        path = path._replace(**{name: getattr(path, name)[kept] for name in ("t", "q", "v", "acceleration")})
         found = energy_balance(problem.system, path, params, springs_and_weight)
         bare = energy_balance(problem.system, path, params)
         between = bare.work - (found.work - found.potential + found.potential[0])  # q is not quite the integral of v

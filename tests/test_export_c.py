@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +12,7 @@ import pytest
 from compiled_c import SANITIZERS, Library, compiled, needs_compiler, numbers, printed
 from friction_problems import CASES as RUBBING
 from jax.flatten_util import ravel_pytree
-from zoo import PROBLEMS, STEPPERS
+from zoo import PROBLEMS, STEPPERS, covering
 
 import hhtjax
 from hhtjax import export_c, hht
@@ -62,7 +62,7 @@ def with_inertia():
     return problem._replace(system=system)
 
 
-def joints(count=8):
+def joints(count=4):
     """Masses between springs, each on a dry surface with stiction."""
 
     def force(q, v, t, params):
@@ -119,21 +119,26 @@ SLOW = {
     **{name: Case(rubbing(name), hht(-0.1), RUBBING[name].duration / 10_000)
        for name in ("stick-slip, Stribeck", "two masses on a belt", "a constraint, H(q), a load", "a rotation, H(q)")},
     "M(q), two joints, converged": Case(rubbing("M(q), two joints"), hht(-0.1, iterations=None), 4e-4),
-    "eight joints": Case(joints, hht(-0.1), 5e-4),
+    "four joints": Case(joints, hht(-0.1), 5e-4),
     "conjugate gradients": Case(Bar, hht(-0.1, solve=hhtjax.conjugate_gradients(20)), 1e-4, 1000),
 }  # fmt: skip
 
 
-CLEAN = (
-    *("auto", "forced double pendulum, hht converged", "squeezer", "top", "bar", "motor", "two masses on a belt"),
-    *("a constraint, H(q), a load", "twice the same constraint"),
-)
-
-
-def exported(case, **options):
+def exported(case):
     scene = case.scene()
     z0 = getattr(scene, "z0", None)
-    return export_c(scene.system, case.stepper, scene.q0, scene.v0, scene.params, z0=z0, **options)
+    return export_c(scene.system, case.stepper, scene.q0, scene.v0, scene.params, z0=z0)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """Of a case, made once."""
+
+    @cache
+    def of(name):
+        return Library(exported({**CASES, **SLOW}[name]), tmp_path_factory.mktemp("c"))
+
+    return of
 
 
 def starts(scene):
@@ -146,14 +151,21 @@ def group(state, model, prefix):
     return np.concatenate([numbers(state, name) for name in names])
 
 
-@pytest.mark.parametrize("name", [*CASES, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
-def test_c_is_simulate(name, tmp_path):
-    case = {**CASES, **SLOW}[name]
-    scene, model = case.scene(), exported(case)
-    library = Library(model, tmp_path)
-    state, flags = library.begin(*starts(scene), dt=case.dt)
+PAIRS = covering(STEPPERS, ("forced Duffing", "forced double pendulum"))  # what whole runs leave out
+MARKS = {f"{problem}, {stepper}": marks for (stepper, problem), marks, *_ in PAIRS}
+
+
+def with_marks(names):
+    return [pytest.param(name, marks=MARKS.get(name) or pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", [*CASES, *with_marks(SLOW)])
+def test_c_is_simulate(name, library):
+    case, c = {**CASES, **SLOW}[name], library(name)
+    scene, model = case.scene(), c.model
+    state, flags = c.begin(*starts(scene), dt=case.dt)
     assert flags == 0
-    flags = library.run(state, case.steps, case.dt)
+    flags = c.run(state, case.steps, case.dt)
     run = hhtjax.simulate(
         scene.system, case.stepper, scene.q0, scene.v0, scene.params, z0=getattr(scene, "z0", None),
         dt=case.dt, num_steps=case.steps, save_every=case.steps // 100,
@@ -225,20 +237,19 @@ int main(void)
 @pytest.mark.parametrize(
     "name", ["auto", "forced double pendulum, hht converged", "squeezer", "top", "bar", "motor", "two masses on a belt"]
 )
-def test_memory_and_arithmetic_are_clean(name, tmp_path):
+def test_memory_and_arithmetic_are_clean(name, library, tmp_path):
     """Under the sanitizers of addresses and undefined behaviour, as a program of its own."""
-    case = {**CASES, **SLOW}[name]
-    scene, model = case.scene(), exported(case, name="clean")
+    case, c = {**CASES, **SLOW}[name], library(name)
+    scene, model = case.scene(), c.model
     arrays = [f"x{i}[] = {{{', '.join(map(repr, np.asarray(x).tolist()))}}}" for i, x in enumerate(starts(scene))]
     first = model.state[0]
     text = MAIN.format(
-        name="clean", arrays=", ".join(arrays), names=", ".join(f"x{i}" for i in range(len(arrays))), dt=case.dt,
+        name=model.name, arrays=", ".join(arrays), names=", ".join(f"x{i}" for i in range(len(arrays))), dt=case.dt,
         steps=200, field=f"{first.name}{'[0]' * bool(first.shape)}",
     )  # fmt: skip
     source = model.write(tmp_path)[0]
     (tmp_path / "main.c").write_text(text)
     flags, value = printed(compiled([source, tmp_path / "main.c"], tmp_path / "main", *SANITIZERS)).split()
-    library = Library(model, tmp_path)
-    state, _ = library.begin(*starts(scene), dt=case.dt)
-    assert int(flags) == library.run(state, 200, case.dt) == 0
+    state, _ = c.begin(*starts(scene), dt=case.dt)
+    assert int(flags) == c.run(state, 200, case.dt) == 0
     assert float(value) == pytest.approx(numbers(state, first.name)[0], rel=1e-14)

@@ -24,7 +24,16 @@ def position(params, q0, rtol=1e-4, stepper: Any = STEPPER):
     return hhtjax.simulate(DUFFING, stepper, q0, ZERO, params, dt=dt, times=TIMES).q[1:]
 
 
-MEASURED = position(TRUE, ONE, 1e-9) + 1e-3 * np.random.default_rng(0).standard_normal((TIMES.size, 1))
+@pytest.fixture(scope="module")
+def measured():
+    return position(TRUE, ONE, 1e-9) + 1e-3 * np.random.default_rng(0).standard_normal((TIMES.size, 1))
+
+
+@pytest.fixture(scope="module")
+def residuals(measured):
+    """By name of the stepper; a fit of each is compiled once."""
+    steppers = {"hht": hhtjax.hht(), "dopri5": STEPPER}
+    return {name: lambda p, x=x: position(p, ONE, stepper=x) - measured for name, x in steppers.items()}
 
 
 def by_array(x, q0: Any = ONE, rtol=1e-3):
@@ -75,10 +84,10 @@ CASES = [("hht", 0.001), pytest.param("dopri5", 0.3, marks=pytest.mark.slow)]  #
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), CASES)
-def test_a_fit_freezes_the_steps_and_chooses_again(name, most):
+def test_a_fit_freezes_the_steps_and_chooses_again(name, most, residuals, measured):
     """The estimates are those of a fit by hand on the steps that are chosen for them, to a part of a standard error."""
     stepper = {"hht": hhtjax.hht(), "dopri5": STEPPER}[name]
-    fitted = hhtjax.fit(lambda p: position(p, ONE, stepper=stepper) - MEASURED, GUESS)
+    fitted = hhtjax.fit(residuals[name], GUESS)
     assert fitted.converged
     assert 1 <= fitted.choices <= 3
     assert f"; steps chosen {fitted.choices} times, and frozen" in fitted.summary()
@@ -88,7 +97,7 @@ def test_a_fit_freezes_the_steps_and_chooses_again(name, most):
 
     def frozen(params):
         path = hhtjax.simulate(*start, params, dt=chosen.dt)
-        return hhtjax.interpolate(path, TIMES).q - MEASURED
+        return hhtjax.interpolate(path, TIMES).q - measured
 
     again = hhtjax.fit(frozen, fitted.params)
     assert again.choices is None
@@ -102,9 +111,9 @@ def test_a_fit_freezes_the_steps_and_chooses_again(name, most):
 
 
 @pytest.mark.slow
-def test_tolerances_above_the_noise_are_named():
+def test_tolerances_above_the_noise_are_named(measured):
     def residuals(p):
-        return position(p, ONE, 1e-2) - MEASURED
+        return position(p, ONE, 1e-2) - measured
 
     found = hhtjax.fit(residuals, GUESS)
     assert not found.converged
@@ -134,10 +143,8 @@ def test_records_and_starts():
 
 
 @pytest.mark.slow
-def test_inside_jit_and_from_several_starts():
-    def residuals(p):
-        return position(p, ONE) - MEASURED
-
+def test_inside_jit_and_from_several_starts(residuals):
+    residuals = residuals["dopri5"]
     alone = hhtjax.fit(residuals, GUESS)
     inside = jax.jit(lambda p: hhtjax.fit(residuals, p).params)(jax.tree.map(jnp.asarray, GUESS))
     many = hhtjax.multistart(residuals, jax.tree.map(lambda x: jnp.array([x, 1.1 * x]), GUESS))

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -29,16 +30,25 @@ def run(case, stepper, num_steps, save_every=1):
 
 @pytest.fixture(scope="module")
 def family():
-    """The free vibration by each of FAMILY, with each of NUM_STEPS."""
-    return [jax.vmap(lambda s, n=n: run(of_scene(dry_oscillator.free()), s, n))(STACKED) for n in NUM_STEPS]
+    """The free vibration by each of FAMILY, with each of NUM_STEPS in its duration: one program, so that the run with
+    long steps goes on."""
+    case, most = of_scene(dry_oscillator.free()), NUM_STEPS[-1]
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(0, None))
+    def by(stepper, duration):
+        return run(case._replace(duration=duration), stepper, most)
+
+    return [by(STACKED, most / n * case.duration) for n in NUM_STEPS]
 
 
 @pytest.mark.slow
 def test_order_two_through_reversals(family):
     errors = []
-    for found in family:
-        q, v = free_vibration_exact(np.asarray(found.t[0]))
-        errors.append([np.max(np.abs(np.asarray(x)[..., 0] - y), axis=1) for x, y in ((found.q, q), (found.v, v))])
+    for found, n in zip(family, NUM_STEPS, strict=True):
+        t, *found = (np.asarray(x)[:, : n + 1] for x in (found.t, found.q, found.v))
+        exact = free_vibration_exact(t[0])
+        errors.append([np.max(np.abs(x[..., 0] - y), axis=1) for x, y in zip(found, exact, strict=True)])
     order = np.log(np.divide(*errors)) / np.log(NUM_STEPS[1] / NUM_STEPS[0])
     assert np.all(np.abs(order - 2) < 0.1), order
 
@@ -226,9 +236,9 @@ def test_newton_in_the_free_step():
 
 
 @pytest.mark.slow
-def test_eight_joints_in_a_row():
+def test_joints_in_a_row():
     """They stick and slip one on the other; the switch of one jerks its neighbours within the step."""
-    n, rates = 8, 1 + 0.3 * jnp.arange(8.0)
+    n, rates = 5, 1 + 0.3 * jnp.arange(5.0)
     row = hhtjax.System(
         jnp.ones(n),
         lambda q, v, t, p: 3.0 * jnp.sin(rates * t) - q,

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from zoo import PROBLEMS, STEPPERS, as_data, each, run
+from zoo import PROBLEMS, STEPPERS, as_data, covering, each, run
 
 import hhtjax
 
@@ -16,33 +16,38 @@ every_stepper = pytest.mark.parametrize("name", each(STEPPERS))
 @pytest.mark.slow
 @every_stepper
 def test_jit_equals_eager(name):
-    problem = PROBLEMS["forced double pendulum"]._replace(duration=0.2)
-    compiled = run(problem, STEPPERS[name], 2)
+    problem, stepper = PROBLEMS["forced double pendulum"]._replace(duration=0.2), as_data(STEPPERS[name])
+    compiled = run(problem, stepper, 2)  # the program is that of vectors, below
     with jax.disable_jit():
-        state = STEPPERS[name].init(problem.system, problem.q0, problem.v0, problem.params, problem.duration / 2)
+        state = stepper.init(problem.system, problem.q0, problem.v0, problem.params, problem.duration / 2)
         for _ in range(2):
-            state, _ = STEPPERS[name].step(problem.system, state, problem.params, problem.duration / 2)
+            state, _ = stepper.step(problem.system, state, problem.params, problem.duration / 2)
     np.testing.assert_allclose(compiled.q[-1], state.q, rtol=1e-10)
     np.testing.assert_allclose(compiled.acceleration[-1], state.w, rtol=1e-9)
     assert float(compiled.t[-1]) == pytest.approx(float(state.t), rel=1e-14)
 
 
+def end(stepper, k, q0, dt):
+    problem = PROBLEMS["forced Duffing"]
+    params = {**problem.params, "k": k}
+    path = hhtjax.simulate(problem.system, stepper, q0, problem.v0, params, dt=dt, num_steps=30)
+    return path.q[-1], path.failure.step
+
+
+ends = jax.jit(jax.vmap(end, (None, 0, 0, 0)))
+
+
 @pytest.mark.slow
 @every_stepper
 def test_vmap_equals_loop(name):
-    """Over the stiffness, the start, the step size, and the numerical damping where there is one."""
-    problem = PROBLEMS["forced Duffing"]
-    stiffness, start, dts = jnp.array([0.5, 1.0, 2.0]), jnp.array([[0.1], [0.5], [-0.4]]), jnp.array([0.02, 0.05, 0.1])
-
-    def end(k, q0, dt):
-        params = {**problem.params, "k": k}
-        path = hhtjax.simulate(problem.system, STEPPERS[name], q0, problem.v0, params, dt=dt, num_steps=30)
-        return path.q[-1], path.failure.step
-
-    batch, failures = jax.jit(jax.vmap(end))(stiffness, start, dts)
+    """Over the stiffness, the start, and the step size; steppers of one family are compiled once."""
+    stiffness, start, dts = np.array([0.5, 1.0, 2.0]), np.array([[0.1], [0.5], [-0.4]]), np.array([0.02, 0.05, 0.1])
+    stepper = as_data(STEPPERS[name])
+    batch, failures = ends(stepper, stiffness, start, dts)
     assert not failures.any()
-    # a Python number as k: the program is that of the next test
-    loop = [end(float(k), q0, dt)[0] for k, q0, dt in zip(stiffness, start, dts, strict=True)]
+    # Python numbers: the program is that of the test of dtypes
+    members = zip(stiffness.tolist(), jnp.asarray(start), dts.tolist(), strict=True)
+    loop = [end(stepper, *member)[0] for member in members]
     np.testing.assert_allclose(batch, jnp.stack(loop), rtol=1e-11)
 
 
@@ -95,8 +100,10 @@ TREES = VECTORS._replace(
 )
 
 
-@pytest.mark.slow
-@every_stepper
+ONE_FORM = ("hht predictor", "hht held", "hht state", "hht twice", "newmark", "bossak", "generalized_alpha")  # of hht's
+
+
+@pytest.mark.parametrize("name", each(STEPPERS, quick=(), rest=ONE_FORM))
 def test_trees_are_kept_and_rows_follow_the_sorted_keys(name):
     """A dict whose keys sort differently from their insertion, against the same system on a vector."""
     ours, flat = (run(problem, as_data(STEPPERS[name]), 2) for problem in (TREES, VECTORS))
@@ -112,20 +119,21 @@ def coupled(q, v, t, params):
     return -jnp.array([[2.0, -1.0], [-1.0, 2.0]]) @ q - 0.1 * q**3
 
 
-MASS = jnp.array([2.0, 3.0])
-COUPLED = [
-    hhtjax.System(mass, coupled)
-    for mass in (MASS, jnp.diag(MASS), lambda q, params: MASS, lambda q, params: jnp.diag(MASS))
-]
+MASS = np.array([2.0, 3.0])
+DIAGONAL = hhtjax.System(MASS, coupled)
+OTHERS = {
+    "full": hhtjax.System(np.diag(MASS), coupled),
+    "a function": hhtjax.System(lambda q, params: jnp.asarray(MASS), coupled),
+    "a full function": hhtjax.System(lambda q, params: jnp.diag(MASS), coupled),
+}
 
 
 @pytest.mark.slow
-@every_stepper
-def test_a_diagonal_mass_equals_the_full_one(name):
+@pytest.mark.parametrize(("name", "mass"), covering(STEPPERS, OTHERS))
+def test_a_diagonal_mass_equals_the_others(name, mass):
     q0, v0, stepper = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), as_data(STEPPERS[name])
-    ends = [hhtjax.simulate(system, stepper, q0, v0, dt=0.05, num_steps=20).q[-1] for system in COUPLED]
-    for end in ends[1:]:
-        np.testing.assert_allclose(end, ends[0], rtol=1e-12)
+    ends = [hhtjax.simulate(x, stepper, q0, v0, dt=0.05, num_steps=20).q[-1] for x in (DIAGONAL, OTHERS[mass])]
+    np.testing.assert_allclose(*ends, rtol=1e-12)
 
 
 @pytest.mark.slow

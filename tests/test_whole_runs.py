@@ -44,7 +44,7 @@ def everything(way, name, stepper):
     return jax.vmap(lambda q0: jax.jvp(partial(way, problem, stepper), (q0,), (jnp.cos(q0),)))(q0)
 
 
-SMOOTH = [(stepper, name) for stepper in zoo.STEPPERS for name in ("forced double pendulum", "forced Duffing")]
+SMOOTH = zoo.covering(zoo.STEPPERS, ("forced double pendulum", "forced Duffing"))
 RUBBING = [("hht predictor", name) for name in zoo.DRY]
 
 

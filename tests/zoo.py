@@ -97,9 +97,20 @@ STEPPERS = {
 }
 
 
-def each(names, quick=("hht auto", "hht converged", "rowda", "rk4")):
-    """Names to run a test over, of which the fast tests take only the quick ones."""
-    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
+EVERY = pytest.mark.slow, pytest.mark.every  # of a product the tests take a part; `-m every` runs the rest
+
+
+def each(names, quick=("hht auto", "hht converged", "rowda", "rk4"), rest=()):
+    """Names to run a test over, of which the fast tests take only the quick ones, and all tests but `-m every` not the
+    rest, which other tests cover."""
+    marks = {name: EVERY if name in rest else () if name in quick else pytest.mark.slow for name in names}
+    return [pytest.param(name, marks=marks[name]) for name in names]
+
+
+def covering(rows, columns):
+    """All pairs, of which the tests take each row once, with the columns in turn."""
+    pairs = [((i - j) % len(columns), row, column) for i, row in enumerate(rows) for j, column in enumerate(columns)]
+    return [pytest.param(*pair, marks=EVERY if away else ()) for away, *pair in pairs]
 
 
 @cache
@@ -124,6 +135,16 @@ def run(problem, stepper, num_steps, **options):
     """The problem from start to end in num_steps steps."""
     system, params, q0, v0, duration = problem
     return hhtjax.simulate(system, stepper, q0, v0, params, dt=duration / num_steps, num_steps=num_steps, **options)
+
+
+def ends_of_two(problem, stepper, num_steps, **options):
+    """Runs that reach the end of a problem in num_steps steps, and in twice as many, each with the row that is its end:
+    one program, for the run with long steps goes on."""
+    system, params, q0, v0, duration = problem
+    more = {"num_steps": 2 * num_steps, "save_every": num_steps} | options
+    return [
+        (hhtjax.simulate(system, stepper, q0, v0, params, dt=duration / (k * num_steps), **more), k) for k in (1, 2)
+    ]
 
 
 def as_data(stepper):
