@@ -128,7 +128,7 @@ def test_float32_stays_float32():
         )
     run.check()
     assert {x.dtype for x in jax.tree.leaves((run.q, run.v, run.events.t, run.events.after))} == {np.dtype(np.float32)}
-    assert abs(float(run.events.t[0]) - np.sqrt(2 / 9.81)) < 1e-6
+    assert abs(float(run.events.t[0]) - np.sqrt(2 / 9.81)) < 1e-7  # three roundings of t
 
 
 def test_a_second_call_compiles_nothing():

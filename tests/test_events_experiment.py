@@ -114,3 +114,30 @@ def test_the_committed_contacts():
         for method in ("HHT auto", "Rosenbrock", "ROWDA"):
             assert by[f"{method} impact"]["accurate"] > 1.5 * by[method]["accurate"]
             assert not set("wX") & set("".join(STOPS["scenes"][name]["grades"][f"{method} impact"]))
+
+
+def test_the_committed_tolerances():
+    """Within .02 to 10 of rtol, but for dopri5 on the ball, whose drag has a kink; and a fit whose interval holds e."""
+    rows, fit = (COMMITTED["tolerance"][key] for key in ("rows", "fit"))
+    assert {row["scene"] for row in rows} == {"ball", "impact oscillator", "bump stop"}
+    assert all(row["right_number_of_events"] for row in rows)
+    smooth = [row["error_over_rtol"] for row in rows if (row["scene"], row["method"]) != ("ball", "dopri5")]
+    assert 0.02 < min(smooth) < max(smooth) < 10
+    assert fit["low"] < fit["truth"] < fit["high"]
+    assert fit["converged"]
+    assert 1 <= fit["choices"] <= 3
+
+
+def test_the_committed_cost():
+    cost = COMMITTED["cost"]
+    assert cost["sweep"]["over_plain_time"] <= 1.5
+    assert cost["sweep"]["impacts"] > cost["sweep"]["members"]
+    for row in cost["rows"]:
+        assert row["none_met_over_plain_time"] <= 2.2
+        assert row["difference_none_met"] == 0
+
+
+def test_the_committed_peers():
+    found = COMMITTED["peers"]
+    assert found["hhtjax"]["error_m"] < 1e-14
+    assert {name.split(",")[0] for name in found["rows"]} == {"MuJoCo", "exudyn"}

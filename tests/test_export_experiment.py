@@ -3,6 +3,12 @@
 import json
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from experiments.export.real_time import explained, most_by_chance
+from experiments.page import find
+
 COMMITTED = json.loads((Path(__file__).parents[1] / "experiments" / "export" / "export.json").read_text())
 
 
@@ -14,5 +20,40 @@ def test_the_committed_numbers_hold_what_is_claimed():
     assert speed["time_over_by_hand"] <= 1.1
     assert len(speed["scenes"]) >= 15
     assert all(row["c_time_over_xla"] <= 1.5 for row in speed["scenes"])
-    assert {row["form"] for row in real["deadlines"]} >= {"step", "empty loop", "Python, step"}
+    assert {row["form"] for row in real["deadlines"]} >= {"step", "waits as long", "empty loop", "Python, step"}
+    for rate, allowed in real["not_explained_allowed"].items():
+        assert find(real["deadlines"], rate=rate, form="step")["not_explained_count"] <= allowed
     assert real["back_to_back"][0]["calls"] == 10_000_000
+
+
+@pytest.mark.parametrize(
+    ("woke", "own", "causes", "holds"),
+    [
+        (20_000, 2_000, (0, 0, 0), True),
+        (150_000, 2_000, (1, 0, 0), True),  # stopped until after the deadline
+        (99_000, 2_000, (0, 1, 0), True),  # or until just before it
+        (20_000, 120_000, (0, 0, 1), True),  # one long step may be an interruption that the kernel does not see
+    ],
+)
+def test_what_a_missed_deadline_comes_from(woke, own, causes, holds):
+    """Of loops that wake after 20 to 30 us and work for 2; in one period the step's does otherwise."""
+    usual = np.stack([np.linspace(20e3, 30e3, 1000), np.linspace(22e3, 32e3, 1000), np.full(1000, 2e3)], axis=1)
+    step = usual.copy()
+    step[500] = woke, woke + own, own
+    rows, allowed = explained({"step": step, "waits as long": usual, "empty loop": usual}, 100_000)
+    found = rows["step"]
+    assert tuple(found[f"{key}_count"] for key in ("woke_too_late", "interrupted", "not_explained")) == causes
+    assert (found["not_explained_count"] <= allowed) is holds
+    assert rows["waits as long"]["missed_count"] == 0
+
+
+def test_a_step_that_is_too_long_is_not_explained():
+    usual = np.stack([np.full(1000, 20e3), np.full(1000, 22e3), np.full(1000, 2e3)], axis=1)
+    long = usual + np.array([0, 120e3, 120e3])
+    rows, allowed = explained({"step": long, "waits as long": long, "empty loop": usual}, 100_000)
+    assert rows["step"]["not_explained_count"] == 1000
+    assert allowed == 0
+
+
+def test_more_than_chance_allows():
+    assert [most_by_chance(n) for n in (0, 1, 10)] == [4, 6, 19]

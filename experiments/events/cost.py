@@ -1,4 +1,4 @@
-"""What events cost: a step with one declared and none met, an impact, derivatives, and compilation.
+"""What events cost: a step with one declared and none met, an impact, derivatives, compilation, and those of a sweep.
 
 Times are the least of runs in turn, since others use the machine.
 """
@@ -13,10 +13,11 @@ import numpy as np
 import hhtjax
 from experiments.events.reference import SCENES
 
-STEPS, PAIRS = 20_000, 21
+STEPS, PAIRS = 4000, 100  # short runs, of which some are undisturbed
 FAR = {"ball": {"floor": -1e6}, "double pendulum": {"stop": 1e6}, "pendulum": {"wall": 1e6}}
 DT = {"ball": 1e-4, "double pendulum": 1e-3, "pendulum": 1e-3}
 GRADIENT_STEPS = 1000
+MEMBERS, MEMBER_STEPS, SWEEP_PAIRS = 64, 1000, 100  # of a sweep over a second
 
 
 def run_of(name, events, num_steps=STEPS):
@@ -88,7 +89,10 @@ def run(report, fast):
             }
         )  # fmt: skip
         report.progress(str(rows[-1]))
-    return {"steps": STEPS, "rows": rows, "impacts": impacts(report, pairs)}
+    return {
+        "steps": STEPS, "rows": rows, "impacts": impacts(report, pairs),
+        "sweep": of_sweep(report, 3 if fast else SWEEP_PAIRS),
+    }  # fmt: skip
 
 
 def impacts(report, pairs):
@@ -102,6 +106,39 @@ def impacts(report, pairs):
     found = {
         "scene": name, "impacts": count, "ns_per_step": 1e9 * without / STEPS,
         "ns_per_impact": 1e9 * (with_impacts - without) / count, "run_over_none_met_time": with_impacts / without,
+    }  # fmt: skip
+    report.progress(str(found))
+    return found
+
+
+def sweep_of(events):
+    """Balls from other heights, with other restitutions: last q, and the events, of the height of the floor."""
+    scene = SCENES["ball"]
+    q0, e = jnp.linspace(0.5, 1.5, MEMBERS)[:, None], jnp.linspace(0.7, 0.9, MEMBERS)
+    axes = dict.fromkeys(scene.params) | {"e": 0}
+
+    def last(floor):
+        runs = hhtjax.sweep(
+            scene.system, hhtjax.hht(), q0, scene.v0, scene.params | {"e": e, "floor": floor},
+            dts=jnp.full(MEMBERS, 1 / MEMBER_STEPS), duration=1.0, num_samples=1, in_axes=(None, 0, None, axes),
+            events=scene.events if events else None,
+        )  # fmt: skip
+        return runs.q[:, -1], runs.events
+
+    return last
+
+
+def of_sweep(report, pairs):
+    """Beside the same without events: with impacts, and with the floor out of reach."""
+    floor, far = jnp.zeros(()), jnp.asarray(-1e6)
+    plain, events = (compiled(sweep_of(with_events), floor)[0] for with_events in (False, True))
+    times = least([partial(plain, floor), partial(events, floor), partial(events, far)], pairs)
+    t = np.asarray(events(floor)[1].t)
+    found = {
+        "members": MEMBERS, "steps": MEMBER_STEPS, "impacts": int(np.isfinite(t).sum()),
+        "steps_with_impacts": np.unique(np.floor(t[np.isfinite(t)] * MEMBER_STEPS)).size,
+        "plain_ms": 1e3 * float(times[0]), "over_plain_time": float(times[1] / times[0]),
+        "none_met_over_plain_time": float(times[2] / times[0]),
     }  # fmt: skip
     report.progress(str(found))
     return found

@@ -6,10 +6,60 @@
 import json
 from pathlib import Path
 
+import numpy as np
+
 from experiments.events import cost, gradients, parameters, peers
 from experiments.page import table
 
 HERE = Path(__file__).parent
+PEERS = "diffrax", "MuJoCo", "exudyn"
+
+
+def bars_table(numbers):
+    """What was asked for, what was measured, and whether it holds."""
+    located = [row for row in numbers["order"] if row["way"] == "located"]
+    least = {m: min(min(r["slopes"].values()) for r in located if r["method"] == m) for m in ("hht", "rowda")}
+    lost = [x for r in numbers["order"] if r["way"] != "located" for x in r["slopes"].values()]
+    met, sweep = numbers["cost"]["rows"], numbers["cost"]["sweep"]
+    ratios = [row["error_over_rtol"] for row in numbers["tolerance"]["rows"]]
+    none_met, median = max(row["none_met_over_plain_time"] for row in met), float(np.median(ratios))
+    within = float(np.mean([0.02 <= x <= 10 for x in ratios]))
+    different, lowest_q = largest_difference(numbers), lowest(numbers)
+    rows = [
+        ["order of hht, worst quantity of five scenes", ">= 1.9", least["hht"], least["hht"] >= 1.9],
+        ["order of rowda", ">= 2.8", least["rowda"], least["rowda"] >= 2.8],
+        ["order, not located, at most", "<= 1.6", max(lost), max(lost) <= 1.6],
+        ["derivatives - formula", "<= 1e-12", different, different <= 1e-12],
+        ["lowest q on the way to rest (m)", ">= -1e-9", lowest_q, lowest_q >= -1e-9],
+        ["time with an event that is not met", "<= 2.2", none_met, none_met <= 2.2],
+        ["time of a sweep of 64 with impacts", "<= 1.5", sweep["over_plain_time"], sweep["over_plain_time"] <= 1.5],
+        ["error over rtol, median of all runs", "0.02 to 10", median, 0.02 <= median <= 10],
+        ["share of these runs within 0.02 to 10", "1", within, within == 1],
+    ]
+    lines = [[what, bar, f"{x:.2g}" if abs(x) < 1e-3 else f"{x:.2f}", "yes" if holds else "**no**"]
+             for what, bar, x, holds in rows]  # fmt: skip
+    return table(["what", "bar", "measured", "holds"], lines)
+
+
+def largest_difference(numbers):
+    """Of derivatives."""
+    return max(max(row["difference"]) for row in numbers["gradients"]["rows"])
+
+
+def lowest(numbers):
+    """Of all runs to rest."""
+    return min(row["lowest_q_m"] for row in numbers["zeno"]["rows"])
+
+
+def tolerances(rows):
+    """Errors over rtol, and steps."""
+    powers = sorted({row["rtol"] for row in rows}, reverse=True)
+    lines = []
+    for name, method in dict.fromkeys((row["scene"], row["method"]) for row in rows):
+        mine = {row["rtol"]: row for row in rows if (row["scene"], row["method"]) == (name, method)}
+        cells = [f"{mine[x]['error_over_rtol']:.2g} ({mine[x]['steps']})" if x in mine else "" for x in powers]
+        lines.append([name, method, *cells])
+    return table(["scene", "", *(f"{x:.0e}" for x in powers)], lines)
 
 
 def slopes(rows):
@@ -57,7 +107,11 @@ def beside(found):
         if isinstance(x, dict) and "error_m" in x
     ]
     for name, x in found["rows"].items():
-        lines += [[name, steps, f"{error:.1e}", ""] for steps, error in zip(x["steps"], x["error_m"], strict=True)]
+        stiffness = [f" ({k:.0e} N/m)" for k in x.get("stiffness_N_m", ())] or [""] * len(x["steps"])
+        entries = zip(stiffness, x["steps"], x["error_m"], strict=True)
+        lines += [[name + k, steps, f"{error:.1e}", "-"] for k, steps, error in entries]
+    missing = {name for name in PEERS if not any(name in line[0] for line in lines)}
+    lines += [[f"{name} was not installed", "", "", ""] for name in sorted(missing)]
     return table(["", "steps", "error of q (m)", "of derivatives"], lines)
 
 
@@ -79,10 +133,14 @@ def page(numbers):
         .read_text()
         .format(
             machine=numbers["machine"],
+            bars=bars_table(numbers),
             slopes=slopes(numbers["order"]),
+            tolerances=tolerances(numbers["tolerance"]["rows"]),
+            fit=numbers["tolerance"]["fit"],
+            of_sweep=numbers["cost"]["sweep"],
             longest=gradients.LONGEST,
             duration=gradients.DURATION,
-            gradient=max(max(row["difference"]) for row in numbers["gradients"]["rows"]),
+            gradient=largest_difference(numbers),
             formula=", ".join(f"{abs(x):.3g}" for x in balls["formula"]),
             after=table(["steps", "x1", "x2", "v1", "v2"], after),
             doubling=doubling["closed_form"]["doubling_rad_s"],

@@ -1,4 +1,4 @@
-"""The ball beside others: MuJoCo's soft limit, and diffrax, whose events end a run that is begun anew by hand."""
+"""The ball beside others: MuJoCo's soft limit and exudyn's contact, and diffrax, whose run is begun anew by hand."""
 
 import importlib.util
 from typing import Any
@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
+from experiments.events import by_exudyn
 from hhtjax.scenes import balls
 
 DURATION, BOUNCES = 1.4, 2
 STEPS = tuple(50 * 2**i for i in range(9))
 E = 0.8
-CONTACT = 0.3  # sqrt(k) dt of the soft limit: a contact of ten steps
+CONTACT = 0.3  # sqrt(k) dt of a soft contact: ten steps long
+STIFFNESSES = 1e5, 1e6, 1e7, 1e8  # N/m, of contacts in which steps are shortened
 
 
 def by_formula(x):
@@ -94,8 +96,25 @@ def run(report, fast):
         found["rows"]["MuJoCo, soft limit"] = {
             "steps": list(sizes), "error_m": [abs(by_mujoco(steps) - float(wanted)) for steps in sizes]
         }  # fmt: skip
+    if importlib.util.find_spec("exudyn"):
+        found["rows"] |= in_exudyn(float(wanted), STEPS[:3] if fast else STEPS)
     report.progress(str(found))
     return found
+
+
+def in_exudyn(wanted, sizes):
+    """Rows by way: with the steps of all, and with those that it shortens where the contact begins and ends."""
+    start, rows = (balls.GRAVITY, E, DURATION), {}
+    for law in by_exudyn.LAWS:
+        ends = [by_exudyn.fallen(law, *start, n, (CONTACT * n / DURATION) ** 2)[0] for n in sizes]
+        rows[f"exudyn, {law}"] = {"steps": list(sizes), "error_m": [abs(q - wanted) for q in ends]}
+    ends, steps = zip(
+        *(by_exudyn.fallen("restitution", *start, 200, k, shortened=True) for k in STIFFNESSES), strict=True
+    )
+    rows["exudyn, restitution, steps shortened at contacts"] = {
+        "steps": steps, "error_m": [abs(q - wanted) for q in ends], "stiffness_N_m": STIFFNESSES
+    }  # fmt: skip
+    return rows
 
 
 def told(error, errors):

@@ -19,9 +19,10 @@ from hhtjax.runs.event_log import Events, noted_down
 from hhtjax.runs.loop import resized_step
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
+from hhtjax.xla import staged
 
 SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two events that are one
-HALVINGS, IMPROVEMENTS = 24, 40
+ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations
 ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
 
 
@@ -77,9 +78,8 @@ def asks(ways, s, s1, params, h):
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in lax.stop_gradient((s, s1)))
     noted = jnp.asarray(ways.events.noted)
     below = (g1 <= 0) & (~noted | (g0 > 0))
-    turns = falls_and_rises(g0, d0, g1, d1)
-    crossing = (g1 - g0 - d1 * h) / jnp.where(turns, d0 - d1, 1)  # of the tangents at both ends
-    return jnp.any(below | (turns & (g0 + d0 * crossing <= 0)))
+    cross_below = g0 * (d1 - d0) <= d0 * (g1 - g0 - d1 * h)  # tangents at both ends; a division is dear
+    return jnp.any(below | (falls_and_rises(g0, d0, g1, d1) & cross_below))
 
 
 def falls_and_rises(g0, d0, g1, d1):
@@ -95,13 +95,8 @@ def pass_events(ways, params, part, h):
         part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, params))
 
     def slot(part, number):
-        found = look(ways, part, params, h)
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
-        part = flag(part, going & ~jnp.any(found.hit), STAYS, found.stays)
-        found_any = going & jnp.any(found.hit)
-        part = flag(part, found_any & (number == ways.max_events), MANY, found.hit & ~found.touches)
-        here = found_any & (number < ways.max_events)
-        return seldom(partial(meet, ways), here, part, found, h, params), None
+        return seldom(partial(meet_or_flag, ways), going, part, number, h, params), None
 
     part, _ = lax.scan(slot, part, jnp.arange(ways.max_events + 1, dtype=jnp.int32))
     met = part.met
@@ -121,6 +116,15 @@ def pass_events(ways, params, part, h):
     return part._replace(end=known(end), met=met)
 
 
+def meet_or_flag(ways, part, number, h, params):
+    """The part behind its first event, if it has one; with what is wrong, if something is."""
+    found = look(ways, part, params, h)
+    here = jnp.any(found.hit)
+    part = flag(part, ~here, STAYS, found.stays)
+    part = flag(part, here & (number == ways.max_events), MANY, found.hit & ~found.touches)
+    return seldom(partial(meet, ways), here & (number < ways.max_events), part, found, h, params)
+
+
 def flag(part, bad, code, which):
     """The part with what went wrong, if it did: at the first of these events."""
     met = part.met
@@ -132,7 +136,7 @@ def flag(part, bad, code, which):
 
 def begin(ways, q, v, t, params, h):
     """The state at a new start."""
-    return ways.stepper.begin(ways.flat, q, v, t, params, h)
+    return staged(lambda q, v, t, h: ways.stepper.begin(ways.flat, q, v, t, params, h))(q, v, t, h)
 
 
 def look(ways, part, params, h):
@@ -155,13 +159,13 @@ def look(ways, part, params, h):
     touches = turns & (cubic(lowest) < 0)
     hit = touches | ((g1 <= 0) & ((g0 > 0) | ((d0 > 0) & ~rising & ~noted)))
 
-    def halve(_, ends):
-        low, high = ends
-        middle = (low + high) / 2
-        above = cubic(middle) > 0
-        return jnp.where(above, middle, low), jnp.where(above, high, middle)
+    def improve(_, ends):
+        low, high, x = ends
+        y, slope = cubic(x), d0 + x * (2 * a + x * 3 * b)
+        low, high = jnp.where(y > 0, x, low), jnp.where(y > 0, high, x)
+        return low, high, improved(x, y, slope, low, high)
 
-    _, place = lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(g0), lowest))
+    *_, place = lax.fori_loop(0, ON_CUBIC, improve, (jnp.zeros_like(g0), lowest, lowest / 2))
     stays = (g1 < 0) & ~hit & ~left & ~noted
     return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, jnp.abs(g0) + jnp.abs(g1))
 
@@ -199,15 +203,20 @@ def meet(ways, part, found, h, params):
     pieces = None if met.pieces is None else met.pieces.divided(before, start, end)
     after = Met(modes, ends, code, i, log, pieces)
     infos = join_info(join_info(choose(part.divided, part.info, ways.no_info), info), more)
-    new = Part(start, end, infos, rest, size, after, jnp.ones_like(part.divided), part.asked)
+    new = Part(start, end, infos, rest, size, after, jnp.ones_like(part.divided), asks(ways, start, end, then, rest))
     return choose(missed & (pick(this, found.touches.astype(h.dtype)) > 0), part, new)
 
 
 def go(ways, params, s, tau, last, h):
     """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
-    short = tau <= SHORT * h
-    s1, info = resized_step(ways.flat, ways.stepper, params, jnp.maximum(tau, SHORT * h), last)(s)
-    return choose(short, drifted(ways.flat, s, tau), s1), choose(short, ways.no_info, info)
+
+    @staged
+    def reached(s, tau, last):
+        short = tau <= SHORT * h
+        s1, info = resized_step(ways.flat, ways.stepper, params, jnp.maximum(tau, SHORT * h), last)(s)
+        return choose(short, drifted(ways.flat, s, tau), s1), choose(short, ways.no_info, info)
+
+    return reached(s, tau, last)
 
 
 def locate(ways, params, part, this, found, h):
@@ -229,8 +238,7 @@ def locate(ways, params, part, this, found, h):
             low, high, tau, _, k = carry
             g, d = (pick(this, x) for x in ways.events.rates(ways.flat, reached(tau), params))
             low, high = jnp.where(g > 0, tau, low), jnp.where(g > 0, high, tau)
-            new = tau - g / jnp.where(d < 0, d, 1)
-            new = jnp.where((d < 0) & (new >= low) & (new <= high), new, (low + high) / 2)
+            new = improved(tau, g, d, low, high)
             return low, high, new, jnp.abs(new - tau), k + 1
 
         begin = jnp.zeros_like(tau), pick(this, found.limit) * part.rest, tau, jnp.full_like(tau, jnp.inf), 0
@@ -238,6 +246,12 @@ def locate(ways, params, part, this, found, h):
 
     start = jnp.clip(jnp.min(found.place), 0, 1) * part.rest
     return lax.custom_root(guard, lax.stop_gradient(start), search, lambda g, y: y / g(jnp.ones_like(y)))
+
+
+def improved(x, y, slope, low, high):
+    """A zero by a step of Newton's method from x, where y falls; the middle where it does not, or leaves its bounds."""
+    new = x - y / jnp.where(slope < 0, slope, 1)
+    return jnp.where((slope < 0) & (new >= low) & (new <= high), new, (low + high) / 2)
 
 
 def is_corner(g, d, h, this, noted):

@@ -115,17 +115,19 @@ class Inputs(NamedTuple):
             mesh = Mesh(mesh.devices.ravel(), ("members",))  # whatever its shape and its types of axes
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
-        static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes_for(self.size)}
+        static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes_for(self.size, self.events)}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
         return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
 
 
-def lanes_for(size):
+def lanes_for(size, events=None):
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
-    A batch takes half the time of single runs, so blocks have to be short enough for their members to be alike.
+    A batch takes half the time of single runs, so blocks have to be short enough for their members to be alike. With
+    events they are twice as long, since a block has more to do beside the arithmetic of its steps.
     """
-    return min(LANES, 1 << (size // BLOCKS).bit_length())
+    blocks = BLOCKS if events is None else BLOCKS // 2
+    return min(LANES, 1 << (size // blocks).bit_length())
 
 
 def _members(control, trees, in_axes):

@@ -27,7 +27,7 @@ PROVEN_TYPES = {"f32", "f64", "i1", "i32", "i64", "ui32", "ui64"}
 # of more, compiling takes long, or fails: LLVM takes 20 s for a gradient of 12,500, as long as for its list of kernels
 MOST_OPERATIONS = 15_000
 MOST_IN_BRANCH = 5000  # of more in one branch, minutes
-MOST_IN_BRANCHES = 20_000  # of all together
+MOST_IN_BRANCHES = 15_000  # of all together, minutes too
 
 
 class Inspection:
