@@ -63,6 +63,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     solves_internal = True
     solves_friction = True
     meets_events = True
+    keeps_sparse = True
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""
@@ -121,6 +122,7 @@ class GeneralizedAlpha(Controlled, Stepper):
 
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""
+        system = system.settled(params)
         known = linear_part(self, system, params, dt)
         if system.friction is not None:
             return bind_friction(self, system, params, dt, known)

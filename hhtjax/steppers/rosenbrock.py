@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from hhtjax.checks import require_number
 from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import factorize_map
+from hhtjax.numerics.sparse_solve import kept
 from hhtjax.steppers.estimate import Embedded, Errors
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
@@ -49,6 +50,7 @@ class Rosenbrock(Embedded, Stepper):
 
     solves_internal = True
     meets_events = True
+    keeps_sparse = True
 
     @property
     def estimate_order(self):
@@ -70,6 +72,7 @@ class Rosenbrock(Embedded, Stepper):
 
     def bind_pair(self, system, params, dt, estimating=True):
         """State -> State, Info, Errors; for a linear system the matrix is factorised here, once."""
+        system = system.settled(params)
         g, r = self.tableau.g, partial(residual, system, params)
         zero, instant = jnp.zeros(system.size, dt.dtype), jnp.zeros_like(dt)
 
@@ -77,8 +80,11 @@ class Rosenbrock(Embedded, Stepper):
             def implicit(x):
                 return tangent(State(instant, system.located((g * dt) ** 2 * x), g * dt * x, x))
 
-            return factorize_map(implicit, zero, factorize)
+            return factorize_map(implicit, zero, ways)
 
+        ways = factorize
+        if system.matrices is not None:
+            ways = kept(system.step_matrix(params, jnp.ones_like(dt), g * dt, (g * dt) ** 2))
         if system.linear:
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 

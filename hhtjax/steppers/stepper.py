@@ -134,6 +134,7 @@ class Stepper(Description):
     solves_rotations = False
     solves_internal = False
     solves_friction = False
+    keeps_sparse = False  # whether it never forms the matrix of a step of a system with sparse ones
     meets_events = False  # whether `begin` gives all that a step needs behind an event
     needs_equal_steps = False  # what it remembers belongs to steps of one size
     resizes = False  # whether `resized` does anything

@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.linear_solve import solve
+from hhtjax.numerics.sparse_matrix import Sparse, combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.matrices import as_matrix
@@ -38,6 +39,18 @@ class FlatSystem(NamedTuple):
     product: Callable | None = None  # q, w, params -> M(q) w, where the system has its own
     local: Any = None  # the `Local` force beside a linear system
     friction: FrictionLaw | None = None  # dry friction, which `force` does not hold
+    matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
+    settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
+
+    def settled(self, params):
+        """What `settle` gives, where there is something to settle."""
+        return self if self.settle is None else self.settle(params)
+
+    def step_matrix(self, params, w, v, q):
+        """w M + v C + q K, `Sparse`, of factors that are numbers."""
+        assert self.matrices is not None
+        M, C, K = self.matrices(params)
+        return combined(*((x, A) for x, A in ((w, M), (v, C), (q, K)) if A is not None))
 
     def inertia(self, q, w, params):
         """M(q) w, and zdot."""
@@ -133,25 +146,65 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
     linear = isinstance(system, LinearSystem)
     _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0)
 
-    def mass(q, params):
-        M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
-        return as_matrix(M, dtype)
+    def on_vectors(system):
+        mass, force = (partial(f, system, unravel, dtype) for f in (_flat_mass, partial(_flat_force, unravel_rates)))
+        flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks)
+        return _with_local(system, flat, dtype) if linear and system.nonlinear is not None else flat
 
-    def force(q, v, t, params):
-        return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, params))[0].astype(dtype)
-
-    product = None
+    flat = on_vectors(system)
     if not linear and system.inertia is not None:
         check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
-        product = partial(_flat_product, system.inertia, unravel, unravel_rates, dtype)
-    flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks, product)
-    if linear and system.nonlinear is not None:
-        flat = _with_local(system, flat, dtype)
+        flat = flat._replace(product=partial(_flat_product, system.inertia, unravel, unravel_rates, dtype))
+    if linear:
+        flat = with_sparse_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
         flat, q, v = _with_internal(system, flat, q, v0, z0)
     if system.friction is not None:
         flat = flat._replace(friction=flat_friction(caller, system, flat, q0, v0, z0, t0, params))
     return flat, q, v
+
+
+def with_sparse_matrices(caller, system, flat, on_vectors, dtype, params):
+    """The system as one whose matrices are kept sparse, if one of them is; on_vectors: such a system -> the flat one."""
+    given = {name: A for name in "MCK" if (A := getattr(system, name)) is not None}
+    shapes = {name: evaluate(caller, name, A, params) if callable(A) else A for name, A in given.items()}
+    if not any(isinstance(A, Sparse) for A in shapes.values()):
+        return flat
+    for name, A in shapes.items():
+        if not isinstance(A, Sparse) and len(A.shape) > 1:
+            raise ValueError(
+                f"{caller}: `{name}` must be sparse, too, or a diagonal (n,), beside a sparse matrix: "
+                f"hhtjax.sparse makes one; received shape {A.shape}."
+            )
+    if system.friction is not None:
+        raise NotImplementedError(f"{caller}: leave out `friction` beside sparse matrices, or hand over dense ones.")
+    if system.nonlinear is not None and system.at is None:
+        raise NotImplementedError(f"{caller}: name the coordinates of `nonlinear` by `at`: the matrices are sparse.")
+
+    def matrices(params):
+        found = {name: as_matrix(A(params) if callable(A) else A, dtype) for name, A in given.items()}
+        return [found.get(name) for name in "MCK"]
+
+    def settle(params):
+        known = matrices(params)
+        return _knowing(on_vectors(system.with_matrices(*known)), lambda params: known)
+
+    return _knowing(flat, matrices)._replace(settle=settle)
+
+
+def _knowing(flat, matrices):
+    """The system, and its linear part, with this function for its matrices."""
+    local = None if flat.local is None else flat.local._replace(linear=flat.local.linear._replace(matrices=matrices))
+    return flat._replace(matrices=matrices, local=local)
+
+
+def _flat_mass(system, unravel, dtype, q, params):
+    M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
+    return as_matrix(M, dtype)
+
+
+def _flat_force(unravel_rates, system, unravel, dtype, q, v, t, params):
+    return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, params))[0].astype(dtype)
 
 
 def _with_local(system, flat, dtype):
