@@ -31,10 +31,16 @@ def linear_part(method, system, params, dt):
         kept = system.linear and system.friction is not None
         return Constant(step_matrix(method, system, params, dt)) if kept else None
 
+    return with_local(step_matrix(method, local.linear, params, dt), local, params)
+
+
+def with_local(A, local, params):
+    """The `Changing` of the matrix of the linear part, and the Jacobian of the force beside it."""
+
     def slope(s):
         return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
 
-    return changing(step_matrix(method, local.linear, params, dt), slope, local.spread, local.size)
+    return changing(A, slope, local.spread, local.size)
 
 
 def step_matrix(method, system, params, dt):
