@@ -10,6 +10,7 @@ products, which XLA computes itself.
 """
 
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +28,7 @@ BLOCKED = 1024  # unknowns up to which it takes them
 SCALAR = 4  # beyond, scalar operations are so many that compiling them takes long
 
 
-def matvec(A, x):
+def matvec(A, x) -> Any:
     """A x for a full or `Sparse` A, or a diagonal one (n,); elementwise for n <= 8, so that XLA can fuse it."""
     if A.ndim == 1:
         return A * x

@@ -31,7 +31,7 @@ class Pattern:
         self.size = self.width * n + int(late.sum())
         digest = blake2b(np.array([n]).tobytes(), digest_size=16)
         for x in (self.rows, self.columns):
-            digest.update(np.ascontiguousarray(x))
+            digest.update(x.tobytes())
         self.digest = digest.digest()
 
     def __eq__(self, other):
@@ -60,7 +60,7 @@ class Pattern:
 
 @jax.tree_util.register_pytree_node_class
 class Sparse:
-    """A sparse matrix (n, n) of which multiples and sums are such; made by `sparse`. values: by the slots of pattern."""
+    """A sparse matrix (n, n), whose multiples and sums are such; made by `sparse`. values: by the slots of pattern."""
 
     __array_ufunc__ = None  # a number of NumPy leaves products to us
     ndim = 2
@@ -75,7 +75,7 @@ class Sparse:
     @classmethod
     def tree_unflatten(cls, pattern, data):
         """Inverse of `tree_flatten`."""
-        return cls(*data, pattern)
+        return cls(data[0], pattern)
 
     def __repr__(self):
         return f"sparse({self.pattern})"
@@ -148,7 +148,7 @@ class Sparse:
         p = self.pattern
         layers = self.values[: p.width * p.n].reshape(p.width, p.n)
         if p.width <= WRITTEN_OUT:
-            y = sum(a * gather(x, i) for a, i in zip(layers, p.layers, strict=True))
+            y = sum((a * gather(x, i) for a, i in zip(layers, p.layers, strict=True)), jnp.zeros_like(x))
         else:
             step = lambda y, layer: (y + layer[0] * gather(x, layer[1]), None)  # noqa: E731
             y, _ = lax.scan(step, jnp.zeros_like(layers[0]), (layers, jnp.asarray(p.layers)))
@@ -182,7 +182,7 @@ def of_dense(A):
 
 
 def combined(*terms):
-    """The sum of factor times matrix, pairs; matrices that are `Sparse`, or diagonals (n,), one at least of the former."""
+    """The sum of factor times matrix, of pairs; matrices are `Sparse`, one at least, or diagonals (n,)."""
     n = next(len(A) for _, A in terms if isinstance(A, Sparse))
     terms = [(c, A if isinstance(A, Sparse) else Sparse(A, diagonal_pattern(n))) for c, A in terms]
     pattern, places = union(*(A.pattern for _, A in terms))

@@ -1,4 +1,4 @@
-"""`Constant` and `Changing`, of low_rank.py, for matrices that are full or `Sparse`; the latter tell what solves leave."""
+"""`Constant` and `Changing`, of low_rank.py, for full matrices and for `Sparse` ones, which tell what solves leave."""
 
 from dataclasses import dataclass
 

@@ -43,7 +43,7 @@ def _factorize(pattern, values):
     """(..., WORDS): the digests of values (..., slots), whose factors are kept."""
     values = np.asarray(values)
     flat = values.reshape(-1, values.shape[-1])
-    digests = [blake2b(np.ascontiguousarray(x), digest_size=4 * WORDS).digest() for x in flat]
+    digests = [blake2b(x.tobytes(), digest_size=4 * WORDS).digest() for x in flat]
     _obtain(pattern, digests, flat)
     return np.frombuffer(b"".join(digests), np.uint32).reshape(*values.shape[:-1], WORDS)
 

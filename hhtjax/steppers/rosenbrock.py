@@ -88,6 +88,7 @@ class Rosenbrock(Embedded, Stepper):
 
         def factorized(tangent, s=None):
             return factorize_map(lambda x: tangent(along(x)), zero, around(ways, lambda: (s, along)))
+
         if system.linear:
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 

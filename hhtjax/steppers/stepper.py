@@ -73,7 +73,7 @@ class Info(NamedTuple):
         dependent_row: number, from 1, of the first constraint that depends on those before it at the start of the step;
             0 while B has full rank.
         solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
-            trust (`banded`, `conjugate_gradients`, a given function).
+            trust (`banded`, `conjugate_gradients`, a given function), or made with a sparse matrix.
         solved: whether that is within its tolerance.
         friction: the part of a step that is left where several joints switch more often than it resolves; infinite
             where a limit is negative or not a number.

@@ -9,11 +9,12 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.linear_solve import solve
-from hhtjax.numerics.sparse_matrix import Sparse, combined
+from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.returned import check_like, check_matrix, count, evaluate
+from hhtjax.systems.sparse_system import with_sparse_matrices
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem
 
 
@@ -162,40 +163,6 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
     if system.friction is not None:
         flat = flat._replace(friction=flat_friction(caller, system, flat, q0, v0, z0, t0, params))
     return flat, q, v
-
-
-def with_sparse_matrices(caller, system, flat, on_vectors, dtype, params):
-    """The system as one whose matrices are kept sparse, if one of them is; on_vectors: such a system -> the flat one."""
-    given = {name: A for name in "MCK" if (A := getattr(system, name)) is not None}
-    shapes = {name: evaluate(caller, name, A, params) if callable(A) else A for name, A in given.items()}
-    if not any(isinstance(A, Sparse) for A in shapes.values()):
-        return flat
-    for name, A in shapes.items():
-        if not isinstance(A, Sparse) and len(A.shape) > 1:
-            raise ValueError(
-                f"{caller}: `{name}` must be sparse, too, or a diagonal (n,), beside a sparse matrix: "
-                f"hhtjax.sparse makes one; received shape {A.shape}."
-            )
-    if system.friction is not None:
-        raise NotImplementedError(f"{caller}: leave out `friction` beside sparse matrices, or hand over dense ones.")
-    if system.nonlinear is not None and system.at is None:
-        raise NotImplementedError(f"{caller}: name the coordinates of `nonlinear` by `at`: the matrices are sparse.")
-
-    def matrices(params):
-        found = {name: as_matrix(A(params) if callable(A) else A, dtype) for name, A in given.items()}
-        return [found.get(name) for name in "MCK"]
-
-    def settle(params):
-        known = matrices(params)
-        return _knowing(on_vectors(system.with_matrices(*known)), lambda params: known)
-
-    return _knowing(flat, matrices)._replace(settle=settle)
-
-
-def _knowing(flat, matrices):
-    """The system, and its linear part, with this function for its matrices."""
-    local = None if flat.local is None else flat.local._replace(linear=flat.local.linear._replace(matrices=matrices))
-    return flat._replace(matrices=matrices, local=local)
 
 
 def _flat_mass(system, unravel, dtype, q, params):

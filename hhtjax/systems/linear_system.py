@@ -11,8 +11,8 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_function, require_integer
 from hhtjax.description import Description, is_array
 from hhtjax.numerics.elimination import matvec
-from hhtjax.systems.friction import require_friction
 from hhtjax.numerics.sparse_matrix import Sparse, of_dense
+from hhtjax.systems.friction import require_friction
 from hhtjax.systems.matrices import as_matrix, constant_matrix, require_mass
 
 
