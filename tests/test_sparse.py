@@ -134,7 +134,7 @@ def test_pivots_are_free_where_the_diagonal_is_none():
 
 
 def test_single_precision():
-    made = LinearSystem(*map(hhtjax.sparse, (M, GYRO, 40 * K)), lambda t, p: jnp.sin(t) * RAMP.astype(t.dtype))
+    made = LinearSystem(*map(hhtjax.sparse, (M, GYRO, 40 * K)))
     with pytest.warns(hhtjax.PrecisionWarning):
         found = run(made, STEPPERS["hht"], 1.0, RAMP.astype(np.float32), num_steps=4)
     assert found.q.dtype == found.info.solve_residual.dtype == np.float32

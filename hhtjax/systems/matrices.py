@@ -40,7 +40,7 @@ def sparse(matrix) -> Sparse:
     >>> ones = np.ones(n)
     >>> K = hhtjax.sparse(scipy.sparse.diags([-ones[1:], 2 * ones, -ones[1:]], [-1, 0, 1]))     # springs in a row
     >>> chain = hhtjax.LinearSystem(ones, K=lambda params: params["k"] * K)
-    >>> start = jnp.sin(jnp.pi * jnp.arange(1, n + 1) / (n + 1)), jnp.zeros(n)
+    >>> start = jnp.sin(jnp.pi * jnp.arange(1.0, n + 1) / (n + 1)), jnp.zeros(n)
     >>> run = hhtjax.simulate(chain, hhtjax.hht(), *start, {"k": 4e8}, dt=0.01, num_steps=100, save_every=100)
     >>> run.check()
     >>> round(float(run.q[-1, n // 2]), 3), round(float(jnp.cos(jnp.pi * 2e4 / (n + 1))), 3)

@@ -34,7 +34,7 @@ def on_host(f, like, *args):
         jax.errors.JaxRuntimeError: f raises.
 
     >>> x = jnp.ones(3)
-    >>> float(jax.jit(lambda x: on_host(np.cumsum, x, x))(x)[-1])
+    >>> float(jax.jit(lambda x: on_host(lambda x: np.cumsum(x, axis=-1), x, x))(x)[-1])
     3.0
     """
     if not is_on():
