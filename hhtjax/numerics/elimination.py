@@ -5,8 +5,8 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 `LOOPED` it is a loop in a kernel, and LAPACK's elsewhere.
 
 LAPACK's threads wait for each other by spinning: where other processes want the cores too, a solve with 200 unknowns
-takes milliseconds. So what is factorised once for many solves has the blocks on its diagonal inverted, and a solve is
-products, which XLA computes itself.
+takes milliseconds, and a factorisation tenths of a second. So what is factorised once for many solves is so in panels,
+has the blocks on its diagonal inverted, and a solve is products, which XLA computes itself.
 """
 
 from functools import partial
@@ -24,7 +24,7 @@ from hhtjax.xla import choose, structural
 UNROLLED = 8
 LOOPED = 16
 BLOCK = 64  # rows of the blocks of `factorize_once`
-BLOCKED = 1024  # unknowns up to which it takes them
+BLOCKED = 512  # unknowns up to which it takes them
 SCALAR = 4  # beyond, scalar operations are so many that compiling them takes long
 
 
@@ -67,23 +67,37 @@ def factorize_once(A):
     """The same for many solves: beyond `LOOPED` unknowns by products, in half the time of LAPACK's substitution."""
     if isinstance(A, Sparse) or not LOOPED < A.shape[-1] <= BLOCKED:
         return factorize(A)
-    LU, _, order = lax.linalg.lu(lax.stop_gradient(A))
+    LU, order, lower = _lu_in_panels(lax.stop_gradient(A))
     blocks = [slice(i, min(i + BLOCK, len(A))) for i in range(0, len(A), BLOCK)]
-    ones = [jnp.eye(i.stop - i.start, dtype=A.dtype) for i in blocks]
-    ways = {"lower": True, "unit_diagonal": True}, {"lower": False}
-    inverse = [
-        [lax.linalg.triangular_solve(LU[i, i], one, left_side=True, **way) for i, one in zip(blocks, ones, strict=True)]
-        for way in ways
-    ]
+    upper = [_inverse(LU[i, i], lower=False) for i in blocks]
     back = jnp.argsort(order)
 
     def apply(b, trans=0):
         if not trans:
-            return _by_blocks(LU, inverse[1], _by_blocks(LU, inverse[0], b[order], blocks), blocks[::-1])
-        upper, lower = ([D.T for D in found] for found in inverse[::-1])
-        return _by_blocks(LU.T, lower, _by_blocks(LU.T, upper, b, blocks), blocks[::-1])[back]
+            return _by_blocks(LU, upper, _by_blocks(LU, lower, b[order], blocks), blocks[::-1])
+        first, second = ([D.T for D in found] for found in (upper, lower))
+        return _by_blocks(LU.T, second, _by_blocks(LU.T, first, b, blocks), blocks[::-1])[back]
 
     return apply
+
+
+def _lu_in_panels(A):
+    """The same as `_lu`, and the inverses of L's diagonal blocks. Panels are too small for LAPACK's threads."""
+    order, inverses = jnp.arange(len(A)), []
+    for k in range(0, len(A), BLOCK):
+        panel, _, rows = lax.linalg.lu(A[k:, k : k + BLOCK])
+        width = panel.shape[1]
+        rest = A[k:][rows]
+        inverses.append(_inverse(panel[:width], lower=True, unit_diagonal=True))
+        top = inverses[-1] @ rest[:width, k + width :]
+        right = jnp.concatenate([top, rest[width:, k + width :] - panel[width:] @ top])
+        A = jnp.concatenate([A[:k], jnp.concatenate([rest[:, :k], panel, right], axis=1)])
+        order = jnp.concatenate([order[:k], order[k:][rows]])
+    return A, order, inverses
+
+
+def _inverse(T, **triangle):
+    return lax.linalg.triangular_solve(T, jnp.eye(len(T), dtype=T.dtype), left_side=True, **triangle)
 
 
 def _by_blocks(A, inverse, b, order):
