@@ -5,8 +5,8 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 `LOOPED` it is a loop in a kernel, and LAPACK's elsewhere.
 
 LAPACK's threads wait for each other by spinning: where other processes want the cores too, a solve with 200 unknowns
-takes milliseconds, and a factorisation tenths of a second. So what is factorised once for many solves is so in panels,
-has the blocks on its diagonal inverted, and a solve is products, which XLA computes itself.
+takes milliseconds. So what is factorised once for many solves has the blocks on its diagonal inverted, and a solve is
+products, which XLA computes itself.
 """
 
 from functools import partial
@@ -67,8 +67,9 @@ def factorize_once(A):
     """The same for many solves: beyond `LOOPED` unknowns by products, in half the time of LAPACK's substitution."""
     if isinstance(A, Sparse) or not LOOPED < A.shape[-1] <= BLOCKED:
         return factorize(A)
-    LU, order, lower = _lu_in_panels(lax.stop_gradient(A))
+    LU, order = _lu_of_lapack(lax.stop_gradient(A))
     blocks = [slice(i, min(i + BLOCK, len(A))) for i in range(0, len(A), BLOCK)]
+    lower = [_inverse(LU[i, i], lower=True, unit_diagonal=True) for i in blocks]
     upper = [_inverse(LU[i, i], lower=False) for i in blocks]
     back = jnp.argsort(order)
 
@@ -79,21 +80,6 @@ def factorize_once(A):
         return _by_blocks(LU.T, second, _by_blocks(LU.T, first, b, blocks), blocks[::-1])[back]
 
     return apply
-
-
-def _lu_in_panels(A):
-    """The same as `_lu`, and the inverses of L's diagonal blocks. Panels are too small for LAPACK's threads."""
-    order, inverses = jnp.arange(len(A)), []
-    for k in range(0, len(A), BLOCK):
-        panel, _, rows = lax.linalg.lu(A[k:, k : k + BLOCK])
-        width = panel.shape[1]
-        rest = A[k:][rows]
-        inverses.append(_inverse(panel[:width], lower=True, unit_diagonal=True))
-        top = inverses[-1] @ rest[:width, k + width :]
-        right = jnp.concatenate([top, rest[width:, k + width :] - panel[width:] @ top])
-        A = jnp.concatenate([A[:k], jnp.concatenate([rest[:, :k], panel, right], axis=1)])
-        order = jnp.concatenate([order[:k], order[k:][rows]])
-    return A, order, inverses
 
 
 def _inverse(T, **triangle):
