@@ -3,10 +3,6 @@
 A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
 up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones; up to
 `LOOPED` it is a loop in a kernel, and LAPACK's elsewhere.
-
-LAPACK's threads wait for each other by spinning: where other processes want the cores too, a solve with 200 unknowns
-takes milliseconds. So what is factorised once for many solves has the blocks on its diagonal inverted, and a solve is
-products, which XLA computes itself.
 """
 
 from functools import partial
@@ -23,8 +19,6 @@ from hhtjax.xla import choose, structural
 
 UNROLLED = 8
 LOOPED = 16
-BLOCK = 64  # rows of the blocks of `factorize_once`
-BLOCKED = 512  # unknowns up to which it takes them
 SCALAR = 4  # beyond, scalar operations are so many that compiling them takes long
 
 
@@ -61,39 +55,6 @@ def factorize(A):
         ways = _substitute, _by_lapack
         return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
     return partial(lu_solve, lu_factor(A))
-
-
-def factorize_once(A):
-    """The same for many solves: beyond `LOOPED` unknowns by products, in half the time of LAPACK's substitution."""
-    if isinstance(A, Sparse) or not LOOPED < A.shape[-1] <= BLOCKED:
-        return factorize(A)
-    LU, order = _lu_of_lapack(lax.stop_gradient(A))
-    blocks = [slice(i, min(i + BLOCK, len(A))) for i in range(0, len(A), BLOCK)]
-    lower = [_inverse(LU[i, i], lower=True, unit_diagonal=True) for i in blocks]
-    upper = [_inverse(LU[i, i], lower=False) for i in blocks]
-    back = jnp.argsort(order)
-
-    def apply(b, trans=0):
-        if not trans:
-            return _by_blocks(LU, upper, _by_blocks(LU, lower, b[order], blocks), blocks[::-1])
-        first, second = ([D.T for D in found] for found in (upper, lower))
-        return _by_blocks(LU.T, second, _by_blocks(LU.T, first, b, blocks), blocks[::-1])[back]
-
-    return apply
-
-
-def _inverse(T, **triangle):
-    return lax.linalg.triangular_solve(T, jnp.eye(len(T), dtype=T.dtype), left_side=True, **triangle)
-
-
-def _by_blocks(A, inverse, b, order):
-    """x with T x = b, T a triangle of A whose blocks on the diagonal have these inverses; order: of the blocks."""
-    down, found = order[0].start == 0, {}
-    for i in order:
-        known = slice(0, i.start) if down else slice(i.stop, len(A))
-        x = jnp.concatenate([found[k] for k in sorted(found)]) if found else b[:0]
-        found[i.start] = inverse[i.start // BLOCK] @ (b[i] - A[i, known] @ x if found else b[i])
-    return jnp.concatenate([found[k] for k in sorted(found)])
 
 
 def _lu(A):

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.elimination import factorize, factorize_once, matvec
+from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.xla import linear_map
 
 
@@ -41,7 +41,7 @@ class Changing:
         self.A0, self.slope, self.spread, self.size = lax.stop_gradient(A0), slope, spread, size
         if size is None:
             return
-        self.inverse = factorize_once(A0)
+        self.inverse = factorize(A0)
         self.columns = jax.vmap(spread)(jnp.eye(size, dtype=A0.dtype))  # E^T
         self.Z = [jax.vmap(lambda e, trans=trans: self.inverse(e, trans=trans))(self.columns).T for trans in (0, 1)]
         self.S = self.columns @ self.Z[0]
@@ -97,7 +97,7 @@ class Constant(Changing, AtState):
 
     def __init__(self, A0):
         self.A0 = lax.stop_gradient(A0)
-        self.inverse = factorize_once(self.A0)
+        self.inverse = factorize(self.A0)
 
     def around(self, state, along):
         """Itself, at every state."""

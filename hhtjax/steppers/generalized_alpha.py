@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
-from hhtjax.numerics.elimination import factorize, factorize_once
+from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.estimate import Controlled
@@ -76,8 +76,7 @@ class GeneralizedAlpha(Controlled, Stepper):
             return begin_constrained(self, system, q, v, t, params, dt)
 
         def acceleration(q, v, t):
-            once = factorize_once if given is None else self.factorize
-            return system.acceleration(q, v, t, params, once)
+            return system.acceleration(q, v, t, params, self.factorize)
 
         shift = c.alpha_m - c.alpha_f
         if self.options.start != "corrected" or (is_concrete(shift) and shift == 0):

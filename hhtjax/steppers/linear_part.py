@@ -5,7 +5,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from hhtjax.numerics.elimination import factorize_once
 from hhtjax.numerics.linear_solve import reuse
 from hhtjax.numerics.low_rank import Constant
 from hhtjax.numerics.sparse_solve import changing, kept
@@ -17,8 +16,7 @@ def factorized_once(method, system, params, dt):
     """The factorised matrix of a linear system, in the place of `factorize`."""
     if system.matrices is not None and method.options.solve is None:
         return kept(step_matrix(method, system, params, dt))
-    once = factorize_once if method.options.solve is None else method.factorize
-    return reuse(method.factorize, once(step_matrix(method, system, params, dt)))
+    return reuse(method.factorize, method.factorize(step_matrix(method, system, params, dt)))
 
 
 def linear_part(method, system, params, dt):

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_number
-from hhtjax.numerics.elimination import factorize, factorize_once
+from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import factorize_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.sparse_solve import kept
@@ -78,7 +78,7 @@ class Rosenbrock(Embedded, Stepper):
         g, r = self.tableau.g, partial(residual, system, params)
         zero, instant = jnp.zeros(system.size, dt.dtype), jnp.zeros_like(dt)
 
-        ways = factorize_once if system.linear else factorize
+        ways = factorize
         if system.matrices is not None:
             A, local = system.step_matrix(params, jnp.ones_like(dt), g * dt, (g * dt) ** 2), system.local
             ways = kept(A) if local is None else with_local(A, local, params)
