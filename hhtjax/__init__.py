@@ -81,6 +81,7 @@ from hhtjax.systems.band_limited import band_limited, band_limited_motion, splin
 from hhtjax.systems.consistent import ConsistentInitial, consistent_initial
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.initial_values import PrecisionWarning
+from hhtjax.systems.matrices import sparse
 from hhtjax.systems.sampled import Sampled, sampled
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Explanation, explain, plain
@@ -89,7 +90,7 @@ __all__ = [  # noqa: RUF022
     "__version__", "analysis", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
     "FirstOrderSystem", "LinearSystem", "System", "PrecisionWarning", "ConsistentInitial", "consistent_initial",
-    "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled", "spline_gain_error",
+    "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled", "sparse", "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
     "bossak", "collocation", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",

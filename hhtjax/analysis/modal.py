@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -11,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_integer
 from hhtjax.description import Description, is_concrete
 from hhtjax.description.presentation import shown
+from hhtjax.numerics.sparse_matrix import Sparse
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import SYMMETRIC, constant_matrix, is_sparse, require_mass
 
@@ -81,6 +83,7 @@ def modes(M, K, count=None) -> NormalModes:
     >>> [round(float(w), 6) for w in found.frequencies], [round(20 * float(np.sin(j * np.pi / 8)), 6) for j in (1, 2)]
     ([7.653669, 14.142136], [7.653669, 14.142136])
     """
+    M, K = map(_of_scipy, (M, K))
     n = _rows("M", M)
     if n != _rows("K", K):
         raise ValueError(f"modes: `K` must have the shape of M, {n} rows; received {_rows('K', K)}.")
@@ -131,7 +134,7 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
     """
     nonlinear, at, friction, sliding = None, None, None, _velocities
     if isinstance(system, LinearSystem):
-        M, C, K, load = system.M, system.C, system.K, system.load
+        (M, C, K), load = map(_of_scipy, (system.M, system.C, system.K)), system.load
         nonlinear, at, friction = system.nonlinear, system.at, system.friction
         sliding = system.sliding or sliding
     elif isinstance(system, tuple) and len(system) in (3, 4):
@@ -142,7 +145,7 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
         )
     if K is None:
         raise ValueError("modal_reduction: `system` must have a stiffness K; received None.")
-    mass, stiffness = (A(params) if callable(A) else A for A in (M, K))
+    mass, stiffness = (_of_scipy(A(params) if callable(A) else A) for A in (M, K))
     frequencies, T = modes(mass, stiffness, count)
     reduced = LinearSystem(
         _Projected(T, M) if callable(M) else np.ones(count),
@@ -164,7 +167,10 @@ class _Projected(Description):
     matrix: Callable
 
     def __call__(self, params):
-        return _project(self.T, jnp.asarray(self.matrix(params)))
+        A = self.matrix(params)
+        if isinstance(A, Sparse):
+            return self.T.T @ jax.vmap(lambda x: A @ x, 1, 1)(jnp.asarray(self.T))
+        return _project(self.T, jnp.asarray(A))
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +203,10 @@ class _ProjectedForce(_Expanded):
 
     def __call__(self, q, v, t, params):
         return jnp.asarray(self.T, q.dtype).T @ super().__call__(q, v, t, params)
+
+
+def _of_scipy(A):
+    return A.tocoo() if isinstance(A, Sparse) and is_concrete(A.values) else A
 
 
 def _velocities(q, v, t, params):

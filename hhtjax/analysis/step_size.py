@@ -15,6 +15,7 @@ from hhtjax.steppers.stepper import require_capable, require_stepper
 from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.sparse_system import require_dense
 from hhtjax.systems.system import LinearSystem, System
 
 # of suggest_step_size
@@ -141,6 +142,7 @@ def suggest_step_size(
             raise ValueError(f"{caller}: `highest` must be left out where there is a `duration`; received {highest}.")
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
+    require_dense(caller, system, params)
     params = freeze(params)
     q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
     require_capable(caller, system, stepper, q0, v0)

@@ -16,6 +16,7 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.rubbing import require_independent_friction
 from hhtjax.systems.sampled import Sampled
+from hhtjax.systems.sparse_system import require_dense
 from hhtjax.systems.system import FirstOrderSystem
 from hhtjax.xla import structural
 
@@ -51,6 +52,7 @@ def given(caller, system, stepper, q0, v0, params, z0):
     q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
     require_capable(caller, system, stepper, q0, v0)
     params = require_params(caller, params)
+    require_dense(caller, system, params)
     if system.friction is not None:
         require_independent_friction(caller, system, q0, v0, 0.0, params, z0)
     if not all(map(is_concrete, jax.tree.leaves((system, stepper, q0, v0, params, z0)))):

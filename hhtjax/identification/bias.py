@@ -23,6 +23,7 @@ from hhtjax.checks import require_number
 from hhtjax.description.presentation import all_known, between, shown
 from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import Stepper, require_stepper
+from hhtjax.systems.sparse_system import require_dense
 from hhtjax.systems.system import LinearSystem, System, require_smooth
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
@@ -119,6 +120,7 @@ def step_size_bias(
             "step_size_bias: `system` has internal states, which M, C and K cannot hold; `refine` takes the bias out."
         )
     require_smooth("step_size_bias", system)
+    require_dense("step_size_bias", system, params)
     _require_on_constraint(system, params, q, t0)
     matrices = _linear_part(system, params, q, v, t0)
     fitted = _rates_of_equations(*matrices)

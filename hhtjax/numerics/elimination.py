@@ -6,12 +6,15 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 """
 
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 
+from hhtjax.numerics.sparse_matrix import Sparse
+from hhtjax.numerics.superlu import factorize_sparse
 from hhtjax.xla import choose, structural
 
 UNROLLED = 8
@@ -19,23 +22,27 @@ LOOPED = 16
 SCALAR = 4  # beyond, scalar operations are so many that compiling them takes long
 
 
-def matvec(A, x):
-    """A x for a full A (n, n), or a diagonal one (n,); elementwise for n <= 8, so that XLA can fuse it."""
+def matvec(A, x) -> Any:
+    """A x for a full or `Sparse` A, or a diagonal one (n,); elementwise for n <= 8, so that XLA can fuse it."""
     if A.ndim == 1:
         return A * x
-    if A.shape[-1] > UNROLLED:
+    if A.shape[-1] > UNROLLED or isinstance(A, Sparse):
         return A @ x
     return sum(A[:, j] * x[j] for j in range(1, A.shape[-1])) + A[:, 0] * x[0]
 
 
 def diagonal(A):
     """Of a full A (n, n), or of a diagonal one (n,), which is its own. jnp.diagonal would ask for the platform."""
+    if isinstance(A, Sparse):
+        return A.diagonal()
     i = jnp.arange(len(A))
     return A if A.ndim == 1 else A[i, i]
 
 
 def factorize(A):
     """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff."""
+    if isinstance(A, Sparse):
+        return factorize_sparse(A)
     A = lax.stop_gradient(A)
     if A.shape[-1] == 2:
         return partial(_cramer, A)

@@ -95,7 +95,7 @@ class Structured(Trusted):
 
     def __call__(self, A):
         """The same for a matrix."""
-        return self.of_map(partial(matvec, A), A[0])
+        return self.of_map(partial(matvec, A), jnp.zeros(len(A), A.dtype))
 
 
 def factorize_with(solve):

@@ -89,7 +89,7 @@ class Known(AtState):
         known, x = self.matrices, jnp.abs(x)
         if known.size is None:
             return matvec(jnp.abs(known.A0 - self.J), x)
-        return matvec(jnp.abs(known.A0), x) + known.columns.T @ (jnp.abs(self.J) @ (known.columns @ x))
+        return matvec(abs(known.A0), x) + known.columns.T @ (jnp.abs(self.J) @ (known.columns @ x))
 
 
 class Constant(Changing, AtState):
@@ -107,7 +107,7 @@ class Constant(Changing, AtState):
         return self.inverse
 
     def bound(self, x):
-        return matvec(jnp.abs(self.A0), jnp.abs(x))
+        return matvec(abs(self.A0), jnp.abs(x))
 
 
 class Updated(Changing):

@@ -14,6 +14,7 @@ class RK4(Stepper):
 
     solves_internal = True
     meets_events = True
+    keeps_sparse = True
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, the first stage of the first step."""

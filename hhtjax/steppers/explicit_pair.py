@@ -48,6 +48,7 @@ class DormandPrince(Embedded, Stepper):
 
     solves_internal = True
     meets_events = True
+    keeps_sparse = True
     estimate_order = 5
     dense_term = True
 

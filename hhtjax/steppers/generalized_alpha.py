@@ -62,10 +62,13 @@ class GeneralizedAlpha(Controlled, Stepper):
     solves_internal = True
     solves_friction = True
     meets_events = True
+    keeps_sparse = True
 
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""
-        c = self.coefficients
+        c, given = self.coefficients, self.options.solve
+        if system.matrices is not None and not (given is None or isinstance(given, Structured)):
+            raise NotImplementedError(f"hht: leave out `solve` with sparse matrices; received {given!r}.")
         if system.friction is not None:
             return begin_friction(self, system, q, v, t, params, dt)
         if system.num_constraints:
@@ -120,6 +123,7 @@ class GeneralizedAlpha(Controlled, Stepper):
 
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""
+        system = system.settled(params)
         known = linear_part(self, system, params, dt)
         if system.friction is not None:
             return bind_friction(self, system, params, dt, known)

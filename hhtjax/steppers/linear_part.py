@@ -6,13 +6,16 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.numerics.linear_solve import reuse
-from hhtjax.numerics.low_rank import Changing, Constant
+from hhtjax.numerics.low_rank import Constant
+from hhtjax.numerics.sparse_solve import changing, kept
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import State
 
 
 def factorized_once(method, system, params, dt):
     """The factorised matrix of a linear system, in the place of `factorize`."""
+    if system.matrices is not None and method.options.solve is None:
+        return kept(step_matrix(method, system, params, dt))
     return reuse(method.factorize, method.factorize(step_matrix(method, system, params, dt)))
 
 
@@ -28,15 +31,24 @@ def linear_part(method, system, params, dt):
         kept = system.linear and system.friction is not None
         return Constant(step_matrix(method, system, params, dt)) if kept else None
 
+    return with_local(step_matrix(method, local.linear, params, dt), local, params)
+
+
+def with_local(A, local, params):
+    """The `Changing` of the matrix of the linear part, and the Jacobian of the force beside it."""
+
     def slope(s):
         return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
 
-    return Changing(step_matrix(method, local.linear, params, dt), slope, local.spread, local.size)
+    return changing(A, slope, local.spread, local.size)
 
 
 def step_matrix(method, system, params, dt):
     """The matrix of the step of a linear system."""
-    zero = jnp.zeros(system.size, dt.dtype)
+    zero = jnp.zeros(system.size if system.matrices is None else 1, dt.dtype)
     rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
     path = partial(method.arrive, system, rest, dt)
+    if system.matrices is not None:
+        _, change = jax.jvp(path, (zero,), (jnp.ones_like(zero),))  # the same for every unknown
+        return system.step_matrix(params, change.w[0], change.v[0], change.q[0])
     return jax.jacfwd(lambda w: residual(system, params, path(w)))(zero)

@@ -22,7 +22,10 @@ import jax.numpy as jnp
 from hhtjax.checks import require_number
 from hhtjax.numerics.elimination import factorize
 from hhtjax.numerics.linear_solve import factorize_map
+from hhtjax.numerics.low_rank import around
+from hhtjax.numerics.sparse_solve import kept
 from hhtjax.steppers.estimate import Embedded, Errors
+from hhtjax.steppers.linear_part import with_local
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.xla import staged
@@ -49,6 +52,7 @@ class Rosenbrock(Embedded, Stepper):
 
     solves_internal = True
     meets_events = True
+    keeps_sparse = True
 
     @property
     def estimate_order(self):
@@ -70,21 +74,27 @@ class Rosenbrock(Embedded, Stepper):
 
     def bind_pair(self, system, params, dt, estimating=True):
         """State -> State, Info, Errors; for a linear system the matrix is factorised here, once."""
+        system = system.settled(params)
         g, r = self.tableau.g, partial(residual, system, params)
         zero, instant = jnp.zeros(system.size, dt.dtype), jnp.zeros_like(dt)
 
-        def factorized(tangent):
-            def implicit(x):
-                return tangent(State(instant, system.located((g * dt) ** 2 * x), g * dt * x, x))
+        ways = factorize
+        if system.matrices is not None:
+            A, local = system.step_matrix(params, jnp.ones_like(dt), g * dt, (g * dt) ** 2), system.local
+            ways = kept(A) if local is None else with_local(A, local, params)
 
-            return factorize_map(implicit, zero, factorize)
+        def along(x):
+            return State(instant, system.located((g * dt) ** 2 * x), g * dt * x, x)
+
+        def factorized(tangent, s=None):
+            return factorize_map(lambda x: tangent(along(x)), zero, around(ways, lambda: (s, along)))
 
         if system.linear:
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 
         def step(s):
             value, tangent = staged(partial(jax.linearize, r), system.size)(s)
-            solve = once if system.linear else factorized(tangent)
+            solve = once if system.linear else factorized(tangent, s)
             end, errors = stages(system, self.tableau, s, dt, r, value, tangent, solve)
             if estimating and not system.linear:  # what the derivatives at the start do not know of the end
                 d = g * dt * jnp.abs(solve(r(end)))

@@ -73,7 +73,7 @@ class Info(NamedTuple):
         dependent_row: number, from 1, of the first constraint that depends on those before it at the start of the step;
             0 while B has full rank.
         solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
-            trust (`banded`, `conjugate_gradients`, a given function).
+            trust (`banded`, `conjugate_gradients`, a given function), or made with a sparse matrix.
         solved: whether that is within its tolerance.
         friction: the part of a step that is left where several joints switch more often than it resolves; infinite
             where a limit is negative or not a number.
@@ -134,6 +134,7 @@ class Stepper(Description):
     solves_rotations = False
     solves_internal = False
     solves_friction = False
+    keeps_sparse = False  # whether it never forms the matrix of a step of a system with sparse ones
     meets_events = False  # whether `begin` gives all that a step needs behind an event
     needs_equal_steps = False  # what it remembers belongs to steps of one size
     resizes = False  # whether `resized` does anything

@@ -39,8 +39,8 @@ Linear systems, and others with few nonlinear forces
 
 `LinearSystem(M, C, K, force)` is factorised once for the whole run, also with a nonlinear force at a few coordinates
 beside it, an end stop, a joint, a damper, or with dry friction. Matrices may be SciPy's sparse ones, as
-`scipy.io.mmread` reads them; `hhtjax.analysis.modal_reduction` reduces large ones to their lowest modes, and knows
-their frequencies.
+`scipy.io.mmread` reads them, and large ones stay sparse (`hhtjax.sparse`); `hhtjax.analysis.modal_reduction` reduces
+large ones to their lowest modes, and knows their frequencies.
 
 >>> n = 100
 >>> K = 1e4 * (2 * jnp.eye(n) - jnp.eye(n, k=1) - jnp.eye(n, k=-1))

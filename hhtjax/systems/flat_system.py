@@ -9,10 +9,12 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.linear_solve import solve
+from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.returned import check_like, check_matrix, count, evaluate
+from hhtjax.systems.sparse_system import with_sparse_matrices
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem
 
 
@@ -38,6 +40,18 @@ class FlatSystem(NamedTuple):
     product: Callable | None = None  # q, w, params -> M(q) w, where the system has its own
     local: Any = None  # the `Local` force beside a linear system
     friction: FrictionLaw | None = None  # dry friction, which `force` does not hold
+    matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
+    settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
+
+    def settled(self, params):
+        """What `settle` gives, where there is something to settle."""
+        return self if self.settle is None else self.settle(params)
+
+    def step_matrix(self, params, w, v, q):
+        """w M + v C + q K, `Sparse`, of factors that are numbers."""
+        assert self.matrices is not None
+        M, C, K = self.matrices(params)
+        return combined(*((x, A) for x, A in ((w, M), (v, C), (q, K)) if A is not None))
 
     def inertia(self, q, w, params):
         """M(q) w, and zdot."""
@@ -133,25 +147,31 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
     linear = isinstance(system, LinearSystem)
     _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0)
 
-    def mass(q, params):
-        M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
-        return as_matrix(M, dtype)
+    def on_vectors(system):
+        mass, force = (partial(f, system, unravel, dtype) for f in (_flat_mass, partial(_flat_force, unravel_rates)))
+        flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks)
+        return _with_local(system, flat, dtype) if linear and system.nonlinear is not None else flat
 
-    def force(q, v, t, params):
-        return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, params))[0].astype(dtype)
-
-    product = None
+    flat = on_vectors(system)
     if not linear and system.inertia is not None:
         check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
-        product = partial(_flat_product, system.inertia, unravel, unravel_rates, dtype)
-    flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks, product)
-    if linear and system.nonlinear is not None:
-        flat = _with_local(system, flat, dtype)
+        flat = flat._replace(product=partial(_flat_product, system.inertia, unravel, unravel_rates, dtype))
+    if linear:
+        flat = with_sparse_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
         flat, q, v = _with_internal(system, flat, q, v0, z0)
     if system.friction is not None:
         flat = flat._replace(friction=flat_friction(caller, system, flat, q0, v0, z0, t0, params))
     return flat, q, v
+
+
+def _flat_mass(system, unravel, dtype, q, params):
+    M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
+    return as_matrix(M, dtype)
+
+
+def _flat_force(unravel_rates, system, unravel, dtype, q, v, t, params):
+    return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, params))[0].astype(dtype)
 
 
 def _with_local(system, flat, dtype):

@@ -31,6 +31,11 @@ def before(params, t, dt):
 
 def bind(stepper, system, params, dt, last=None):
     """`stepper.bind`, with held inputs constant over each step. last: the step before, where it is another than dt."""
+    if system.matrices is not None and not stepper.keeps_sparse:
+        raise NotImplementedError(
+            f"{type(stepper).__name__} cannot keep the matrices of the system sparse; use hht() or another of its "
+            "family, rosenbrock(), rowda() or rk4(), or hand over arrays: K.toarray()."
+        )
     if not holds(params):
         return stepper.bind(system, params, dt)
 

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, require_integer
 from hhtjax.description import Description, is_array
 from hhtjax.numerics.elimination import matvec
+from hhtjax.numerics.sparse_matrix import Sparse, of_dense
 from hhtjax.systems.friction import require_friction
 from hhtjax.systems.matrices import as_matrix, constant_matrix, require_mass
 
@@ -24,8 +26,10 @@ class LinearSystem(Description):
 
     Args:
         M, C, K: mass, damping and stiffness: arrays (n, n), or (n,) for a diagonal, or matrices of scipy.sparse, such
-            as `scipy.io.mmread` gives, of up to 5000 rows (they become dense, or diagonals), or functions of params
-            that return arrays. C and K may be None. Rows follow `jax.flatten_util.ravel_pytree(v)`.
+            as `scipy.io.mmread` gives, or functions of params that return arrays, or what `hhtjax.sparse` makes. C and
+            K may be None. Rows follow `jax.flatten_util.ravel_pytree(v)`. Sparse matrices of more than 300 rows stay
+            sparse, are factorised by SciPy's SuperLU, and solved with in each step by the `hht` family, `rosenbrock`
+            and `rowda`, with the same derivatives; smaller ones become dense, or diagonals.
         force: f, `force(t, params)`, a pytree structured like v; None for free vibration.
         nonlinear: g, `nonlinear(q, v, t, params)`, a pytree structured like v. With `at`: of the coordinates q[at] and
             v[at], (k,) each, the forces (k,) on these.
@@ -75,9 +79,9 @@ class LinearSystem(Description):
             elif callable(matrix):
                 require_function("LinearSystem", name, matrix, f"{name}(params)")
             else:
-                matrix = constant_matrix("LinearSystem", name, matrix)
+                matrix = constant_matrix("LinearSystem", name, matrix, keep=True)
             object.__setattr__(self, name, matrix)
-        known = [name for name in "MCK" if is_array(getattr(self, name))]
+        known = [name for name in "MCK" if is_array(getattr(self, name)) or isinstance(getattr(self, name), Sparse)]
         for name in known[1:]:
             n, shape = len(getattr(self, known[0])), getattr(self, name).shape
             if shape[0] != n:
@@ -85,7 +89,10 @@ class LinearSystem(Description):
                     f"LinearSystem: `{name}` must have shape ({n}, {n}), or ({n},) for a diagonal, to fit "
                     f"`{known[0]}`; received shape {shape}."
                 )
-        if is_array(self.M):
+        if any(isinstance(getattr(self, name), Sparse) for name in known):
+            for name in known:
+                object.__setattr__(self, name, of_dense(getattr(self, name)))
+        if "M" in known:
             require_mass("LinearSystem", "M", self.M)
         if force is not None:
             require_function("LinearSystem", "force", force, "force(t, params)")
@@ -114,6 +121,13 @@ class LinearSystem(Description):
         Q, unravel = ravel_pytree(Q)
         return unravel(Q + self.spread(self.local_force(q, v, t, params), Q.size))
 
+    def with_matrices(self, M, C, K):
+        """The same with these in the place of functions."""
+        new = object.__new__(LinearSystem)
+        for name, value in {**vars(self), "M": M, "C": C, "K": K}.items():
+            object.__setattr__(new, name, value)
+        return new
+
     def linear_force(self, q, v, t, params):
         """f(t) - C v - K q, a pytree structured like v."""
         v, unravel = ravel_pytree(v)
@@ -135,7 +149,8 @@ class LinearSystem(Description):
         """Numbers (k,) of the coordinates `at` as a vector (n,)."""
         if self.at is None:
             return x
-        place = [self.at.index(i) if i in self.at else len(self.at) for i in range(n)]
+        place = np.full(n, len(self.at))
+        place[list(self.at)] = np.arange(len(self.at))
         return jnp.append(x, jnp.zeros_like(x[:1]))[jnp.array(place)]  # no scatter, which would keep XLA from fusing
 
 

@@ -5,20 +5,76 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.numerics.sparse_matrix import Sparse, of_scipy
 
 LARGEST_CHECKED = 256  # rows of a mass matrix that is looked at
 LARGEST_DENSE = 5000  # rows of a sparse matrix that is made dense: 200 MB
+SMALL = 300  # rows of a sparse matrix up to which a dense one is solved as quickly
 SYMMETRIC = 1e-6  # relative size of M - M^T that passes
 
 
 def as_matrix(value, dtype):
     """(n, n) or (n,), of the dtype of the state; a scalar is the matrix of one degree of freedom."""
+    if isinstance(value, Sparse):
+        return value.astype(dtype)
     return jnp.atleast_1d(jnp.asarray(value)).astype(dtype)
 
 
-def constant_matrix(caller, name, received):
-    """The array (n, n) or (n,), or an error; of a matrix of scipy.sparse, a dense one, or the diagonal that it is."""
+def sparse(matrix) -> Sparse:
+    """A sparse matrix whose numbers are data, for functions of params in a `LinearSystem`.
+
+    Its multiples, sums and differences are sparse, too: `lambda params: params["k"] * K + params["shift"] * M`. What is
+    constant in a `LinearSystem` needs no such thing.
+
+    Args:
+        matrix: of scipy.sparse, (n, n).
+
+    Returns:
+        A `Sparse`: data for jit, vmap and derivatives are its `values`; where they are belongs to the program.
+
+    Raises:
+        TypeError, ValueError: what is no such matrix, is not square, or not finite.
+
+    >>> import jax.numpy as jnp, numpy as np, hhtjax, scipy.sparse
+    >>> n = 20_000
+    >>> ones = np.ones(n)
+    >>> K = hhtjax.sparse(scipy.sparse.diags([-ones[1:], 2 * ones, -ones[1:]], [-1, 0, 1]))     # springs in a row
+    >>> chain = hhtjax.LinearSystem(ones, K=lambda params: params["k"] * K)
+    >>> start = jnp.sin(jnp.pi * jnp.arange(1.0, n + 1) / (n + 1)), jnp.zeros(n)
+    >>> run = hhtjax.simulate(chain, hhtjax.hht(), *start, {"k": 4e8}, dt=0.01, num_steps=100, save_every=100)
+    >>> run.check()
+    >>> round(float(run.q[-1, n // 2]), 3), round(float(jnp.cos(jnp.pi * 2e4 / (n + 1))), 3)
+    (-1.0, -1.0)
+    """
+    if isinstance(matrix, Sparse):
+        return matrix
+    if not is_sparse(matrix):
+        raise TypeError(f"sparse: `matrix` must be a matrix of scipy.sparse; received {matrix!r}.")
+    return _sparse("sparse", "matrix", matrix)
+
+
+def _sparse(caller, name, matrix):
+    """The `Sparse` of a matrix of scipy.sparse, or an error."""
+    if len(matrix.shape) != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise ValueError(
+            f"{caller}: `{name}` must have shape (n, n), or (n,) for a diagonal; received shape {matrix.shape}."
+        )
+    if not is_real(np.zeros(1, matrix.dtype)):
+        raise TypeError(f"{caller}: `{name}` must be real; received a sparse matrix of {matrix.dtype}.")
+    found = of_scipy(matrix if matrix.dtype.kind == "f" else matrix.astype(float))
+    if not np.all(np.isfinite(found.values)):
+        raise ValueError(f"{caller}: `{name}` must be finite; received {matrix!r}.")
+    return found
+
+
+def constant_matrix(caller, name, received, keep=False):
+    """The array (n, n) or (n,), or an error; of a matrix of scipy.sparse, the diagonal that it is, or a dense one.
+
+    keep: more than SMALL rows stay sparse, as does a `Sparse`.
+    """
     if is_sparse(received):
+        if keep and (isinstance(received, Sparse) or _stays_sparse(received)):
+            return received if isinstance(received, Sparse) else _sparse(caller, name, received)
         received = _dense(caller, name, received)
     try:
         value = received if is_array(received) else np.asarray(received)
@@ -46,6 +102,10 @@ def is_sparse(x):
     return hasattr(x, "tocoo") and hasattr(x, "nnz")
 
 
+def _stays_sparse(matrix):
+    return len(matrix.shape) == 2 and matrix.shape[0] > SMALL and half_bandwidth(matrix.tocoo()) > 0
+
+
 def half_bandwidth(entries):
     """p with A[i, j] = 0 for |i - j| > p, of a matrix in scipy.sparse's format of coordinates."""
     return int(np.max(np.abs(entries.row.astype(int) - entries.col), initial=0))
@@ -71,6 +131,8 @@ def require_mass(caller, name, M, massless=False):
 
     In units in which its diagonal is 1. Tracers pass, and what is too large for a look at each run.
     """
+    if isinstance(M, Sparse):
+        return _require_sparse_mass(caller, name, M)
     if not is_concrete(M) or len(M) > LARGEST_CHECKED:
         return
     M = np.asarray(M)
@@ -87,6 +149,17 @@ def require_mass(caller, name, M, massless=False):
         raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is {what}.")
 
 
+def _require_sparse_mass(caller, name, M):
+    """What of it can be seen without a factorisation."""
+    if not is_concrete(M.values):
+        return
+    A = M.tocoo()
+    if np.min(A.diagonal()) <= 0:
+        raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is not.")
+    if abs(A - A.T).max() > SYMMETRIC * abs(A).max():
+        raise ValueError(f"{caller}: `{name}` must be symmetric; received one that differs from its transpose.")
+
+
 UNSYMMETRIC, INDEFINITE = 1, 2  # what mass_flaw finds
 
 
@@ -95,7 +168,7 @@ def mass_flaw(M, massless):
 
     NaN passes: the acceleration tells of it.
     """
-    if len(M) > LARGEST_CHECKED:
+    if len(M) > LARGEST_CHECKED or isinstance(M, Sparse):
         return jnp.zeros((), jnp.int32)
     M = lax.stop_gradient(M)
     symmetric, rounding = jnp.array(True), 0.0

@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows fourteen functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows fifteen functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -46,6 +46,7 @@ The rest of the library knows fourteen functions of this room, and works as well
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
+    on_host(f, like, *args)   f(*args), an array like `like`, by a function of NumPy arrays
     together(f, x)            f(x), of which a batch has all values or none
     explain(f, *args)         what became of the loops of a program
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
@@ -78,6 +79,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 
 from hhtjax.xla.explanation import Explanation, explain
 from hhtjax.xla.gate import or_plain, plain
+from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
@@ -99,6 +101,7 @@ __all__ = [
     "largest_in_batch",
     "linear_map",
     "listed",
+    "on_host",
     "on_scalars",
     "one_kernel",
     "or_plain",
