@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows fourteen functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows fifteen functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -48,6 +48,7 @@ The rest of the library knows fourteen functions of this room, and works as well
     derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
     together(f, x)            f(x), of which a batch has all values or none
     explain(f, *args)         what became of the loops of a program
+    calls(names, f, *args)    whether a program calls compiled functions of these names
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
@@ -76,7 +77,7 @@ NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule w
 all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
 """
 
-from hhtjax.xla.explanation import Explanation, explain
+from hhtjax.xla.explanation import Explanation, calls, explain
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, staged, structural
 from hhtjax.xla.linear_maps import linear_map
@@ -93,6 +94,7 @@ __all__ = [
     "NotListed",
     "Scalar",
     "TwoWays",
+    "calls",
     "choose",
     "derivative",
     "explain",
