@@ -204,6 +204,11 @@ def _split(eqn, x):
     return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"])
 
 
+def _unstack(eqn, x):
+    axis = eqn.params["axis"]
+    return [np.take(x, [i], axis).reshape(out.aval.shape) for i, out in enumerate(eqn.outvars)]
+
+
 def _rev(eqn, x):
     return [np.flip(x, eqn.params["dimensions"])]
 
@@ -264,7 +269,7 @@ RULES = {
     **dict.fromkeys(ELEMENTWISE, _elementwise),
     **{"broadcast_in_dim": _broadcast_in_dim, "concatenate": _concatenate, "dot_general": _dot_general, "iota": _iota},
     **{"reshape": _reshape, "squeeze": _squeeze, "rev": _rev, "slice": _slice},
-    **{"split": _split, "stack": _stack, "transpose": _transpose},
+    **{"split": _split, "stack": _stack, "transpose": _transpose, "unstack": _unstack},
     **{
         "gather": _moved(0),
         "dynamic_slice": _moved(0),
