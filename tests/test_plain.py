@@ -1,5 +1,6 @@
 """The switch: plain JAX, by a context, by the environment, or for a JAX that is not known."""
 
+import gc
 import re
 from concurrent.futures import ThreadPoolExecutor
 
@@ -116,3 +117,16 @@ def test_an_error_of_the_users_own_stays():
     )
     with pytest.raises(jax.errors.JaxRuntimeError, match="mine"):
         hhtjax.simulate(system, hhtjax.rk4(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=3)
+
+
+@pytest.mark.parametrize("was", [True, False])
+def test_garbage_is_collected_as_before(was):
+    """Not while programs are made, and again after them, or after an error."""
+    try:
+        (gc.enable if was else gc.disable)()
+        assert not gate.or_plain(gc.isenabled) and gc.isenabled() == was
+        with pytest.raises(ZeroDivisionError):
+            gate.or_plain(lambda: 1 / 0)
+        assert gc.isenabled() == was
+    finally:
+        gc.enable()

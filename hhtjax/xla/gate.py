@@ -1,5 +1,6 @@
 """Whether the machinery is on: with the versions of JAX that it is tested with, and unless a user says no."""
 
+import gc
 import os
 import warnings
 from collections.abc import Callable
@@ -61,7 +62,8 @@ def or_plain(run: Callable, again: Callable | None = None):
     3.0
     """
     try:
-        return run()
+        with _collecting_later():
+            return run()
     except jax.errors.JaxRuntimeError as error:
         if not is_on():
             raise
@@ -75,6 +77,19 @@ def or_plain(run: Callable, again: Callable | None = None):
         stacklevel=3,
     )
     return result
+
+
+@contextmanager
+def _collecting_later():
+    """No garbage collection inside: tracing makes a million objects that stay, and to look through them again and again
+    takes a quarter of its time."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 def why_off():
