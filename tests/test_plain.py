@@ -124,7 +124,8 @@ def test_garbage_is_collected_as_before(was):
     """Not while programs are made, and again after them, or after an error."""
     try:
         (gc.enable if was else gc.disable)()
-        assert not gate.or_plain(gc.isenabled) and gc.isenabled() == was
+        assert not gate.or_plain(gc.isenabled)
+        assert gc.isenabled() == was
         with pytest.raises(ZeroDivisionError):
             gate.or_plain(lambda: 1 / 0)
         assert gc.isenabled() == was
