@@ -1,18 +1,19 @@
 """The first call: CPU seconds until a result is there, each in a process of its own; with a cache on disk, its second.
 
-    python -m experiments.benchmarks.first_call simulate pendulum
+    python -m experiments.benchmarks.first_call                     # the table, some ten minutes
+    python -m experiments.benchmarks.first_call simulate pendulum   # one number of it, in this process
 
-prints what one process needs, imports apart. It is what all its threads compute, divided into tracing (Python: the
-system's functions, JAX, the rewriting), lowering (to MLIR) and compiling (XLA and LLVM) as elapsed times are.
+It is what all threads compute, imports apart, divided into tracing (Python: the system's functions, JAX, the
+rewriting), lowering (to MLIR) and compiling (XLA and LLVM) as elapsed times are.
 """
 
 import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -94,10 +95,10 @@ def first(call, scene):
     """Seconds in this process: {total, tracing, lowering, compiling}."""
     spent = dict.fromkeys(EVENTS, 0.0)
 
-    def listen(event, seconds, **_):
+    def listen(event, duration_secs, **_):
         for name, ending in EVENTS.items():
             if event.endswith(ending):
-                spent[name] += seconds
+                spent[name] += duration_secs
 
     jnp.zeros(1).block_until_ready()
     jax.monitoring.register_event_duration_secs_listener(listen)
@@ -108,18 +109,29 @@ def first(call, scene):
     return {"total": cpu, "tracing": cpu - sum(found.values()), **found}
 
 
-def apart(call, scene, cache=None):
-    """`first` in a new process."""
+def apart(call, scene, cache):
+    """`first` in a new process, with a cache on disk."""
     command = [sys.executable, "-m", "experiments.benchmarks.first_call", call, scene]
-    here = {} if cache is None else {"JAX_COMPILATION_CACHE_DIR": cache, **KEEP_ALL}
-    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(command, env=os.environ | here | {"PYTHONPATH": path}, check=True, capture_output=True)
+    keep = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    done = subprocess.run(command, env=os.environ | keep, check=True, stdout=subprocess.PIPE)
     return json.loads(done.stdout.decode().splitlines()[-1])
 
 
-KEEP_ALL = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+def table():
+    """A line for each call and scene."""
+    columns = ["total", "tracing", "lowering", "compiling"]
+    print(f"{'CPU s':<34}", *(f"{name:>10}" for name in (*columns, "again")))
+    for scene in SCENES:
+        for call in CALLS:
+            with tempfile.TemporaryDirectory() as cache:
+                once, again = (apart(call, scene, cache) for _ in range(2))
+            numbers = *(once[name] for name in columns), again["total"]
+            print(f"{call + ', ' + scene:<34}", *(f"{x:10.2f}" for x in numbers), flush=True)
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    print(json.dumps(first(*sys.argv[1:])))
+    if len(sys.argv) > 1:
+        print(json.dumps(first(*sys.argv[1:])))
+    else:
+        table()
