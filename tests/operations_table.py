@@ -110,6 +110,7 @@ TABLE = {
         *("lax.concatenate([e], 0)", "jnp.concatenate([l, x])", "jnp.stack([x, y], 1)", "jnp.stack([s, t, s])"),
         *("jnp.stack([i, j])", "jnp.stack([e, e])", "lax.split(x, (1, 0, 2))", "lax.split(X, (2, 1), 1)", "jnp.split(i, 3)"),
         *("lax.split(l, (30, 40))", "jnp.tile(x, (2, 1))", "jnp.repeat(x, 2)", "jnp.roll(x, 1)", "jnp.roll(X, -1, 1)"),
+        *("jnp.unstack(X, axis=1)[2]", "jnp.stack(list(C)[::-1])", "jnp.stack(list(i))[::2]", "jnp.unstack(x)[1] * s"),
         *("lax.slice(x, (1,), (3,))", "lax.slice(X, (0, 0), (2, 3), (1, 2))", "lax.slice(X, (1, 1), (1, 3))", "l[::9]"),
         *("lax.slice(C, (0, 1, 0), (2, 2, 2), (2, 1, 1))", "x[-2:]", "X[1]", "X[..., None, 1]", "l[3:60:7]", "s[None]"),
         *("lax.pad(x, 0.0, [(1, 2, 0)])", "lax.pad(x, 1.5, [(-1, 2, 1)])", "lax.pad(x, s, [(1, -1, 2)])"),

@@ -96,7 +96,7 @@ def check_parameters(caller, params0, name="params0"):
 def check_scale(caller, scale, params0):
     """The scale of each entry of params0, by default its size, or 1 where that is 0."""
     if scale is None:
-        return jax.tree.map(lambda x: jnp.where(x == 0, 1, jnp.abs(x)), params0)
+        return jax.tree.map(_size, params0)
     scale = freeze(scale)
     if jax.tree.structure(scale) != jax.tree.structure(params0):
         raise ValueError(
@@ -115,6 +115,14 @@ def check_scale(caller, scale, params0):
                 f"{where} must have the shape of its parameter, {parameter.shape}; received {jnp.shape(leaf)}."
             )
     return jax.tree.map(lambda s, x: jnp.broadcast_to(jnp.asarray(s, x.dtype), x.shape), scale, params0)
+
+
+def _size(x):
+    """|x|, and 1 where that is 0; by NumPy where it can, which has nothing to compile."""
+    if not is_concrete(x):
+        return jnp.where(x == 0, 1, jnp.abs(x))
+    x = np.asarray(x)
+    return jnp.asarray(np.where(x == 0, np.ones_like(x), np.abs(x)))
 
 
 def check_prior(caller, prior, params0):

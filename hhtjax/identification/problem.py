@@ -62,7 +62,8 @@ class Coordinates:
         self.transforms = transforms
         self.free = [i for i, T in enumerate(transforms) if T is not tf.fixed]
         start = [transforms[i].coordinate(self.leaves[i], self.scales[i]) for i in self.free]
-        self.x0, self.unravel = ravel_pytree(start)
+        x0, self.unravel = ravel_pytree(start)
+        self.x0 = x0.astype(x0.dtype)  # as x is later: what is traced for a Python number is traced anew
         self.longest = np.repeat([transforms[i].longest_step for i in self.free], [x.size for x in start])
 
     def free_leaves(self, x):

@@ -9,13 +9,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description import is_array
+from hhtjax.xla import calls
 
 PAIR = "hhtjax: a run, and the choice of its steps"
-PROBE = "hhtjax: are there steps to choose"
-
-
-class ThereAre(Exception):
-    """The answer to the probe."""
+CONTROLLED = {"run_over", "run_chosen"}  # names of what runs over the steps that have been chosen
 
 
 def with_steps_for(f, x, y):
@@ -31,8 +28,6 @@ def with_steps_for(f, x, y):
 def run_and_choice(data):
     """What a run starts from, and what its steps are chosen for, constant to derivatives: the same, but inside
     `with_steps_for`."""
-    if _inside(PROBE):
-        raise ThereAre
     if not _inside(PAIR):
         return data, lax.stop_gradient(data)
     both = jax.tree.map(lambda x: lax.all_gather(x, PAIR) if is_array(x) else (x, x), data)
@@ -41,12 +36,12 @@ def run_and_choice(data):
 
 
 def chooses_steps(f, *args):
-    """Whether there are runs under error control in f(*args)."""
-    try:
-        jax.eval_shape(jax.vmap(lambda _: f(*args), axis_name=PROBE), jnp.zeros(1))
-    except ThereAre:
-        return True
-    return False
+    """Whether there are runs under error control in f(*args).
+
+    >>> chooses_steps(jnp.sin, jnp.ones(2))
+    False
+    """
+    return calls(CONTROLLED, f, *args)
 
 
 def _inside(axis):

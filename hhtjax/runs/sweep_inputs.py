@@ -20,7 +20,7 @@ from hhtjax.runs.sweep_grid import (
     require_times,
 )
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
-from hhtjax.systems.consistent import examine, require_consistent
+from hhtjax.systems.consistent import distances, examine, require_consistent
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.rubbing import require_independent_friction
 
@@ -201,14 +201,14 @@ def _require_consistent(system, data, mapped, t0):
     worst = {0}
     if any(mapped):
 
-        def relative_distances(leaves):
-            stepper, q0, v0, params, z0 = jax.tree.unflatten(structure, leaves)
-            _, found = examine(system, q0, v0, t0, params, z0, stepper.redundant)
-            return [relative for _, _, relative in found]
+        def examined(leaves):
+            _, q0, v0, params, z0 = jax.tree.unflatten(structure, leaves)
+            return examine(system, q0, v0, t0, params, z0)
 
         with evaluated_now():
-            found = jax.vmap(relative_distances, ([0 if flag else None for flag in mapped],))(leaves)
-        worst |= {int(np.argmax(relative)) for relative in found}
+            every = jax.vmap(examined, ([0 if flag else None for flag in mapped],))(leaves)
+        found = distances(every, data[0].redundant)
+        worst |= {int(np.argmax(relative)) for _, _, relative in found}
     for i in sorted(worst):
         stepper, q0, v0, params, z0 = _member(data, mapped, i)
         require_consistent(f"sweep: member {i}", system, q0, v0, t0, params, stepper.redundant, z0)

@@ -11,7 +11,7 @@ from jax import lax
 
 from hhtjax.description import evaluated_now, freeze, is_concrete, thaw
 from hhtjax.description.presentation import shown
-from hhtjax.numerics.linear_solve import solve_map
+from hhtjax.numerics.linear_solve import RANK_TOLERANCE, solve_map
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import (
     acceleration_and_multipliers,
@@ -141,21 +141,47 @@ def nearest_position(system, q0, t, params, factorize):
     return system.move(q0, z[:n]), change <= math.sqrt(eps) * (1 + size + jnp.max(jnp.abs(z[:n])))
 
 
-@partial(jax.jit, static_argnames="redundant")
-def examine(system, q0, v0, t0, params, z0, redundant):
-    """B, and for Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not, in the
-    coordinate that is farthest, and in that which is farthest beside its own size."""
+@jax.jit
+def examine(system, q0, v0, t0, params, z0):
+    """M and B, Phi and dPhi/dt, and the sizes of the coordinates and of their rates."""
     params = thaw(params)
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
-    B = jacobian(flat, q, t, params)
-    both = violation(flat, q, v, t, params)
-    away = partial(correction, flat, q, t, params, factorize=factorize_constrained(flat.size, redundant))
-    found = []
-    for x, size in zip(both, (kinematics.sizes(flat.blocks, q), flat.located(jnp.abs(v))), strict=True):
-        distance = flat.located(jnp.abs(away(x)))
-        found.append((jnp.max(jnp.abs(x)), jnp.max(distance), jnp.max(distance / (1 + size))))
-    return B, found
+    M, B = flat.mass(q, params), jacobian(flat, q, t, params)
+    sizes = kinematics.sizes(flat.blocks, q), flat.located(jnp.abs(v))
+    return jnp.diag(M) if M.ndim == 1 else M, B[:, : flat.positions], violation(flat, q, v, t, params), sizes
+
+
+def distances(examined, redundant):
+    """For Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not, in the coordinate that
+    is farthest, and in that which is farthest beside its own size; by NumPy, which has nothing to compile."""
+    M, B, both, sizes = jax.tree.map(np.asarray, examined)
+    n, end = M.shape[-1], M.shape[-1] + B.shape[-2]
+    A = np.zeros((*M.shape[:-2], end, end), M.dtype)
+    A[..., :n, :n], A[..., n:, :n], A[..., :n, n:] = M, B, -np.swapaxes(B, -1, -2)
+    for x, size in zip(both, sizes, strict=True):
+        b = np.concatenate([np.zeros_like(size), x], axis=-1)
+        away = np.abs(_solved(A, b, n, redundant)[..., :n])
+        yield tuple(np.max(y, axis=-1) for y in (np.abs(x), away, away / (1 + size)))
+
+
+@np.errstate(all="ignore")
+def _solved(A, b, n, redundant):
+    """z with A z = b, smallest where constraints may be redundant; NaN where there is none. A batch goes first."""
+    try:
+        if redundant is None:
+            return np.linalg.solve(A, b[..., None])[..., 0]
+        d = np.abs(np.diagonal(A, axis1=-2, axis2=-1))[..., :n]
+        first = 1 / np.sqrt(np.where(d == 0, 1, d))
+        rest = 1 / np.max(np.abs(first[..., None] * A[..., :n, n:]), axis=(-2, -1))[..., None]
+        scale = np.concatenate([first, np.broadcast_to(rest, (*rest.shape[:-1], A.shape[-1] - n))], axis=-1)
+        tolerance = max(RANK_TOLERANCE, 100 * float(np.finfo(A.dtype).eps))
+        inverse = np.linalg.pinv(scale[..., :, None] * A * scale[..., None, :], rcond=tolerance)
+        return scale * (inverse @ (scale * b)[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        if b.ndim == 1:
+            return np.full_like(b, np.nan)
+        return np.stack([_solved(*one, n, redundant) for one in zip(A, b, strict=True)])
 
 
 def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None):
@@ -163,10 +189,10 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
     with evaluated_now():
-        B, found = examine(system, q0, v0, t0, params, z0, redundant)
-        found = jax.tree.map(float, found)
+        examined = jax.tree.map(np.asarray, examine(system, q0, v0, t0, params, z0))
     if redundant is None:
-        require_independent(caller, np.asarray(B))
+        require_independent(caller, examined[1])
+    found = distances(examined, redundant)
     for name, meaning, (violated, distance, relative) in zip(("q0", "v0"), ("Phi", "dPhi/dt"), found, strict=True):
         if not relative <= CONSISTENT:
             raise ValueError(

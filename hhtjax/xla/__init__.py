@@ -49,6 +49,7 @@ The rest of the library knows fifteen functions of this room, and works as well 
     on_host(f, like, *args)   f(*args), an array like `like`, by a function of NumPy arrays
     together(f, x)            f(x), of which a batch has all values or none
     explain(f, *args)         what became of the loops of a program
+    calls(names, f, *args)    whether a program calls compiled functions of these names
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
@@ -77,7 +78,7 @@ NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule w
 all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
 """
 
-from hhtjax.xla.explanation import Explanation, explain
+from hhtjax.xla.explanation import Explanation, calls, explain
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, staged, structural
@@ -95,6 +96,7 @@ __all__ = [
     "NotListed",
     "Scalar",
     "TwoWays",
+    "calls",
     "choose",
     "derivative",
     "explain",

@@ -67,3 +67,36 @@ def explain(f, *args) -> Explanation:
     paths = tuple(verdict or off for verdict in found)
     memory: Any = compiled.memory_analysis()
     return Explanation(paths, seconds, None if memory is None else memory.temp_size_in_bytes)
+
+
+def calls(names, f, *args):
+    """Whether f(*args), as it is traced, calls a compiled function of one of these names.
+
+    Args:
+        names: of functions that `jax.jit` compiles.
+        f: any function.
+        args: pytrees of arrays.
+
+    Returns:
+        True or False.
+
+    Raises:
+        whatever f raises.
+
+    >>> calls({"sine"}, lambda x: jax.vmap(jax.jit(lambda x: x))(x), jax.numpy.ones(2))
+    False
+    """
+    return _calls(names, jax.make_jaxpr(f)(*args).jaxpr, set())
+
+
+def _calls(names, jaxpr, seen):
+    """seen: ids of what has been looked through; a cached trace may be called often."""
+    if id(jaxpr) in seen:
+        return False
+    seen.add(id(jaxpr))
+    inner = []
+    for eqn in jaxpr.eqns:
+        if eqn.params.get("name") in names:
+            return True
+        inner += [x for x in jax.tree.leaves(list(eqn.params.values())) if hasattr(x, "eqns")]
+    return any(_calls(names, getattr(x, "jaxpr", x), seen) for x in inner)

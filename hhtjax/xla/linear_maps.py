@@ -131,16 +131,17 @@ def _reshape(eqn, x, *sizes):
     """Axes of length 1 come and go; others, where they are joined or divided, are kept apart no longer."""
     if eqn.params.get("dimensions") is not None and eqn.primitive.name == "reshape":
         return None
-    shape = eqn.outvars[0].aval.shape
+    return [_reshaped(x, eqn.outvars[0].aval.shape)]
+
+
+def _reshaped(x, shape):
     old, new = ([i for i, length in enumerate(s) if length != 1] for s in (x.shape, shape))
     same = [x.shape[i] for i in old] == [shape[i] for i in new]
-    return [
-        x.map(
-            lambda y: y.reshape(shape),
-            shape,
-            lambda axis, offset: (new[old.index(axis)], offset) if same and axis in old else None,
-        )
-    ]
+    return x.map(
+        lambda y: y.reshape(shape),
+        shape,
+        lambda axis, offset: (new[old.index(axis)], offset) if same and axis in old else None,
+    )
 
 
 def _transpose(eqn, x):
@@ -168,6 +169,15 @@ def _split(eqn, x):
         stop = [i + length for i, length in zip(start, variable.aval.shape, strict=True)]
         results.append(_cut(x, start, stop, (1,) * len(start)))
         start[eqn.params["axis"]] = stop[eqn.params["axis"]]
+    return results
+
+
+def _unstack(eqn, x):
+    axis, results = eqn.params["axis"], []
+    for i, variable in enumerate(eqn.outvars):
+        start, stop = [0] * len(x.shape), list(x.shape)
+        start[axis], stop[axis] = i, i + 1
+        results.append(_reshaped(_cut(x, start, stop, (1,) * len(start)), variable.aval.shape))
     return results
 
 
@@ -253,6 +263,7 @@ RULES = {
     "transpose": _transpose,
     "slice": _slice,
     "split": _split,
+    "unstack": _unstack,
     "pad": _pad,
     "concatenate": _concatenate,
     "reduce_sum": _reduce_sum,

@@ -86,6 +86,7 @@ UNDERSTOOD = {
     "squeeze": _of_any("dimensions"),
     "stack": _of_any("axis"),
     "transpose": _of_any("permutation"),
+    "unstack": _of_any("axis"),
     "cond": _of_any("branches"),
     "while": _of_any("cond_nconsts", "cond_jaxpr", "body_nconsts", "body_jaxpr"),
     "custom_linear_solve": _of_any("const_lengths", "jaxprs"),

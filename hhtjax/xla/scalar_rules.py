@@ -204,6 +204,10 @@ def _split(eqn, x):
     return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"])
 
 
+def _unstack(eqn, x):
+    return [np.take(x, [i], eqn.params["axis"]).reshape(out.aval.shape) for i, out in enumerate(eqn.outvars)]
+
+
 def _rev(eqn, x):
     return [np.flip(x, eqn.params["dimensions"])]
 
@@ -221,11 +225,6 @@ def _iota(eqn):
 def _structural(eqn, x):
     dtype = eqn.outvars[0].aval.dtype
     return [each(lambda x: ZEROS.get(dtype, x) if is_known(x) and x == 0 else x, x)]
-
-
-def _largest(eqn, x):
-    """In a list there is no batch."""
-    return [x] if recorder_of(x.flat) is not None else _elementwise(eqn, x)
 
 
 def _moved(*moves):
@@ -269,7 +268,7 @@ RULES = {
     **dict.fromkeys(ELEMENTWISE, _elementwise),
     **{"broadcast_in_dim": _broadcast_in_dim, "concatenate": _concatenate, "dot_general": _dot_general, "iota": _iota},
     **{"reshape": _reshape, "squeeze": _squeeze, "rev": _rev, "slice": _slice},
-    **{"split": _split, "stack": _stack, "transpose": _transpose},
+    **{"split": _split, "stack": _stack, "transpose": _transpose, "unstack": _unstack},
     **{
         "gather": _moved(0),
         "dynamic_slice": _moved(0),
@@ -281,7 +280,8 @@ RULES = {
     **{f"reduce_{kind}": _choice(kind) for kind in ("max", "min")},
     **{"reduce_sum": _reduction("add"), "reduce_prod": _reduction("mul")},
     "hhtjax_structural": _structural,
-    "hhtjax_largest_in_batch": _largest,
+    # a list has no batch
+    "hhtjax_largest_in_batch": lambda eqn, x: [x] if recorder_of(x.flat) is not None else _elementwise(eqn, x),
 }
 # of known numbers; without "max" and "min", which may choose between zeros of different signs
 NUMPY = {

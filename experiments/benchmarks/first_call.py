@@ -1,0 +1,137 @@
+"""The first call: CPU seconds until a result is there, each in a process of its own; with a cache on disk, its second.
+
+    python -m experiments.benchmarks.first_call                     # the table, some ten minutes
+    python -m experiments.benchmarks.first_call simulate pendulum   # one number of it, in this process
+
+It is what all threads compute, imports apart, divided into tracing (Python: the system's functions, JAX, the
+rewriting), lowering (to MLIR) and compiling (XLA and LLVM) as elapsed times are.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+import hhtjax
+from experiments.sweeps import large
+from hhtjax.scenes import body_chain, double_pendulum, pendulum, squeezer, top
+
+NUM_STEPS = 50
+EVENTS = {"lowering": "jaxpr_to_mlir_module_duration", "compiling": "backend_compile_duration"}
+
+
+def beam():
+    """(system, params, q0, v0), the step, the stepper."""
+    system, q0, v0, dt = large.beam(50)
+    return (system, {"k": 1.0}, q0, v0), dt, hhtjax.hht()
+
+
+def of_scene(make, dt):
+    """The same of a scene."""
+    return make()[:4], dt, hhtjax.hht()
+
+
+SCENES = {
+    "pendulum": partial(of_scene, pendulum.minimal, 1e-3),
+    "double pendulum": partial(of_scene, double_pendulum.stiff, 1e-3),
+    "squeezer": partial(of_scene, squeezer.squeezer, 1e-5),
+    "top": partial(of_scene, top.minimal, 1e-4),
+    "chain of 4 bodies": partial(of_scene, partial(body_chain.body_chain, 4), 1e-3),
+    "beam of 50": beam,
+}
+FITTED = {"pendulum": "l", "double pendulum": "g", "squeezer": "moment", "top": "g", "chain of 4 bodies": "g"}
+
+
+def simulate(scene):
+    """As users write it."""
+    (system, params, q0, v0), dt, stepper = SCENES[scene]()
+    run = hhtjax.simulate(system, stepper, q0, v0, params, dt=dt, num_steps=NUM_STEPS)
+    run.check()
+    return run.q
+
+
+def gradient(scene):
+    """In all params, reverse."""
+    (system, params, q0, v0), dt, stepper = SCENES[scene]()
+
+    def loss(params):
+        run = hhtjax.simulate(system, stepper, q0, v0, params, dt=dt, num_steps=NUM_STEPS)
+        return sum(jnp.sum(x**2) for x in jax.tree.leaves(run.q))
+
+    return jax.jit(jax.grad(loss))(params)
+
+
+def fit(scene):
+    """Of one parameter, to a run with another value of it."""
+    (system, params, q0, v0), dt, stepper = SCENES[scene]()
+    name = FITTED.get(scene, "k")
+
+    def residuals(x):
+        run = hhtjax.simulate(system, stepper, q0, v0, params | {name: x}, dt=dt, num_steps=NUM_STEPS)
+        return jax.tree.map(lambda now, then: now[1:] - then, run.q, q0)
+
+    return hhtjax.fit(residuals, params[name], max_iterations=2).params
+
+
+def sweep(scene):
+    """Of eight step sizes."""
+    (system, params, q0, v0), dt, stepper = SCENES[scene]()
+    dts = dt * jnp.linspace(0.5, 1.0, 8)
+    runs = hhtjax.sweep(system, stepper, q0, v0, params, dts=dts, duration=NUM_STEPS * dt, num_samples=10)
+    runs.check()
+    return runs.q
+
+
+CALLS = {f.__name__: f for f in (simulate, gradient, fit, sweep)}
+
+
+def first(call, scene):
+    """Seconds in this process: {total, tracing, lowering, compiling}."""
+    spent = dict.fromkeys(EVENTS, 0.0)
+
+    def listen(event, duration_secs, **_):
+        for name, ending in EVENTS.items():
+            if event.endswith(ending):
+                spent[name] += duration_secs
+
+    jnp.zeros(1).block_until_ready()
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    start, cpu = time.perf_counter(), time.process_time()
+    jax.block_until_ready(CALLS[call](scene))
+    elapsed, cpu = time.perf_counter() - start, time.process_time() - cpu
+    found = {name: cpu * seconds / elapsed for name, seconds in spent.items()}
+    return {"total": cpu, "tracing": cpu - sum(found.values()), **found}
+
+
+def apart(call, scene, cache):
+    """`first` in a new process, with a cache on disk."""
+    command = [sys.executable, "-m", "experiments.benchmarks.first_call", call, scene]
+    keep = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    done = subprocess.run(command, env=os.environ | keep, check=True, stdout=subprocess.PIPE)
+    return json.loads(done.stdout.decode().splitlines()[-1])
+
+
+def table():
+    """A line for each call and scene."""
+    columns = ["total", "tracing", "lowering", "compiling"]
+    print(f"{'CPU s':<34}", *(f"{name:>10}" for name in (*columns, "again")))
+    for scene in SCENES:
+        for call in CALLS:
+            with tempfile.TemporaryDirectory() as cache:
+                once, again = (apart(call, scene, cache) for _ in range(2))
+            numbers = *(once[name] for name in columns), again["total"]
+            print(f"{call + ', ' + scene:<34}", *(f"{x:10.2f}" for x in numbers), flush=True)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    if len(sys.argv) > 1:
+        print(json.dumps(first(*sys.argv[1:])))
+    else:
+        table()
