@@ -128,9 +128,8 @@ def beam(n):
 def membrane(n):
     """M and K of a square of bilinear elements, 0.1 m each, held at its edge, unit density and tension."""
     m, h = int(n**0.5), 0.1
-    ones = np.ones(m - 1)
     k, mass = (
-        sparse.diags_array([a * ones, b * np.ones(m), a * ones], offsets=[-1, 0, 1])
+        sparse.dia_array((np.outer([a, b, a], np.ones(m)), [-1, 0, 1]), shape=(m, m))
         for a, b in ((-1 / h, 2 / h), (h / 6, 4 * h / 6))
     )
     return sparse.kron(mass, mass).tocsr(), (sparse.kron(k, mass) + sparse.kron(mass, k)).tocsr()
