@@ -9,9 +9,8 @@ sets have no say in it. Forces, less them in m y'' = ..., and readings:
 """
 
 import time
+from typing import Any, NamedTuple
 
-import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
@@ -111,18 +110,20 @@ def run(report: Report, fast: bool):
     else:
         print(f"GENERATED record: the measured one was not found. To use it, {data.HOW_TO_GET_IT}.")
     u = data.reconstruct(sets.train.u)
-    own = {name: data.START.get(name, 0.0) for name in MODELS[BEST]}
-    unknown, row = fit_and_score(report, sets, u, BEST, (own, data.first_state(sets.train)))
-    rows, tests = [row | {"kept": True}], []
+    train, own = sets.train, {name: data.START.get(name, 0.0) for name in MODELS[BEST]}
+    kept = fitted(report, train, u, BEST, (own, data.first_state(train)))
+    rows, tests = [], []
     for _ in range(1 if fast else ROUNDS):
-        tests.append(ranked(report, sets.train, u, unknown))
+        unknown = kept.result.params
+        tests.append(ranked(report, train, u, unknown))
         tried = [
-            fit_and_score(report, sets, u, f"+ {name}", (unknown[0] | {name: 0.0}, unknown[1]))
+            fitted(report, train, u, f"+ {name}", (unknown[0] | {name: 0.0}, unknown[1]))
             for name in first_of_each(tests[-1])[: 1 if fast else None]
         ]
-        best = min(range(len(tried)), key=lambda i: tried[i][1]["left_out_mV"])
-        rows += [row | {"kept": i == best} for i, (_, row) in enumerate(tried)]
-        unknown = tried[best][0]
+        left_out = compare([kept, *tried], fast)
+        rows += [scored(report, sets.tests, kept, left_out) | {"kept": True}] if not rows else []
+        kept = min(tried, key=lambda fit: left_out[fit.name])
+        rows += [scored(report, sets.tests, fit, left_out) | {"kept": fit is kept} for fit in tried]
     shown = [key for key in rows[0] if key not in ("estimates", "standard_errors", "unit")]
     report.table(shown, [[row[key] for key in shown] for row in rows])
     plot(report, rows)
@@ -154,58 +155,58 @@ def first_of_each(ranking):
     return [name for name in ranking if name in first and ranking[name]["cost_drop_percent"] >= least]
 
 
-def fit_and_score(report: Report, sets, u, name, guess):
-    """The estimate and its initial state, and a row of errors in mV."""
+class Fit(NamedTuple):
+    """A model, its residuals in V, and what `fit` makes of them."""
+
+    name: str
+    residuals: Any
+    result: Any
+
+
+def fitted(report: Report, record: Record, u, name, guess):
+    """The `Fit` of parameters and initial state, from this guess on."""
     begun = time.perf_counter()
-    record, own = sets.train, guess[0]
     y = jnp.asarray(record.y)
     sizes = SCALE | {key: size for key, (_, size, _) in CANDIDATES.items()}
-    scale = {key: sizes[key] for key in own}, STATE_SCALE
 
     def residuals(unknown):
         own, start = unknown
         return simulate(own, start, u, len(y)) - y
 
-    result = hhtjax.fit(residuals, guess, scale=scale)
-    fitted, errors = result.params[0], result.standard_errors[0]
+    result = hhtjax.fit(residuals, guess, scale=({key: sizes[key] for key in guess[0]}, STATE_SCALE))
+    report.progress(f"{name}: {time.perf_counter() - begun:.0f} s with compiling; {result.reason}")
+    return Fit(name, residuals, result)
+
+
+def compare(fits, fast):
+    """{model: RMSE in mV} of parts of the training record, each predicted by the fit to all the others."""
+    parts = 2 if fast else PARTS
+    always = np.arange(len(fits[0].result.residual)) < WASHOUT
+    results, functions = ({fit.name: getattr(fit, key) for fit in fits} for key in ("result", "residuals"))
+    compared = hhtjax.compare(results, functions, folds=parts, always=always, progress=True)
+    print(f"{compared.summary()}\n")
+    return {name: 1e3 * float(x) for name, x in zip(compared.names, compared.cross_validated, strict=True)}
+
+
+def scored(report: Report, tests, fit, left_out):
+    """A row of errors in mV, and of estimates."""
+    own, errors = fit.result.params[0], fit.result.standard_errors[0]
     row = {
-        "model": name,
+        "model": fit.name,
         "parameters": len(own),
-        "train_mV": rmse(result.residual),
-        "left_out_mV": left_out(residuals, result, scale),
+        "train_mV": rmse(fit.result.residual),
+        "left_out_mV": left_out[fit.name],
     }
     for test in ("arrow_full", "arrow_no_extrapolation", "multisine"):
-        error = test_error(fitted, sets.tests[test])
+        error = test_error(own, tests[test])
         row[f"{test}_mV"] = rmse(error)
         if test == "arrow_full":
             row["largest_arrow_full_mV"] = 1e3 * float(np.max(np.abs(error[WASHOUT:])))
-    row |= {
-        "estimates": {key: float(x) for key, x in fitted.items()},
-        "standard_errors": {key: float(errors[key]) for key in fitted},
+    report.progress(f"{fit.name}: left out {row['left_out_mV']:.4f} mV, arrow {row['arrow_full_mV']:.4f} mV")
+    return row | {
+        "estimates": {key: float(x) for key, x in own.items()},
+        "standard_errors": {key: float(errors[key]) for key in own},
     }
-    report.progress(
-        f"{name}: left out {row['left_out_mV']:.4f} mV, arrow {row['arrow_full_mV']:.4f} mV, "
-        f"{time.perf_counter() - begun:.0f} s with compiling; {result.reason}"
-    )
-    return result.params, row
-
-
-def left_out(residuals, result, scale):
-    """RMSE in mV of PARTS parts of the training record, each predicted by all the others, to first order:
-
-        e_g = r_g + J_g (J^T J - J_g^T J_g)^-1 J_g^T r_g
-
-    with Jacobian and residual at the fit to all, which so many samples make a good approximation of the refits.
-    """
-    flat, unravel = jax.flatten_util.ravel_pytree(result.params)
-    size = jax.flatten_util.ravel_pytree(scale)[0]
-    J = np.asarray(jax.jit(jax.jacfwd(lambda x: residuals(unravel(flat + size * x))))(jnp.zeros_like(flat)))
-    r = np.asarray(result.residual)
-    errors = []
-    for rows in np.array_split(np.arange(WASHOUT, len(r)), PARTS):
-        part = J[rows]
-        errors.append(r[rows] + part @ np.linalg.lstsq(J.T @ J - part.T @ part, part.T @ r[rows], rcond=None)[0])
-    return 1e3 * float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 
 def test_error(own, record: Record):
