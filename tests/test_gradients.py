@@ -28,6 +28,27 @@ def test_gradients_on_the_duffing_oscillator(name):
     check_gradient(path_loss(problem, tight(STEPPERS[name]), 30, 1), arguments)
 
 
+def test_gradients_of_the_default_where_it_chooses_the_held_state():
+    """Steps so long that both points are chosen; of params that hold integers, too."""
+
+    def force(q, v, t, params):
+        stiffness = params["k"] * jnp.where(params["mode"] == 1, 1.0, 2.0)
+        return -stiffness * (q**3 + q - q[::-1]) * jnp.array([0.5, 1.0])[params["place"]]
+
+    system = hhtjax.System(jnp.ones(2), force)
+
+    def path(k, **options):
+        params = {"k": k, "mode": jnp.array(1), "place": jnp.array(1)}
+        start = jnp.array([1.0, -0.7]), jnp.array([0.3, 2.0]), params
+        return hhtjax.simulate(system, hhtjax.hht(-0.05, **options), *start, dt=0.35, num_steps=12).q
+
+    chosen = path(4.0)
+    assert min(np.max(np.abs(chosen - path(4.0, linearize=x))) for x in ("predictor", "held")) > 0.1
+    with hhtjax.plain():
+        np.testing.assert_allclose(path(4.0), chosen, rtol=1e-12)
+    check_gradient(lambda k: jnp.sum(path(k) ** 2), 4.0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hht auto", "hht state", "hht converged", "kim_hht"])
 def test_gradients_on_the_forced_double_pendulum(name):
