@@ -10,7 +10,6 @@ import numpy as np
 from hhtjax.runs.events import before_any
 from hhtjax.systems import held, kinematics
 
-SAFETY = 0.9
 NOT_FINITE = 1e6  # the error of a step that is not finite
 LOWEST = 1e-4  # error of the step before, as the controller sees it
 ROUNDINGS = 16  # of t, of which a step is at least
@@ -21,7 +20,7 @@ class Controller(NamedTuple):
     """Of the factors by which steps change: the PI controller's exponents, divided by the order of the estimate, and
     bounds behind a step that was accepted. Growth by more than 2 is unstable for some methods."""
 
-    safety: Any = SAFETY
+    safety: Any = 0.9
     proportional: Any = 0.7
     integral: Any = 0.4
     least: Any = 0.2

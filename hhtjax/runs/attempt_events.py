@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.numerics.seldom import choose, seldom
-from hhtjax.runs.attempt import AT_EVENT, BROKEN, NOT_FINITE, SAFETY, TOO_SHORT, Trial, Try, sizes, succeeded
+from hhtjax.runs.attempt import AT_EVENT, BROKEN, NOT_FINITE, TOO_SHORT, Trial, Try, sizes, succeeded
 from hhtjax.runs.event_failures import FINE, MANY
 from hhtjax.runs.loop import neutral_info, resized_step
 from hhtjax.runs.meeting import SHORT, Part, Ways, asks, pass_events
@@ -76,7 +76,8 @@ def behind(trial, tried, walk, part, h):
     error = jnp.where(met.ended, 0, trial.bounds.relative(trial.flat, errors, q_size, v_size))
     fine = succeeded(part.end, part.info, error)
     error = jnp.where(fine, error, NOT_FINITE)
-    best = SAFETY * jnp.maximum(error, float(jnp.finfo(h.dtype).tiny)) ** (-1 / trial.stepper.estimate_order)
+    small = jnp.maximum(error, float(jnp.finfo(h.dtype).tiny))
+    best = trial.controller.safety * small ** (-1 / trial.stepper.estimate_order)
     shorter = rest * jnp.clip(best, 0.1, 0.9)
     h = jnp.where(error <= 1, jnp.minimum(h, rest * best), h - rest + shorter)
     return Try(new, error, h, shorter, jnp.where(fine, TOO_SHORT, BROKEN))
