@@ -157,6 +157,7 @@ def test_many_parameters_take_an_optax_optimiser():
             ValueError,
             r"`params0\['rate'\]` must lie between 2.0 and 3.0, for its transform; received 1.5",
         ),
+        ({"weights": None}, TypeError, "`weights` must be a number, an array or a pytree of them; received None"),
         ({"weights": -1.0}, ValueError, "`weights` must not be negative; received -1.0"),
         ({"weights": np.ones(7)}, ValueError, r"`weights` must have the leading axes .* \(40,\); received \(7,\)"),
         ({"loss": "hubert"}, ValueError, "`loss` must be one of huber, soft_l1, cauchy, a function .* 'hubert'"),

@@ -30,6 +30,18 @@ def test_one_kernel_gives_what_the_plain_path_gives(monkeypatch):
 
 
 @on_cpu
+def test_a_loop_of_which_only_an_integer_is_used():
+    def count(x):
+        def halved(carry):
+            return carry[0] / 2, carry[1] + 1
+
+        return kernels.one_kernel(lambda x: jax.lax.while_loop(lambda carry: carry[0] > 0.1, halved, (x, 0)), x)[1]
+
+    assert int(jax.jit(count)(1.0)) == 4
+    assert paths(count, 1.0) == ("one kernel",)
+
+
+@on_cpu
 def test_a_conditional_on_an_argument_stays():
     def f(i, x):
         return kernels.one_kernel(lambda i, x: jax.lax.switch(i, [jnp.sin, jnp.cos], x), i, x)

@@ -208,6 +208,8 @@ def spread_weights(caller, weights, shapes, name="weights"):
 
 def check_weights(caller, weights):
     """Finite numbers, or Booleans: True to keep, False for a missing sample."""
+    if weights is None:
+        raise TypeError(f"{caller}: `weights` must be a number, an array or a pytree of them; received None.")
     for path, leaf in jax.tree_util.tree_leaves_with_path(weights):
         where = f"{caller}: `weights{jax.tree_util.keystr(path)}`"
         if not isinstance(leaf, bool) and np.dtype(getattr(leaf, "dtype", float)).kind != "b":

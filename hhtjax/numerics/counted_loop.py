@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import eval_jaxpr
 from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.numerics.hoisted import hoisted
 from hhtjax.xla import TwoWays, derivative, staged, together
 
 SLOTS, LEVELS = 64, 3
@@ -27,14 +27,13 @@ def repeat(body, carry, count):
     Beyond LONGEST iterations its derivatives are NaN.
     """
     count = jnp.asarray(count)
-    trace = jax.make_jaxpr(body)(jnp.zeros_like(count), carry)  # tells what body closes over, integers too
+    call, constants = hoisted(body, jnp.zeros_like(count), carry)
     leaves, structure = jax.tree.flatten(carry)
 
-    @jax.jit
-    def traced(i, leaves, constants):
-        return eval_jaxpr(trace.jaxpr, constants, i, *leaves)
+    def on_leaves(i, leaves, constants):
+        return jax.tree.leaves(call(constants, i, structure.unflatten(leaves)))
 
-    return jax.tree.unflatten(structure, _repeat(traced, count, [jnp.asarray(x) for x in leaves], trace.consts))
+    return structure.unflatten(_repeat(on_leaves, count, [jnp.asarray(x) for x in leaves], constants))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

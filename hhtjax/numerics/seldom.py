@@ -5,8 +5,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.core import eval_jaxpr
 
+from hhtjax.numerics.hoisted import hoisted
 from hhtjax.xla import largest_in_batch
 
 
@@ -42,7 +42,7 @@ def derivative_of(f, value):
     >>> print(jax.grad(lambda x: derivative_of(lambda: x**2, lambda: x * x))(3.0))
     6.0
     """
-    (value, in_value), (f, in_f) = map(_converted, (value, f))
+    (value, in_value), (f, in_f) = map(hoisted, (value, f))
 
     @jax.custom_jvp
     def call(in_value, in_f):
@@ -53,14 +53,3 @@ def derivative_of(f, value):
         return jax.jvp(f, x[1:], dx[1:])
 
     return call(in_value, in_f)
-
-
-def _converted(f):
-    """f() as a function of all that it closes over, and that: integers too, which `jax.closure_convert` leaves."""
-    trace, like = jax.make_jaxpr(f, return_shape=True)()
-
-    @jax.jit
-    def call(constants):
-        return jax.tree.unflatten(jax.tree.structure(like), eval_jaxpr(trace.jaxpr, constants))
-
-    return call, trace.consts

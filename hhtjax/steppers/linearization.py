@@ -31,7 +31,7 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
     ways = path(s.w), held, lambda r: jnp.sum(r**2 / D), limit
     other = jax.jit(about)  # traced once
     # derivatives by one expansion about the state that was chosen: through both they would take longer to compile
-    return derivative_of(lambda: other(better_state(r, *ways))[:2], lambda: better_solve(about, other, *ways))
+    return derivative_of(lambda: other(better_state(r, *ways))[:2], lambda: better_solve(about, other, *ways[1:]))
 
 
 def better_state(r, predicted, held, size, limit):
@@ -42,7 +42,7 @@ def better_state(r, predicted, held, size, limit):
     return choose(use_predictor, predicted, held)
 
 
-def better_solve(about, other, _, held, size, limit):
+def better_solve(about, other, held, size, limit):
     """The solution about that state, with a second evaluation of r only where the first residual is large.
 
     A branch around it all, and no choice of a state before it: the processor goes on while it waits for the residual.

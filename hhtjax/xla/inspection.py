@@ -88,7 +88,7 @@ class Inspection:
         self.object(ir.StringAttr(op.attributes["call_target_name"]).value)
 
     def _look_into_branches(self, op):
-        """Each counted by itself: what is seldom taken, as at events, may have as many operations as all the rest."""
+        """Counted apart, each and together: what is seldom taken, as at events, may be longer than all the rest."""
         around, self.most = (self.operations, self.most), min(self.most, MOST_IN_BRANCH)
         for region in op.regions:
             self.operations = 0

@@ -137,7 +137,7 @@ def named(name, f):
 
 def _watch(tree):
     """An identity on either side of a call: whatever autodiff makes of it, one is behind the call or its transpose."""
-    return jax.tree.map(lambda x: watch_p.bind(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x, tree)
+    return jax.tree.map(watch_p.bind, tree)  # integers too: all that is used of a run may be the number of its steps
 
 
 inside_p = Primitive("hhtjax_inside")  # whether a kernel holds it; the operand keeps it where the choice is
