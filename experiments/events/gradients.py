@@ -80,9 +80,9 @@ def after_the_step(x, steps):
 
 
 def run(report, fast):
-    """Largest differences from the formulas."""
+    """Largest differences from the formulas; the smoke run has the first case, in forward mode."""
     rows, sizes = [], STEPS[::13] if fast else STEPS
-    for case, (scene_of, x, g, formula) in CASES.items():
+    for case, (scene_of, x, g, formula) in list(CASES.items())[: 1 if fast else None]:
         x = jnp.array(x)
         wanted = np.asarray(jax.jacfwd(formula)(x, g))
         for mode in ("forward",) if fast else ("forward", "reverse"):
