@@ -30,6 +30,7 @@ OFF = 3.0  # guess over truth, or its inverse
 PERIODS, SAMPLES = 5, 400  # of a record
 HORIZONS = (0.1, 0.3, 1.0)  # parts of a record, one fit after the other
 PRIOR = hhtjax.Gaussian(0.0, 1.5)  # of the logarithms
+SOUGHT = hhtjax.bounded(-7.0, 7.0)  # within a factor of 1000: the first parts of records tell little of some
 STEPPER = hhtjax.hht(alpha=-0.05, linearize="predictor")
 
 
@@ -68,7 +69,7 @@ def fit_part(x, guess, duration, measured, deviation, horizon, steps_per_sample)
     def residuals(params):
         return angles(params, duration, STEPPER, steps_per_sample) - measured
 
-    return fit_logarithms(residuals, x, guess, weights=present[:, None] / deviation, prior=PRIOR)
+    return fit_logarithms(residuals, x, guess, weights=present[:, None] / deviation, prior=PRIOR, transforms=SOUGHT)
 
 
 def recover(report, seeds):

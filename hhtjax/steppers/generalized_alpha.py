@@ -168,8 +168,9 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
             h exceeds the fastest time scale of the system. Default: simple; corrected with constraints. Internal
             states start simple always.
         formulation: of constraints. "ggl": Phi = 0 and dPhi/dt = 0, by one more multiplier for each (Gear,
-            Gupta, Leimkuhler 1985); "index3": Phi = 0 alone, of index 3 as an equation. With constraints, as with dry
-            friction, the one linearisation is at the predictor.
+            Gupta, Leimkuhler 1985); "index3": Phi = 0 alone, of index 3 as an equation: its
+            multipliers, and their derivatives, hold roundings over h^2. With constraints, as with dry friction, the
+            one linearisation is at the predictor.
         redundant: "least_squares" for constraints that depend on each other, always or in singular positions: of
             their multipliers the smallest. One singular value decomposition per solve. By default they are
             an error at the start, and a failure named by `solution.check()` at the step where they become so.
