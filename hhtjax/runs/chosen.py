@@ -136,7 +136,8 @@ def to_next_sample(loop, form, begun, keep, in_pieces):
 def begun_with(flat, stepper, params, loop, run):
     """The state with which the next step of a run begins: behind a jump of held inputs."""
     state, count, _ = run
-    return held.entered(stepper, flat, params, *loop.sizes(count), state)[1]
+    t, h = loop.sizes(count)
+    return held.entered(stepper, flat, params, t, h, state)[1]
 
 
 def kept(flat, stepper, state):
