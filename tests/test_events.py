@@ -11,7 +11,9 @@ from hhtjax import Event, System, hht, impact, rowda, simulate, sweep
 
 NAMES = "q0", "q1", "v0", "v1", "g", "c", "e", "gap", "r", "ground"  # what the run of two balls depends on
 BALLS = System(jnp.ones(2), lambda q, v, t, p: -p["g"] - p["c"] * v)
-CONTACT = Event(lambda q, v, t, p: q[1] - p["r"] * q[0] - p["gap"], impact("e"))  # of both, or of the second and a floor
+CONTACT = Event(
+    lambda q, v, t, p: q[1] - p["r"] * q[0] - p["gap"], impact("e")
+)  # of both, or of the second and a floor
 LANDING = Event(lambda q, v, t, p: q[1] - p["ground"], terminal=True)
 STEPS = 30
 
