@@ -108,8 +108,8 @@ def test_derivatives_are_those_of_the_accepted_steps():
     def found(x):
         params = {"c": x[2], "e": x[3], "floor": x[4]}
         run = simulate(
-            problem.system, hht(-0.3, linearize="predictor"), x[:1], x[1:2], params, dt=adaptive(1e-3, 1e-6, max_steps=500),
-            times=np.array([0.3, 0.5, 1.5]), events=problem.events)  # fmt: skip
+            problem.system, hht(-0.3, linearize="predictor"), x[:1], x[1:2], params,
+            dt=adaptive(1e-3, 1e-6, max_steps=500), times=np.array([0.3, 0.5, 1.5]), events=problem.events)  # fmt: skip
         return jnp.array([jnp.sum(jnp.sin(run.q)), run.v[2, 0] + run.v[-1, 0], run.events.t[1]])
 
     x, step, along = np.array([1.0, 0.0, 0.3, 0.8, 0.0]), 1e-6, np.array([0.6, -0.7, 1.1, 0.4, -0.9])
