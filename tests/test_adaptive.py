@@ -200,6 +200,9 @@ def test_tolerances_and_all_else_are_data():
 
     go(1e-3, 1e5, 0.3)
     compiled = chosen_steps._cache_size(), run_over._cache_size()
+    tolerances = {"rtol": 1e-2, "atol": 1e-6}
+    for times in ([0.4], [0.1, 0.2, 0.4]):  # any number of them, and whatever becomes of the run
+        hhtjax.choose_steps(CONTACT, hhtjax.rowda(), jnp.full(1, 0.3), ZERO, 1e5, times=times, **tolerances)
     few, many = go(1e-2, 1e5, 0.3), go(1e-5, 2e5, 0.4)
     assert (chosen_steps._cache_size(), run_over._cache_size()) == compiled
     assert few.steps.accepted < many.steps.accepted
