@@ -270,6 +270,7 @@ def test_the_error_of_the_whole_run(references):
     assert float(found.allowed) == pytest.approx(10 * (1e-3 * float(np.max(abs(found.q))) + 1e-6))
     spring = hhtjax.System(ONE, lambda q, v, t, p: -100 * q - 1e4 * q**3)  # undamped, some 30 periods
     times = np.linspace(0, 2, 65)[1:]
+    programs = set()
     for verify in (True, "tolerance"):
         run = hhtjax.simulate(
             spring, METHODS["hht"], ONE, ZERO, dt=hhtjax.adaptive(1e-3, 1e-6, verify=verify), times=times
@@ -279,6 +280,8 @@ def test_the_error_of_the_whole_run(references):
         ):
             run.check()
         assert 0.1 < np.max(run.error) < 0.3
+        programs.add(chosen_steps._cache_size())
+    assert len(programs) == 1
 
 
 @pytest.mark.slow
