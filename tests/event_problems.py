@@ -86,14 +86,19 @@ def walled_pendulum():
     return Problem(system, [wall], np.array([1.0, 0.0]), np.zeros(2), None, 1.5, end)
 
 
+def pressed(on, q, v, t, p):
+    """A spring, a load, and a bump stop with a damper."""
+    return -p["k"] * q + p["load"] * jnp.cos(3 * t) - on * (p["stiff"] * (q - p["place"]) + p["c"] * v)
+
+
+PRESSED = System(jnp.ones(1), lambda q, v, t, p: pressed(p["on"], q, v, t, p))
+JUMPING = System(jnp.ones(1), lambda q, v, t, p: pressed(jnp.where(q > p["place"], 1.0, 0.0), q, v, t, p))
+TOUCHING = Event(lambda q, v, t, p: (p["place"] - q[0]) * (1 - 2 * p["on"]), switch=lambda p: p | {"on": 1 - p["on"]})
+
+
 def bump_stop(located=True):
     """A driven mass whose bump stop has a damper: a force that jumps, by a mode or by its place."""
-
-    def force(q, v, t, p):
-        on = p["on"] if located else jnp.where(q > 0.3, 1.0, 0.0)
-        return -20 * q + 10 * jnp.cos(3 * t) - on * (400 * (q - 0.3) + 5 * v)
-
-    stop = Event(lambda q, v, t, p: (0.3 - q[0]) * (1 - 2 * p["on"]), switch=lambda p: p | {"on": 1 - p["on"]})
+    params = {"on": 0.0, "k": 20.0, "load": 10.0, "stiff": 400.0, "c": 5.0, "place": 0.3}
     t, y, on = 0.0, np.zeros(2), 0
     while t < 3.0:
 
@@ -106,4 +111,5 @@ def bump_stop(located=True):
         event.terminal, event.direction = True, -1.0
         run = solve_ivp(rates, (t, 3.0), y, events=event, **PRECISE)
         t, y, on = run.t[-1], run.y[:, -1], 1 - on
-    return Problem(System(jnp.ones(1), force), [stop] if located else [], np.zeros(1), np.zeros(1), {"on": 0.0}, 3.0, y)
+    system, events = (PRESSED, [TOUCHING]) if located else (JUMPING, [])
+    return Problem(system, events, np.zeros(1), np.zeros(1), params, 3.0, y)

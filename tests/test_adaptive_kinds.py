@@ -22,7 +22,8 @@ UNEVEN = np.array([0.0, 0.07, 0.08, 0.25, 0.31, 0.5])
 BEHIND = np.concatenate([UNEVEN[1:], [0.1, 0.2, 0.3, 0.4]]) + 1e-3
 TIMES = np.sort(np.concatenate([DURATION * np.arange(1, 26) / 25, BEHIND]))  # some in the first step behind a jump
 HELD = {"even": {"dt": 0.1}, "uneven": {"times": UNEVEN}}
-METHODS = {"hht": hhtjax.hht(-0.3), "rowda": hhtjax.rowda(), "dopri5": hhtjax.dopri5()}
+LIGHT = hhtjax.hht(linearize="predictor")  # half the program of "auto"
+METHODS = {"hht": hhtjax.hht(-0.3, linearize="predictor"), "rowda": hhtjax.rowda(), "dopri5": hhtjax.dopri5()}
 
 
 def held(name, values: Any = VALUES):
@@ -56,9 +57,8 @@ def pushed_exactly(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", HELD)
-@pytest.mark.parametrize("method", zoo.each(METHODS, quick=("hht", "dopri5")))
-def test_steps_end_where_held_inputs_jump(name, method):
+@pytest.mark.parametrize(("method", "name"), zoo.covering(METHODS, HELD))
+def test_steps_end_where_held_inputs_jump(method, name):
     """So errors of q, and of v between the steps, follow the tolerance."""
     exact = pushed_exactly(name)
     for rtol in (1e-2, 1e-3, 1e-5):
@@ -74,8 +74,8 @@ def test_steps_end_where_held_inputs_jump(name, method):
 
 
 @pytest.mark.slow
-def test_held_inputs_in_other_runs():
-    """In a sweep, whose members have inputs of their own; for derivatives in the values; in single precision."""
+def test_held_inputs_in_a_sweep():
+    """Whose members have inputs of their own."""
     stepper, rtol = METHODS["hht"], np.array([1e-2, 1e-4])
     members = jnp.stack([VALUES, -VALUES])
     runs = hhtjax.sweep(
@@ -86,29 +86,45 @@ def test_held_inputs_in_other_runs():
     for i, one in enumerate(members):
         np.testing.assert_allclose(runs.q[i], pushed("even", stepper, rtol[i], one).q, rtol=1e-7, atol=1e-9)
 
+
+SPRING = hhtjax.System(ONE, lambda q, v, t, u: u(t) - 4 * jnp.sin(q))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_level")
+def test_derivatives_in_held_inputs():
+    """Forward = reverse = differences over the same steps."""
+    controlled = {"dt": hhtjax.adaptive(1e-3, 1e-6, max_steps=4000), "times": TIMES[-1:]}
+
+    def run(values, **options):
+        return hhtjax.simulate(SPRING, METHODS["hht"], ONE, ZERO, held("uneven", values)["u"], **options)
+
     def end(values):
-        return jnp.sum(pushed("uneven", stepper, 1e-3, values).q[-1])
+        return run(values, **controlled).q[-1, 0]
 
-    start = jnp.asarray(VALUES)
-    reverse, forward = jax.jit(lambda x: (jax.grad(end)(x), jax.jacfwd(end)(x)))(start)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    steps = pushed("uneven", stepper, 1e-3).dt
+    @jax.jit
+    def ways(values, along):
+        return jax.grad(end)(values), jax.jvp(end, (values,), (along,))[1]
 
-    def frozen(values):
-        run = hhtjax.simulate(SYSTEM, stepper, *START, held("uneven", values), dt=steps)
-        return float(jnp.sum(run.q[-1]))
-
+    start, eye = jnp.asarray(VALUES), jnp.eye(6)
+    steps = run(start, **controlled).dt
+    reverse, forward = zip(*(ways(start, e) for e in eye), strict=True)
+    np.testing.assert_allclose(reverse[0], forward, rtol=1e-9)
+    frozen = jax.jit(lambda values: run(values, dt=steps).q[-1, 0])
     for i in (0, 3):
-        e = 1e-4 * np.eye(6)[i]
+        e = 1e-4 * eye[i]
         assert (frozen(start + e) - frozen(start - e)) / 2e-4 == pytest.approx(float(forward[i]), rel=1e-6)
-    spring = hhtjax.System(ONE, lambda q, v, t, u: u(t) - 4 * q)
+
+
+@pytest.mark.slow
+def test_held_inputs_in_single_precision():
     dt, u = hhtjax.adaptive(1e-3, 1e-6), held("even", VALUES.astype(np.float32))["u"]
     single = ONE.astype(np.float32), ZERO.astype(np.float32), u
     with pytest.warns(hhtjax.PrecisionWarning):
-        found = hhtjax.simulate(spring, stepper, *single, dt=dt, times=[0.55])
+        found = hhtjax.simulate(SPRING, METHODS["hht"], *single, dt=dt, times=[0.55])
     found.check()
     assert found.q.dtype == np.float32
-    double = hhtjax.simulate(spring, stepper, ONE, ZERO, held("even")["u"], dt=dt, times=[0.55])
+    double = hhtjax.simulate(SPRING, METHODS["hht"], ONE, ZERO, held("even")["u"], dt=dt, times=[0.55])
     np.testing.assert_allclose(found.q, double.q, atol=1e-3)
 
 
@@ -129,7 +145,7 @@ def rubbed(name, rtol, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", zoo.each(RUBBING, quick=("free",)))
+@pytest.mark.parametrize("name", zoo.each(RUBBING, quick=("free",), rest=("belt",)))
 def test_the_error_of_dry_friction_follows_the_tolerance(name):
     """Through all switches, 6 to 25; those of the free vibration, which end no sticking, reject nothing."""
     system, params, q0, v0, duration, *_ = RUBBING[name]
@@ -173,7 +189,7 @@ KINDS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", zoo.each(KINDS, quick=()))
+@pytest.mark.parametrize("name", zoo.each(KINDS, quick=(), rest=("a rotation",)))
 def test_dry_friction_with_more_than_coordinates(name):
     """Against the same at 1e-5, whose order is tested elsewhere; through all switches."""
     system, params, q0, v0, duration, z0, *_ = KINDS[name]
@@ -182,7 +198,7 @@ def test_dry_friction_with_more_than_coordinates(name):
     @jax.jit
     def go(rtol):
         dt = hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=20_000)
-        return hhtjax.simulate(system, hhtjax.hht(), q0, v0, params, z0=z0, dt=dt, times=times)
+        return hhtjax.simulate(system, LIGHT, q0, v0, params, z0=z0, dt=dt, times=times)
 
     fine = go(1e-5)
     assert np.sum(np.diff(np.sign(fine.friction), axis=0) != 0) >= 2
@@ -206,13 +222,18 @@ def test_controlled_steps_of_stick_slip_are_fewer_than_equal_ones():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_level")
 def test_derivatives_through_switches():
     """Forward = reverse = differences over the same steps."""
     system, params, q0, v0, *_ = RUBBING["free"]
 
     def end(F, dt=None):
-        options = {"dt": hhtjax.adaptive(1e-3, 1e-6, max_steps=1000), "times": [0.5]} if dt is None else {"dt": dt}
-        return hhtjax.simulate(system, hhtjax.hht(), q0, v0, params | {"F": F}, **options)
+        options = (
+            {"dt": hhtjax.adaptive(1e-3, 1e-6, max_steps=1000), "times": np.linspace(0.1, 0.5, 5)}
+            if dt is None
+            else {"dt": dt}
+        )
+        return hhtjax.simulate(system, LIGHT, q0, v0, params | {"F": F}, **options)
 
     steps, F = end(4.0).dt, jnp.asarray(4.0)
     ways = jax.jit(lambda F: (jax.grad(lambda F: end(F).q[-1, 0])(F), jax.jacfwd(lambda F: end(F).q[-1, 0])(F)))

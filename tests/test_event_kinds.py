@@ -10,16 +10,16 @@ from helpers import check_message
 import hhtjax
 from hhtjax import Event, FirstOrderSystem, System, hht, impact, rk4, rotation, simulate
 
+LIGHT = hht(linearize="predictor")  # half the program of "auto"
 FREE = System(jnp.ones(1), lambda q, v, t, p: 0 * q)
 
 
 @pytest.mark.slow
 def test_a_rotation_meets_a_stop():
     """A body that turns about z, up to an angle of 1 with e = .5."""
-    inertia = jnp.array([1.0, 2.0, 3.0])
-    body = System(inertia, lambda q, v, t, p: -jnp.cross(v, inertia * v))
+    body = System(jnp.array([1.0, 2.0, 3.0]), lambda q, v, t, p: 0 * v)  # about a principal axis there is no torque
     stop = Event(lambda R, v, t, p: 1.0 - jnp.arctan2(R[1, 0], R[0, 0]), impact(0.5))
-    run = simulate(body, hht(), jnp.eye(3), jnp.array([0.0, 0.0, 2.0]), dt=0.11, num_steps=10, events=[stop])
+    run = simulate(body, LIGHT, jnp.eye(3), jnp.array([0.0, 0.0, 2.0]), dt=0.11, num_steps=10, events=[stop])
     run.check()
     angle = 1.0 - (1.1 - 0.5)
     assert abs(run.events.t[0] - 0.5) < 1e-12
@@ -41,13 +41,13 @@ def test_internal_states_go_on_through_an_impact():
         return [y[1], 10 * (0.5 * y[2] - 0.01 * y[1]), 20 * (2.0 - y[2] - 0.5 * y[1])]
 
     start = [0.0, 0.0, 0.0]
-    end = bounce(rates, start, 0.8, lambda y: 1.0 - y[0], lambda y: [y[0], -(0.5 + 0.1 * y[2]) * y[1], y[2]])
+    end = bounce(rates, start, 0.75, lambda y: 1.0 - y[0], lambda y: [y[0], -(0.5 + 0.1 * y[2]) * y[1], y[2]])
     zero = np.zeros(1)
     error = []
-    for n in (100, 200):
-        run = simulate(arm, hht(), zero, zero, z0=zero, dt=0.8 / n, num_steps=n, events=[stop])
+    for k in (1, 2):  # one program: the run with long steps goes on
+        run = simulate(arm, LIGHT, zero, zero, z0=zero, dt=0.006 / k, num_steps=250, save_every=125, events=[stop])
         run.check()
-        error.append(np.abs(np.concatenate([run.q[-1], run.v[-1], run.z[-1]]) - end).max())
+        error.append(np.abs(np.concatenate([run.q[k], run.v[k], run.z[k]]) - end).max())
     assert run.events.count >= 1
     assert run.events.z.shape == (100, 1)
     assert error[1] < 2e-4

@@ -13,11 +13,22 @@ from hhtjax import Event, FirstOrderSystem, LinearSystem, SimulationError, Syste
 
 BALL = System(jnp.ones(1), lambda q, v, t, p: 0 * q - p["g"])
 FLOOR = Event(lambda q, v, t, p: q[0] - p["floor"], impact("e"))
+LIGHT = hht(linearize="predictor")  # half the program of "auto"
+
+
+DRAGGED = event_problems.dragged_ball()
+
+
+def dragged(stepper=LIGHT, dt=0.05, q0=DRAGGED.q0, events=DRAGGED.events, extrapolate=1, **params):
+    """With a spare event or none, from one program each."""
+    return simulate(
+        DRAGGED.system, stepper, q0, DRAGGED.v0, DRAGGED.params | params, dt=dt, num_steps=30, save_every=5,
+        events=events, extrapolate=extrapolate)  # fmt: skip
 
 
 def come_to_rest(e, num_steps):
     return simulate(
-        BALL, hht(), jnp.ones(1), jnp.zeros(1), {"g": G, "floor": 0.0, "e": e}, dt=2.0 / num_steps,
+        BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": G, "floor": 0.0, "e": e}, dt=2.0 / num_steps,
         num_steps=num_steps, events=[FLOOR])  # fmt: skip
 
 
@@ -43,7 +54,7 @@ def test_resting_contact_fails_by_name():
 def test_a_corner_fails_by_name():
     walls = [Event(lambda q, v, t, p, i=i: q[i], impact(0.5)) for i in range(2)]
     free = System(jnp.ones(2), lambda q, v, t, p: 0 * q)
-    run = simulate(free, hht(), jnp.full(2, 0.35), jnp.full(2, -1.0), dt=0.1, num_steps=10, events=walls)
+    run = simulate(free, LIGHT, jnp.full(2, 0.35), jnp.full(2, -1.0), dt=0.1, num_steps=10, events=walls)
     with pytest.raises(SimulationError, match=r"step 4 .* failed: another event happens at the same time as event"):
         run.check()
     assert np.isnan(run.q[4:]).all()
@@ -51,19 +62,13 @@ def test_a_corner_fails_by_name():
 
 def test_an_impact_that_nothing_can_follow_fails_by_name():
     clock = Event(lambda q, v, t, p: 0.25 - t + 0 * q[0], impact(0.5))
-    run = simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), {"g": 0.0}, dt=0.1, num_steps=5, events=[clock])
+    run = simulate(BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": 0.0}, dt=0.1, num_steps=5, events=[clock])
     check_message(SimulationError, "step 3 (to t = 0.3) failed: no velocity changes the guard of event 0", run.check)
 
 
 @pytest.mark.slow
 def test_no_event_no_change():
-    scene = event_problems.double_pendulum.free()
-    far = Event(lambda q, v, t, p: q[0] - q[1] + 1e6, impact(0.5))
-    q0 = jnp.array([1.2, 0.4])
-    runs = [
-        simulate(scene.system, hht(), q0, jnp.zeros(2), scene.params, dt=1e-3, num_steps=500, **options)
-        for options in ({}, {"events": [far]})
-    ]
+    runs = [dragged(floor=-1e6, events=events) for events in (None, DRAGGED.events)]
     assert bool(jnp.all(runs[0].q == runs[1].q))
     assert runs[1].events.count == 0
     assert runs[0].events is None
@@ -72,24 +77,19 @@ def test_no_event_no_change():
 
 @pytest.mark.slow
 def test_a_sweep_is_its_members():
-    problem = event_problems.dragged_ball()
     e, q0 = np.linspace(0.7, 0.9, 5), np.linspace(0.6, 1.4, 5)[:, None]
     dts = np.array([0.1, 0.02, 0.013, 0.05, 0.007])
-    params = {**problem.params, "e": e}
-    options = {"in_axes": (None, 0, None, {"c": None, "e": 0, "floor": None}), "events": problem.events}
-    runs = sweep(problem.system, hht(), q0, problem.v0, params, dts=dts, duration=1.5, num_samples=3, **options)
+    params = {**DRAGGED.params, "e": e}
+    options = {"in_axes": (None, 0, None, {"c": None, "e": 0, "floor": None}), "events": DRAGGED.events}
+    runs = sweep(DRAGGED.system, LIGHT, q0, DRAGGED.v0, params, dts=dts, duration=1.5, num_samples=3, **options)
     runs.check()
     assert runs.events.t.shape == (5, 100)
-    for i in (0, 3):
-        one = {**problem.params, "e": e[i]}
-        steps = round(1.5 / float(runs.dt[i]))
-        run = simulate(
-            problem.system, hht(), q0[i], problem.v0, one, dt=1.5 / steps, num_steps=steps, save_every=steps // 3,
-            events=problem.events)  # fmt: skip
-        assert run.events.count == runs.events.count[i]
-        assert abs(run.q - runs.q[i]).max() < 1e-12
+    for i, steps in ((0, 15), (3, 30)):  # one program: the run with long steps goes on
+        run = dragged(dt=1.5 / steps, q0=q0[i], e=e[i])
+        assert np.sum(np.asarray(run.events.t) < 1.5) == int(runs.events.count[i])
+        assert abs(run.q[: steps + 1 : steps // 15][:4] - runs.q[i]).max() < 1e-12
         assert abs(run.events.t[0] - runs.events.t[i, 0]) < 1e-12
-    at_times = sweep(problem.system, hht(), q0, problem.v0, params, dts=dts, times=[0.4, 0.45, 1.5], **options)
+    at_times = sweep(DRAGGED.system, LIGHT, q0, DRAGGED.v0, params, dts=dts, times=[0.4, 0.45, 1.5], **options)
     at_times.check()
     assert abs(at_times.q[-1, -1] - runs.q[-1, -1]).max() < 1e-4
 
@@ -99,7 +99,7 @@ def test_a_member_that_fails_leaves_the_others_alone():
     e = np.array([0.5, 1.0, 0.9])
     params = {"g": G, "floor": 0.0, "e": e}
     runs = sweep(
-        BALL, hht(), np.ones(1), np.zeros(1), params, dts=np.full(3, 0.01), duration=1.6, num_samples=4,
+        BALL, LIGHT, np.ones(1), np.zeros(1), params, dts=np.full(3, 0.01), duration=1.6, num_samples=4,
         in_axes=(None, None, None, {"g": None, "floor": None, "e": 0}), events=[FLOOR])  # fmt: skip
     assert [int(x) > 0 for x in runs.failure.step] == [True, False, False]
     check_message(SimulationError, "member 0 (1 of 3 failed)", runs.check)
@@ -108,15 +108,13 @@ def test_a_member_that_fails_leaves_the_others_alone():
 
 @pytest.mark.slow
 def test_the_same_numbers_on_plain_jax():
-    problem = event_problems.walled_pendulum()
+    def end():
+        run = dragged()
+        return np.concatenate([run.q[-1], run.v[-1], run.acceleration[-1], run.events.t[:2]])
 
-    def end(q0):
-        run = simulate(problem.system, hht(), q0, problem.v0, dt=0.03, num_steps=50, events=problem.events)
-        return jnp.concatenate([run.q[-1], run.v[-1], run.multipliers[-1], run.events.t[:1]])
-
-    found = end(problem.q0)
+    found = end()
     with hhtjax.plain():
-        plain = end(problem.q0)
+        plain = end()
     assert abs(found - plain).max() < 1e-12
 
 
@@ -124,7 +122,7 @@ def test_float32_stays_float32():
     params = {"g": np.float32(9.81), "floor": np.float32(0), "e": np.float32(0.8)}
     with pytest.warns(hhtjax.PrecisionWarning):
         run = simulate(
-            BALL, hht(), np.ones(1, np.float32), np.zeros(1, np.float32), params, dt=0.01, num_steps=100, events=[FLOOR]
+            BALL, LIGHT, np.ones(1, np.float32), np.zeros(1, np.float32), params, dt=0.01, num_steps=100, events=[FLOOR]
         )
     run.check()
     assert {x.dtype for x in jax.tree.leaves((run.q, run.v, run.events.t, run.events.after))} == {np.dtype(np.float32)}
@@ -142,7 +140,7 @@ def test_a_second_call_compiles_nothing():
 
     def call(e):
         params = {"g": G, "floor": 0.0, "e": e}
-        return simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=5, events=[floor])
+        return simulate(BALL, LIGHT, jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=5, events=[floor])
 
     call(0.5)
     before = len(traced)
@@ -152,7 +150,7 @@ def test_a_second_call_compiles_nothing():
 
 def test_what_is_between_the_saved_times():
     params = {"g": G, "floor": 0.0, "e": 0.8}
-    run = simulate(BALL, hht(), jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=12, save_every=3, events=[FLOOR])
+    run = simulate(BALL, LIGHT, jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=12, save_every=3, events=[FLOOR])
     fall = np.sqrt(2 / G)
     first, second = 0.8 * G * fall, 0.64 * G * fall
     times = np.linspace(0, 1.2, 60)
@@ -168,14 +166,11 @@ def test_what_is_between_the_saved_times():
 @pytest.mark.slow
 def test_extrapolation_across_impacts():
     """The part of dt^2 goes; what is left of order 3 depends on where in its step an event falls."""
-    problem = event_problems.dragged_ball()
 
     def error(levels):
-        run = simulate(
-            problem.system, hht(0.0), problem.q0, problem.v0, problem.params, dt=1.5 / 40, num_steps=40,
-            extrapolate=levels, events=problem.events)  # fmt: skip
+        run = dragged(hht(0.0, linearize="predictor"), extrapolate=levels)
         run.check()
-        return abs(run.q[-1, 0] - problem.end[0])
+        return abs(run.q[-1, 0] - DRAGGED.end[0])
 
     assert error(2) < error(1) / 100
 
@@ -184,7 +179,7 @@ def test_extrapolation_across_impacts():
 def test_runs_that_meet_other_events_cannot_be_joined():
     """A guard that is below zero for so short a time that only the finer steps see it."""
     short = Event(lambda q, v, t, p: 1.0 - 2.0 * jnp.exp(-(((t - 0.2) / 0.02) ** 2)) + 0 * q[0])
-    run = simulate(BALL, hht(), np.zeros(1), np.zeros(1), {"g": G}, dt=0.4, num_steps=4, extrapolate=2, events=[short])
+    run = simulate(BALL, LIGHT, np.zeros(1), np.zeros(1), {"g": G}, dt=0.4, num_steps=4, extrapolate=2, events=[short])
     check_message(SimulationError, "the runs that extrapolate joins do not meet the same events", run.check)
 
 
@@ -205,7 +200,7 @@ def test_events_of_a_first_order_system():
     """A clock that is set back at 1; and one that is only noted."""
     clock = FirstOrderSystem(lambda y, t, p: 1.0 + 0 * y)
     back = Event(lambda y, t, p: 1.0 - y[0], lambda y, t, p: 0 * y)
-    run = simulate(clock, hht(), np.zeros(1), dt=0.3, num_steps=12, events=[back])
+    run = simulate(clock, LIGHT, np.zeros(1), dt=0.3, num_steps=12, events=[back])
     run.check()
     assert abs(run.events.t[:3] - np.array([1.0, 2.0, 3.0])).max() < 1e-13
     assert run.events.count == 3
@@ -234,7 +229,7 @@ def test_every_member_of_a_sweep_is_looked_at():
 
     def runs(q0, params):
         options = {"in_axes": (None, 0, None, axes), "events": [FLOOR]}
-        return sweep(BALL, hht(), q0, np.zeros(1), params, dts=np.full(3, 0.1), duration=0.2, num_samples=1, **options)
+        return sweep(BALL, LIGHT, q0, np.zeros(1), params, dts=np.full(3, 0.1), duration=0.2, num_samples=1, **options)
 
     heights = np.array([[1.0], [1.0], [-1.0]])
     check_message(

@@ -1,5 +1,6 @@
 """Fits through runs under error control: steps frozen at one point, chosen again, until the estimates stay."""
 
+from functools import cache
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ DUFFING = hhtjax.System(ONE, lambda q, v, t, p: -p["k"] * q - p["k3"] * q**3 - 0
 TIMES = np.linspace(0, 5, 101)[1:]
 TRUE, GUESS = {"k": 4.0, "k3": 2.0}, {"k": 5.0, "k3": 1.5}
 STEPPER = hhtjax.dopri5()
+LIGHT = hhtjax.hht(linearize="predictor")  # half the program of "auto"
 
 
 def position(params, q0, rtol=1e-4, stepper: Any = STEPPER):
@@ -32,20 +34,18 @@ def measured():
 @pytest.fixture(scope="module")
 def residuals(measured):
     """By name of the stepper; a fit of each is compiled once."""
-    steppers = {"hht": hhtjax.hht(), "dopri5": STEPPER}
+    steppers = {"hht": LIGHT, "dopri5": STEPPER}
     return {name: lambda p, x=x: position(p, ONE, stepper=x) - measured for name, x in steppers.items()}
 
 
 def by_array(x, q0: Any = ONE, rtol=1e-3):
-    return position({"k": x[0], "k3": x[1]}, q0, rtol, hhtjax.hht(linearize="predictor"))
+    return position({"k": x[0], "k3": x[1]}, q0, rtol, LIGHT)
 
 
 def in_sweep(x):
     rtol = np.array([1e-2, 1e-3])
     dts, params = hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=1000), {"k": x[0], "k3": x[1]}
-    return hhtjax.sweep(
-        DUFFING, hhtjax.hht(linearize="predictor"), ONE, ZERO, params, dts=dts, times=TIMES
-    ).q[:, 1:]  # fmt: skip
+    return hhtjax.sweep(DUFFING, LIGHT, ONE, ZERO, params, dts=dts, times=TIMES).q[:, 1:]
 
 
 FORMS = {  # of residuals, and the tolerances of their runs
@@ -57,36 +57,56 @@ FORMS = {  # of residuals, and the tolerances of their runs
 }
 
 
+X, Y = np.array([4.0, 2.0]), np.array([5.0, 1.5])
+
+
+@cache
+def by_hand(rtol):
+    """q at X, and its derivatives, over the steps for Y."""
+    start = DUFFING, LIGHT, ONE, ZERO
+    chosen = hhtjax.choose_steps(*start, {"k": Y[0], "k3": Y[1]}, times=TIMES, rtol=rtol, atol=1e-3 * rtol)
+
+    @jax.jit
+    def along(dx):
+        def run(x):
+            path = hhtjax.simulate(*start, {"k": x[0], "k3": x[1]}, dt=chosen.dt)
+            return hhtjax.interpolate(path, TIMES).q
+
+        return jax.jvp(run, (X,), (dx,))
+
+    (value, first), (_, second) = map(along, np.eye(2))
+    return np.asarray(value), np.stack([first, second], axis=-1)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", zoo.each(FORMS, quick=("alone", "vmap")))
+@pytest.mark.usefixtures("one_level")
+@pytest.mark.parametrize("name", zoo.each(FORMS, quick=("jit",), rest=("alone", "scan")))
 def test_the_steps_are_those_of_the_other_point(name):
     """Values and derivatives against steps that are chosen by hand, whatever stands between."""
     f, tolerances = FORMS[name]
-    x, y = jnp.array([4.0, 2.0]), jnp.array([5.0, 1.5])
+    if name == "jit":
+        f(X)  # so that it knows the other form, too
 
-    def by_hand(x, rtol):
-        start = DUFFING, hhtjax.hht(linearize="predictor"), ONE, ZERO
-        chosen = hhtjax.choose_steps(*start, {"k": y[0], "k3": y[1]}, times=TIMES, rtol=rtol, atol=1e-3 * rtol)
-        path = hhtjax.simulate(*start, {"k": x[0], "k3": x[1]}, dt=chosen.dt)
-        return hhtjax.interpolate(path, TIMES).q
+    @jax.jit
+    def ways(dx):
+        value, forward = jax.jvp(lambda x: with_steps_for(f, x, Y), (X,), (dx,))
+        return value, forward, jax.grad(lambda x: jnp.sum(with_steps_for(f, x, Y)))(X)
 
-    f(x)  # so that jit knows the other form, too
-    for transform in (lambda f: f, jax.jacfwd):
-        found = transform(lambda x: with_steps_for(f, x, y))(x)
-        expected = jnp.stack([transform(lambda x, rtol=rtol: by_hand(x, rtol))(x) for rtol in tolerances])
-        np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=1e-9, atol=1e-10)
-    reverse = jax.grad(lambda x: jnp.sum(with_steps_for(f, x, y)))(x)
-    np.testing.assert_allclose(reverse, jnp.sum(found.reshape(-1, 2), axis=0), rtol=1e-9)
+    (value, first, reverse), (_, second, _) = map(ways, np.eye(2))
+    forward = np.stack([first, second], axis=-1)
+    for found, expected in zip((value, forward), zip(*map(by_hand, tolerances), strict=True), strict=True):
+        np.testing.assert_allclose(found.reshape(np.shape(expected)), expected, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(reverse, np.sum(forward.reshape(-1, 2), axis=0), rtol=1e-9)
 
 
-CASES = [("hht", 0.001), pytest.param("dopri5", 0.3, marks=pytest.mark.slow)]  # choices change its rejected steps
+CASES = [("hht", 0.001), pytest.param("dopri5", 0.3, marks=zoo.EVERY)]  # choices change its rejected steps
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), CASES)
 def test_a_fit_freezes_the_steps_and_chooses_again(name, most, residuals, measured):
     """The estimates are those of a fit by hand on the steps that are chosen for them, to a part of a standard error."""
-    stepper = {"hht": hhtjax.hht(), "dopri5": STEPPER}[name]
+    stepper = {"hht": LIGHT, "dopri5": STEPPER}[name]
     fitted = hhtjax.fit(residuals[name], GUESS)
     assert fitted.converged
     assert 1 <= fitted.choices <= 3
@@ -144,7 +164,7 @@ def test_records_and_starts():
 
 @pytest.mark.slow
 def test_inside_jit_and_from_several_starts(residuals):
-    residuals = residuals["dopri5"]
+    residuals = residuals["hht"]
     alone = hhtjax.fit(residuals, GUESS)
     inside = jax.jit(lambda p: hhtjax.fit(residuals, p).params)(jax.tree.map(jnp.asarray, GUESS))
     many = hhtjax.multistart(residuals, jax.tree.map(lambda x: jnp.array([x, 1.1 * x]), GUESS))

@@ -32,9 +32,16 @@ ALARM = 10  # times what was asked for, above which the error of a whole run is 
 
 
 @partial(jax.jit, static_argnames=("progress", "room"))
-def chosen_steps(problem, times, control, events=None, progress=False, room=()):
-    """`Steps` to the last of the times, and the times at which they end; no tracer of autodiff may come in."""
-    return choose(problem, problem.times(times)[-1], control, progress, events, room)
+def chosen_steps(problem, end, control, events=None, progress=False, room=()):
+    """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in."""
+    return choose(problem, problem.times(end), control, progress, events, room)
+
+
+def steps_for(choice, progress, room):
+    """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
+    problem, times, control, events = choice
+    control = replace(control, verify=False)
+    return or_plain(partial(chosen_steps, problem, times[-1], control, events, progress=progress, room=room[:1]))
 
 
 class Grid(NamedTuple):
@@ -225,18 +232,17 @@ def choose_steps(
     problem = Problem.checked("choose_steps", system, stepper, q0, v0, params, t0, z0)
     control = adaptive(**tolerances)
     times = checked_times("choose_steps", problem, times, control)
-    room = require_integer("choose_steps", "max_events", max_events), 1
+    room = (require_integer("choose_steps", "max_events", max_events),)
     if events is not None:
         events = require_events("choose_steps", problem, events)
-    arguments = lax.stop_gradient((problem, times, control, events))
-    return trimmed(or_plain(partial(chosen_steps, *arguments, progress=progress, room=room))[0])
+    return trimmed(steps_for(lax.stop_gradient((problem, times, control, events)), progress, room)[0])
 
 
 def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
     (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
-    steps, ends = or_plain(partial(chosen_steps, *choice, progress=progress, room=room))
+    steps, ends = steps_for(choice, progress, room)
     run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, room=room))
     if control.verify:
         better = finer(problem, times, control, steps, ends, choice, events, room)
@@ -249,7 +255,7 @@ def finer(problem, times, control, steps, ends, choice, events, room):
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
     if control.verify == "tolerance":
         *start, looser, theirs = choice
-        steps, ends = or_plain(partial(chosen_steps, *start, quarter(looser), theirs, room=room))
+        steps, ends = steps_for((*start, quarter(looser), theirs), False, room)
     halved = control.verify != "tolerance"
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, halved=halved, room=room))
 
