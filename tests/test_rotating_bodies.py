@@ -59,8 +59,8 @@ def start(constrained):
     return hhtjax.consistent_initial(HELD, q0, v0, PARAMS)[:2]
 
 
-def numpy_acceleration(R, s, Om, rate, t, constrained):
-    """A, the cart's acceleration, and L; written once more, on arrays."""
+def numpy_terms(R, s, Om, rate, t):
+    """M, Q, B of one row, and what of the second derivative of Phi is without accelerations; once more, on arrays."""
     m, cart, k, c = (float(PARAMS[x]) for x in ("m", "cart", "k", "c"))
     a = np.cross(ARM, -np.eye(3))
     row = -m * (R @ a)[0]
@@ -69,10 +69,15 @@ def numpy_acceleration(R, s, Om, rate, t, constrained):
     moment = np.cross(ARM, R.T @ [0, 0, -9.81 * m]) - m * np.cross(ARM, centripetal) - np.cross(Om, J @ Om)
     moment += np.array([0.5, -1.0, 0.3]) * np.cos(3 * t) - 0.1 * Om
     Q = np.append(moment, -m * E1 @ R @ centripetal - k * s - c * rate + 2 * np.sin(4 * t))
+    B = np.append(np.cross(TIP, R.T @ E3), 0.4 * s)
+    return M, Q, B, E3 @ R @ np.cross(Om, np.cross(Om, TIP)) + 0.4 * rate**2 + 0.2 * np.sin(2 * t)
+
+
+def numpy_acceleration(R, s, Om, rate, t, constrained):
+    """A, the cart's acceleration, and L."""
+    M, Q, B, gamma = numpy_terms(R, s, Om, rate, t)
     if not constrained:
         return np.linalg.solve(M, Q), np.zeros(0)
-    B = np.append(np.cross(TIP, R.T @ E3), 0.4 * s)
-    gamma = E3 @ R @ np.cross(Om, np.cross(Om, TIP)) + 0.4 * rate**2 + 0.2 * np.sin(2 * t)
     wL = np.linalg.solve(np.block([[M, -B[:, None]], [B, 0.0]]), np.append(Q, -gamma))
     return wL[:4], wL[4:]
 
@@ -109,12 +114,12 @@ def check_order(make, constrained, alpha, expected, quantities=4):
 
 @cache
 def final_state(make, constrained):
-    """State at the end, as a function of alpha and the number of steps, compiled once."""
+    """State at the end, as a function of alpha, the number of steps and the time they take, compiled once."""
     system, (q0, v0) = (HELD if constrained else FREE), start(constrained)
 
     @jax.jit
-    def end(alpha, num_steps):
-        stepper, dt = make(alpha), DURATION / num_steps
+    def end(alpha, num_steps, duration=DURATION):
+        stepper, dt = make(alpha), duration / num_steps
         begin = stepper.init(system, q0, v0, PARAMS, dt)
         return jax.lax.fori_loop(0, num_steps, lambda _, s: stepper.step(system, s, PARAMS, dt)[0], begin)
 
@@ -152,11 +157,24 @@ def test_order_with_a_moving_constraint(form):
 
 
 @pytest.mark.parametrize("constrained", [pytest.param(False, marks=EVERY), pytest.param(True, marks=pytest.mark.slow)])
-def test_literal_step_is_of_first_order(constrained):
-    """Cardona and Geradin's projection of the forces by T^-T: of order 1 but for alpha = 0, where w and L oscillate."""
+def test_literal_step_is_as_printed_and_of_first_order(constrained):
+    """Cardona and Geradin's projection of forces by T^T: of order 1 but for alpha = 0, where w and L oscillate."""
     literal = partial(hhtjax.conventional_hht, fictive_time=False, tolerance=1e-12)
     check_order(literal, constrained, jnp.asarray(0.0), 2, quantities=2 if constrained else 3)
     check_order(literal, constrained, jnp.asarray(-0.3), 1)
+    alpha, dt = -0.3, 0.02
+    end = final_state(literal, constrained)(jnp.asarray(alpha), 1, dt)
+    (R0, *before), (R1, *after) = (
+        (np.asarray(q["R"]), q["s"][0], np.asarray(v["R"]), v["s"][0]) for q, v in (start(constrained), (end.q, end.v))
+    )
+    (_, Q0, B0, _), (M1, Q1, B1, _) = numpy_terms(R0, *before, 0.0), numpy_terms(R1, *after, dt)
+    if constrained:
+        Q0, Q1 = Q0 + B0 * numpy_acceleration(R0, *before, 0.0, True)[1], Q1 + B1 * end.L
+    now = M1 @ np.append(end.w["R"], end.w["s"]) - (1 + alpha) * Q1
+    psi = Rotation.from_matrix(R0.T @ R1).as_rotvec()
+    P, angle = np.cross(psi, -np.eye(3)), np.linalg.norm(psi)
+    T = np.eye(3) - (1 - np.cos(angle)) / angle**2 * P + (angle - np.sin(angle)) / angle**3 * P @ P
+    np.testing.assert_allclose(np.append(T.T @ now[:3], now[3]), -alpha * Q0, atol=1e-9)
 
 
 def test_end_of_chart_is_the_motion_of_the_rotation():
@@ -230,13 +248,13 @@ def test_gradients():
         return cross(arm, R.T @ jnp.array([0.0, 0.0, -9.81 * m])) - cross(Om, params["J"] @ Om)
 
     def height(R, t, params):
-        return jnp.sum(R[2] * params["tip"], keepdims=True) - params["tip"][2] + 0.05 * jnp.sin(2 * t)
+        return jnp.sum(R[2] * params["tip"], keepdims=True) - TIP[2] + 0.05 * jnp.sin(2 * t)
 
     body = hhtjax.System(lambda R, params: params["J"], moments, height)
 
     def loss(x):
         m, inertia, tip, rate, dt = x
-        params = {"m": 2.0 * m, "J": jnp.asarray(J) * inertia, "tip": jnp.asarray(TIP) * jnp.array([1.0, tip, 1.0])}
+        params = {"m": 2.0 * m, "J": jnp.asarray(J) * inertia, "tip": jnp.asarray(TIP) * tip}
         begin = hhtjax.consistent_initial(body, jnp.eye(3), rate * jnp.asarray(OM0), params)[:2]
         run = hhtjax.simulate(body, hhtjax.hht(-0.05), *begin, params, dt=0.02 * dt, num_steps=20)
         parts = run.q * jnp.arange(9.0).reshape(1, 3, 3), run.v, run.multipliers
