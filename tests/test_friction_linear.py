@@ -9,6 +9,7 @@ import pytest
 
 import hhtjax
 from hhtjax import LinearSystem, System
+from hhtjax.numerics.low_rank import Changing, Updated
 
 PARAMS = {"F": 1.0}
 STOP = -50.0
@@ -84,6 +85,23 @@ def test_derivatives_are_those_of_the_general_system():
     reverse, _ = jax.jit(jax.grad(linear, has_aux=True))(1.0)
     assert np.ptp(np.sign(friction)) == 2
     np.testing.assert_allclose([forward, reverse], [exact, exact], rtol=1e-9)
+
+
+def test_an_updated_inverse_is_that_of_the_whole_matrix():
+    """A0 - E J E^T + H^T D of two joints, and its transpose; no part is symmetric."""
+    rng = np.random.default_rng(0)
+    A, J, H, D = (jnp.asarray(rng.normal(size=shape)) for shape in ((4, 4), (2, 2), (2, 4), (2, 4)))
+    b, at = rng.normal(size=4), jnp.array([3, 0])
+    E = jnp.eye(4)[:, at]
+
+    @jax.jit
+    def solved():
+        known = Changing(A, lambda state: lambda x: J @ x[at], lambda y: E @ y, 2)
+        inverse = Updated(known, H, lambda state: lambda x: D @ x).around(None, lambda w: w).of_map(None, b)
+        return inverse(b, trans=0), inverse(b, trans=1)
+
+    whole = A - E @ J @ E.T + H.T @ D
+    np.testing.assert_allclose(solved(), [np.linalg.solve(M, b) for M in (whole, whole.T)], rtol=1e-10)
 
 
 @pytest.mark.slow
