@@ -18,7 +18,7 @@ ValueError for another shape.
 Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """
 
-from functools import partial
+from functools import partial, reduce
 from math import factorial
 
 import jax
@@ -124,7 +124,6 @@ def log(R) -> jax.Array:
     q = products[jnp.argmax(jnp.diag(products))]  # a multiple of the quaternion
     q = jnp.where(q[0] < 0, -q, q)
     q0, q = q[0], q[1:]
-
     y = jnp.sum(q**2)
     small = 16 * y < q0**2  # an angle below 0.49
     near = jnp.where(small, q0, 1)
@@ -276,18 +275,14 @@ def inverse_coefficient(x):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _power_series(coefficients, x):
-    value = jnp.full_like(x, coefficients[-1])
-    for c in reversed(coefficients[:-1]):
-        value = value * x + c
-    return value
+    """Its derivatives are series too: through this recursion, each would be three times as long as the one before."""
+    return reduce(lambda value, c: value * x + c, coefficients[-2::-1], jnp.full_like(x, coefficients[-1]))
 
 
 @_power_series.defjvp
-def _slope(coefficients, primals, tangents):
-    """By the series of the derivative: through the recursion each derivative would be three times as long."""
-    (x,), (dx,) = primals, tangents
-    slope = tuple(k * c for k, c in enumerate(coefficients))[1:]
-    return _power_series(coefficients, x), (_power_series(slope, x) if slope else jnp.zeros_like(x)) * dx
+def _(coefficients, primals, tangents):
+    slope = tuple(k * c for k, c in enumerate(coefficients))[1:] or (0.0,)
+    return _power_series(coefficients, *primals), _power_series(slope, *primals) * tangents[0]
 
 
 def _polynomial(psi, f, g):
