@@ -18,6 +18,7 @@ ValueError for another shape.
 Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """
 
+from functools import partial, reduce
 from math import factorial
 
 import jax
@@ -51,8 +52,8 @@ GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
 )
 TERMS = range(11)  # of c4 and c5: to rounding for x < 1, third derivatives too
-C4, C5 = ([1 / factorial(2 * j + k) for j in TERMS] for k in (4, 5))
-ARCTANGENT = [1 / (2 * k + 1) for k in range(16)]  # arctan(z) / z in powers of -z^2: likewise for z < 1/4
+C4, C5 = (tuple(1 / factorial(2 * j + k) for j in TERMS) for k in (4, 5))
+ARCTANGENT = tuple(1 / (2 * k + 1) for k in range(16))  # arctan(z) / z in powers of -z^2: likewise for z < 1/4
 
 
 def hat(x) -> jax.Array:
@@ -123,7 +124,6 @@ def log(R) -> jax.Array:
     q = products[jnp.argmax(jnp.diag(products))]  # a multiple of the quaternion
     q = jnp.where(q[0] < 0, -q, q)
     q0, q = q[0], q[1:]
-
     y = jnp.sum(q**2)
     small = 16 * y < q0**2  # an angle below 0.49
     near = jnp.where(small, q0, 1)
@@ -273,11 +273,16 @@ def inverse_coefficient(x):
     return jnp.where(small, c3 - 2 * c4, (2 * c2 - c1) / jnp.where(small, 1, x)) / (2 * c2)
 
 
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _power_series(coefficients, x):
-    value = jnp.full_like(x, coefficients[-1])
-    for c in reversed(coefficients[:-1]):
-        value = value * x + c
-    return value
+    """Its derivatives are series too: through this recursion, each would be three times as long as the one before."""
+    return reduce(lambda value, c: value * x + c, coefficients[-2::-1], jnp.full_like(x, coefficients[-1]))
+
+
+@_power_series.defjvp
+def _(coefficients, primals, tangents):
+    slope = tuple(k * c for k, c in enumerate(coefficients))[1:] or (0.0,)
+    return _power_series(coefficients, *primals), _power_series(slope, *primals) * tangents[0]
 
 
 def _polynomial(psi, f, g):

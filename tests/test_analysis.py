@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from closed_forms import CLOSED_FORMS
 from jax.flatten_util import ravel_pytree
-from zoo import as_data
+from zoo import EVERY, as_data
 
 import hhtjax
 from hhtjax import analysis
@@ -103,7 +103,11 @@ def test_powers_of_the_trapezoidal_rule_at_infinity():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "formulation"),
-    [(pendulum.cartesian(), "index3"), (pendulum.cartesian(), "ggl"), (squeezer.squeezer(), "index3")],
+    [
+        (pendulum.cartesian(), "index3"),
+        (pendulum.cartesian(), "ggl"),
+        pytest.param(squeezer.squeezer(), "index3", marks=EVERY),
+    ],
     ids=("pendulum, index3", "pendulum, ggl", "squeezer, index3"),
 )
 def test_each_constraint_of_a_mechanism_has_the_spectrum_at_infinity(scene, formulation):

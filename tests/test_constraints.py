@@ -242,17 +242,19 @@ def test_consistent_initial_is_nearest_and_consistent():
 @pytest.mark.slow
 @pytest.mark.parametrize(("formulation", "iterations"), [("ggl", 1), ("index3", None)])
 def test_gradients(formulation, iterations):
-    """Of a loss of the whole path, through the projection of the start: stiffness, damping, length, v0 and dt."""
+    """Of a loss of the whole path, once through the projection of the start: stiffness, damping, length, v0 and dt."""
+
+    consistent = start()
 
     def loss(arguments):
         k, c, length, v0, dt = arguments
         params = PARAMS | {"k": k, "c": c, "l": length}
-        begin = hhtjax.consistent_initial(SLIDER, Q0, v0, params)
+        begin = hhtjax.consistent_initial(SLIDER, Q0, v0, params) if formulation == "ggl" else consistent
         stepper = hhtjax.hht(-0.1, formulation=formulation, iterations=iterations, tolerance=1e-13)
         path = hhtjax.simulate(SLIDER, stepper, begin.q, begin.v, params, dt=dt, num_steps=12)
         return jnp.sum(path.q**2) + 0.1 * jnp.sum(path.v**2) + 1e-3 * jnp.sum(path.multipliers**2)
 
-    check_gradient(loss, (30.0, 0.4, 0.8, GUESS, 0.02))
+    check_gradient(loss, (30.0, 0.4, 0.8, GUESS if formulation == "ggl" else None, 0.02))
 
 
 @pytest.mark.slow

@@ -157,7 +157,13 @@ def check_derivatives(end, start):
         assert abs(central - forward[i]) < 1e-6 * size[i], (i, central, forward[i])
 
 
-NAMES = "k", "c", "F", "m"
+NAMES, FEW = ("k", "c", "F", "m"), 32  # steps, as many as are not checkpointed
+
+
+def last(found):
+    """A number of the end of a run in which the first joint sticks and the last reverses, and no number of another."""
+    switched = jnp.any(found.sticking[:, 0]) & (jnp.ptp(jnp.sign(found.friction[:, -1])) == 2)
+    return jnp.where(switched, found.q[-1] @ jnp.arange(1.0, 1 + found.q.shape[1]), jnp.nan)
 
 
 @pytest.mark.slow
@@ -177,7 +183,7 @@ def test_derivatives_are_those_of_the_exact_motion():
     assert dict(zip(NAMES, away < 0.02, strict=True)) == dict.fromkeys(NAMES, True), away
 
     def end(params):
-        return run(case._replace(params={**case.params, **params}), hhtjax.hht(), 400, save_every=400).q[-1, 0]
+        return last(run(case._replace(params={**case.params, **params}, duration=3.2), hhtjax.hht(), FEW))
 
     check_derivatives(end, {name: case.params[name] for name in NAMES})
 
@@ -188,8 +194,7 @@ def test_derivatives_through_coupled_switches():
     case = arm()._replace(duration=2.0)
 
     def end(start):
-        found = run(case._replace(params={"F": start[0]}, q0=start[1]), hhtjax.hht(), 250, save_every=250)
-        return jnp.sum(found.q[-1] * jnp.array([1.0, 2.0]))
+        return last(run(case._replace(params={"F": start[0]}, q0=start[1]), hhtjax.hht(), FEW))
 
     check_derivatives(end, (2.5, case.q0))
 
@@ -238,7 +243,7 @@ def test_newton_in_the_free_step():
 @pytest.mark.slow
 def test_joints_in_a_row():
     """They stick and slip one on the other; the switch of one jerks its neighbours within the step."""
-    n, rates = 5, 1 + 0.3 * jnp.arange(5.0)
+    n, rates = 3, 1 + 0.3 * jnp.arange(3.0)
     row = hhtjax.System(
         jnp.ones(n),
         lambda q, v, t, p: 3.0 * jnp.sin(rates * t) - q,

@@ -9,6 +9,7 @@ import pytest
 
 import hhtjax
 from hhtjax import LinearSystem, System
+from hhtjax.numerics.low_rank import Changing, Updated
 
 PARAMS = {"F": 1.0}
 STOP = -50.0
@@ -30,10 +31,11 @@ def limit(q, v, t, params):
     return params["F"] * (1 + stiction + 0.1 * jnp.abs(q[-2:]))
 
 
-def pair(n, nonlinear=False):
+def pair(n, nonlinear=False, joints=2):
     """The same as a LinearSystem and as a System."""
     M, C, K = matrices(n)
-    at, dry = [1, n - 2], {"friction": limit, "sliding": rates}
+    at = [1, n - 2]
+    dry = {"friction": lambda *x: limit(*x)[:joints], "sliding": lambda *x: rates(*x)[:joints]}
     local = {"nonlinear": lambda q, v, t, params: STOP * q**3, "at": at} if nonlinear else {}
 
     def load(t, params):
@@ -47,9 +49,9 @@ def pair(n, nonlinear=False):
     return LinearSystem(M, C, K, load, **local, **dry), System(M, force, **dry)
 
 
-def run(system, n, params=PARAMS, num_steps=400, **options):
+def run(system, n, params=PARAMS, dt=0.01, num_steps=400, **options):
     q0 = jnp.linspace(0, 1.0, n)
-    return hhtjax.simulate(system, hhtjax.hht(-0.1, **options), q0, 0 * q0, params, dt=0.01, num_steps=num_steps)
+    return hhtjax.simulate(system, hhtjax.hht(-0.1, **options), q0, 0 * q0, params, dt=dt, num_steps=num_steps)
 
 
 @cache
@@ -70,12 +72,36 @@ def test_the_motion_is_that_of_the_general_system(n, nonlinear, iterations):
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_the_general_system():
-    def end(system, F):
-        return jnp.sum(run(system, 4, {"F": F}, 100).q[-1] ** 2)
+    """Of one joint, whose switches are differentiated; those of several are as of any system."""
 
-    linear, general = (partial(end, system) for system in pair(4, nonlinear=True))
-    exact, *found = jax.jit(lambda F: (jax.grad(general)(F), jax.grad(linear)(F), jax.jacfwd(linear)(F)))(1.0)
-    np.testing.assert_allclose(found, exact, rtol=1e-9)
+    def end(system, F):
+        found = run(system, 4, {"F": F}, 0.04, 32)  # as many as are not checkpointed
+        return jnp.sum(found.q[-1] ** 2), found.friction
+
+    linear, general = (partial(end, system) for system in pair(4, nonlinear=True, joints=1))
+    (_, exact, friction), (_, forward, _) = (
+        jax.jit(lambda F, end=end: jax.jvp(end, (F,), (1.0,), has_aux=True))(1.0) for end in (general, linear)
+    )
+    reverse, _ = jax.jit(jax.grad(linear, has_aux=True))(1.0)
+    assert np.ptp(np.sign(friction)) == 2
+    np.testing.assert_allclose([forward, reverse], [exact, exact], rtol=1e-9)
+
+
+def test_an_updated_inverse_is_that_of_the_whole_matrix():
+    """A0 - E J E^T + H^T D of two joints, and its transpose; no part is symmetric."""
+    rng = np.random.default_rng(0)
+    A, J, H, D = (jnp.asarray(rng.normal(size=shape)) for shape in ((4, 4), (2, 2), (2, 4), (2, 4)))
+    b, at = rng.normal(size=4), jnp.array([3, 0])
+    E = jnp.eye(4)[:, at]
+
+    @jax.jit
+    def solved():
+        known = Changing(A, lambda state: lambda x: J @ x[at], lambda y: E @ y, 2)
+        inverse = Updated(known, H, lambda state: lambda x: D @ x).around(None, lambda w: w).of_map(None, b)
+        return inverse(b, trans=0), inverse(b, trans=1)
+
+    whole = A - E @ J @ E.T + H.T @ D
+    np.testing.assert_allclose(solved(), [np.linalg.solve(M, b) for M in (whole, whole.T)], rtol=1e-10)
 
 
 @pytest.mark.slow

@@ -41,6 +41,7 @@ def test_constrained_top():
 
 
 @pytest.mark.slow
+@pytest.mark.every
 def test_literal_constrained_top():
     """Cardona and Geradin's own step: 13 mm off, the error measured for the paper's HHT; the repaired one 16 mm."""
     scene, exact = top.constrained(), np.array(read_top()[0.5]["x_disk"])
@@ -71,8 +72,8 @@ def test_minimal_top():
 
 @pytest.mark.slow
 def test_body_chain():
-    """Three rods on spherical joints: energy and the vertical momentum kept to second order, joints closed."""
-    scene = body_chain.body_chain()
+    """Two rods on spherical joints: energy and the vertical momentum kept to second order, joints closed."""
+    scene = body_chain.body_chain(bodies=2)
     errors = []
     for dt, half in ((1 / 500, 26), (1 / 1000, 51)):  # one program; over half a second
         run = hhtjax.simulate(
@@ -85,7 +86,7 @@ def test_body_chain():
         spin = np.sum(np.einsum("tnij,tnj->tni", R, inertia * Om) + m * np.cross(x, v), 1)[:, 2]
         errors.append([np.max(np.abs(y - y[0])[:half]) for y in (energy, spin)])
         assert np.max(run.info.constraint) < 1e-8
-        np.testing.assert_allclose(run.multipliers[:, 2].max() > 3 * m * g, True)
+        np.testing.assert_allclose(run.multipliers[:, 2].max() > 2 * m * g, True)
     slopes = np.log2(np.array(errors[0]) / np.array(errors[1]))
     assert np.all(slopes > 1.85)
-    assert errors[1][0] < 1e-3 * 3 * m * g
+    assert errors[1][0] < 1e-3 * 2 * m * g

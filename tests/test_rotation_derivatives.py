@@ -19,18 +19,42 @@ from hhtjax.rotation import (
 
 
 @cache
-def forward(f, order):
-    """All derivatives of this order: f's shape, then (3,) for each."""
-    for _ in range(order):
-        f = jax.jacfwd(f)
-    return batched(f)
+def forward(f):
+    """f and its derivatives up to the third, (3,) for each after the shape of f: one program has all orders."""
+
+    def derived(lower):
+        def f_and_lower(x):
+            y, *rest = lower(x)
+            return y, (y, *rest)
+
+        def all_orders(x):
+            highest, rest = jax.jacfwd(f_and_lower, has_aux=True)(x)
+            return highest, *rest
+
+        return all_orders
+
+    found = derived(derived(derived(lambda x: (f(x),))))
+    return batched(lambda x: found(x)[::-1])
 
 
 def reverse(f, weights):
-    """In reverse mode all through: the gradient of f . weights[0], of that . weights[1], and so on."""
+    """In reverse mode all through: the gradients of f . weights[0], of that . weights[1], and so on."""
+
+    def derived(lower, w):
+        def value_and_lower(x):
+            y, *rest = lower(x)
+            return jnp.sum(w * y), (y, *rest)
+
+        def all_orders(x):
+            highest, rest = jax.grad(value_and_lower, has_aux=True)(x)
+            return highest, *rest
+
+        return all_orders
+
+    found = lambda x: (f(x),)  # noqa: E731
     for w in weights:
-        f = jax.grad(lambda x, f=f, w=w: jnp.sum(w * f(x)))
-    return batched(f)
+        found = derived(found, w)
+    return batched(lambda x: found(x)[-2::-1])
 
 
 def contract(derivative, weights):
@@ -41,24 +65,25 @@ def contract(derivative, weights):
     return derivative
 
 
-def random_weights(shape, order):
-    rng = np.random.default_rng(order)
-    return [rng.uniform(-1, 1, shape), *rng.uniform(-1, 1, (order - 1, 3))]
+def random_weights(shape):
+    rng = np.random.default_rng(1)
+    return [rng.uniform(-1, 1, shape), *rng.uniform(-1, 1, (2, 3))]
 
 
-@pytest.mark.parametrize("order", [1, *(pytest.param(order, marks=pytest.mark.slow) for order in (2, 3))])
-@pytest.mark.parametrize("f", [exp, tangent, inverse_tangent])
-def test_derivatives(f, order):
+@pytest.mark.parametrize("f", [exp, *(pytest.param(f, marks=pytest.mark.slow) for f in (tangent, inverse_tangent))])
+def test_derivatives(f):
     """Forward mode, reverse mode, and fourth-order central differences of the derivative before."""
-    h, weights = 1e-3, random_weights((3, 3), order)
-    derivative, before = np.asarray(forward(f, order)(VECTORS)), forward(f, order - 1)
+    h, weights = 1e-3, random_weights((3, 3))
+    found = forward(f)(VECTORS)
 
     def difference(step):
-        return before(VECTORS + step) - before(VECTORS - step)
+        return [x - y for x, y in zip(forward(f)(VECTORS + step), forward(f)(VECTORS - step), strict=True)]
 
-    differences = [(8 * difference(h * e) - difference(2 * h * e)) / (12 * h) for e in EYE]
-    assert_close(derivative, np.stack(differences, axis=-1), 1e-11)
-    assert_close(reverse(f, weights)(VECTORS), contract(derivative, weights), 1e-13)
+    differences = [(difference(h * e), difference(2 * h * e)) for e in EYE]
+    for order, by_reverse in enumerate(reverse(f, weights)(VECTORS), 1):
+        columns = [(8 * one[order - 1] - two[order - 1]) / (12 * h) for one, two in differences]
+        assert_close(found[order], np.stack(columns, axis=-1), 1e-11)
+        assert_close(by_reverse, contract(found[order], weights[:order]), 1e-13)
 
 
 @pytest.mark.parametrize("f", [exp, tangent, inverse_tangent])
@@ -80,21 +105,23 @@ def test_derivatives_at_zero(f, factors, order):
     for directions in np.ndindex((3,) * order):
         products = [np.linalg.multi_dot([EYE, *(P[i] for i in p), EYE]) for p in permutations(directions)]
         exact[:, :, *directions] = factors[order - 1] * np.mean(products, axis=0)
-    at_zero = forward(f, order)(VECTORS)[np.linalg.norm(VECTORS, axis=1) < 1e-100]
+    at_zero = forward(f)(VECTORS)[order][np.linalg.norm(VECTORS, axis=1) < 1e-100]
     assert_close(at_zero, np.broadcast_to(exact, at_zero.shape), 1e-15)
 
 
-@pytest.mark.parametrize("order", [1, *(pytest.param(order, marks=pytest.mark.slow) for order in (2, 3))])
-def test_derivatives_of_log(order):
+@pytest.mark.slow
+def test_derivatives_of_log():
     """log(exp(psi)) = psi: the first derivative is I and the next ones are 0."""
 
     def identity(psi):
         return log(exp(psi))
 
-    psi, weights = np.concatenate([VECTORS, NEAR_PI]), random_weights(3, order)
-    exact = np.broadcast_to(EYE if order == 1 else np.zeros((3,) * (order + 1)), (len(psi),) + (3,) * (order + 1))
-    assert_close(forward(identity, order)(psi), exact, 1e-14 * 10 ** (order - 1))
-    assert_close(reverse(identity, weights)(psi), contract(exact, weights), 1e-14 * 10 ** (order - 1))
+    psi, weights = np.concatenate([VECTORS, NEAR_PI]), random_weights(3)
+    found = forward(identity)(psi)
+    for order, by_reverse in enumerate(reverse(identity, weights)(psi), 1):
+        exact = np.broadcast_to(EYE if order == 1 else np.zeros((3,) * (order + 1)), found[order].shape)
+        assert_close(found[order], exact, 1e-14 * 10 ** (order - 1))
+        assert_close(by_reverse, contract(exact, weights[:order]), 1e-14 * 10 ** (order - 1))
 
 
 @pytest.mark.slow
@@ -106,14 +133,13 @@ def test_derivative_of_log_is_the_inverse_tangent():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", ORDERS)
-def test_derivatives_of_coefficients(order):
+def test_derivatives_of_coefficients():
     """Forward, with relative errors of the series and absolute ones beyond; and reverse, of a random combination."""
-    weights = np.random.default_rng(order).uniform(-1, 1, 6)
-    forward, backward = six, lambda x: sum(w * f for w, f in zip(weights, six(x), strict=True))
-    for _ in range(order):
-        forward, backward = jax.jacfwd(forward), jax.grad(backward)
-    exact = np.array([exact_coefficients(x, order) for x in X]).T
-    error = np.abs(np.array(batched(forward)(X)) - exact)
-    assert np.all(error < np.where(X < 1, 1e-13 * np.abs(exact), 1e-14))
-    assert_close(batched(backward)(X), weights @ exact, 1e-14)
+    weights = np.random.default_rng(1).uniform(-1, 1, 6)
+    found = forward(lambda x: jnp.stack(six(x)))(X)
+    by_reverse = reverse(lambda x: jnp.stack(six(x)), [weights, 1.0, 1.0])(X)
+    for order in (1, 2, 3):
+        exact = np.array([exact_coefficients(x, order) for x in X])
+        error = np.abs(found[order] - exact)
+        assert np.all(error < np.where(X[:, None] < 1, 1e-13 * np.abs(exact), 1e-14))
+        assert_close(by_reverse[order - 1], exact @ weights, 1e-14)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import check_gradient, path_loss
-from zoo import PROBLEMS, Problem, run
+from zoo import EVERY, PROBLEMS, Problem, run
 
 import hhtjax
 from hhtjax import operator_splitting
@@ -191,7 +191,7 @@ def test_gradients(modified):
 
 
 @pytest.mark.slow
-@every_form
+@pytest.mark.parametrize("modified", [False, pytest.param(True, marks=EVERY)])
 def test_gradients_on_the_double_pendulum(modified):
     problem = PROBLEMS["double pendulum"]
     arguments = problem.params, problem.q0, problem.v0, 0.02, 0.1
