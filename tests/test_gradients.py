@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import check_gradient, path_loss, tight
-from zoo import PROBLEMS, STEPPERS, each
+from zoo import EVERY, PROBLEMS, STEPPERS, each
 
 import hhtjax
 
@@ -19,8 +19,11 @@ DAMPING = {
 }
 
 
+ALIKE = "newmark", "bossak", "generalized_alpha", "dopri5"  # others with other coefficients
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", each(STEPPERS))
+@pytest.mark.parametrize("name", each(STEPPERS, rest=ALIKE))
 def test_gradients_on_the_duffing_oscillator(name):
     """In one plain loop: more steps would be checkpointed, as they are on the double pendulum."""
     problem = PROBLEMS["forced Duffing"]
@@ -50,7 +53,7 @@ def test_gradients_of_the_default_where_it_chooses_the_held_state():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["hht auto", "hht state", "hht converged", "kim_hht"])
+@pytest.mark.parametrize("name", each(["hht auto", "hht state", "hht converged", "kim_hht"], rest=["kim_hht"]))
 def test_gradients_on_the_forced_double_pendulum(name):
     problem = PROBLEMS["forced double pendulum"]
     arguments = problem.params, problem.q0, problem.v0, 0.02, 0.1
@@ -58,8 +61,12 @@ def test_gradients_on_the_forced_double_pendulum(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("iterations", [1, None])
-@pytest.mark.parametrize(("name", "value"), [("hht", -0.1), ("bossak", -0.1), ("generalized_alpha", 0.7)])
+@pytest.mark.parametrize(
+    ("name", "value", "iterations"),
+    [("hht", -0.1, None), ("bossak", -0.1, 1), ("generalized_alpha", 0.7, 1)]
+    + [pytest.param(*x, marks=EVERY)
+       for x in (("hht", -0.1, 1), ("bossak", -0.1, None), ("generalized_alpha", 0.7, None))],
+)  # fmt: skip
 def test_gradient_with_respect_to_the_numerical_damping(name, value, iterations):
     problem = PROBLEMS["forced Duffing"]
 

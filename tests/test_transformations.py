@@ -6,17 +6,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from zoo import PROBLEMS, STEPPERS, as_data, covering, each, run
+from zoo import PROBLEMS, STEPPERS, Problem, as_data, covering, each, run
 
 import hhtjax
 
 every_stepper = pytest.mark.parametrize("name", each(STEPPERS))
 
 
+ONE_FORM = ("hht predictor", "hht held", "hht state", "hht twice", "newmark", "bossak", "generalized_alpha")  # of hht's
+
+
+def coupled_mass(q, params):
+    return jnp.array([[2.0, 0.3], [0.3, 1.0]]) + params["m"] * jnp.diag(q**2)
+
+
+def coupled_force(q, v, t, params):
+    return -params["k"] * (2 * q - q[::-1] + q**3) - 0.1 * v * q[::-1] + jnp.array([jnp.sin(5.0 * t), 0.5])
+
+
+VECTORS = Problem(
+    hhtjax.System(coupled_mass, coupled_force),
+    {"m": 0.4, "k": 30.0}, jnp.array([0.3, -0.2]), jnp.array([0.5, -1.0]), 0.2,
+)  # fmt: skip
+
+
 @pytest.mark.slow
-@every_stepper
+@pytest.mark.parametrize("name", each(STEPPERS, rest=ONE_FORM))
 def test_jit_equals_eager(name):
-    problem, stepper = PROBLEMS["forced double pendulum"]._replace(duration=0.2), as_data(STEPPERS[name])
+    problem, stepper = VECTORS, as_data(STEPPERS[name])
     compiled = run(problem, stepper, 2)  # the program is that of vectors, below
     with jax.disable_jit():
         state = stepper.init(problem.system, problem.q0, problem.v0, problem.params, problem.duration / 2)
@@ -89,7 +106,6 @@ def tree(x):
     return {"b": x[1], "a": {"x": x[:1]}}
 
 
-VECTORS = PROBLEMS["forced double pendulum"]._replace(duration=0.04)
 TREES = VECTORS._replace(
     system=hhtjax.System(
         lambda q, params: VECTORS.system.mass(vector(q), params),
@@ -98,9 +114,6 @@ TREES = VECTORS._replace(
     q0=tree(VECTORS.q0),
     v0=tree(VECTORS.v0),
 )
-
-
-ONE_FORM = ("hht predictor", "hht held", "hht state", "hht twice", "newmark", "bossak", "generalized_alpha")  # of hht's
 
 
 @pytest.mark.parametrize("name", each(STEPPERS, quick=(), rest=ONE_FORM))
