@@ -38,7 +38,7 @@ class Library:
     def __init__(self, model, folder, *flags):
         self.model = model
         paths = model.write(Path(folder))
-        path = compiled(paths[:1], Path(folder) / f"{model.name}{next(COUNT)}.so", "-O1", "-fPIC", "-shared", *flags)
+        path = compiled(paths[:1], Path(folder) / f"{model.name}{next(COUNT)}.so", "-fPIC", "-shared", *flags)
         self.real = ctypes.c_float if "typedef float" in model.header else ctypes.c_double
         num_inputs = sum(field.size for field in model.inputs)
         members = [("t", self.real), *map(self._member, model.state), ("flags", ctypes.c_int)]

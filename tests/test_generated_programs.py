@@ -18,17 +18,27 @@ pytestmark = [
 ]
 
 
+def examples(number):
+    """So many, the same each time; without shrinking: programs.py does it by lines, in a moment."""
+    options: dict = {"deadline": None, "database": None, "phases": [Phase.generate]}
+    chosen = settings(max_examples=number, derandomize=True, suppress_health_check=list(HealthCheck), **options)
+    return lambda test: chosen(given(st.randoms(use_true_random=False), st.integers(3, 10))(test))
+
+
 @pytest.mark.slow
-@settings(
-    max_examples=100,
-    derandomize=True,
-    deadline=None,
-    database=None,
-    phases=[Phase.generate],
-    suppress_health_check=list(HealthCheck),
-)  # without shrinking: programs.py does it by lines, in a moment
-@given(st.randoms(use_true_random=False), st.integers(3, 10))
+@examples(40)
 def test_same_numbers(rng, lines):
+    check_same_numbers(rng, lines)
+
+
+@pytest.mark.slow
+@pytest.mark.every
+@examples(100)
+def test_same_numbers_of_more(rng, lines):
+    check_same_numbers(rng, lines)
+
+
+def check_same_numbers(rng, lines):
     with usual_promotion(), np.errstate(all="ignore"):
         text, args = program(rng, lines)
         try:

@@ -1,4 +1,4 @@
-"""Whole runs of the zoo: with the machinery, on plain JAX, and step by step, with forward derivatives and vmap."""
+"""Whole runs of the zoo: with the machinery and on plain JAX, with forward derivatives and vmap; and step by step."""
 
 from functools import partial
 
@@ -38,13 +38,23 @@ def simulated(problem, stepper, q0):
 
 @partial(jax.jit, static_argnums=(0, 1))
 def everything(way, name, stepper):
-    """Positions, and their derivatives in q0, of a batch of two; steppers of one family are compiled once."""
+    """Positions, and their derivatives in q0, of a batch of two; step by step, positions of the first alone.
+
+    Steppers of one family are compiled once.
+    """
     problem = (zoo.PROBLEMS | zoo.DRY)[name]
+    if way is step_by_step:
+        return way(problem, stepper, problem.q0)
     q0 = jnp.stack([problem.q0, 0.7 * problem.q0])
     return jax.vmap(lambda q0: jax.jvp(partial(way, problem, stepper), (q0,), (jnp.cos(q0),)))(q0)
 
 
-SMOOTH = zoo.covering(zoo.STEPPERS, ("forced double pendulum", "forced Duffing"))
+COUPLED = "hht auto", "hht converged"  # the others go through the same solves
+SMOOTH = [
+    pytest.param(stepper, name, marks=zoo.EVERY if name == "forced double pendulum" and stepper not in COUPLED else ())
+    for name in ("forced Duffing", "forced double pendulum")
+    for stepper in zoo.STEPPERS
+]
 RUBBING = [("hht predictor", name) for name in zoo.DRY]
 
 
@@ -55,14 +65,14 @@ def test_same_three_ways(name, stepper):
     with hhtjax.plain():
         plain = everything(simulated, name, stepper)
     by_steps = everything(step_by_step, name, stepper)
-    for x, y, z in zip(fast, plain, by_steps, strict=True):
+    for x, y in zip(fast, plain, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(z, y, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(by_steps, plain[0][0], rtol=1e-10, atol=1e-12)
 
 
 EVENTS = {
     "impact": (event_problems.dragged_ball, hhtjax.hht(-0.3)),
-    "switch": (event_problems.bump_stop, hhtjax.rowda()),
+    "switch": (event_problems.bump_stop, hhtjax.rk4()),
 }
 
 
@@ -74,8 +84,9 @@ def test_events_the_same_on_plain_jax(name):
 
     def run(q0):
         found = hhtjax.simulate(
-            problem.system, stepper, q0, problem.v0, problem.params, dt=0.05, num_steps=24, events=problem.events
-        )
+            problem.system, stepper, q0, problem.v0, problem.params, dt=0.05, num_steps=24, events=problem.events,
+            max_events=1, keep_events=2,
+        )  # fmt: skip
         return found.q, found.v, found.events.t[:2], found.events.count
 
     def everything(q0):
@@ -97,4 +108,4 @@ def test_random_systems(seed):
     """programs.py --whole-runs makes more of them."""
     with usual_promotion():
         _, *run = whole_runs.random_run(seed)
-        assert not list(whole_runs.compare(*run, modes=("value", "forward")))
+        assert not list(whole_runs.compare(*run, modes=("both",)))

@@ -89,14 +89,16 @@ def run(report: Report, fast: bool, full: bool = False):
     sets = data.load(fast)
     tell(sets, fast)
     names = ["6 parameters"] if fast else list(MODELS) if full else [BEST]
-    models, best = {}, names[-1]
+    models, linear, best = {}, None, names[-1]
     for name in names:
         report.progress(
             f"fitting {name} and the initial state to {len(sets.train.y)} samples, twice: the first compiles"
         )
-        result, models[name] = fit_and_score(report, sets, MODELS[name], name == best, full)
+        fit = fit_training(sets.train, SUBSTEPS, 0.0, MODELS[name])
+        linear = fit if MODELS[name] == LINEAR else linear
+        models[name] = scored(report, sets, fit, name == best, full)
         if name == best and (fast or full):
-            plot_parameters(report, result)
+            plot_parameters(report, fit[0])
     sizes = ("train", *sets.tests)
     report.table(
         ["RMSE in mV", *sizes, "fit, warm, s", "with compiling, s"],
@@ -108,7 +110,7 @@ def run(report: Report, fast: bool, full: bool = False):
     numbers = {f"{part}_mV": models[best][f"{part}_mV"] for part in sizes}
     numbers |= {"data": "measured" if sets.measured else "generated", "fast": fast, "models": models}
     if fast or full:
-        numbers["by_step_size"] = step_size_study(report, sets, fast)
+        numbers["by_step_size"] = step_size_study(report, sets, fast, linear)
     else:
         print("All models, and the bias of the estimates by step size: python -m experiments silverbox --full\n")
     report.numbers(rounded(numbers))
@@ -125,9 +127,9 @@ def tell(sets, fast: bool):
     print("The gain of the input is fixed to 1: a common factor of all parameters cannot be identified.\n", flush=True)
 
 
-def fit_and_score(report: Report, sets, terms, chart: bool, full: bool):
-    """One model: its fit, its errors on all sets, charted as soon as they are known, and all of it as numbers."""
-    result, seconds, compiling = fit_training(sets.train, SUBSTEPS, 0.0, terms)
+def scored(report: Report, sets, fit, chart: bool, full: bool):
+    """One model by its fit: its errors on all sets, charted as soon as they are known, and all of it as numbers."""
+    result, seconds, compiling = fit
     params = result.params[0]
     costs = ", ".join(f"{x:.4g}" for x in np.asarray(result.history.cost)[: int(result.iterations) + 1])
     report.progress(f"{int(result.iterations)} iterations in {seconds:.2f} s after compilation; cost in V^2: {costs}")
@@ -160,19 +162,23 @@ def fit_and_score(report: Report, sets, terms, chart: bool, full: bool):
     }
     if full:
         numbers["standard_error_over_scatter"] = over_scatter(report, sets.train, result, SUBSTEPS)
-    return result, numbers
+    return numbers
 
 
-def step_size_study(report: Report, sets, fast: bool):
+def step_size_study(report: Report, sets, fast: bool, known):
     """RMSE, fit time, and the bias of stiffness and damping, for other steps per sample and other alphas.
 
     The bias predicted is that of the linear part's amplification matrix; the one measured is against Richardson's
     value of the three finest steps. Agreement: the relative change of his value from those steps to steps half as long.
+    known: the fit with SUBSTEPS and alpha = 0.
     """
     rows, agreement = [], {}
     for alpha in (0.0,) if fast else (0.0, -0.05, -0.3):
-        counts = (1, 2) if fast else (1, 2, 4, 8, 16)
-        fits = [fit_training(sets.train, substeps, alpha) for substeps in counts]
+        counts = (SUBSTEPS // 2, SUBSTEPS) if fast else (1, 2, 4, 8, 16)
+        fits = [
+            known if (substeps, alpha) == (SUBSTEPS, 0.0) else fit_training(sets.train, substeps, alpha)
+            for substeps in counts
+        ]
         ratios = np.array([[float(fit[0].params[0][name] / fit[0].params[0]["m"]) for name in "kc"] for fit in fits])
         exact = richardson(list(ratios[-3:]), 2)
         for levels in () if fast else (2, 3):

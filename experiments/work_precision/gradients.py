@@ -116,10 +116,10 @@ def our_rows(name, sizes, reverse_sizes, only=FORWARD):
     return rows
 
 
-def controlled_rows(name, tolerances):
+def controlled_rows(name, tolerances, methods=("rowda, adaptive", "dopri5, adaptive")):
     """Both modes under error control, through the steps that were chosen."""
     s, rows = start(name), []
-    for method in ("rowda, adaptive", "dopri5, adaptive"):
+    for method in methods:
         solution = ours.controlled(name, method, lambda s: scaled(cases()[name].scene.params, s))
 
         def loss(s, tolerance, solution=solution):
