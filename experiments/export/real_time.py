@@ -61,7 +61,7 @@ def deadlines(program, period, count):
 def explained(found, period):
     """{form: what its misses come from}, of what `deadlines` gives; and how likely the step, were it no other than the
     loop that waits, had as many that nothing explains: 0 if it does not fit into a period that begins as half of them
-    do. (Where the empty loop itself is often late for more than a period, nothing explains a miss; so all are compared.)
+    do. (Where the empty loop itself often wakes a period late, nothing explains a miss; so all are compared.)
     """
     usual = np.quantile(found["empty loop"][:, 0], USUALLY)
     rows, in_turns = {}, {}
