@@ -143,8 +143,8 @@ def to_next_sample(loop, form, begun, keep, in_pieces):
 def begun_with(flat, stepper, params, loop, run):
     """The state with which the next step of a run begins: behind a jump of held inputs."""
     state, count, _ = run
-    t, h = loop.sizes(count)
-    return held.entered(stepper, flat, params, t, h, state)[1]
+    h, last = loop.sizes(count)
+    return held.entered(stepper, flat, params, h, last, state)[1]
 
 
 def kept(flat, stepper, state):
