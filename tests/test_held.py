@@ -10,6 +10,8 @@ from zoo import as_data
 
 import hhtjax
 from hhtjax.scenes import pendulum
+from hhtjax.systems import held
+from hhtjax.systems.flat_system import flatten
 
 VALUES = 3 * np.random.default_rng(0).normal(size=6)
 STEPPERS = {
@@ -36,6 +38,19 @@ def force(q, v, t, params):
 
 
 SYSTEM = hhtjax.System(mass, force)
+
+
+def pushed(scene):
+    """A pendulum pushed by a force, u(t) in both directions."""
+
+    def force(q, v, t, params):
+        return scene.system.force(q, v, t, scene.params) + params["u"](t)
+
+    return hhtjax.System(
+        lambda q, p: scene.system.mass(q, scene.params),
+        force,
+        lambda q, t, p: scene.system.constraint(q, t, scene.params),
+    )
 
 
 def path(stepper, steps, values=VALUES):
@@ -82,19 +97,22 @@ def test_first_order_systems_too():
 
 @pytest.mark.slow
 def test_with_constraints_multipliers_jump_too():
-    """A pendulum pushed by a held force: the position after each sample, of second order."""
+    """The position after each sample, of second order."""
     scene = pendulum.cartesian()
-
-    def pushed(q, v, t, params):
-        return scene.system.force(q, v, t, scene.params) + jnp.stack([params["u"](t), 0.0 * t])
-
-    system = hhtjax.System(
-        lambda q, p: scene.system.mass(q, scene.params),
-        pushed,
-        lambda q, t, p: scene.system.constraint(q, t, scene.params),
-    )
-    found = order(system, hhtjax.hht(-0.05), (scene.q0, scene.v0), 8, (hhtjax.hht(0.0), 256))
+    found = order(pushed(scene), hhtjax.hht(-0.05), (scene.q0, scene.v0), 8, (hhtjax.hht(0.0), 256))
     assert abs(found - 2) < 0.15
+
+
+def test_a_jump_leads_to_the_start_under_the_new_force():
+    scene = pendulum.cartesian()
+    system = pushed(scene)
+    stepper, params = hhtjax.hht(-0.3), [{"u": lambda t, u=u: jnp.asarray(u)} for u in VALUES[:2]]
+    old, new = (stepper.init(system, scene.q0, scene.v0, p, dt=0.1) for p in params)
+    flat, _, _ = flatten("test", system, scene.q0, scene.v0, 0.0, params[0])
+    found = held.jump(stepper, flat, old, *params)
+    for name in ("w", "L"):
+        np.testing.assert_allclose(getattr(found, name), getattr(new, name), rtol=1e-12)
+        assert np.abs(getattr(old, name) - getattr(new, name)).max() > 1
 
 
 @pytest.mark.slow

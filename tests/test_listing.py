@@ -1,6 +1,7 @@
 """Every operation with a rule, with its options, in C: the numbers of NumPy, NaN, infinities and zeros included."""
 
 import ctypes
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -102,6 +103,29 @@ def test_singular_values_in_c(tmp_path):
             for ours, expected in ((U * S @ V, A), (U.T @ U, np.eye(n)), (V @ V.T, np.eye(n))):
                 np.testing.assert_allclose(ours, expected, atol=1e-13 * n)
             np.testing.assert_allclose(S, np.linalg.svd(A)[1], atol=1e-13 * n)
+
+
+def test_large_products_in_c_whatever_is_summed(tmp_path):
+    """As loops: over either axis of either matrix, of constants and of what a loop has computed, and with vectors."""
+    rng = np.random.default_rng(0)
+    sides = (rng.standard_normal((24, 20)), 1), (rng.standard_normal((20, 24)), 0)  # the axis of 20 is summed
+    others = (rng.standard_normal((20, 2)), 0), (rng.standard_normal((2, 20)), 1), (rng.standard_normal(20), 0)
+
+    def products(x):
+        found = []
+        for (A, i), (B, j) in product(sides, others):
+            for y, z in ((A, x * B), (x * A, B)):
+                found.append(jnp.tensordot(y, z, (i, j)))
+        return jnp.concatenate([jnp.ravel(y) for y in found])
+
+    f = Written(0, products, (np.float64(1.5),))
+    loops = [(x.params["rows"], x.params["columns"]) for x in f.listing.operations if x.name == "product"]
+    assert {(24, 2), (24, 1)} == set(loops)
+    (tmp_path / "f.c").write_text("#include <string.h>\n" + f.text)
+    library = ctypes.CDLL(str(compiled([tmp_path / "f.c"], tmp_path / "f.so", "-O1", "-fPIC", "-shared")))
+    out = np.zeros(f.size)
+    library.f0(out.ctypes.data_as(ctypes.c_void_p))
+    np.testing.assert_allclose(out, products(1.5), rtol=1e-13)
 
 
 def test_each_operation_stands_once():
