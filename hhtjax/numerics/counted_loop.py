@@ -12,7 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.hoisted import hoisted
-from hhtjax.xla import TwoWays, derivative, staged, together
+from hhtjax.xla import TwoWays, derivative, row_written, staged, together
 
 SLOTS, LEVELS = 64, 3
 LONGEST = SLOTS**LEVELS  # iterations that reverse mode can go back
@@ -81,29 +81,6 @@ def merged(choices, new, old):
     return [next(new) if chosen else x for chosen, x in zip(choices, old, strict=True)]
 
 
-def row_written(axis):
-    """(array, row, number) -> the array with the row along an axis. What vmap makes of this in JAX is a scatter, even
-    for one number, and no part of a kernel."""
-
-    @jax.custom_batching.custom_vmap
-    def write(array, row, number):
-        return lax.dynamic_update_index_in_dim(array, row, number, axis)
-
-    @write.def_vmap
-    def _(size, batched, array, row, number):
-        if batched[2]:
-            in_axes = tuple(0 if x else None for x in batched)
-            plain = partial(lax.dynamic_update_index_in_dim, axis=axis)
-            return jax.vmap(plain, in_axes)(array, row, number), True
-        array, row = (
-            x if there else jnp.broadcast_to(x, (size, *x.shape))
-            for x, there in zip((array, row), batched[:2], strict=True)
-        )
-        return row_written(axis + 1)(array, row, number), True
-
-    return write
-
-
 class Loop:
     """Floats: which parts of the carry are floating numbers; moves: which of the constants have tangents."""
 
@@ -161,7 +138,7 @@ class Loop:
             blocks = (number + size - 1) // size
 
             def keep(j, kept, carry):
-                return [row_written(0)(k, x, j) for k, x in zip(kept, carry, strict=True)]
+                return [row_written(k, x, j) for k, x in zip(kept, carry, strict=True)]
 
             def block(j, now):
                 carry, kept = now

@@ -32,7 +32,12 @@ def seldom(f, asked, carry, *more):
         known = choose(asked, (carry, more), lax.stop_gradient((carry, more)))
         return choose(asked, f(known[0], *known[1]), carry)
 
-    return lax.cond(largest_in_batch(asked), branch, lambda carry, *_: carry, carry, *more)
+    return if_any(branch, asked, carry, *more)
+
+
+def if_any(f, asked, carry, *more):
+    """The same of an f that by itself leaves members alone that have not asked."""
+    return lax.cond(largest_in_batch(asked), f, lambda carry, *_: carry, carry, *more)
 
 
 def derivative_of(f, value):

@@ -198,4 +198,4 @@ def begin(trial, q, v, t0):
     walk = Walk(state, h, longest, past, 0 * one, one, q_size, v_size, none, none, none)
     if trial.ways is None:
         return walk
-    return walk._replace(met=before_any(trial.ways, state, trial.params, trial.ways.max_events))
+    return walk._replace(met=before_any(trial.ways, trial.params))

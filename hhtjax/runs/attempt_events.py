@@ -44,14 +44,15 @@ def past_events(trial, tried, walk, h):
 
 def passed(trial, tried, walk, h):
     """The same where there may be one."""
-    ways, log = trial.ways, walk.met.log
-    met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE), log=log._replace(count=0 * log.count))
+    ways = trial.ways
+    met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE))
     part = Part(walk.state, tried.walk.state, ways.no_info, h, walk.last, met, met.ended, ~met.ended)
-    part = pass_events(ways, trial.params, part, h)
-    later = jnp.arange(log.t.size, dtype=log.count.dtype) < part.met.log.count
-    later &= part.met.log.t > part.met.log.t[0] + SHORT * h
-    second = jnp.min(jnp.where(later, part.met.log.t, jnp.inf))
-    middle = jnp.where(jnp.any(later), (part.met.log.t[0] + second) / 2 - walk.state.t, h / 2)
+    part, (rows, there) = pass_events(ways, trial.params, part, h)
+    times = jnp.where(there, rows[:, 0], jnp.inf)
+    first = jnp.min(times)
+    later = there & (times > first + SHORT * h)
+    second = jnp.min(jnp.where(later, times, jnp.inf))
+    middle = jnp.where(jnp.any(later), (first + second) / 2 - walk.state.t, h / 2)
     code = jnp.where((part.met.code == FINE) & jnp.any(later), MANY, part.met.code).astype(met.code.dtype)
     part = part._replace(met=part.met._replace(code=code))
     lost = tried._replace(

@@ -18,11 +18,11 @@ from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.interpolate import between
-from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, saved
+from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, resting, saved
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_grid import require_times
-from hhtjax.steppers.stepper import State, Stepper, join_info, public
+from hhtjax.steppers.stepper import State, Stepper, public
 from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_plain
@@ -110,7 +110,7 @@ def follow(problem, times, grid, events=None, room=()):
         return read_off(flat, ends, extra, times, grid.reached)
     met = form.joined(met[0])
     times = jnp.where(met.ended, jnp.minimum(times, state.t), times)
-    return with_told_events(flat, read_off(flat, ends, extra, times, grid.reached), met)
+    return with_told_events(flat, read_off(flat, ends, extra, times, grid.reached), met, room[1])
 
 
 def to_next_sample(loop, form, begun, keep, in_pieces):
@@ -127,11 +127,8 @@ def to_next_sample(loop, form, begun, keep, in_pieces):
         def step(i, carry):
             last, run, info = carry
             here = i < count
-            after, more = advance(run, here) if in_pieces else advance(run)
-            old = last, run[:3], info
-            new = () if in_pieces else begun(run), after[:3], join_info(info, more)
-            last, run, info = jax.tree.map(partial(jnp.where, here), new, old)
-            return last, (*run, *after[3:]), info  # what events made is of steps that were taken
+            last = () if in_pieces else jax.tree.map(partial(jnp.where, here), begun(run), last)
+            return last, *resting(advance, in_pieces, run, info, here)
 
         last, run, info = repeat(step, (*carry, loop.no_info), most)
         pair = form.of(Pieces.around)(run[3].pieces, time) if in_pieces else (last, run[0])

@@ -2,9 +2,14 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 
 from hhtjax.description.presentation import shown
+from hhtjax.xla import largest_in_batch, row_written
+
+WHOLE = 65  # numbers, at least: an array of fewer would be taken to pieces
 
 
 @shown
@@ -32,12 +37,42 @@ class Events(NamedTuple):
     rate: Any
 
 
-def noted_down(log, t, which, q, before, after, rate):
-    """`Events` on vectors, z within before and after, with one more, as long as there is room."""
-    here = jnp.arange(log.t.size, dtype=log.count.dtype) == log.count
+class Log(NamedTuple):
+    """The events met so far, on vectors: how many, a row of numbers for each that is kept, and one for all others."""
 
-    def put(new, old):
-        return jnp.where(here, new, old) if jnp.ndim(new) == 0 else jnp.where(here[:, None], new[None, :], old)
+    count: Any
+    rows: Any
 
-    entry = {"t": t, "which": which, "q": q, "before": before, "after": after, "rate": rate}
-    return log._replace(count=log.count + 1, **{name: put(x, getattr(log, name)) for name, x in entry.items()})
+    @classmethod
+    def empty(cls, like, keep):
+        """Room for so many rows like this one."""
+        number = max(keep + 1, -(-WHOLE // like.size))
+        return cls(jnp.zeros((), jnp.int32), jnp.full((number, like.size), jnp.nan, like.dtype))
+
+    def with_more(self, rows, there, keep):
+        """With those of the rows that are there, as long as there is room. What is written moves nothing else."""
+
+        def enter(log, more):
+            row, there = more
+            return lax.cond(largest_in_batch(there), write, lambda log, *_: log, log, row, there), None
+
+        def write(log, row, there):
+            number = jnp.where(there & (log.count < keep), log.count, keep)
+            return Log(log.count + there.astype(log.count.dtype), row_written(log.rows, row, number))
+
+        return lax.scan(enter, self, (rows, there))[0]
+
+    def told(self, flat, keep):
+        """As `Events`."""
+        n, N, rows = flat.positions, flat.size, self.rows[:keep]
+        q, before, after = jnp.split(rows[:, 3:], [rows.shape[1] - 3 - 2 * N, rows.shape[1] - 3 - N], axis=1)
+        t, which, rate = rows[:, 0], jnp.where(jnp.isnan(rows[:, 1]), -1, rows[:, 1]).astype(jnp.int32), rows[:, 2]
+        z = None if n in (0, N) else jax.vmap(flat.unravel_internal)(before[:, n:])
+        q, unravel = (jax.vmap(flat.unravel)(q), flat.unravel_rates) if n else (None, flat.unravel)
+        before, after = (jax.vmap(lambda v: unravel(flat.located(v) if n else v))(v) for v in (before, after))
+        return Events(self.count, t, which, q, before, after, z, rate)
+
+
+def row_of(t, which, rate, q, before, after):
+    """What is noted of an event."""
+    return jnp.concatenate([jnp.stack([t, which.astype(t.dtype), rate]), q, before, after])

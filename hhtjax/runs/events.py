@@ -2,16 +2,15 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
-from hhtjax.numerics.seldom import choose, seldom
+from hhtjax.numerics.seldom import choose, if_any
 from hhtjax.runs.event_failures import FINE
-from hhtjax.runs.event_log import Events
+from hhtjax.runs.event_log import Log
 from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.loop import first_failure
-from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events
+from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events, unnoted
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 
@@ -23,8 +22,9 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     """
     start = loop.carry[0]
     stepper = stepper.astype(start.v.dtype)
-    ways = Ways(flat, stepper, flatten_events(flat, events, params, stepper.redundant), max_events, loop.no_info)
-    met = before_any(ways, start, params, keep)
+    ways = Ways(flat, stepper, flatten_events(flat, events, params, stepper.redundant), max_events, loop.no_info, keep)
+    met = before_any(ways, params)
+    met = met._replace(log=Log.empty(unnoted(start)[0], keep))
     if in_pieces:
         met = met._replace(pieces=Pieces.none(start, max_events + 1))
     step = past_events(ways, params, loop.bound, loop.sizes)
@@ -32,7 +32,7 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
 
 
 def past_events(ways, params, bound, sizes):
-    """The step of a run with events, where `here`; else the same without a look at them.
+    """The step of a run with events, which rests where not `here`.
 
     bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
     """
@@ -43,7 +43,11 @@ def past_events(ways, params, bound, sizes):
     def across(part, h, params):
         return pass_events(ways, params, part, h)
 
-    def step(carry, here=True):
+    def meet(now, h, params):
+        part, (rows, there) = across(now[0], h, params)
+        return part, now[1].with_more(rows, there, ways.keep)
+
+    def step(carry, here=None):
         *run, met = carry
         now = events.with_modes(params, met.modes)
         (new, count, _), info = (fixed or bound(now))(tuple(run))
@@ -51,36 +55,34 @@ def past_events(ways, params, bound, sizes):
         h, last = sizes(before)
         if any(events.ends):
             new, info = choose(met.ended, state, new), choose(met.ended, ways.no_info, info)
-        asked = asks(ways, state, new, now, h) & ~met.ended & here
+        # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
+        new, count = at_rest(here, (new, count), (state, before))
+        asked = asks(ways, state, new, now, h)
+        for there in (here, ~met.ended if any(events.ends) else None):
+            asked = asked if there is None else asked & there
         if met.pieces is not None:
             begun = held.entered(ways.stepper, ways.flat, now, h, last, state)[1]
-            met = met._replace(pieces=choose(here, met.pieces.whole(begun, new), met.pieces))
-        part = Part(state, new, info, h, last, met, jnp.zeros_like(met.ended), asked)
-        part = seldom(across, asked, part, h, params)
-        failure = first_failure(ways.flat, failure, count, part.end, part.info)
-        return (part.end, count, failure, part.met), part.info
+            met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new), met.pieces))
+        part = Part(state, new, info, h, last, met._replace(log=None), jnp.zeros_like(met.ended), asked)
+        part, log = if_any(meet, asked, (part, met.log), h, params)
+        told = first_failure(ways.flat, failure, count, part.end, part.info)
+        return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
 
     return step
 
 
-def before_any(ways, start, params, keep):
+def at_rest(here, new, old):
+    """The new, or, where a member of a sweep rests, the old."""
+    return new if here is None else choose(here, new, old)
+
+
+def before_any(ways, params):
     """`Met` before the first event."""
-    none, dtype = jnp.zeros((), jnp.int32), start.v.dtype
-
-    def empty(*shape):
-        return jnp.full((keep, *shape), jnp.nan, dtype)
-
-    N = start.v.size
-    which, q = jnp.full(keep, -1, jnp.int32), empty(start.q.size)
-    log = Events(none, empty(), which, q, empty(N), empty(N), None, empty())
-    return Met(ways.events.modes(params), jnp.array(False), none + FINE, none, log)
+    none = jnp.zeros((), jnp.int32)
+    return Met(ways.events.modes(params), jnp.array(False), none + FINE, none)
 
 
-def with_told_events(flat, solution, met):
+def with_told_events(flat, solution, met, keep):
     """The `Solution` with its `Events`, and what was wrong with one of them."""
-    log, n = met.log, flat.positions
-    z = None if n in (0, flat.size) else jax.vmap(flat.unravel_internal)(log.before[:, n:])
-    q, rows = (jax.vmap(flat.unravel)(log.q), flat.unravel_rates) if n else (None, flat.unravel)
-    before, after = (jax.vmap(lambda v: rows(flat.located(v) if n else v))(v) for v in (log.before, log.after))
-    events = log._replace(q=q, before=before, after=after, z=z)
-    return solution._replace(events=events, failure=solution.failure._replace(event=met.code, guard=met.event))
+    failure = solution.failure._replace(event=met.code, guard=met.event)
+    return solution._replace(events=met.log.told(flat, keep), failure=failure)

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description.presentation import overwrite
+from hhtjax.numerics.seldom import choose
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_law import is_settled
-from hhtjax.steppers.stepper import Info, public
+from hhtjax.steppers.stepper import Info, join_info, public
 from hhtjax.systems import held
 from hhtjax.systems.matrices import mass_flaw
 from hhtjax.xla import staged
@@ -109,6 +110,13 @@ def counted(take_step, flat, t0, dt, before=None):
         return (state, count, first_failure(flat, failure, count, state, info)), info
 
     return step
+
+
+def resting(advance, by_itself, run, info, here):
+    """The run and what is known of it after a step, or, not `here`, without. by_itself: whether `advance` can rest."""
+    after, more = advance(run, here) if by_itself else advance(run)
+    info = choose(here, join_info(info, more), info)
+    return after if by_itself else choose(here, after, run), info
 
 
 def saved(flat, state):

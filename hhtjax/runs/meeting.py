@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.seldom import choose, seldom
+from hhtjax.numerics.seldom import choose, if_any, seldom
 from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, STAYS
-from hhtjax.runs.event_log import Events, noted_down
+from hhtjax.runs.event_log import row_of
 from hhtjax.runs.loop import resized_step
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
@@ -34,17 +34,18 @@ class Ways(NamedTuple):
     events: Any
     max_events: int
     no_info: Any
+    keep: int = 0  # how many events are noted
 
 
 class Met(NamedTuple):
     """What a run with events carries along: numbers that switches changed, whether it has ended, what went wrong (code
-    and event), the log, and, where it is read off between its steps, the pieces of the last."""
+    and event), the `Log`, and, where it is read off between its steps, the pieces of the last."""
 
     modes: list
     ended: Any
     code: Any
     event: Any
-    log: Events  # on vectors
+    log: Any = None
     pieces: Any = None
 
 
@@ -88,7 +89,8 @@ def falls_and_rises(g0, d0, g1, d1):
 
 
 def pass_events(ways, params, part, h):
-    """The step across all events in it: of the `Part` that is returned, end, info and met are to be used."""
+    """The step across all events in it: a `Part`, of which end, info and met are to be used, and what to note of
+    up to max_events + 1 of them, rows and whether each is there. Members that have not asked stay as they are."""
     if held.holds(params):
         old = held.before(params, part.start.t, part.last)
         params = held.held_at(params, part.start.t + h / 2)
@@ -96,9 +98,9 @@ def pass_events(ways, params, part, h):
 
     def slot(part, number):
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
-        return seldom(partial(meet_or_flag, ways), going, part, number, h, params), None
+        return if_any(partial(meet_or_flag, ways), going, (part, unnoted(part.start)), going, number, h, params)
 
-    part, _ = lax.scan(slot, part, jnp.arange(ways.max_events + 1, dtype=jnp.int32))
+    part, noted = lax.scan(slot, part, jnp.arange(ways.max_events + 1, dtype=jnp.int32))
     met = part.met
 
     def anew(s, params):
@@ -113,16 +115,22 @@ def pass_events(ways, params, part, h):
 
     if met.pieces is not None:
         met = met._replace(pieces=met.pieces._replace(end=known(met.pieces.end)))
-    return part._replace(end=known(end), met=met)
+    return part._replace(end=known(end), met=met), noted
 
 
-def meet_or_flag(ways, part, number, h, params):
-    """The part behind its first event, if it has one; with what is wrong, if something is."""
+def unnoted(s):
+    """The row of no event, and that it is not there."""
+    return row_of(s.t, jnp.zeros((), jnp.int32), s.t, s.q, s.v, s.v), jnp.array(False)
+
+
+def meet_or_flag(ways, now, going, number, h, params):
+    """The part behind its first event, if it has one, and what to note; with what is wrong, if something is."""
+    part, noted = now
     found = look(ways, part, params, h)
-    here = jnp.any(found.hit)
-    part = flag(part, ~here, STAYS, found.stays)
+    here = going & jnp.any(found.hit)
+    part = flag(part, going & ~here, STAYS, found.stays)
     part = flag(part, here & (number == ways.max_events), MANY, found.hit & ~found.touches)
-    return seldom(partial(meet, ways), here & (number < ways.max_events), part, found, h, params)
+    return seldom(partial(meet, ways), here & (number < ways.max_events), (part, noted), found, h, params)
 
 
 def flag(part, bad, code, which):
@@ -170,8 +178,9 @@ def look(ways, part, params, h):
     return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, jnp.abs(g0) + jnp.abs(g1))
 
 
-def meet(ways, part, found, h, params):
-    """The part of the step behind its first event."""
+def meet(ways, now, found, h, params):
+    """The part of the step behind its first event, and what to note of that."""
+    part, *_ = now
     events, flat, met = ways.events, ways.flat, part.met
     numbers = jnp.arange(found.hit.size, dtype=met.event.dtype)
     i = jnp.min(jnp.where(found.place == jnp.min(found.place), numbers, numbers.size))
@@ -186,7 +195,7 @@ def meet(ways, part, found, h, params):
     missed = ~(jnp.abs(pick(this, g)) <= 1e-3 * jnp.abs(rate) * h + noise * pick(this, found.size))
 
     v, modes = events.outcome(i, e.q, e.v, e.t, now)
-    log = noted_down(met.log, e.t, i, e.q, e.v, v, rate)
+    row = row_of(e.t, i, rate, e.q, e.v, v)
     noted, ends = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, events.ends))
     beside = ~noted & jnp.any(is_corner(g, d, h, this, events.noted))
     code = jnp.where(beside, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
@@ -201,10 +210,11 @@ def meet(ways, part, found, h, params):
     end, more = go(ways, then, start, rest, size, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
     pieces = None if met.pieces is None else met.pieces.divided(before, start, end)
-    after = Met(modes, ends, code, i, log, pieces)
+    after = Met(modes, ends, code, i, pieces=pieces)
     infos = join_info(join_info(choose(part.divided, part.info, ways.no_info), info), more)
     new = Part(start, end, infos, rest, size, after, jnp.ones_like(part.divided), asks(ways, start, end, then, rest))
-    return choose(missed & (pick(this, found.touches.astype(h.dtype)) > 0), part, new)
+    none = missed & (pick(this, found.touches.astype(h.dtype)) > 0)
+    return choose(none, part, new), (row, ~none)
 
 
 def go(ways, params, s, tau, last, h):

@@ -163,4 +163,4 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
     start = loop.carry[0]
     flaw = flaw_at_start(problem.system, flat, start, params)
     solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
-    return with_told_events(flat, solution, form.joined(met[0])) if met else solution
+    return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution

@@ -25,6 +25,7 @@ from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.rubbing import require_independent_friction
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
+VECTORS = 16  # members, of fewer of which LLVM writes a loop out, one member after the other
 NAMES = "stepper", "q0", "v0", "params", "z0"  # of what may differ
 
 
@@ -124,10 +125,12 @@ def lanes_for(size, events=None):
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
     A batch takes half the time of single runs, so blocks have to be short enough for their members to be alike. With
-    events they are twice as long, since a block has more to do beside the arithmetic of its steps.
+    events they are longer, since a block has more to do beside the arithmetic of its steps.
     """
-    blocks = BLOCKS if events is None else BLOCKS // 2
-    return min(LANES, 1 << (size // blocks).bit_length())
+    if events is None:
+        return min(LANES, 1 << (size // BLOCKS).bit_length())
+    lanes = 1 << (2 * size // BLOCKS).bit_length()
+    return min(LANES, max(lanes, VECTORS if size >= 4 * VECTORS else 1))
 
 
 def _members(control, trees, in_axes):

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -10,8 +9,7 @@ from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.events import loop_with_events, with_told_events
-from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of
-from hhtjax.steppers.stepper import join_info
+from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, resting
 from hhtjax.systems.flat_system import flatten
 from hhtjax.xla import on_scalars, one_kernel
 
@@ -39,11 +37,7 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
 
         def step(i, carry):
             run, info = carry
-            here = i < substeps
-            after, more = advance(run, here)
-            new, old = (after[:3], join_info(info, more)), (run[:3], info)
-            run, info = jax.tree.map(partial(jnp.where, here), new, old)
-            return (*run, *after[3:]), info  # what events made is of steps that were taken
+            return resting(advance, events is not None, run, info, i < substeps)
 
         return repeat(step, carry, longest), None
 
@@ -60,18 +54,17 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
     start = loop.carry[0]
     flaw = flaw_at_start(system, flat, start, params)
     solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
-    return with_told_events(flat, solution, form.joined(met[0])) if met else solution
+    return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution
 
 
 def _paces(flat, stepper, params, loop, form, substeps, longest):
     """The function of a run and an interval that gives the step, and how many the member takes, and its block."""
 
     def stepped(bound, sizes):
-        """The step, which looks for events as long as the member does not rest."""
+        """The step, with events one that rests."""
         if loop.past is not None:
             return form.of(loop.past(bound, sizes))
-        step = form.of(bound(params))
-        return lambda run, here: step(run)
+        return form.of(bound(params))
 
     def pace(run, interval):
         if interval is None:

@@ -21,6 +21,8 @@ KNOWN = {
     *("bitcast_convert", "cbrt", "complex", "count_leading_zeros", "imag", "popcnt", "real", "shift_left"),
     *("shift_right_arithmetic", "shift_right_logical"),
 }
+IDLE = {"stablehlo.return", "stablehlo.constant", "stablehlo.broadcast_in_dim"}
+MANY = 4  # values of a conditional: of fewer, a loop is no better
 # those it knows if they are small
 CHECKS = {"dot_general": is_small_product, "reduce": is_small_sum, "reduce_window": is_small_sum}
 PROVEN_TYPES = {"f32", "f64", "i1", "i32", "i64", "ui32", "ui64"}
@@ -35,7 +37,8 @@ class Inspection:
 
     objection: the first thing that cannot be in one kernel, in words, or None; is_proven: all else is known to compile;
     finished: names of the functions, each after those that it calls; stages: {name of a staged function: its calls};
-    products: to be written out; choices: between two forms of a function.
+    products: to be written out; choices: between two forms of a function; seldom: conditionals with nothing to do in
+    one branch.
     """
 
     def __init__(self, functions, call, is_partitioned=False):
@@ -43,7 +46,7 @@ class Inspection:
         self.seen, self.finished = set(), []
         self.operations = self.in_branches = 0
         self.most = MOST_OPERATIONS
-        self.stages, self.products, self.choices = {}, [], []
+        self.stages, self.products, self.choices, self.seldom = {}, [], [], []
         self.is_proven = True
         self.objection = "partitioned over devices; shard_map leaves each its own kernel" if is_partitioned else None
         self.look(call)
@@ -71,6 +74,8 @@ class Inspection:
             self.is_proven &= name not in KNOWN and _types(op) <= PROVEN_TYPES
             if name in ("case", "if"):
                 self._look_into_branches(op)
+                if has_idle_branch(op):
+                    self.seldom.append(op)
             else:
                 self._look_at_all(directly_in(op))
         else:
@@ -131,6 +136,13 @@ def is_choice(op):
         index = index.operands[len(index.operands) // 2].owner
     known = {} if isinstance(index, ir.Block) else index.attributes
     return ATTRIBUTES in known and inside_p.name in known[ATTRIBUTES]
+
+
+def has_idle_branch(case):
+    """Whether a conditional on a boolean has nothing to do where that is false, and many values to pass on."""
+    if case.name != "stablehlo.case" or len(case.regions) != 2 or len(case.results) < MANY:
+        return False
+    return {x.operation.name for x in case.regions[0].blocks[0]} <= IDLE
 
 
 def form_inside(case):

@@ -68,6 +68,8 @@ def _cut(module, found, call):
     """Makes the function called a kernel."""
     for choice in found.choices:
         _take_form_inside(choice)
+    for case in found.seldom:
+        _loop_at_most_once(case)
     for product in found.products:
         _call_stage([product], _insert(module, _as_stage(written_out(module, product))))
     write_sines(module, found.finished)
@@ -189,6 +191,35 @@ def _take_form_inside(case):
         op.move_before(case)
     for result, value in zip(case.results, end.operands, strict=True):
         result.replace_all_uses_with(value)
+    case.erase()
+
+
+def _loop_at_most_once(case):
+    """A loop in the place of a conditional: XLA copies what that passes on, in either branch; what a loop carries stays
+    where it is."""
+    idle, taken = ([x.operation for x in region.blocks[0]] for region in case.regions)
+    for op in idle[:-1]:
+        op.move_before(case)
+    with case.location, ir.InsertionPoint(case):
+        zero = mlir.ir_constant(np.int32(0))
+        asked = stablehlo.compare(case.operands[0], zero, stablehlo.ComparisonDirectionAttr.get("NE"))
+        start = [asked, *idle[-1].operands]
+        types, places = [x.type for x in start], [case.location] * len(start)
+        loop = stablehlo.WhileOp(types, start)
+        around, inside = (region.blocks.append(*types, arg_locs=places) for region in loop.regions)
+        with ir.InsertionPoint(around):
+            stablehlo.ReturnOp([around.arguments[0]])
+        with ir.InsertionPoint(inside):
+            end = stablehlo.ReturnOp([mlir.ir_constant(np.bool_(False)), *taken[-1].operands])
+    carried = dict(zip(start[1:], list(inside.arguments)[1:], strict=True))
+    for op in taken[:-1]:
+        op.move_before(end)
+    for op in (inner for x in directly_in(loop.operation) for inner in _operations(x)):
+        for i, x in enumerate(op.operands):
+            if x in carried:
+                op.operands[i] = carried[x]
+    for old, new in zip(case.results, list(loop.results)[1:], strict=True):
+        old.replace_all_uses_with(new)
     case.erase()
 
 

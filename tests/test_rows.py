@@ -1,0 +1,77 @@
+"""A row written into an array, by batches too, and the loop in the place of a conditional that passes arrays on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from hhtjax.xla import largest_in_batch, one_kernel, row_written
+
+BATCHES = {  # axes of array, row and number, the inner batch first
+    "one": [],
+    "each its own": [(0, 0, 0)],
+    "one number": [(0, 0, None)],
+    "one array": [(None, 0, 0)],
+    "one row, one number": [(0, None, None)],
+    "each its own, twice": [(0, 0, 0), (1, 0, 0)],
+    "one number for the inner": [(0, 0, None), (0, None, 0)],
+    "one number for the outer": [(None, None, 0), (0, 0, None)],
+}
+
+
+def chosen(array, row, number):
+    return jnp.where((jnp.arange(array.shape[0], dtype=number.dtype) == number)[:, None], row[None], array)
+
+
+@pytest.mark.parametrize("batches", BATCHES.values(), ids=BATCHES)
+def test_a_row_is_written(batches):
+    shapes, f, g = [[4, 3], [3], []], row_written, chosen
+    for size, axes in zip((5, 2), batches, strict=False):
+        f, g = jax.vmap(f, axes), jax.vmap(g, axes)
+        for shape, axis in zip(shapes, axes, strict=True):
+            shape[:0] = [] if axis is None else [size]
+        if axes[0] == 1:
+            shapes[0][:2] = shapes[0][1::-1]
+    rng = np.random.default_rng(0)
+    array, row = (jnp.asarray(rng.normal(size=shape)) for shape in shapes[:2])
+    number = jnp.asarray(rng.integers(0, 4, size=shapes[2]), jnp.int32)
+    expected = g(array, row, number)
+    np.testing.assert_array_equal(jax.jit(f)(array, row, number), expected)
+    weights = jnp.asarray(rng.normal(size=expected.shape))
+    for derivative in (jax.grad, jax.jacfwd):
+        found, known = (derivative(lambda x, f=f: jnp.sum(weights * f(*x, number) ** 2))((array, row)) for f in (f, g))
+        for x, y in zip(found, known, strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-14)
+
+
+def test_a_row_that_does_not_fit():
+    with pytest.raises(TypeError, match="row_written: a row like those of"):
+        row_written(jnp.zeros((4, 3)), jnp.zeros(2), jnp.zeros((), jnp.int32))
+
+
+def noted(x, rows):
+    """200 steps, of which some write a row of two members."""
+
+    def step(i, carry):
+        x, rows, count, sizes = carry
+        new = 1.01 * x
+
+        def write(new, x, rows, count, sizes):
+            return x / 2, row_written(rows, new, count), count + 1, sizes + new
+
+        asked = largest_in_batch(jnp.max(new) > 2)
+        return lax.cond(asked, write, lambda new, x, *rest: (new, *rest), new, x, rows, count, sizes)
+
+    return lax.fori_loop(0, 200, step, (x, rows, jnp.zeros((), jnp.int32), 0 * x))
+
+
+def test_a_conditional_becomes_a_loop():
+    """In a kernel, with the same values; and in its loop nothing of the size of the rows is copied."""
+    x, rows = jnp.array([[1.0, 1.2], [0.5, 1.5]]), jnp.zeros((2, 50, 2))
+    inside = jax.jit(jax.vmap(lambda *args: one_kernel(noted, *args))).lower(x, rows).compile()
+    for found, known in zip(inside(x, rows), jax.vmap(noted)(x, rows), strict=True):
+        np.testing.assert_allclose(found, known, rtol=1e-13)
+    text = inside.as_text()
+    assert "conditional(" not in text
+    assert sum(" copy(" in line and "[2,50,2]" in line for line in text.splitlines()) <= 1
