@@ -25,7 +25,7 @@ from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.rubbing import require_independent_friction
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
-VECTORS = 16  # members, of fewer of which LLVM writes a loop out, one member after the other
+VECTORS = 32  # members, of fewer of which LLVM often writes loops out, one member after the other
 NAMES = "stepper", "q0", "v0", "params", "z0"  # of what may differ
 
 
@@ -116,21 +116,21 @@ class Inputs(NamedTuple):
             mesh = Mesh(mesh.devices.ravel(), ("members",))  # whatever its shape and its types of axes
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
-        static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes_for(self.size, self.events)}
+        lanes = lanes_for(self.size, any(self.mapped), 1 if mesh is None else mesh.size)
+        static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
         return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
 
 
-def lanes_for(size, events=None):
+def lanes_for(size, alike=False, devices=1):
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
-    A batch takes half the time of single runs, so blocks have to be short enough for their members to be alike. With
-    events they are longer, since a block has more to do beside the arithmetic of its steps.
+    Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If they
+    differ in more than the size of their steps they are taken to be alike, and blocks are no shorter than it takes
+    for vector instructions: a batch takes half the time then.
     """
-    if events is None:
-        return min(LANES, 1 << (size // BLOCKS).bit_length())
-    lanes = 1 << (2 * size // BLOCKS).bit_length()
-    return min(LANES, max(lanes, VECTORS if size >= 4 * VECTORS else 1))
+    lanes = 1 << (size // BLOCKS).bit_length()
+    return min(LANES, max(lanes, VECTORS if alike and size >= 2 * VECTORS * devices else 1))
 
 
 def _members(control, trees, in_axes):
