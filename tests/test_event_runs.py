@@ -129,6 +129,22 @@ def test_float32_stays_float32():
     assert abs(float(run.events.t[0]) - np.sqrt(2 / 9.81)) < 1e-7  # three roundings of t
 
 
+def test_float32_finds_the_part_of_a_step():
+    """To a millionth of it, against the formula; late in a run the rounding of t + tau is larger than that."""
+    heights = np.linspace(0.002, 0.009, 8, dtype=np.float32)
+    numbers = {"g": np.float32(9.81), "floor": np.float32(0), "e": np.float32(0.8)}
+
+    def tau(height):
+        start = np.array([height]), -np.ones(1, np.float32)
+        run = simulate(BALL, hhtjax.hht(0.0), *start, numbers, dt=0.01, num_steps=1, events=[FLOOR])
+        return run.events.t[0]
+
+    with pytest.warns(hhtjax.PrecisionWarning):
+        found = np.array([tau(height) for height in heights])
+    exact = (np.sqrt(1 + 2 * 9.81 * heights.astype(float)) - 1) / 9.81
+    assert np.abs(found - exact).max() < 1e-6 * 0.01
+
+
 def test_a_second_call_compiles_nothing():
     traced = []
 

@@ -75,3 +75,46 @@ def test_a_conditional_becomes_a_loop():
     text = inside.as_text()
     assert "conditional(" not in text
     assert sum(" copy(" in line and "[2,50,2]" in line for line in text.splitlines()) <= 1
+
+
+def nested(x, y, number):
+    """Conditionals within one another, on values from outside, some twice, in another order; integers; a switch."""
+
+    def idle(*x):
+        return x[:4]
+
+    def step(i, carry):
+        *now, number = carry
+        out = jnp.sin(now[0] + y)
+
+        def inner(a, b, c, d):
+            return b + out, a * y, c + b, d - a
+
+        def outer(a, b, c, d):
+            p, q, r, s = lax.cond(largest_in_batch(a * b > 0.3), inner, idle, a, b, c, d)
+            twice = lax.cond(p > q, lambda a, b, c, d: (b, a, d + out, c), idle, p, q, a, a)
+            return twice[3] + a, twice[1], r + twice[0], s + 0.01 * i.astype(s.dtype)
+
+        now = lax.cond(largest_in_batch(i % 3 == 1), outer, idle, *now)
+        now = lax.cond(now[0] > 0.2, idle, lambda a, b, c, d: (a + 0.1, b - 0.1, c * y, d), *now)
+        now = lax.switch(jnp.clip(i - 3, -2, 9).astype(jnp.int32), [idle, lambda *x: tuple(0.9 * x for x in x)], *now)
+        whole = lax.cond(
+            i % 5 == 4, lambda n: (n + 1, n, n - 1, n), lambda n: (n, jnp.zeros_like(n), jnp.full_like(n, 7), n), number
+        )
+        return *now[:3], now[3] + 1e-3 * sum(whole[1:]).astype(out.dtype), whole[0]
+
+    return lax.fori_loop(0, 17, step, (x, x / 2, x - 0.2, x * x, number))
+
+
+def test_conditionals_in_conditionals_become_loops():
+    """With the same values, also of a batch and of tangents."""
+    x, y, number = jnp.array([0.7, -0.4, 1.1]), jnp.array(0.3), jnp.array(3, jnp.int32)
+
+    def tangent(f):
+        return lambda x, y, number: jax.jvp(lambda x, y: f(x, y, number)[:4], (x, y), (1 + x, 2 + y))
+
+    for change in (lambda f: f, tangent):
+        both = [change(lambda *args, f=f: f(nested, *args)) for f in (one_kernel, lambda f, *args: f(*args))]
+        inside, known = (jax.jit(jax.vmap(f, (0, None, None))) for f in both)
+        for a, b in zip(*(jax.tree.leaves(f(x, y, number)) for f in (inside, known)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-15)
