@@ -129,3 +129,9 @@ def slope(problem, stepper):
     assert all(converged for _, converged in ends)
     errors = [np.linalg.norm(state.q - reference(problem)) for state, _ in ends]
     return np.log2(errors[0] / errors[1])
+
+
+def forward(f, x):
+    """f' by plain JAX."""
+    with hhtjax.plain():
+        return jax.jit(lambda x: jax.jvp(f, (x,), (jnp.ones_like(x),))[1])(x)
