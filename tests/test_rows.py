@@ -45,6 +45,14 @@ def test_a_row_is_written(batches):
             np.testing.assert_allclose(x, y, rtol=1e-14)
 
 
+def test_numbers_have_no_tangents():
+    array, row, number = jnp.zeros((4, 3)), jnp.ones(3), jnp.ones((), jnp.int32)
+    none = np.zeros((), jax.dtypes.float0)
+    value, tangent = jax.jvp(lambda number: row_written(array, row, number), (number,), (none,))
+    np.testing.assert_array_equal(value, array.at[1].set(row))
+    assert not tangent.any()
+
+
 def test_a_row_that_does_not_fit():
     with pytest.raises(TypeError, match="row_written: a row like those of"):
         row_written(jnp.zeros((4, 3)), jnp.zeros(2), jnp.zeros((), jnp.int32))

@@ -10,6 +10,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from hhtjax.xla.two_ways import no_tangent
+
 
 def row_written(array, row, number):
     """The array (K, ...) with the row (...) in the place of that of a number, 0 to K - 1.
@@ -77,7 +79,7 @@ def _jvp(args, dots, *, axis):
     """Linear in the array and the row."""
     out = write_p.bind(*args, axis=axis)
     if all(type(dot) is ad.Zero for dot in dots[:2]):
-        return out, ad.Zero.from_primal_value(out)
+        return out, no_tangent(out)
     return out, write_p.bind(*map(ad.instantiate_zeros, dots[:2]), args[2], axis=axis)
 
 
