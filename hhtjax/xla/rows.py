@@ -10,8 +10,6 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from hhtjax.xla.two_ways import no_tangent
-
 
 def row_written(array, row, number):
     """The array (K, ...) with the row (...) in the place of that of a number, 0 to K - 1.
@@ -77,10 +75,8 @@ def _shape(array, row, number, *, axis):
 
 def _jvp(args, dots, *, axis):
     """Linear in the array and the row."""
-    out = write_p.bind(*args, axis=axis)
-    if all(type(dot) is ad.Zero for dot in dots[:2]):
-        return out, no_tangent(out)
-    return out, write_p.bind(*map(ad.instantiate_zeros, dots[:2]), args[2], axis=axis)
+    moves = map(ad.instantiate_zeros, dots[:2])
+    return write_p.bind(*args, axis=axis), write_p.bind(*moves, args[2], axis=axis)
 
 
 def _transpose(cotangent, array, row, number, *, axis):
