@@ -26,6 +26,7 @@ from hhtjax.systems.rubbing import require_independent_friction
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 VECTORS = 32  # members, of fewer of which LLVM often writes loops out, one member after the other
+ALIKE = 1.5  # times the number of steps
 NAMES = "stepper", "q0", "v0", "params", "z0"  # of what may differ
 
 
@@ -116,21 +117,25 @@ class Inputs(NamedTuple):
             mesh = Mesh(mesh.devices.ravel(), ("members",))  # whatever its shape and its types of axes
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
-        lanes = lanes_for(self.size, any(self.mapped), 1 if mesh is None else mesh.size)
+        lanes = lanes_for(self.size, are_alike(dts))
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
         return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
 
 
-def lanes_for(size, alike=False, devices=1):
+def lanes_for(size, alike=False):
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
-    Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If they
-    differ in more than the size of their steps they are taken to be alike, and blocks are no shorter than it takes
-    for vector instructions: a batch takes half the time then.
+    Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If all are
+    alike, they are no shorter than it takes for vector instructions: a batch of small systems takes half the time then.
     """
     lanes = 1 << (size // BLOCKS).bit_length()
-    return min(LANES, max(lanes, VECTORS if alike and size >= 2 * VECTORS * devices else 1))
+    return min(LANES, max(lanes, VECTORS if alike and size >= 2 * VECTORS else 1))
+
+
+def are_alike(dts):
+    """Whether members are known to take about as many steps."""
+    return is_concrete(dts) and float(np.max(dts)) <= ALIKE * float(np.min(dts))
 
 
 def _members(control, trees, in_axes):
