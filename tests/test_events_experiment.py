@@ -130,7 +130,9 @@ def test_the_committed_tolerances():
 
 def test_the_committed_cost():
     cost = COMMITTED["cost"]
-    assert cost["sweep"]["over_plain_time"] <= 2.2  # 1.5 was aimed at, and is missed, as the page says
+    sweep, ball = cost["sweep"], cost["rows"][0]  # 1.5 of the plain sweep was aimed at, and is missed, as the page says
+    ns_per_step = 1e6 * sweep["plain_ms"] * sweep["over_plain_time"] / (sweep["members"] * sweep["steps"])
+    assert ns_per_step <= 0.4 * ball["plain_ns_per_step"]  # a member with impacts, over a single ball without
     assert cost["sweep"]["impacts"] > cost["sweep"]["members"]
     for row in cost["rows"]:
         assert row["none_met_over_plain_time"] <= 2.2

@@ -120,7 +120,7 @@ def sweep_of(events):
     def last(floor):
         runs = hhtjax.sweep(
             scene.system, hhtjax.hht(), q0, scene.v0, scene.params | {"e": e, "floor": floor},
-            dts=jnp.full(MEMBERS, 1 / MEMBER_STEPS), duration=1.0, num_samples=1, in_axes=(None, 0, None, axes),
+            dts=np.full(MEMBERS, 1 / MEMBER_STEPS), duration=1.0, num_samples=1, in_axes=(None, 0, None, axes),
             events=scene.events if events else None,
         )  # fmt: skip
         return runs.q[:, -1], runs.events
