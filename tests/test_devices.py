@@ -1,11 +1,15 @@
 """A sweep over several devices and several processes has the bits of a sweep on one."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import PartitionSpec
 
 import hhtjax
 from experiments.sweeps.devices import case, swept
+from hhtjax.xla import gate
+from hhtjax.xla.parameters import is_understood
 
 MEMBERS = 300
 
@@ -34,3 +38,18 @@ def test_a_mesh_of_one_device_changes_nothing():
         )
 
     jax.tree.map(np.testing.assert_array_equal, run(None), run(jax.make_mesh((1,), ("anything",))))
+
+
+@pytest.mark.skipif(not gate.is_on(), reason="this JAX evaluates nothing on scalars")
+def test_inside_shard_map_operations_are_understood():
+    """JAX gives arrays that are made there a sharding, which says nothing."""
+
+    def made(x):
+        return jnp.ones_like(x) + x
+
+    mesh, whole = jax.make_mesh((1,), ("members",)), PartitionSpec()
+    split = jax.shard_map(made, mesh=mesh, in_specs=whole, out_specs=whole, check_vma=False)
+    ((eqn,),) = [jax.make_jaxpr(split)(jnp.ones((2, 2))).eqns]
+    inside = eqn.params["jaxpr"].eqns
+    assert "broadcast_in_dim" in {x.primitive.name for x in inside}
+    assert all(map(is_understood, inside))

@@ -285,8 +285,6 @@ for name, count in (("hhtjax", gradients), ("diffrax", theirs)):
     work = f"{count.size} draws, {count.mean():.1f} gradients each, {1e3 * t_gradient[name]:.2f} ms a gradient"
     print(f"{name:<8}{work}: {per_second[name]:.3g} effective samples per second")
 print(f"hhtjax makes {ratio:.0f} times as many")
-assert per_second["hhtjax"] > 20
-assert ratio > 20
 
 # %% [markdown]
 # ## What to try next

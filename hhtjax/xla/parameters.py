@@ -23,6 +23,13 @@ def _none(value):
     return value is None
 
 
+def _own(sharding):
+    """None, or what shard_map says of arrays that each device has to itself."""
+    return sharding is None or (
+        getattr(getattr(sharding, "mesh", None), "are_all_axes_manual", False) and not any(sharding.spec)
+    )
+
+
 def _empty(value):
     return not value
 
@@ -66,7 +73,7 @@ UNDERSTOOD = {
     "integer_pow": _of_any("y"),
     "mul": {"out_dtype": _none},
     "round": _of_any("rounding_method"),
-    "broadcast_in_dim": {**_of_any("shape", "broadcast_dimensions"), "sharding": _none},
+    "broadcast_in_dim": {**_of_any("shape", "broadcast_dimensions"), "sharding": _own},
     "concatenate": _of_any("dimension"),
     "dot_general": {
         **{"dimension_numbers": _any, "precision": _usual_precision, "preferred_element_type": _any},
@@ -75,7 +82,7 @@ UNDERSTOOD = {
     "dynamic_slice": _of_any("slice_sizes"),
     "dynamic_update_slice": {},
     "gather": {**_GATHERED, **_of_any("slice_sizes", "fill_value")},
-    "iota": {**_of_any("dtype", "shape", "dimension"), "sharding": _none},
+    "iota": {**_of_any("dtype", "shape", "dimension"), "sharding": _own},
     "pad": _of_any("padding_config"),
     **{f"reduce_{kind}": _SUM for kind in ("sum", "prod", "max", "min", "and", "or")},
     "reshape": {**_of_any("new_sizes", "dimensions"), "sharding": _none},
