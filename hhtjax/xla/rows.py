@@ -53,20 +53,22 @@ def _written(array, row, number, *, axis):
     return lax.fori_loop(0, members, write, array.reshape(members, *shape)).reshape(array.shape)
 
 
+def _of_members(f, array, *others):
+    """f(array, *others) of each member; the last of the others are numbers, one for each."""
+    for _ in others[-1].shape:
+        f = jax.vmap(f)
+    return f(array, *others)
+
+
 def _scattered(array, row, number, *, axis):
     """The same where many threads write at once."""
-    one = partial(lax.dynamic_update_index_in_dim, axis=axis - number.ndim)
-    for _ in number.shape:
-        one = jax.vmap(one)
-    return one(array, row, number)
+    return _of_members(partial(lax.dynamic_update_index_in_dim, axis=axis - number.ndim), array, row, number)
 
 
 def _read(array, number, axis):
     """The rows of these numbers."""
     one = partial(lax.dynamic_index_in_dim, axis=axis - number.ndim, keepdims=False)
-    for _ in number.shape:
-        one = jax.vmap(one)
-    return one(array, number)
+    return _of_members(one, array, number)
 
 
 def _shape(array, row, number, *, axis):
