@@ -87,7 +87,7 @@ def run_every_one(options) -> int:
     return int(bool(failed))
 
 
-USAGE = "python -m experiments NAME [--fast | --full | --parts A,B] [--out DIR] [--formats png,pdf,svg]"
+USAGE = "python -m experiments NAME [--fast | --full | --parts A,B] [--gpu] [--out DIR] [--formats png,pdf,svg]"
 
 
 def parse(arguments: list[str]):
@@ -98,6 +98,7 @@ def parse(arguments: list[str]):
     size.add_argument("--fast", action="store_true", help="a smoke run: less data, fewer settings")
     size.add_argument("--full", action="store_true", help=f"everything, where less is shown by default: {IN_PART[0]}")
     size.add_argument("--parts", default="", help="of an experiment in parts, these; the numbers of the others stay")
+    parser.add_argument("--gpu", action="store_true", help="benchmarks alone: on the accelerator that JAX finds")
     parser.add_argument("--out", type=Path, default=HERE / "output", help="folder for figures, JSON and page")
     parser.add_argument("--formats", default="png", help="of figures: png, pdf, svg, or several with commas")
     options = parser.parse_args(arguments)
@@ -105,6 +106,8 @@ def parse(arguments: list[str]):
         parser.error(f"--full is for {', '.join(IN_PART)}; the others show everything they have anyway")
     if options.parts and options.name in COMMANDS:
         parser.error("--parts is for one experiment")
+    if options.gpu and (options.name != "benchmarks" or options.parts):
+        parser.error("--gpu is for benchmarks, and a part of its own")
     return options
 
 
@@ -113,14 +116,14 @@ def run(name: str, options) -> None:
     from experiments.report import Report
 
     part = name in IN_PART and not options.full and not options.fast
-    parts = tuple(filter(None, options.parts.split(",")))
+    parts = ("accelerator",) if options.gpu else tuple(filter(None, options.parts.split(",")))
     flag = " --fast" if options.fast else " --full" if options.full else ""
-    flag += f" --parts {options.parts}" if parts else ""
+    flag += " --gpu" if options.gpu else f" --parts {options.parts}" if parts else ""
     mode = "fast" if options.fast else "part" if part else "full"
     report = Report(name, options.out, mode, f"python -m experiments {name}{flag}", options.formats.split(","), parts)
     module = importlib.import_module(f"experiments.{EXPERIMENTS[name]}")
     known = [part.__name__.rpartition(".")[2] for group in getattr(module, "GROUPS", []) for part in group]
-    if unknown := [part for part in parts if part not in known]:
+    if not options.gpu and (unknown := [part for part in parts if part not in known]):
         sys.exit(f"{name} has {'the parts ' + ', '.join(known) if known else 'no parts'}; received {unknown[0]!r}.")
     module.run(report, options.fast, *([options.full] if name in IN_PART else []))
     report.close()

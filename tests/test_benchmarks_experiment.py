@@ -1,5 +1,6 @@
 """The C that the library is measured against does the same arithmetic, the charts are read rightly, and the pages."""
 
+import json
 from functools import partial
 
 import jax
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 
 import hhtjax
-from experiments.benchmarks import native
+from experiments.__main__ import main
+from experiments.benchmarks import accelerator, native, page
 from experiments.benchmarks.chain import FORMULATIONS, chain
 from experiments.cardona_geradin1989.index_1 import unconstrained
 from experiments.work_precision import gradients, ours
@@ -36,6 +38,41 @@ def test_c_steps_like_the_library(as_printed):
         np.testing.assert_allclose(single()[:6], ours, rtol=1e-9, atol=1e-11)
         np.testing.assert_allclose(single.path[:, :2], run.q[1:], rtol=1e-9)
         np.testing.assert_allclose(native.Run(found, scene, batch, *options.values(), -0.1)()[:6, 0], ours, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_the_accelerator_is_measured_where_there_is_one(tmp_path, capsys, monkeypatch):
+    """The program of --gpu runs here, with few members, and without diffrax, whose program is the larger one; in full
+    it says that there is none."""
+    monkeypatch.setattr(accelerator, "is_installed", lambda name: False)
+    with pytest.raises(SystemExit, match=r"benchmarks --gpu: JAX finds no accelerator, only .*cpu:0.*; --fast tries"):
+        main(["benchmarks", "--gpu", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit):
+        main(["silverbox", "--gpu"])
+    assert "--gpu is for benchmarks" in capsys.readouterr().err
+    assert main(["benchmarks", "--gpu", "--fast", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "benchmarks.json").read_text())["accelerator"]
+    (row,) = found["pendulums"]
+    assert all(x < 1e-3 for x in row["median_difference_rad"].values())
+    assert "| 8 |" in page.accelerator(found)
+
+
+@pytest.mark.filterwarnings("ignore:simulate. in float32")
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_lorenz_steps_keep_their_precision(precision):
+    y, h = np.array([1.0, 0.0, 0.0]), accelerator.LORENZ_DT
+
+    def rate(y):
+        return np.asarray(accelerator.lorenz(y, 0.0, 20.0))
+
+    for _ in range(2):
+        k1 = rate(y)
+        k2 = rate(y + h / 2 * k1)
+        k3 = rate(y + h / 2 * k2)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(y + h * k3))
+    found = accelerator.lorenz_end(2, jnp.asarray(20.0, precision))
+    assert found.dtype == precision
+    np.testing.assert_allclose(found, y, rtol=1e-6 if precision == np.float32 else 1e-13)
 
 
 def test_both_formulations_of_the_chain_are_one():

@@ -1,11 +1,22 @@
-"""Speed, as ratios within one run: against C, by structure, of batches and gradients, of chains, of compilation."""
+"""Speed, as ratios within one run: against C, by structure, of batches, gradients and chains, of the first call."""
 
-from experiments.benchmarks import against_c, batches, chains, compile_time, gradients, many_unknowns, structure
+from experiments.benchmarks import (
+    accelerator,
+    against_c,
+    batches,
+    chains,
+    compile_time,
+    first_call,
+    gradients,
+    many_unknowns,
+    structure,
+)
 from experiments.benchmarks.measure import machine
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = [against_c, structure, batches, many_unknowns], [gradients, chains, compile_time]  # two processes if fast
+GROUPS = [against_c, structure, batches, many_unknowns], [gradients, chains, compile_time, first_call]  # for --fast
+ON_ACCELERATOR = (accelerator,)  # --gpu: on another machine than the rest
 
 
 def run(report: Report, fast: bool):
@@ -13,4 +24,4 @@ def run(report: Report, fast: bool):
     found = machine()
     for name, value in found.items():
         print(f"{name:<16}{value}", flush=True)
-    run_experiment(report, GROUPS, fast, found)
+    run_experiment(report, (*GROUPS, ON_ACCELERATOR) if report.parts else GROUPS, fast, found)

@@ -1,6 +1,6 @@
 """The first call: CPU seconds until a result is there, each in a process of its own; with a cache on disk, its second.
 
-    python -m experiments.benchmarks.first_call                     # the table, some ten minutes
+    python -m experiments benchmarks --parts first_call             # the table, some ten minutes
     python -m experiments.benchmarks.first_call simulate pendulum   # one number of it, in this process
 
 It is what all threads compute, imports apart, divided into tracing (Python: the system's functions, JAX, the
@@ -117,21 +117,25 @@ def apart(call, scene, cache):
     return json.loads(done.stdout.decode().splitlines()[-1])
 
 
-def table():
-    """A line for each call and scene."""
-    columns = ["total", "tracing", "lowering", "compiling"]
-    print(f"{'CPU s':<34}", *(f"{name:>10}" for name in (*columns, "again")))
-    for scene in SCENES:
-        for call in CALLS:
-            with tempfile.TemporaryDirectory() as cache:
-                once, again = (apart(call, scene, cache) for _ in range(2))
-            numbers = *(once[name] for name in columns), again["total"]
-            print(f"{call + ', ' + scene:<34}", *(f"{x:10.2f}" for x in numbers), flush=True)
+def cell(report, call, scene):
+    """What the first call takes, and the first of a second process."""
+    with tempfile.TemporaryDirectory() as cache:
+        once, again = (apart(call, scene, cache) for _ in range(2))
+    row = {"scene": scene, "call": call, "cpu_time_s": once, "with_cache_cpu_time_s": again["total"]}
+    report.progress(str(row))
+    return row
+
+
+def run(report, fast):
+    """A row for each scene and call."""
+    cells = [(call, scene) for scene in SCENES for call in CALLS][: 1 if fast else None]
+    rows = [cell(report, *x) for x in cells]
+    header = ["scene", "call", *rows[0]["cpu_time_s"], "total with a cache"]
+    lines = [[r["scene"], r["call"], *r["cpu_time_s"].values(), r["with_cache_cpu_time_s"]] for r in rows]
+    report.table(header, lines)
+    return {"num_steps": NUM_STEPS, "rows": rows}
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    if len(sys.argv) > 1:
-        print(json.dumps(first(*sys.argv[1:])))
-    else:
-        table()
+    print(json.dumps(first(*sys.argv[1:])))

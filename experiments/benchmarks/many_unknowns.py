@@ -182,9 +182,9 @@ def sparse_meshes(sizes, repeats):
 def run(report, fast):
     """Both."""
     if fast:
-        found = {"dense": dense([20], 50, 1), "sparse": sparse_meshes([(400, 5)], 1)}
+        found: dict = {"num_steps": 50, "dense": dense([20], 50, 1), "sparse": sparse_meshes([(400, 5)], 1)}
     else:
-        found = {"dense": dense([20, 50, 100, 200], 1000, 5)}
+        found = {"num_steps": 1000, "dense": dense([20, 50, 100, 200], 1000, 5)}
         report.progress("dense")
         found["sparse"] = sparse_meshes([(1000, 100), (10_000, 40), (100_000, 20)], 5)
     report.table(list(found["dense"][0]), [list(row.values()) for row in found["dense"]])

@@ -63,6 +63,52 @@ def bars(numbers):
     return table(["what", "bar", "here", "met"], lines)
 
 
+def first_call(numbers):
+    """A row for each scene and call."""
+    rows = [
+        {**r, **r["cpu_time_s"], "again": r["with_cache_cpu_time_s"], "share": r["with_cache_cpu_time_s"] / total}
+        for r in numbers["rows"]
+        if (total := r["cpu_time_s"]["total"])
+    ]
+    parts = {name: name for name in ("total", "tracing", "lowering", "compiling")}
+    return rows_table(rows, {"scene": "scene", "call": "call", **parts, "with a cache": "again", "share": "share"})
+
+
+def dense(rows):
+    """Ours beside the loop by hand."""
+    columns = {"ours (us)": "ours_us_per_step", "by hand (us)": "hand_us_per_step", "ratio": "over_hand"}
+    rows = [{**r, "n": f"{r['n']}", "busy": f"{r['busy_processes']}"} for r in rows]
+    return rows_table(rows, {"n": "n", "busy": "busy", **columns, "ratio of medians": "median_over_hand"})
+
+
+def sparse(rows):
+    """ms per step in every way."""
+    names = list(dict.fromkeys(name for r in rows for name in r["ms_per_step"]))
+    rows = [{**r["ms_per_step"], **r, "n": f"{r['n']}"} for r in rows]
+    columns = {f"{name} (ms)": name for name in names}
+    return rows_table(rows, {"mesh": "mesh", "n": "n", **columns, "sparse over SuperLU": "over_superlu"})
+
+
+def accelerator(numbers):
+    """What `--gpu` measured, if it was ever run."""
+    if numbers is None:
+        return (
+            "Nothing was measured: no accelerator was at hand. `python -m experiments benchmarks --gpu` measures, on "
+            "one that JAX finds, `vmap` of a run of the double pendulum up to a million members, diffrax's beside it, "
+            "and 8.4 million Lorenz systems in single precision. Nothing of the library is made for accelerators: it "
+            "runs there as plain JAX does."
+        )
+    rows = [{"members": f"{r['members']}", **r["ns_per_step_and_member"]} for r in numbers["pendulums"]]
+    lorenz = numbers["lorenz"]
+    published = ", ".join(f"{name}: {x} ms" for name, x in lorenz["published_ms"].items())
+    return (
+        f"{numbers['device']}, jax {numbers['jax']}; double pendulums in float64, ns per step and member:\n\n"
+        f"{rows_table(rows, {key: key for row in rows for key in row})}\n\n"
+        f"{lorenz['members']} Lorenz systems, {lorenz['num_steps']} steps of `rk4` in float32: "
+        f"{lorenz['time_ms']:.3g} ms (published: {published})."
+    )
+
+
 def page(numbers):
     """The text of README.md."""
     c, batches, gradients = (numbers[part] for part in ("against_c", "batches", "gradients"))
@@ -151,6 +197,14 @@ def page(numbers):
                 numbers["compile_time"]["rows"],
                 {"method": "method", "of": "compiled", "s": "compile_s", "over Kvaerno3's": "over_kvaerno3"},
             ),
+            first_steps=numbers["first_call"]["num_steps"],
+            first_call=first_call(numbers["first_call"]),
+            cores=machine["cores"],
+            busy=max(r["busy_processes"] for r in numbers["many_unknowns"]["dense"]),
+            dense_steps=numbers["many_unknowns"]["num_steps"],
+            dense=dense(numbers["many_unknowns"]["dense"]),
+            sparse=sparse(numbers["many_unknowns"]["sparse"]),
+            accelerator=accelerator(numbers.get("accelerator")),
         )
     )
 

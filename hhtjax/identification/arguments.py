@@ -1,12 +1,13 @@
 """What `fit` is given, checked and brought into one form."""
 
 import math
+import sys
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from hhtjax.checks import require_function, require_integer
 from hhtjax.description import freeze, is_array, is_concrete, is_real, thaw
@@ -15,7 +16,6 @@ from hhtjax.identification.losses import LOSSES
 
 FEW = 64  # parameters up to which a forward-mode Jacobian is the cheaper derivative
 LEVENBERG_MARQUARDT = "levenberg_marquardt"
-FOR_MANY = optax.lbfgs()  # one object, so that a second fit finds the first one's program
 
 
 class Gaussian(NamedTuple):
@@ -49,14 +49,26 @@ class Options(NamedTuple):
     progress: bool
 
 
+@cache
+def for_many():
+    """The optimiser of many parameters: one object, so that a second fit finds the first one's program."""
+    import optax  # a quarter of the time to import hhtjax, and few fits need it
+
+    return optax.lbfgs()
+
+
+def is_of_optax(optimizer):
+    """Whether it is an optimiser of optax, which is imported then."""
+    optax = sys.modules.get("optax")
+    return optax is not None and isinstance(optimizer, optax.GradientTransformation)
+
+
 def check_options(
     caller, residuals, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress
 ):
     """`Options` with the defaults filled in, or an error that names what is wrong."""
     require_function(caller, "residuals", residuals, "residuals(params)")
-    if not (
-        optimizer is None or optimizer == LEVENBERG_MARQUARDT or isinstance(optimizer, optax.GradientTransformation)
-    ):
+    if not (optimizer is None or optimizer == LEVENBERG_MARQUARDT or is_of_optax(optimizer)):
         raise TypeError(
             f'{caller}: `optimizer` must be an optax optimiser, "{LEVENBERG_MARQUARDT}" or None; '
             f"received {optimizer!r}."
@@ -66,7 +78,7 @@ def check_options(
     if not free:
         raise ValueError(f"{caller}: `transforms` must leave a parameter free; received {tf.fixed} for all.")
     if optimizer is None:
-        optimizer = LEVENBERG_MARQUARDT if free <= FEW else FOR_MANY
+        optimizer = LEVENBERG_MARQUARDT if free <= FEW else for_many()
     if loss is not None and not callable(loss) and loss not in LOSSES:
         raise ValueError(f"{caller}: `loss` must be one of {', '.join(LOSSES)}, a function or None; received {loss!r}.")
     if max_iterations is None:

@@ -4,7 +4,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import optax
 from jax import lax
 
 from hhtjax.identification.progress import (
@@ -23,6 +22,8 @@ from hhtjax.identification.progress import (
 
 def descend(f, x, objective, optimizer, tolerance, max_iterations, progress, patience=5):
     """An optax optimiser on the cost; returns the best point it saw."""
+    import optax  # where a fit needs it: see `for_many`
+
     optimizer = optax.with_extra_args_support(optimizer)
     running = jnp.asarray(RUNNING, jnp.int32)
 
