@@ -57,6 +57,15 @@ def test_derivatives_and_batches_are_one_kernel_too():
     assert paths(jax.vmap(end), jnp.ones(3)) == ("one kernel",)
 
 
+SPECIAL = (
+    *(jnp.acos, jnp.asin, jnp.asinh, jnp.atan, jnp.atanh, jnp.cosh, jnp.sinh, lambda c: jnp.acosh(1.5 + c)),
+    *(jax.lax.erf, jax.lax.erfc, jax.lax.erf_inv, jax.lax.lgamma, jax.lax.digamma, jax.lax.bessel_i1e, jnp.square),
+    *(
+        lambda c: jax.lax.nextafter(c, 2 * c),
+        lambda c: jax.lax.zeta(c + 2, c + 1),
+        lambda c: jax.lax.polygamma(1.0, 1 + c),
+    ),
+)
 SUPPORTED = {
     "elementwise": lambda c: jnp.tanh(c) + jnp.arctan2(c, 1 + c) + jax.scipy.special.erf(c) + c**0.3,
     "control flow": lambda c: jax.lax.cond(c[0] > 0.5, lambda c: c / 2, lambda c: c + 1, c),
@@ -75,12 +84,14 @@ SUPPORTED = {
     "4095 numbers": lambda c: c / 2 + jnp.sum(jnp.sin(jnp.arange(4095.0) * c[0])) / 9999,
     "cube roots, on trial": lambda c: jnp.cbrt(c) / 2,
     "small products and sums": lambda c: jnp.outer(c, c) @ c / 9 + jnp.sum(c) / 9 + jnp.cumsum(c) / 9,
+    "special functions": lambda c: c / 2 + sum(f(jnp.tanh(c) / 2) for f in SPECIAL) / 99,
     "interpolation": lambda c: jnp.interp(c, jnp.arange(10.0), jnp.arange(10.0) ** 2) / 9,
     "random numbers": lambda c: c / 2 + jax.random.normal(jax.random.key(3), (4,)),
     "float32": lambda c: jnp.sin(c.astype(jnp.float32)).astype(c.dtype),
 }
 UNSUPPORTED = {
     "sort": lambda c: jnp.sort(c) / 2,
+    "top_k": lambda c: jax.lax.top_k(c, 4)[0] / 2,
     "scatter": lambda c: c.at[order].add(c) / 3,
     "lapack": lambda c: jnp.linalg.solve(jnp.eye(4) + jnp.outer(c, c), c),
     "fft": lambda c: jnp.abs(jnp.fft.fft(c)) / 9,
@@ -109,7 +120,7 @@ def test_what_xla_cannot_compile_into_one_kernel_runs_plainly(name):
     assert np.allclose(jax.jit(run, static_argnums=0)(f, x), jax.jit(run, static_argnums=0)(loop, x), rtol=1e-12)
     verdict = paths(partial(run, f), x)[-1]
     assert verdict == "one kernel" if name in SUPPORTED else verdict.startswith("plain")
-    if name.strip() in ("sort", "dot_general", "reduce"):
+    if name.strip() in ("sort", "top_k", "dot_general", "reduce"):
         assert name.strip() in verdict
 
 

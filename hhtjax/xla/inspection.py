@@ -21,6 +21,14 @@ KNOWN = {
     *("bitcast_convert", "cbrt", "complex", "count_leading_zeros", "imag", "popcnt", "real", "shift_left"),
     *("shift_right_arithmetic", "shift_right_logical"),
 }
+# in other dialects; those of CHLO become elementwise operations, but for top_k, a sort
+ELSEWHERE = {
+    "chlo": {
+        *("acos", "acosh", "asin", "asinh", "atan", "atanh", "bessel_i1e", "cosh", "digamma", "erf", "erf_inv"),
+        *("erfc", "lgamma", "next_after", "polygamma", "sinh", "square", "zeta"),
+    },
+    "func": {"func", "return"},
+}
 IDLE = {"stablehlo.return", "stablehlo.constant", "stablehlo.broadcast_in_dim"}
 MANY = 4  # values of a conditional: of fewer, a loop is no better
 # those it knows if they are small
@@ -70,7 +78,7 @@ class Inspection:
             if not CHECKS[name](op):
                 self.object(f"{name} of {' and '.join(str(x.type) for x in op.operands)}")
             self.is_proven &= _types(op) <= PROVEN_TYPES
-        elif (dialect == "stablehlo" and name in PROVEN | KNOWN) or dialect in ("chlo", "func"):
+        elif name in (PROVEN | KNOWN if dialect == "stablehlo" else ELSEWHERE.get(dialect, ())):
             self.is_proven &= name not in KNOWN and _types(op) <= PROVEN_TYPES
             if name in ("case", "if"):
                 self._look_into_branches(op)
