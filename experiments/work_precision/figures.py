@@ -28,6 +28,21 @@ SHOWN = {  # of a package: the methods that are drawn, where the page has all of
 }
 
 
+GRADIENTS = {
+    "ours": (
+        *("hht, predictor, forward", "hht, predictor, reverse", "hht, extrapolate=2, forward", "rowda, forward"),
+        *("rowda, adaptive, forward", "rowda, adaptive, reverse", "rk4, forward", "rk4, reverse"),
+        *("dopri5, adaptive, forward", "dopri5, adaptive, reverse"),
+    ),
+    "diffrax": (
+        *("diffrax Tsit5, forward", "diffrax Tsit5, reverse", "diffrax Kvaerno3, forward"),
+        *("diffrax Kvaerno5, forward", "diffrax Kvaerno5, reverse"),
+    ),
+    "SciPy": ("SciPy LSODA, differences",),
+    "MuJoCo": (),
+    "exudyn": (),
+}
+
 OURS = COLOURS[0], COLOURS[0], COLOURS[6], COLOURS[6], COLOURS[5], COLOURS[5], COLOURS[7], COLOURS[7], COLOURS[7]
 
 
@@ -94,8 +109,8 @@ def panels(lines, names, x, xlabel, ylabel, shown=None):
     return drawn
 
 
-def draw(report, lines, names, gradient_lines, gradient_names):
-    """All figures."""
+def draw(report, lines, names):
+    """The figures of runs."""
     counted = {package: [m for m in methods if "Kvaerno" not in m] for package, methods in SHOWN.items()}
     error = "RMS error ({unit})"
     for i, some in enumerate((names[:4], names[4:]), 1):
@@ -103,6 +118,19 @@ def draw(report, lines, names, gradient_lines, gradient_names):
         report.figure(
             f"work_precision_solves_{i}", panels(lines, some, "solves", "factorised matrices", error, counted)
         )
-    label = "time of value and gradient (ms)"
-    figure = panels(gradient_lines, gradient_names, "time_s", label, "relative error")
-    report.figure("work_precision_gradients", figure)
+
+
+def gradient_figures(names):
+    """{name of a figure: scenes}."""
+    return {
+        name: some
+        for name, some in {"work_precision_gradients": names[:4], "work_precision_gradients_2": names[4:]}.items()
+        if some
+    }
+
+
+def draw_gradients(report, lines, names):
+    """The figures of gradients."""
+    for name, some in gradient_figures(names).items():
+        label = "time of value and gradient (ms)"
+        report.figure(name, panels(lines, some, "time_s", label, "relative error", GRADIENTS))
