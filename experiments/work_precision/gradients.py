@@ -28,7 +28,6 @@ IMPLICIT = ("Kvaerno3", "forward"), ("Kvaerno5", "forward")  # reverse takes lon
 PEERS = *EXPLICIT, *IMPLICIT, ("Kvaerno5", "reverse")
 SIZES = tuple(2**i for i in range(11))  # steps between sample times
 REVERSE_SIZES = 4, 16, 64  # each compiled anew
-TOLERANCES = tuple(10.0**-n for n in range(3, 10))
 MOST_STEPS = 2**15
 LONGEST_LINE = 10  # s behind its first point, after which nothing finer is tried
 STEPPERS = {"hht": ours.SMOOTH, "rk4": hhtjax.rk4()}  # of runs by `simulate`
@@ -76,6 +75,11 @@ def start(name):
 def seen(name, path):
     """Of positions (times, size) those that are in the loss."""
     return path[:, : cases()[name].size] if SCENES[name].seen is None else path[:, np.array(SCENES[name].seen)]
+
+
+def nan_unless(fine):
+    """A factor, so that derivatives are NaN too."""
+    return jnp.where(fine, 1.0, jnp.nan)
 
 
 @cache
@@ -161,7 +165,7 @@ def controlled_rows(name, tolerances, methods=("rowda, adaptive", "dopri5, adapt
                 def loss(s, tolerance):
                     found = solution(tolerance, s)
                     value = jnp.mean(seen(name, jax.vmap(flat)(found.q)[1:]) ** 2)
-                    return jnp.where(found.steps.stop == 0, value, jnp.nan)
+                    return value * nan_unless(found.steps.stop == 0)
 
                 return sweep(name, f"{method}, {mode}", "ours", tolerances, partial(jax.jit(derivative(loss)), s))
 
@@ -192,7 +196,7 @@ def diffrax_rows(name, tolerances, peers):
         )
         fine = found.result == diffrax.RESULTS.successful
         assert found.ys is not None
-        return jnp.where(fine, jnp.mean(seen(name, found.ys) ** 2), jnp.nan)
+        return jnp.mean(seen(name, found.ys) ** 2) * nan_unless(fine)
 
     for solver, mode in peers:
         forward = mode == "forward"
@@ -235,7 +239,7 @@ def entries(report, name, installed):
     report.progress(f"gradients, {name}: ours")
     rows += scipy_rows(name, scipy_peers.TOLERANCES[2::2])
     if installed:
-        rows += diffrax_rows(name, TOLERANCES, of.peers)
+        rows += diffrax_rows(name, diffrax_peers.TOLERANCES, of.peers)
     report.progress(f"gradients, {name}: the others")
     return rows
 
