@@ -14,7 +14,7 @@ from experiments.benchmarks import accelerator, native, page
 from experiments.benchmarks.chain import FORMULATIONS, chain
 from experiments.cardona_geradin1989.index_1 import unconstrained
 from experiments.work_precision import gradients, ours
-from experiments.work_precision.cases import linkage
+from experiments.work_precision.cases import cases, linkage
 from experiments.work_precision.timing import time_to
 from hhtjax.scenes import double_pendulum
 
@@ -124,3 +124,20 @@ def test_errors_of_controlled_gradients_are_within_their_tolerance(method):
     assert len(rows) == 2
     for row in rows:
         assert row["rms_error"] / row["setting"] < 100
+
+
+def test_gradients_are_taken_on_all_scenes():
+    assert set(gradients.SCENES) == set(cases())
+    assert all(2 <= gradients.start(name).size <= 4 for name in gradients.SCENES)
+
+
+def test_more_steps_are_allowed_only_where_the_default_is_used_up():
+    asked = []
+
+    def rows_for(most, tolerances):
+        asked.append((most, tolerances))
+        return [{"rms_error": x if most * x > 1 else None} for x in tolerances[:3]]  # finer ones are not tried
+
+    rows = ours.while_needed(rows_for, [1e-2, 1e-3, 3e-5, 1e-9])
+    assert asked == [(10_000, [1e-2, 1e-3, 3e-5, 1e-9]), (100_000, [3e-5])]
+    assert [row["rms_error"] for row in rows] == [1e-2, 1e-3, 3e-5]

@@ -28,14 +28,33 @@ SHOWN = {  # of a package: the methods that are drawn, where the page has all of
 }
 
 
+BOTH = "forward", "reverse"
+GRADIENTS = {
+    "ours": tuple(
+        f"{method}, {mode}"
+        for method in ("hht, predictor", "hht, extrapolate=2", "rowda", "rowda, adaptive", "rk4", "dopri5, adaptive")
+        for mode in BOTH
+    ),
+    "diffrax": tuple(f"diffrax {solver}, {mode}" for solver in ("Tsit5", "Kvaerno3", "Kvaerno5") for mode in BOTH),
+    "SciPy": ("SciPy LSODA, differences",),
+    "MuJoCo": (),
+    "exudyn": (),
+}
+
 OURS = COLOURS[0], COLOURS[0], COLOURS[6], COLOURS[6], COLOURS[5], COLOURS[5], COLOURS[7], COLOURS[7], COLOURS[7]
 
 
-def style(package, number):
-    """Colour by package, of ours by kind; marker by method."""
+def kind(method):
+    """The method without the mode of its gradient."""
+    return method.removesuffix(", forward").removesuffix(", reverse")
+
+
+def style(package, number, is_reverse):
+    """Colour by package, of ours by kind; marker by method, hollow for a gradient in reverse mode."""
     line = {"ls": "-", "lw": 1.4} if package == "ours" else {"ls": "--", "lw": 0.9}
     colour = OURS[number % len(OURS)] if package == "ours" else COLOURS[PACKAGES.index(package)]
-    return line | {"color": colour, "marker": MARKERS[number % len(MARKERS)], "ms": 3.5}
+    hollow = {"mfc": "white"} if is_reverse else {}
+    return line | {"color": colour, "marker": MARKERS[number % len(MARKERS)], "ms": 3.5} | hollow
 
 
 def curves(lines, case, x, shown):
@@ -44,13 +63,15 @@ def curves(lines, case, x, shown):
     scale = 1e3 if x == "time_s" else 1
     for package in PACKAGES:
         methods = list(dict.fromkeys(line["method"] for line in lines if line["package"] == package))
-        methods = methods if shown is None else [m for m in shown[package] if m in methods]
-        for number, method in enumerate(methods):
+        methods = [m for m in shown[package] if m in methods]
+        kinds = list(dict.fromkeys(map(kind, methods)))
+        for method in methods:
             mine = [line for line in lines if (line["case"], line["method"]) == (case, method) and x in line]
             pairs = [pair for line in mine for pair in zip(line[x], line["rms_error"], strict=True)]
             points = [(scale * a, e) for a, e in pairs if a and e and e < WORST]
             if points:
-                found[package][method] = (*np.array(points).T, style(package, number))
+                look = style(package, kinds.index(kind(method)), method.endswith(", reverse"))
+                found[package][method] = (*np.array(points).T, look)
     return found
 
 
@@ -64,10 +85,10 @@ def front(panel, packages, label):
         panel.step(work, np.minimum.accumulate(error), where="post", color="#bbbbbb", lw=3, zorder=1, label=label)
 
 
-def panels(lines, names, x, xlabel, ylabel, shown=None):
+def panels(lines, names, x, xlabel, ylabel, shown):
     """A row for each case: our methods, then those of others, each with the best of the other side in grey.
 
-    x: the key of the horizontal axis; shown: {package: methods}, by default all.
+    x: the key of the horizontal axis; shown: {package: methods}.
     """
     drawn, grid = subplots(len(names), 2, width=175, height=25 + 50 * len(names), squeeze=False, sharey="row")
     keys = {}, {}
@@ -90,12 +111,12 @@ def panels(lines, names, x, xlabel, ylabel, shown=None):
     for panel in grid[-1]:
         panel.set_xlabel(xlabel)
     key = keys[0] | keys[1]
-    drawn.legend(key.values(), key.keys(), loc="outside upper center", ncols=4 if shown else 3)
+    drawn.legend(key.values(), key.keys(), loc="outside upper center", ncols=4 if max(map(len, key)) < 26 else 3)
     return drawn
 
 
-def draw(report, lines, names, gradient_lines, gradient_names):
-    """All figures."""
+def draw(report, lines, names):
+    """The figures of runs."""
     counted = {package: [m for m in methods if "Kvaerno" not in m] for package, methods in SHOWN.items()}
     error = "RMS error ({unit})"
     for i, some in enumerate((names[:4], names[4:]), 1):
@@ -103,6 +124,19 @@ def draw(report, lines, names, gradient_lines, gradient_names):
         report.figure(
             f"work_precision_solves_{i}", panels(lines, some, "solves", "factorised matrices", error, counted)
         )
-    label = "time of value and gradient (ms)"
-    figure = panels(gradient_lines, gradient_names, "time_s", label, "relative error")
-    report.figure("work_precision_gradients", figure)
+
+
+def gradient_figures(names):
+    """{name of a figure: scenes}."""
+    return {
+        name: some
+        for name, some in {"work_precision_gradients": names[:4], "work_precision_gradients_2": names[4:]}.items()
+        if some
+    }
+
+
+def draw_gradients(report, lines, names):
+    """The figures of gradients."""
+    for name, some in gradient_figures(names).items():
+        label = "time of value and gradient (ms)"
+        report.figure(name, panels(lines, some, "time_s", label, "relative error", GRADIENTS))

@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 
 from experiments.page import busy, table
-from experiments.work_precision.figures import PACKAGES
+from experiments.work_precision.figures import PACKAGES, gradient_figures
+from experiments.work_precision.gradients import SCENES
 from experiments.work_precision.timing import FINEST
 
 HERE = Path(__file__).parent
@@ -52,27 +53,37 @@ def bars(entries):
     return table(["error", "best peer", "best of ours", "ratio", "over the default `hht()`", "bar"], rows)
 
 
-def losses(times):
-    """For each case the errors at which a peer is faster than all of ours, and those at which only `hht()` loses."""
+def losses(times, default=None):
+    """For each case the errors at which a peer is faster than all of ours, and those at which only `default` loses."""
     lines = []
     for name, entries in times.items():
         lost, default_lost = [], []
         for level in entries[0]["time_s"]:
             (ours, _), (theirs, peer) = best(entries, level, PACKAGES[:1]), best(entries, level, PACKAGES[1:])
-            default = next(e["time_s"][level] for e in entries if e["method"] == "hht")
+            usual = next((e["time_s"][level] for e in entries if e["method"] == default), None)
             if theirs is None:
                 continue
             if ours is None or theirs < ours:
                 times_faster = "none of ours gets there" if ours is None else f"{ours / theirs:.1f} times as fast"
                 lost.append(f"{level} ({peer}: {times_faster})")
-            elif default is None or theirs < default:
-                times_faster = "hht does not get there" if default is None else f"{default / theirs:.1f} times as fast"
+            elif default and (usual is None or theirs < usual):
+                times_faster = (
+                    f"{default} does not get there" if usual is None else f"{usual / theirs:.1f} times as fast"
+                )
                 default_lost.append(f"{level} ({peer}: {times_faster})")
         if lost:
             lines.append(f"* {name}: all of ours lose at {', '.join(lost)}.")
         if default_lost:
-            lines.append(f"* {name}: the default `hht()` loses, others of ours do not, at {', '.join(default_lost)}.")
+            lines.append(
+                f"* {name}: the default `{default}()` loses, others of ours do not, at {', '.join(default_lost)}."
+            )
     return "\n".join(lines) or "Nowhere, in these runs."
+
+
+def parameters(names):
+    """Of each scene those that its gradient is taken in."""
+    note = " (the loss has the height of the rod alone: all entries of a rotation have a constant sum of squares)"
+    return "; ".join(f"{x}: {', '.join(SCENES[x].keys)}{note if SCENES[x].seen else ''}" for x in names)
 
 
 def times_table(entries, heading):
@@ -84,6 +95,7 @@ def times_table(entries, heading):
 def page(numbers):
     """The text of README.md."""
     machine, times, missing = numbers["machine"], numbers["times"], numbers["not_installed"]
+    gradients = numbers["gradient_times"]
     versions = ", ".join(f"{name} {version}" for name, version in numbers["versions"].items())
     return (
         (HERE / "page.md")
@@ -100,8 +112,14 @@ def page(numbers):
             finest=FINEST,
             best=best_table(times),
             bars=bars(times[STIFF]),
-            losses=losses(times),
-            gradients="\n\n".join(times_table(entries, name) for name, entries in numbers["gradient_times"].items()),
+            losses=losses(times, "hht"),
+            gradient_figures="\n\n".join(
+                f"![Error of the gradient against time]({name}.png)" for name in gradient_figures(list(gradients))
+            ),
+            parameters=parameters(gradients),
+            gradient_losses=losses(gradients),
+            best_gradients=best_table(gradients),
+            gradients="\n\n".join(times_table(entries, name) for name, entries in gradients.items()),
             tables="\n\n".join(times_table(entries, name) for name, entries in times.items()),
         )
     )

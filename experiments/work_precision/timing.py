@@ -11,6 +11,7 @@ LONGEST = 0.3  # s, of a run; nothing finer is tried after one that takes longer
 FINEST = 1e-9  # error, below which nothing finer is tried
 REPEATS = 50
 PATIENCE = 0.08  # s, for the repeats of a run
+LEVELS = 1e-2, 1e-3, 1e-4, 1e-6, 1e-8
 
 
 def seconds(function, compiles):
@@ -78,3 +79,24 @@ def time_to(rows, error):
             x, y = ([np.log(r[key]) for r in (before, row)] for key in ("rms_error", "time_s"))
             return float(np.exp(np.interp(-np.log(error), -np.array(x), y)))
     return None
+
+
+def times(rows):
+    """[{method, package, time to each level}] of one case."""
+    found = []
+    for method in dict.fromkeys(r["method"] for r in rows):
+        mine = [r for r in rows if r["method"] == method]
+        found.append(
+            {
+                "method": method,
+                "package": mine[0]["package"],
+                "time_s": {f"{level:g}": time_to(mine, level) for level in LEVELS},
+            }
+        )
+    return found
+
+
+def show(report, entries):
+    """Times in ms."""
+    rows = [[e["method"], *("-" if t is None else 1e3 * t for t in e["time_s"].values())] for e in entries]
+    report.table(["method", *(f"{level:g}" for level in LEVELS)], rows)

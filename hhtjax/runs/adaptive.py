@@ -41,8 +41,10 @@ def adaptive(
     largest values so far; rtol^(1/2) because errors of steps add up, and only for the `hht` family. So errors of the
     run follow rtol, but nothing is promised: an error that grows, the phase of an undamped vibration or chaos, is seen
     by no estimate of one step, and what happens and is over within a step neither (give dt_max). `verify` sees the
-    first. Steps end where held inputs, `sampled(order=0)`, jump. With dry friction the error is that of the motion on
-    either side of a switch: the jump of the acceleration is no reason to reject.
+    first: on a planet's orbit an error of the energy is one of the period, and adds up; a revolution (e = 0.5) ends 13
+    to 40 tolerances off with methods of order 2, up to 12 with `rowda`, 4 with `dopri5`. Steps end where held inputs,
+    `sampled(order=0)`, jump. With dry friction the error is that of the motion on either side of a switch: the jump of
+    the acceleration is no reason to reject.
 
     With `events` steps pass them as steps of given sizes do, and what is left of a step behind an event has an error of
     its own. Where there is none, as in free flight, steps grow without bound, and a guard that falls and rises again
@@ -57,7 +59,8 @@ def adaptive(
         atol_v: in that of v; by default atol per unit of time.
         dt_min, dt_max: bounds of the step; a step below dt_min is a failure that `check()` names. Never below 16
             roundings of t.
-        max_steps: steps at most, the rejected included. Part of the program; all else is data.
+        max_steps: steps at most, the rejected included. Part of the program; all else is data. Memory for so many is
+            filled in each call: no more than are needed, for 100,000 take some 10 to 100 microseconds.
         verify: True, run again with every step halved, and state `run.error`, the error of the whole run at each of
             `times`, for three times the solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|). Where
             the motion jumps, as in relaxation oscillations, at times that move by more than a step, that is a false

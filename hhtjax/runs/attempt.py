@@ -12,6 +12,7 @@ from hhtjax.systems import held, kinematics
 
 NOT_FINITE = 1e6  # the error of a step that is not finite
 LOWEST = 1e-4  # error of the step before, as the controller sees it
+WIDEST = 2.4  # exponents of e of factors that steps change by: 0.09 to 11, beyond all bounds of them
 ROUNDINGS = 16  # of t, of which a step is at least
 DONE, TOO_SHORT, TOO_MANY, BROKEN, AT_EVENT = range(5)
 
@@ -124,7 +125,21 @@ def next_step(h, error, before, accept, order, pi=PI):
     now = jnp.log(jnp.maximum(error, 1e-10))
     exponent = jnp.where(accept, pi.integral * before - pi.proportional * now, -now) / order
     least, most = jnp.where(accept, pi.least, 0.1), jnp.where(accept, pi.most, 0.9)
-    return h * jnp.clip(pi.safety * jnp.exp(exponent), least, most), jnp.maximum(now, float(np.log(LOWEST)))
+    return h * jnp.clip(pi.safety * rough_exp(exponent), least, most), jnp.maximum(now, float(np.log(LOWEST)))
+
+
+def rough_exp(x):
+    """exp(x) to 3e-7 for |x| <= WIDEST, beyond that of its ends; XLA's own would take a tenth of the time of a step.
+
+    >>> x = np.linspace(-3.0, 3.0, 99)
+    >>> bool(jnp.all(abs(rough_exp(x) / np.exp(np.clip(x, -WIDEST, WIDEST)) - 1) < 3e-6))  # float32 here
+    True
+    """
+    y = jnp.clip(x, -WIDEST, WIDEST) / 16
+    power = 1 + y * (1 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y / 120))))
+    for _ in range(4):
+        power = power * power
+    return power
 
 
 def succeeded(state, info, error):

@@ -25,7 +25,7 @@ from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import State, Stepper, public
 from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_plain
+from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
 
 TINY = 1e-9  # part of a run
 ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
@@ -33,8 +33,15 @@ ALARM = 10  # times what was asked for, above which the error of a whole run is 
 
 @partial(jax.jit, static_argnames=("progress", "room"))
 def chosen_steps(problem, end, control, events=None, progress=False, room=()):
-    """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in."""
-    return choose(problem, problem.times(end), control, progress, events, room)
+    """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in.
+
+    One kernel, what comes before and behind the loop too: each part that stands alone costs about a microsecond.
+    """
+
+    def found(problem, end, control, events):
+        return choose(problem, problem.times(end), control, progress, events, room)
+
+    return one_kernel(found, problem, end, control, events, around=True)
 
 
 def steps_for(choice, progress, room):
@@ -83,8 +90,12 @@ class Grid(NamedTuple):
 @partial(jax.jit, static_argnames=("halved", "room"))
 def run_over(problem, times, ends, accepted, events=None, halved=False, room=()):
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
-    t0, times = problem.times(problem.t0), problem.times(times)
-    return follow(problem, times, Grid.of(t0, times, ends, accepted, halved), events, room)
+
+    def run(problem, times, ends, accepted, events):
+        t0, times = problem.times(problem.t0), problem.times(times)
+        return follow(problem, times, Grid.of(t0, times, ends, accepted, halved), events, room)
+
+    return one_kernel(run, problem, times, ends, accepted, events, around=True)  # as above
 
 
 def follow(problem, times, grid, events=None, room=()):
@@ -126,7 +137,7 @@ def to_next_sample(loop, form, begun, keep, in_pieces):
 
         def step(i, carry):
             last, run, info = carry
-            here = i < count
+            here = or_alone(i < count)
             last = () if in_pieces else jax.tree.map(partial(jnp.where, here), begun(run), last)
             return last, *resting(advance, in_pieces, run, info, here)
 

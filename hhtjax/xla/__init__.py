@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows seventeen functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows eighteen functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -43,6 +43,7 @@ The rest of the library knows seventeen functions of this room, and works as wel
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
+    or_alone(x)               x of a member of a batch, True where there is none
     row_written(x, row, i)    x with another row, each member of a batch its own
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
@@ -82,7 +83,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 from hhtjax.xla.explanation import Explanation, calls, explain
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.host import on_host
-from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, staged, structural
+from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
 from hhtjax.xla.recording import NotListed, listed
@@ -108,6 +109,7 @@ __all__ = [
     "on_host",
     "on_scalars",
     "one_kernel",
+    "or_alone",
     "or_plain",
     "plain",
     "polynomial_sines",

@@ -63,10 +63,23 @@ def explain(f, *args) -> Explanation:
     compiled = lowered.compile()
     seconds = time.perf_counter() - start
     off = f"plain: {why_off() or 'inside hhtjax.plain()'}"
-    found = re.findall(rf'{VERDICT} = "([^"]*)"|call @{LOOP}', lowered.as_text())
-    paths = tuple(verdict or off for verdict in found)
+    found = [re.findall(rf'{VERDICT} = "([^"]*)"|call @{LOOP}', text) for text in _called(lowered.as_text())]
+    paths = tuple(verdict or off for verdicts in found for verdict in verdicts)
     memory: Any = compiled.memory_analysis()
     return Explanation(paths, seconds, None if memory is None else memory.temp_size_in_bytes)
+
+
+def _called(text):
+    """Of a lowered program the functions that `main` calls, directly or not, as they stand there: of what became a
+    kernel the form before remains."""
+    found = re.findall(r"func\.func .*?@([^\s(]+)\((.*?)(?=func\.func |\Z)", text, re.DOTALL)
+    inside, reached, waiting = dict(found), set(), ["main"]
+    while waiting:
+        name = waiting.pop()
+        if name in inside and name not in reached:
+            reached.add(name)
+            waiting += re.findall(r"call @([^\s(]+)\(", inside[name])
+    return [inside[name] for name in inside if name in reached]
 
 
 def calls(names, f, *args):

@@ -17,15 +17,17 @@ from hhtjax.xla.gate import is_on
 
 # names of functions; autodiff and vmap keep them
 KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"
+AROUND = KERNEL + "_around"
 LOOP = "hhtjax_loop"  # where the machinery is off: a name for `explain` to find, and nothing else
 
 
-def one_kernel(f, *args):
+def one_kernel(f, *args, around=False):
     """f(*args) of pytrees of arrays, as one kernel where XLA can; the same values otherwise.
 
     Args:
         f: a function of pytrees of arrays.
         *args: these.
+        around: whether f has kernels of its own, which it keeps where it cannot be one: `explain` tells of these.
 
     Returns:
         f(*args).
@@ -37,9 +39,9 @@ def one_kernel(f, *args):
     6.0
     """
     if not is_on():
-        return named(LOOP, f)(*args)
+        return f(*args) if around else named(LOOP, f)(*args)
     f, constants = jax.closure_convert(f, *args)
-    return _watch(named(KERNEL, f)(*_watch(args), *_watch(constants)))
+    return _watch(named(AROUND if around else KERNEL, f)(*_watch(args), *_watch(constants)))
 
 
 def staged(f, size=None):
@@ -125,6 +127,24 @@ def largest_in_batch(x):
     return largest_p.bind(x)
 
 
+def or_alone(x):
+    """Whether a member of a batch goes on while others do; what is no member always does, and never chooses.
+
+    Args:
+        x: a boolean scalar, true where there is no batch.
+
+    Returns:
+        x, or, without vmap, True.
+
+    Raises:
+        TypeError: x is no array.
+
+    >>> print(or_alone(jnp.array(True)), jax.vmap(or_alone)(jnp.array([True, False])))
+    True [ True False]
+    """
+    return alone_p.bind(x)
+
+
 def named(name, f):
     """f as a function of this name in the program."""
 
@@ -157,6 +177,12 @@ largest_p = Primitive("hhtjax_largest_in_batch")
 largest_p.def_impl(lambda x: x)
 largest_p.def_abstract_eval(lambda x: x)
 batching.primitive_batchers[largest_p] = lambda values, axes: (largest_p.bind(jnp.max(values[0], axis=axes[0])), None)
+
+
+alone_p = Primitive("hhtjax_or_alone")
+alone_p.def_impl(lambda x: jnp.array(True))
+alone_p.def_abstract_eval(lambda x: x)
+batching.primitive_batchers[alone_p] = lambda values, axes: (values[0], axes[0])
 
 
 watch_p = Primitive("hhtjax_watch")

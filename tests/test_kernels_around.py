@@ -1,0 +1,53 @@
+"""Kernels with all that is around their loops; and what of a run is for batches only."""
+
+import re
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import SPRING, ZERO
+from linked_pendulums import on_cpu, paths
+
+import hhtjax
+from hhtjax.xla import kernels
+from hhtjax.xla.lowering import UNTOLD
+
+x = jnp.linspace(0.1, 1.0, 4)
+
+
+@on_cpu
+def test_a_kernel_around_others():
+    """It is one with what is around them, where it can be, and is told of by them alone."""
+
+    def around(f, x):
+        def whole(x):
+            return f(kernels.one_kernel(lambda x: 2 * x, x)) + 1
+
+        return kernels.one_kernel(whole, x, around=True)
+
+    for f, verdict in ((jnp.cos, "one kernel"), (jnp.sort, "plain: stablehlo.sort")):
+        assert f'{UNTOLD} = "{verdict}"' in jax.jit(partial(around, f)).lower(-x).as_text()
+        assert paths(partial(around, f), -x) == ("one kernel",)
+        np.testing.assert_allclose(jax.jit(partial(around, f))(-x), f(-2 * x) + 1, rtol=1e-15)
+
+
+@on_cpu
+@pytest.mark.parametrize("derivative", [lambda f: f, jax.grad])
+def test_a_controlled_run_is_two_kernels_with_all_that_is_around_its_loops(derivative):
+    def end(q):
+        dt = hhtjax.adaptive(1e-3, 1e-6, max_steps=100)
+        return hhtjax.simulate(SPRING, hhtjax.hht(), q[None], ZERO, dt=dt, times=np.ones(1)).q[-1, 0]
+
+    lowered = jax.jit(derivative(end)).lower(1.0).as_text()
+    assert re.findall(f'{UNTOLD} = "([^"]*)"', lowered).count("one kernel") >= 2
+    assert f'{UNTOLD} = "plain' not in lowered
+
+
+def test_who_is_alone_goes_on():
+    some = jnp.array([True, False])
+    assert jax.jit(kernels.or_alone)(False)
+    for batch in (jax.vmap(kernels.or_alone), jax.jit(jax.vmap(kernels.or_alone))):
+        assert batch(some).tolist() == some.tolist()
+    assert jax.vmap(jax.vmap(kernels.or_alone))(some[None]).tolist() == [some.tolist()]
