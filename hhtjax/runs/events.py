@@ -13,6 +13,7 @@ from hhtjax.runs.loop import first_failure
 from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events, unnoted
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
+from hhtjax.xla import in_turn
 
 
 def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False):
@@ -24,7 +25,7 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     stepper = stepper.astype(start.v.dtype)
     ways = Ways(flat, stepper, flatten_events(flat, events, params, stepper.redundant), max_events, loop.no_info, keep)
     met = before_any(ways, params)
-    met = met._replace(log=Log.empty(unnoted(start)[0], keep))
+    met = met._replace(log=Log.empty(unnoted(start)[0], keep, max_events + 1))
     if in_pieces:
         met = met._replace(pieces=Pieces.none(start, max_events + 1))
     step = past_events(ways, params, loop.bound, loop.sizes)
@@ -43,9 +44,24 @@ def past_events(ways, params, bound, sizes):
     def across(part, h, params):
         return pass_events(ways, params, part, h)
 
-    def meet(now, h, params):
-        part, (rows, there) = across(now[0], h, params)
-        return part, now[1].with_more(rows, there, ways.keep)
+    def meets(state, new, counts, ended, now, h):
+        """Whether there may be an event. counts: of steps, before and after; the same of a member that rests."""
+        asked = asks(ways, state, new, now, h)
+        if counts is not None:
+            asked = asked & (counts[0] != counts[1])
+        return asked & ~ended if any(events.ends) else asked
+
+    def meet(carry, h, params):
+        part, log = carry
+        part, (rows, there) = across(part, h, params)
+        return part, log.with_more(rows, there, ways.keep)
+
+    def meet_in_turn(carry, counts, h, params):
+        part, log = carry
+        now = events.with_modes(params, part.met.modes)
+        # anew: what this branch alone needs is nothing that a step without events has to keep
+        part = part._replace(asked=meets(part.start, part.end, counts, part.met.ended, now, h))
+        return in_turn(meet, part.asked, (part, log), h, params)
 
     def step(carry, here=None):
         *run, met = carry
@@ -57,14 +73,14 @@ def past_events(ways, params, bound, sizes):
             new, info = choose(met.ended, state, new), choose(met.ended, ways.no_info, info)
         # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
         new, count = at_rest(here, (new, count), (state, before))
-        asked = asks(ways, state, new, now, h)
-        for there in (here, ~met.ended if any(events.ends) else None):
-            asked = asked if there is None else asked & there
+        counts = None if here is None else (before, count)
+        asked = meets(state, new, counts, met.ended, now, h)
         if met.pieces is not None:
             begun = held.entered(ways.stepper, ways.flat, now, h, last, state)[1]
             met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new), met.pieces))
-        part = Part(state, new, info, h, last, met._replace(log=None), jnp.zeros_like(met.ended), asked)
-        part, log = if_any(meet, asked, (part, met.log), h, params)
+        none = jnp.zeros_like(met.ended)
+        part = Part(state, new, info, h, last, met._replace(log=None), none, none)
+        part, log = if_any(meet_in_turn, asked, (part, met.log), counts, h, params)
         told = first_failure(ways.flat, failure, count, part.end, part.info)
         return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
 

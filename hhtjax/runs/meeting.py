@@ -120,7 +120,8 @@ def pass_events(ways, params, part, h):
 
 def unnoted(s):
     """The row of no event, and that it is not there."""
-    return row_of(s.t, jnp.zeros((), jnp.int32), s.t, s.q, s.v, s.v), jnp.array(False)
+    row = row_of(s.t, jnp.zeros((), jnp.int32), s.t, s.q, s.v, s.v)
+    return jnp.full_like(row, jnp.nan), jnp.array(False)
 
 
 def meet_or_flag(ways, now, going, number, h, params):

@@ -140,6 +140,11 @@ def _watch(tree):
     return jax.tree.map(watch_p.bind, tree)  # integers too: all that is used of a run may be the number of its steps
 
 
+def _largest(x, axis):
+    """Of booleans by their sum: a loop over those LLVM writes out, number by number."""
+    return jnp.sum(x, axis=axis, dtype=int) > 0 if x.dtype == bool else jnp.max(x, axis=axis)
+
+
 inside_p = Primitive("hhtjax_inside")  # whether a kernel holds it; the operand keeps it where the choice is
 inside_p.def_impl(lambda x: jnp.array(False))
 inside_p.def_abstract_eval(lambda x: x.update(shape=(), dtype=np.dtype(bool), weak_type=False))
@@ -156,7 +161,7 @@ batching.defvectorized(structural_p)
 largest_p = Primitive("hhtjax_largest_in_batch")
 largest_p.def_impl(lambda x: x)
 largest_p.def_abstract_eval(lambda x: x)
-batching.primitive_batchers[largest_p] = lambda values, axes: (largest_p.bind(jnp.max(values[0], axis=axes[0])), None)
+batching.primitive_batchers[largest_p] = lambda values, axes: (largest_p.bind(_largest(values[0], axes[0])), None)
 
 
 watch_p = Primitive("hhtjax_watch")
