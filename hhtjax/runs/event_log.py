@@ -57,9 +57,10 @@ class Log(NamedTuple):
     def told(self, flat, keep):
         """As `Events`."""
         n, N, columns = flat.positions, flat.size, self.columns[:, :keep]
-        t, which, rate, *columns = jnp.split(columns, [1, 2, 3, 3 + n, 3 + n + N])
+        end = len(columns) - 2 * N  # of q, in which a rotation has nine numbers
+        t, which, rate, *columns = jnp.split(columns, [1, 2, 3, end, end + N])
         which = jnp.where(jnp.isnan(which[0]), -1, which[0]).astype(jnp.int32)
-        q, before, after = (x.T for x in columns)
+        q, before, after = (x.reshape(-1, 1) if len(x) == 1 else x.T for x in columns)  # no copy
         z = None if n in (0, N) else jax.vmap(flat.unravel_internal)(before[:, n:])
         q, unravel = (jax.vmap(flat.unravel)(q), flat.unravel_rates) if n else (None, flat.unravel)
         before, after = (jax.vmap(lambda v: unravel(flat.located(v) if n else v))(v) for v in (before, after))

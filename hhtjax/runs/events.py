@@ -74,7 +74,7 @@ def past_events(ways, params, bound, sizes):
         # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
         new, count = at_rest(here, (new, count), (state, before))
         counts = None if here is None else (before, count)
-        asked = meets(state, new, counts, met.ended, now, h)
+        asked = meets(state, new, None, met.ended, now, h)
         if met.pieces is not None:
             begun = held.entered(ways.stepper, ways.flat, now, h, last, state)[1]
             met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new), met.pieces))

@@ -117,13 +117,13 @@ class Inputs(NamedTuple):
             mesh = Mesh(mesh.devices.ravel(), ("members",))  # whatever its shape and its types of axes
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
-        lanes = lanes_for(self.size, are_alike(dts))
+        lanes = lanes_for(self.size, are_alike(dts), self.events is not None, 1 if mesh is None else mesh.size)
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
         return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
 
 
-def lanes_for(size, alike=False):
+def lanes_for(size, alike=False, events=False, hands=1):
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
     Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If all are

@@ -13,6 +13,7 @@ from jax.interpreters import ad, batching, mlir
 from hhtjax.xla.gate import is_on
 from hhtjax.xla.interpreter import alone, evaluate
 from hhtjax.xla.rows import place, write_p
+from hhtjax.xla.two_ways import no_tangent
 
 
 def in_turn(f, asked, carry, *more):
@@ -138,10 +139,7 @@ def _jvp(args, dots, *, closed, number):
         return _all_at_once(*now, closed=closed, number=number)
 
     after, found = jax.jvp(f, [args[i] for i in moving], [dots[i] for i in moving])
-    return after, [
-        ad.Zero.from_primal_value(x) if dot.dtype == jax.dtypes.float0 else dot
-        for x, dot in zip(after, found, strict=True)
-    ]
+    return after, [no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found]
 
 
 turn_p = Primitive("hhtjax_in_turn")
