@@ -22,7 +22,8 @@ from hhtjax.systems import held
 from hhtjax.xla import staged
 
 SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two events that are one
-ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations
+ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations, at most
+NEARLY = 1e-6  # part of a step, on the cubic, which itself is no nearer
 ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
 
 
@@ -168,13 +169,19 @@ def look(ways, part, params, h):
     touches = turns & (cubic(lowest) < 0)
     hit = touches | ((g1 <= 0) & ((g0 > 0) | ((d0 > 0) & ~rising & ~noted)))
 
-    def improve(_, ends):
-        low, high, x = ends
+    def improve(now):
+        low, high, x, _, k = now
         y, slope = cubic(x), d0 + x * (2 * a + x * 3 * b)
         low, high = jnp.where(y > 0, x, low), jnp.where(y > 0, high, x)
-        return low, high, improved(x, y, slope, low, high)
+        new = improved(x, y, slope, low, high)
+        return low, high, new, jnp.max(jnp.where(hit, jnp.abs(new - x), 0)), k + 1
 
-    *_, place = lax.fori_loop(0, ON_CUBIC, improve, (jnp.zeros_like(g0), lowest, lowest / 2))
+    def unfinished(now):
+        *_, change, k = now
+        return (change > NEARLY) & (k < ON_CUBIC)
+
+    first = jnp.zeros_like(g0), lowest, lowest / 2, jnp.full_like(part.rest, jnp.inf), 0
+    place = lax.while_loop(unfinished, improve, first)[2]
     stays = (g1 < 0) & ~hit & ~left & ~noted
     return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, jnp.abs(g0) + jnp.abs(g1))
 
