@@ -128,9 +128,15 @@ def lanes_for(size, alike=False, events=False, hands=1):
 
     Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If all are
     alike, they are no shorter than it takes for vector instructions: a batch of small systems takes half the time then.
+    A step with events holds shorter loops, which LLVM writes out if they are not twice as long: where no hand gets
+    more to do.
     """
     lanes = 1 << (size // BLOCKS).bit_length()
-    return min(LANES, max(lanes, VECTORS if alike and size >= 2 * VECTORS else 1))
+    if alike and size >= 2 * VECTORS:
+        lanes = max(lanes, VECTORS)
+        work, twice = (-(-size // (hands * x)) * x for x in (lanes, 2 * lanes))
+        lanes *= 2 if events and lanes == VECTORS and twice <= work else 1
+    return min(LANES, lanes)
 
 
 def are_alike(dts):

@@ -17,6 +17,7 @@ from hhtjax.xla.gate import is_on
 
 # names of functions; autodiff and vmap keep them
 KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"
+SUMMED = 32  # numbers
 LOOP = "hhtjax_loop"  # where the machinery is off: a name for `explain` to find, and nothing else
 
 
@@ -141,8 +142,13 @@ def _watch(tree):
 
 
 def _largest(x, axis):
-    """Of booleans by their sum: a loop over those LLVM writes out, number by number."""
-    return jnp.sum(x, axis=axis, dtype=int) > 0 if x.dtype == bool else jnp.max(x, axis=axis)
+    """Of booleans by their sum, of no more than SUMMED: LLVM writes those out, number by number."""
+    if x.dtype != bool:
+        return jnp.max(x, axis=axis)
+    x = jnp.moveaxis(x, axis, 0)
+    while len(x) > SUMMED and len(x) % 2 == 0:
+        x = x[: len(x) // 2] | x[len(x) // 2 :]
+    return jnp.sum(x, axis=0, dtype=int) > 0
 
 
 inside_p = Primitive("hhtjax_inside")  # whether a kernel holds it; the operand keeps it where the choice is
