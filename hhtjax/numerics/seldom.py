@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.hoisted import hoisted
-from hhtjax.xla import largest_in_batch
+from hhtjax.xla import in_turn, largest_in_batch
 
 
 def choose(where, x, y):
@@ -28,11 +28,27 @@ def seldom(f, asked, carry, *more):
     ([2.0, 0.0], [0.25, 1.0])
     """
 
+    return if_any(_careful(f, asked), asked, carry, *more)
+
+
+def seldom_alone(f, asked, carry, *more):
+    """The same, one member of a batch after the other, each as it is alone: for what is long, and few ask for at a time.
+
+    >>> import jax, jax.numpy as jnp
+    >>> print(jax.vmap(lambda x: seldom_alone(jnp.sqrt, x > 1, x))(jnp.array([4.0, 0.0])))
+    [2. 0.]
+    """
+    return if_any(partial(in_turn, _careful(f, asked), asked), asked, carry, *more)
+
+
+def _careful(f, asked):
+    """f, of which only members that have asked see anything."""
+
     def branch(carry, *more):
         known = choose(asked, (carry, more), lax.stop_gradient((carry, more)))
         return choose(asked, f(known[0], *known[1]), carry)
 
-    return if_any(branch, asked, carry, *more)
+    return branch
 
 
 def if_any(f, asked, carry, *more):

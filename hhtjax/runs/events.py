@@ -37,31 +37,8 @@ def past_events(ways, params, bound, sizes):
 
     bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
     """
-    events = ways.events
+    events, pass_them = ways.events, passing(ways)
     fixed = None if events.modes(params) else bound(params)
-
-    @checkpoint  # reverse mode would keep all that is in there for each step
-    def across(part, h, params):
-        return pass_events(ways, params, part, h)
-
-    def meets(state, new, counts, ended, now, h):
-        """Whether there may be an event. counts: of steps, before and after; the same of a member that rests."""
-        asked = asks(ways, state, new, now, h)
-        if counts is not None:
-            asked = asked & (counts[0] != counts[1])
-        return asked & ~ended if any(events.ends) else asked
-
-    def meet(carry, h, params):
-        part, log = carry
-        part, (rows, there) = across(part, h, params)
-        return part, log.with_more(rows, there, ways.keep)
-
-    def meet_in_turn(carry, counts, h, params):
-        part, log = carry
-        now = events.with_modes(params, part.met.modes)
-        # anew: what this branch alone needs is nothing that a step without events has to keep
-        part = part._replace(asked=meets(part.start, part.end, counts, part.met.ended, now, h))
-        return in_turn(meet, part.asked, (part, log), h, params)
 
     def step(carry, here=None):
         *run, met = carry
@@ -73,18 +50,46 @@ def past_events(ways, params, bound, sizes):
             new, info = choose(met.ended, state, new), choose(met.ended, ways.no_info, info)
         # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
         new, count = at_rest(here, (new, count), (state, before))
-        counts = None if here is None else (before, count)
-        asked = meets(state, new, None, met.ended, now, h)
         if met.pieces is not None:
             begun = held.entered(ways.stepper, ways.flat, now, h, last, state)[1]
             met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new), met.pieces))
-        none = jnp.zeros_like(met.ended)
-        part = Part(state, new, info, h, last, met._replace(log=None), none, none)
-        part, log = if_any(meet_in_turn, asked, (part, met.log), counts, h, params)
+        no = jnp.zeros_like(met.ended)
+        part = Part(state, new, info, h, last, met._replace(log=None), no, no)
+        counts = None if here is None else (before, count)
+        part, log = if_any(pass_them, may_meet(ways, part, h, params), (part, met.log), counts, h, params)
         told = first_failure(ways.flat, failure, count, part.end, part.info)
         return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
 
     return step
+
+
+def may_meet(ways, part, h, params):
+    """Whether there may be an event in a step."""
+    asked = asks(ways, part.start, part.end, ways.events.with_modes(params, part.met.modes), h)
+    return asked & ~part.met.ended if any(ways.events.ends) else asked
+
+
+def passing(ways):
+    """The function of a step and the log, with the counts of steps before and after it, that passes its events."""
+
+    @checkpoint  # reverse mode would keep all that is in there for each step
+    def across(part, h, params):
+        return pass_events(ways, params, part, h)
+
+    def noted(now, h, params):
+        part, log = now
+        part, (rows, there) = across(part, h, params)
+        return part, log.with_more(rows, there, ways.keep)
+
+    def pass_them(now, counts, h, params):
+        part, log = now
+        # who asks, anew: what is needed here alone is nothing that a step without events has to keep
+        asked = may_meet(ways, part, h, params)
+        if counts is not None:
+            asked = asked & (counts[0] != counts[1])  # members that do not rest
+        return in_turn(noted, asked, (part._replace(asked=asked), log), h, params)
+
+    return pass_them
 
 
 def at_rest(here, new, old):

@@ -40,20 +40,21 @@ def in_turn(f, asked, carry, *more):
     """
     if jax.default_backend() != "cpu" or not is_on():
         return f(carry, *more)
-    arguments, structure = jax.tree.flatten((carry, *more))
-    arguments = [jnp.asarray(x) for x in arguments]
-    like = jax.tree.structure(carry)
-    number = like.num_leaves
+    leaves, structure = jax.tree.flatten((carry, *more))
+    leaves = [jnp.asarray(x) for x in leaves]
+    like, count = jax.tree.structure(carry), len(leaves)
 
     def on_leaves(*leaves):
         after, found = jax.tree.flatten(f(*structure.unflatten(leaves)))
-        if found != like or any(x.shape != y.shape or x.dtype != y.dtype for x, y in zip(after, leaves, strict=False)):
-            raise TypeError(f"in_turn: a function is needed that returns what the carry is, {like}; it returns {found}.")
+        types = [[(x.shape, x.dtype) for x in map(jnp.asarray, xs)] for xs in (after, leaves[: like.num_leaves])]
+        if found != like or types[0] != types[1]:
+            raise TypeError(f"in_turn: the function returns {found} of {types[0]}; the carry is {like} of {types[1]}.")
         return after
 
-    trace = jax.make_jaxpr(on_leaves)(*arguments)
-    closed = _closed(lambda *x: eval_jaxpr(trace.jaxpr, x[len(arguments) :], *x[: len(arguments)]), *arguments, *trace.consts)
-    return like.unflatten(turn_p.bind(asked, *arguments, *trace.consts, closed=closed, number=number))
+    trace = jax.make_jaxpr(on_leaves)(*leaves)
+    leaves = [*leaves, *trace.consts]
+    closed = _closed(lambda *x: eval_jaxpr(trace.jaxpr, x[count:], *x[:count]), *leaves)
+    return like.unflatten(turn_p.bind(asked, *leaves, closed=closed, number=like.num_leaves))
 
 
 def _closed(f, *like):
@@ -145,7 +146,7 @@ def _jvp(args, dots, *, closed, number):
 turn_p = Primitive("hhtjax_in_turn")
 turn_p.multiple_results = True
 turn_p.def_impl(_all_at_once)
-turn_p.def_abstract_eval(lambda asked, *args, closed, number: closed.out_avals)
+turn_p.def_effectful_abstract_eval(lambda asked, *args, closed, number: (closed.out_avals, closed.effects))
 batching.primitive_batchers[turn_p] = _batch
 ad.primitive_jvps[turn_p] = _jvp
 mlir.register_lowering(turn_p, mlir.lower_fun(_all_at_once, multiple_results=True))
