@@ -51,9 +51,9 @@ def _careful(f, asked):
     return branch
 
 
-def if_any(f, asked, carry, *more):
-    """The same of an f that by itself leaves members alone that have not asked."""
-    return lax.cond(largest_in_batch(asked), f, lambda carry, *_: carry, carry, *more)
+def if_any(f, asked, carry, *more, kept=True):
+    """The same of an f that by itself leaves members alone that have not asked. kept: as of `largest_in_batch`."""
+    return lax.cond(largest_in_batch(asked, kept), f, lambda carry, *_: carry, carry, *more)
 
 
 def derivative_of(f, value):

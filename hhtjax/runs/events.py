@@ -56,7 +56,8 @@ def past_events(ways, params, bound, sizes):
         no = jnp.zeros_like(met.ended)
         part = Part(state, new, info, h, last, met._replace(log=None), no, no)
         counts = None if here is None else (before, count)
-        part, log = if_any(pass_them, may_meet(ways, part, h, params), (part, met.log), counts, h, params)
+        asked = may_meet(ways, part, h, params)
+        part, log = if_any(pass_them, asked, (part, met.log), counts, h, params, kept=False)
         told = first_failure(ways.flat, failure, count, part.end, part.info)
         return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
 

@@ -106,7 +106,7 @@ UNDERSTOOD = {
     },
     "hhtjax_in_turn": _of_any("closed", "number"),
     "hhtjax_structural": {},
-    "hhtjax_largest_in_batch": {},
+    "hhtjax_largest_in_batch": _of_any("kept"),
 }
 
 
