@@ -27,7 +27,6 @@ def seldom(f, asked, carry, *more):
     >>> [float(y) for y in jax.vmap(root)(jnp.array([4.0, 0.0]))], [float(jax.grad(root)(x)) for x in (4.0, 0.0)]
     ([2.0, 0.0], [0.25, 1.0])
     """
-
     return if_any(_careful(f, asked), asked, carry, *more)
 
 

@@ -115,6 +115,8 @@ def _cond(run, eqn, which, *values):
 
 def _in_turn(run, eqn, asked, *values):
     number, closed = eqn.params["number"], eqn.params["closed"]
+    if closed is not eqn.params["at_once"]:  # of a batch
+        return None
     (flat, back), (flat_more, back_more) = _layout(eqn.outvars), _layout(eqn.invars[1 + number :])
 
     def f(carry, more):

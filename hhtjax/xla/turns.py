@@ -54,7 +54,7 @@ def in_turn(f, asked, carry, *more):
     trace = jax.make_jaxpr(on_leaves)(*leaves)
     leaves = [*leaves, *trace.consts]
     closed = _closed(lambda *x: eval_jaxpr(trace.jaxpr, x[count:], *x[:count]), *leaves)
-    return like.unflatten(turn_p.bind(asked, *leaves, closed=closed, number=like.num_leaves))
+    return like.unflatten(turn_p.bind(asked, *leaves, closed=closed, at_once=closed, number=like.num_leaves))
 
 
 def _closed(f, *like):
@@ -62,7 +62,7 @@ def _closed(f, *like):
     return jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in map(jnp.asarray, like)))
 
 
-def _all_at_once(asked, *args, closed, number):
+def _evaluated(closed, *args):
     return eval_jaxpr(closed.jaxpr, closed.consts, *args)
 
 
@@ -73,28 +73,33 @@ class _Own(NamedTuple):
     member: Any
     number: int  # of the argument
 
-    def taken(self):
-        return lax.dynamic_index_in_dim(self.array, self.member, keepdims=False)
+
+def _taken(x):
+    """A member's number itself."""
+    return lax.dynamic_index_in_dim(x.array, x.member, keepdims=False) if isinstance(x, _Own) else x
 
 
 def _put(x, own):
     """The array of the batch, with what a member has now."""
     if isinstance(x, _Own) and x.number == own.number:
         return x.array
-    return lax.dynamic_update_index_in_dim(own.array, x.taken() if isinstance(x, _Own) else x, own.member, 0)
+    return lax.dynamic_update_index_in_dim(own.array, _taken(x), own.member, 0)
 
 
 def _apply(eqn, values):
     """The results of one operation; what is written into a member's own stays in its place."""
-    if eqn.primitive is write_p and isinstance(values[0], _Own) and eqn.params["members"] == 0:
-        own, block, number = values
+    own, *others = values or [None]
+    others = [_taken(x) for x in others]
+    if eqn.primitive is write_p and isinstance(own, _Own) and eqn.params["members"] == 0:
+        block, number = others
         at = place(own.member, number, block.ndim, eqn.params["axis"])
         return [own._replace(array=lax.dynamic_update_slice(own.array, block[None], at))]
-    return alone(eqn)(*(x.taken() if isinstance(x, _Own) else x for x in values))
+    return alone(eqn)(*map(_taken, values))
 
 
-def _one_by_one(asked, *args, closed, number, mapped):
-    """For each member that asks; mapped: which of the arguments differ between them."""
+def _one_by_one(closed, mapped, number, *args):
+    """For each member that asks, as the last argument says; mapped: which of the others differ between members."""
+    *args, asked = args
     numbers = jnp.arange(asked.size, dtype=jnp.int32)
 
     def next_from(i):
@@ -107,10 +112,10 @@ def _one_by_one(asked, *args, closed, number, mapped):
         after = evaluate(closed.jaxpr, [*closed.consts, *mine], _apply)
         return next_from(i + 1), [_put(x, own) for x, own in zip(after, mine[:number], strict=True)]
 
-    return lax.while_loop(lambda now: now[0] < asked.size, visit, (next_from(0), list(args[:number])))[1]
+    return lax.while_loop(lambda now: now[0] < asked.size, visit, (next_from(0), args[:number]))[1]
 
 
-def _batch(args, axes, *, closed, number):
+def _batch(args, axes, *, closed, at_once, number):
     """The carry differs between members, whatever else does."""
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
     mapped = [i < number or axis is not None for i, axis in enumerate(axes[1:])]
@@ -119,17 +124,19 @@ def _batch(args, axes, *, closed, number):
         jnp.broadcast_to(x, (size, *x.shape)) if own and axis is None else x
         for x, own, axis in zip(args, mapped, axes[1:], strict=True)
     ]
-    if axes[0] is None:
-        f = jax.vmap(partial(_all_at_once, None, closed=closed, number=number), [0 if own else None for own in mapped])
-        return turn_p.bind(asked, *args, closed=_closed(f, *args), number=number), [0] * number
 
-    def f(*x):
-        return _one_by_one(x[-1], *x[:-1], closed=closed, number=number, mapped=mapped)
+    def together(closed, *args):
+        return jax.vmap(partial(_evaluated, closed), [0 if own else None for own in mapped])(*args[: len(mapped)])
 
-    return turn_p.bind(jnp.any(asked), *args, asked, closed=_closed(f, *args, asked), number=number), [0] * number
+    values = partial(together, closed)
+    if axes[0] is not None:
+        args, asked = [*args, asked], jnp.any(asked)
+        values = partial(_one_by_one, closed, mapped, number)
+    forms = {"closed": _closed(values, *args), "at_once": _closed(partial(together, at_once), *args)}
+    return turn_p.bind(asked, *args, **forms, number=number), [0] * number
 
 
-def _jvp(args, dots, *, closed, number):
+def _jvp(args, dots, *, at_once, **params):
     """Of those that move."""
     moving = [i for i, dot in enumerate(dots) if type(dot) is not ad.Zero and dot.dtype != jax.dtypes.float0]
 
@@ -137,16 +144,21 @@ def _jvp(args, dots, *, closed, number):
         now = list(args)
         for i, x in zip(moving, moved, strict=True):
             now[i] = x
-        return _all_at_once(*now, closed=closed, number=number)
+        return _evaluated(at_once, *now[1:])
 
     after, found = jax.jvp(f, [args[i] for i in moving], [dots[i] for i in moving])
     return after, [no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found]
 
 
+def _values(asked, *args, closed, **params):
+    return _evaluated(closed, *args)
+
+
+# closed: the function; at_once: the same in the form of which derivatives are taken
 turn_p = Primitive("hhtjax_in_turn")
 turn_p.multiple_results = True
-turn_p.def_impl(_all_at_once)
-turn_p.def_effectful_abstract_eval(lambda asked, *args, closed, number: (closed.out_avals, closed.effects))
+turn_p.def_impl(_values)
+turn_p.def_effectful_abstract_eval(lambda *args, closed, **params: (closed.out_avals, closed.effects))
 batching.primitive_batchers[turn_p] = _batch
 ad.primitive_jvps[turn_p] = _jvp
-mlir.register_lowering(turn_p, mlir.lower_fun(_all_at_once, multiple_results=True))
+mlir.register_lowering(turn_p, mlir.lower_fun(_values, multiple_results=True))
