@@ -65,13 +65,14 @@ def test_a_block_is_written_along_an_axis(batches):
     number = numbers if batches else numbers[1]
     weights = jnp.asarray(rng.normal(size=g(array, block, number).shape))
 
-    def both(f):
-        return lambda x: (f(*x, number), jnp.sum(weights * f(*x, number) ** 2))
+    def modes(f):
+        def square(x):
+            return jnp.sum(weights * f(*x, number) ** 2)
 
-    for derivative in (lambda f: lambda x: f(x)[0], lambda f: jax.grad(lambda x: f(x)[1]), lambda f: jax.jacfwd(f)):
-        found, expected = (jax.tree.leaves(jax.jit(derivative(both(h)))((array, block))) for h in (f, g))
-        for x, y in zip(found, expected, strict=True):
-            np.testing.assert_allclose(x, y, rtol=1e-14)
+        return lambda x: (f(*x, number), jax.grad(square)(x), jax.jacfwd(square)(x))
+
+    for x, y in zip(*(jax.tree.leaves(jax.jit(modes(h))((array, block))) for h in (f, g)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-14)
 
 
 def test_a_block_that_does_not_fit():

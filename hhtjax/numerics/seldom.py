@@ -31,7 +31,7 @@ def seldom(f, asked, carry, *more):
 
 
 def seldom_alone(f, asked, carry, *more):
-    """The same, one member of a batch after the other, each as it is alone: for what is long, and few ask for at a time.
+    """The same, one member of a batch after the other, each as it is alone: for what is long, and seldom at one time.
 
     >>> import jax, jax.numpy as jnp
     >>> print(jax.vmap(lambda x: seldom_alone(jnp.sqrt, x > 1, x))(jnp.array([4.0, 0.0])))

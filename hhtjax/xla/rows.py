@@ -59,13 +59,14 @@ def block_written(array, block, number, axis=0):
     length = block.shape[axis] if block.ndim == array.ndim else 0
     if (*array.shape[:axis], length, *array.shape[axis + 1 :]) != block.shape or block.dtype != array.dtype:
         raise TypeError(
-            f"block_written: a part of {array.shape} along axis {axis} is needed; received {block.shape}, {block.dtype}."
+            f"block_written: a part of {array.shape} along axis {axis} is needed; "
+            f"received {block.shape}, {block.dtype}."
         )
     return write_p.bind(array, block, number, members=0, axis=axis)
 
 
 def _written(array, block, number, *, members, axis):
-    """Along an axis of what a member has; so many axes before are of members, with one number for all or each its own."""
+    """Along an axis of a member's; so many axes before are of members, with one number for all or one for each."""
     if not number.ndim:
         return lax.dynamic_update_slice_in_dim(array, block, number, members + axis)
     count, shape = math.prod(number.shape), array.shape[members:]

@@ -88,10 +88,8 @@ def _put(x, own):
 
 def _apply(eqn, values):
     """The results of one operation; what is written into a member's own stays in its place."""
-    own, *others = values or [None]
-    others = [_taken(x) for x in others]
-    if eqn.primitive is write_p and isinstance(own, _Own) and eqn.params["members"] == 0:
-        block, number = others
+    if eqn.primitive is write_p and isinstance(values[0], _Own) and eqn.params["members"] == 0:
+        own, block, number = values[0], *map(_taken, values[1:])
         at = place(own.member, number, block.ndim, eqn.params["axis"])
         return [own._replace(array=lax.dynamic_update_slice(own.array, block[None], at))]
     return alone(eqn)(*map(_taken, values))
