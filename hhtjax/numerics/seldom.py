@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.xla import in_turn, largest_in_batch
@@ -73,3 +74,30 @@ def derivative_of(f, value):
         return jax.jvp(f, x[1:], dx[1:])
 
     return call(in_value, in_f)
+
+
+def derivative_by(f, value, *args):
+    """value(*args), which is what f(*args) is, with the derivatives of f in those of the arguments that move.
+
+    >>> import jax
+    >>> print(jax.grad(lambda x: derivative_by(lambda x, y: x**y, lambda x, y: x * x, x, 2))(3.0))
+    6.0
+    """
+    leaves, structure = jax.tree.flatten(args)
+
+    @jax.custom_jvp
+    def call(leaves):
+        return value(*structure.unflatten(leaves))
+
+    @partial(call.defjvp, symbolic_zeros=True)
+    def _(primals, tangents):
+        (x,), (dots,) = primals, tangents
+        moving = [i for i, dot in enumerate(dots) if not isinstance(dot, SymbolicZero)]
+
+        def of_moving(moved):
+            new = dict(zip(moving, moved, strict=True))
+            return f(*structure.unflatten([new.get(i, old) for i, old in enumerate(x)]))
+
+        return jax.jvp(of_moving, ([x[i] for i in moving],), ([dots[i] for i in moving],))
+
+    return call(leaves)

@@ -23,7 +23,7 @@ from hhtjax.xla import staged
 
 SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two events that are one
 ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations, at most
-NEARLY = 1e-6  # part of a step, on the cubic, which itself is no nearer
+NEARLY = 1e-8  # part of a step: the next iteration would change a rounding
 ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
 
 

@@ -117,26 +117,29 @@ class Inputs(NamedTuple):
             mesh = Mesh(mesh.devices.ravel(), ("members",))  # whatever its shape and its types of axes
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
-        lanes = lanes_for(self.size, are_alike(dts), self.events is not None, 1 if mesh is None else mesh.size)
+        lanes = lanes_for(self.size, are_alike(dts))
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
         return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
 
 
-def lanes_for(size, alike=False, events=False, hands=1):
+def lanes_for(size, alike=False):
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
     Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If all are
     alike, they are no shorter than it takes for vector instructions: a batch of small systems takes half the time then.
-    A step with events holds shorter loops, which LLVM writes out if they are not twice as long: where no hand gets
-    more to do.
     """
     lanes = 1 << (size // BLOCKS).bit_length()
-    if alike and size >= 2 * VECTORS:
-        lanes = max(lanes, VECTORS)
-        work, twice = (-(-size // (hands * x)) * x for x in (lanes, 2 * lanes))
-        lanes *= 2 if events and lanes == VECTORS and twice <= work else 1
-    return min(LANES, lanes)
+    return min(LANES, max(lanes, VECTORS if alike and size >= 2 * VECTORS else 1))
+
+
+def wider(size, lanes, hands=1):
+    """Members in a block of a sweep with events: twice VECTORS in the place of these, if no hand gets more to do.
+
+    A step with events holds shorter loops, which LLVM writes out if they are no longer.
+    """
+    work, twice = (-(-size // (hands * x)) * x for x in (lanes, 2 * lanes))
+    return 2 * lanes if lanes == VECTORS and twice <= work else lanes
 
 
 def are_alike(dts):
