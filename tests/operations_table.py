@@ -192,6 +192,7 @@ TABLE = {
         *("lax.scan(lambda a, _: (jnp.sin(a), None), x, None, length=3)", "lax.map(lambda r: r @ x, X)", "lax.scan(lambda a, r: (a, r), x, e)"),
         *("steep(x)", "steep(x) * x", "steep(s)", "flat(x)", "flat(s) * s", "jax.nn.relu(x)", "jax.nn.softplus(x)", "jax.nn.silu(X)"),
         *("in_turn(lambda v: jnp.where(d, v * y, v), d, x)", "in_turn(lambda v, w: (v[0] * w, v[1]), n > 0, (x, i), y)"),
+        *("in_turn(lambda v: jnp.where(n > 0, v + n, v), n > 0, i)",),
         *("jax.vmap(lambda v, w: in_turn(lambda v: jnp.where(v > w, v * w, v), v > w, v))(x, y)",),
         *("jax.jit(lambda x, y: (x @ y, y))(x, y)", "jax.jit(jax.jit(lambda x: x[::-1]))(x)", "jax.jit(lambda: np.arange(3.0))() * x"),
         *("jax.checkpoint(lambda x: jnp.sin(x) * y)(x)", "jax.vmap(jnp.dot, (0, None))(X, x)", "jax.vmap(lambda k: x[k])(i)"),
