@@ -9,6 +9,7 @@ from jax import lax
 from jax.core import eval_jaxpr
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jax.interpreters import partial_eval as pe
 
 from hhtjax.xla.gate import is_on
 from hhtjax.xla.interpreter import alone, evaluate
@@ -59,7 +60,7 @@ def in_turn(f, asked, carry, *more):
 
 def _closed(f, *like):
     """The jaxpr of f, which closes over no tracer."""
-    return jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in map(jnp.asarray, like)))
+    return jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in like))
 
 
 def _evaluated(closed, *args):
@@ -148,6 +149,36 @@ def _jvp(args, dots, *, at_once, **params):
     return after, [no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found]
 
 
+def _needed(used, eqn):
+    """Without what nobody uses of the carry, and what only that is made from."""
+    if eqn.effects:
+        return [True] * len(eqn.invars), eqn
+    if not any(used):
+        return [False] * len(eqn.invars), None
+    params, forms = eqn.params, ("closed", "at_once")
+    inputs = [pe.dce_jaxpr(params[form].jaxpr, used)[1] for form in forms]
+    carry = [i for i, x in enumerate(used) if x]
+    places = carry + [i for i, x in enumerate(map(max, *inputs)) if x and i not in carry]
+    kept = [eqn.invars[1 + i] for i in places]
+
+    def of(closed):
+        pruned, _ = pe.dce_jaxpr(closed.jaxpr, used, instantiate=True)
+
+        def f(*args):
+            given = dict(zip(places, args, strict=True))
+            nobody = (jnp.zeros(x.shape, x.dtype) for x in closed.in_avals)
+            return eval_jaxpr(pruned, closed.consts, *(given.get(i, x) for i, x in enumerate(nobody)))
+
+        return _closed(f, *(x.aval for x in kept))
+
+    new = dict.fromkeys(forms, of(params["closed"]))
+    if params["at_once"] is not params["closed"]:
+        new["at_once"] = of(params["at_once"])
+    outvars = [eqn.outvars[i] for i in carry]
+    new = eqn.replace(invars=[eqn.invars[0], *kept], outvars=outvars, params={**new, "number": len(carry)})
+    return [True, *(i in places for i in range(len(eqn.invars) - 1))], new
+
+
 def _values(asked, *args, closed, **params):
     return _evaluated(closed, *args)
 
@@ -159,4 +190,5 @@ turn_p.def_impl(_values)
 turn_p.def_effectful_abstract_eval(lambda *args, closed, **params: (closed.out_avals, closed.effects))
 batching.primitive_batchers[turn_p] = _batch
 ad.primitive_jvps[turn_p] = _jvp
+pe.dce_rules[turn_p] = _needed
 mlir.register_lowering(turn_p, mlir.lower_fun(_values, multiple_results=True))
