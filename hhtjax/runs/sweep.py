@@ -111,7 +111,8 @@ def sweep(
             raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
         return sweep_chosen(inputs, progress)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
-    lanes = keywords["lanes"] if events is None else wider(inputs.size, keywords["lanes"], mesh.size if mesh else 1)
+    lanes, hands = keywords["lanes"], 1 if mesh is None else mesh.size
+    lanes = lanes if events is None else wider(inputs.size, lanes, hands)
     runs = partial(run_sweep, **keywords)
     if lanes == keywords["lanes"]:
         return or_plain(partial(runs, *arguments))
