@@ -151,6 +151,7 @@ def _closed(jaxpr):
 CALLS = {
     **{"cond": _cond, "while": _while, "scan": _scan, "custom_linear_solve": _solve},
     **{"jit": _called("jaxpr"), "closed_call": _called("call_jaxpr"), "checkpoint": _called("jaxpr")},
+    "hhtjax_in_turn": lambda self, params, asked, *values: self(params["closed"], *values),
     **{"custom_jvp_call": _called("call_jaxpr"), "custom_vjp_call": _called("call_jaxpr")},
 }
 

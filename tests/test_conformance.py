@@ -16,6 +16,7 @@ from zoo import each
 
 from hhtjax.xla import gate, linear_maps, parameters, scalar_calls, scalar_rules
 from hhtjax.xla.kernels import largest_in_batch, staged, structural
+from hhtjax.xla.turns import in_turn
 
 pytestmark = [
     pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX"),
@@ -28,7 +29,7 @@ SIGNS_OF_XLA = ("z + 0.0", "0.0 + z", "z - -0.0", "fill_value=-0.0")
 
 def scope():
     known = {"lax": lax, "jnp": jnp, "np": np, "jax": jax, "staged": staged, "structural": structural}
-    known |= {"largest_in_batch": largest_in_batch}
+    known |= {"largest_in_batch": largest_in_batch, "in_turn": in_turn}
     exec(HEADER, known)
     return known
 

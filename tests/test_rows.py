@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from hhtjax.xla import gate, largest_in_batch, one_kernel, row_written
+from hhtjax.xla import block_written, gate, largest_in_batch, one_kernel, row_written
 
 BATCHES = {  # axes of array, row and number, the inner batch first
     "one": [],
@@ -43,6 +43,41 @@ def test_a_row_is_written(batches):
         found, known = (derivative(lambda x, f=f: jnp.sum(weights * f(*x, number) ** 2))((array, row)) for f in (f, g))
         for x, y in zip(found, known, strict=True):
             np.testing.assert_allclose(x, y, rtol=1e-14)
+
+
+@pytest.mark.parametrize("batches", [[], [(0, 0, 0)], [(0, None, 0), (1, 0, None)]], ids=["one", "a batch", "two"])
+def test_a_block_is_written_along_an_axis(batches):
+    """Into columns, of which those beyond the last are the last."""
+
+    def known(array, block, number):
+        columns = jnp.arange(5, dtype=number.dtype) - jnp.minimum(number, 3)
+        return jnp.where(columns == 0, block[:, :1], jnp.where(columns == 1, block[:, 1:], array))
+
+    f, g, numbers = lambda *args: block_written(*args, axis=1), known, jnp.array([0, 4, 2], jnp.int32)
+    shapes = [[3, 5], [3, 2]]
+    for axes in batches:
+        f, g = jax.vmap(f, axes), jax.vmap(g, axes)
+    if batches:
+        shapes[0][:0] = [3] if len(batches) == 1 else [3, 2]
+        shapes[1][:0] = [3] if len(batches) == 1 else [2]
+    rng = np.random.default_rng(0)
+    array, block = (jnp.asarray(rng.normal(size=shape)) for shape in shapes)
+    number = numbers if batches else numbers[1]
+    weights = jnp.asarray(rng.normal(size=g(array, block, number).shape))
+
+    def modes(f):
+        def square(x):
+            return jnp.sum(weights * f(*x, number) ** 2)
+
+        return lambda x: (f(*x, number), jax.grad(square)(x), jax.jacfwd(square)(x))
+
+    for x, y in zip(*(jax.tree.leaves(jax.jit(modes(h))((array, block))) for h in (f, g)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-14)
+
+
+def test_a_block_that_does_not_fit():
+    with pytest.raises(TypeError, match="block_written: a part of"):
+        block_written(jnp.zeros((4, 3)), jnp.zeros((2, 3)), jnp.zeros((), jnp.int32), axis=1)
 
 
 def test_numbers_have_no_tangents():

@@ -5,9 +5,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.hoisted import hoisted
-from hhtjax.xla import largest_in_batch
+from hhtjax.xla import in_turn, largest_in_batch
 
 
 def choose(where, x, y):
@@ -27,17 +28,32 @@ def seldom(f, asked, carry, *more):
     >>> [float(y) for y in jax.vmap(root)(jnp.array([4.0, 0.0]))], [float(jax.grad(root)(x)) for x in (4.0, 0.0)]
     ([2.0, 0.0], [0.25, 1.0])
     """
+    return if_any(_careful(f, asked), asked, carry, *more)
+
+
+def seldom_alone(f, asked, carry, *more):
+    """The same, one member of a batch after the other, each as it is alone: for what is long, and seldom at one time.
+
+    >>> import jax, jax.numpy as jnp
+    >>> print(jax.vmap(lambda x: seldom_alone(jnp.sqrt, x > 1, x))(jnp.array([4.0, 0.0])))
+    [2. 0.]
+    """
+    return if_any(partial(in_turn, _careful(f, asked), asked), asked, carry, *more)
+
+
+def _careful(f, asked):
+    """f, of which only members that have asked see anything."""
 
     def branch(carry, *more):
         known = choose(asked, (carry, more), lax.stop_gradient((carry, more)))
         return choose(asked, f(known[0], *known[1]), carry)
 
-    return if_any(branch, asked, carry, *more)
+    return branch
 
 
-def if_any(f, asked, carry, *more):
-    """The same of an f that by itself leaves members alone that have not asked."""
-    return lax.cond(largest_in_batch(asked), f, lambda carry, *_: carry, carry, *more)
+def if_any(f, asked, carry, *more, kept=True):
+    """The same of an f that by itself leaves members alone that have not asked. kept: as of `largest_in_batch`."""
+    return lax.cond(largest_in_batch(asked, kept), f, lambda carry, *_: carry, carry, *more)
 
 
 def derivative_of(f, value):
@@ -58,3 +74,30 @@ def derivative_of(f, value):
         return jax.jvp(f, x[1:], dx[1:])
 
     return call(in_value, in_f)
+
+
+def derivative_by(f, value, *args):
+    """value(*args), which is what f(*args) is, with the derivatives of f in those of the arguments that move.
+
+    >>> import jax
+    >>> print(jax.grad(lambda x: derivative_by(lambda x, y: x**y, lambda x, y: x * x, x, 2))(3.0))
+    6.0
+    """
+    leaves, structure = jax.tree.flatten(args)
+
+    @jax.custom_jvp
+    def call(leaves):
+        return value(*structure.unflatten(leaves))
+
+    @partial(call.defjvp, symbolic_zeros=True)
+    def _(primals, tangents):
+        (x,), (dots,) = primals, tangents
+        moving = [i for i, dot in enumerate(dots) if not isinstance(dot, SymbolicZero)]
+
+        def of_moving(moved):
+            new = dict(zip(moving, moved, strict=True))
+            return f(*structure.unflatten([new.get(i, old) for i, old in enumerate(x)]))
+
+        return jax.jvp(of_moving, ([x[i] for i in moving],), ([dots[i] for i in moving],))
+
+    return call(leaves)

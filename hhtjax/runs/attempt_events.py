@@ -11,7 +11,7 @@ from functools import partial, reduce
 import jax
 import jax.numpy as jnp
 
-from hhtjax.numerics.seldom import choose, seldom
+from hhtjax.numerics.seldom import choose, seldom_alone
 from hhtjax.runs.attempt import AT_EVENT, BROKEN, NOT_FINITE, TOO_SHORT, Trial, Try, sizes, succeeded
 from hhtjax.runs.event_failures import FINE, MANY
 from hhtjax.runs.loop import neutral_info, resized_step
@@ -39,7 +39,7 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
 def past_events(trial, tried, walk, h):
     """The try, past the events in its step."""
     asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, trial.params_of(walk), h)
-    return seldom(partial(passed, trial), asked, tried, walk, h)
+    return seldom_alone(partial(passed, trial), asked, tried, walk, h)
 
 
 def passed(trial, tried, walk, h):

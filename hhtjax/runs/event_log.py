@@ -4,10 +4,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from hhtjax.description.presentation import shown
-from hhtjax.xla import largest_in_batch, row_written
+from hhtjax.xla import block_written
 
 WHOLE = 65  # numbers, at least: an array of fewer would be taken to pieces
 
@@ -38,39 +37,34 @@ class Events(NamedTuple):
 
 
 class Log(NamedTuple):
-    """The events met so far, on vectors: how many, a row of numbers for each that is kept, and one for all others."""
+    """The events met so far, on vectors: how many, and a column of numbers for each that is kept, NaN beyond, and for
+    those of one step more, of which nothing is told."""
 
     count: Any
-    rows: Any
+    columns: Any
 
     @classmethod
-    def empty(cls, like, keep):
-        """Room for so many rows like this one."""
-        number = max(keep + 1, -(-WHOLE // like.size))
-        return cls(jnp.zeros((), jnp.int32), jnp.full((number, like.size), jnp.nan, like.dtype))
+    def empty(cls, like, keep, at_once):
+        """Room for so many columns like this one, and for so many in a step."""
+        number = max(keep + at_once, -(-WHOLE // like.size))
+        return cls(jnp.zeros((), jnp.int32), jnp.full((like.size, number), jnp.nan, like.dtype))
 
     def with_more(self, rows, there, keep):
-        """With those of the rows that are there, as long as there is room. What is written moves nothing else."""
-
-        def enter(log, more):
-            row, there = more
-            return lax.cond(largest_in_batch(there), write, lambda log, *_: log, log, row, there), None
-
-        def write(log, row, there):
-            number = jnp.where(there & (log.count < keep), log.count, keep)
-            return Log(log.count + there.astype(log.count.dtype), row_written(log.rows, row, number))
-
-        return lax.scan(enter, self, (rows, there))[0]
+        """With the first of these, as many as are there, as long as there is room; the others are NaN."""
+        columns = block_written(self.columns, rows.T, jnp.minimum(self.count, keep), axis=1)
+        return Log(self.count + jnp.sum(there, dtype=self.count.dtype), columns)
 
     def told(self, flat, keep):
         """As `Events`."""
-        n, N, rows = flat.positions, flat.size, self.rows[:keep]
-        q, before, after = jnp.split(rows[:, 3:], [rows.shape[1] - 3 - 2 * N, rows.shape[1] - 3 - N], axis=1)
-        t, which, rate = rows[:, 0], jnp.where(jnp.isnan(rows[:, 1]), -1, rows[:, 1]).astype(jnp.int32), rows[:, 2]
+        n, N, columns = flat.positions, flat.size, self.columns[:, :keep]
+        end = len(columns) - 2 * N  # of q, in which a rotation has nine numbers
+        t, which, rate, *columns = jnp.split(columns, [1, 2, 3, end, end + N])
+        which = jnp.where(jnp.isnan(which[0]), -1, which[0]).astype(jnp.int32)
+        q, before, after = (x.reshape(-1, 1) if len(x) == 1 else x.T for x in columns)  # no copy
         z = None if n in (0, N) else jax.vmap(flat.unravel_internal)(before[:, n:])
         q, unravel = (jax.vmap(flat.unravel)(q), flat.unravel_rates) if n else (None, flat.unravel)
         before, after = (jax.vmap(lambda v: unravel(flat.located(v) if n else v))(v) for v in (before, after))
-        return Events(self.count, t, which, q, before, after, z, rate)
+        return Events(self.count, t[0], which, q, before, after, z, rate[0])
 
 
 def row_of(t, which, rate, q, before, after):

@@ -13,6 +13,7 @@ from hhtjax.runs.loop import first_failure
 from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events, unnoted
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
+from hhtjax.xla import in_turn
 
 
 def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False):
@@ -24,7 +25,7 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     stepper = stepper.astype(start.v.dtype)
     ways = Ways(flat, stepper, flatten_events(flat, events, params, stepper.redundant), max_events, loop.no_info, keep)
     met = before_any(ways, params)
-    met = met._replace(log=Log.empty(unnoted(start)[0], keep))
+    met = met._replace(log=Log.empty(unnoted(start)[0], keep, max_events + 1))
     if in_pieces:
         met = met._replace(pieces=Pieces.none(start, max_events + 1))
     step = past_events(ways, params, loop.bound, loop.sizes)
@@ -36,16 +37,8 @@ def past_events(ways, params, bound, sizes):
 
     bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
     """
-    events = ways.events
+    events, pass_them = ways.events, passing(ways)
     fixed = None if events.modes(params) else bound(params)
-
-    @checkpoint  # reverse mode would keep all that is in there for each step
-    def across(part, h, params):
-        return pass_events(ways, params, part, h)
-
-    def meet(now, h, params):
-        part, (rows, there) = across(now[0], h, params)
-        return part, now[1].with_more(rows, there, ways.keep)
 
     def step(carry, here=None):
         *run, met = carry
@@ -57,18 +50,47 @@ def past_events(ways, params, bound, sizes):
             new, info = choose(met.ended, state, new), choose(met.ended, ways.no_info, info)
         # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
         new, count = at_rest(here, (new, count), (state, before))
-        asked = asks(ways, state, new, now, h)
-        for there in (here, ~met.ended if any(events.ends) else None):
-            asked = asked if there is None else asked & there
         if met.pieces is not None:
             begun = held.entered(ways.stepper, ways.flat, now, h, last, state)[1]
             met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new), met.pieces))
-        part = Part(state, new, info, h, last, met._replace(log=None), jnp.zeros_like(met.ended), asked)
-        part, log = if_any(meet, asked, (part, met.log), h, params)
+        no = jnp.zeros_like(met.ended)
+        part = Part(state, new, info, h, last, met._replace(log=None), no, no)
+        counts = None if here is None else (before, count)
+        asked = may_meet(ways, part, h, params)
+        part, log = if_any(pass_them, asked, (part, met.log), counts, h, params, kept=False)
         told = first_failure(ways.flat, failure, count, part.end, part.info)
         return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
 
     return step
+
+
+def may_meet(ways, part, h, params):
+    """Whether there may be an event in a step."""
+    asked = asks(ways, part.start, part.end, ways.events.with_modes(params, part.met.modes), h)
+    return asked & ~part.met.ended if any(ways.events.ends) else asked
+
+
+def passing(ways):
+    """The function of a step and the log, with the counts of steps before and after it, that passes its events."""
+
+    @checkpoint  # reverse mode would keep all that is in there for each step
+    def across(part, h, params):
+        return pass_events(ways, params, part, h)
+
+    def noted(now, h, params):
+        part, log = now
+        part, (rows, there) = across(part, h, params)
+        return part, log.with_more(rows, there, ways.keep)
+
+    def pass_them(now, counts, h, params):
+        part, log = now
+        # who asks, anew: what is needed here alone is nothing that a step without events has to keep
+        asked = may_meet(ways, part, h, params)
+        if counts is not None:
+            asked = asked & (counts[0] != counts[1])  # members that do not rest
+        return in_turn(noted, asked, (part._replace(asked=asked), log), h, params)
+
+    return pass_them
 
 
 def at_rest(here, new, old):

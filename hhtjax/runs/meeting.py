@@ -22,7 +22,8 @@ from hhtjax.systems import held
 from hhtjax.xla import staged
 
 SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two events that are one
-ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations
+ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations, at most
+NEARLY = 1e-8  # part of a step: the next iteration would change a rounding
 ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
 
 
@@ -75,12 +76,12 @@ class Found(NamedTuple):
 
 
 def asks(ways, s, s1, params, h):
-    """Whether an event may fall into the step from s to s1: no more than a look at both ends."""
+    """Whether an event may fall into the step from s to s1: no more than a look at both ends, in few operations."""
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in lax.stop_gradient((s, s1)))
     noted = jnp.asarray(ways.events.noted)
     below = (g1 <= 0) & (~noted | (g0 > 0))
     cross_below = g0 * (d1 - d0) <= d0 * (g1 - g0 - d1 * h)  # tangents at both ends; a division is dear
-    return jnp.any(below | (falls_and_rises(g0, d0, g1, d1) & cross_below))
+    return jnp.any(below | ((d0 < 0) & (d1 > 0) & cross_below))
 
 
 def falls_and_rises(g0, d0, g1, d1):
@@ -120,7 +121,8 @@ def pass_events(ways, params, part, h):
 
 def unnoted(s):
     """The row of no event, and that it is not there."""
-    return row_of(s.t, jnp.zeros((), jnp.int32), s.t, s.q, s.v, s.v), jnp.array(False)
+    row = row_of(s.t, jnp.zeros((), jnp.int32), s.t, s.q, s.v, s.v)
+    return jnp.full_like(row, jnp.nan), jnp.array(False)
 
 
 def meet_or_flag(ways, now, going, number, h, params):
@@ -167,13 +169,19 @@ def look(ways, part, params, h):
     touches = turns & (cubic(lowest) < 0)
     hit = touches | ((g1 <= 0) & ((g0 > 0) | ((d0 > 0) & ~rising & ~noted)))
 
-    def improve(_, ends):
-        low, high, x = ends
+    def improve(now):
+        low, high, x, _, k = now
         y, slope = cubic(x), d0 + x * (2 * a + x * 3 * b)
         low, high = jnp.where(y > 0, x, low), jnp.where(y > 0, high, x)
-        return low, high, improved(x, y, slope, low, high)
+        new = improved(x, y, slope, low, high)
+        return low, high, new, jnp.max(jnp.where(hit, jnp.abs(new - x), 0)), k + 1
 
-    *_, place = lax.fori_loop(0, ON_CUBIC, improve, (jnp.zeros_like(g0), lowest, lowest / 2))
+    def unfinished(now):
+        *_, change, k = now
+        return (change > NEARLY) & (k < ON_CUBIC)
+
+    first = jnp.zeros_like(g0), lowest, lowest / 2, jnp.full_like(part.rest, jnp.inf), 0
+    place = lax.while_loop(unfinished, improve, first)[2]
     stays = (g1 < 0) & ~hit & ~left & ~noted
     return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, jnp.abs(g0) + jnp.abs(g1))
 

@@ -8,12 +8,13 @@ import numpy as np
 from jax import lax
 from jax.sharding import NamedSharding, PartitionSpec
 
+from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.loop import show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
-from hhtjax.runs.sweep_inputs import Inputs
+from hhtjax.runs.sweep_inputs import Inputs, wider
 from hhtjax.runs.sweep_member import run_member
 from hhtjax.xla import or_plain
 
@@ -110,7 +111,13 @@ def sweep(
             raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
         return sweep_chosen(inputs, progress)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
-    return or_plain(partial(run_sweep, *arguments, **keywords))
+    lanes, hands = keywords["lanes"], 1 if mesh is None else mesh.size
+    lanes = lanes if events is None else wider(inputs.size, lanes, hands)
+    runs = partial(run_sweep, **keywords)
+    if lanes == keywords["lanes"]:
+        return or_plain(partial(runs, *arguments))
+    # derivatives keep many states, of so many members more than a cache holds
+    return or_plain(partial(derivative_by, runs, partial(runs, lanes=lanes), *arguments))
 
 
 @partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))

@@ -133,6 +133,15 @@ def lanes_for(size, alike=False):
     return min(LANES, max(lanes, VECTORS if alike and size >= 2 * VECTORS else 1))
 
 
+def wider(size, lanes, hands=1):
+    """Members in a block of a sweep with events: twice VECTORS in the place of these, if no hand gets more to do.
+
+    A step with events holds shorter loops, which LLVM writes out if they are no longer.
+    """
+    work, twice = (-(-size // (hands * x)) * x for x in (lanes, 2 * lanes))
+    return 2 * lanes if lanes == VECTORS and twice <= work else lanes
+
+
 def are_alike(dts):
     """Whether members are known to take about as many steps."""
     return is_concrete(dts) and float(np.max(dts)) <= ALIKE * float(np.min(dts))

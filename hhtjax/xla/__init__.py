@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows eighteen functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows twenty functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -43,8 +43,10 @@ The rest of the library knows eighteen functions of this room, and works as well
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
+    in_turn(f, asked, x)      f(x), of which a batch visits only members that ask
     or_alone(x)               x of a member of a batch, True where there is none
     row_written(x, row, i)    x with another row, each member of a batch its own
+    block_written(x, y, i)    the same of a part along an axis
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
@@ -87,9 +89,10 @@ from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, s
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
 from hhtjax.xla.recording import NotListed, listed
-from hhtjax.xla.rows import row_written
+from hhtjax.xla.rows import block_written, row_written
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
+from hhtjax.xla.turns import in_turn
 from hhtjax.xla.two_ways import TwoWays, derivative, together
 
 __all__ = [
@@ -99,10 +102,12 @@ __all__ = [
     "NotListed",
     "Scalar",
     "TwoWays",
+    "block_written",
     "calls",
     "choose",
     "derivative",
     "explain",
+    "in_turn",
     "largest_in_batch",
     "linear_map",
     "listed",

@@ -18,6 +18,7 @@ from hhtjax.xla.gate import is_on
 # names of functions; autodiff and vmap keep them
 KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"
 AROUND = KERNEL + "_around"
+WRITTEN_OUT = 32  # numbers of a sum in a loop, one after the other
 LOOP = "hhtjax_loop"  # where the machinery is off: a name for `explain` to find, and nothing else
 
 
@@ -104,7 +105,7 @@ def structural(x):
     return structural_p.bind(x) if is_on() else jnp.asarray(x)
 
 
-def largest_in_batch(x):
+def largest_in_batch(x, kept=True):
     """The scalar x; under vmap the largest over the members, the same for all of them.
 
     A bound of a loop that is the same for all, or a condition: of a condition of their own vmap makes a choice, and
@@ -113,6 +114,7 @@ def largest_in_batch(x):
 
     Args:
         x: an integer or boolean scalar.
+        kept: False for a boolean that nothing else needs.
 
     Returns:
         A scalar, which vmap gives no axis.
@@ -124,7 +126,7 @@ def largest_in_batch(x):
     >>> print(seldom(jnp.array([1.0, -2.0])))
     [1. 0.]
     """
-    return largest_p.bind(x)
+    return largest_p.bind(x, kept=kept)
 
 
 def or_alone(x):
@@ -160,6 +162,16 @@ def _watch(tree):
     return jax.tree.map(watch_p.bind, tree)  # integers too: all that is used of a run may be the number of its steps
 
 
+def _largest(values, axes, kept):
+    """By halves and a sum where the booleans of a batch are in no array, which has instructions of its own."""
+    x = jnp.moveaxis(values[0], axes[0], 0)
+    if kept:
+        return largest_p.bind(jnp.max(x, axis=0), kept=kept), None
+    while len(x) > WRITTEN_OUT and len(x) % 2 == 0:
+        x = x[: len(x) // 2] | x[len(x) // 2 :]
+    return largest_p.bind(jnp.sum(x, axis=0, dtype=int) > 0, kept=kept), None
+
+
 inside_p = Primitive("hhtjax_inside")  # whether a kernel holds it; the operand keeps it where the choice is
 inside_p.def_impl(lambda x: jnp.array(False))
 inside_p.def_abstract_eval(lambda x: x.update(shape=(), dtype=np.dtype(bool), weak_type=False))
@@ -174,9 +186,9 @@ batching.defvectorized(structural_p)
 
 
 largest_p = Primitive("hhtjax_largest_in_batch")
-largest_p.def_impl(lambda x: x)
-largest_p.def_abstract_eval(lambda x: x)
-batching.primitive_batchers[largest_p] = lambda values, axes: (largest_p.bind(jnp.max(values[0], axis=axes[0])), None)
+largest_p.def_impl(lambda x, kept: x)
+largest_p.def_abstract_eval(lambda x, kept: x)
+batching.primitive_batchers[largest_p] = _largest
 
 
 alone_p = Primitive("hhtjax_or_alone")

@@ -237,5 +237,5 @@ uncached: Any = {"cacheable": False} if is_possible else {}
 mlir.register_lowering(watch_p, _lower, **uncached)
 mlir.register_lowering(inside_p, _lower_inside, **uncached)
 mlir.register_lowering(structural_p, lambda ctx, x: [x])
-mlir.register_lowering(largest_p, lambda ctx, x: [x])
+mlir.register_lowering(largest_p, lambda ctx, x, kept: [x])
 mlir.register_lowering(alone_p, lambda ctx, x: [mlir.ir_constant(np.bool_(True))])

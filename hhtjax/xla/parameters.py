@@ -104,8 +104,9 @@ UNDERSTOOD = {
         **dict.fromkeys(("in_layouts", "out_layouts"), _no_layout),
         **{"ctx_mesh": lambda mesh: mesh.empty, "compiler_options_kvs": _empty},
     },
+    "hhtjax_in_turn": _of_any("closed", "at_once", "number"),
     "hhtjax_structural": {},
-    "hhtjax_largest_in_batch": {},
+    "hhtjax_largest_in_batch": _of_any("kept"),
 }
 
 

@@ -15,6 +15,7 @@ from hhtjax.xla.interpreter import alone
 from hhtjax.xla.kernels import STAGED
 from hhtjax.xla.pieces import arranged, as_scalar, each, is_in_pieces, is_known, is_small
 from hhtjax.xla.sharing import in_stages
+from hhtjax.xla.turns import in_turn
 
 
 def _call(run, eqn, *values):
@@ -112,6 +113,18 @@ def _cond(run, eqn, which, *values):
     return back_results(lax.switch(which.item(), [branch(closed) for closed in eqn.params["branches"]], *flat(values)))
 
 
+def _in_turn(run, eqn, asked, *values):
+    number, closed = eqn.params["number"], eqn.params["closed"]
+    if closed is not eqn.params["at_once"]:  # of a batch
+        return None
+    (flat, back), (flat_more, back_more) = _layout(eqn.outvars), _layout(eqn.invars[1 + number :])
+
+    def f(carry, more):
+        return flat(run(closed, [*back(carry), *back_more(more)]))
+
+    return back(in_turn(f, asked.item(), flat(values[:number]), flat_more(values[number:])))
+
+
 def _custom_linear_solve(run, eqn, *values):
     lengths, closed = eqn.params["const_lengths"], eqn.params["jaxprs"]
     flat, back = _layout(eqn.outvars)
@@ -159,6 +172,7 @@ def _custom_jvp_call(run, eqn, *values):
 
 CALLS = {
     "cond": _cond,
+    "hhtjax_in_turn": _in_turn,
     "jit": _call,
     "while": _while_loop,
     "custom_linear_solve": _custom_linear_solve,

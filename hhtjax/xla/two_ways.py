@@ -110,10 +110,10 @@ def _values(*x, f):
 def _jvp_by(function, args, dots, **params):
     """Found by autodiff."""
     found = jax.jvp(partial(function, **params), args, tuple(map(_instantiated, args, dots)))
-    return found[0], [_no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found[1]]
+    return found[0], [no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found[1]]
 
 
-def _no_tangent(x):
+def no_tangent(x):
     """Zero, of a value or of a tangent."""
     dtype = x.dtype if jnp.issubdtype(x.dtype, jnp.inexact) else jax.dtypes.float0
     return ad.Zero(ShapedArray(x.shape, dtype))
@@ -125,7 +125,7 @@ def _jvp_of_both(args, dots, ways, count):
     if all(type(dot) is ad.Zero for dot in dots[:count]):
         moves = map(ad.instantiate_zeros, dots[count:])
         changes = linear_p.bind(*args[:count], *moves, ways=ways, count=count, backwards=False)
-        return out, [*(_no_tangent(x) for x in out[: ways.number]), *changes]
+        return out, [*(no_tangent(x) for x in out[: ways.number]), *changes]
     return out, _jvp_by(_both, args, dots, ways=ways._replace(forward=ways.slow), count=count)[1]
 
 
