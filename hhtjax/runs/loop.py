@@ -178,7 +178,13 @@ def failure_of(known, count, info, failure):
     for i, x in reversed(known):
         fine = jnp.all(jnp.isfinite(x))
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
-    failed, newton, row, left, friction = ~finite | told_failure(info), finite, failure.row, failure.solve, failure.friction
+    failed, newton, row, left, friction = (
+        ~finite | told_failure(info),
+        finite,
+        failure.row,
+        failure.solve,
+        failure.friction,
+    )
     if info.dependent_row is not None:
         newton = newton & (info.dependent_row == 0)
     if info.solved is not None:

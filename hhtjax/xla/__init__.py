@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows seventeen functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows nineteen functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -54,6 +54,8 @@ The rest of the library knows seventeen functions of this room, and works as wel
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
+    alone(run, inside)        run(), compiled with options such as WIDE, or inside() in a jit of the user's
+    wide_pays()               whether WIDE vectors are there
 
 The contract
 ------------
@@ -80,7 +82,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 """
 
 from hhtjax.xla.explanation import Explanation, calls, explain
-from hhtjax.xla.gate import or_plain, plain
+from hhtjax.xla.gate import WIDE, alone, or_plain, plain, wide_pays
 from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, staged, structural
 from hhtjax.xla.linear_maps import linear_map
@@ -93,11 +95,13 @@ from hhtjax.xla.two_ways import TwoWays, derivative, together
 
 __all__ = [
     "RANGE",
+    "WIDE",
     "Explanation",
     "Listing",
     "NotListed",
     "Scalar",
     "TwoWays",
+    "alone",
     "calls",
     "choose",
     "derivative",
@@ -115,6 +119,7 @@ __all__ = [
     "staged",
     "structural",
     "together",
+    "wide_pays",
 ]
 
 
