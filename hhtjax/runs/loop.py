@@ -115,7 +115,7 @@ def resting(advance, by_itself, run, info, here):
     """The run and what is known of it after a step, or, not `here`, without. by_itself: whether `advance` can rest."""
     after, more = advance(run, here) if by_itself else advance(run)
     info = choose(here, join_info(info, more), info)
-    return after if by_itself else if_any(lambda after, run: choose(here, after, run), ~here, after, run), info
+    return after if by_itself else if_any(partial(choose, here), ~here, after, run), info
 
 
 def saved(flat, state):
@@ -154,44 +154,33 @@ def first_failure(flat, failure, count, state, info):
     _, *values, _ = saved(flat, state)
     known = [(i, x) for i, x in enumerate(values) if x is not None]
     known.sort(key=lambda x: x[0] < INTERNAL_STATE)
-    note = partial(failure_of, known, count, info)
-    # one number tells that all is well; one that is too large for it is not
+    # a sum that is finite tells that all are; where it is not, look closer
     suspect = ~jnp.isfinite(sum(jnp.sum(x) for _, x in known)) | told_failure(info)
-    return if_any(note, suspect & (failure.step == 0), failure)
+    return if_any(partial(failure_of, known, count, info), suspect & (failure.step == 0), failure)
 
 
 def told_failure(info):
     """Whether a step says by itself that it failed."""
-    failed = jnp.array(False)
-    if info.converged is not None:
-        failed = failed | ~info.converged
-    if info.dependent_row is not None:
-        failed = failed | (info.dependent_row > 0)
-    if info.solved is not None:
-        failed = failed | ~info.solved
+    failed = jnp.array(False) if info.dependent_row is None else info.dependent_row > 0
+    for well in (info.converged, info.solved):
+        failed = failed if well is None else failed | ~well
     return failed
 
 
 def failure_of(known, count, info, failure):
-    """The same, looked at quantity by quantity."""
+    """The same, from each quantity by itself, [(number, array)]."""
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
     for i, x in reversed(known):
         fine = jnp.all(jnp.isfinite(x))
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
-    failed, newton, row, left, friction = (
-        ~finite | told_failure(info),
-        finite,
-        failure.row,
-        failure.solve,
-        failure.friction,
-    )
+    newton, row, left, friction = finite, failure.row, failure.solve, failure.friction
     if info.dependent_row is not None:
         newton = newton & (info.dependent_row == 0)
     if info.solved is not None:
         newton = newton & info.solved
     if info.friction is not None:
         newton = newton & is_settled(info.friction)
-    first = failed & (failure.step == 0)
+    first = (~finite | told_failure(info)) & (failure.step == 0)
     if info.dependent_row is not None:
         row = jnp.where(first, info.dependent_row, failure.row)
     if info.solved is not None:

@@ -62,8 +62,7 @@ def polynomial_sines(x, stage=lambda f: f):
     >>> [round(float(y), 6) for y in polynomial_sines(jnp.asarray(jnp.pi / 6))]
     [0.5, 0.866025]
     """
-    r, k = stage(_reduced)(x)
-    sine, cosine = stage(_near_zero)(r)
+    k, sine, cosine = _of_quarter(x, stage)
     odd, second_half = _is_odd(k), _is_odd(lax.floor(k / 2))
     sine, cosine = lax.select(odd, cosine, sine), lax.select(odd, sine, cosine)
     sine, cosine = lax.select(second_half, -sine, sine), lax.select(odd != second_half, -cosine, cosine)
@@ -71,14 +70,19 @@ def polynomial_sines(x, stage=lambda f: f):
 
 
 def _sines_by_bits(x, stage):
-    """The same, with half the operations after the polynomials: the bits of k, instead of its halves. What lists
-    operations, or evaluates them on scalars, knows no bits."""
-    r, k = stage(_reduced)(x)
-    sine, cosine = stage(_near_zero)(r)
+    """The same by the bits of k: half the operations after the polynomials. Where operations are listed, or evaluated
+    on scalars, there are no bits."""
+    k, sine, cosine = _of_quarter(x, stage)
     bits = _bits(k + ONES)
     odd = lax.ne(bits & 1, jnp.int64(0))
     sine, cosine = lax.select(odd, cosine, sine), lax.select(odd, sine, cosine)
     return lax.select(x == 0, x, _with_sign(sine, bits)), _with_sign(cosine, bits + 1)
+
+
+def _of_quarter(x, stage):
+    """k, sin r and cos r."""
+    r, k = stage(_reduced)(x)
+    return k, *stage(_near_zero)(r)
 
 
 def _reduced(x):
@@ -99,8 +103,11 @@ def _is_odd(k):
 
 
 def _polynomial(coefficients, z):
-    """Horner's scheme."""
-    return reduce(lambda value, c: c + z * value, reversed(coefficients))
+    """Horner's scheme; of a single number, with nothing to do beside it, Estrin's, which waits less."""
+    if z.ndim:
+        return reduce(lambda value, c: c + z * value, reversed(coefficients))
+    a, b, c, d, e, f = coefficients
+    return (a + b * z) + z * z * ((c + d * z) + z * z * (e + f * z))
 
 
 def _bits(x):
