@@ -9,7 +9,7 @@ import pytest
 import zoo
 
 import hhtjax
-from hhtjax.runs.sweep import run_sweep, run_sweep_wide
+from hhtjax.runs.sweep import run_sweep
 from hhtjax.scenes import pendulum
 
 ONE, ZERO = np.ones(1), np.zeros(1)
@@ -87,17 +87,12 @@ def test_equal_distances_give_what_duration_and_number_give():
         np.testing.assert_allclose(getattr(runs, name), getattr(equal, name), atol=1e-10)
 
 
-def programs():
-    """Number of compiled ones."""
-    return run_sweep._cache_size() + run_sweep_wide._cache_size()
-
-
 def test_times_are_data():
     sweep(dts=DTS, times=TIMES)
-    compiled = programs()
+    compiled = run_sweep.number()
     for times in ([3, 4, 5, 6, 9], jnp.asarray(TIMES), TIMES.astype(np.float32)):
         sweep(dts=DTS, times=times)
-    assert programs() == compiled
+    assert run_sweep.number() == compiled
 
 
 def test_the_work_is_about_the_sum_over_the_members():

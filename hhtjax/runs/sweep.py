@@ -15,7 +15,7 @@ from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.runs.sweep_member import run_member
-from hhtjax.xla import WIDE, alone, or_plain
+from hhtjax.xla import Programs, or_plain
 
 
 def sweep(
@@ -110,11 +110,10 @@ def sweep(
             raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
         return sweep_chosen(inputs, progress)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
-    first, inside = (partial(program, *arguments, **keywords) for program in (program_of(inputs), run_sweep))
-    return or_plain(partial(alone, first, inside))
+    return or_plain(partial(run_sweep, inputs.unknowns(), *arguments, **keywords))
 
 
-def _run(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
+def _run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
     """The sweep of `Inputs`, compiled."""
     dtype = jax.tree.leaves(data[1])[0].dtype
     dts, duration, t0, times = jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), (dts, duration, t0, times))
@@ -159,13 +158,7 @@ def _run(system, data, dts, duration, t0, times, events, *, mapped, num_samples,
 
 
 STATIC = "mapped", "num_samples", "lanes", "mesh", "progress", "room"
-run_sweep = jax.jit(_run, static_argnames=STATIC)
-run_sweep_wide = jax.jit(_run, static_argnames=STATIC, compiler_options=WIDE)
-
-
-def program_of(inputs):
-    """Of the two the faster one, outside of other jits."""
-    return run_sweep_wide if inputs.is_small() else run_sweep
+run_sweep = Programs(_run_sweep, static_argnames=STATIC)
 
 
 def _by_many(hand, mesh):

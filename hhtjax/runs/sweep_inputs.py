@@ -23,12 +23,10 @@ from hhtjax.steppers.stepper import require_capable, require_stepper, require_sy
 from hhtjax.systems.consistent import distances, examine, require_consistent
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.rubbing import require_independent_friction
-from hhtjax.xla import wide_pays
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 VECTORS = 32  # members, of fewer of which LLVM often writes loops out, one member after the other
 NUMBERS = 4095  # in the matrices of a block; more are slower, and may keep XLA from making one kernel of the steps
-SMALL = 8  # coordinates; loops over a few more than these are no faster, or slower, with vectors of eight numbers
 ALIKE = 1.5  # times the number of steps
 NAMES = "stepper", "q0", "v0", "params", "z0"  # of what may differ
 
@@ -114,10 +112,6 @@ class Inputs(NamedTuple):
     def unknowns(self):
         """Number of coordinates of a member."""
         return sum(jnp.size(x) for x in jax.tree.leaves(_member(self.data, self.mapped, 0)[1]))
-
-    def is_small(self):
-        """Whether wide vectors pay: loops over members, and none over nine to fifteen coordinates, their remainder."""
-        return self.unknowns() <= SMALL and wide_pays()
 
     def call(self, mesh=None, progress=False):
         """The arguments of `run_sweep`."""

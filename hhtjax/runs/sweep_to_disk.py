@@ -15,7 +15,7 @@ import numpy as np
 from hhtjax.checks import require_integer
 from hhtjax.description import VERSION, is_concrete
 from hhtjax.runs.adaptive import Adaptive
-from hhtjax.runs.sweep import program_of
+from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.xla import or_plain
 
@@ -85,7 +85,7 @@ def sweep_to_disk(
     folder, size = Path(folder), inputs.dts.size
     places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
     arguments, keywords = inputs.chunk(places[0]).call()
-    program = program_of(inputs)
+    program = run_sweep.of(inputs.unknowns())
     lowered = program.lower(*arguments, **keywords)
     _claim(folder, _manifest(inputs, lowered, chunk, len(places)))
     compiled = None

@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows nineteen functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows eighteen functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -54,8 +54,7 @@ The rest of the library knows nineteen functions of this room, and works as well
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
-    alone(run, inside)        run(), compiled with options such as WIDE, or inside() in a jit of the user's
-    wide_pays()               whether WIDE vectors are there
+    Programs(f)               f, compiled with WIDE vectors where that pays
 
 The contract
 ------------
@@ -82,7 +81,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 """
 
 from hhtjax.xla.explanation import Explanation, calls, explain
-from hhtjax.xla.gate import WIDE, alone, or_plain, plain, wide_pays
+from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, staged, structural
 from hhtjax.xla.linear_maps import linear_map
@@ -92,6 +91,7 @@ from hhtjax.xla.rows import row_written
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
 from hhtjax.xla.two_ways import TwoWays, derivative, together
+from hhtjax.xla.vectors import WIDE, Programs
 
 __all__ = [
     "RANGE",
@@ -99,9 +99,9 @@ __all__ = [
     "Explanation",
     "Listing",
     "NotListed",
+    "Programs",
     "Scalar",
     "TwoWays",
-    "alone",
     "calls",
     "choose",
     "derivative",
@@ -119,7 +119,6 @@ __all__ = [
     "staged",
     "structural",
     "together",
-    "wide_pays",
 ]
 
 

@@ -10,8 +10,6 @@ import jax
 VARIABLE = "HHTJAX_PLAIN"  # 1: off; 0: on, also with a JAX newer than those tested
 OLDEST = 0, 10, 2  # the first JAX in which this works; older ones abort, or lose constants of the calls
 NEWEST = 0, 10, 2  # the last one with which the conformance tests have passed
-WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits, where the processor has them; XLA takes 256 by default
-
 is_possible = jax.__version_info__ >= OLDEST
 # part of the key under which JAX keeps a compiled function, so that both forms of it can be there
 _plain = jax.make_user_context(default_value=False) if is_possible else None
@@ -76,37 +74,6 @@ def or_plain(run: Callable, again: Callable | None = None):
         stacklevel=3,
     )
     return result
-
-
-def wide_pays():
-    """Whether a program of loops over members may ask for WIDE vectors: on the CPU, with the machinery."""
-    return is_on() and jax.default_backend() == "cpu"
-
-
-def alone(run, inside):
-    """run(), a program with options of its own for the compiler; inside(), the same without, in a jit of the user's.
-
-    Args:
-        run, inside: functions without arguments.
-
-    Returns:
-        What one of them returns.
-
-    Raises:
-        whatever they raise.
-
-    >>> import jax.numpy as jnp
-    >>> twice = lambda x: 2 * x
-    >>> wide = jax.jit(twice, compiler_options=WIDE)
-    >>> float(jax.jit(lambda x: alone(lambda: wide(x), lambda: twice(x)))(3.0))
-    6.0
-    """
-    try:
-        return run()
-    except ValueError as error:
-        if "compiler_options" not in str(error):
-            raise
-    return inside()
 
 
 def why_off():
