@@ -121,11 +121,12 @@ def simulate(
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room}
         unknowns = sum(map(jnp.size, jax.tree.leaves(problem.q0)))
-        return or_plain(partial(_program, unknowns, problem, refined(dt, k), events, **sizes, progress=progress))
+        return or_plain(partial(_simulate, unknowns, problem, refined(dt, k), events, **sizes, progress=progress))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
+@partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room"))
 def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
     flat, q, v, t0, params = problem.flat()
     dt = jnp.asarray(dt).astype(q.dtype)
@@ -164,6 +165,3 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
     flaw = flaw_at_start(problem.system, flat, start, params)
     solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution
-
-
-_program = Programs(_simulate, static_argnames=("num_steps", "save_every", "progress", "room"))

@@ -113,7 +113,8 @@ def sweep(
     return or_plain(partial(run_sweep, inputs.unknowns(), *arguments, **keywords))
 
 
-def _run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
+@partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
+def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
     """The sweep of `Inputs`, compiled."""
     dtype = jax.tree.leaves(data[1])[0].dtype
     dts, duration, t0, times = jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), (dts, duration, t0, times))
@@ -155,10 +156,6 @@ def _run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_sa
         times = t0 + H * jnp.arange(num_samples + 1).astype(dtype)
     ends = any(event.terminal for event in events or ())  # then each has times of its own
     return runs if ends else runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))
-
-
-STATIC = "mapped", "num_samples", "lanes", "mesh", "progress", "room"
-run_sweep = Programs(_run_sweep, static_argnames=STATIC)
 
 
 def _by_many(hand, mesh):

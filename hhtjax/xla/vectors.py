@@ -9,7 +9,7 @@ import jax
 from hhtjax.xla.gate import is_on
 
 WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits; where a processor has none so long, nothing changes
-MOST_UNKNOWNS = 8  # loops over some more unknowns than this, and not over members, take up to twice the time
+MOST_UNKNOWNS = 4  # loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
 
 
 class Programs:
