@@ -4,6 +4,8 @@ A batch of double pendulums then takes half the time. It is an option for the co
 start here. Inside a jit of the user's those of that jit hold: `jax.jit(f, compiler_options=hhtjax.xla.WIDE)`.
 """
 
+from typing import Any
+
 import jax
 
 from hhtjax.xla.gate import is_on
@@ -22,8 +24,8 @@ class Programs:
 
     def __init__(self, f, **static):
         """static: of `jax.jit`."""
-        self.usual = jax.jit(f, **static)
-        self.wide = jax.jit(f, compiler_options=WIDE, **static)
+        self.usual: Any = jax.jit(f, **static)
+        self.wide: Any = jax.jit(f, compiler_options=WIDE, **static)
 
     def of(self, unknowns):
         """The one that is faster for a system of so many unknowns."""
