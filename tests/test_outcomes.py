@@ -1,6 +1,7 @@
 """What a run says about failed steps, and that all its arguments may be tracers."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,8 @@ from zoo import STEPPERS
 
 import hhtjax
 from hhtjax import SimulationError, System
+from hhtjax.runs.loop import first_failure, no_failure
+from hhtjax.steppers.stepper import Info, State
 
 
 def push(q, v, t, params):
@@ -60,6 +63,14 @@ def test_check_names_the_first_step_that_is_not_finite(force, name):
 def test_check_is_silent_when_all_is_well():
     assert run().check() is None
     assert jax.vmap(lambda q0: run(q0=q0))(jnp.ones((3, 1))).check() is None
+
+
+@pytest.mark.parametrize(("q", "step"), [([1e308, 1e308], 0), ([jnp.inf, -jnp.inf], 3), ([jnp.nan, 0.0], 3)])
+def test_numbers_with_a_sum_too_large_are_no_failure(q, step):
+    state = State(jnp.zeros(()), jnp.array(q), jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
+    flat, count = SimpleNamespace(positions=2, size=2), jnp.asarray(3, jnp.int32)
+    noted = first_failure(flat, no_failure(Info()), count, state, Info())
+    assert (noted.step, noted.newton) == (step, False)
 
 
 def test_check_names_the_bad_member_of_a_batch():

@@ -56,9 +56,9 @@ def test_members_of_one_block_rest_when_they_are_done():
 
 def test_new_values_are_not_compiled_anew():
     sweep(PARAMS)
-    compiled = run_sweep._cache_size()
+    compiled = run_sweep.number()
     sweep({"k": 9.0, "c": 0.3}, dts=DTS[::-1] / 7, duration=2.0, t0=1.0)
-    assert run_sweep._cache_size() == compiled
+    assert run_sweep.number() == compiled
 
 
 @pytest.mark.slow

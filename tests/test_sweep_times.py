@@ -89,10 +89,10 @@ def test_equal_distances_give_what_duration_and_number_give():
 
 def test_times_are_data():
     sweep(dts=DTS, times=TIMES)
-    compiled = run_sweep._cache_size()
+    compiled = run_sweep.number()
     for times in ([3, 4, 5, 6, 9], jnp.asarray(TIMES), TIMES.astype(np.float32)):
         sweep(dts=DTS, times=times)
-    assert run_sweep._cache_size() == compiled
+    assert run_sweep.number() == compiled
 
 
 def test_the_work_is_about_the_sum_over_the_members():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from jax import lax
 
-from hhtjax.runs.sweep_inputs import wider
 from hhtjax.xla import block_written, gate, in_turn, one_kernel
 
 pytestmark = pytest.mark.skipif(not gate.is_on(), reason="with this JAX all go at once")
@@ -111,8 +110,3 @@ def test_a_kernel_copies_nothing_that_is_written_into():
     _, columns, count = program(x, columns)
     assert count.tolist() == [2, 3, 3]
     np.testing.assert_array_equal(jnp.sum(columns > 0, axis=2), jnp.stack([count, count], axis=1))
-
-
-def test_blocks_are_wider_where_no_hand_gets_more_to_do():
-    assert [wider(size, 32) for size in (64, 65, 96, 97, 128)] == [64, 32, 32, 64, 64]
-    assert (wider(64, 32, hands=2), wider(128, 32, hands=2), wider(1024, 64)) == (32, 64, 64)

@@ -8,13 +8,12 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description.presentation import overwrite
-from hhtjax.numerics.seldom import choose
+from hhtjax.numerics.seldom import choose, if_any
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_law import is_settled
 from hhtjax.steppers.stepper import Info, join_info, public
 from hhtjax.systems import held
 from hhtjax.systems.matrices import mass_flaw
-from hhtjax.xla import staged
 
 
 class Loop(NamedTuple):
@@ -116,7 +115,7 @@ def resting(advance, by_itself, run, info, here):
     """The run and what is known of it after a step, or, not `here`, without. by_itself: whether `advance` can rest."""
     after, more = advance(run, here) if by_itself else advance(run)
     info = choose(here, join_info(info, more), info)
-    return after if by_itself else choose(here, after, run), info
+    return after if by_itself else if_any(partial(choose, here), ~here, after, run), info
 
 
 def saved(flat, state):
@@ -155,20 +154,33 @@ def first_failure(flat, failure, count, state, info):
     _, *values, _ = saved(flat, state)
     known = [(i, x) for i, x in enumerate(values) if x is not None]
     known.sort(key=lambda x: x[0] < INTERNAL_STATE)
-    checks = staged(lambda values: [jnp.all(jnp.isfinite(x)) for x in values])([x for _, x in known])
+    # a sum that is finite tells that all are; where it is not, look closer
+    suspect = ~jnp.isfinite(sum(jnp.sum(x) for _, x in known)) | told_failure(info)
+    return if_any(partial(failure_of, known, count, info), suspect & (failure.step == 0), failure)
+
+
+def told_failure(info):
+    """Whether a step says by itself that it failed."""
+    failed = jnp.array(False) if info.dependent_row is None else info.dependent_row > 0
+    for well in (info.converged, info.solved):
+        failed = failed if well is None else failed | ~well
+    return failed
+
+
+def failure_of(known, count, info, failure):
+    """The same, from each quantity by itself, [(number, array)]."""
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
-    for (i, _), fine in reversed(list(zip(known, checks, strict=True))):
+    for i, x in reversed(known):
+        fine = jnp.all(jnp.isfinite(x))
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
-    failed, newton, row, left, friction = ~finite, finite, failure.row, failure.solve, failure.friction
-    if info.converged is not None:
-        failed = failed | ~info.converged
+    newton, row, left, friction = finite, failure.row, failure.solve, failure.friction
     if info.dependent_row is not None:
-        failed, newton = failed | (info.dependent_row > 0), newton & (info.dependent_row == 0)
+        newton = newton & (info.dependent_row == 0)
     if info.solved is not None:
-        failed, newton = failed | ~info.solved, newton & info.solved
+        newton = newton & info.solved
     if info.friction is not None:
         newton = newton & is_settled(info.friction)
-    first = failed & (failure.step == 0)
+    first = (~finite | told_failure(info)) & (failure.step == 0)
     if info.dependent_row is not None:
         row = jnp.where(first, info.dependent_row, failure.row)
     if info.solved is not None:

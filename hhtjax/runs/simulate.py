@@ -19,7 +19,7 @@ from hhtjax.runs.problem import Problem
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import on_scalars, one_kernel, or_plain
+from hhtjax.xla import Programs, on_scalars, one_kernel, or_plain
 
 
 def simulate(
@@ -120,12 +120,13 @@ def simulate(
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room}
-        return or_plain(partial(_simulate, problem, refined(dt, k), events, **sizes, progress=progress))
+        unknowns = sum(map(jnp.size, jax.tree.leaves(problem.q0)))
+        return or_plain(partial(_simulate, unknowns, problem, refined(dt, k), events, **sizes, progress=progress))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
-@partial(jax.jit, static_argnames=("num_steps", "save_every", "progress", "room"))
+@partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room"))
 def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
     flat, q, v, t0, params = problem.flat()
     dt = jnp.asarray(dt).astype(q.dtype)

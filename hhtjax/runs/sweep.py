@@ -14,9 +14,9 @@ from hhtjax.runs.loop import show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
-from hhtjax.runs.sweep_inputs import Inputs, wider
+from hhtjax.runs.sweep_inputs import VECTORS, Inputs
 from hhtjax.runs.sweep_member import run_member
-from hhtjax.xla import or_plain
+from hhtjax.xla import Programs, or_plain
 
 
 def sweep(
@@ -111,16 +111,14 @@ def sweep(
             raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
         return sweep_chosen(inputs, progress)
     arguments, keywords = inputs.call(mesh=mesh, progress=progress)
-    lanes, hands = keywords["lanes"], 1 if mesh is None else mesh.size
-    lanes = lanes if events is None else wider(inputs.size, lanes, hands)
-    runs = partial(run_sweep, **keywords)
-    if lanes == keywords["lanes"]:
+    runs = partial(run_sweep, inputs.unknowns(), **keywords)
+    if events is None or keywords["lanes"] <= VECTORS:
         return or_plain(partial(runs, *arguments))
     # derivatives keep many states, of so many members more than a cache holds
-    return or_plain(partial(derivative_by, runs, partial(runs, lanes=lanes), *arguments))
+    return or_plain(partial(derivative_by, partial(runs, lanes=VECTORS), runs, *arguments))
 
 
-@partial(jax.jit, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
+@partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
 def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
     """The sweep of `Inputs`, compiled."""
     dtype = jax.tree.leaves(data[1])[0].dtype

@@ -26,6 +26,7 @@ from hhtjax.systems.rubbing import require_independent_friction
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 VECTORS = 32  # members, of fewer of which LLVM often writes loops out, one member after the other
+NUMBERS = 4095  # in the matrices of a block; more are slower, and may keep XLA from making one kernel of the steps
 ALIKE = 1.5  # times the number of steps
 NAMES = "stepper", "q0", "v0", "params", "z0"  # of what may differ
 
@@ -108,6 +109,10 @@ class Inputs(NamedTuple):
         dts = self.dts[members]
         return self._replace(data=_member(self.data, self.mapped, members), dts=dts, size=dts.size)
 
+    def unknowns(self):
+        """Number of coordinates of a member."""
+        return sum(jnp.size(x) for x in jax.tree.leaves(_member(self.data, self.mapped, 0)[1]))
+
     def call(self, mesh=None, progress=False):
         """The arguments of `run_sweep`."""
         if mesh is not None and not isinstance(mesh, Mesh):
@@ -117,29 +122,29 @@ class Inputs(NamedTuple):
             mesh = Mesh(mesh.devices.ravel(), ("members",))  # whatever its shape and its types of axes
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
-        lanes = lanes_for(self.size, are_alike(dts))
+        hands = 1 if mesh is None else mesh.size
+        lanes = lanes_for(self.size, least_lanes(self.size, self.unknowns(), hands) if are_alike(dts) else 1)
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
         return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
 
 
-def lanes_for(size, alike=False):
+def lanes_for(size, least=1):
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
     Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If all are
-    alike, they are no shorter than it takes for vector instructions: a batch of small systems takes half the time then.
+    alike, they are no shorter than `least`.
     """
-    lanes = 1 << (size // BLOCKS).bit_length()
-    return min(LANES, max(lanes, VECTORS if alike and size >= 2 * VECTORS else 1))
+    return min(LANES, max(1 << (size // BLOCKS).bit_length(), least))
 
 
-def wider(size, lanes, hands=1):
-    """Members in a block of a sweep with events: twice VECTORS in the place of these, if no hand gets more to do.
-
-    A step with events holds shorter loops, which LLVM writes out if they are no longer.
-    """
-    work, twice = (-(-size // (hands * x)) * x for x in (lanes, 2 * lanes))
-    return 2 * lanes if lanes == VECTORS and twice <= work else lanes
+def least_lanes(size, unknowns, hands=1):
+    """Of members that are alike: as many as vector instructions are fast with, if no hand gets more to do by it."""
+    if size < 2 * VECTORS:
+        return 1
+    most = max(VECTORS, min(LANES, NUMBERS // max(unknowns, 1) ** 2))
+    choices = [VECTORS << i for i in reversed(range((most // VECTORS).bit_length()))]
+    return min(choices, key=lambda lanes: -(-size // (lanes * hands)) * lanes)
 
 
 def are_alike(dts):

@@ -85,13 +85,14 @@ def sweep_to_disk(
     folder, size = Path(folder), inputs.dts.size
     places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
     arguments, keywords = inputs.chunk(places[0]).call()
-    lowered = run_sweep.lower(*arguments, **keywords)
+    program = run_sweep.of(inputs.unknowns())
+    lowered = program.lower(*arguments, **keywords)
     _claim(folder, _manifest(inputs, lowered, chunk, len(places)))
     compiled = None
     for number, members in enumerate(places):
         path = folder / f"chunk-{number:05d}.npz"
         if not _is_whole(path):
-            compiled = compiled or or_plain(lowered.compile, lambda: run_sweep.lower(*arguments, **keywords).compile())
+            compiled = compiled or or_plain(lowered.compile, lambda: program.lower(*arguments, **keywords).compile())
             runs = compiled(*inputs.chunk(members).call()[0])
             kept = min(chunk, size - number * chunk)
             _write(path, lambda file, runs=runs, kept=kept: np.savez(file, **_named(runs, kept)))

@@ -35,7 +35,7 @@ True
 The door
 --------
 
-The rest of the library knows twenty functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 21 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -57,6 +57,7 @@ The rest of the library knows twenty functions of this room, and works as well o
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
+    Programs(f)               f, compiled with WIDE vectors where that pays
 
 The contract
 ------------
@@ -94,12 +95,15 @@ from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
 from hhtjax.xla.turns import in_turn
 from hhtjax.xla.two_ways import TwoWays, derivative, together
+from hhtjax.xla.vectors import WIDE, Programs
 
 __all__ = [
     "RANGE",
+    "WIDE",
     "Explanation",
     "Listing",
     "NotListed",
+    "Programs",
     "Scalar",
     "TwoWays",
     "block_written",
