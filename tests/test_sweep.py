@@ -160,6 +160,13 @@ def test_under_jit_and_vmap_and_what_a_traced_step_size_may_be():
     np.testing.assert_allclose(runs.q[1, :3], sweep({"k": 5.0, "c": 0.1}, dts=DTS).q[:3], rtol=1e-12)
 
 
+@pytest.mark.parametrize("dts", [DTS, jnp.asarray(DTS), DTS.tolist()], ids=["NumPy", "JAX", "list"])
+def test_step_sizes_known_inside_a_jit(dts):
+    """An array of JAX around a jitted function is known, and what is done to it in there would be traced."""
+    shape = jax.eval_shape(jax.jit(lambda params: sweep(params, dts=dts).q), PARAMS)
+    assert shape.shape == (5, 5, 1)
+
+
 @pytest.mark.slow
 def test_constrained_members_and_those_that_violate_their_constraint():
     scene = pendulum.cartesian()

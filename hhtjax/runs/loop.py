@@ -115,7 +115,7 @@ def resting(advance, by_itself, run, info, here):
     """The run and what is known of it after a step, or, not `here`, without. by_itself: whether `advance` can rest."""
     after, more = advance(run, here) if by_itself else advance(run)
     info = choose(here, join_info(info, more), info)
-    return after if by_itself else if_any(partial(choose, here), ~here, after, run), info
+    return after if by_itself else if_any(partial(choose, here), ~here, after, run, kept=False), info
 
 
 def saved(flat, state):
@@ -156,7 +156,7 @@ def first_failure(flat, failure, count, state, info):
     known.sort(key=lambda x: x[0] < INTERNAL_STATE)
     # a sum that is finite tells that all are; where it is not, look closer
     suspect = ~jnp.isfinite(sum(jnp.sum(x) for _, x in known)) | told_failure(info)
-    return if_any(partial(failure_of, known, count, info), suspect & (failure.step == 0), failure)
+    return if_any(partial(failure_of, known, count, info), suspect & (failure.step == 0), failure, kept=False)
 
 
 def told_failure(info):

@@ -110,8 +110,8 @@ def sweep(
         if mesh is not None:
             raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
         return sweep_chosen(inputs, progress)
-    arguments, keywords = inputs.call(mesh=mesh, progress=progress)
-    runs = partial(run_sweep, inputs.unknowns(), **keywords)
+    (unknowns, *arguments), keywords = inputs.call(mesh=mesh, progress=progress)
+    runs = partial(run_sweep, unknowns, **keywords)
     if events is None or keywords["lanes"] <= VECTORS:
         return or_plain(partial(runs, *arguments))
     # derivatives keep many states, of so many members more than a cache holds
@@ -147,6 +147,10 @@ def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_sam
         if progress:
             show_progress(number + 1, rounds, "block")
         mine = [x[members] if flag else x for x, flag in zip(leaves, mapped, strict=True)]
+        if lanes == 1:  # a batch of one is slower, and has to be ready to rest
+            mine = [x[0] if flag else x for x, flag in zip(mine, mapped, strict=True)]
+            run = member(mine, dts[members[0]], substeps[members[0]], substeps[members[0]])
+            return jax.tree.map(lambda x: x[None], run)
         longest = jnp.max(substeps[members], axis=0)
         return jax.vmap(member, (axes, 0, 0, None))(mine, dts[members], substeps[members], longest)
 

@@ -1,5 +1,6 @@
 """What a sweep is made from: the checks of what a user hands over, and which of it differs between members."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -111,10 +112,12 @@ class Inputs(NamedTuple):
 
     def unknowns(self):
         """Number of coordinates of a member."""
-        return sum(jnp.size(x) for x in jax.tree.leaves(_member(self.data, self.mapped, 0)[1]))
+        leaves, structure = jax.tree.flatten(self.data)
+        sizes = [math.prod(jnp.shape(x)[flag:]) for x, flag in zip(leaves, self.mapped, strict=True)]
+        return sum(jax.tree.leaves(structure.unflatten(sizes)[1]))
 
     def call(self, mesh=None, progress=False):
-        """The arguments of `run_sweep`."""
+        """The arguments and keywords of `run_sweep`: (unknowns that vectors are to fit, *arguments), keywords."""
         if mesh is not None and not isinstance(mesh, Mesh):
             raise TypeError(f"sweep: `mesh` must be a jax.sharding.Mesh; received {mesh!r}.")
         data, dts = self.data, self.dts
@@ -123,9 +126,11 @@ class Inputs(NamedTuple):
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
         hands = 1 if mesh is None else mesh.size
-        lanes = lanes_for(self.size, least_lanes(self.size, self.unknowns(), hands) if are_alike(dts) else 1)
+        unknowns = self.unknowns()
+        lanes = lanes_for(self.size, least_lanes(self.size, unknowns, hands) if are_alike(dts) else 1)
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
-        arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
+        fitting = unknowns if lanes > 1 else None
+        arguments = fitting, self.system, data, dts, self.duration, self.t0, self.times, self.events
         return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
 
 
@@ -149,7 +154,10 @@ def least_lanes(size, unknowns, hands=1):
 
 def are_alike(dts):
     """Whether members are known to take about as many steps."""
-    return is_concrete(dts) and float(np.max(dts)) <= ALIKE * float(np.min(dts))
+    if not is_concrete(dts):
+        return False
+    dts = np.asarray(dts)  # inside a jit, what is done to an array of JAX would be traced
+    return float(np.max(dts)) <= ALIKE * float(np.min(dts))
 
 
 def _members(control, trees, in_axes):

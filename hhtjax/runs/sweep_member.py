@@ -11,7 +11,7 @@ from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, resting
 from hhtjax.systems.flat_system import flatten
-from hhtjax.xla import on_scalars, one_kernel
+from hhtjax.xla import on_scalars, one_kernel, or_alone
 
 
 def run_member(system, data, dt, substeps, longest, t0, num_samples, times, events, room):
@@ -37,7 +37,7 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
 
         def step(i, carry):
             run, info = carry
-            return resting(advance, events is not None, run, info, i < substeps)
+            return resting(advance, events is not None, run, info, or_alone(i < substeps))
 
         return repeat(step, carry, longest), None
 

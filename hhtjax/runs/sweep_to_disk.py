@@ -84,8 +84,8 @@ def sweep_to_disk(
         raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
     folder, size = Path(folder), inputs.dts.size
     places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
-    arguments, keywords = inputs.chunk(places[0]).call()
-    program = run_sweep.of(inputs.unknowns())
+    (unknowns, *arguments), keywords = inputs.chunk(places[0]).call()
+    program = run_sweep.of(unknowns)
     lowered = program.lower(*arguments, **keywords)
     _claim(folder, _manifest(inputs, lowered, chunk, len(places)))
     compiled = None
@@ -93,7 +93,7 @@ def sweep_to_disk(
         path = folder / f"chunk-{number:05d}.npz"
         if not _is_whole(path):
             compiled = compiled or or_plain(lowered.compile, lambda: program.lower(*arguments, **keywords).compile())
-            runs = compiled(*inputs.chunk(members).call()[0])
+            runs = compiled(*inputs.chunk(members).call()[0][1:])
             kept = min(chunk, size - number * chunk)
             _write(path, lambda file, runs=runs, kept=kept: np.savez(file, **_named(runs, kept)))
         if progress:

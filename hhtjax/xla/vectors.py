@@ -28,8 +28,8 @@ class Programs:
         self.wide: Any = jax.jit(f, compiler_options=WIDE, **static)
 
     def of(self, unknowns):
-        """The one that is faster for a system of so many unknowns."""
-        pays = unknowns <= MOST_UNKNOWNS and is_on() and jax.default_backend() == "cpu"
+        """The one that is faster for a system of so many unknowns; None where members come one by one."""
+        pays = unknowns is not None and unknowns <= MOST_UNKNOWNS and is_on() and jax.default_backend() == "cpu"
         return self.wide if pays else self.usual
 
     def __call__(self, unknowns, *args, **keywords):
