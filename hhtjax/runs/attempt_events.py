@@ -15,7 +15,7 @@ from hhtjax.numerics.seldom import choose, seldom_alone
 from hhtjax.runs.attempt import AT_EVENT, BROKEN, NOT_FINITE, TOO_SHORT, Trial, Try, sizes, succeeded
 from hhtjax.runs.event_failures import FINE, MANY
 from hhtjax.runs.loop import neutral_info, resized_step
-from hhtjax.runs.meeting import SHORT, Part, Ways, asks, pass_events
+from hhtjax.runs.meeting import SHORT, Part, Ways, asks, pass_events, reaching
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 
@@ -33,7 +33,8 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
 
     no_info = neutral_info(jax.eval_shape(one, end)[1])
     flat_events = flatten_events(flat, events, params, stepper.redundant)
-    return trial._replace(ways=Ways(flat, stepper, flat_events, room[0], no_info), past_events=past_events)
+    ways = Ways(flat, stepper, flat_events, room[0], no_info, reaching(flat, stepper, no_info))
+    return trial._replace(ways=ways, past_events=past_events)
 
 
 def past_events(trial, tried, walk, h):

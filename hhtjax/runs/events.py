@@ -10,7 +10,7 @@ from hhtjax.runs.event_failures import FINE
 from hhtjax.runs.event_log import Log
 from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.loop import first_failure
-from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events, unnoted
+from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events, reaching, unnoted
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 from hhtjax.xla import in_turn
@@ -23,7 +23,8 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     """
     start = loop.carry[0]
     stepper = stepper.astype(start.v.dtype)
-    ways = Ways(flat, stepper, flatten_events(flat, events, params, stepper.redundant), max_events, loop.no_info, keep)
+    flat_events, no_info = flatten_events(flat, events, params, stepper.redundant), loop.no_info
+    ways = Ways(flat, stepper, flat_events, max_events, no_info, reaching(flat, stepper, no_info), keep)
     met = before_any(ways, params)
     met = met._replace(log=Log.empty(unnoted(start)[0], keep, max_events + 1))
     if in_pieces:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.description import freeze, thaw
 from hhtjax.numerics.seldom import choose, if_any, seldom
 from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, STAYS
 from hhtjax.runs.event_log import row_of
@@ -35,6 +36,7 @@ class Ways(NamedTuple):
     events: Any
     max_events: int
     no_info: Any
+    reach: Any  # of `reaching`
     keep: int = 0  # how many events are noted
 
 
@@ -227,14 +229,19 @@ def meet(ways, now, found, h, params):
 
 def go(ways, params, s, tau, last, h):
     """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
+    return ways.reach(freeze(params), s, tau, last, h)
+
+
+def reaching(flat, stepper, no_info):
+    """What `go` calls: one function for all places of a program, so that it is traced once."""
 
     @staged
-    def reached(s, tau, last):
+    def reach(params, s, tau, last, h):
         short = tau <= SHORT * h
-        s1, info = resized_step(ways.flat, ways.stepper, params, jnp.maximum(tau, SHORT * h), last)(s)
-        return choose(short, drifted(ways.flat, s, tau), s1), choose(short, ways.no_info, info)
+        s1, info = resized_step(flat, stepper, thaw(params), jnp.maximum(tau, SHORT * h), last)(s)
+        return choose(short, drifted(flat, s, tau), s1), choose(short, no_info, info)
 
-    return reached(s, tau, last)
+    return reach
 
 
 def locate(ways, params, part, this, found, h):
