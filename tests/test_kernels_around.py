@@ -1,6 +1,9 @@
 """Kernels with all that is around their loops; and what of a run is for batches only."""
 
+import os
 import re
+import subprocess
+import sys
 from functools import partial
 
 import jax
@@ -51,3 +54,28 @@ def test_who_is_alone_goes_on():
     for batch in (jax.vmap(kernels.or_alone), jax.jit(jax.vmap(kernels.or_alone))):
         assert batch(some).tolist() == some.tolist()
     assert jax.vmap(jax.vmap(kernels.or_alone))(some[None]).tolist() == [some.tolist()]
+
+
+SHARDED = """
+import jax, jax.numpy as jnp
+from jax.sharding import NamedSharding, PartitionSpec
+from hhtjax import explain
+from hhtjax.xla import gate, kernels
+mesh = jax.make_mesh((2,), ("b",))
+x = jnp.arange(8.0)
+def f(c):
+    return kernels.one_kernel(lambda c: jax.lax.scan(lambda c, _: (c - jnp.mean(c) / 2, None), c, None, 3)[0], c)
+sharded = jax.device_put(x, NamedSharding(mesh, PartitionSpec("b")))
+assert jnp.allclose(jax.jit(f)(sharded), f(x))
+assert explain(f, sharded).paths[0].startswith("plain: partitioned"), explain(f, sharded).paths
+by_hand = jax.shard_map(f, mesh=mesh, in_specs=PartitionSpec("b"), out_specs=PartitionSpec("b"), check_vma=False)
+assert explain(by_hand, sharded).paths == ("one kernel",)
+"""
+
+
+@on_cpu
+def test_a_program_divided_among_devices_is_plain():
+    """In a process of its own, for there are two devices."""
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    run = subprocess.run([sys.executable, "-c", SHARDED], env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr[-2000:]

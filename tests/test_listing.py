@@ -25,7 +25,7 @@ REFUSED = {
     *("dot_general", "dynamic_update_slice", "exp", "population_count", "pure_callback", "reduce"),
     *("reduce_precision", "reduce_xor", "scatter", "scatter-add", "scatter-max", "scatter-min", "scatter-mul"),
     *("scatter-sub", "shift_left", "shift_right_arithmetic", "shift_right_logical", "sin", "sort", "top_k"),
-    "while",
+    *("hhtjax_in_turn", "while"),
 }
 
 

@@ -36,7 +36,8 @@ def test_members_that_are_alike_share_blocks_as_large_as_kernels_allow(unknowns)
     for size in (64, 100, 256, 5000):
         lanes = least_lanes(size, unknowns)
         assert lanes & (lanes - 1) == 0
-        assert VECTORS <= lanes <= min(size, LANES)
+        assert VECTORS <= lanes <= LANES
+        assert -(-size // lanes) * lanes == -(-size // VECTORS) * VECTORS  # none fills up more
         assert lanes == VECTORS or lanes * unknowns**2 <= NUMBERS
         assert lanes_for(size, lanes) >= lanes
     assert [least_lanes(256, 2), least_lanes(256, 2, hands=8), least_lanes(60, 2)] == [LANES, VECTORS, 1]

@@ -22,6 +22,9 @@ STEPPERS = {  # the first is the arithmetic of the C source
     "converged": hhtjax.hht(ALPHA, iterations=None),
 }
 
+BATCHES = [(name, "jnp") for name in list(STEPPERS)[:2]] + [(next(iter(STEPPERS)), "polynomial")]
+VECTORS = {256: None, 512: hhtjax.xla.WIDE}  # bits, and the options of a jit
+
 
 def ours(scene, stepper, num_steps, save_every, q0):
     """The last position."""
@@ -91,25 +94,27 @@ ours_jit = jax.jit(ours, static_argnums=(1, 2, 3))
 
 
 def batch(num_steps, repeats):
-    """A batch from random angles: ns per step and trajectory."""
+    """A batch from random angles: ns per step and trajectory, with the vectors of a user's jit, and with wide ones."""
     angles = np.random.default_rng(0).normal(size=(MEMBERS, 2))
     functions, compile_s = {}, {}
-    for trigonometry, module in TRIGONOMETRY.items():
-        stepper = STEPPERS["non-iterative, predictor"]
-        runs = jax.vmap(partial(ours, double_pendulum.free(module), stepper, num_steps, num_steps))
-        program, compile_s[trigonometry] = compiled(runs, jnp.asarray(angles))
-        functions[trigonometry] = partial(program, jnp.asarray(angles))
+    for method, trigonometry in BATCHES:
+        scene = double_pendulum.free(TRIGONOMETRY[trigonometry])
+        runs = jax.vmap(partial(ours, scene, STEPPERS[method], num_steps, num_steps))
+        for bits, options in VECTORS.items():
+            key = method, trigonometry, bits
+            program, compile_s[key] = compiled(runs, jnp.asarray(angles), options=options)
+            functions[key] = partial(program, jnp.asarray(angles))
     rivals = c_runs(double_pendulum.free(), angles.T, num_steps)
     times = least_seconds(functions | rivals, repeats)
     fastest = min((times[name] for name in rivals), default=None)
     rows = [
         {
-            "trigonometry": name,
-            "ns_per_step_and_member": 1e9 * times[name] / num_steps / MEMBERS,
-            "over_c": times[name] / fastest if fastest else None,
-            "compile_s": compile_s[name],
+            **dict(zip(("method", "trigonometry", "vectors_bits"), key, strict=True)),
+            "ns_per_step_and_member": 1e9 * times[key] / num_steps / MEMBERS,
+            "over_c": times[key] / fastest if fastest else None,
+            "compile_s": compile_s[key],
         }
-        for name in functions
+        for key in functions
     ]
     return rows, {name: 1e9 * times[name] / num_steps / MEMBERS for name in rivals}
 
@@ -127,7 +132,7 @@ def run(report, fast):
     report.table(["C, one trajectory", "ns per step"], list(c.items()))
     batch_rows, batch_c = ([], {}) if fast else batch(2000, 9)
     if batch_rows:
-        header = [f"batch of {MEMBERS}", "ns per step and member", "over the best C", "compile (s)"]
+        header = [f"batch of {MEMBERS}", "sines", "bits", "ns per step and member", "over the best C", "compile (s)"]
         report.table(header, [dashed(row.values()) for row in batch_rows])
         report.table(["C, batch", "ns per step and member"], list(batch_c.items()))
     stiff = {} if fast else newton(20_000, 9)

@@ -28,11 +28,14 @@ def least_seconds(functions, repeats):
     return times
 
 
-def compiled(function, *args):
-    """The compiled function, and the wall time in s of tracing and compiling it, with every cache empty."""
+def compiled(function, *args, options=None):
+    """The compiled function, and the wall time in s of tracing and compiling it, with every cache empty.
+
+    options: of XLA.
+    """
     jax.clear_caches()
     start = time.perf_counter()
-    program = jax.jit(function).lower(*args).compile()
+    program = jax.jit(function).lower(*args).compile(options)
     return program, time.perf_counter() - start
 
 

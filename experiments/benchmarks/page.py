@@ -31,9 +31,17 @@ def bars(numbers):
     found = []
     if c["c_ns_per_step"]:
         found += [
-            ("one trajectory, polynomial sines, end saved, over C", 1.2, single["polynomial", "end"]["over_c"]),
-            ("the same with jnp.sin", 2.0, single["jnp", "end"]["over_c"]),
-            ("batch of 256, polynomial sines, over C", 1.5, find(c["batch"], trigonometry="polynomial")["over_c"]),
+            ("one trajectory, predictor, end saved, over C", 1.1, single["jnp", "end"]["over_c"]),
+            ("one trajectory, auto, over C", 1.5, find(c["single"], method=AUTO, trigonometry="jnp")["over_c"]),
+        ]
+        found += [
+            (
+                f"batch of 256, {method.split()[-1]}, {where}, over C",
+                1.5,
+                find(c["batch"], method=method, trigonometry="jnp", vectors_bits=bits)["over_c"],
+            )
+            for method in (PREDICTOR, AUTO)
+            for bits, where in ((512, "wide vectors"), (256, "a user's jit"))
         ]
     for name in ("polynomial", "jnp"):
         ratio = single[name, "path"]["ns_per_step"] / single[name, "end"]["ns_per_step"]
@@ -144,10 +152,16 @@ def page(numbers):
             ),
             c=table(["C", "ns per step"], [[name, number(x)] for name, x in c["c_ns_per_step"].items()]),
             members=c["members"],
-            batch=table(
-                ["", "ns per step and member", "over the best C"],
-                [[r["trigonometry"], number(r["ns_per_step_and_member"]), number(r["over_c"])] for r in c["batch"]]
-                + [[name, number(x), "-"] for name, x in c["c_batch_ns"].items()],
+            batch=rows_table(
+                [{**r, "bits": f"{r['vectors_bits']}"} for r in c["batch"]]
+                + [{"method": name, "bits": "", "ns_per_step_and_member": x} for name, x in c["c_batch_ns"].items()],
+                {
+                    "method": "method",
+                    "sines": "trigonometry",
+                    "vectors (bits)": "bits",
+                    "ns per step and member": "ns_per_step_and_member",
+                    "over the best C": "over_c",
+                },
             ),
             stiff=", ".join(f"{name} {x:.0f}" for name, x in c["stiff_ns_per_step"].items()),
             structure=rows_table(

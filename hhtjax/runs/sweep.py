@@ -147,12 +147,7 @@ def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_sam
         if progress:
             show_progress(number + 1, rounds, "block")
         mine = [x[members] if flag else x for x, flag in zip(leaves, mapped, strict=True)]
-        if lanes == 1:  # a batch of one is slower, and has to be ready to rest
-            mine = [x[0] if flag else x for x, flag in zip(mine, mapped, strict=True)]
-            run = member(mine, dts[members[0]], substeps[members[0]], substeps[members[0]])
-            return jax.tree.map(lambda x: x[None], run)
-        longest = jnp.max(substeps[members], axis=0)
-        return jax.vmap(member, (axes, 0, 0, None))(mine, dts[members], substeps[members], longest)
+        return _together(member, axes, mine, dts[members], substeps[members])
 
     def hand(members, *data):
         """The blocks of one device, one after the other."""
@@ -165,6 +160,14 @@ def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_sam
         times = t0 + H * jnp.arange(num_samples + 1).astype(dtype)
     ends = any(event.terminal for event in events or ())  # then each has times of its own
     return runs if ends else runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))
+
+
+def _together(member, axes, mine, dts, substeps):
+    """The members of a block; a batch of one would be slower, and would have to be ready to rest."""
+    if len(dts) > 1:
+        return jax.vmap(member, (axes, 0, 0, None))(mine, dts, substeps, jnp.max(substeps, axis=0))
+    alone = [x if axis is None else x[0] for x, axis in zip(mine, axes, strict=True)]
+    return jax.tree.map(lambda x: x[None], member(alone, dts[0], substeps[0], substeps[0]))
 
 
 def _by_many(hand, mesh):
