@@ -11,17 +11,18 @@ scattering, LAPACK or callbacks in your functions. `explain` tells which, and wh
 >>> print(hhtjax.explain(fall, 0.1))  # doctest: +ELLIPSIS
 loop 1: ...
 
-A step of the double pendulum, its functions in plain `jnp` and no Jacobian written by hand, then takes as long as C
-with everything written by hand, 55 ns, and in a batch 11 ns for each member: sines of float64 numbers in a kernel are
-polynomials, to 2 units in the last place, where XLA would call a function for each. The gradient of a run takes 2.7 to
-3.8 times the run, in memory that grows with the square root of the number of steps. Systems of few operations are
-stepped number by number, not array by array, with every sine evaluated once. What is no single kernel runs as a list of
-them, several times slower, with all that the columns of a Jacobian share evaluated once: the squeezing mechanism with
-its 19 unknowns takes 19 microseconds a step. Jacobians keep track of what depends on which unknown, so that for a chain
-of N links, or springs between neighbours, they take N^2 numbers and not N^3; a chain or a tree may give the product
-M(q) w without M: `System(..., inertia=)`. Measured, against C, by structure, batches and gradients, on a page,
-`experiments/benchmarks/README.md`; error against time beside diffrax, SciPy, MuJoCo and exudyn, losses included, on
-another, `experiments/work_precision/README.md`.
+A step of the double pendulum, its functions in plain `jnp` and no Jacobian written by hand, then takes about as long as
+C with everything written by hand, 40 ns, and in a batch 8 ns for each member, or 4 with vectors of 512 bits, which
+`sweep` and `jax.vmap` of `simulate` take where no jit is around them (else `jax.jit(f,
+compiler_options=hhtjax.xla.WIDE)`). Sines of float64 numbers in a kernel are polynomials, to 2 units in the last place,
+where XLA would call a function for each. The gradient of a run takes 2.7 to 3.9 times the run, in memory that grows
+with the square root of the number of steps. Systems of few operations are stepped number by number, not array by array,
+with every sine evaluated once. What is no single kernel runs as a list of them, several times slower, with all that the
+columns of a Jacobian share evaluated once: the squeezing mechanism with its 19 unknowns takes 19 microseconds a step.
+Jacobians keep track of what depends on which unknown, so that for a chain of N links, or springs between neighbours,
+they take N^2 numbers and not N^3; a chain or a tree may give the product M(q) w without M: `System(..., inertia=)`.
+Measured, against C, by structure, batches and gradients, on a page, `experiments/benchmarks/README.md`; error against
+time beside diffrax, SciPy, MuJoCo and exudyn, losses included, on another, `experiments/work_precision/README.md`.
 
 All this may change rounding, and nothing else. Who doubts a number runs the same on plain JAX, and compares; the
 environment variable `HHTJAX_PLAIN=1` does it for a whole process. With a JAX newer than the last one tested it is so
