@@ -207,7 +207,8 @@ def figure(rows, names):
             mine = [row for row in rows if row["mesh"] == mesh and name in row["ms_per_step"]]
             style = {"color": COLOURS[i], "marker": MARKERS[i], "ms": 4, "lw": 1}
             axes.loglog([row["n"] for row in mine], [row["ms_per_step"][name] for row in mine], **style, label=name)
-        axes.set(xlabel="unknowns", title=mesh)
+        axes.set(xlabel="unknowns")
+        axes.set_title(mesh, loc="right")  # the legend is on the left
     panels[0].set(ylabel="time per step (ms)")
     legend(panels[0])
     return drawn
