@@ -15,27 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
+from experiments.benchmarks.against_c import DT, ours
 from experiments.benchmarks.measure import least_seconds, temporary_bytes
 from experiments.work_precision.diffrax_peers import make_solver
 from hhtjax.scenes import double_pendulum
 
-DT, NUM_STEPS = 1e-3, 1000
+NUM_STEPS = 1000
 MEMBERS = 1_000, 10_000, 100_000, 1_000_000
 LORENZ_MEMBERS, LORENZ_DT = 2**23, 1e-3  # as published for MPGOS and DiffEqGPU: 1000 steps of RK4 in single precision
 PUBLISHED_MS = {"MPGOS, V100": 94, "DiffEqGPU, V100": 145}
 
 
-def pendulum_end(stepper, num_steps, q0):
-    """The last position of one member."""
-    scene = double_pendulum.free()
-    run = hhtjax.simulate(
-        scene.system, stepper, q0, scene.v0, scene.params, dt=DT, num_steps=num_steps, save_every=num_steps
-    )
-    return run.q[-1]
-
-
-def pendulum_end_by_diffrax(num_steps, q0):
-    """The same by an implicit method of order 3, with as many equal steps."""
+def end_by_diffrax(num_steps, q0):
+    """The last position of one member by an implicit method of order 3, with as many equal steps."""
     import diffrax  # pyright: ignore[reportMissingImports]  # of an extra of its own
 
     scene = double_pendulum.free()
@@ -58,19 +50,17 @@ def lorenz_end(num_steps, rho):
     """The last state of one member, in the precision of rho."""
     start = jnp.array([1.0, 0.0, 0.0], rho.dtype)
     system, dt = hhtjax.FirstOrderSystem(lorenz), jnp.asarray(LORENZ_DT, rho.dtype)
-    return hhtjax.simulate(system, hhtjax.rk4(), start, params=rho, dt=dt, num_steps=num_steps, save_every=num_steps).q[
-        -1
-    ]
+    run = hhtjax.simulate(system, hhtjax.rk4(), start, params=rho, dt=dt, num_steps=num_steps, save_every=num_steps)
+    return run.q[-1]
 
 
 def pendulums(report, sizes, num_steps, repeats):
     """ns per step and member, of ours and of diffrax, and how far their ends lie apart."""
-    ways = {
-        "hht": partial(pendulum_end, hhtjax.hht(), num_steps),
-        "hht, predictor": partial(pendulum_end, hhtjax.hht(linearize="predictor"), num_steps),
-    }
+    steppers = {"hht": hhtjax.hht(), "hht, predictor": hhtjax.hht(linearize="predictor")}
+    scene = double_pendulum.free()
+    ways = {name: partial(ours, scene, stepper, num_steps, num_steps) for name, stepper in steppers.items()}
     if is_installed("diffrax"):
-        ways["diffrax Kvaerno3"] = partial(pendulum_end_by_diffrax, num_steps)
+        ways["diffrax Kvaerno3"] = partial(end_by_diffrax, num_steps)
     rows = []
     for members in sizes:
         q0 = jnp.asarray(np.random.default_rng(0).normal(size=(members, 2)))

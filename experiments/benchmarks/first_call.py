@@ -1,6 +1,6 @@
 """The first call: CPU seconds until a result is there, each in a process of its own; with a cache on disk, its second.
 
-    python -m experiments benchmarks --parts first_call             # the table, some ten minutes
+    python -m experiments benchmarks --parts first_call             # the table, some four minutes
     python -m experiments.benchmarks.first_call simulate pendulum   # one number of it, in this process
 
 It is what all threads compute, imports apart, divided into tracing (Python: the system's functions, JAX, the
