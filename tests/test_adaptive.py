@@ -11,7 +11,7 @@ from helpers import ONE, SPRING, ZERO, run
 from scipy.integrate import solve_ivp
 
 import hhtjax
-from hhtjax.runs.chosen import chosen_steps, run_over
+from hhtjax.runs.chosen import chosen_steps, run_recorded
 from hhtjax.scenes import pendulum, top
 
 SAMPLES = 32
@@ -198,13 +198,16 @@ def test_tolerances_and_all_else_are_data():
         dt = hhtjax.adaptive(rtol, 1e-6)
         return hhtjax.simulate(CONTACT, hhtjax.rowda(), jnp.full(1, q0), ZERO, k, dt=dt, times=np.array([0.2, 0.4]))
 
+    def choose(times):
+        hhtjax.choose_steps(CONTACT, hhtjax.rowda(), jnp.full(1, 0.3), ZERO, 1e5, times=times, rtol=1e-2, atol=1e-6)
+
     go(1e-3, 1e5, 0.3)
-    compiled = chosen_steps._cache_size(), run_over._cache_size()
-    tolerances = {"rtol": 1e-2, "atol": 1e-6}
-    for times in ([0.4], [0.1, 0.2, 0.4]):  # any number of them, and whatever becomes of the run
-        hhtjax.choose_steps(CONTACT, hhtjax.rowda(), jnp.full(1, 0.3), ZERO, 1e5, times=times, **tolerances)
+    choose([0.4])
+    compiled = [f._cache_size() for f in (run_recorded, chosen_steps)]
+    for times in ([0.3], [0.1, 0.2, 0.4]):  # of the steps alone any number
+        choose(times)
     few, many = go(1e-2, 1e5, 0.3), go(1e-5, 2e5, 0.4)
-    assert (chosen_steps._cache_size(), run_over._cache_size()) == compiled
+    assert [f._cache_size() for f in (run_recorded, chosen_steps)] == compiled
     assert few.steps.accepted < many.steps.accepted
     batch = jax.jit(jax.vmap(go, (0, None, None)))(np.array([1e-2, 1e-5]), 2e5, 0.4)
     batch.check()
@@ -280,7 +283,7 @@ def test_the_error_of_the_whole_run(references):
         ):
             run.check()
         assert 0.1 < np.max(run.error) < 0.3
-        programs.add(chosen_steps._cache_size())
+        programs.add((run_recorded._cache_size(), chosen_steps._cache_size()))
     assert len(programs) == 1
 
 

@@ -7,27 +7,28 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_batching import custom_vmap
 
 from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
+from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
 from hhtjax.runs.choose import Steps, choose, trimmed
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.events import loop_with_events, with_told_events
-from hhtjax.runs.freezing import run_and_choice
-from hhtjax.runs.interpolate import between
-from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, resting, saved
+from hhtjax.runs.freezing import is_pair, run_and_choice
+from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, resting
 from hhtjax.runs.problem import Problem
+from hhtjax.runs.read_off import kept, read_off
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_grid import require_times
-from hhtjax.steppers.stepper import State, Stepper, public
+from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
 
-TINY = 1e-9  # part of a run
 ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
@@ -39,7 +40,7 @@ def chosen_steps(problem, end, control, events=None, progress=False, room=()):
     """
 
     def found(problem, end, control, events):
-        return choose(problem, problem.times(end), control, progress, events, room)
+        return choose(problem, problem.times(end), control, progress, events, room)[:2]
 
     return one_kernel(found, problem, end, control, events, around=True)
 
@@ -49,6 +50,39 @@ def steps_for(choice, progress, room):
     problem, times, control, events = choice
     control = replace(control, verify=False)
     return or_plain(partial(chosen_steps, problem, times[-1], control, events, progress=progress, room=room[:1]))
+
+
+def run_in_two(problem, times, control, progress=False):
+    """The `Solution` at `times`, its `Steps`, and the times at which they end."""
+    steps, ends = chosen_steps(*lax.stop_gradient((problem, times[-1], control)), progress=progress)
+    return run_over(problem, times, ends, steps.accepted), steps, ends
+
+
+@partial(jax.jit, static_argnames=("progress",))
+def run_recorded(problem, times, control, progress=False):
+    """The same in one pass, but for what vmap makes of it; without derivatives."""
+
+    def record(problem, times, control):
+        steps, ends, run = choose(problem, times[-1], control, progress, times=problem.times(times))
+        return run, steps, ends
+
+    @custom_vmap
+    def in_one(problem, times, control):
+        return one_kernel(record, problem, times, control, around=True)
+
+    @in_one.def_vmap
+    def _(size, batched, *args):
+        axes = jax.tree.map(lambda mapped: 0 if mapped else None, batched)
+        found = jax.vmap(partial(run_in_two, progress=progress), axes, axis_size=size)(*args)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return in_one(problem, times, control)
+
+
+def run_in_one(problem, times, control, progress=False):
+    """The same, with the derivatives of two passes."""
+    ways = (partial(f, progress=progress) for f in (run_in_two, run_recorded))
+    return derivative_by(*ways, problem, times, control)
 
 
 class Grid(NamedTuple):
@@ -155,48 +189,6 @@ def begun_with(flat, stepper, params, loop, run):
     return held.entered(stepper, flat, params, h, last, state)[1]
 
 
-def kept(flat, stepper, state):
-    """What is saved of a state, and what its dense output adds."""
-    extra = None
-    if stepper.dense_term:
-        e_q, e_v = state.memory
-        extra = public(flat, State(state.t, e_q, e_v, 0 * e_v))
-        extra = extra.q, (None if flat.positions == 0 else extra.v), extra.z
-    return saved(flat, state), extra
-
-
-def read_off(flat, pair, extra, times, reached):
-    """The `Solution` at the times, each between the two of a pair; NaN beyond what was reached."""
-    a, b = (jax.tree.map(lambda x: x[1:], run._replace(dt=None, info=None, failure=None)) for run in pair)
-    start = jax.tree.map(lambda x: x[:1], pair[0]._replace(dt=None, info=None, failure=None))
-    # a part of a step that is a rounding, behind an event, is the beginning of a long one
-    long = times[-1] - start.t[0]
-    H = jnp.where(b.t - a.t > TINY * long, b.t - a.t, long)
-    s = jnp.where(times <= reached, (times - a.t) / H, jnp.nan)
-    found = between(a, b, H, s)
-    if extra is not None:
-        found = with_dense_term(flat, found, extra, s, H)
-    path = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), start, found._replace(t=times))
-    return path._replace(info=pair[1].info, failure=pair[1].failure)
-
-
-def with_dense_term(flat, found, extra, s, H):
-    """`found`, with s^2 (1 - s)^2 times what the stepper's dense output adds to cubics, and the rate of that."""
-    weight, rate = (s * (1 - s)) ** 2, 2 * s * (1 - s) * (1 - 2 * s) / H
-    e_q, e_v, e_z = extra
-    terms = [("q", flat.unravel, weight, e_q)]
-    if flat.positions:
-        terms += [("v", flat.unravel_rates, weight, e_v), ("acceleration", flat.unravel_rates, rate, e_v)]
-        terms += [("z", flat.unravel_internal, weight, e_z), ("zdot", flat.unravel_internal, rate, e_z)]
-    else:
-        terms += [("v", flat.unravel_rates, rate, e_q)]
-    for name, unravel, factor, e in terms:
-        if e is not None:
-            more = jax.vmap(unravel)(factor[:, None] * e)
-            found = found._replace(**{name: jax.tree.map(jnp.add, getattr(found, name), more)})
-    return found
-
-
 def choose_steps(
     system: System | LinearSystem | FirstOrderSystem,
     stepper: Stepper,
@@ -249,20 +241,28 @@ def choose_steps(
 def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
-    (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
-    steps, ends = steps_for(choice, progress, room)
-    run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, room=room))
+    in_one = events is None and problem.system.friction is None and not is_pair()
+    if in_one:
+        data = problem, times, replace(control, verify=False)
+        run, steps, ends = or_plain(partial(run_in_one, *data, progress=progress))
+        choice = lax.stop_gradient((problem, times, control, events))
+    else:
+        (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
+        steps, ends = steps_for(choice, progress, room)
+        run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, room=room))
     if control.verify:
-        better = finer(problem, times, control, steps, ends, choice, events, room)
+        better = finer(problem, times, control, steps, ends, choice, events, room, in_one)
         run = run._replace(**verified(run, better, control, problem.stepper.order))
     steps = trimmed(steps)
     return run._replace(dt=steps.dt, steps=steps)
 
 
-def finer(problem, times, control, steps, ends, choice, events, room):
+def finer(problem, times, control, steps, ends, choice, events, room, in_one):
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
+    *start, looser, theirs = choice
+    if control.verify == "tolerance" and in_one:
+        return or_plain(partial(run_in_one, *start, quarter(replace(looser, verify=False))))[0]
     if control.verify == "tolerance":
-        *start, looser, theirs = choice
         steps, ends = steps_for((*start, quarter(looser), theirs), False, room)
     halved = control.verify != "tolerance"
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, halved=halved, room=room))
