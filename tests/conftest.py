@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 import jax
@@ -55,8 +56,33 @@ def share_programs():
     os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 
+class Contexts(threading.local):
+    """Of MLIR, one for many programs. JAX makes one for each, which takes longer than all else about a small program
+    that is loaded; it is renewed now and then because it keeps the constants of its programs."""
+
+    left = 0
+
+    def __init__(self, make):
+        self.make = make
+
+    def __call__(self):
+        if not self.left:
+            self.context, self.left = self.make(), 100
+        self.left -= 1
+        return self.context
+
+
+def share_contexts():
+    """As above, where this has been tried."""
+    if jax.__version_info__[:2] == (0, 10):
+        from jax._src.interpreters import mlir
+
+        mlir.make_ir_context = Contexts(mlir.make_ir_context)
+
+
 set_flags()
 share_programs()
+share_contexts()
 os.environ.setdefault("MPLBACKEND", "Agg")  # charts of doctests need no display
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
