@@ -58,14 +58,17 @@ def share_programs():
 
 class Contexts(threading.local):
     """Of MLIR, one for many programs. JAX makes one for each, which takes longer than all else about a small program
-    that is loaded; it is renewed now and then because it keeps the constants of its programs."""
+    that is loaded. What is compiled while another program is lowered has its own, as JAX counts on; and all are renewed
+    now and then, for they keep the constants of their programs."""
 
     left = 0
 
-    def __init__(self, make):
-        self.make = make
+    def __init__(self, make, current):
+        self.make, self.current = make, current
 
     def __call__(self):
+        if self.current() is not None:
+            return self.make()
         if not self.left:
             self.context, self.left = self.make(), 100
         self.left -= 1
@@ -76,8 +79,9 @@ def share_contexts():
     """As above, where this has been tried."""
     if jax.__version_info__[:2] == (0, 10):
         from jax._src.interpreters import mlir
+        from jaxlib.mlir import ir
 
-        mlir.make_ir_context = Contexts(mlir.make_ir_context)
+        mlir.make_ir_context = Contexts(mlir.make_ir_context, lambda: ir.Context.current)
 
 
 set_flags()
