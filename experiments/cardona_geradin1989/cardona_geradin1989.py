@@ -13,7 +13,7 @@ from experiments.cardona_geradin1989 import (
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = [infinity, pendulum, formulations, drift, mechanisms], [squeezer, work_precision, top]  # two processes if fast
+GROUPS = [infinity, pendulum, formulations, drift, mechanisms], [squeezer, work_precision, top]
 
 
 def run(report: Report, fast: bool):

@@ -5,7 +5,7 @@ from experiments.export import pendulum, real_time, speed
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = [pendulum, speed], [real_time]  # two processes if fast
+GROUPS = [pendulum, speed], [real_time]
 
 
 def run(report: Report, fast: bool):

@@ -20,7 +20,7 @@ from experiments.stability import (
 GROUPS = (
     [gallery, reported, advice],
     [adaptive, tolerances, controller, dry, stops, constrained, rotating, drift, peers],
-)  # two processes if fast
+)
 
 
 def run(report: Report, fast: bool):
