@@ -25,13 +25,13 @@ from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import State, Stepper, public
 from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
+from hhtjax.xla import Programs, largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
 
 TINY = 1e-9  # part of a run
 ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
-@partial(jax.jit, static_argnames=("progress", "room"))
+@partial(Programs, static_argnames=("progress", "room"))
 def chosen_steps(problem, end, control, events=None, progress=False, room=()):
     """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in.
 
@@ -87,7 +87,7 @@ class Grid(NamedTuple):
         return h, last, jnp.where(is_there, end, jnp.inf)
 
 
-@partial(jax.jit, static_argnames=("halved", "room"))
+@partial(Programs, static_argnames=("halved", "room"))
 def run_over(problem, times, ends, accepted, events=None, halved=False, room=()):
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
 

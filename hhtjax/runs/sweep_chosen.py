@@ -13,7 +13,7 @@ from hhtjax.runs.chosen import Grid, follow, quarter, verified
 from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.loop import show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
-from hhtjax.xla import or_plain
+from hhtjax.xla import Programs, or_plain
 
 
 def sweep_chosen(inputs, progress):
@@ -25,7 +25,7 @@ def sweep_chosen(inputs, progress):
     return runs._replace(dt=steps.dt, steps=steps)
 
 
-@partial(jax.jit, static_argnames=("mapped", "size", "lanes", "progress", "room"))
+@partial(Programs, static_argnames=("mapped", "size", "lanes", "progress", "room"))
 def run_chosen(system, start, choice, *, mapped, size, lanes, progress, room):
     """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, of runs, of steps."""
 

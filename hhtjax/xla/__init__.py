@@ -58,7 +58,7 @@ The rest of the library knows 21 functions of this room, and works as well on pl
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
-    Programs(f)               f, compiled with WIDE vectors where that pays
+    Programs(f)               f, compiled QUICKly, with WIDE vectors where that pays
 
 The contract
 ------------
@@ -90,15 +90,16 @@ from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
+from hhtjax.xla.programs import QUICK, WIDE, Programs
 from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.rows import block_written, row_written
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
 from hhtjax.xla.turns import in_turn
 from hhtjax.xla.two_ways import TwoWays, derivative, together
-from hhtjax.xla.vectors import WIDE, Programs
 
 __all__ = [
+    "QUICK",
     "RANGE",
     "WIDE",
     "Explanation",

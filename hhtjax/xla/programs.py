@@ -1,0 +1,57 @@
+"""Options for the compiler, of the programs that start here; inside a jit of the user's those of that jit hold.
+
+QUICK: XLA:CPU compiles each fusion that stands outside a kernel by a pipeline of MLIR, some 10 ms for a few sums, and
+gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that.
+WIDE: vectors of 512 bits for loops over the members of a batch, where XLA:CPU takes half of that, unless it is asked: a
+batch of double pendulums then takes half the time.
+"""
+
+from typing import Any
+
+import jax
+
+from hhtjax.xla.gate import is_on
+
+QUICK = {"xla_cpu_use_fusion_emitters": False}  # numbers as before, to rounding, and runs as fast
+WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits; where a processor has none so long, nothing changes
+MOST_UNKNOWNS = 4  # loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
+
+
+class Programs:
+    """A function of arrays as programs: with options, and one to be called wherever it is.
+
+    >>> twice = Programs(lambda x: 2 * x)
+    >>> float(twice(2.0)), float(twice(3.0, unknowns=2)), float(jax.jit(twice)(3.0))
+    (4.0, 6.0, 6.0)
+    """
+
+    are_refused = False  # the options, by an XLA that does not know one
+
+    def __init__(self, f, **static):
+        """static: of `jax.jit`."""
+        self.usual: Any = jax.jit(f, **static)
+        self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
+        self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
+
+    def of(self, unknowns=None):
+        """What is compiled for a system of so many unknowns; None where members come one by one, or there are none."""
+        if Programs.are_refused or not is_on() or jax.default_backend() != "cpu":
+            return self.usual
+        return self.wide if unknowns is not None and unknowns <= MOST_UNKNOWNS else self.quick
+
+    def __call__(self, *args, unknowns=None, **keywords):
+        """The values of the function."""
+        try:
+            return self.of(unknowns)(*args, **keywords)
+        except ValueError as error:  # there are options inside a jit of the user's
+            if "compiler_options" not in str(error):
+                raise
+        except jax.errors.JaxRuntimeError as error:
+            if "No such compile option" not in str(error):
+                raise
+            Programs.are_refused = True
+        return self.usual(*args, **keywords)
+
+    def number(self):
+        """Of all that have been compiled."""
+        return sum(program._cache_size() for program in (self.usual, self.quick, self.wide))
