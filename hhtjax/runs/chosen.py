@@ -48,7 +48,8 @@ def steps_for(choice, progress, room):
     """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
     problem, times, control, events = choice
     control = replace(control, verify=False)
-    return or_plain(partial(chosen_steps, problem, times[-1], control, events, progress=progress, room=room[:1]))
+    keywords = {"progress": progress, "room": room[:1], "unknowns": problem.unknowns()}
+    return or_plain(partial(chosen_steps, problem, times[-1], control, events, **keywords))
 
 
 class Grid(NamedTuple):
@@ -251,7 +252,8 @@ def run_controlled(problem, times, control, progress, events=None, room=()) -> S
     times = checked_times("simulate", problem, times, control)
     (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
     steps, ends = steps_for(choice, progress, room)
-    run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, room=room))
+    keywords = {"room": room, "unknowns": problem.unknowns()}
+    run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
     if control.verify:
         better = finer(problem, times, control, steps, ends, choice, events, room)
         run = run._replace(**verified(run, better, control, problem.stepper.order))
@@ -264,8 +266,8 @@ def finer(problem, times, control, steps, ends, choice, events, room):
     if control.verify == "tolerance":
         *start, looser, theirs = choice
         steps, ends = steps_for((*start, quarter(looser), theirs), False, room)
-    halved = control.verify != "tolerance"
-    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, halved=halved, room=room))
+    keywords = {"halved": control.verify != "tolerance", "room": room, "unknowns": problem.unknowns()}
+    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
 
 
 def quarter(control):

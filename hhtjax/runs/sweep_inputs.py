@@ -117,7 +117,7 @@ class Inputs(NamedTuple):
         return sum(jax.tree.leaves(structure.unflatten(sizes)[1]))
 
     def call(self, mesh=None, progress=False):
-        """The arguments and keywords of `run_sweep`, and with these the unknowns that vectors are to fit."""
+        """The arguments and keywords of `run_sweep`; with these what its program is chosen by."""
         if mesh is not None and not isinstance(mesh, Mesh):
             raise TypeError(f"sweep: `mesh` must be a jax.sharding.Mesh; received {mesh!r}.")
         data, dts = self.data, self.dts
@@ -129,7 +129,7 @@ class Inputs(NamedTuple):
         unknowns = self.unknowns()
         lanes = lanes_for(self.size, least_lanes(self.size, unknowns, hands) if are_alike(dts) else 1)
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
-        fitting = {"unknowns": unknowns if lanes > 1 else None}
+        fitting = {"unknowns": unknowns, "wide": lanes > 1}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
         return arguments, {**static, **fitting, "mesh": mesh, "progress": progress, "room": self.room}
 

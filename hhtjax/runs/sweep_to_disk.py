@@ -85,10 +85,10 @@ def sweep_to_disk(
     folder, size = Path(folder), inputs.dts.size
     places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
     arguments, keywords = inputs.chunk(places[0]).call()
-    unknowns = keywords.pop("unknowns")
+    kind = keywords.pop("unknowns"), keywords.pop("wide")
 
     def lower():
-        return run_sweep.of(unknowns).lower(*arguments, **keywords)
+        return run_sweep.of(*kind).lower(*arguments, **keywords)
 
     lowered = lower()
     _claim(folder, _manifest(inputs, lowered, chunk, len(places)))

@@ -1,9 +1,12 @@
 """Options for the compiler, of the programs that start here; inside a jit of the user's those of that jit hold.
 
 QUICK: XLA:CPU compiles each fusion that stands outside a kernel by a pipeline of MLIR, some 10 ms for a few sums, and
-gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that.
+gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. What
+it makes of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without.
 WIDE: vectors of 512 bits for loops over the members of a batch, where XLA:CPU takes half of that, unless it is asked: a
 batch of double pendulums then takes half the time.
+
+For a jit of one's own: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
 """
 
 from typing import Any
@@ -12,16 +15,17 @@ import jax
 
 from hhtjax.xla.gate import is_on
 
-QUICK = {"xla_cpu_use_fusion_emitters": False}  # numbers as before, to rounding, and runs as fast
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+MOST_QUICK = 32  # unknowns; with 40, steps of a beam take 1.2 times as long
 WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits; where a processor has none so long, nothing changes
-MOST_UNKNOWNS = 4  # loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
+MOST_WIDE = 4  # unknowns; loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
 
 
 class Programs:
     """A function of arrays as programs: with options, and one to be called wherever it is.
 
     >>> twice = Programs(lambda x: 2 * x)
-    >>> float(twice(2.0)), float(twice(3.0, unknowns=2)), float(jax.jit(twice)(3.0))
+    >>> float(twice(2.0)), float(twice(3.0, unknowns=2, wide=True)), float(jax.jit(twice)(3.0))
     (4.0, 6.0, 6.0)
     """
 
@@ -33,16 +37,16 @@ class Programs:
         self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
 
-    def of(self, unknowns=None):
-        """What is compiled for a system of so many unknowns; None where members come one by one, or there are none."""
-        if Programs.are_refused or not is_on() or jax.default_backend() != "cpu":
+    def of(self, unknowns=0, wide=False):
+        """The one for a system of so many unknowns, 0 where nothing is known of one; wide: for members of a batch."""
+        if Programs.are_refused or unknowns > MOST_QUICK or not is_on() or jax.default_backend() != "cpu":
             return self.usual
-        return self.wide if unknowns is not None and unknowns <= MOST_UNKNOWNS else self.quick
+        return self.wide if wide and unknowns <= MOST_WIDE else self.quick
 
-    def __call__(self, *args, unknowns=None, **keywords):
+    def __call__(self, *args, unknowns=0, wide=False, **keywords):
         """The values of the function."""
         try:
-            return self.of(unknowns)(*args, **keywords)
+            return self.of(unknowns, wide)(*args, **keywords)
         except ValueError as error:  # there are options inside a jit of the user's
             if "compiler_options" not in str(error):
                 raise
