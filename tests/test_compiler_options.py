@@ -20,32 +20,30 @@ def twice(x):
 def test_few_unknowns_take_options_and_no_jit_of_a_user_has_them():
     programs = Programs(twice)
     quick, wide = (programs.quick, programs.wide) if ARE_TAKEN else (programs.usual, programs.usual)
-    assert (programs.of(2, wide=True), programs.of(12, wide=True), programs.of(2), programs.of()) == (
-        wide,
-        *[quick] * 3,
-    )
-    assert programs.of(33) is programs.usual
+    found = programs.of(2, 2), programs.of(3, 9), programs.of(2), programs.of()
+    assert found == (wide, quick, quick, quick)
+    assert programs.of(33) is programs.of(33, 4) is programs.usual
     with plain():
         assert programs.of(2) is programs.usual
-    assert programs(3.0, unknowns=2, wide=True) == 6
+    assert programs(3.0, rates=2, numbers=2) == 6
     assert wide._cache_size() == programs.number() == 1
-    assert jax.jit(lambda x: programs(x, unknowns=2, wide=True))(3.0) == 6
-    assert jax.vmap(lambda x: programs(x, unknowns=2, wide=True))(jnp.ones(2))[0] == 2
+    assert jax.jit(lambda x: programs(x, rates=2, numbers=2))(3.0) == 6
+    assert jax.vmap(lambda x: programs(x, rates=2, numbers=2))(jnp.ones(2))[0] == 2
     assert jax.grad(programs)(3.0) == 2
 
 
 @pytest.mark.skipif(not ARE_TAKEN, reason="no options here")
-@pytest.mark.parametrize("wide", [False, True])
-def test_an_option_that_xla_does_not_know_is_tried_once(wide, monkeypatch):
+@pytest.mark.parametrize("numbers", [None, 2])
+def test_an_option_that_xla_does_not_know_is_tried_once(numbers, monkeypatch):
     monkeypatch.setattr("hhtjax.xla.programs.QUICK", {"xla_cpu_of_another_time": True})
     monkeypatch.setattr(Programs, "are_refused", False)
     programs = Programs(twice)
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_of_another_time"):  # so it reaches the compiler
-        programs.of(2, wide)(3.0)
-    assert programs(3.0, unknowns=2, wide=wide) == 6
-    assert programs.of(2, wide) is programs.usual
+        programs.of(2, numbers)(3.0)
+    assert programs(3.0, rates=2, numbers=numbers) == 6
+    assert programs.of(2, numbers) is programs.usual
     monkeypatch.setattr(Programs, "are_refused", False)
-    assert jax.value_and_grad(lambda x: programs(x, unknowns=2, wide=wide))(3.0) == (6, 2)
+    assert jax.value_and_grad(lambda x: programs(x, rates=2, numbers=numbers))(3.0) == (6, 2)
 
 
 def test_programs_of_the_library_are_chosen_by_their_unknowns(monkeypatch):
@@ -58,7 +56,7 @@ def test_programs_of_the_library_are_chosen_by_their_unknowns(monkeypatch):
     hhtjax.sweep(*start, dts=jnp.array([0.1, 0.2]), duration=0.4, num_samples=2)
     hhtjax.fit(lambda k: k - jnp.ones(2), 2.0)
     hhtjax.choose_steps(*start, times=jnp.array([0.1]), rtol=1e-2, atol=1e-2)
-    assert chosen == [(3, True), (3, False), (0, False), (3, False)]
+    assert chosen == [(3, 3), (3, None), (0, None), (3, None)]
 
 
 def test_errors_of_the_function_are_its_own():

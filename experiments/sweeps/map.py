@@ -76,7 +76,7 @@ def run(report, fast):
     (scale, alpha, h), shape, axes = members(fast)
     prepared = inputs(scene, scale, alpha, h)
     arguments, keywords = prepared.call()
-    program = run_sweep.of(keywords.pop("unknowns"), keywords.pop("wide")).lower(*arguments, **keywords).compile()
+    program = run_sweep.of(keywords.pop("rates"), keywords.pop("numbers")).lower(*arguments, **keywords).compile()
     before = peak_bytes()
     functions = {"map": lambda: program(*arguments)} | c_runs(scene)
     times = least_seconds(functions, 0 if fast else 2)  # in turns

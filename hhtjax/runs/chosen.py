@@ -48,7 +48,7 @@ def steps_for(choice, progress, room):
     """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
     problem, times, control, events = choice
     control = replace(control, verify=False)
-    keywords = {"progress": progress, "room": room[:1], "unknowns": problem.unknowns()}
+    keywords = {"progress": progress, "room": room[:1], "rates": problem.rates()}
     return or_plain(partial(chosen_steps, problem, times[-1], control, events, **keywords))
 
 
@@ -252,7 +252,7 @@ def run_controlled(problem, times, control, progress, events=None, room=()) -> S
     times = checked_times("simulate", problem, times, control)
     (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
     steps, ends = steps_for(choice, progress, room)
-    keywords = {"room": room, "unknowns": problem.unknowns()}
+    keywords = {"room": room, "rates": problem.rates()}
     run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
     if control.verify:
         better = finer(problem, times, control, steps, ends, choice, events, room)
@@ -266,7 +266,7 @@ def finer(problem, times, control, steps, ends, choice, events, room):
     if control.verify == "tolerance":
         *start, looser, theirs = choice
         steps, ends = steps_for((*start, quarter(looser), theirs), False, room)
-    keywords = {"halved": control.verify != "tolerance", "room": room, "unknowns": problem.unknowns()}
+    keywords = {"halved": control.verify != "tolerance", "room": room, "rates": problem.rates()}
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
 
 

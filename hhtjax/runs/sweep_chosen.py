@@ -20,7 +20,7 @@ def sweep_chosen(inputs, progress):
     """The `Solution` of a sweep whose `dts` are an `Adaptive`."""
     static = {"mapped": inputs.mapped, "size": inputs.size, "lanes": lanes_for(inputs.size), "progress": progress}
     starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times, inputs.events))
-    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, room=inputs.room, unknowns=inputs.unknowns()))
+    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, room=inputs.room, rates=inputs.sizes()[1]))
     steps = trimmed(runs.steps)
     return runs._replace(dt=steps.dt, steps=steps)
 

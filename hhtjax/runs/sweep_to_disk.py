@@ -85,7 +85,7 @@ def sweep_to_disk(
     folder, size = Path(folder), inputs.dts.size
     places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
     arguments, keywords = inputs.chunk(places[0]).call()
-    kind = keywords.pop("unknowns"), keywords.pop("wide")
+    kind = keywords.pop("rates"), keywords.pop("numbers")
 
     def lower():
         return run_sweep.of(*kind).lower(*arguments, **keywords)

@@ -16,16 +16,16 @@ import jax
 from hhtjax.xla.gate import is_on
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}
-MOST_QUICK = 32  # unknowns; with 40, steps of a beam take 1.2 times as long
+MOST_QUICK = 32  # rates; with 40, steps of a beam take 1.2 times as long
 WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits; where a processor has none so long, nothing changes
-MOST_WIDE = 4  # unknowns; loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
+MOST_WIDE = 4  # coordinates; loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
 
 
 class Programs:
     """A function of arrays as programs: with options, and one to be called wherever it is.
 
     >>> twice = Programs(lambda x: 2 * x)
-    >>> float(twice(2.0)), float(twice(3.0, unknowns=2, wide=True)), float(jax.jit(twice)(3.0))
+    >>> float(twice(2.0)), float(twice(3.0, rates=2, numbers=2)), float(jax.jit(twice)(3.0))
     (4.0, 6.0, 6.0)
     """
 
@@ -37,16 +37,17 @@ class Programs:
         self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
 
-    def of(self, unknowns=0, wide=False):
-        """The one for a system of so many unknowns, 0 where nothing is known of one; wide: for members of a batch."""
-        if Programs.are_refused or unknowns > MOST_QUICK or not is_on() or jax.default_backend() != "cpu":
+    def of(self, rates=0, numbers=None):
+        """The one for a system of so many rates, 0 where nothing is known of one. numbers: in the position of a member
+        of a batch, None where members come one by one."""
+        if Programs.are_refused or rates > MOST_QUICK or not is_on() or jax.default_backend() != "cpu":
             return self.usual
-        return self.wide if wide and unknowns <= MOST_WIDE else self.quick
+        return self.wide if numbers is not None and numbers <= MOST_WIDE else self.quick
 
-    def __call__(self, *args, unknowns=0, wide=False, **keywords):
+    def __call__(self, *args, rates=0, numbers=None, **keywords):
         """The values of the function."""
         try:
-            return self.of(unknowns, wide)(*args, **keywords)
+            return self.of(rates, numbers)(*args, **keywords)
         except ValueError as error:  # there are options inside a jit of the user's
             if "compiler_options" not in str(error):
                 raise
