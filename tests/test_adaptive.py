@@ -202,12 +202,12 @@ def test_tolerances_and_all_else_are_data():
         return hhtjax.simulate(CONTACT, hhtjax.rowda(), jnp.full(1, q0), ZERO, k, dt=dt, times=np.array([0.2, 0.4]))
 
     go(1e-3, 1e5, 0.3)
-    compiled = chosen_steps._cache_size(), run_over._cache_size()
+    compiled = chosen_steps.number(), run_over.number()
     tolerances = {"rtol": 1e-2, "atol": 1e-6}
     for times in ([0.4], [0.1, 0.2, 0.4]):  # any number of them, and whatever becomes of the run
         hhtjax.choose_steps(CONTACT, hhtjax.rowda(), jnp.full(1, 0.3), ZERO, 1e5, times=times, **tolerances)
     few, many = go(1e-2, 1e5, 0.3), go(1e-5, 2e5, 0.4)
-    assert (chosen_steps._cache_size(), run_over._cache_size()) == compiled
+    assert (chosen_steps.number(), run_over.number()) == compiled
     assert few.steps.accepted < many.steps.accepted
     batch = jax.jit(jax.vmap(go, (0, None, None)))(np.array([1e-2, 1e-5]), 2e5, 0.4)
     batch.check()
@@ -283,7 +283,7 @@ def test_the_error_of_the_whole_run(references):
         ):
             run.check()
         assert 0.1 < np.max(run.error) < 0.3
-        programs.add(chosen_steps._cache_size())
+        programs.add(chosen_steps.number())
     assert len(programs) == 1
 
 

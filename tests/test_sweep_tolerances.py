@@ -111,10 +111,10 @@ def test_what_differs_is_data_and_failures_are_alone():
     stiffness = {"k": jnp.array([1.0, 4e4, 4.0, 9.0, 1.0]), "c": jnp.array([0.1, 0.1, jnp.nan, 0.1, 0.2])}
     axes = None, None, None, 0
     good = sweep(stiffness | {"c": stiffness["c"].at[2].set(0.3)}, np.array(1e-4), in_axes=axes)
-    compiled = run_chosen._cache_size()
+    compiled = run_chosen.number()
     runs = sweep(stiffness, np.array(2e-4), in_axes=axes)
     again = sweep(stiffness, np.array(1e-4), in_axes=axes)
-    assert run_chosen._cache_size() == compiled
+    assert run_chosen.number() == compiled
     assert runs.steps.stop.tolist() == [0, 2, 3, 0, 0]
     with pytest.raises(hhtjax.SimulationError, match=r"member 1 \(2 of 5 failed\), stopped at t = .*max_steps=4000"):
         again.check()

@@ -25,13 +25,13 @@ from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import State, Stepper, public
 from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
+from hhtjax.xla import Programs, largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
 
 TINY = 1e-9  # part of a run
 ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
-@partial(jax.jit, static_argnames=("progress", "room"))
+@partial(Programs, static_argnames=("progress", "room"))
 def chosen_steps(problem, end, control, events=None, progress=False, room=()):
     """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in.
 
@@ -48,7 +48,8 @@ def steps_for(choice, progress, room):
     """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
     problem, times, control, events = choice
     control = replace(control, verify=False)
-    return or_plain(partial(chosen_steps, problem, times[-1], control, events, progress=progress, room=room[:1]))
+    keywords = {"progress": progress, "room": room[:1], "rates": problem.rates()}
+    return or_plain(partial(chosen_steps, problem, times[-1], control, events, **keywords))
 
 
 class Grid(NamedTuple):
@@ -87,7 +88,7 @@ class Grid(NamedTuple):
         return h, last, jnp.where(is_there, end, jnp.inf)
 
 
-@partial(jax.jit, static_argnames=("halved", "room"))
+@partial(Programs, static_argnames=("halved", "room"))
 def run_over(problem, times, ends, accepted, events=None, halved=False, room=()):
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
 
@@ -251,7 +252,8 @@ def run_controlled(problem, times, control, progress, events=None, room=()) -> S
     times = checked_times("simulate", problem, times, control)
     (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
     steps, ends = steps_for(choice, progress, room)
-    run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, room=room))
+    keywords = {"room": room, "rates": problem.rates()}
+    run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
     if control.verify:
         better = finer(problem, times, control, steps, ends, choice, events, room)
         run = run._replace(**verified(run, better, control, problem.stepper.order))
@@ -264,8 +266,8 @@ def finer(problem, times, control, steps, ends, choice, events, room):
     if control.verify == "tolerance":
         *start, looser, theirs = choice
         steps, ends = steps_for((*start, quarter(looser), theirs), False, room)
-    halved = control.verify != "tolerance"
-    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, halved=halved, room=room))
+    keywords = {"halved": control.verify != "tolerance", "room": room, "rates": problem.rates()}
+    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
 
 
 def quarter(control):
