@@ -40,14 +40,13 @@ def earlier(report, module) -> dict:
     return next((x for place in places if (x := read(place / f"{report.name}.json"))), {})
 
 
-def run_experiment(report, groups, fast, machine: Any = None):
+def run_experiment(report, parts, fast, machine: Any = None):
     """All parts, one after the other: times are undisturbed, and they share what they compile.
 
-    groups: lists of parts. machine: what it is run on; by default in a few words.
+    machine: what it is run on; by default in a few words.
     Where the report names parts, these alone are run, and their numbers put into those of the run before, or the
     committed ones.
     """
-    parts = [part for group in groups for part in group]
     if report.parts:
         before = earlier(report, parts[0])
         chosen = [part for part in parts if part.__name__.rpartition(".")[2] in report.parts]

@@ -75,9 +75,7 @@ def test_a_part_is_made_anew_and_says_so(monkeypatch, tmp_path):
     """The other parts keep their numbers and what made them."""
     runner = importlib.import_module("experiments.__main__")
     first, second = (SimpleNamespace(__name__=f"here.{name}", __doc__=name, __file__=__file__) for name in ("a", "b"))
-    module = SimpleNamespace(
-        GROUPS=([first], [second]), run=lambda report, fast: run_experiment(report, module.GROUPS, fast)
-    )
+    module = SimpleNamespace(PARTS=(first, second), run=lambda report, fast: run_experiment(report, module.PARTS, fast))
     monkeypatch.setattr(runner, "EXPERIMENTS", {"stub": "stub"})
     monkeypatch.setitem(sys.modules, "experiments.stub", module)
 

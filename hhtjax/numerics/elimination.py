@@ -51,7 +51,7 @@ def factorize(A):
     if A.shape[-1] <= UNROLLED:
         return partial(_substitute, _lu(A))
     if A.shape[-1] <= LOOPED:
-        factors = choose(_lu, _lu_of_lapack, A)
+        factors = choose(_lu, panels.lu, A)
         ways = _substitute, _by_lapack
         return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
     return partial(_by_lapack, panels.lu(A))
@@ -125,12 +125,6 @@ def _written_out(start, stop, body, x):
     for k in range(start, stop):
         x = body(k, x)
     return x
-
-
-def _lu_of_lapack(A):
-    """The same as `_lu`."""
-    LU, _, order = lax.linalg.lu(A)
-    return LU, order.astype(jnp.result_type(int))
 
 
 def _by_lapack(factors, b, trans=0):

@@ -18,7 +18,7 @@ def lu(A):
     n = len(A)
     if n * n <= ELEMENTS or n > LARGEST:
         LU, _, order = lax.linalg.lu(A)
-        return LU, order
+        return LU, order.astype(jnp.result_type(int))
     rest = max(int(ELEMENTS**0.5), n // 2)
     number = -(-(n - rest) // (ELEMENTS // n))
     width = -(-(n - rest) // number)
