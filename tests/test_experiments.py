@@ -97,6 +97,12 @@ def test_a_part_is_made_anew_and_says_so(monkeypatch, tmp_path):
         told(4, "--parts", "c")
 
 
+@pytest.mark.parametrize("module", EXPERIMENTS.values())
+def test_the_parts_of_an_experiment_can_be_told_apart(module):
+    parts = getattr(importlib.import_module(f"experiments.{module}"), "PARTS", ())
+    assert all(callable(part.run) and part.__doc__ for part in parts)
+
+
 def test_an_unknown_name_gives_the_list_and_fails():
     result = experiments("silverbocks")
     assert result.returncode == 2
