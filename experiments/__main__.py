@@ -122,7 +122,7 @@ def run(name: str, options) -> None:
     mode = "fast" if options.fast else "part" if part else "full"
     report = Report(name, options.out, mode, f"python -m experiments {name}{flag}", options.formats.split(","), parts)
     module = importlib.import_module(f"experiments.{EXPERIMENTS[name]}")
-    known = [part.__name__.rpartition(".")[2] for group in getattr(module, "GROUPS", []) for part in group]
+    known = [part.__name__.rpartition(".")[2] for part in getattr(module, "PARTS", [])]
     if not options.gpu and (unknown := [part for part in parts if part not in known]):
         sys.exit(f"{name} has {'the parts ' + ', '.join(known) if known else 'no parts'}; received {unknown[0]!r}.")
     module.run(report, options.fast, *([options.full] if name in IN_PART else []))

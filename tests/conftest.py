@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 import jax
@@ -55,8 +56,37 @@ def share_programs():
     os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 
+class Contexts(threading.local):
+    """Of MLIR, one for many programs. JAX makes one for each, which takes longer than all else about a small program
+    that is loaded. What is compiled while another program is lowered has its own, as JAX counts on; and all are renewed
+    now and then, for they keep the constants of their programs."""
+
+    left = 0
+
+    def __init__(self, make, current):
+        self.make, self.current = make, current
+
+    def __call__(self):
+        if self.current() is not None:
+            return self.make()
+        if not self.left:
+            self.context, self.left = self.make(), 100
+        self.left -= 1
+        return self.context
+
+
+def share_contexts():
+    """As above, where this has been tried."""
+    if jax.__version_info__[:2] == (0, 10):
+        from jax._src.interpreters import mlir
+        from jaxlib.mlir import ir
+
+        mlir.make_ir_context = Contexts(mlir.make_ir_context, lambda: ir.Context.current)
+
+
 set_flags()
 share_programs()
+share_contexts()
 os.environ.setdefault("MPLBACKEND", "Agg")  # charts of doctests need no display
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -75,9 +75,7 @@ def test_a_part_is_made_anew_and_says_so(monkeypatch, tmp_path):
     """The other parts keep their numbers and what made them."""
     runner = importlib.import_module("experiments.__main__")
     first, second = (SimpleNamespace(__name__=f"here.{name}", __doc__=name, __file__=__file__) for name in ("a", "b"))
-    module = SimpleNamespace(
-        GROUPS=([first], [second]), run=lambda report, fast: run_experiment(report, module.GROUPS, fast)
-    )
+    module = SimpleNamespace(PARTS=(first, second), run=lambda report, fast: run_experiment(report, module.PARTS, fast))
     monkeypatch.setattr(runner, "EXPERIMENTS", {"stub": "stub"})
     monkeypatch.setitem(sys.modules, "experiments.stub", module)
 
@@ -97,6 +95,12 @@ def test_a_part_is_made_anew_and_says_so(monkeypatch, tmp_path):
     assert (again["a"], again["b"], list(again["made_by"]["parts"])) == (3, 2, ["b", "a"])
     with pytest.raises(SystemExit, match=r"stub has the parts a, b; received 'c'"):
         told(4, "--parts", "c")
+
+
+@pytest.mark.parametrize("module", EXPERIMENTS.values())
+def test_the_parts_of_an_experiment_can_be_told_apart(module):
+    parts = getattr(importlib.import_module(f"experiments.{module}"), "PARTS", ())
+    assert all(callable(part.run) and part.__doc__ for part in parts)
 
 
 def test_an_unknown_name_gives_the_list_and_fails():

@@ -139,9 +139,9 @@ def test_tolerances_above_the_noise_are_named(measured):
     assert not found.converged
     assert found.reason == "stopped: the estimates change whenever steps are chosen anew; take a smaller rtol"
     assert found.choices == 5
-    compiled = solve._cache_size()
+    compiled = solve.number()
     assert hhtjax.fit(residuals, TRUE).choices is not None
-    assert solve._cache_size() == compiled
+    assert solve.number() == compiled
 
 
 @pytest.mark.slow

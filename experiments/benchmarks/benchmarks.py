@@ -15,7 +15,7 @@ from experiments.benchmarks.measure import machine
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = [against_c, structure, batches, many_unknowns], [gradients, chains, compile_time, first_call]  # for --fast
+PARTS = against_c, structure, batches, many_unknowns, gradients, chains, compile_time, first_call
 ON_ACCELERATOR = (accelerator,)  # --gpu: on another machine than the rest
 
 
@@ -24,4 +24,4 @@ def run(report: Report, fast: bool):
     found = machine()
     for name, value in found.items():
         print(f"{name:<16}{value}", flush=True)
-    run_experiment(report, (*GROUPS, ON_ACCELERATOR) if report.parts else GROUPS, fast, found)
+    run_experiment(report, PARTS + ON_ACCELERATOR if report.parts else PARTS, fast, found)

@@ -56,15 +56,20 @@ def simulate(scene):
     return run.q
 
 
-def gradient(scene):
-    """In all params, reverse."""
+def gradient(scene, options=None):
+    """In all params, reverse, in a jit of the user's."""
     (system, params, q0, v0), dt, stepper = SCENES[scene]()
 
     def loss(params):
         run = hhtjax.simulate(system, stepper, q0, v0, params, dt=dt, num_steps=NUM_STEPS)
         return sum(jnp.sum(x**2) for x in jax.tree.leaves(run.q))
 
-    return jax.jit(jax.grad(loss))(params)
+    return jax.jit(jax.grad(loss), compiler_options=options)(params)
+
+
+def quick(scene):
+    """The same, compiled as `simulate` is."""
+    return gradient(scene, hhtjax.xla.QUICK)
 
 
 def fit(scene):
@@ -88,7 +93,7 @@ def sweep(scene):
     return runs.q
 
 
-CALLS = {f.__name__: f for f in (simulate, gradient, fit, sweep)}
+CALLS = {f.__name__: f for f in (simulate, gradient, fit, sweep)} | {"gradient, QUICK": quick}
 
 
 def first(call, scene):

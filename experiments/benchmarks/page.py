@@ -71,15 +71,17 @@ def bars(numbers):
     return table(["what", "bar", "here", "met"], lines)
 
 
-def first_call(numbers):
-    """A row for each scene and call."""
-    rows = [
-        {**r, **r["cpu_time_s"], "again": r["with_cache_cpu_time_s"], "share": r["with_cache_cpu_time_s"] / total}
-        for r in numbers["rows"]
-        if (total := r["cpu_time_s"]["total"])
-    ]
-    parts = {name: name for name in ("total", "tracing", "lowering", "compiling")}
-    return rows_table(rows, {"scene": "scene", "call": "call", **parts, "with a cache": "again", "share": "share"})
+def first_call(numbers, before):
+    """A row for each scene and call, beside what it took at an earlier commit."""
+    then = {(r["scene"], r["call"]): r["cpu_time_s"]["total"] for r in before["rows"]}
+    rows = []
+    for r in numbers["rows"]:
+        total, again = r["cpu_time_s"]["total"], r["with_cache_cpu_time_s"]
+        earlier = then[r["scene"], r["call"].split(",")[0]]
+        times = {**r["cpu_time_s"], "before": earlier, "over before": total / earlier}
+        rows.append({**r, **times, "with a cache": again, "share": again / total})
+    columns = "scene", "call", "before", "total", "over before", "tracing", "lowering", "compiling"
+    return rows_table(rows, {name: name for name in (*columns, "with a cache", "share")})
 
 
 def dense(rows):
@@ -120,7 +122,7 @@ def accelerator(numbers):
 def page(numbers):
     """The text of README.md."""
     c, batches, gradients = (numbers[part] for part in ("against_c", "batches", "gradients"))
-    machine = numbers["machine"]
+    machine, before = numbers["machine"], json.loads((HERE / "first_call_before.json").read_text())
     differences = [
         r["q_minus_c_rad"] for r in c["single"] if r["method"] == PREDICTOR and r["q_minus_c_rad"] is not None
     ]
@@ -212,7 +214,8 @@ def page(numbers):
                 {"method": "method", "of": "compiled", "s": "compile_s", "over Kvaerno3's": "over_kvaerno3"},
             ),
             first_steps=numbers["first_call"]["num_steps"],
-            first_call=first_call(numbers["first_call"]),
+            first_call=first_call(numbers["first_call"], before),
+            before=before,
             cores=machine["cores"],
             busy=max(r["busy_processes"] for r in numbers["many_unknowns"]["dense"]),
             dense_steps=numbers["many_unknowns"]["num_steps"],

@@ -13,9 +13,9 @@ from experiments.cardona_geradin1989 import (
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = [infinity, pendulum, formulations, drift, mechanisms], [squeezer, work_precision, top]  # two processes if fast
+PARTS = infinity, pendulum, formulations, drift, mechanisms, squeezer, work_precision, top
 
 
 def run(report: Report, fast: bool):
     """All parts."""
-    run_experiment(report, GROUPS, fast)
+    run_experiment(report, PARTS, fast)

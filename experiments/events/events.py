@@ -4,9 +4,9 @@ from experiments.events import cost, gradients, order, parameters, peers, poinca
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = [order, gradients, zeno, tolerance], [poincare, cost, parameters, peers]  # two processes if fast
+PARTS = order, gradients, zeno, tolerance, poincare, cost, parameters, peers
 
 
 def run(report: Report, fast: bool):
     """All parts."""
-    run_experiment(report, GROUPS, fast)
+    run_experiment(report, PARTS, fast)

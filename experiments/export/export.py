@@ -5,9 +5,9 @@ from experiments.export import pendulum, real_time, speed
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = [pendulum, speed], [real_time]  # two processes if fast
+PARTS = pendulum, speed, real_time
 
 
 def run(report: Report, fast: bool):
     """All parts."""
-    run_experiment(report, GROUPS, fast, machine())
+    run_experiment(report, PARTS, fast, machine())

@@ -27,7 +27,7 @@ from hhtjax.scenes import duffing
 SUBSTEPS = 4  # of rk4, more exact than the 8 non-iterative ones of `silverbox`
 ROUNDS = 2  # terms added
 WORTH = 1 / 3  # of the largest drop of the cost that the score test promises: candidates below are not fitted
-PARTS = 8  # of the training record, left out in turn
+FOLDS = 8  # of the training record, left out in turn
 FAST, SLOW = 2e-3, 0.3  # s
 FORCES = {  # name: force over its parameter, and the parameter's typical size and unit
     "k4": (lambda y, v, z: y**4, 1.0, "1/V^3"),
@@ -127,7 +127,7 @@ def run(report: Report, fast: bool):
     shown = [key for key in rows[0] if key not in ("estimates", "standard_errors", "unit")]
     report.table(shown, [[row[key] for key in shown] for row in rows])
     plot(report, rows)
-    numbers = {"models": rows, "score_tests": tests, "substeps": SUBSTEPS, "parts": PARTS}
+    numbers = {"models": rows, "score_tests": tests, "substeps": SUBSTEPS, "parts": FOLDS}
     report.numbers(rounded(numbers | {"data": "measured" if sets.measured else "generated", "fast": fast}))
 
 
@@ -180,7 +180,7 @@ def fitted(report: Report, record: Record, u, name, guess):
 
 def compare(fits, fast):
     """{model: RMSE in mV} of parts of the training record, each predicted by the fit to all the others."""
-    parts = 2 if fast else PARTS
+    parts = 2 if fast else FOLDS
     always = np.arange(len(fits[0].result.residual)) < WASHOUT
     results, functions = ({fit.name: getattr(fit, key) for fit in fits} for key in ("result", "residuals"))
     compared = hhtjax.compare(results, functions, folds=parts, always=always, progress=True)

@@ -84,8 +84,8 @@ def run(report, fast):
         import diffrax  # pyright: ignore[reportMissingImports]  # of an extra of its own
     except ImportError:
         diffrax = None
-    counts, repeats = (STEPS_PER_SAMPLE[:2], 1) if fast else (STEPS_PER_SAMPLE, 5)
-    finest = 8 if fast else 256
+    counts, repeats = (STEPS_PER_SAMPLE[:1], 1) if fast else (STEPS_PER_SAMPLE, 5)
+    finest = 2 if fast else 256
     exact = angles(TRUTH, hhtjax.hht(alpha=0.0, iterations=None), finest)
     measured = exact * (1 + 0.01 * jax.random.normal(jax.random.key(0), exact.shape))
     x = TRUTH + AWAY

@@ -4,14 +4,9 @@ from experiments.kim2019 import alpha, arm, linear, order, repaired, splitting, 
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-GROUPS = (
-    [stability, linear, order, splitting],
-    [tables, alpha, repaired, timing],  # which share the runs of tables
-    [vehicle],
-    [arm],
-)
+PARTS = stability, linear, order, splitting, tables, alpha, repaired, timing, vehicle, arm
 
 
 def run(report: Report, fast: bool):
     """All parts."""
-    run_experiment(report, GROUPS, fast)
+    run_experiment(report, PARTS, fast)

@@ -17,12 +17,12 @@ from experiments.stability import (
     tolerances,
 )
 
-GROUPS = (
-    [gallery, reported, advice],
-    [adaptive, tolerances, controller, dry, stops, constrained, rotating, drift, peers],
-)  # two processes if fast
+PARTS = (
+    *(gallery, reported, advice, adaptive, tolerances, controller),
+    *(dry, stops, constrained, rotating, drift, peers),
+)
 
 
 def run(report: Report, fast: bool):
     """All parts."""
-    run_experiment(report, GROUPS, fast)
+    run_experiment(report, PARTS, fast)

@@ -75,8 +75,8 @@ def run(report, fast):
     scene = double_pendulum.stiff(trigonometry=trigonometry)
     (scale, alpha, h), shape, axes = members(fast)
     prepared = inputs(scene, scale, alpha, h)
-    (unknowns, *arguments), keywords = prepared.call()
-    program = run_sweep.of(unknowns).lower(*arguments, **keywords).compile()
+    arguments, keywords = prepared.call()
+    program = run_sweep.of(keywords.pop("rates"), keywords.pop("numbers")).lower(*arguments, **keywords).compile()
     before = peak_bytes()
     functions = {"map": lambda: program(*arguments)} | c_runs(scene)
     times = least_seconds(functions, 0 if fast else 2)  # in turns

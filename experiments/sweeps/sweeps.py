@@ -4,9 +4,9 @@ from experiments.parts import run_experiment
 from experiments.report import Report
 from experiments.sweeps import devices, large, map, one_call, orders, real_time
 
-GROUPS = [map, real_time, one_call], [devices, orders, large]  # two processes if fast
+PARTS = map, real_time, one_call, devices, orders, large
 
 
 def run(report: Report, fast: bool):
     """All parts."""
-    run_experiment(report, GROUPS, fast)
+    run_experiment(report, PARTS, fast)

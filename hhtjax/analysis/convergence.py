@@ -11,6 +11,7 @@ from hhtjax.checks import require_number
 from hhtjax.description.presentation import shown
 from hhtjax.steppers.stepper import require_stepper
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.xla import Programs
 
 
 @shown
@@ -90,7 +91,7 @@ def observed_order(
     return ObservedOrder(float(duration) / counts[: len(error)], error, slope)
 
 
-@jax.jit
+@Programs
 def _end(system, stepper, q0, v0, params, z0, t0, dt, num_steps):
     """q at the end as a vector; one compilation for all numbers of steps."""
     state = stepper.init(system, q0, v0, params, dt, t0, z0)

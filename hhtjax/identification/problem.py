@@ -20,6 +20,7 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.rounds import in_rounds
 from hhtjax.identification.sandwich import count_segments, uncertainty, variance_inflation
 from hhtjax.runs.freezing import chooses_steps, with_steps_for
+from hhtjax.xla import Programs
 
 
 class Data(NamedTuple):
@@ -87,7 +88,7 @@ class Coordinates:
         return [pair.mean for pair in pairs], [pair.deviation for pair in pairs]
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(Programs, static_argnums=(0, 1))
 def solve(residuals, options: Options, params0, data: Data) -> FitResult:
     """The fit, with what it says about itself as data."""
     coordinates = Coordinates(options.transforms, params0, data.scale)

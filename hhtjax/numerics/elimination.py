@@ -2,7 +2,7 @@
 
 A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
 up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones; up to
-`LOOPED` it is a loop in a kernel, and LAPACK's elsewhere.
+`LOOPED` it is a loop in a kernel, and LAPACK's elsewhere. Hundreds are LAPACK's in panels (panels.py).
 """
 
 from functools import partial
@@ -11,8 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.scipy.linalg import lu_factor, lu_solve
 
+from hhtjax.numerics import panels
 from hhtjax.numerics.sparse_matrix import Sparse
 from hhtjax.numerics.superlu import factorize_sparse
 from hhtjax.xla import choose, structural
@@ -51,10 +51,10 @@ def factorize(A):
     if A.shape[-1] <= UNROLLED:
         return partial(_substitute, _lu(A))
     if A.shape[-1] <= LOOPED:
-        factors = choose(_lu, _lu_of_lapack, A)
+        factors = choose(_lu, panels.lu, A)
         ways = _substitute, _by_lapack
         return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
-    return partial(lu_solve, lu_factor(A))
+    return partial(_by_lapack, panels.lu(A))
 
 
 def _lu(A):
@@ -125,12 +125,6 @@ def _written_out(start, stop, body, x):
     for k in range(start, stop):
         x = body(k, x)
     return x
-
-
-def _lu_of_lapack(A):
-    """The same as `_lu`."""
-    LU, _, order = lax.linalg.lu(A)
-    return LU, order.astype(jnp.result_type(int))
 
 
 def _by_lapack(factors, b, trans=0):

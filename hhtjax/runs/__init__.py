@@ -48,7 +48,9 @@ False
 The first call
 --------------
 
-takes seconds: the functions are traced, and XLA compiles what becomes of them. JAX can keep that on disk, and then a
+takes seconds: the functions are traced, and XLA compiles what becomes of them, where a jit of yours is around it in up
+to twice the time that it takes elsewhere, unless that asks for the same: `jax.jit(f,
+compiler_options=hhtjax.xla.QUICK)`, for systems of up to 32 unknowns on the CPU. JAX can keep that on disk, and then a
 second process has only to trace, in a quarter to two thirds of the time. Before the first call:
 
     jax.config.update("jax_compilation_cache_dir", ".jax_cache")

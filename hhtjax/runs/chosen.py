@@ -27,12 +27,12 @@ from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
+from hhtjax.xla import Programs, is_untouched, largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
 
 ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
-@partial(jax.jit, static_argnames=("progress", "room"))
+@partial(Programs, static_argnames=("progress", "room"))
 def chosen_steps(problem, end, control, events=None, progress=False, room=()):
     """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in.
 
@@ -49,21 +49,23 @@ def steps_for(choice, progress, room):
     """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
     problem, times, control, events = choice
     control = replace(control, verify=False)
-    return or_plain(partial(chosen_steps, problem, times[-1], control, events, progress=progress, room=room[:1]))
+    keywords = {"progress": progress, "room": room[:1], "rates": problem.rates()}
+    return or_plain(partial(chosen_steps, problem, times[-1], control, events, **keywords))
 
 
 def run_in_two(problem, times, control, progress=False):
     """The `Solution` at `times`, its `Steps`, and the times at which they end."""
-    steps, ends = chosen_steps(*lax.stop_gradient((problem, times[-1], control)), progress=progress)
-    return run_over(problem, times, ends, steps.accepted), steps, ends
+    rates, choice = problem.rates(), lax.stop_gradient((problem, times[-1], control))
+    steps, ends = chosen_steps(*choice, progress=progress, rates=rates)
+    return run_over(problem, times, ends, steps.accepted, rates=rates), steps, ends
 
 
-@partial(jax.jit, static_argnames=("progress",))
+@partial(Programs, static_argnames=("progress",))
 def run_recorded(problem, times, control, progress=False):
     """The same in one pass, but for what vmap makes of it; without derivatives."""
 
     def record(problem, times, control):
-        steps, ends, run = choose(problem, times[-1], control, progress, times=problem.times(times))
+        steps, ends, run = choose(problem, problem.times(times[-1]), control, progress, times=problem.times(times))
         return run, steps, ends
 
     @custom_vmap
@@ -81,7 +83,7 @@ def run_recorded(problem, times, control, progress=False):
 
 def run_in_one(problem, times, control, progress=False):
     """The same, with the derivatives of two passes."""
-    ways = (partial(f, progress=progress) for f in (run_in_two, run_recorded))
+    ways = partial(run_in_two, progress=progress), partial(run_recorded, progress=progress, rates=problem.rates())
     return derivative_by(*ways, problem, times, control)
 
 
@@ -121,7 +123,7 @@ class Grid(NamedTuple):
         return h, last, jnp.where(is_there, end, jnp.inf)
 
 
-@partial(jax.jit, static_argnames=("halved", "room"))
+@partial(Programs, static_argnames=("halved", "room"))
 def run_over(problem, times, ends, accepted, events=None, halved=False, room=()):
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
 
@@ -241,15 +243,16 @@ def choose_steps(
 def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
-    in_one = events is None and problem.system.friction is None and not is_pair()
-    if in_one:
-        data = problem, times, replace(control, verify=False)
+    data = problem, times, replace(control, verify=False)
+    in_one = events is None and problem.system.friction is None and is_untouched(data) and not is_pair()
+    if in_one:  # else the program that chooses steps for a derivative or a batch is that of `choose_steps`
         run, steps, ends = or_plain(partial(run_in_one, *data, progress=progress))
         choice = lax.stop_gradient((problem, times, control, events))
     else:
         (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
         steps, ends = steps_for(choice, progress, room)
-        run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, room=room))
+        keywords = {"room": room, "rates": problem.rates()}
+        run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
     if control.verify:
         better = finer(problem, times, control, steps, ends, choice, events, room, in_one)
         run = run._replace(**verified(run, better, control, problem.stepper.order))
@@ -264,8 +267,8 @@ def finer(problem, times, control, steps, ends, choice, events, room, in_one):
         return or_plain(partial(run_in_one, *start, quarter(replace(looser, verify=False))))[0]
     if control.verify == "tolerance":
         steps, ends = steps_for((*start, quarter(looser), theirs), False, room)
-    halved = control.verify != "tolerance"
-    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, halved=halved, room=room))
+    keywords = {"halved": control.verify != "tolerance", "room": room, "rates": problem.rates()}
+    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
 
 
 def quarter(control):

@@ -9,6 +9,7 @@ from hhtjax.description import evaluated_now, freeze, is_concrete, thaw
 from hhtjax.systems import held, returned
 from hhtjax.systems.events import Event, Impact, flatten_events
 from hhtjax.systems.system import FirstOrderSystem
+from hhtjax.xla import Programs
 
 AT_GUARD = 1e3  # roundings of the terms of a guard that count as zero
 
@@ -97,7 +98,7 @@ def _require_same(caller, params, after):
             )
 
 
-@jax.jit
+@Programs
 def _guards_at_start(problem, events):
     """g and dg/dt of all events, what g is the sum of, whether it depends on v, and the restitution, 0 without."""
     flat, q, v, t0, params = problem.flat()

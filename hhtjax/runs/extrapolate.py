@@ -9,6 +9,7 @@ from hhtjax import rotation
 from hhtjax.numerics.richardson import richardson, take_out
 from hhtjax.runs.event_failures import DIFFER
 from hhtjax.systems import kinematics
+from hhtjax.xla import Programs
 
 MOST = 4  # levels; rounding and work grow with each
 
@@ -22,7 +23,7 @@ def extrapolated(run, levels, order, join):
     return _combine([run(2**level) for level in range(levels)], order=order, join=join)
 
 
-@partial(jax.jit, static_argnames=("order", "join"))
+@partial(Programs, static_argnames=("order", "join"))
 def _combine(solutions, order, join):
     first = solutions[0]
 

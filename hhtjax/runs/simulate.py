@@ -118,10 +118,11 @@ def simulate(
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
+    kind = {"rates": problem.rates(), "numbers": sum(map(jnp.size, jax.tree.leaves(problem.q0)))}
+
     def run(k):
-        sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room}
-        unknowns = sum(map(jnp.size, jax.tree.leaves(problem.q0)))
-        return or_plain(partial(_simulate, unknowns, problem, refined(dt, k), events, **sizes, progress=progress))
+        sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
+        return or_plain(partial(_simulate, problem, refined(dt, k), events, **sizes, **kind))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 

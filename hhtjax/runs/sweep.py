@@ -110,8 +110,8 @@ def sweep(
         if mesh is not None:
             raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
         return sweep_chosen(inputs, progress)
-    (unknowns, *arguments), keywords = inputs.call(mesh=mesh, progress=progress)
-    runs = partial(run_sweep, unknowns, **keywords)
+    arguments, keywords = inputs.call(mesh=mesh, progress=progress)
+    runs = partial(run_sweep, **keywords)
     if events is None or keywords["lanes"] <= VECTORS:
         return or_plain(partial(runs, *arguments))
     # derivatives keep many states, of so many members more than a cache holds

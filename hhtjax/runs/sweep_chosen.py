@@ -13,19 +13,19 @@ from hhtjax.runs.chosen import Grid, follow, quarter, verified
 from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.loop import show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
-from hhtjax.xla import or_plain
+from hhtjax.xla import Programs, or_plain
 
 
 def sweep_chosen(inputs, progress):
     """The `Solution` of a sweep whose `dts` are an `Adaptive`."""
     static = {"mapped": inputs.mapped, "size": inputs.size, "lanes": lanes_for(inputs.size), "progress": progress}
     starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times, inputs.events))
-    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, room=inputs.room))
+    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, room=inputs.room, rates=inputs.sizes()[1]))
     steps = trimmed(runs.steps)
     return runs._replace(dt=steps.dt, steps=steps)
 
 
-@partial(jax.jit, static_argnames=("mapped", "size", "lanes", "progress", "room"))
+@partial(Programs, static_argnames=("mapped", "size", "lanes", "progress", "room"))
 def run_chosen(system, start, choice, *, mapped, size, lanes, progress, room):
     """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, of runs, of steps."""
 

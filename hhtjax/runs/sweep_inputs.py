@@ -110,14 +110,15 @@ class Inputs(NamedTuple):
         dts = self.dts[members]
         return self._replace(data=_member(self.data, self.mapped, members), dts=dts, size=dts.size)
 
-    def unknowns(self):
-        """Number of coordinates of a member."""
+    def sizes(self):
+        """How many numbers the position of a member holds, and how many rates it has."""
         leaves, structure = jax.tree.flatten(self.data)
         sizes = [math.prod(jnp.shape(x)[flag:]) for x, flag in zip(leaves, self.mapped, strict=True)]
-        return sum(jax.tree.leaves(structure.unflatten(sizes)[1]))
+        numbers, rates = (sum(jax.tree.leaves(x)) for x in structure.unflatten(sizes)[1:3])
+        return numbers, rates or numbers
 
     def call(self, mesh=None, progress=False):
-        """The arguments and keywords of `run_sweep`: (unknowns that vectors are to fit, *arguments), keywords."""
+        """The arguments and keywords of `run_sweep`; with these what its program is chosen by."""
         if mesh is not None and not isinstance(mesh, Mesh):
             raise TypeError(f"sweep: `mesh` must be a jax.sharding.Mesh; received {mesh!r}.")
         data, dts = self.data, self.dts
@@ -126,12 +127,12 @@ class Inputs(NamedTuple):
             # arrays on one device could not be read by another process
             data, dts = jax.tree.map(lambda x: np.asarray(x) if is_array(x) and is_concrete(x) else x, (data, dts))
         hands = 1 if mesh is None else mesh.size
-        unknowns = self.unknowns()
+        unknowns, rates = self.sizes()
         lanes = lanes_for(self.size, least_lanes(self.size, unknowns, hands) if are_alike(dts) else 1)
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
-        fitting = unknowns if lanes > 1 else None
-        arguments = fitting, self.system, data, dts, self.duration, self.t0, self.times, self.events
-        return arguments, {**static, "mesh": mesh, "progress": progress, "room": self.room}
+        fitting = {"rates": rates, "numbers": unknowns if lanes > 1 else None}
+        arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
+        return arguments, {**static, **fitting, "mesh": mesh, "progress": progress, "room": self.room}
 
 
 def lanes_for(size, least=1):

@@ -84,16 +84,20 @@ def sweep_to_disk(
         raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
     folder, size = Path(folder), inputs.dts.size
     places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
-    (unknowns, *arguments), keywords = inputs.chunk(places[0]).call()
-    program = run_sweep.of(unknowns)
-    lowered = program.lower(*arguments, **keywords)
+    arguments, keywords = inputs.chunk(places[0]).call()
+    kind = keywords.pop("rates"), keywords.pop("numbers")
+
+    def lower():
+        return run_sweep.of(*kind).lower(*arguments, **keywords)
+
+    lowered = lower()
     _claim(folder, _manifest(inputs, lowered, chunk, len(places)))
     compiled = None
     for number, members in enumerate(places):
         path = folder / f"chunk-{number:05d}.npz"
         if not _is_whole(path):
-            compiled = compiled or or_plain(lowered.compile, lambda: program.lower(*arguments, **keywords).compile())
-            runs = compiled(*inputs.chunk(members).call()[0][1:])
+            compiled = compiled or or_plain(lowered.compile, lambda: lower().compile())
+            runs = compiled(*inputs.chunk(members).call()[0])
             kept = min(chunk, size - number * chunk)
             _write(path, lambda file, runs=runs, kept=kept: np.savez(file, **_named(runs, kept)))
         if progress:

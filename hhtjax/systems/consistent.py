@@ -24,6 +24,7 @@ from hhtjax.systems.constraints import (
 )
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.xla import Programs
 
 MAX_ITERATIONS = 50
 CONSISTENT = 1e-6  # distance of initial values from consistent ones that passes, beside 1 + |q|, each coordinate
@@ -91,7 +92,7 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
     return start
 
 
-@partial(jax.jit, static_argnames="redundant")
+@partial(Programs, static_argnames="redundant")
 def _consistent_initial(system, q0, v0, params, t0, z0, redundant):
     """The result, B at q0, and max|Phi| at the end."""
     params = thaw(params)
@@ -141,7 +142,7 @@ def nearest_position(system, q0, t, params, factorize):
     return system.move(q0, z[:n]), change <= math.sqrt(eps) * (1 + size + jnp.max(jnp.abs(z[:n])))
 
 
-@jax.jit
+@Programs
 def examine(system, q0, v0, t0, params, z0):
     """M and B, Phi and dPhi/dt, and the sizes of the coordinates and of their rates."""
     params = thaw(params)

@@ -5,6 +5,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.numerics.panels import pivots
 from hhtjax.numerics.sparse_matrix import Sparse, of_scipy
 
 LARGEST_CHECKED = 256  # rows of a mass matrix that is looked at
@@ -179,8 +180,8 @@ def mass_flaw(M, massless):
         scaled = M / jnp.outer(size, size)
         symmetric = ~(jnp.max(jnp.abs(scaled - scaled.T)) > SYMMETRIC + 16 * n * rounding)
         shift = 8 * n * rounding * massless * jnp.eye(n, dtype=M.dtype)
-        pivots = jnp.diagonal(lax.linalg.cholesky(scaled + shift)) ** 2  # NaN where there is none
-        smallest = jnp.where(smallest > 0, jnp.min(jnp.where(jnp.isnan(pivots), -1, pivots)), smallest)
+        found = pivots(scaled + shift)
+        smallest = jnp.where(smallest > 0, jnp.min(jnp.where(jnp.isnan(found), -1, found)), smallest)
     positive = (smallest >= -rounding) if massless else (smallest > rounding)
     flaw = jnp.where(symmetric, jnp.where(positive, 0, INDEFINITE), UNSYMMETRIC)
     return jnp.where(jnp.any(jnp.isnan(M)), 0, flaw).astype(jnp.int32)

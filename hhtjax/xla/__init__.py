@@ -13,14 +13,16 @@ loop 1: ...
 
 A step of the double pendulum, its functions in plain `jnp` and no Jacobian written by hand, then takes about as long as
 C with everything written by hand, 40 ns, and in a batch 8 ns for each member, or 4 with vectors of 512 bits, which
-`sweep` and `jax.vmap` of `simulate` take where no jit is around them (else `jax.jit(f,
-compiler_options=hhtjax.xla.WIDE)`). Sines of float64 numbers in a kernel are polynomials, to 2 units in the last place,
-where XLA would call a function for each. The gradient of a run takes 2.7 to 3.9 times the run, in memory that grows
-with the square root of the number of steps. Systems of few operations are stepped number by number, not array by array,
-with every sine evaluated once. What is no single kernel runs as a list of them, several times slower, with all that the
-columns of a Jacobian share evaluated once: the squeezing mechanism with its 19 unknowns takes 19 microseconds a step.
-Jacobians keep track of what depends on which unknown, so that for a chain of N links, or springs between neighbours,
-they take N^2 numbers and not N^3; a chain or a tree may give the product M(q) w without M: `System(..., inertia=)`.
+`sweep` and `jax.vmap` of `simulate` take where no jit is around them. Such runs, and fits, are compiled in half the
+time, too; inside a jit of the user's its own options hold: `jax.jit(f, compiler_options=hhtjax.xla.QUICK |
+hhtjax.xla.WIDE)` (QUICK: up to 32 unknowns; WIDE: batches of up to four; both for XLA on the CPU). Sines of float64
+numbers in a kernel are polynomials, to 2 units in the last place, where XLA would call a function for each. The
+gradient of a run takes 2.7 to 3.9 times the run, in memory that grows with the square root of the number of steps.
+Systems of few operations are stepped number by number, not array by array, with every sine evaluated once. What is no
+single kernel runs as a list of them, several times slower, with all that the columns of a Jacobian share evaluated
+once: the squeezing mechanism with its 19 unknowns takes 19 microseconds a step. Jacobians keep track of what depends on
+which unknown, so that for a chain of N links, or springs between neighbours, they take N^2 numbers and not N^3; a chain
+or a tree may give the product M(q) w without M: `System(..., inertia=)`.
 Measured, against C, by structure, batches and gradients, on a page, `experiments/benchmarks/README.md`; error against
 time beside diffrax, SciPy, MuJoCo and exudyn, losses included, on another, `experiments/work_precision/README.md`.
 
@@ -36,13 +38,14 @@ True
 The door
 --------
 
-The rest of the library knows 21 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 22 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
+    is_untouched(tree)        whether no derivative and no batch is being made of its arrays
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
     in_turn(f, asked, x)      f(x), of which a batch visits only members that ask
     or_alone(x)               x of a member of a batch, True where there is none
@@ -58,7 +61,7 @@ The rest of the library knows 21 functions of this room, and works as well on pl
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
     plain()                   a context without all that
     or_plain(run)             run(), or the same without all that where XLA refuses it
-    Programs(f)               f, compiled with WIDE vectors where that pays
+    Programs(f)               f, compiled QUICKly, with WIDE vectors where that pays
 
 The contract
 ------------
@@ -90,15 +93,17 @@ from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
+from hhtjax.xla.programs import QUICK, WIDE, Programs
 from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.rows import block_written, row_written
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
+from hhtjax.xla.transforms import is_untouched
 from hhtjax.xla.turns import in_turn
 from hhtjax.xla.two_ways import TwoWays, derivative, together
-from hhtjax.xla.vectors import WIDE, Programs
 
 __all__ = [
+    "QUICK",
     "RANGE",
     "WIDE",
     "Explanation",
@@ -113,6 +118,7 @@ __all__ = [
     "derivative",
     "explain",
     "in_turn",
+    "is_untouched",
     "largest_in_batch",
     "linear_map",
     "listed",

@@ -1,0 +1,78 @@
+"""Options for the compiler: which programs take them, and where those without take their place."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import hhtjax
+from hhtjax.runs.sweep_inputs import LANES, NUMBERS, VECTORS, lanes_for, least_lanes
+from hhtjax.xla import Programs, gate, plain
+
+ARE_TAKEN = gate.is_on() and jax.default_backend() == "cpu"
+
+
+def twice(x):
+    if isinstance(x, str):
+        raise ValueError(x)
+    return 2 * x
+
+
+def test_few_unknowns_take_options_and_no_jit_of_a_user_has_them():
+    programs = Programs(twice)
+    quick, wide = (programs.quick, programs.wide) if ARE_TAKEN else (programs.usual, programs.usual)
+    found = programs.of(2, 2), programs.of(3, 9), programs.of(2), programs.of()
+    assert found == (wide, quick, quick, quick)
+    assert programs.of(33) is programs.of(33, 4) is programs.usual
+    with plain():
+        assert programs.of(2) is programs.usual
+    assert programs(3.0, rates=2, numbers=2) == 6
+    assert wide._cache_size() == programs.number() == 1
+    assert jax.jit(lambda x: programs(x, rates=2, numbers=2))(3.0) == 6
+    assert jax.vmap(lambda x: programs(x, rates=2, numbers=2))(jnp.ones(2))[0] == 2
+    assert jax.grad(programs)(3.0) == 2
+
+
+@pytest.mark.skipif(not ARE_TAKEN, reason="no options here")
+@pytest.mark.parametrize("numbers", [None, 2])
+def test_an_option_that_xla_does_not_know_is_tried_once(numbers, monkeypatch):
+    monkeypatch.setattr("hhtjax.xla.programs.QUICK", {"xla_cpu_of_another_time": True})
+    monkeypatch.setattr(Programs, "are_refused", False)
+    programs = Programs(twice)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_of_another_time"):  # so it reaches the compiler
+        programs.of(2, numbers)(3.0)
+    assert programs(3.0, rates=2, numbers=numbers) == 6
+    assert programs.of(2, numbers) is programs.usual
+    monkeypatch.setattr(Programs, "are_refused", False)
+    assert jax.value_and_grad(lambda x: programs(x, rates=2, numbers=numbers))(3.0) == (6, 2)
+
+
+def test_programs_of_the_library_are_chosen_by_their_unknowns(monkeypatch):
+    """A run, a sweep, a fit, and steps that are chosen."""
+    chosen = []
+    monkeypatch.setattr(Programs, "of", lambda self, *kind: chosen.append(kind) or self.usual)
+    spring = hhtjax.System(jnp.ones(3), lambda q, v, t, k: -k * q)
+    start = spring, hhtjax.hht(), jnp.ones(3), jnp.zeros(3), 1.0
+    hhtjax.simulate(*start, dt=0.1, num_steps=2)
+    hhtjax.sweep(*start, dts=jnp.array([0.1, 0.2]), duration=0.4, num_samples=2)
+    hhtjax.fit(lambda k: k - jnp.ones(2), 2.0)
+    hhtjax.choose_steps(*start, times=jnp.array([0.1]), rtol=1e-2, atol=1e-2)
+    assert chosen == [(3, 3), (3, None), (0, None), (3, None)]
+
+
+def test_errors_of_the_function_are_its_own():
+    programs = Programs(twice, static_argnames="x")
+    with pytest.raises(ValueError, match="mine"):
+        programs(x="mine")
+
+
+@pytest.mark.parametrize("unknowns", [1, 2, 3, 6, 8, 12, 1000])
+def test_members_that_are_alike_share_blocks_as_large_as_kernels_allow(unknowns):
+    for size in (64, 100, 256, 5000):
+        lanes = least_lanes(size, unknowns)
+        assert lanes & (lanes - 1) == 0
+        assert VECTORS <= lanes <= LANES
+        assert -(-size // lanes) * lanes == -(-size // VECTORS) * VECTORS  # none fills up more
+        assert lanes == VECTORS or lanes * unknowns**2 <= NUMBERS
+        assert lanes_for(size, lanes) >= lanes
+    assert [least_lanes(256, 2), least_lanes(256, 2, hands=8), least_lanes(60, 2)] == [LANES, VECTORS, 1]
+    assert [least_lanes(size, 2) for size in (65, 97, 130, 190)] == [32, 128, 32, 64]  # none fills up more
