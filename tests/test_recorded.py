@@ -9,7 +9,7 @@ from helpers import ONE, ZERO
 from test_held import SYSTEM, VALUES
 
 import hhtjax
-from hhtjax.runs.chosen import run_in_one, run_in_two
+from hhtjax.runs.controlled import run_in_one, run_in_two
 from hhtjax.runs.problem import Problem
 from hhtjax.scenes import pendulum
 

@@ -20,7 +20,8 @@ from experiments.stability.gallery import FAST_SCENES
 from experiments.stability.scenes import all_cases
 from hhtjax.runs.attempt import PI, Controller
 from hhtjax.runs.choose import choose
-from hhtjax.runs.chosen import run_over, verified
+from hhtjax.runs.chosen import run_over
+from hhtjax.runs.controlled import verified
 from hhtjax.runs.problem import Problem
 
 RTOLS = 1e-2, 1e-3, 1e-4, 1e-5

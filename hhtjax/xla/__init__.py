@@ -45,7 +45,7 @@ The rest of the library knows 22 functions of this room, and works as well on pl
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
-    is_untouched(tree)        whether no derivative and no batch is being made of its arrays
+    is_untouched()            whether neither a derivative nor a batch is being made here
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
     in_turn(f, asked, x)      f(x), of which a batch visits only members that ask
     or_alone(x)               x of a member of a batch, True where there is none
