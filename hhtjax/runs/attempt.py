@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.numerics.rough import rough_exp, rough_log
+from hhtjax.numerics.rough import rough_exp, rough_log, without_rounding
 from hhtjax.runs.events import before_any
 from hhtjax.systems import held, kinematics
+from hhtjax.xla import staged
 
 LOWEST = 1e-4  # error of the step before, as the controller sees it
 ROUNDINGS = 16  # of t, of which a step is at least
@@ -135,7 +136,7 @@ def next_step(h, error, before, accept, order, pi=PI):
     exponent = slope * now + jnp.where(accept, pi.integral / order * before, 0)
     least, most = jnp.where(accept, pi.least, 0.1), jnp.where(accept, pi.most, 0.9)
     factor = jnp.clip(pi.safety * rough_exp(exponent), least, most)
-    return h * factor, jnp.maximum(now, float(np.log(LOWEST)))
+    return h * without_rounding(factor), jnp.maximum(now, float(np.log(LOWEST)))
 
 
 def judged(state, info, error):
@@ -169,12 +170,13 @@ def attempt(trial, walk):
     """Walk -> Walk after one try, and how that began."""
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
     h, t1 = next_end(params, trial.end, walk)
-    resized, state = trial.stepper.resized(walk.state, h * (1 / walk.last))
+    resized, state = trial.stepper.resized(walk.state, h / walk.last)
     now, state = held.entered(resized, trial.flat, params, h, walk.last, state)
     s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, walk.past)(state)
     s1 = s1._replace(t=t1)
     q_size, v_size = map(jnp.maximum, (walk.q_size, walk.v_size), sizes(trial.flat, s1))
     error = judged(s1, info, bounds.relative(trial.flat, errors, q_size, v_size))
+    error = staged(lambda x: x)(error)
     h1, before = next_step(h, error, walk.before, error <= 1, order, trial.controller)
     h1 = jnp.minimum(h1, bounds.most)
     new = walk._replace(state=s1, last=h, past=past, before=before, q_size=q_size, v_size=v_size)
