@@ -10,7 +10,8 @@ import importlib
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 # Has to be there before JAX starts, and for the processes that experiments start.
@@ -73,15 +74,18 @@ def run_alone(arguments: list[str]) -> int:
 def run_every_one(options) -> int:
     """All experiments, each in a process of its own: none changes the times of another, or ends the others if it fails.
 
-    One after the other; in smoke runs, whose times are void, as many at a time as cores.
+    One after the other; smoke runs, whose times are void, share as many processes as there are cores.
     """
+    size = {name: ["--fast"] if options.fast else ["--full"] if name in IN_PART else [] for name in EXPERIMENTS}
+    every = [[name, *size[name], "--out", str(options.out), "--formats", options.formats] for name in EXPERIMENTS]
+    if options.fast:
+        from experiments.smoke import run_beside
 
-    def run(name: str) -> int:
-        size = ["--fast"] if options.fast else ["--full"] if name in IN_PART else []
-        return run_alone([name, *size, "--out", str(options.out), "--formats", options.formats])
-
-    with ThreadPoolExecutor(os.cpu_count() if options.fast else 1) as pool:
-        failed = [name for name, code in zip(EXPERIMENTS, pool.map(run, EXPERIMENTS), strict=True) if code]
+        with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+            codes = list(pool.map(run_beside, every))
+    else:
+        codes = map(run_alone, every)
+    failed = [name for name, code in zip(EXPERIMENTS, codes, strict=True) if code]
     if failed:
         print(f"Failed: {', '.join(failed)}.", file=sys.stderr)
     return int(bool(failed))

@@ -8,11 +8,13 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import pytest
 
 from experiments.__main__ import EXPERIMENTS
 from experiments.check import check
 from experiments.parts import run_experiment
+from experiments.smoke import run_beside
 
 ROOT = Path(__file__).parents[1]
 SLOW = "--xla_backend_optimization_level=0"
@@ -69,6 +71,19 @@ def test_how_much_is_run_and_what_the_numbers_say_of_it(monkeypatch, tmp_path):
     assert told("vehicle", "vehicle") == ([False], "full", ["vehicle"])
     assert told("silverbox", "all") == ([False, True], "full", ["silverbox", "--full"])
     assert "python -m experiments vehicle" in (tmp_path / "experiments.html").read_text(encoding="utf-8")
+
+
+def test_a_smoke_run_that_fails_says_why_and_leaves_the_process_to_others(monkeypatch, tmp_path, capsys):
+    runner = importlib.import_module("experiments.__main__")
+    monkeypatch.setattr(runner, "EXPERIMENTS", {name: name for name in ("bad", "good")})
+    monkeypatch.setattr(jax, "clear_caches", lambda: None)  # of these tests
+    modules = {"bad": lambda report, fast: 1 / 0, "good": lambda report, fast: print("all is well")}
+    for name, function in modules.items():
+        monkeypatch.setitem(sys.modules, f"experiments.{name}", SimpleNamespace(run=function))
+    assert [run_beside([name, "--fast", "--out", str(tmp_path)]) for name in modules] == [1, 0]
+    printed = capsys.readouterr()
+    assert "ZeroDivisionError" in printed.err
+    assert "all is well" in printed.out
 
 
 def test_a_part_is_made_anew_and_says_so(monkeypatch, tmp_path):

@@ -98,7 +98,7 @@ def run(report, fast):
         return {"method": method, **setting, "relative_error": error, "seconds": seconds}
 
     rows = []
-    for method, (make, options, alpha) in METHODS.items():
+    for method, (make, options, alpha) in list(METHODS.items())[:: 2 if fast else 1]:
         for n in counts:
             call = partial(take, alpha, make, tuple(options.items()), n)
             rows.append(row(method, {"h_s": DURATION / SAMPLES / n}, *timed(call, repeats)))
