@@ -185,8 +185,7 @@ def test_derivatives_are_those_of_the_accepted_steps():
         return jnp.sum(hhtjax.interpolate(path, times).q ** 2)
 
     along = {"k": 1.0, "c": 0.5}
-    compiled = jax.jit(loss)  # for what is known of derivatives, or not, when steps are chosen
-    reverse = jax.grad(compiled)(params)
+    reverse = jax.grad(jax.jit(loss))(params)  # where a derivative is not known of when steps are chosen
     value, forward = jax.jit(lambda x: jax.jvp(loss, (x,), (along,)))(params)
     for found in (value, jnp.sum(whole.q**2)):
         assert float(found) == pytest.approx(float(frozen(params)) + 1.0, rel=1e-12)  # and the start

@@ -81,7 +81,8 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     start = begin(trial, q, v, t0)
     form = on_scalars(partial(attempt, trial._replace(ways=None)), start)  # as in a run: events are seldom
     one_try = form.of(partial(attempt, trial))
-    record, keep = (), lambda record, *_: record
+    record: Any = ()
+    keep = lambda record, *_: record  # noqa: E731
     if times is not None:
         record, keep = recorder(flat, trial.stepper, form, jax.eval_shape(one_try, form.tree)[1].info, times)
 
