@@ -64,6 +64,8 @@ TABLE = {
         *(f"lax.integer_pow({a}, {n})" for a in "xzj" for n in (0, 1, 2, 3, 5)),
         *("x**2 - x**3", "x.astype(jnp.float32) - x.astype(int).astype(jnp.float32)"),  # one operation, two options
         *("lax.integer_pow(z, -1)", "lax.integer_pow(x, -3)", "lax.population_count(j)", "lax.clz(j)", "lax.sin(g)"),
+        *(f"lax.bitcast_convert_type({x}, np.{y})" for x in "xz" for y in ("int64", "int32")),
+        *("lax.bitcast_convert_type(m, np.float64)", "lax.bitcast_convert_type(lax.bitcast_convert_type(x, np.int32), float)"),
         *("lax.exp(x, accuracy=lax.Tolerance(1e-3))", "lax.sin(x, accuracy=lax.AccuracyMode.HIGHEST)"),
     ],
     "of two": [

@@ -11,7 +11,8 @@ from helpers import ONE, SPRING, ZERO, run
 from scipy.integrate import solve_ivp
 
 import hhtjax
-from hhtjax.runs.chosen import chosen_steps, run_over
+from hhtjax.runs.chosen import chosen_steps
+from hhtjax.runs.controlled import run_recorded
 from hhtjax.scenes import pendulum, top
 
 SAMPLES = 32
@@ -184,10 +185,10 @@ def test_derivatives_are_those_of_the_accepted_steps():
         return jnp.sum(hhtjax.interpolate(path, times).q ** 2)
 
     along = {"k": 1.0, "c": 0.5}
-    (value, reverse), (_, forward) = jax.jit(lambda x: (jax.value_and_grad(loss)(x), jax.jvp(loss, (x,), (along,))))(
-        params
-    )
-    assert float(value) == pytest.approx(float(frozen(params)) + 1.0, rel=1e-12)  # and the start
+    reverse = jax.grad(jax.jit(loss))(params)  # where a derivative is not known of when steps are chosen
+    value, forward = jax.jit(lambda x: jax.jvp(loss, (x,), (along,)))(params)
+    for found in (value, jnp.sum(whole.q**2)):
+        assert float(found) == pytest.approx(float(frozen(params)) + 1.0, rel=1e-12)  # and the start
     for name in params:
         h = 1e-5
         at = [float(frozen(params | {name: params[name] + s * h})) for s in (-1, 1)]
@@ -201,15 +202,18 @@ def test_tolerances_and_all_else_are_data():
         dt = hhtjax.adaptive(rtol, 1e-6)
         return hhtjax.simulate(CONTACT, hhtjax.rowda(), jnp.full(1, q0), ZERO, k, dt=dt, times=np.array([0.2, 0.4]))
 
+    def choose(times):
+        hhtjax.choose_steps(CONTACT, hhtjax.rowda(), jnp.full(1, 0.3), ZERO, 1e5, times=times, rtol=1e-2, atol=1e-6)
+
     go(1e-3, 1e5, 0.3)
-    compiled = chosen_steps.number(), run_over.number()
-    tolerances = {"rtol": 1e-2, "atol": 1e-6}
-    for times in ([0.4], [0.1, 0.2, 0.4]):  # any number of them, and whatever becomes of the run
-        hhtjax.choose_steps(CONTACT, hhtjax.rowda(), jnp.full(1, 0.3), ZERO, 1e5, times=times, **tolerances)
+    choose([0.4])
+    compiled = run_recorded.number(), chosen_steps.number()
+    for times in ([0.3], [0.1, 0.2, 0.4]):  # of the steps alone any number
+        choose(times)
     few, many = go(1e-2, 1e5, 0.3), go(1e-5, 2e5, 0.4)
-    assert (chosen_steps.number(), run_over.number()) == compiled
+    assert (run_recorded.number(), chosen_steps.number()) == compiled
     assert few.steps.accepted < many.steps.accepted
-    batch = jax.jit(jax.vmap(go, (0, None, None)))(np.array([1e-2, 1e-5]), 2e5, 0.4)
+    batch = jax.vmap(jax.jit(go), (0, None, None))(np.array([1e-2, 1e-5]), 2e5, 0.4)
     batch.check()
     np.testing.assert_allclose(batch.q[1], many.q, rtol=1e-9)
     assert batch.dt.shape == (2, 10_000)
@@ -283,7 +287,7 @@ def test_the_error_of_the_whole_run(references):
         ):
             run.check()
         assert 0.1 < np.max(run.error) < 0.3
-        programs.add(chosen_steps.number())
+        programs.add((run_recorded.number(), chosen_steps.number()))
     assert len(programs) == 1
 
 

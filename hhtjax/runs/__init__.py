@@ -95,10 +95,11 @@ compare at the times of the measurements.
 Tolerances
 ----------
 
-`dt=adaptive(rtol, atol)` chooses steps by their errors, in one loop, and then runs them; the run is differentiable, and
-the steps constant. `run.steps` tells how many were accepted and rejected, `check()` names the time at which there were
-no more. It pays where a motion has parts of very different speed, as contacts and relaxation; conservative motions of
-one time scale want equal steps, whose errors cancel over a period.
+`dt=adaptive(rtol, atol)` chooses steps by their errors, in one loop that keeps the samples too. For derivatives, and in
+a batch, a run over these steps follows: it is differentiable, and the steps constant. `run.steps` tells how many were
+accepted and rejected, `check()` names the time at which there were no more. It pays where a motion has parts of very
+different speed, as contacts and relaxation; conservative motions of one time scale want equal steps, whose errors
+cancel over a period.
 
 >>> run = hhtjax.simulate(pendulum, hhtjax.hht(), q0, v0, params, dt=hhtjax.adaptive(1e-3, 1e-6), times=[0.123, 4.56])
 >>> run.check()

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.numerics.rough import rough_exp, rough_log, without_rounding
 from hhtjax.runs.events import before_any
 from hhtjax.systems import held, kinematics
+from hhtjax.xla import staged
 
-NOT_FINITE = 1e6  # the error of a step that is not finite
 LOWEST = 1e-4  # error of the step before, as the controller sees it
-WIDEST = 2.4  # exponents of e of factors that steps change by: 0.09 to 11, beyond all bounds of them
 ROUNDINGS = 16  # of t, of which a step is at least
 DONE, TOO_SHORT, TOO_MANY, BROKEN, AT_EVENT = range(5)
 
@@ -77,6 +77,14 @@ class Try(NamedTuple):
     why: Any
 
 
+class Begun(NamedTuple):
+    """What else is known of a try: the state it began with, when it was to end, and its `Info`."""
+
+    state: Any
+    end: Any
+    info: Any
+
+
 class Bounds(NamedTuple):
     """Tolerances and bounds in the dtype of the state. scale: the tolerance of the run, relative to that of a step."""
 
@@ -100,11 +108,12 @@ class Bounds(NamedTuple):
 
     def relative(self, flat, errors, q_size, v_size):
         """The largest error, 1 where it is the tolerance."""
-        error = jnp.max(jnp.abs(errors.v) / (self.atol_v + self.rtol * v_size))
+        # reciprocals, which are there before the errors are
+        error = jnp.max(jnp.abs(errors.v) * (self.scale / (self.atol_v + self.rtol * v_size)))
         if flat.positions:
-            e_q = jnp.abs(flat.located(errors.q)) / (self.atol + self.rtol * q_size)
+            e_q = jnp.abs(flat.located(errors.q)) * (self.scale / (self.atol + self.rtol * q_size))
             error = jnp.maximum(error, jnp.max(e_q))
-        return error * self.scale
+        return error
 
     def first(self, state, v_size, span):
         """A step that changes v by about its tolerance, and not more than a hundredth of all."""
@@ -122,33 +131,23 @@ def sizes(flat, state):
 def next_step(h, error, before, accept, order, pi=PI):
     """The PI controller: Gustafsson's, in the form of Hairer and Wanner, Sec. IV.2; before, and what is returned beside
     the step, are logarithms of errors."""
-    now = jnp.log(jnp.maximum(error, 1e-10))
-    exponent = jnp.where(accept, pi.integral * before - pi.proportional * now, -now) / order
+    now = rough_log(jnp.maximum(error, 1e-10))
+    slope = jnp.where(accept, -pi.proportional / order, -1 / order)
+    exponent = slope * now + jnp.where(accept, pi.integral / order * before, 0)
     least, most = jnp.where(accept, pi.least, 0.1), jnp.where(accept, pi.most, 0.9)
-    return h * jnp.clip(pi.safety * rough_exp(exponent), least, most), jnp.maximum(now, float(np.log(LOWEST)))
+    factor = jnp.clip(pi.safety * rough_exp(exponent), least, most)
+    return h * without_rounding(factor), jnp.maximum(now, float(np.log(LOWEST)))
 
 
-def rough_exp(x):
-    """exp(x) to 3e-7 for |x| <= WIDEST, beyond that of its ends; XLA's own would take a tenth of the time of a step.
-
-    >>> x = np.linspace(-3.0, 3.0, 99)
-    >>> bool(jnp.all(abs(rough_exp(x) / np.exp(np.clip(x, -WIDEST, WIDEST)) - 1) < 3e-6))  # float32 here
-    True
-    """
-    y = jnp.clip(x, -WIDEST, WIDEST) / 16
-    power = 1 + y * (1 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y / 120))))
-    for _ in range(4):
-        power = power * power
-    return power
-
-
-def succeeded(state, info, error):
-    """Whether all that a step tells is fine."""
-    fine = jnp.isfinite(error) & jnp.all(jnp.isfinite(state.w)) & jnp.all(jnp.isfinite(state.q))
+def judged(state, info, error):
+    """The error of a step, infinite where something that it tells is not fine."""
+    for x in (state.q, state.v, state.w, state.L):
+        error = error if x is None else error + jnp.sum(0 * x)  # NaN where one is not finite
+    fine = error < jnp.inf
     independent = None if info.dependent_row is None else info.dependent_row == 0
     for told in (info.converged, info.solved, independent):
         fine = fine if told is None else fine & told
-    return fine
+    return jnp.where(fine, error, jnp.inf)
 
 
 def is_walking(walk, end):
@@ -163,12 +162,12 @@ def next_end(params, end, walk):
     due = jnp.minimum(end, held.jump_after(params, t)) if held.holds(params) else end
     left = due - t
     lands = left <= h
-    h = jnp.where(lands, left, jnp.where(left < 2 * h, left / 2, h))
+    h = jnp.where(lands, left, jnp.minimum(h, left / 2))
     return h, jnp.where(lands, due, t + h)
 
 
 def attempt(trial, walk):
-    """Walk -> Walk after one try, and the time at which it would have ended."""
+    """Walk -> Walk after one try, and how that began."""
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
     h, t1 = next_end(params, trial.end, walk)
     resized, state = trial.stepper.resized(walk.state, h / walk.last)
@@ -176,16 +175,15 @@ def attempt(trial, walk):
     s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, walk.past)(state)
     s1 = s1._replace(t=t1)
     q_size, v_size = map(jnp.maximum, (walk.q_size, walk.v_size), sizes(trial.flat, s1))
-    error = bounds.relative(trial.flat, errors, q_size, v_size)
-    fine = succeeded(s1, info, error)
-    error = jnp.where(fine, error, NOT_FINITE)
+    error = judged(s1, info, bounds.relative(trial.flat, errors, q_size, v_size))
+    error = staged(lambda x: x)(error)
     h1, before = next_step(h, error, walk.before, error <= 1, order, trial.controller)
     h1 = jnp.minimum(h1, bounds.most)
     new = walk._replace(state=s1, last=h, past=past, before=before, q_size=q_size, v_size=v_size)
-    tried = Try(new._replace(accepted=walk.accepted + 1), error, h1, h1, jnp.where(fine, TOO_SHORT, BROKEN))
+    tried = Try(new._replace(accepted=walk.accepted + 1), error, h1, h1, why_short(error))
     if trial.ways is not None:
         tried = trial.past_events(trial, tried, walk, h)
-    return taken(trial, walk, tried), s1.t
+    return taken(trial, walk, tried), Begun(state, s1.t, info)
 
 
 def taken(trial, walk, tried):
@@ -195,10 +193,14 @@ def taken(trial, walk, tried):
     if walk.met is not None:  # what is wrong there
         again = again._replace(met=walk.met._replace(code=tried.walk.met.code, event=tried.walk.met.event))
     walk = jax.tree.map(partial(jnp.where, accept), tried.walk, again)._replace(h=tried.h, error=tried.error)
-    stop = jnp.where(accept | (tried.shortest >= trial.bounds.least), DONE, tried.why).astype(jnp.int32)
-    walk = walk._replace(stop=stop)
-    spent = is_walking(walk, trial.end) & (walk.accepted + walk.rejected >= trial.max_steps)
-    return walk._replace(stop=jnp.where(spent, TOO_MANY, stop))
+    fine = accept | (tried.shortest >= trial.bounds.least)
+    spent = (walk.accepted + walk.rejected >= trial.max_steps) & is_walking(walk, trial.end)
+    return walk._replace(stop=jnp.where(fine, jnp.where(spent, TOO_MANY, DONE), tried.why).astype(jnp.int32))
+
+
+def why_short(error):
+    """Why there are no more steps if this one has become too short."""
+    return jnp.where(error < jnp.inf, TOO_SHORT, BROKEN)
 
 
 def begin(trial, q, v, t0):

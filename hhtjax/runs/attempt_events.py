@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.numerics.seldom import choose, seldom_alone
-from hhtjax.runs.attempt import AT_EVENT, BROKEN, NOT_FINITE, TOO_SHORT, Trial, Try, sizes, succeeded
+from hhtjax.runs.attempt import AT_EVENT, Trial, Try, judged, sizes, why_short
 from hhtjax.runs.event_failures import FINE, MANY
 from hhtjax.runs.loop import neutral_info, resized_step
 from hhtjax.runs.meeting import SHORT, Part, Ways, asks, pass_events, reaching
@@ -57,7 +57,7 @@ def passed(trial, tried, walk, h):
     code = jnp.where((part.met.code == FINE) & jnp.any(later), MANY, part.met.code).astype(met.code.dtype)
     part = part._replace(met=part.met._replace(code=code))
     lost = tried._replace(
-        walk=tried.walk._replace(met=part.met), error=jnp.full_like(tried.error, NOT_FINITE), h=middle, shortest=middle,
+        walk=tried.walk._replace(met=part.met), error=jnp.full_like(tried.error, jnp.inf), h=middle, shortest=middle,
         why=jnp.full_like(tried.why, AT_EVENT),
     )  # fmt: skip
     judged = choose(part.divided, behind(trial, tried, walk, part, h), tried)
@@ -76,10 +76,9 @@ def behind(trial, tried, walk, part, h):
     params = held.held_at(trial.params_of(new), part.start.t + rest / 2)
     errors = trial.stepper.bind_estimated(trial.flat, params, rest, past)(part.start)[2]
     error = jnp.where(met.ended, 0, trial.bounds.relative(trial.flat, errors, q_size, v_size))
-    fine = succeeded(part.end, part.info, error)
-    error = jnp.where(fine, error, NOT_FINITE)
+    error = judged(part.end, part.info, error)
     small = jnp.maximum(error, float(jnp.finfo(h.dtype).tiny))
     best = trial.controller.safety * small ** (-1 / trial.stepper.estimate_order)
     shorter = rest * jnp.clip(best, 0.1, 0.9)
     h = jnp.where(error <= 1, jnp.minimum(h, rest * best), h - rest + shorter)
-    return Try(new, error, h, shorter, jnp.where(fine, TOO_SHORT, BROKEN))
+    return Try(new, error, h, shorter, why_short(error))

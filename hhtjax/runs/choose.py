@@ -13,6 +13,7 @@ from hhtjax.description.presentation import overwrite, shown
 from hhtjax.runs.attempt import AT_EVENT, BROKEN, PI, TOO_MANY, TOO_SHORT, Bounds, attempt, begin, is_walking
 from hhtjax.runs.attempt_events import trial_of
 from hhtjax.runs.event_failures import EVENTS
+from hhtjax.runs.recorded import recorder, solution
 from hhtjax.runs.solution import SimulationError, first_bad
 from hhtjax.xla import on_scalars, one_kernel
 
@@ -71,32 +72,40 @@ class Steps(NamedTuple):
         return "" if not is_concrete(self.stop) else self._fault() or "all accepted"
 
 
-def choose(problem, end, control, progress=False, events=None, room=(), controller=PI):
+def choose(problem, end, control, progress=False, events=None, room=(), controller=PI, times=None):
     """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf behind them; no tracer of autodiff may
-    come in."""
+    come in. times: where samples are kept on the way, (K,); the third result is the `Solution` there, or None."""
     flat, q, v, t0, _ = problem.flat()
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
     trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
-    walk = begin(trial, q, v, t0)
-    form = on_scalars(partial(attempt, trial._replace(ways=None)), walk)  # as in a run: events are seldom
+    start = begin(trial, q, v, t0)
+    form = on_scalars(partial(attempt, trial._replace(ways=None)), start)  # as in a run: events are seldom
     one_try = form.of(partial(attempt, trial))
+    record: Any = ()
+    keep = lambda record, *_: record  # noqa: E731
+    if times is not None:
+        record, keep = recorder(flat, trial.stepper, form, jax.eval_shape(one_try, form.tree)[1].info, times)
 
     def unfinished(carry):
         return is_walking(carry[0], end)
 
     def body(carry):
-        walk, times = carry
-        new, t = one_try(walk)
+        walk, ends, record = carry
+        new, begun = one_try(walk)
         if progress:
             show(walk.state.t, new.state.t, t0, end)
-        t = jnp.where(new.accepted > walk.accepted, t, jnp.inf)
-        return new, lax.dynamic_update_index_in_dim(times, t, walk.accepted, 0)
+        accepted = new.accepted > walk.accepted
+        ends = lax.dynamic_update_index_in_dim(ends, jnp.where(accepted, begun.end, jnp.inf), walk.accepted, 0)
+        return new, ends, keep(record, begun, new.state, accepted)
 
     def run(walk):
-        return lax.while_loop(unfinished, body, (walk, jnp.full(control.max_steps, jnp.inf, t0.dtype)))
+        return lax.while_loop(unfinished, body, (walk, jnp.full(control.max_steps, jnp.inf, t0.dtype), record))
 
-    walk, times = one_kernel(run, form.tree)
-    return as_steps(form.joined(walk), times, t0, bounds.least), times
+    walk, ends, record = one_kernel(run, form.tree)
+    steps = as_steps(form.joined(walk), ends, t0, bounds.least)
+    if times is not None:
+        record = solution(problem, start.state, form.joined(record.around), times, steps.reached)
+    return steps, ends, record or None
 
 
 def as_steps(walk, times, t0, least):

@@ -116,9 +116,9 @@ class Search(NamedTuple):
 
     def next(self, arrays, bounds, walk):
         """The walk after one try, the same if it is over, and the end of the step; NaN where none was accepted."""
-        new, t = self.form.of(partial(attempt, self.trial(arrays, bounds)))(walk)
+        new, begun = self.form.of(partial(attempt, self.trial(arrays, bounds)))(walk)
         new = jax.tree.map(partial(jnp.where, is_walking(walk, self.end)), new, walk)
-        return new, jnp.where(new.accepted > walk.accepted, t, jnp.nan)
+        return new, jnp.where(new.accepted > walk.accepted, begun.end, jnp.nan)
 
     def tries(self, walks, arrays, bounds):
         """The walks of a block after a number of tries, and (ROUND, lanes) the ends of steps."""

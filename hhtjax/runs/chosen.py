@@ -16,19 +16,14 @@ from hhtjax.runs.choose import Steps, choose, trimmed
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.events import loop_with_events, with_told_events
-from hhtjax.runs.freezing import run_and_choice
-from hhtjax.runs.interpolate import between
-from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, resting, saved
+from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, resting
 from hhtjax.runs.problem import Problem
-from hhtjax.runs.solution import Solution
+from hhtjax.runs.read_off import kept, read_off
 from hhtjax.runs.sweep_grid import require_times
-from hhtjax.steppers.stepper import State, Stepper, public
+from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems import held
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Programs, largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
-
-TINY = 1e-9  # part of a run
-ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
 @partial(Programs, static_argnames=("progress", "room"))
@@ -39,7 +34,7 @@ def chosen_steps(problem, end, control, events=None, progress=False, room=()):
     """
 
     def found(problem, end, control, events):
-        return choose(problem, problem.times(end), control, progress, events, room)
+        return choose(problem, problem.times(end), control, progress, events, room)[:2]
 
     return one_kernel(found, problem, end, control, events, around=True)
 
@@ -156,48 +151,6 @@ def begun_with(flat, stepper, params, loop, run):
     return held.entered(stepper, flat, params, h, last, state)[1]
 
 
-def kept(flat, stepper, state):
-    """What is saved of a state, and what its dense output adds."""
-    extra = None
-    if stepper.dense_term:
-        e_q, e_v = state.memory
-        extra = public(flat, State(state.t, e_q, e_v, 0 * e_v))
-        extra = extra.q, (None if flat.positions == 0 else extra.v), extra.z
-    return saved(flat, state), extra
-
-
-def read_off(flat, pair, extra, times, reached):
-    """The `Solution` at the times, each between the two of a pair; NaN beyond what was reached."""
-    a, b = (jax.tree.map(lambda x: x[1:], run._replace(dt=None, info=None, failure=None)) for run in pair)
-    start = jax.tree.map(lambda x: x[:1], pair[0]._replace(dt=None, info=None, failure=None))
-    # a part of a step that is a rounding, behind an event, is the beginning of a long one
-    long = times[-1] - start.t[0]
-    H = jnp.where(b.t - a.t > TINY * long, b.t - a.t, long)
-    s = jnp.where(times <= reached, (times - a.t) / H, jnp.nan)
-    found = between(a, b, H, s)
-    if extra is not None:
-        found = with_dense_term(flat, found, extra, s, H)
-    path = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), start, found._replace(t=times))
-    return path._replace(info=pair[1].info, failure=pair[1].failure)
-
-
-def with_dense_term(flat, found, extra, s, H):
-    """`found`, with s^2 (1 - s)^2 times what the stepper's dense output adds to cubics, and the rate of that."""
-    weight, rate = (s * (1 - s)) ** 2, 2 * s * (1 - s) * (1 - 2 * s) / H
-    e_q, e_v, e_z = extra
-    terms = [("q", flat.unravel, weight, e_q)]
-    if flat.positions:
-        terms += [("v", flat.unravel_rates, weight, e_v), ("acceleration", flat.unravel_rates, rate, e_v)]
-        terms += [("z", flat.unravel_internal, weight, e_z), ("zdot", flat.unravel_internal, rate, e_z)]
-    else:
-        terms += [("v", flat.unravel_rates, rate, e_q)]
-    for name, unravel, factor, e in terms:
-        if e is not None:
-            more = jax.vmap(unravel)(factor[:, None] * e)
-            found = found._replace(**{name: jax.tree.map(jnp.add, getattr(found, name), more)})
-    return found
-
-
 def choose_steps(
     system: System | LinearSystem | FirstOrderSystem,
     stepper: Stepper,
@@ -245,47 +198,6 @@ def choose_steps(
     if events is not None:
         events = require_events("choose_steps", problem, events)
     return trimmed(steps_for(lax.stop_gradient((problem, times, control, events)), progress, room)[0])
-
-
-def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
-    """The run that `simulate` returns for an `Adaptive` in the place of dt."""
-    times = checked_times("simulate", problem, times, control)
-    (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
-    steps, ends = steps_for(choice, progress, room)
-    keywords = {"room": room, "rates": problem.rates()}
-    run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
-    if control.verify:
-        better = finer(problem, times, control, steps, ends, choice, events, room)
-        run = run._replace(**verified(run, better, control, problem.stepper.order))
-    steps = trimmed(steps)
-    return run._replace(dt=steps.dt, steps=steps)
-
-
-def finer(problem, times, control, steps, ends, choice, events, room):
-    """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
-    if control.verify == "tolerance":
-        *start, looser, theirs = choice
-        steps, ends = steps_for((*start, quarter(looser), theirs), False, room)
-    keywords = {"halved": control.verify != "tolerance", "room": room, "rates": problem.rates()}
-    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
-
-
-def quarter(control):
-    """A quarter of the tolerance."""
-    return replace(control, **{name: getattr(control, name) / 4 for name in ("rtol", "atol", "atol_v")})
-
-
-def verified(run, finer, control, order):
-    """The error of the whole run at each of its times, by Richardson from a finer one, and what is allowed."""
-
-    def largest(q):
-        return jnp.max(jnp.stack([jnp.max(jnp.abs(x).reshape(len(x), -1), axis=1) for x in jax.tree.leaves(q)]), axis=0)
-
-    q, better = lax.stop_gradient((run.q, finer.q))
-    left = 0.25 if control.verify == "tolerance" else 0.5**order  # of the error
-    error = largest(jax.tree.map(jnp.subtract, better, q)) / (1 - left)
-    rtol, atol = (jnp.asarray(x).astype(error.dtype) for x in (control.rtol, control.atol))
-    return {"error": error, "allowed": lax.stop_gradient(ALARM * (rtol * jnp.max(largest(q)) + atol))}
 
 
 def checked_times(caller, problem, times, control):

@@ -12,7 +12,7 @@ from hhtjax.description import is_array
 from hhtjax.xla import calls
 
 PAIR = "hhtjax: a run, and the choice of its steps"
-CONTROLLED = {"run_over", "run_chosen"}  # names of what runs over the steps that have been chosen
+CONTROLLED = {"run_over", "run_recorded", "run_chosen"}  # names of what runs over the steps that have been chosen
 
 
 def with_steps_for(f, x, y):
@@ -28,7 +28,7 @@ def with_steps_for(f, x, y):
 def run_and_choice(data):
     """What a run starts from, and what its steps are chosen for, constant to derivatives: the same, but inside
     `with_steps_for`."""
-    if not _inside(PAIR):
+    if not is_pair():
         return data, lax.stop_gradient(data)
     both = jax.tree.map(lambda x: lax.all_gather(x, PAIR) if is_array(x) else (x, x), data)
     run, choice = (jax.tree.map(lambda x, two, i=i: two[i], data, both) for i in (0, 1))
@@ -44,9 +44,10 @@ def chooses_steps(f, *args):
     return calls(CONTROLLED, f, *args)
 
 
-def _inside(axis):
+def is_pair():
+    """Whether both points of `with_steps_for` are here."""
     try:
-        lax.axis_index(axis)
+        lax.axis_index(PAIR)
     except NameError:
         return False
     return True

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.adaptive import Adaptive
-from hhtjax.runs.chosen import run_controlled
+from hhtjax.runs.controlled import run_controlled
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated

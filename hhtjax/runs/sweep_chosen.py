@@ -9,7 +9,8 @@ from jax import lax
 
 from hhtjax.runs.choose import trimmed
 from hhtjax.runs.choose_many import Members, choose_many
-from hhtjax.runs.chosen import Grid, follow, quarter, verified
+from hhtjax.runs.chosen import Grid, follow
+from hhtjax.runs.controlled import quarter, verified
 from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.loop import show_progress
 from hhtjax.runs.sweep_inputs import lanes_for

@@ -9,8 +9,9 @@ ATTRIBUTES = "mhlo.frontend_attributes"
 
 # operations the emitter knows, whatever their size
 PROVEN = {
-    *("abs", "add", "and", "atan2", "broadcast_in_dim", "case", "ceil", "clamp", "compare", "concatenate", "constant"),
-    *("convert", "cosine", "divide", "dynamic_slice", "dynamic_update_slice", "exponential", "exponential_minus_one"),
+    *("abs", "add", "and", "atan2", "bitcast_convert", "broadcast_in_dim", "case", "ceil", "clamp", "compare"),
+    *("concatenate", "constant", "convert", "cosine", "divide", "dynamic_slice", "dynamic_update_slice", "exponential"),
+    "exponential_minus_one",
     *("floor", "gather", "if", "iota", "is_finite", "log", "log_plus_one", "logistic", "maximum", "minimum"),
     *("multiply", "negate", "not", "optimization_barrier", "or", "pad", "power", "remainder", "reshape", "return"),
     *("reverse", "round_nearest_afz", "round_nearest_even", "rsqrt", "select", "sign", "sine", "slice", "sqrt"),
@@ -18,8 +19,8 @@ PROVEN = {
 }
 # those it should know: a kernel that holds one is compiled on trial
 KNOWN = {
-    *("bitcast_convert", "cbrt", "complex", "count_leading_zeros", "imag", "popcnt", "real", "shift_left"),
-    *("shift_right_arithmetic", "shift_right_logical"),
+    *("cbrt", "complex", "count_leading_zeros", "imag", "popcnt", "real", "shift_left", "shift_right_arithmetic"),
+    "shift_right_logical",
 }
 # in other dialects; those of CHLO become elementwise operations, but for top_k, a sort
 ELSEWHERE = {

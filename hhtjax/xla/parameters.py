@@ -8,10 +8,10 @@ from jax import lax
 
 ELEMENTWISE = {
     *("abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil"),
-    *("clamp", "convert_element_type", "copy", "cos", "cosh", "div", "eq", "erf", "exp", "exp2", "expm1", "floor"),
-    *("ge", "gt", "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne"),
-    *("neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt"),
-    *("square", "stop_gradient", "sub", "tan", "tanh", "xor"),
+    *("bitcast_convert_type", "clamp", "convert_element_type", "copy", "cos", "cosh", "div", "eq", "erf", "exp"),
+    *("exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max"),
+    *("min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign"),
+    *("sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor"),
 }
 
 
@@ -69,6 +69,7 @@ _GATHERED = {**_of_any("dimension_numbers", "unique_indices", "indices_are_sorte
 _SUM = {"axes": _any, "out_sharding": _none}
 UNDERSTOOD = {
     **{name: {"accuracy": _none} for name in ELEMENTWISE},
+    "bitcast_convert_type": _of_any("new_dtype"),
     "convert_element_type": {**_of_any("new_dtype", "weak_type"), "sharding": _none},
     "integer_pow": _of_any("y"),
     "mul": {"out_dtype": _none},

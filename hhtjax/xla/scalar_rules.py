@@ -266,8 +266,9 @@ def _filling(eqn):
 
 RULES = {
     **dict.fromkeys(ELEMENTWISE, _elementwise),
+    "bitcast_convert_type": lambda eqn, x: _elementwise(eqn, x) if eqn.outvars[0].aval.shape == x.shape else None,
     **{"broadcast_in_dim": _broadcast_in_dim, "concatenate": _concatenate, "dot_general": _dot_general, "iota": _iota},
-    **{"reshape": _reshape, "squeeze": _squeeze, "rev": _rev, "slice": _slice},
+    **{"reshape": _reshape, "squeeze": _squeeze, "rev": _rev, "slice": _slice, "hhtjax_structural": _structural},
     **{"split": _split, "stack": _stack, "transpose": _transpose, "unstack": _unstack},
     **{
         "gather": _moved(0),
@@ -279,7 +280,6 @@ RULES = {
     **{f"reduce_{kind}": _reduction(kind) for kind in ("and", "or")},
     **{f"reduce_{kind}": _choice(kind) for kind in ("max", "min")},
     **{"reduce_sum": _reduction("add"), "reduce_prod": _reduction("mul")},
-    "hhtjax_structural": _structural,
     # a list has no batch
     "hhtjax_largest_in_batch": lambda eqn, x: [x] if recorder_of(x.flat) is not None else _elementwise(eqn, x),
 }
