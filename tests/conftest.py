@@ -23,7 +23,7 @@ QUICK = {
     "xla_llvm_enable_alias_scope_metadata": "false",  # which buffers are not one: a tenth of the time, to optimise by
     "xla_llvm_enable_noalias_metadata": "false",
 }
-LARGE = 1_300_000_000  # bytes of a test process, above which it forgets its compiled programs
+LARGE = 1_700_000_000  # bytes of a test process, above which it forgets its compiled programs
 
 
 def is_known(flag):

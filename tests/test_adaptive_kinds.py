@@ -39,6 +39,11 @@ def pushed(name, stepper, rtol, values=VALUES, **options):
     return hhtjax.simulate(SYSTEM, stepper, *START, held(name, values), dt=dt, times=TIMES)
 
 
+def taken(steps):
+    """Of the array of a traced run, which is as long as there may be steps."""
+    return np.asarray(steps)[np.asarray(steps) > 0]
+
+
 def pushed_exactly(name):
     """q and v from jump to jump, by SciPy."""
     y, found, ends = np.concatenate(START), [], [0.0, *jumps_of(name), DURATION]
@@ -100,17 +105,18 @@ def test_derivatives_in_held_inputs():
         return hhtjax.simulate(SPRING, METHODS["hht"], ONE, ZERO, held("uneven", values)["u"], **options)
 
     def end(values):
-        return run(values, **controlled).q[-1, 0]
+        found = run(values, **controlled)
+        return found.q[-1, 0], found.dt
 
     @jax.jit
     def ways(values, along):
-        return jax.grad(end)(values), jax.jvp(end, (values,), (along,))[1]
+        _, forward, steps = jax.jvp(end, (values,), (along,), has_aux=True)
+        return jax.grad(end, has_aux=True)(values)[0], forward, steps
 
     start, eye = jnp.asarray(VALUES), jnp.eye(6)
-    steps = run(start, **controlled).dt
-    reverse, forward = zip(*(ways(start, e) for e in eye), strict=True)
+    reverse, forward, steps = zip(*(ways(start, e) for e in eye), strict=True)
     np.testing.assert_allclose(reverse[0], forward, rtol=1e-9)
-    frozen = jax.jit(lambda values: run(values, dt=steps).q[-1, 0])
+    frozen = jax.jit(lambda values: run(values, dt=taken(steps[0])).q[-1, 0])
     for i in (0, 3):
         e = 1e-4 * eye[i]
         assert (frozen(start + e) - frozen(start - e)) / 2e-4 == pytest.approx(float(forward[i]), rel=1e-6)
@@ -136,12 +142,11 @@ RUBBING = {
 }
 
 
-def rubbed(name, rtol, **options):
+def rubbed(name, rtol):
+    """One program for all tolerances."""
     system, params, q0, v0, duration, *_ = RUBBING[name]
-    times = duration * np.arange(1, 65) / 64
-    return hhtjax.simulate(
-        system, hhtjax.hht(), q0, v0, params, dt=hhtjax.adaptive(rtol, 1e-3 * rtol, **options), times=times
-    )
+    dt = hhtjax.adaptive(rtol, 1e-3 * rtol, max_steps=100_000)
+    return hhtjax.simulate(system, LIGHT, q0, v0, params, dt=dt, times=duration * np.arange(1, 65) / 64)
 
 
 @pytest.mark.slow
@@ -214,9 +219,9 @@ def test_controlled_steps_of_stick_slip_are_fewer_than_equal_ones():
     """For the same error."""
     system, params, q0, v0, duration, *_ = RUBBING["stick-slip"]
     found = rubbed("stick-slip", 1e-4)
-    fine = rubbed("stick-slip", 1e-6, max_steps=100_000)
+    fine = rubbed("stick-slip", 1e-6)
     tries = int(found.steps.accepted + found.steps.rejected)
-    equal = hhtjax.sweep(system, hhtjax.hht(), q0, v0, params, dts=[duration / tries], times=found.t[1:])
+    equal = hhtjax.sweep(system, LIGHT, q0, v0, params, dts=[duration / tries], times=found.t[1:])
     errors = [np.max(np.abs(x - fine.q)) for x in (found.q, equal.q[0])]
     assert errors[1] > 1.5 * errors[0]
 
@@ -226,18 +231,23 @@ def test_controlled_steps_of_stick_slip_are_fewer_than_equal_ones():
 def test_derivatives_through_switches():
     """Forward = reverse = differences over the same steps."""
     system, params, q0, v0, *_ = RUBBING["free"]
+    controlled = {"dt": hhtjax.adaptive(1e-3, 1e-6, max_steps=1000), "times": np.linspace(0.1, 0.5, 5)}
 
-    def end(F, dt=None):
-        options = (
-            {"dt": hhtjax.adaptive(1e-3, 1e-6, max_steps=1000), "times": np.linspace(0.1, 0.5, 5)}
-            if dt is None
-            else {"dt": dt}
-        )
+    def run(F, **options):
         return hhtjax.simulate(system, LIGHT, q0, v0, params | {"F": F}, **options)
 
-    steps, F = end(4.0).dt, jnp.asarray(4.0)
-    last = lambda F: end(F).q[-1, 0]  # noqa: E731
-    reverse, (_, forward) = jax.jit(lambda F: (jax.grad(last)(F), jax.jvp(last, (F,), (1.0,))))(F)
+    def end(F):
+        found = run(F, **controlled)
+        return found.q[-1, 0], found.dt
+
+    @jax.jit
+    def ways(F):
+        _, forward, steps = jax.jvp(end, (F,), (1.0,), has_aux=True)
+        return jax.grad(end, has_aux=True)(F)[0], forward, steps
+
+    F = 4.0
+    reverse, forward, steps = ways(F)
     assert float(reverse) == pytest.approx(float(forward), rel=1e-10)
-    high, low = (float(hhtjax.interpolate(end(F + h, steps), 0.5).q[0]) for h in (1e-6, -1e-6))
+    frozen = jax.jit(lambda F: hhtjax.interpolate(run(F, dt=taken(steps)), 0.5).q[0])
+    high, low = (float(frozen(F + h)) for h in (1e-6, -1e-6))
     assert (high - low) / 2e-6 == pytest.approx(float(forward), rel=1e-6)

@@ -137,6 +137,7 @@ def test_squeezer_without_iterations():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("formulation", ["index3", "ggl"])
+@pytest.mark.compiled
 def test_multipliers_of_a_pendulum(formulation):
     """In the unit of force, for a Phi in units of length: minus the tension m (g cos + v^2/l)."""
     length = 0.5

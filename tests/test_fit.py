@@ -36,6 +36,7 @@ def _promotion():
         yield
 
 
+@pytest.mark.compiled
 def test_estimate_and_naive_covariance_are_scipys(capfd):
     """With progress on stderr; a second start costs no tracing."""
     calls = []

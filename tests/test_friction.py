@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from friction_problems import arm, free_vibration_exact, of_scene
-from jax.flatten_util import ravel_pytree
+from helpers import check_gradient
 from zoo import everywhere
 
 import hhtjax
@@ -141,20 +141,8 @@ def test_one_factorisation_per_step():
         assert sum(eqn.primitive.name == "lu" for eqn in everywhere(trace.jaxpr)) == 1
 
 
-def check_derivatives(end, start):
-    """Forward, along a direction, = reverse = central differences, so short that no switch leaves its step between."""
-    x, unravel = ravel_pytree(start)
-    reverse = jax.jit(jax.grad(lambda x: end(unravel(x))))(x)
-    size = np.abs(reverse) + 1e-2 * np.max(np.abs(reverse))
-    value_and_forward = jax.jit(lambda x, direction: jax.jvp(lambda x: end(unravel(x)), (x,), (direction,)))
-    direction = np.where(reverse < 0, -1, 1) * np.linspace(1.0, 0.5, x.size) / size  # nothing cancels
-    assert abs(value_and_forward(x, direction)[1] - reverse @ direction) < 1e-10
-    for i, e in enumerate(1e-6 * np.eye(x.size)):
-        central = (value_and_forward(x + e, direction)[0] - value_and_forward(x - e, direction)[0]) / 2e-6
-        assert abs(central - reverse[i]) < 1e-6 * size[i], (i, central, reverse[i])
-
-
-NAMES, FEW = ("k", "c", "F", "m"), 32  # steps, as many as are not checkpointed
+NAMES, SHORT = ("k", "c", "F", "m"), 1e-6  # of differences, so short that no switch leaves its step between
+FEW = 32  # steps, as many as are not checkpointed
 
 
 def last(found):
@@ -182,7 +170,7 @@ def test_derivatives_are_those_of_the_exact_motion():
     def end(params):
         return last(run(case._replace(params={**case.params, **params}, duration=3.2), hhtjax.hht(), FEW))
 
-    check_derivatives(end, {name: case.params[name] for name in NAMES})
+    check_gradient(end, {name: case.params[name] for name in NAMES}, step=SHORT)
 
 
 @pytest.mark.slow
@@ -193,7 +181,7 @@ def test_derivatives_through_coupled_switches():
     def end(start):
         return last(run(case._replace(params={"F": start[0]}, q0=start[1]), hhtjax.hht(), FEW))
 
-    check_derivatives(end, (2.5, case.q0))
+    check_gradient(end, (2.5, case.q0), step=SHORT)
 
 
 @pytest.mark.slow

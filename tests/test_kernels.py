@@ -7,7 +7,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from linked_pendulums import N, end, loss, on_cpu, paths, run
+from linked_pendulums import LIGHT, N, end, loss, on_cpu, paths, run
 
 import hhtjax
 from hhtjax.xla import inspection, kernels, trial
@@ -19,6 +19,7 @@ EIGHTS = jnp.sin(jnp.arange(3.0 * 4 * 5 * 8)).reshape(3, 4, 5, 8)
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_one_kernel_gives_what_the_plain_path_gives(monkeypatch):
     one = jax.jit(jax.value_and_grad(loss))(2.0)
     monkeypatch.setattr(inspection, "PROVEN", set())
@@ -27,6 +28,7 @@ def test_one_kernel_gives_what_the_plain_path_gives(monkeypatch):
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_a_loop_of_which_only_an_integer_is_used():
     def count(x):
         def halved(carry):
@@ -39,6 +41,7 @@ def test_a_loop_of_which_only_an_integer_is_used():
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_a_conditional_on_an_argument_stays():
     def f(i, x):
         return kernels.one_kernel(lambda i, x: jax.lax.switch(i, [jnp.sin, jnp.cos], x), i, x)
@@ -49,7 +52,7 @@ def test_a_conditional_on_an_argument_stays():
 
 @on_cpu
 def test_derivatives_and_batches_are_one_kernel_too():
-    assert paths(jax.grad(loss), 2.0) == ("one kernel", "one kernel")
+    assert paths(jax.grad(partial(loss, stepper=hhtjax.hht())), 2.0) == ("one kernel", "one kernel")
     assert paths(lambda p: jax.jvp(loss, (p,), (p,)), 2.0) == ("one kernel",)
     assert paths(jax.vmap(end), jnp.ones(3)) == ("one kernel",)
 
@@ -100,6 +103,7 @@ UNSUPPORTED = {
 
 @on_cpu
 @pytest.mark.parametrize("name", [*SUPPORTED, *UNSUPPORTED])
+@pytest.mark.compiled
 def test_what_xla_cannot_compile_into_one_kernel_runs_plainly(name):
     body = (SUPPORTED | UNSUPPORTED)[name]
 
@@ -147,6 +151,7 @@ def product(lengths):
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_every_product_compiles_in_value_and_reverse():
     """Batched or not; and what autodiff and vmap make of it."""
 
@@ -179,11 +184,12 @@ def force(q, v, t, p):
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_forces_with_products_of_matrices_are_one_kernel():
     system = hhtjax.System(jnp.ones(3), force)
 
     def end(p, q0):
-        return jnp.sum(hhtjax.simulate(system, hhtjax.hht(), q0, 0 * q0, p, dt=0.02, num_steps=9).q[-1] ** 2)
+        return jnp.sum(hhtjax.simulate(system, LIGHT, q0, 0 * q0, p, dt=0.02, num_steps=9).q[-1] ** 2)
 
     def all_of(p):
         return jax.value_and_grad(end, (0, 1))(p, q0), jax.vmap(end, (0, None))(jnp.array([1.0, p]), q0)
@@ -233,6 +239,7 @@ def test_common_programs_are_compiled_without_a_trial(monkeypatch):
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_a_stage_of_a_large_batch_is_not_divided_among_threads():
     """XLA would call what kernels are not linked with."""
     c = jnp.linspace(0.1, 1.0, 10**5)
@@ -247,6 +254,7 @@ def test_a_stage_of_a_large_batch_is_not_divided_among_threads():
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_a_batch_of_thousands_compiles():
     q0 = jnp.outer(jnp.linspace(-1, 1, 5000), jnp.ones(N))
     assert jnp.all(jnp.isfinite(jax.vmap(partial(end, 2.0))(q0)))
@@ -262,6 +270,7 @@ def test_a_program_for_several_platforms_is_plain():
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_shared_values_are_computed_once():
     def sines(barrier):
         def body(x, _):

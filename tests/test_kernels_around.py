@@ -21,6 +21,7 @@ x = jnp.linspace(0.1, 1.0, 4)
 
 
 @on_cpu
+@pytest.mark.compiled
 def test_a_kernel_around_others():
     """It is one with what is around them, where it can be, and is told of by them alone."""
 

@@ -54,6 +54,7 @@ PROGRAMS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.compiled
 def test_a_run_is_the_same_with_and_without(name):
     force, q0, stepper = PROGRAMS[name]
     system = hhtjax.System(np.ones(q0.size), force)
@@ -70,6 +71,7 @@ def test_a_run_is_the_same_with_and_without(name):
         np.testing.assert_array_equal(np.signbit(x)[zeros], np.signbit(y)[zeros])
 
 
+@pytest.mark.compiled
 def test_zero_times_nan_is_told():
     force, q0, stepper = PROGRAMS["zero times NaN"]
     run = hhtjax.simulate(hhtjax.System(np.ones(3), force), stepper, q0, 0.1 * q0, dt=0.1, num_steps=6)

@@ -92,6 +92,7 @@ def test_zeros_of_either_sign_are_not_the_same():
     assert signs == [np.inf, -np.inf]
 
 
+@pytest.mark.compiled
 def test_the_program_has_each_sine_once():
     def f(x, y):
         sine, cosine = jnp.sin(x - y), jnp.cos(x - y)

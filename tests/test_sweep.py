@@ -72,6 +72,7 @@ def test_the_work_is_about_the_sum_over_the_members():
 
 
 @pytest.mark.slow
+@pytest.mark.compiled
 def test_derivatives_forward_and_reverse_are_those_of_the_runs():
     def loss(params, t0):
         return jnp.sum(sweep(params, t0=t0, dts=DTS[:3]).q[:, 1:] ** 2)

@@ -14,6 +14,7 @@ every_stepper = pytest.mark.parametrize("name", each(STEPPERS))
 
 
 ONE_FORM = ("hht predictor", "hht held", "hht state", "hht twice", "newmark", "bossak", "generalized_alpha")  # of hht's
+OWN = ("operator_splitting",)  # such tests in a file of its own
 
 
 def coupled_mass(q, params):
@@ -31,7 +32,7 @@ VECTORS = Problem(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", each(STEPPERS, rest=ONE_FORM))
+@pytest.mark.parametrize("name", each(STEPPERS, rest=(*ONE_FORM, *OWN, "wilson", "dopri5")))
 def test_jit_equals_eager(name):
     problem, stepper = VECTORS, as_data(STEPPERS[name])
     compiled = run(problem, stepper, 2)  # the program is that of vectors, below
@@ -55,7 +56,7 @@ ends = jax.jit(jax.vmap(end, (None, 0, 0, 0)))
 
 
 @pytest.mark.slow
-@every_stepper
+@pytest.mark.parametrize("name", each(STEPPERS, rest=OWN))
 def test_vmap_equals_loop(name):
     """Over the stiffness, the start, and the step size; steppers of one family are compiled once."""
     stiffness, start, dts = np.array([0.5, 1.0, 2.0]), np.array([[0.1], [0.5], [-0.4]]), np.array([0.02, 0.05, 0.1])

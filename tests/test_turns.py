@@ -73,6 +73,7 @@ def test_in_turn_is_at_once(batches):
         np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-15)
 
 
+@pytest.mark.compiled
 def test_only_members_that_ask_are_visited():
     """One that does not leave the others alone shows it; of those that ask, each once."""
     x = jnp.arange(8.0).reshape(2, 4)
@@ -86,6 +87,7 @@ def test_what_is_returned_is_like_the_carry():
             in_turn(f, jnp.array(True), jnp.ones(2))
 
 
+@pytest.mark.compiled
 def test_a_kernel_copies_nothing_that_is_written_into():
     """200 steps in one kernel, in some of which a member writes into columns of its own."""
 

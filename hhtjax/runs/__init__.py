@@ -14,7 +14,7 @@ Everything composes with `jit`, `vmap` and `grad`: dt, alpha, q0, v0 and params 
 >>> q0, v0, params = jnp.array([1.0]), jnp.array([0.0]), {"l": 0.5}
 >>> def final_angle(dt, alpha, length):
 ...     stepper = hhtjax.hht(alpha=alpha)
-...     return hhtjax.simulate(pendulum, stepper, q0, v0, {"l": length}, dt=dt, num_steps=100).q[-1, 0]
+...     return hhtjax.simulate(pendulum, stepper, q0, v0, {"l": length}, dt=dt, num_steps=30).q[-1, 0]
 >>> [bool(jnp.isfinite(x)) for x in jax.grad(final_angle, argnums=(0, 1, 2))(1e-2, -0.05, 0.5)]
 [True, True, True]
 >>> jax.vmap(final_angle, in_axes=(0, None, None))(jnp.logspace(-4, -1, 7), -0.05, 0.5).shape     # many steps at once
@@ -127,7 +127,7 @@ the time among them. `run.events` tells what happened, when, and the velocities 
 >>> def bounce(e):
 ...     params = {"e": e, "floor": 0.0}
 ...     return hhtjax.simulate(
-...         ball, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), params, dt=1e-2, num_steps=60, events=[floor])
+...         ball, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), params, dt=2e-2, num_steps=30, events=[floor])
 >>> run = bounce(0.8)
 >>> run.check()
 >>> [round(float(v[0, 0]), 4) for v in (run.events.before, run.events.after)]
