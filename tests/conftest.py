@@ -94,9 +94,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
 def pytest_collection_finish(session):
-    """Tracing makes many objects and few circles; looking for these, in all there is, took a tenth of the time."""
+    """Tracing makes many objects and hardly a circle; to look for these took a twentieth of the time. They are looked
+    for where programs are forgotten."""
     gc.freeze()
-    gc.set_threshold(50_000, 20, 20)
+    gc.disable()
 
 
 def memory():

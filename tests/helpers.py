@@ -70,11 +70,11 @@ def tight(stepper):
     return with_tolerance(stepper, 1e-13)
 
 
-def check_gradient(loss, arguments, rtol=1e-10, step=1e-4, least=1e-3):
+def check_gradient(loss, arguments, rtol=1e-10, step=1e-4):
     """Compares three derivatives of loss(arguments), a pytree of numbers; returns that of reverse mode, a vector.
 
     Reverse mode by differences in each argument; forward mode along one direction, in which each counts as much.
-    step: of the differences, relative; least: size of a derivative beside the largest, below which it counts as such.
+    step: of the differences, relative.
     """
     x0, unravel = ravel_pytree(arguments)
     x0 = np.asarray(x0)
@@ -83,7 +83,7 @@ def check_gradient(loss, arguments, rtol=1e-10, step=1e-4, least=1e-3):
         return loss(unravel(x))
 
     reverse = np.asarray(jax.jit(jax.grad(f))(x0))
-    size = np.maximum(np.abs(reverse), least * np.max(np.abs(reverse)))
+    size = np.maximum(np.abs(reverse), 1e-3 * np.max(np.abs(reverse)))
     assert np.all(np.isfinite(reverse))
     # one program gives the derivative along a direction and, for the differences, the values
     value_and_forward = jax.jit(lambda x, direction: jax.jvp(f, (x,), (direction,)))
