@@ -97,7 +97,7 @@ def _add(eqn, *values):
     """What does not depend on x adds nothing: the map is linear."""
     shape = eqn.outvars[0].aval.shape
     if eqn.primitive.name == "sub" and _depends(values[1]):
-        values = values[0], values[1].map(jnp.negative, values[1].shape)
+        values = values[0], values[1].map(lax.neg, values[1].shape)
     return [reduce(add, [_fit(x, shape) for x in values if _depends(x)])]
 
 
@@ -106,18 +106,18 @@ def _multiply(eqn, x, y):
     if _depends(x) and _depends(y):
         return None
     x, y = (x, y) if _depends(x) else (y, x)
-    return [_fit(x, shape).map(lambda z: z * y, shape)]
+    return [_fit(x, shape).map(lambda z: lax.mul(z, y), shape)]
 
 
 def _divide(eqn, x, y):
     shape = eqn.outvars[0].aval.shape
-    return None if _depends(y) else [_fit(x, shape).map(lambda z: z / y, shape)]
+    return None if _depends(y) else [_fit(x, shape).map(lambda z: lax.div(z, y), shape)]
 
 
 def _select(eqn, which, *cases):
     def chosen(y, case):
         return lax.select_n(
-            which, *(y if i == case else jnp.broadcast_to(zero_like(y), y.shape) for i in range(len(cases)))
+            which, *(y if i == case else lax.broadcast(zero_like(y), y.shape) for i in range(len(cases)))
         )
 
     return [reduce(add, [x.map(partial(chosen, case=i), x.shape) for i, x in enumerate(cases) if _depends(x)])]
@@ -138,7 +138,7 @@ def _reshaped(x, shape):
     old, new = ([i for i, length in enumerate(s) if length != 1] for s in (x.shape, shape))
     same = [x.shape[i] for i in old] == [shape[i] for i in new]
     return x.map(
-        lambda y: y.reshape(shape),
+        lambda y: lax.reshape(y, shape),
         shape,
         lambda axis, offset: (new[old.index(axis)], offset) if same and axis in old else None,
     )
@@ -146,7 +146,7 @@ def _reshaped(x, shape):
 
 def _transpose(eqn, x):
     to, shape = eqn.params["permutation"], eqn.outvars[0].aval.shape
-    return [x.map(lambda y: y.transpose(to), shape, lambda axis, offset: (to.index(axis), offset))]
+    return [x.map(lambda y: lax.transpose(y, to), shape, lambda axis, offset: (to.index(axis), offset))]
 
 
 def _cut(x, start, stop, steps):

@@ -55,7 +55,9 @@ class Terms:
         shape, total = (self.n, *self.shape), self.full
         for (axis, offset), y in self.along.items():
             k, i = (lax.broadcasted_iota(jnp.int32, shape, j) for j in (0, axis + 1))
-            total = add_if_any(total, jnp.where(k == i + int(offset), y[None], zero_like(y)))
+            y = lax.broadcast_in_dim(y, shape, range(1, len(shape)))
+            there = lax.eq(k, lax.add(i, np.int32(offset)) if offset else i)
+            total = add_if_any(total, lax.select(there, y, lax.broadcast(zero_like(y), shape)))
         return total
 
 
@@ -66,4 +68,4 @@ def zero_like(like):
 
 def add_if_any(x, y):
     """x + y, where None is nothing."""
-    return y if x is None else x if y is None else x + y
+    return y if x is None else x if y is None else lax.add(x, y)
