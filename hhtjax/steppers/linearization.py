@@ -18,7 +18,8 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
     """w at t + dt by one linearisation of r, about the state that `where` says, and its `Info`."""
 
     # each traced once, however many states r is expanded about
-    expand = Expand(*(jax.jit(partial(jax.linearize, f), inline=True) for f in (r, path)), s.w)
+    of_r, of_path = (jax.jit(partial(jax.linearize, f), inline=True) for f in (r, path))
+    expand = Expand(of_r, of_path, s.w)
 
     @jax.jit
     def solution(expansion):

@@ -30,7 +30,7 @@ def linearized_solve(r, path, w, factorize, at=None, again=False):
 
 def solve_and_keep(r, path, w, factorize, at=None, again=False):
     """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
-    expansion = Expand(*(partial(jax.linearize, f) for f in (r, path)), w)(at)
+    expansion = Expand(partial(jax.linearize, r), partial(jax.linearize, path), w)(at)
     return *solve_expanded(r, path, w, factorize, again, expansion), expansion.along
 
 
@@ -49,7 +49,7 @@ class Expand:
 
     def __init__(self, r, path, w):
         self.r, self.path, self.w = r, path, w
-        self.predicted, self.other = (staged(f, w.size) for f in (self._predicted, self._other))
+        self.predicted, self.other = staged(self._predicted, w.size), staged(self._other, w.size)
 
     def __call__(self, at=None):
         """The `Expansion`; each in one stage."""
