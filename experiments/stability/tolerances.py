@@ -11,7 +11,7 @@ import hhtjax
 from experiments.cells import SAMPLES
 from experiments.linearization.scenes import unit_mass
 from experiments.report import COLOURS, MARKERS, side_by_side
-from hhtjax.plot import legend, subplots
+from hhtjax.plot import subplots
 from hhtjax.rotation import cross
 from hhtjax.scenes import Scene
 
@@ -167,7 +167,7 @@ def draw(rtols, scenes):
     axes[0, 0].set_ylabel("error of q over the tolerance (1)")
     axes[0, 0].plot([], [], "--", color="0.3", label="plain")
     axes[0, 0].plot([], [], "-", color="0.3", label='verify="tighten"')
-    legend(axes[0, -1], *axes[0, 0].get_legend_handles_labels())
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=6)
     return figure
 
 
