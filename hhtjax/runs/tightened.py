@@ -42,7 +42,8 @@ def tighten(once, judge, one):
     """
     found = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(once, one))
     error, allowed = jax.tree.map(jnp.zeros_like, jax.eval_shape(judge, found[0], found[0], one))
-    begun = Round(*found, 2 * one, one, error, allowed, one > 0, jnp.zeros((), jnp.int32))
+    run, steps, ends = found
+    begun = Round(run, steps, ends, 2 * one, one, error, allowed, one > 0, jnp.zeros((), jnp.int32))
 
     def goes_on(last):
         return jnp.any(last.is_open) & (last.number < ROUNDS)
