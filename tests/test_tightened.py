@@ -86,6 +86,26 @@ def test_what_cannot_be_reached_is_named(monkeypatch):
 
 
 @pytest.mark.slow
+def test_members_of_a_sweep_wait_for_each_other():
+    """A harmonic one and one whose phase drifts, which takes a round more."""
+    stiffness = np.array([0.0, K])
+    control = hhtjax.adaptive(1e-2, 1e-5, max_steps=60_000, verify="tighten")
+    runs = hhtjax.sweep(SPRING, STEPPER, ONE, ZERO, stiffness, dts=control, times=TIMES, in_axes=(None, None, None, 0))
+    runs.check()
+    shares = []
+    for i, k in enumerate(stiffness):
+        alone = controlled(k, rtol=1e-2)
+        shares.append(float(alone.steps.tightened))
+        mine = jax.tree.map(lambda x, i=i: x[i], runs)
+        assert mine.steps.accepted == alone.steps.accepted
+        assert float(mine.steps.tightened) == pytest.approx(shares[-1], rel=1e-7)
+        np.testing.assert_allclose(mine.dt[: alone.dt.size], alone.dt, rtol=1e-7)
+        for which in ("q", "v", "error", "allowed"):
+            np.testing.assert_allclose(getattr(mine, which), getattr(alone, which), rtol=1e-6, atol=1e-9)
+    assert shares[0] > 2 * shares[1]
+
+
+@pytest.mark.slow
 def test_with_events():
     """A spring that throws its mass against a wall, without loss: |cos(20 t)|."""
     system = hhtjax.System(ONE, lambda q, v, t, k: -400 * q)

@@ -74,8 +74,8 @@ def rounds(members, progress):
         return run_many(members, steps, ends, progress), steps, ends
 
     def judge(run, before, share):
-        def one(arrays, *those):
-            return compared(*those, members.control(arrays))
+        def one(arrays, run, before, share):
+            return compared(run, before, share, members.control(arrays))
 
         return jax.vmap(one, (members.axes, 0, 0, 0))(members.arrays, run, before, share)
 
