@@ -99,7 +99,7 @@ def test_members_of_a_sweep_wait_for_each_other():
         mine = jax.tree.map(lambda x, i=i: x[i], runs)
         assert mine.steps.accepted == alone.steps.accepted
         assert float(mine.steps.tightened) == pytest.approx(shares[-1], rel=1e-7)
-        np.testing.assert_allclose(mine.dt[: alone.dt.size], alone.dt, rtol=1e-7)
+        np.testing.assert_allclose(mine.dt[: alone.dt.size], alone.dt, rtol=1e-5)
         for which in ("q", "v", "error", "allowed"):
             np.testing.assert_allclose(getattr(mine, which), getattr(alone, which), rtol=1e-6, atol=1e-9)
     assert shares[0] > 2 * shares[1]
