@@ -47,7 +47,9 @@ WRONG = {
     "gamma": ({}, {"stepper": hhtjax.newmark(0.3025, 0.6)}, "simulate: GeneralizedAlpha has no estimate of its error"),
     "rtol": ({"rtol": 0.0}, {}, "adaptive: `rtol` must be positive and finite; received 0.0."),
     "atol": ({"atol": -1.0}, {}, "adaptive: `atol` must be positive and finite; received -1.0."),
-    "verify": ({"verify": "yes"}, {}, 'adaptive: `verify` must be True, False or "tolerance"; received \'yes\'.'),
+    "verify": (
+        {"verify": "yes"}, {}, 'adaptive: `verify` must be True, False, "tolerance" or "tighten"; received \'yes\'.'
+    ),
     "bounds": ({"dt_min": 0.2, "dt_max": 0.1}, {}, "adaptive: `dt_min` must not exceed dt_max=0.1; received 0.2."),
     "max_steps": ({"max_steps": 0}, {}, "adaptive: `max_steps` must be a positive integer; received 0."),
 }  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 from helpers import ONE, ZERO
 
 import hhtjax
-from hhtjax.runs.controlled import run_in_two, run_recorded
+from hhtjax.runs.controlled import in_two_passes, run_recorded
 from hhtjax.runs.problem import Problem
 
 SWING = hhtjax.System(ONE, lambda q, v, t, k: -k * jnp.sin(q) - 0.1 * v)
@@ -23,7 +23,7 @@ CONTROL = hhtjax.adaptive(1e-3, 1e-6, max_steps=2000)
 @pytest.mark.parametrize("name", CASES)
 def test_all_that_a_run_tells(name):
     problem = Problem.checked("test", *CASES[name], 0.0, None)
-    (run, steps, _), (other, same_steps, _) = (f(problem, TIMES, CONTROL) for f in (run_recorded, run_in_two))
+    (run, steps, _), (other, same_steps, _) = (f(problem, TIMES, CONTROL) for f in (run_recorded, in_two_passes))
     assert int(steps.accepted) > 10
     assert jax.tree.structure((run, steps)) == jax.tree.structure((other, same_steps))
     for x, y in zip(jax.tree.leaves((run, steps)), jax.tree.leaves((other, same_steps)), strict=True):

@@ -63,11 +63,15 @@ def test_under_error_control_nothing_is_silently_wrong():
     assert len(rows) == 21 * (6 * 3 + 3)
     assert found["cells"]["halved"]["silently_wrong"] == found["cells"]["tolerance"]["silently_wrong"] == 0
     assert found["cells"]["halved"]["beyond"] == 0
+    tight = found["cells"]["tighten"]
+    assert tight["silently_wrong"] == tight["beyond"] == 0
+    assert tight["named"] < 0.02 * len(rows)
+    assert tight["within_the_tolerance"] > 0.95 * len(rows) > 2 * found["cells"]["no"]["within_the_tolerance"]
     assert found["cells"]["no"]["accurate"] > 0.75 * len(rows)
 
 
 def test_errors_follow_the_tolerance_on_scenes_of_their_own():
-    """But for the orbit, whose period drifts, and beads that come to rest."""
+    """But for the orbit, whose period drifts, and beads that come to rest; with `verify="tighten"` there too."""
     found = COMMITTED["tolerances"]
     assert found["rtol"] == list(tolerances.RTOLS)
     for scene, by in found["scenes"].items():
@@ -77,6 +81,8 @@ def test_errors_follow_the_tolerance_on_scenes_of_their_own():
             assert len(errors) >= len(found["rtol"]) - 1
             low, high = {"Kepler, e = 0.5": (0.02, 50), "charged beads": (0.005, 10)}.get(scene, (0.02, 10))
             assert all(low < e < high for e in errors)
+            assert len(x["tightened"]) == len(tolerances.TIGHTENED)
+            assert all(run["error"] < 1 for run in x["tightened"])
 
 
 def test_no_constants_of_the_controller_gain_on_both_halves():

@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from pathlib import Path
 
+from experiments.cells import geometric_mean
 from experiments.page import table
 from experiments.stability.dry import SET_VALUED, fewest_accurate
 from experiments.stability.peers import MAX_STEPS
@@ -100,6 +101,30 @@ def outside(found):
     everything = [(f"{s} with {m}", e) for s, x, m in _rows(found) for e in x["error"]]
     beyond = Counter(name for name, e in everything if e is not None and not LOW <= e <= HIGH)
     return len(everything), beyond, sum(e is None for _, e in everything)
+
+
+def tightened(adaptive, found):
+    """Those of `verify="tighten"`: cells of the gallery, and runs of the other motions."""
+    cells = adaptive["cells"]
+    beyond = {"silently wrong": cells["tighten"]["silently_wrong"], "beyond ten tolerances": cells["tighten"]["beyond"]}
+    runs = [run for _, x, _ in _rows(found) for run in x["tightened"]]
+    errors = [run["error"] for run in runs if run["error"] is not None]
+    ratios = [run["stated"] / run["error"] for run in runs if run["error"] is not None]
+    return {
+        "adaptive_tries": f"{adaptive['tries']['tighten']:,}".replace(",", " "),
+        "tight_within": cells["tighten"]["within_the_tolerance"],
+        "plain_within": cells["no"]["within_the_tolerance"],
+        "tight_all": sum(len(rows) for x in adaptive["scenes"].values() for rows in x["grades"].values()),
+        "tight_named": cells["tighten"]["named"],
+        "tight_beyond": ", ".join(f"{n or 'none'} {what}" for what, n in beyond.items()),
+        "tight_least": found["tightened_rtol"][-1],
+        "tight_runs": len(runs),
+        "tight_runs_within": sum(e <= 1 for e in errors),
+        "tight_largest": max(errors),
+        "tight_stated": f"{min(ratios):.2g} to {max(ratios):.2g}",
+        "tight_stated_mean": geometric_mean(ratios),
+        "tight_share": min(run["share"] for run in runs),
+    }
 
 
 def _rows(found):
@@ -196,6 +221,7 @@ def page(numbers):
             controller_runs=both(controller[half]["table"][0]["runs"] for half in ("tuned", "held_out")),
             controller_best=f"{100 * (1 - min(row['work'] for row in controller['held_out']['table'])):.1f}",
             tolerances=tolerances_table(tolerances),
+            **tightened(adaptive, tolerances),
             tolerances_runs=runs_at_all,
             tolerances_within=runs_at_all - sum(beyond.values()) - too_early,
             tolerances_beyond="; ".join(f"{n} of {name}" for name, n in beyond.items()),

@@ -10,12 +10,14 @@ from scipy.integrate import solve_ivp
 import hhtjax
 from experiments.cells import SAMPLES
 from experiments.linearization.scenes import unit_mass
-from experiments.report import side_by_side
+from experiments.report import COLOURS, MARKERS, side_by_side
+from hhtjax.plot import subplots
 from hhtjax.rotation import cross
 from hhtjax.scenes import Scene
 
 RTOLS = tuple(10.0**-n for n in range(2, 9))
 ATOL = 1e-3  # over rtol
+TIGHTENED = RTOLS[:5]  # below, methods of order 2 take millions of steps
 MAX_STEPS = 400_000
 LOW, HIGH = 0.02, 10.0  # of errors, over the tolerance
 METHODS = {
@@ -110,25 +112,63 @@ def reference(scene):
     return run.y[: scene.q0.size].T
 
 
-@partial(jax.jit, static_argnames="method")
-def controlled(scene, rtol, method):
+@partial(jax.jit, static_argnames=("method", "verify"))
+def controlled(scene, rtol, method, verify=False):
     """A run under error control."""
     system, params, q0, v0, duration = scene
     times = duration * jnp.arange(1, SAMPLES + 1) / SAMPLES
-    control = hhtjax.adaptive(rtol, ATOL * rtol, max_steps=MAX_STEPS)
+    control = hhtjax.adaptive(rtol, ATOL * rtol, max_steps=MAX_STEPS, verify=verify)
     return hhtjax.simulate(system, METHODS[method], q0, v0, params, dt=control, times=times)
 
 
 def assess(scene, q, method, rtols):
-    """For each tolerance the error over rtol max|q| + atol, and the tries of steps; None where steps end too early."""
-    errors, tries = [], []
+    """For each tolerance the error over rtol max|q| + atol, None where steps end too early, and the tries of steps.
+
+    tightened: the same with `verify="tighten"`, what is stated of the error, and for which share steps were chosen.
+    """
+    found: dict = {"error": [], "tries": [], "tightened": []}
     for rtol in rtols:
         run = controlled(scene, rtol, method)
-        steps = run.steps
         allowed = rtol * (np.abs(q).max() + ATOL)
-        errors.append(None if int(steps.stop) else float(np.abs(np.asarray(run.q)[1:] - q).max() / allowed))
-        tries.append(int(steps.accepted + steps.rejected))
-    return {"error": errors, "tries": tries}
+        found["error"].append(error_over(allowed, run, q))
+        found["tries"].append(int(run.steps.accepted + run.steps.rejected))
+        if rtol in TIGHTENED:
+            run = controlled(scene, rtol, method, "tighten")
+            found["tightened"].append(
+                {
+                    "error": error_over(allowed, run, q),
+                    "stated": float(np.max(run.error) / allowed),
+                    "steps": int(run.steps.accepted),
+                    "share": float(run.steps.tightened),
+                }
+            )
+    return found
+
+
+def error_over(allowed, run, q):
+    """The largest, None where steps end too early."""
+    return None if int(run.steps.stop) else float(np.abs(np.asarray(run.q)[1:] - q).max() / allowed)
+
+
+def draw(rtols, scenes):
+    """Errors against the tolerance, a panel for each scene, with and without `verify`."""
+    figure, axes = subplots(1, len(scenes), width=175, height=70, sharey=True, squeeze=False)
+    for ax, (name, by_method) in zip(axes[0], scenes.items(), strict=True):
+        ax.axhspan(LOW, HIGH, color="0.93", zorder=0)
+        ax.axhline(1, color="0.6", linewidth=0.6, zorder=0)
+        for (method, found), colour, marker in zip(by_method.items(), COLOURS, MARKERS, strict=False):
+            style = {"color": colour, "marker": marker, "markersize": 3}
+            errors = [np.nan if e is None else e for e in found["error"]]
+            ax.loglog(rtols, errors, "--", markerfacecolor="none", linewidth=0.7, **style)
+            tight = [np.nan if x["error"] is None else x["error"] for x in found["tightened"]]
+            ax.loglog(rtols[: len(tight)], tight, "-", label=method, **style)
+        ax.set_title(name, fontsize="medium")
+        ax.set_xlabel("rtol (1)")
+    axes[0, 0].set_ylabel("error of q over the tolerance (1)")
+    axes[0, 0].plot([], [], "--", color="0.3", label="plain")
+    axes[0, 0].plot([], [], "-", color="0.3", label='verify="tighten"')
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=6)
+    return figure
 
 
 def run(report, fast):
@@ -145,4 +185,5 @@ def run(report, fast):
     print("Errors over the tolerance\n")
     rows = [[s, m, *map(str, x["error"])] for s, by in scenes.items() for m, x in by.items()]
     report.table(["scene", "method", *(f"{x:g}" for x in rtols)], rows)
-    return {"rtol": rtols, "scenes": scenes}
+    report.figure("stability_tolerances", draw(rtols, scenes))
+    return {"rtol": rtols, "tightened_rtol": TIGHTENED, "scenes": scenes}

@@ -41,10 +41,10 @@ def adaptive(
     largest values so far; rtol^(1/2) because errors of steps add up, and only for the `hht` family. So errors of the
     run follow rtol, but nothing is promised: an error that grows, the phase of an undamped vibration or chaos, is seen
     by no estimate of one step, and what happens and is over within a step neither (give dt_max). `verify` sees the
-    first: on a planet's orbit an error of the energy is one of the period, and adds up; a revolution (e = 0.5) ends 13
-    to 40 tolerances off with methods of order 2, up to 12 with `rowda`, 4 with `dopri5`. Steps end where held inputs,
-    `sampled(order=0)`, jump. With dry friction the error is that of the motion on either side of a switch: the jump of
-    the acceleration is no reason to reject.
+    first, and "tighten" mends it: on a planet's orbit an error of the energy is one of the period, and adds up; a
+    revolution (e = 0.5) ends 13 to 40 tolerances off with methods of order 2, up to 12 with `rowda`, 4 with `dopri5`,
+    and within one with "tighten". Steps end where held inputs, `sampled(order=0)`, jump. With dry friction the error is
+    that of the motion on either side of a switch: the jump of the acceleration is no reason to reject.
 
     With `events` steps pass them as steps of given sizes do, and what is left of a step behind an event has an error of
     its own. Where there is none, as in free flight, steps grow without bound, and a guard that falls and rises again
@@ -64,7 +64,9 @@ def adaptive(
         verify: True, run again with every step halved, and state `run.error`, the error of the whole run at each of
             `times`, for three times the solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|). Where
             the motion jumps, as in relaxation oscillations, at times that move by more than a step, that is a false
-            alarm: "tolerance" runs again with steps for a quarter of the tolerance instead.
+            alarm: "tolerance" runs again with steps for a quarter of the tolerance instead. "tighten" goes on from
+            there: steps for ever smaller tolerances, `run.steps.tightened` times those given, until the error of the
+            run, by the run before, is below the tolerance itself at each of `times`; `check()` fails if it never is.
 
     Returns:
         An `Adaptive`.
@@ -88,8 +90,8 @@ def adaptive(
         raise ValueError(f"adaptive: arrays must have one length, that of the members; received {sizes}.")
     if is_concrete(dt_min) and is_concrete(dt_max) and np.any(np.greater(dt_min, dt_max)):
         raise ValueError(f"adaptive: `dt_min` must not exceed dt_max={dt_max}; received {dt_min}.")
-    if not isinstance(verify, bool) and verify != "tolerance":
-        raise ValueError(f'adaptive: `verify` must be True, False or "tolerance"; received {verify!r}.')
+    if not isinstance(verify, bool) and verify not in ("tolerance", "tighten"):
+        raise ValueError(f'adaptive: `verify` must be True, False, "tolerance" or "tighten"; received {verify!r}.')
     max_steps = require_integer("adaptive", "max_steps", max_steps)
     rtol, atol, atol_v, dt_min, dt_max = map(_as_data, (rtol, atol, atol_v, dt_min, dt_max))
     return Adaptive(rtol, atol, atol_v, dt_min, dt_max, max_steps, verify)

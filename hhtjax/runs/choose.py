@@ -37,6 +37,7 @@ class Steps(NamedTuple):
         estimate: of the last step tried, relative to the tolerance.
         dt_min: below which steps were not to fall.
         event, guard: those of `Failure`, of the last step tried; None without events.
+        tightened: with `verify="tighten"` how much of the tolerance they were chosen for; None without.
     """
 
     dt: Any
@@ -48,6 +49,7 @@ class Steps(NamedTuple):
     dt_min: Any
     event: Any = None
     guard: Any = None
+    tightened: Any = None
 
     def check(self):
         """Raises `SimulationError` naming why, and at which time, steps ended too early; for a batch the first."""

@@ -16,6 +16,7 @@ from hhtjax.runs.attempt import Bounds, attempt, begin, is_walking
 from hhtjax.runs.attempt_events import trial_of
 from hhtjax.runs.choose import as_steps
 from hhtjax.runs.problem import Problem
+from hhtjax.runs.verified import scaled
 from hhtjax.xla import on_scalars, one_kernel
 
 ROUND = 256  # tries of a block, before members are sorted anew
@@ -44,17 +45,25 @@ class Members(NamedTuple):
         """Its tolerances."""
         return jax.tree.unflatten(self.structure, arrays)[1]
 
+    def for_share(self, share):
+        """The same for so much of their tolerances, one number or one for each member."""
+        data, control = jax.tree.unflatten(self.structure, self.arrays)
+        tolerances = jax.tree.leaves(scaled(control, share))
+        of_data = len(self.axes) - len(tolerances)
+        axes = self.axes[:of_data] + [0 if jnp.ndim(x) else None for x in tolerances]
+        return self._replace(arrays=jax.tree.leaves(data) + tolerances, axes=axes)
+
     def of(self, numbers):
         """The arrays of the members of these numbers."""
         return [x if axis is None else x[numbers] for x, axis in zip(self.arrays, self.axes, strict=True)]
 
 
-def choose_many(members, control_of):
+def choose_many(members):
     """`Steps` of each member to the last of the times, and (size, max_steps) where they end; inf behind them.
 
-    control_of: a member's arrays -> its `Adaptive`. No tracer of autodiff may come in.
+    No tracer of autodiff may come in.
     """
-    search, bounds, walks = Search.begun(members, control_of)
+    search, bounds, walks = Search.begun(members)
     max_steps, size, lanes = search.max_steps, members.size, members.lanes
 
     def block(order, number, carry):
@@ -86,16 +95,15 @@ class Search(NamedTuple):
     """How the members of a block try steps."""
 
     members: Members
-    control_of: Any
     end: Any
     max_steps: int
     form: Any  # of a walk
 
     @classmethod
-    def begun(cls, members, control_of):
+    def begun(cls, members):
         """The search, and the `Bounds` and walks of all members before their first steps."""
         one = members.of(0)
-        search = cls(members, control_of, members.times[-1], control_of(one).max_steps, None)
+        search = cls(members, members.times[-1], members.control(one).max_steps, None)
         bounds, walk = search.start(one)
         plain = search.trial(one, bounds)._replace(ways=None)
         search = search._replace(form=on_scalars(partial(attempt, plain), walk))
@@ -106,7 +114,7 @@ class Search(NamedTuple):
         """A member's `Bounds` and walk."""
         problem = self.members.problem(arrays)
         flat, q, v, t0, _ = problem.flat()
-        bounds = Bounds.of(flat, problem.stepper, self.control_of(arrays), t0, self.end)
+        bounds = Bounds.of(flat, problem.stepper, self.members.control(arrays), t0, self.end)
         return bounds, begin(self.trial(arrays, bounds), q, v, t0)
 
     def trial(self, arrays, bounds):

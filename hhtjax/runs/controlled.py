@@ -12,68 +12,94 @@ from hhtjax.description import is_concrete
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.choose import choose, trimmed
-from hhtjax.runs.chosen import checked_times, chosen_steps, run_over, steps_for
+from hhtjax.runs.chosen import checked_times, run_over, steps_for
 from hhtjax.runs.freezing import is_pair, run_and_choice
 from hhtjax.runs.solution import Solution
+from hhtjax.runs.tightened import tighten
+from hhtjax.runs.verified import compared, scaled, verified
 from hhtjax.xla import Programs, is_untouched, one_kernel, or_plain
-
-ALARM = 10  # times what was asked for, above which the error of a whole run is a failure
 
 
 def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
-    data = problem, times, replace(control, verify=False)
-    in_one = events is None and problem.system.friction is None and is_untouched() and not is_pair()
+    start, alone = (problem, times, control, events), is_untouched() and not is_pair()
+    if control.verify == "tighten":
+        return run_tightened(start, alone, progress, room)
+    in_one = alone and passes_alone(problem, events)
     if in_one:  # else the program that chooses steps for a derivative or a batch is that of `choose_steps`
-        run, steps, ends = or_plain(partial(run_in_one, *data, progress=progress))
-        choice = lax.stop_gradient((problem, times, control, events))
+        run, steps, ends = or_plain(partial(run_in_one, problem, times, unverified(control), progress=progress))
+        choice = lax.stop_gradient(start)
     else:
-        (problem, times, control, events), choice = run_and_choice((problem, times, control, events))
-        steps, ends = steps_for(choice, progress, room)
-        keywords = {"room": room, "rates": problem.rates()}
-        run = or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
+        start, choice = run_and_choice(start)
+        run, steps, ends = run_in_two(start, choice, progress, room)
     if control.verify:
-        better = finer(problem, times, control, steps, ends, choice, events, room, in_one)
-        run = run._replace(**verified(run, better, control, problem.stepper.order))
+        better = finer(start, choice, steps, ends, room, in_one)
+        run = run._replace(**verified(run, better, start[2], problem.stepper.order))
     steps = trimmed(steps)
     return run._replace(dt=steps.dt, steps=steps)
 
 
-def finer(problem, times, control, steps, ends, choice, events, room, in_one):
+def passes_alone(problem, events):
+    """Whether the steps and the samples are found in one pass, where nothing is made of the run."""
+    return events is None and problem.system.friction is None
+
+
+def unverified(control):
+    """The same steps."""
+    return replace(control, verify=False)
+
+
+def finer(start, choice, steps, ends, room, in_one):
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
-    *start, looser, theirs = choice
-    if control.verify == "tolerance" and in_one:
-        return or_plain(partial(run_in_one, *start, quarter(replace(looser, verify=False))))[0]
-    if control.verify == "tolerance":
-        steps, ends = steps_for((*start, quarter(looser), theirs), False, room)
-    keywords = {"halved": control.verify != "tolerance", "room": room, "rates": problem.rates()}
+    problem, times, control, events = start
+    if control.verify != "tolerance":
+        keywords = {"halved": True, "room": room, "rates": problem.rates()}
+        return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
+    *begin, looser, theirs = choice
+    if in_one:
+        return or_plain(partial(run_in_one, *begin, scaled(unverified(looser), 1 / 4)))[0]
+    return run_in_two(start, (*begin, scaled(looser, 1 / 4), theirs), room=room)[0]
+
+
+def run_in_two(start, choice, progress=False, room=()):
+    """The `Solution` of a start, (problem, times, control, events), over the steps for a choice, another; its `Steps`,
+    and the times at which they end."""
+    steps, ends = steps_for(choice, progress, room)
+    return over(start, steps, ends, room), steps, ends
+
+
+def over(start, steps, ends, room=()):
+    """The `Solution` over these steps."""
+    problem, times, _, events = start
+    keywords = {"room": room, "rates": problem.rates()}
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
 
 
-def quarter(control):
-    """A quarter of the tolerance."""
-    return replace(control, **{name: getattr(control, name) / 4 for name in ("rtol", "atol", "atol_v")})
+def run_tightened(start, alone, progress, room):
+    """The run with steps for as much of the tolerance as makes its error what was asked for."""
+    start, choice = (start, lax.stop_gradient(start)) if alone else run_and_choice(start)
+    problem, times, control, events = choice
+    choice = problem, times, unverified(control), events
+    last = or_plain(partial(rounds, choice, progress=progress, room=room, rates=problem.rates()))
+    run = last.run if alone else over(start, last.steps, last.ends, room)
+    steps = trimmed(last.steps)._replace(tightened=last.share)
+    return run._replace(dt=steps.dt, steps=steps, error=last.error, allowed=last.allowed)
 
 
-def verified(run, finer, control, order):
-    """The error of the whole run at each of its times, by Richardson from a finer one, and what is allowed."""
+@partial(Programs, static_argnames=("progress", "room"))
+def rounds(choice, progress, room):
+    """The last `Round`; no tracer of autodiff may come in."""
+    problem, times, control, events = choice
 
-    def largest(q):
-        return jnp.max(jnp.stack([jnp.max(jnp.abs(x).reshape(len(x), -1), axis=1) for x in jax.tree.leaves(q)]), axis=0)
+    def once(share):
+        tighter = scaled(control, share)
+        if passes_alone(problem, events):
+            return run_in_one(problem, times, tighter, progress)
+        again = problem, times, tighter, events
+        return run_in_two(again, again, progress, room)
 
-    q, better = lax.stop_gradient((run.q, finer.q))
-    left = 0.25 if control.verify == "tolerance" else 0.5**order  # of the error
-    error = largest(jax.tree.map(jnp.subtract, better, q)) / (1 - left)
-    rtol, atol = (jnp.asarray(x).astype(error.dtype) for x in (control.rtol, control.atol))
-    return {"error": error, "allowed": lax.stop_gradient(ALARM * (rtol * jnp.max(largest(q)) + atol))}
-
-
-def run_in_two(problem, times, control, progress=False):
-    """The `Solution` at `times`, its `Steps`, and the times at which they end."""
-    rates, choice = problem.rates(), lax.stop_gradient((problem, times[-1], control))
-    steps, ends = chosen_steps(*choice, progress=progress, rates=rates)
-    return run_over(problem, times, ends, steps.accepted, rates=rates), steps, ends
+    return tighten(once, partial(compared, control=control), problem.times(1.0))
 
 
 @partial(Programs, static_argnames=("progress",))
@@ -91,10 +117,16 @@ def run_recorded(problem, times, control, progress=False):
     @in_one.def_vmap
     def _(size, batched, *args):
         axes = jax.tree.map(lambda mapped: 0 if mapped else None, batched)
-        found = jax.vmap(partial(run_in_two, progress=progress), axes, axis_size=size)(*args)
+        found = jax.vmap(partial(in_two_passes, progress=progress), axes, axis_size=size)(*args)
         return found, jax.tree.map(lambda _: True, found)
 
     return in_one(problem, times, control)
+
+
+def in_two_passes(problem, times, control, progress=False):
+    """The same."""
+    start = problem, times, control, None
+    return run_in_two(start, lax.stop_gradient(start), progress)
 
 
 def run_in_one(problem, times, control, progress=False):
@@ -102,7 +134,7 @@ def run_in_one(problem, times, control, progress=False):
     data = problem, times, control
     in_one, in_two = (
         partial(run_recorded, progress=progress, rates=problem.rates()),
-        partial(run_in_two, progress=progress),
+        partial(in_two_passes, progress=progress),
     )
     if is_concrete(jnp.zeros(())):  # there is no jit
         return in_one(*data)

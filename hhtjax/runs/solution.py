@@ -97,7 +97,7 @@ class Solution(NamedTuple):
         sticking: (K + 1, m), whether a joint sticks; None without.
         steps: what error control chose, the `Steps`; dt are those accepted. None without.
         error: (K + 1,) of a run with `adaptive(verify=)`, that of q at each saved time, in its largest coordinate.
-        allowed: what `check` lets pass of it, 10 (rtol max|q| + atol).
+        allowed: what `check` lets pass of it, 10 (rtol max|q| + atol); a tenth of that with verify="tighten".
         events: what happened on the way, `Events`; None without.
     """
 
@@ -168,10 +168,12 @@ class Solution(NamedTuple):
         which = f"member {', '.join(map(str, member))}, " if member else ""
         where = (*member, i)
         time = np.asarray(self.t)[where]
-        return (
-            f"{which}at t = {time:.6g} the error of the run is {error[where]:.3g}, by a finer run, "
-            f"and {allowed[tuple(member)]:.3g} was allowed, 10 times the tolerance. Take a smaller rtol."
-        )
+        known = f"{which}at t = {time:.6g} the error of the run is {error[where]:.3g}, by a"
+        asked = f"{allowed[tuple(member)]:.3g} was allowed,"
+        if self.steps.tightened is None:
+            return f"{known} finer run, and {asked} 10 times the tolerance. Take a smaller rtol."
+        share = float(np.asarray(self.steps.tightened)[tuple(member)])
+        return f"{known} coarser run, and {asked} although steps were chosen for {share:.2g} of the tolerance."
 
     def _table(self):
         """The run in a line, and its arrays."""

@@ -10,10 +10,11 @@ from jax import lax
 from hhtjax.runs.choose import trimmed
 from hhtjax.runs.choose_many import Members, choose_many
 from hhtjax.runs.chosen import Grid, follow
-from hhtjax.runs.controlled import quarter, verified
 from hhtjax.runs.freezing import run_and_choice
 from hhtjax.runs.loop import show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
+from hhtjax.runs.tightened import tighten
+from hhtjax.runs.verified import compared, verified
 from hhtjax.xla import Programs, or_plain
 
 
@@ -40,18 +41,45 @@ def run_chosen(system, start, choice, *, mapped, size, lanes, progress, room):
     axes = [0 if flag else None for flag in mapped] + [0 if jnp.ndim(x) else None for x in jax.tree.leaves(control)]
     members, frozen = members_of(*start), members_of(*choice)
 
+    if control.verify == "tighten":
+        last = rounds(frozen, progress)
+        steps, told = last.steps._replace(tightened=last.share), {"error": last.error, "allowed": last.allowed}
+        runs = run_many(members, steps, last.ends, progress)
+    else:
+        steps, ends = choose_many(frozen)
+        runs = run_many(members, steps, ends, progress)
+        told = errors(members, frozen, control.verify, runs, steps, ends, progress) if control.verify else {}
+    return runs._replace(dt=steps.dt, steps=steps, **told)
+
+
+def errors(members, frozen, verify, runs, steps, ends, progress):
+    """What the `Solution` tells of its errors, by the runs with halved steps, or with those for a quarter of the
+    tolerance."""
+
     def error(arrays, run, finer):
         return verified(run, finer, members.control(arrays), members.problem(arrays).stepper.order)
 
-    steps, ends = choose_many(frozen, frozen.control)
-    runs = run_many(members, steps, ends, progress)
-    if control.verify == "tolerance":
-        finer = run_many(members, *choose_many(frozen, lambda arrays: quarter(frozen.control(arrays))), progress)
-        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(members.arrays, runs, finer))
-    elif control.verify:
-        finer = run_many(members, steps, ends, progress, halved=True)
-        runs = runs._replace(**jax.vmap(error, (axes, 0, 0))(members.arrays, runs, finer))
-    return runs._replace(dt=steps.dt, steps=steps)
+    is_halved = verify != "tolerance"
+    if not is_halved:
+        steps, ends = choose_many(frozen.for_share(1 / 4))
+    finer = run_many(members, steps, ends, progress, halved=is_halved)
+    return jax.vmap(error, (members.axes, 0, 0))(members.arrays, runs, finer)
+
+
+def rounds(members, progress):
+    """The last `Round` of all members; those whose runs are as good as asked for wait for the others."""
+
+    def once(share):
+        steps, ends = choose_many(members.for_share(share))
+        return run_many(members, steps, ends, progress), steps, ends
+
+    def judge(run, before, share):
+        def one(arrays, run, before, share):
+            return compared(run, before, share, members.control(arrays))
+
+        return jax.vmap(one, (members.axes, 0, 0, 0))(members.arrays, run, before, share)
+
+    return tighten(once, judge, jnp.ones(members.size, members.t0.dtype))
 
 
 def run_many(members, steps, ends, progress, halved=False):
