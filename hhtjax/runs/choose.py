@@ -79,11 +79,12 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
     trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
     start = begin(trial, q, v, t0)
-    form = on_scalars(partial(attempt, trial._replace(ways=None)), start)  # as in a run: events are seldom
-    one_try = form.of(partial(attempt, trial))
+    plain = partial(attempt, trial._replace(ways=None))
+    form = on_scalars(plain, start, derivatives=False)  # as in a run: events are seldom
+    one_try = form.of(plain if trial.ways is None else partial(attempt, trial))
     recorder = None
     if times is not None:
-        recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(one_try, form.tree)[1].info)
+        recorder = Recorder.of(flat, trial.stepper, form, form.returned()[1].info)
 
     def unfinished(carry):
         return is_walking(carry[0], end)
