@@ -25,7 +25,7 @@ from hhtjax.xla.scalar_calls import CALLS
 from hhtjax.xla.scalar_rules import RULES
 
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
-MOST_IN_VALUES = 2 * MOST_OPERATIONS  # where nobody asks for derivatives
+MOST_IN_VALUES = 2500  # where nobody asks for derivatives
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["elements"], meta_fields=["shape"])
