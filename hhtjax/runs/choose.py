@@ -84,7 +84,7 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     one_try = form.of(plain if trial.ways is None else partial(attempt, trial))
     recorder = None
     if times is not None:
-        recorder = Recorder.of(flat, trial.stepper, form, form.returned()[1].info)
+        recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, start)[1].info)
 
     def unfinished(carry):
         return is_walking(carry[0], end)

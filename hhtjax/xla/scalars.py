@@ -25,7 +25,7 @@ from hhtjax.xla.scalar_calls import CALLS
 from hhtjax.xla.scalar_rules import RULES
 
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
-MOST_IN_VALUES = 2500  # where nobody asks for derivatives
+MOST_IN_VALUES = 2500  # where nobody asks for derivatives; of more compiling takes longer than it saves
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["elements"], meta_fields=["shape"])
@@ -37,23 +37,25 @@ class Scalars:
     shape: tuple
 
 
-def pays(f, *args):
+def pays(f, *args, derivatives=True):
     """Whether f of these trees is better evaluated on scalars: few operations, all known, of more than one number.
 
     Operations that are not known may keep XLA from making one kernel of a loop; without one, scalars take longer.
     """
-    return may_pay(args) and _work(_traced(f, *args)[0].jaxpr) <= MOST_OPERATIONS
-
-
-def may_pay(tree):
-    """Whether that depends on the function."""
-    return jax.default_backend() == "cpu" and is_on() and any(jnp.size(x) != 1 for x in jax.tree.leaves(tree))
+    if jax.default_backend() != "cpu" or not is_on():
+        return False
+    if all(jnp.size(x) == 1 for x in jax.tree.leaves(args)):
+        return False
+    return _work(_traced(f, *args)[0].jaxpr) <= (MOST_OPERATIONS if derivatives else MOST_IN_VALUES)
 
 
 def _traced(f, *args):
-    """The closed jaxpr of f of trees, of `Scalars` too, and what f returns, in shapes."""
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape if _is_scalars(x) else jnp.shape(x), _dtype(x)), args, is_leaf=_is_scalars)
-    return jax.make_jaxpr(f, return_shape=True)(*shapes)
+    """The closed jaxpr of f of trees, of `Scalars` too, and what it returns, in shapes. JAX traces a function once."""
+
+    def like(x):
+        return jax.ShapeDtypeStruct(x.shape if _is_scalars(x) else jnp.shape(x), _dtype(x))
+
+    return jax.make_jaxpr(f, return_shape=True)(*jax.tree.map(like, args, is_leaf=_is_scalars))
 
 
 def _work(jaxpr):
@@ -83,21 +85,14 @@ def split(tree):
 
 class Form(NamedTuple):
     """How functions of a tree are evaluated. tree: with `Scalars` for its small arrays, or as it was; `of` gives the
-    form of a function, `like` that of another such tree, and `joined` arrays again. f: the function that it was made
-    for, which is traced once for this and for its own form; traced: its closed jaxpr, and what it returns, or None."""
+    form of a function, `like` that of another such tree, and `joined` arrays again."""
 
     tree: Any
     is_split: bool = False
-    f: Any = None
-    traced: Any = None
 
     def of(self, f):
         """f of such trees, to such trees."""
-        return by_scalars(f, self.traced if f is self.f else None)
-
-    def returned(self):
-        """What f returns of arrays, in shapes."""
-        return jax.eval_shape(self.f, self.tree) if self.traced is None else self.traced[1]
+        return by_scalars(f)
 
     def like(self, tree):
         """Another tree of the same arrays, in this form."""
@@ -126,11 +121,7 @@ def on_scalars(f, tree, derivatives=True):
     >>> bool(jnp.all(form.joined(form.of(jnp.sin)(form.tree)) == jnp.sin(1.0)))
     True
     """
-    if not may_pay(tree):
-        return Form(tree, f=f)
-    traced = _traced(f, tree)
-    is_split = _work(traced[0].jaxpr) <= (MOST_OPERATIONS if derivatives else MOST_IN_VALUES)
-    form = Form(tree, is_split, f, traced)
+    form = Form(tree, pays(f, tree, derivatives=derivatives))
     return form._replace(tree=form.like(tree))
 
 
@@ -146,14 +137,14 @@ def join(tree):
     return jax.tree.map(joined, tree, is_leaf=_is_scalars)
 
 
-def by_scalars(f, traced=None):
-    """f of trees that `split` made, to such trees; f itself of trees it left alone. traced: of f, if it is."""
+def by_scalars(f):
+    """f of trees that `split` made, to such trees; f itself of trees it left alone."""
 
     def g(*args):
-        leaves, structure = jax.tree.flatten(args, is_leaf=_is_scalars)
+        leaves = jax.tree.leaves(args, is_leaf=_is_scalars)
         if not any(map(_is_scalars, leaves)):
             return f(*args)
-        trace, like = traced or _traced(f, *args)
+        trace, like = _traced(f, *args)
         values = [arranged(x.elements, x.shape) if _is_scalars(x) else pieces(x) for x in leaves]
         with np.errstate(all="ignore"):
             values = _run(trace, values)
