@@ -181,6 +181,16 @@ def test_when_it_pays(monkeypatch):
     assert not pays(jnp.sin, two)
 
 
+@old
+def test_more_pays_without_derivatives(monkeypatch):
+    monkeypatch.setattr(scalars, "MOST_OPERATIONS", 1)
+    two = jnp.ones(2)
+    assert not scalars.on_scalars(jnp.sin, two).is_split
+    assert scalars.on_scalars(jnp.sin, two, derivatives=False).is_split
+    monkeypatch.setattr(scalars, "MOST_IN_VALUES", 1)
+    assert not scalars.on_scalars(jnp.sin, two, derivatives=False).is_split
+
+
 def value_and_gradient(scene, stepper):
     """Of a run, and all of it; traced anew."""
     system = hhtjax.System(lambda *args: scene.system.mass(*args), lambda *args: scene.system.force(*args))

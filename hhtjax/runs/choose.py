@@ -13,7 +13,7 @@ from hhtjax.description.presentation import overwrite, shown
 from hhtjax.runs.attempt import AT_EVENT, BROKEN, PI, TOO_MANY, TOO_SHORT, Bounds, attempt, begin, is_walking
 from hhtjax.runs.attempt_events import trial_of
 from hhtjax.runs.event_failures import EVENTS
-from hhtjax.runs.recorded import recorder, solution
+from hhtjax.runs.recorded import Recorder, solution
 from hhtjax.runs.solution import SimulationError, first_bad
 from hhtjax.xla import on_scalars, one_kernel
 
@@ -81,33 +81,39 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
     trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
     start = begin(trial, q, v, t0)
-    form = on_scalars(partial(attempt, trial._replace(ways=None)), start)  # as in a run: events are seldom
-    one_try = form.of(partial(attempt, trial))
-    record: Any = ()
-    keep = lambda record, *_: record  # noqa: E731
+    plain = partial(attempt, trial._replace(ways=None))
+    form = on_scalars(plain, start, derivatives=False)  # as in a run: events are seldom
+    one_try = form.of(plain if trial.ways is None else partial(attempt, trial))
+    recorder: Any = None
     if times is not None:
-        record, keep = recorder(flat, trial.stepper, form, jax.eval_shape(one_try, form.tree)[1].info, times)
+        recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, start)[1].info)
 
     def unfinished(carry):
         return is_walking(carry[0], end)
 
     def body(carry):
-        walk, ends, record = carry
+        walk, ends, since = carry
         new, begun = one_try(walk)
         if progress:
             show(walk.state.t, new.state.t, t0, end)
         accepted = new.accepted > walk.accepted
         ends = lax.dynamic_update_index_in_dim(ends, jnp.where(accepted, begun.end, jnp.inf), walk.accepted, 0)
-        return new, ends, keep(record, begun, new.state, accepted)
+        return new, ends, recorder and recorder.add(since, begun, accepted)
+
+    def to_sample(carry, time):
+        walk, ends, since = lax.while_loop(lambda x: unfinished(x) & (x[0].state.t < time), body, carry)
+        since, around = recorder.sample(since, walk.state)
+        return (walk, ends, since), around
 
     def run(walk):
-        return lax.while_loop(unfinished, body, (walk, jnp.full(control.max_steps, jnp.inf, t0.dtype), record))
+        carry = walk, jnp.full(control.max_steps, jnp.inf, t0.dtype), recorder and recorder.none
+        return (lax.while_loop(unfinished, body, carry), None) if times is None else lax.scan(to_sample, carry, times)
 
-    walk, ends, record = one_kernel(run, form.tree)
+    (walk, ends, _), around = one_kernel(run, form.tree)
     steps = as_steps(form.joined(walk), ends, t0, bounds.least)
-    if times is not None:
-        record = solution(problem, start.state, form.joined(record.around), times, steps.reached)
-    return steps, ends, record or None
+    if times is None:
+        return steps, ends, None
+    return steps, ends, solution(problem, start.state, form.joined(around), times, steps.reached)
 
 
 def as_steps(walk, times, t0, least):

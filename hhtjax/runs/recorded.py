@@ -8,58 +8,46 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jax import lax
 
 from hhtjax.numerics.seldom import choose as either
-from hhtjax.runs.loop import as_solution, flaw_at_start, neutral_info, no_failure
+from hhtjax.runs.loop import as_solution, flaw_at_start, neutral_info, no_failure, saved
 from hhtjax.runs.read_off import kept, read_off
 from hhtjax.steppers.stepper import join_info
 
 
-class Record(NamedTuple):
-    """Of the steps so far. number: of the samples that they have passed; info: joined since the last of these;
-    around: what was kept at the beginning, and at the end, of the step of each sample, and the info to there."""
+class Since(NamedTuple):
+    """Of the steps since the last sample. first: what was saved at the beginning of the last; info: theirs, joined."""
 
-    number: Any
+    first: Any
     info: Any
-    around: Any
 
 
-def recorder(flat, stepper, form, info, times):
-    """An empty `Record` at these times for walks in this form, and the function that keeps the next try.
+class Recorder(NamedTuple):
+    """How walks in one form are recorded. none: `Since` before the first try; begin, end: what is kept of a state."""
 
-    info: that of a try, for its structure.
-    """
-    no_info = neutral_info(info)
-    keep = form.of(partial(kept, flat, stepper))
-    pair = keep(form.tree.state), keep(form.tree.state)
-    empty = jax.tree.map(lambda x: jnp.broadcast_to(x, (times.size, *jnp.shape(x))), (*pair, no_info))
-    due_times = jnp.append(times, jnp.inf)
+    none: Since
+    begin: Any
+    end: Any
 
-    def keep_try(record, begun, state, accepted):
-        info = either(accepted, join_info(record.info, begun.info), record.info)
+    @classmethod
+    def of(cls, flat, stepper, form, info):
+        """info: that of a try, for its structure."""
+        begin, end = form.of(partial(saved, flat)), form.of(partial(kept, flat, stepper))
+        return cls(Since(begin(form.tree.state), neutral_info(info)), begin, end)
 
-        def due(record):
-            here = lax.dynamic_index_in_dim(due_times, record.number, keepdims=False)
-            return accepted & (here <= state.t)
+    def add(self, since, begun, accepted):
+        """Since, with a try; of one that is rejected the beginning too: it is that of the next."""
+        return Since(self.begin(begun.state), either(accepted, join_info(since.info, begun.info), since.info))
 
-        def write(record):
-            new = keep(begun.state), keep(state), record.info
-            around = jax.tree.map(
-                lambda rows, x: lax.dynamic_update_index_in_dim(rows, x, record.number, 0), record.around, new
-            )
-            return Record(record.number + 1, no_info, around)
-
-        return lax.while_loop(due, write, record._replace(info=info))
-
-    return Record(jnp.zeros((), jnp.int32), no_info, empty), keep_try
+    def sample(self, since, state):
+        """Since a sample before this state, and what lies around it: in a step, whose end this is."""
+        return since._replace(info=self.none.info), (since.first, self.end(state), since.info)
 
 
 def solution(problem, start, around, times, reached):
     """The `Solution` at the times, from what was kept around them."""
     flat, _, _, _, params = problem.flat()
-    (first, _), (second, extra), info = around
+    first, (second, extra), info = around
     flaw, failure = flaw_at_start(problem.system, flat, start, params), no_failure(jax.tree.map(lambda x: x[0], info))
     ends = [as_solution(flat, start, path, None, info, failure, flaw) for path in (first, second)]
     return read_off(flat, ends, extra, times, reached)

@@ -49,7 +49,7 @@ def solve_and_keep(r, path, w, factorize, at=None, again=False):
     info = told(factorize, left_by(factorize, f, value, dw))
     return (
         w - dw,
-        info._replace(defect=inverse(r(path(w - dw)))) if again else info,
+        info._replace(defect=inverse(staged(r, w.size)(path(w - dw)))) if again else info,
         inverse,
         along,
         value if at is None else here,

@@ -25,6 +25,7 @@ from hhtjax.xla.scalar_calls import CALLS
 from hhtjax.xla.scalar_rules import RULES
 
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
+MOST_IN_VALUES = 2500  # where nobody asks for derivatives; of more compiling takes longer than it saves
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["elements"], meta_fields=["shape"])
@@ -36,7 +37,7 @@ class Scalars:
     shape: tuple
 
 
-def pays(f, *args):
+def pays(f, *args, derivatives=True):
     """Whether f of these trees is better evaluated on scalars: few operations, all known, of more than one number.
 
     Operations that are not known may keep XLA from making one kernel of a loop; without one, scalars take longer.
@@ -45,7 +46,16 @@ def pays(f, *args):
         return False
     if all(jnp.size(x) == 1 for x in jax.tree.leaves(args)):
         return False
-    return _work(jax.make_jaxpr(f)(*args).jaxpr) <= MOST_OPERATIONS
+    return _work(_traced(f, *args)[0].jaxpr) <= (MOST_OPERATIONS if derivatives else MOST_IN_VALUES)
+
+
+def _traced(f, *args):
+    """The closed jaxpr of f of trees, of `Scalars` too, and what it returns, in shapes. JAX traces a function once."""
+
+    def like(x):
+        return jax.ShapeDtypeStruct(x.shape if _is_scalars(x) else jnp.shape(x), _dtype(x))
+
+    return jax.make_jaxpr(f, return_shape=True)(*jax.tree.map(like, args, is_leaf=_is_scalars))
 
 
 def _work(jaxpr):
@@ -93,12 +103,13 @@ class Form(NamedTuple):
         return join(tree)
 
 
-def on_scalars(f, tree):
+def on_scalars(f, tree, derivatives=True):
     """The form in which f of the tree is better evaluated: on scalars where that pays, else on arrays.
 
     Args:
         f: a function of the tree.
         tree: a pytree of arrays.
+        derivatives: whether some may be taken.
 
     Returns:
         A `Form`: its `tree` is what f, and others, are evaluated with, and `joined` makes arrays of what they return.
@@ -110,7 +121,7 @@ def on_scalars(f, tree):
     >>> bool(jnp.all(form.joined(form.of(jnp.sin)(form.tree)) == jnp.sin(1.0)))
     True
     """
-    form = Form(tree, pays(f, tree))
+    form = Form(tree, pays(f, tree, derivatives=derivatives))
     return form._replace(tree=form.like(tree))
 
 
@@ -130,11 +141,10 @@ def by_scalars(f):
     """f of trees that `split` made, to such trees; f itself of trees it left alone."""
 
     def g(*args):
-        leaves, structure = jax.tree.flatten(args, is_leaf=_is_scalars)
+        leaves = jax.tree.leaves(args, is_leaf=_is_scalars)
         if not any(map(_is_scalars, leaves)):
             return f(*args)
-        shapes = [jax.ShapeDtypeStruct(x.shape, _dtype(x)) for x in leaves]
-        trace, like = jax.make_jaxpr(f, return_shape=True)(*structure.unflatten(shapes))
+        trace, like = _traced(f, *args)
         values = [arranged(x.elements, x.shape) if _is_scalars(x) else pieces(x) for x in leaves]
         with np.errstate(all="ignore"):
             values = _run(trace, values)
@@ -149,7 +159,7 @@ def _is_scalars(x):
 
 
 def _dtype(x):
-    return x.elements[0].dtype if _is_scalars(x) else x.dtype
+    return jnp.result_type(x.elements[0] if _is_scalars(x) else x)
 
 
 def _as_scalars(value, like):
