@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import zoo
 from descriptions import DESCRIPTIONS, ONE, TWO, lagrangian, pull, run
 
 import hhtjax
 from hhtjax import LinearSystem, System
+from hhtjax.scenes import double_pendulum
 
 # ---------------------------------------------------------------------------------------------- jit
 
@@ -202,3 +204,14 @@ def test_num_steps_and_save_every_are_part_of_the_program():
         run(system, hhtjax.rk4(), params={"k": 4.0}, **options)
         counts.append(len(calls))
     assert 0 < counts[0] < counts[1] < counts[2]
+
+
+def test_both_solves_of_a_step_are_one_traced_function():
+    """About the predicted state and about the held one."""
+    scene = double_pendulum.free()
+    stepper, dt = hhtjax.hht(), jnp.asarray(1e-3)
+    state = stepper.init(scene.system, scene.q0, scene.v0, scene.params, dt)
+    step = jax.make_jaxpr(lambda state: stepper.step(scene.system, state, scene.params, dt)[0])(state)
+    solves = [eqn.params["jaxpr"] for eqn in zoo.everywhere(step.jaxpr) if eqn.params.get("name") == "solution"]
+    assert len(solves) == 2
+    assert solves[0] is solves[1]

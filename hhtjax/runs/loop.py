@@ -37,11 +37,12 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     def take_step(params):
         return jax.jit(held.bind(stepper, flat, params, dt), inline=True)  # traced once, wherever it is called
 
-    def advance(params):
-        return counted(take_step(params), flat, t0, dt)
+    step = take_step(params)
+
+    def advance(now):
+        return counted(step if now is params else take_step(now), flat, t0, dt)
 
     start = stepper.begin(flat, q, v, t0, held.before(params, t0, dt), dt)
-    step = take_step(params)
     no_info = neutral_info(jax.eval_shape(step, start)[1])
     carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
     return Loop(carry, counted(step, flat, t0, dt), partial(saved, flat), no_info, advance, lambda count: (dt, dt))

@@ -150,11 +150,11 @@ def _free_step(options, system, r, path, z, s, factorize):
     """The step in which every joint keeps its friction, and those that stuck have none; its factors are kept."""
     if options.iterations is None:
         z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
-        z, _, inverse, along, _ = solve_and_keep(r, path, z, factorize)
+        z, _, inverse, along = solve_and_keep(r, path, z, factorize)
         return z, info, inverse, along
-    z, info, inverse, along, _ = solve_and_keep(r, path, z, factorize)
+    z, info, inverse, along = solve_and_keep(r, path, z, factorize)
     for _ in range(options.iterations - 1):
-        z, more, inverse, along, _ = solve_and_keep(r, path, z, factorize)
+        z, more, inverse, along = solve_and_keep(r, path, z, factorize)
         info = join_info(info, more)
     return z, info, inverse, along
 

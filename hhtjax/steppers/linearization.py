@@ -1,12 +1,15 @@
 """The state about which the non-iterative step expands its residual: where it is worth the most."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.elimination import diagonal
+from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import choose, derivative_of, seldom
-from hhtjax.steppers.newton import left_by, solve_and_keep, told
+from hhtjax.steppers.newton import Expand, left_by, solve_expanded, told
 from hhtjax.xla import staged
 
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
@@ -15,9 +18,17 @@ HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held 
 def linearized_step(system, params, r, path, s, dt, factorize, where, again=False):
     """w at t + dt by one linearisation of r, about the state that `where` says, and its `Info`."""
 
+    # each traced once, however many states r is expanded about
+    of_r, of_path = (jax.jit(partial(linearize, f), inline=True) for f in (r, path))
+    expand = Expand(of_r, of_path, s.w)
+
+    @jax.jit
+    def solution(expansion):
+        return solve_expanded(r, path, s.w, factorize, again, expansion)[:2]
+
     def about(at):
-        w, info, *_, here = solve_and_keep(r, path, s.w, factorize, at, again)
-        return w, info, here
+        expansion = expand(at)
+        return *solution(expansion), expansion.here
 
     if where == "predictor":
         return about(None)[:2]
@@ -29,9 +40,15 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
     D = system.with_ones(diagonal(system.mass(s.q, params)))
     limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
     ways = path(s.w), held, lambda r: jnp.sum(r**2 / D), limit
-    other = jax.jit(about)  # traced once
     # derivatives by one expansion about the state that was chosen: through both they would take longer to compile
-    return derivative_of(lambda: other(better_state(r, *ways))[:2], lambda: better_solve(about, other, *ways[1:]))
+    return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better_solve(about, *ways[1:]))
+
+
+def linearize(f, x):
+    """As JAX does it, with a tangent that can leave a jit, and is traced once, however often it is called."""
+    value, tangent = jax.linearize(f, x)
+    call, constants = hoisted(tangent, x)
+    return value, jax.tree_util.Partial(call, constants)
 
 
 def better_state(r, predicted, held, size, limit):
@@ -42,7 +59,7 @@ def better_state(r, predicted, held, size, limit):
     return choose(use_predictor, predicted, held)
 
 
-def better_solve(about, other, held, size, limit):
+def better_solve(about, held, size, limit):
     """The solution about that state, with a second evaluation of r only where the first residual is large.
 
     A branch around it all, and no choice of a state before it: the processor goes on while it waits for the residual.
@@ -51,7 +68,7 @@ def better_solve(about, other, held, size, limit):
     predicted_size = size(here)
 
     def better(found):
-        w, info, here = other(held)
+        w, info, here = about(held)
         return choose(predicted_size <= size(here), found, (w, info))
 
     return seldom(better, ~(predicted_size <= limit), (w, info))

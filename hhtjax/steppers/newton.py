@@ -1,6 +1,7 @@
 """How a step is solved: by one linearisation, or by Newton's iteration."""
 
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,32 +29,55 @@ def linearized_solve(r, path, w, factorize, at=None, again=False):
 
 
 def solve_and_keep(r, path, w, factorize, at=None, again=False):
-    """The same, the solve b -> x for more right-hand sides, the linear function from x to the change of state, and the
-    residual at the state about which r was expanded."""
+    """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
+    expansion = Expand(partial(jax.linearize, r), partial(jax.linearize, path), w)(at)
+    return *solve_expanded(r, path, w, factorize, again, expansion), expansion.along
 
-    def expand(w, at):
-        start, along = jax.linearize(path, w)
-        if at is None:
-            return *jax.linearize(r, start), along, None
-        here, tangent = jax.linearize(r, at)
-        return here + tangent(jax.tree.map(jnp.subtract, start, at)), tangent, along, here
 
-    value, tangent, along, here = staged(expand, w.size)(w, at)
+class Expansion(NamedTuple):
+    """Of r about a state. value: of r at path(w), by its tangent there; here: r there; along: the tangent of path."""
+
+    value: Any
+    at: Any
+    tangent: Any
+    along: Any
+    here: Any
+
+
+class Expand:
+    """State -> the `Expansion` about it, or about path(w) for None. r, path: what `jax.linearize` makes of them."""
+
+    def __init__(self, r, path, w):
+        self.r, self.path, self.w = r, path, w
+        self.predicted, self.other = staged(self._predicted, w.size), staged(self._other, w.size)
+
+    def __call__(self, at=None):
+        """The `Expansion`; each in one stage."""
+        return Expansion(*(self.predicted(self.w) if at is None else self.other(self.w, at)))
+
+    def _predicted(self, w):
+        start, along = self.path(w)
+        here, tangent = self.r(start)
+        return here, start, tangent, along, here
+
+    def _other(self, w, at):
+        start, along = self.path(w)
+        here, tangent = self.r(at)
+        return here + tangent(jax.tree.map(jnp.subtract, start, at)), at, tangent, along, here
+
+
+def solve_expanded(r, path, w, factorize, again, expansion):
+    """w1 with r(path(w1)) = 0 by the expansion, its `Info`, and the solve."""
+    value, at, tangent, along, _ = expansion
 
     def f(dw):
         return tangent(along(dw))
 
-    factorize = around(factorize, lambda: (path(w) if at is None else at, along))
+    factorize = around(factorize, lambda: (at, along))
     inverse = factorize_map(f, value, factorize)
     dw = inverse(value)
-    info = told(factorize, left_by(factorize, f, value, dw))
-    return (
-        w - dw,
-        info._replace(defect=inverse(staged(r, w.size)(path(w - dw)))) if again else info,
-        inverse,
-        along,
-        value if at is None else here,
-    )
+    w1, info = w - dw, told(factorize, left_by(factorize, f, value, dw))
+    return w1, info._replace(defect=inverse(staged(r, w.size)(path(w1)))) if again else info, inverse
 
 
 def left_by(factorize, f, b, x):
