@@ -88,7 +88,14 @@ def _by_pieces(at, steady):
 
 def _settled(at, steady):
     """Past the events of this very instant; who switches has s = 0, whatever is differentiated."""
-    steady = lax.stop_gradient(steady)
+    sig, keeps = _switching(at, steady)
+    keeps = keeps > 0
+    return at._replace(s=jnp.where(keeps, at.s, 0), sig=sig, kept=at.kept & keeps)
+
+
+@jax.custom_jvp
+def _switching(at, steady):
+    """Directions behind the events of this very instant; and 1 for those who keep on, a float as it has no tangent."""
 
     def unfinished(carry):
         at, (wait, _, _), i = carry
@@ -99,9 +106,15 @@ def _settled(at, steady):
         at = _on(at, *found)
         return at, _next(at, steady), i + 1
 
-    begin = lax.stop_gradient(at)._replace(kept=jnp.ones_like(at.kept))
+    begin = at._replace(kept=jnp.ones_like(at.kept))
     end, *_ = lax.while_loop(unfinished, visit, (begin, _next(begin, steady), 0))
-    return at._replace(s=jnp.where(end.kept, at.s, 0), sig=end.sig, kept=at.kept & end.kept)
+    return end.sig, end.kept.astype(at.s.dtype)
+
+
+@_switching.defjvp
+def _(primals, _):
+    found = _switching(*primals)
+    return found, jax.tree.map(jnp.zeros_like, found)
 
 
 def _event(at, steady):
