@@ -60,7 +60,7 @@ def of_pair(n, nonlinear, iterations):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "nonlinear", "iterations"), [(4, False, None), (20, True, 1)])
+@pytest.mark.parametrize(("n", "nonlinear", "iterations"), [(6, False, None), (20, True, 1)])
 def test_the_motion_is_that_of_the_general_system(n, nonlinear, iterations):
     linear, general = of_pair(n, nonlinear, iterations)
     linear.check()
@@ -121,7 +121,7 @@ def test_one_factorisation_outside_the_loop():
 @pytest.mark.slow
 def test_all_modes_slip_as_the_coordinates_do():
     """The reduced system, with as many modes as there are masses."""
-    n = 4
+    n = 6
     linear = pair(n)[0]
     reduced, q0 = hhtjax.analysis.modal_reduction(linear, n), jnp.linspace(0, 1.0, n)
     x0 = reduced.project(q0)

@@ -22,6 +22,7 @@ from hhtjax.steppers.friction_law import Switch
 from hhtjax.systems.friction import solve_some
 
 EVENTS = 64  # per joint and step: none needs so many, but without an end are those of a K that is not positive
+ROUNDING = 64  # of a load that a joint at rest bears beyond its limit
 PIECES = 2  # per joint, of a step that is differentiated
 
 
@@ -146,7 +147,8 @@ def _next(at, steady):
     now, end = load(at.theta), load(1.0)
     d = jnp.sign(end)
     beyond = d * now >= f
-    breaks = rests & jnp.where(beyond, d * load(middle) > f, d * end > f)
+    most = f + ROUNDING * float(jnp.finfo(f.dtype).eps) * jnp.max(f)  # else it could stop and break away for ever
+    breaks = rests & jnp.where(beyond, d * load(middle) > most, d * end > most)
     grows = breaks & ~beyond
     crossed = (1 - at.theta) * (f - d * now) / jnp.where(grows, d * (end - now), 1)
     wait = jnp.where(stops, until_rest, jnp.where(breaks, jnp.where(grows, crossed, 0), jnp.inf))
