@@ -42,9 +42,8 @@ def test_dry_friction_with_an_input_and_its_flag(tmp_path):
 
     rubbing = 1 << list(FLAGS).index("FRICTION")
     assert f"RUBBING_FRICTION = {rubbing} " in library.model.header
-    first = int(run.failure.step) - 1  # in which they switch too often
-    assert flags == [0] * first + [rubbing] * (59 - first)
-    assert run.failure.friction > 0
+    assert not any(flags)  # also where both joints reverse in one step
+    run.check()
     wrong = type(library.defaults).from_buffer_copy(library.defaults)
     wrong.F = -1.0
     state, _ = library.begin(case.q0, case.v0, samples[0], dt=0.02)

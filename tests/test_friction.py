@@ -14,6 +14,8 @@ from zoo import everywhere
 
 import hhtjax
 from hhtjax.scenes import belt, dry_oscillator
+from hhtjax.steppers.friction_events import run_events
+from hhtjax.steppers.friction_law import switch
 from hhtjax.steppers.residual import Coefficients
 
 FAMILY = [*map(hhtjax.hht, (0.0, -0.05, -0.3)), *map(hhtjax.generalized_alpha, (0.0, 0.5, 1.0))]
@@ -223,6 +225,40 @@ def test_newton_in_the_free_step():
     once, converged = (run(case, hhtjax.hht(iterations=k), 250) for k in (1, None))
     converged.check()
     np.testing.assert_allclose(once.q, converged.q, atol=1e-10)
+
+
+def test_joints_that_do_not_jerk_each_other_switch_each_by_itself():
+    """Also where all of them reverse within a step; with the same derivatives."""
+    rng, m = np.random.default_rng(0), 3
+    s, sf, f, W = np.abs(rng.normal(size=(4, 200, m)))
+    sig = rng.choice([-1.0, 1.0], size=s.shape)
+    s, sf, sig, tau, f, W, Wh = map(jnp.asarray, (sig * s, -sig * (sf + 1), sig, sig * f, f, W, W / 3))
+
+    def alone(s, sf, sig, tau, f, W, Wh):
+        return switch(sf, s, sig, tau, f, W, Wh), 0.0
+
+    def coupled(s, sf, sig, tau, f, W, Wh):
+        return run_events(sf, s, sig, tau, f, jnp.diag(W), jnp.diag(Wh))
+
+    def by(law, *given):
+        def force(s, sf, *given):
+            end, left = law(s, sf, *given)
+            return jnp.sum(jnp.arange(1.0, 1 + m) * end.tau), (end, left)
+
+        return jax.jit(jax.vmap(jax.grad(force, argnums=(0, 1), has_aux=True)))(*given)
+
+    given = s, sf, sig, tau, f, W, Wh
+    (expected, (exact, _)), (found, (end, left)) = by(alone, *given), by(coupled, *given)
+    values, more = jax.jit(jax.vmap(coupled))(*given)
+    assert not np.any(left)
+    assert not np.any(more)
+    np.testing.assert_array_equal(values.sig, end.sig)
+    reverses = exact.sig == -sig
+    assert np.any(np.all(reverses, axis=1))
+    assert not np.all(reverses)
+    for name in ("sig", "tau", "slid"):
+        np.testing.assert_allclose(getattr(end, name), getattr(exact, name), atol=1e-12)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ nobody switches, is known where a joint slides, and at rest it is what keeps the
 
 An event: a joint that slides comes to rest, or the load of one at rest grows to its limit and it breaks away. Who does
 it first switches; of several at once, the first of them, until none is left (Murty 1974: finite, as K is positive).
+How many that takes no small number bounds, so values come from a loop that ends with the step. Derivatives need a fixed
+number, of what moves them only: the pieces between instants, however many switch at one.
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +21,9 @@ from hhtjax.numerics.elimination import matvec
 from hhtjax.steppers.friction_law import Switch
 from hhtjax.systems.friction import solve_some
 
-EVENTS = 2  # per joint and step, as a reversal is two
+EVENTS = 64  # per joint and step: none needs so many, but without an end are those of a K that is not positive
+ROUNDING = 64  # of a load that a joint at rest bears beyond its limit
+PIECES = 2  # per joint, of a step that is differentiated
 
 
 class Moment(NamedTuple):
@@ -71,21 +75,55 @@ def _to_the_end(at, steady):
 
 @_to_the_end.defjvp
 def _(primals, tangents):
-    return jax.jvp(_skipping, primals, tangents)
+    return jax.jvp(_by_pieces, primals, tangents)
 
 
-def _skipping(at, steady):
-    """The same in a fixed number of events, for reverse mode."""
+def _by_pieces(at, steady):
+    """The same in a fixed number of pieces, for reverse mode."""
 
     def visit(at, _):
-        return lax.cond(at.theta < 1, lambda at: _event(at, steady), lambda at: at, at), None
+        return lax.cond(at.theta < 1, lambda at: _event(_settled(at, steady), steady), lambda at: at, at), None
 
-    return lax.scan(visit, at, length=EVENTS * len(at.s))[0]
+    return lax.scan(visit, at, length=PIECES * len(at.s))[0]
+
+
+def _settled(at, steady):
+    """Past the events of this very instant; who switches has s = 0, whatever is differentiated."""
+    sig, keeps = _switching(at, steady)
+    keeps = keeps > 0
+    return at._replace(s=jnp.where(keeps, at.s, 0), sig=sig, kept=at.kept & keeps)
+
+
+@jax.custom_jvp
+def _switching(at, steady):
+    """Directions behind the events of this very instant; and 1 for those who keep on, a float as it has no tangent."""
+
+    def unfinished(carry):
+        at, (wait, _, _), i = carry
+        return (at.theta < 1) & (jnp.min(wait) <= 0) & (i < EVENTS * len(at.s))
+
+    def visit(carry):
+        at, found, i = carry
+        at = _on(at, *found)
+        return at, _next(at, steady), i + 1
+
+    begin = at._replace(kept=jnp.ones_like(at.kept))
+    end, *_ = lax.while_loop(unfinished, visit, (begin, _next(begin, steady), 0))
+    return end.sig, end.kept.astype(at.s.dtype)
+
+
+@_switching.defjvp
+def _(primals, _):
+    found = _switching(*primals)
+    return found, jax.tree.map(jnp.zeros_like, found)
 
 
 def _event(at, steady):
     """On to the next event, and past it; or to the end of the step."""
-    wait, to, speed = _next(at, steady)
+    return _on(at, *_next(at, steady))
+
+
+def _on(at, wait, to, speed):
     first, rest = jnp.argmin(wait), 1 - at.theta
     due = wait[first] < rest
     go = jnp.where(due, wait[first], rest)
@@ -109,7 +147,8 @@ def _next(at, steady):
     now, end = load(at.theta), load(1.0)
     d = jnp.sign(end)
     beyond = d * now >= f
-    breaks = rests & jnp.where(beyond, d * load(middle) > f, d * end > f)
+    most = f + ROUNDING * float(jnp.finfo(f.dtype).eps) * jnp.max(f)  # else it could stop and break away for ever
+    breaks = rests & jnp.where(beyond, d * load(middle) > most, d * end > most)
     grows = breaks & ~beyond
     crossed = (1 - at.theta) * (f - d * now) / jnp.where(grows, d * (end - now), 1)
     wait = jnp.where(stops, until_rest, jnp.where(breaks, jnp.where(grows, crossed, 0), jnp.inf))
