@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.elimination import matvec
+from hhtjax.numerics.seldom import seldom
 from hhtjax.steppers.friction_law import Switch
 from hhtjax.systems.friction import solve_some
 
@@ -81,8 +82,11 @@ def _(primals, tangents):
 def _by_pieces(at, steady):
     """The same in a fixed number of pieces, for reverse mode."""
 
-    def visit(at, _):
-        return lax.cond(at.theta < 1, lambda at: _event(_settled(at, steady), steady), lambda at: at, at), None
+    def piece(at, steady):
+        return _event(_settled(at, steady), steady)
+
+    def visit(at, _):  # a `lax.cond` cannot be transposed in a batch, as this is the rule of a derivative
+        return seldom(piece, at.theta < 1, at, steady), None
 
     return lax.scan(visit, at, length=PIECES * len(at.s))[0]
 
