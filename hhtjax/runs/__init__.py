@@ -57,7 +57,7 @@ second process has only to trace, in a quarter to two thirds of the time. Before
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)      # keeps small programs too
 
 After the imports, `import gc; gc.freeze()` spares the garbage collector all that they have made, which it else looks
-through again and again while functions are traced: some 5 % of a first call. The library leaves the collector alone.
+through again and again while functions are traced: 5 to 20 % of a first call. The library leaves the collector alone.
 
 Sweeps
 ------
