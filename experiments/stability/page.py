@@ -103,6 +103,11 @@ def outside(found):
     return len(everything), beyond, sum(e is None for _, e in everything)
 
 
+def spaced(number):
+    """Its thousands apart."""
+    return f"{number:,}".replace(",", " ")
+
+
 def tightened(adaptive, found):
     """Those of `verify="tighten"`: cells of the gallery, and runs of the other motions."""
     cells = adaptive["cells"]
@@ -111,7 +116,7 @@ def tightened(adaptive, found):
     errors = [run["error"] for run in runs if run["error"] is not None]
     ratios = [run["stated"] / run["error"] for run in runs if run["error"] is not None]
     return {
-        "adaptive_tries": f"{adaptive['tries']['tighten']:,}".replace(",", " "),
+        "adaptive_tries": spaced(adaptive["tries"]["tighten"]),
         "tight_within": cells["tighten"]["within_the_tolerance"],
         "plain_within": cells["no"]["within_the_tolerance"],
         "tight_all": sum(len(rows) for x in adaptive["scenes"].values() for rows in x["grades"].values()),
@@ -226,7 +231,7 @@ def page(numbers):
             tolerances_within=runs_at_all - sum(beyond.values()) - too_early,
             tolerances_beyond="; ".join(f"{n} of {name}" for name, n in beyond.items()),
             tolerances_early=too_early,
-            tolerances_most=f"{TRIES:,}".replace(",", " "),
+            tolerances_most=spaced(TRIES),
             blown_up=reported["cells"]["again"],
             once=reported["cells"]["blown_up"],
             named=reported["cells"]["named_by_check"],

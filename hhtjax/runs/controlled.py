@@ -52,10 +52,8 @@ def unverified(control):
 
 def finer(start, choice, steps, ends, room, in_one):
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
-    problem, times, control, events = start
-    if control.verify != "tolerance":
-        keywords = {"halved": True, "room": room, "rates": problem.rates()}
-        return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
+    if start[2].verify != "tolerance":
+        return over(start, steps, ends, room, halved=True)
     *begin, looser, theirs = choice
     if in_one:
         return or_plain(partial(run_in_one, *begin, scaled(unverified(looser), 1 / 4)))[0]
@@ -69,10 +67,10 @@ def run_in_two(start, choice, progress=False, room=()):
     return over(start, steps, ends, room), steps, ends
 
 
-def over(start, steps, ends, room=()):
-    """The `Solution` over these steps."""
+def over(start, steps, ends, room=(), halved=False):
+    """The `Solution` over these steps, each halved or not."""
     problem, times, _, events = start
-    keywords = {"room": room, "rates": problem.rates()}
+    keywords = {"halved": halved, "room": room, "rates": problem.rates()}
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
 
 

@@ -93,14 +93,12 @@ def _by_pieces(at, steady):
 
 def _settled(at, steady):
     """Past the events of this very instant; who switches has s = 0, whatever is differentiated."""
-    sig, keeps = _switching(at, steady)
-    keeps = keeps > 0
+    sig, keeps = _switching(*lax.stop_gradient((at, steady)))
     return at._replace(s=jnp.where(keeps, at.s, 0), sig=sig, kept=at.kept & keeps)
 
 
-@jax.custom_jvp
 def _switching(at, steady):
-    """Directions behind the events of this very instant; and 1 for those who keep on, a float as it has no tangent."""
+    """Directions behind the events of this very instant, and who keeps on."""
 
     def unfinished(carry):
         at, (wait, _, _), i = carry
@@ -113,13 +111,7 @@ def _switching(at, steady):
 
     begin = at._replace(kept=jnp.ones_like(at.kept))
     end, *_ = lax.while_loop(unfinished, visit, (begin, _next(begin, steady), 0))
-    return end.sig, end.kept.astype(at.s.dtype)
-
-
-@_switching.defjvp
-def _(primals, _):
-    found = _switching(*primals)
-    return found, jax.tree.map(jnp.zeros_like, found)
+    return end.sig, end.kept
 
 
 def _event(at, steady):

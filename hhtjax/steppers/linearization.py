@@ -9,7 +9,7 @@ from jax import lax
 from hhtjax.numerics.elimination import diagonal
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import choose, derivative_of, seldom
-from hhtjax.steppers.newton import Expand, left_by, solve_expanded, told
+from hhtjax.steppers.newton import Expand, left_by, linearized_solve, solve_expanded, told
 from hhtjax.xla import staged
 
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
@@ -17,8 +17,16 @@ HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held 
 
 def linearized_step(system, params, r, path, s, dt, factorize, where, again=False):
     """w at t + dt by one linearisation of r, about the state that `where` says, and its `Info`."""
+    if where == "predictor":
+        return linearized_solve(r, path, s.w, factorize, None, again)
+    now = s._replace(t=s.t + dt)
+    if where == "state":
+        return linearized_solve(r, path, s.w, factorize, now, again)
+    held = now._replace(q=system.move(s.q, dt * s.v))
+    if where == "held":
+        return linearized_solve(r, path, s.w, factorize, held, again)
 
-    # each traced once, however many states r is expanded about
+    # each traced once, for both states that r is expanded about
     of_r, of_path = (jax.jit(partial(linearize, f), inline=True) for f in (r, path))
     expand = Expand(of_r, of_path, s.w)
 
@@ -30,13 +38,6 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
         expansion = expand(at)
         return *solution(expansion), expansion.here
 
-    if where == "predictor":
-        return about(None)[:2]
-    if where == "state":
-        return about(s._replace(t=s.t + dt))[:2]
-    held = s._replace(t=s.t + dt, q=system.move(s.q, dt * s.v))
-    if where == "held":
-        return about(held)[:2]
     D = system.with_ones(diagonal(system.mass(s.q, params)))
     limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
     ways = path(s.w), held, lambda r: jnp.sum(r**2 / D), limit
