@@ -33,6 +33,17 @@ def test_factorisations_in_panels():
     assert np.all(np.isnan(pivots[1, n - n % panels.BLOCK :]))
 
 
+def test_pivots_of_few():
+    """Those of Cholesky's factor, without LAPACK; none behind one that is not positive."""
+    n = panels.FEW
+    S = np.stack([spd(n)[0], np.diag(np.where(np.arange(n) == n - 2, -1.0, 1.0))])
+    program = jax.jit(jax.vmap(panels.pivots)).lower(S)
+    assert "lapack" not in program.as_text()
+    first, second = program.compile()(S)
+    assert np.allclose(first, np.diagonal(np.linalg.cholesky(S[0])) ** 2, rtol=1e-12)
+    assert np.array_equal(second, [*(n - 2) * [1.0], -1.0, np.nan], equal_nan=True)
+
+
 def test_solves_of_hundreds_of_unknowns():
     """By the same factors, transposed too."""
     A, b = spd(200)

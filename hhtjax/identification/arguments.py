@@ -134,7 +134,7 @@ def _size(x):
     if not is_concrete(x):
         return jnp.where(x == 0, 1, jnp.abs(x))
     x = np.asarray(x)
-    return jnp.asarray(np.where(x == 0, np.ones_like(x), np.abs(x)))
+    return jnp.asarray(np.where(x == 0, np.ones_like(x), np.abs(x)), x.dtype)
 
 
 def check_prior(caller, prior, params0):

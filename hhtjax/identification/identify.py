@@ -210,12 +210,13 @@ def _check_data(caller, params0, scale, weights, prior, tolerance):
 
 def _finished(caller, result, weights):
     """The result of a fit outside of jit: trouble told, and the history cut to what happened."""
-    if result.code == BAD_START:
+    code = int(result.code)
+    if code == BAD_START:
         missing = "" if weights is not True else "; give missing samples the weight False"
         raise ValueError(
             f"{caller}: `residuals` must be finite at params0; received {first_bad(result.residual)}{missing}."
         )
-    if result.code == NO_INFLUENCE:
+    if code == NO_INFLUENCE:
         raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")
     if result.uncertainty is not None:
         size = sum(np.size(x) for x in jax.tree.leaves(result.residual))

@@ -10,6 +10,7 @@ from jax import lax
 
 ELEMENTS = 16_000  # of a panel
 BLOCK = 32  # rows of a symmetric matrix that LAPACK factorises without threads
+FEW = 16  # rows of a symmetric matrix for which LAPACK is not called
 LARGEST = 512  # unknowns; beyond, a program of many sizes would take long to compile, and threads are worth waiting for
 
 
@@ -54,6 +55,8 @@ def _first_columns(A, number, width):
 def pivots(A):
     """Of the factorisation L D L^T of a symmetric A: the diagonal of D, NaN where one before is not positive."""
     n = len(A)
+    if n <= FEW:
+        return _pivots_of_few(A)
     if n * n <= ELEMENTS:
         return jnp.diagonal(lax.linalg.cholesky(A)) ** 2
     number = -(-n // BLOCK)
@@ -71,6 +74,18 @@ def pivots(A):
 
     A = jnp.eye(size, dtype=A.dtype).at[:n, :n].set(A)
     return lax.fori_loop(0, number, eliminate, (A, jnp.zeros_like(A[0])))[1][:n]
+
+
+def _pivots_of_few(A):
+    """The same by elimination: the first call of LAPACK has JAX import SciPy, a tenth of a second."""
+    i = jnp.arange(len(A))
+
+    def eliminate(k, carry):
+        A, found = carry
+        d = A[k, k]
+        return A - jnp.outer(A[:, k], A[k] / jnp.where(d > 0, d, jnp.nan)), jnp.where(i == k, d, found)
+
+    return lax.fori_loop(0, len(A), eliminate, (A, jnp.zeros_like(A[0])))[1]
 
 
 def _substitute(L, B):

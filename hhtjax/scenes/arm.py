@@ -17,7 +17,7 @@ from jax import lax
 from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.rotation import GENERATORS
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
@@ -208,5 +208,5 @@ def swing(joints=6) -> Scene:
         "rest": [0.0, -0.6, 0.9, 0.4, -0.5, 0.3],
     }
     params = chain(**{name: np.asarray(value, float)[:joints] for name, value in arrays.items()})
-    q0 = jnp.array([0.8, -1.1, 1.5, 0.4, -0.5, 0.3])[:joints]
-    return Scene(newton_euler, params, q0, jnp.zeros_like(q0), 2.0)
+    q0 = np.array([0.8, -1.1, 1.5, 0.4, -0.5, 0.3])[:joints]
+    return Scene(newton_euler, params, array(q0), array(0 * q0), 2.0)

@@ -8,7 +8,7 @@ T = sqrt(8 h/g), and the ball is at rest from T (1/2 + e/(1 - e)) on: infinitely
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import EventScene
+from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
 
@@ -51,7 +51,7 @@ def bouncing(restitution=0.8, drag=0.1) -> EventScene:
     """
     params = {"m": 1.0, "g": GRAVITY, "c": drag, "floor": 0.0, "e": restitution}
     events = (Event(height, reset=impact("e")),)
-    return EventScene(System(mass, weight_and_drag), params, jnp.array([1.0]), jnp.zeros(1), 1.5, events)
+    return EventScene(System(mass, weight_and_drag), params, array([1.0]), array([0.0]), 1.5, events)
 
 
 def two(restitution=1.0) -> EventScene:
@@ -62,4 +62,4 @@ def two(restitution=1.0) -> EventScene:
     """
     params = {"m": 1.0, "diameter": 0.1, "e": restitution}
     events = (Event(distance, reset=impact("e")),)
-    return EventScene(System(mass, no_force), params, jnp.array([0.0, 0.5]), jnp.array([1.0, 0.0]), 1.0, events)
+    return EventScene(System(mass, no_force), params, array([0.0, 0.5]), array([1.0, 0.0]), 1.0, events)

@@ -5,7 +5,7 @@ s = v - u,    |tau_i| <= F_i (1 + stiction exp(-|s_i|/vs))
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
@@ -33,8 +33,8 @@ def limit(q, v, t, params):
 def two_masses() -> Scene:
     """25 switches in 5 s (SI units)."""
     params = {
-        "m": jnp.array([1.0, 0.7]), "k": jnp.array([30.0, 50.0]), "between": 40.0, "c": 0.05, "u": 0.3,
-        "F": jnp.array([5.0, 4.0]), "stiction": 0.5, "vs": 0.1,
+        "m": array([1.0, 0.7]), "k": array([30.0, 50.0]), "between": 40.0, "c": 0.05, "u": 0.3,
+        "F": array([5.0, 4.0]), "stiction": 0.5, "vs": 0.1,
     }  # fmt: skip
     system = System(mass, force, friction=limit, sliding=sliding)
-    return Scene(system, params, jnp.array([0.1, 0.0]), jnp.zeros(2), 5.0)
+    return Scene(system, params, array([0.1, 0.0]), array([0.0, 0.0]), 5.0)

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_integer, require_number
-from hhtjax.rotation import cross, exp
-from hhtjax.scenes.scene import Scene
+from hhtjax.rotation import cross
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
@@ -61,9 +61,9 @@ def body_chain(bodies=3, spin=5.0) -> Scene:
     """
     require_number("body_chain", "spin", spin, np.isfinite, "be finite")
     N = require_integer("body_chain", "bodies", bodies)
-    params = {"m": jnp.array(1.0), "l": jnp.array(0.5), "r": jnp.array(0.05), "g": jnp.array(9.81)}
-    R = exp(jnp.array([0.0, -np.pi / 3, 0.0]))
-    x = -params["l"] * (jnp.arange(N, dtype=R.dtype) + 0.5)[:, None] * R[None, :, 2]
-    q0 = {"R": jnp.tile(R, (N, 1, 1)), "x": x}
-    v0 = {"R": jnp.tile(jnp.array([0.0, 0.0, spin]), (N, 1)), "x": jnp.zeros((N, 3))}
-    return Scene(System(mass, force, joints), params, q0, v0, 2.0)
+    length, c, s = 0.5, np.cos(np.pi / 3), np.sin(np.pi / 3)
+    R = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+    x = -length * (np.arange(N) + 0.5)[:, None] * R[:, 2]
+    q0, v0 = {"R": np.tile(R, (N, 1, 1)), "x": x}, {"R": array(N * [[0.0, 0.0, spin]]), "x": np.zeros((N, 3))}
+    params = {"m": 1.0, "l": length, "r": 0.05, "g": 9.81}
+    return Scene(System(mass, force, joints), *jax.tree.map(array, (params, q0, v0)), 2.0)

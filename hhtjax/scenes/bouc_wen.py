@@ -9,7 +9,7 @@ as beta gamma and beta delta only.
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import InternalScene
+from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
 
@@ -56,7 +56,7 @@ SAMPLED = System(sampled_mass, sampled_force, internal=sampled_internal)
 def benchmark() -> InternalScene:
     """The benchmark's oscillator, driven at 30 Hz below its resonance (SI units)."""
     params = {**BENCHMARK, "amplitude": 100.0, "frequency": 2 * jnp.pi * 30.0}
-    zero = jnp.zeros(1)
+    zero = array([0.0])
     return InternalScene(System(mass, force, internal=internal), params, zero, zero, 0.1, zero)
 
 
@@ -67,5 +67,5 @@ def measured(params, u, duration) -> InternalScene:
         params: as `BENCHMARK` has them. u: force, N, a function of time that is a pytree, as `hhtjax.sampled` makes.
         duration: s.
     """
-    zero = jnp.zeros(1)
+    zero = array([0.0])
     return InternalScene(SAMPLED, (params, u), zero, zero, duration, zero)

@@ -8,7 +8,7 @@ jump. A stop holds on to the mass until it is back at the gap, as one whose own 
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import EventScene
+from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import System
 
@@ -61,7 +61,7 @@ UPPER, LOWER = Event(before_upper, switch=turn_upper), Event(before_lower, switc
 def bump_stop() -> EventScene:
     """Three strokes into a stop 0.3 m away, from 3 m/s, without a drive (SI units)."""
     params = {"m": 1.0, "k": 20.0, "A": 0.0, "W": 0.0, "K": 400.0, "C": 5.0, "gap": 0.3, "upper": 0.0}
-    return EventScene(System(mass, with_upper), params, jnp.zeros(1), jnp.array([3.0]), 3.0, (UPPER,))
+    return EventScene(System(mass, with_upper), params, array([0.0]), array([3.0]), 3.0, (UPPER,))
 
 
 def backlash() -> EventScene:
@@ -69,4 +69,4 @@ def backlash() -> EventScene:
     params = {
         "m": 1.0, "k": 0.0, "A": 20.0, "W": 20.0, "K": 1e4, "C": 20.0, "gap": 0.005, "upper": 0.0, "lower": 0.0,
     }  # fmt: skip
-    return EventScene(System(mass, with_both), params, jnp.zeros(1), jnp.zeros(1), 0.5, (UPPER, LOWER))
+    return EventScene(System(mass, with_both), params, array([0.0]), array([0.0]), 0.5, (UPPER, LOWER))

@@ -9,7 +9,7 @@ from functools import cache, partial
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import EventScene, Scene
+from hhtjax.scenes.scene import EventScene, Scene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
 
@@ -65,7 +65,7 @@ def free(trigonometry=jnp) -> Scene:
     """
     params = {"m": (1.0, 1.0), "l": (1.0, 1.5), "k": (0.0, 0.0), "c": (0.0, 0.0), "g": GRAVITY}
     system = System(_using(trigonometry, mass), _using(trigonometry, force))
-    return Scene(system, params, jnp.zeros(2), jnp.zeros(2), 10.0)
+    return Scene(system, params, array([0.0, 0.0]), array([0.0, 0.0]), 10.0)
 
 
 def stiff(as_printed=False, trigonometry=jnp) -> Scene:
@@ -78,7 +78,7 @@ def stiff(as_printed=False, trigonometry=jnp) -> Scene:
     params = {"m": (10.0, 1.0), "l": (1.0, 1.5), "k": (400.0, 300.0), "c": (15.0, 10000.0), "g": GRAVITY}
     torques = force_as_printed if as_printed else force
     system = System(_using(trigonometry, mass), _using(trigonometry, torques))
-    return Scene(system, params, jnp.zeros(2), jnp.zeros(2), 8.0)
+    return Scene(system, params, array([0.0, 0.0]), array([0.0, 0.0]), 8.0)
 
 
 def left_of_stop(q, v, t, params):

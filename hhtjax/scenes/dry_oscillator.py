@@ -7,7 +7,7 @@ Free, without damping and stiction, its motion is half cosines about F/k and -F/
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
@@ -32,7 +32,7 @@ SYSTEM = System(mass, force, friction=limit)
 def free() -> Scene:
     """Five reversals, then it sticks (SI units)."""
     params = {"m": 1.0, "k": 100.0, "c": 0.0, "A": 0.0, "W": 0.0, "F": 4.0, "stiction": 0.0, "vs": 0.05}
-    return Scene(SYSTEM, params, jnp.array([0.5]), jnp.zeros(1), 2.2)
+    return Scene(SYSTEM, params, array([0.5]), array([0.0]), 2.2)
 
 
 def driven(stiction=0.3) -> Scene:
@@ -48,4 +48,4 @@ def driven(stiction=0.3) -> Scene:
     0.5
     """
     params = {"m": 1.0, "k": 20.0, "c": 0.1, "A": 6.0, "W": 2.0, "F": 3.0, "stiction": stiction, "vs": 0.05}
-    return Scene(SYSTEM, params, jnp.zeros(1), jnp.zeros(1), 15.0)
+    return Scene(SYSTEM, params, array([0.0]), array([0.0]), 15.0)

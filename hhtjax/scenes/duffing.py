@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
@@ -35,13 +35,13 @@ def sampled_mass(q, params):
 def driven() -> Scene:
     """A hardening oscillator driven near its resonance (SI units)."""
     params = {"m": 1.0, "c": 0.2, "k": 1.0, "k2": 0.0, "k3": 1.0, "amplitude": 0.8, "frequency": 1.3}
-    return Scene(System(mass, force), params, jnp.array([0.5]), jnp.array([0.0]), 10.0)
+    return Scene(System(mass, force), params, array([0.5]), array([0.0]), 10.0)
 
 
 def hardening_spring() -> Scene:
     """A stiff hardening spring let go, 100 q + 10^4 q^3: where the predictor form fails first."""
     params = {"m": 1.0, "c": 0.0, "k": 100.0, "k2": 0.0, "k3": 1e4, "amplitude": 0.0, "frequency": 0.0}
-    return Scene(System(mass, force), params, jnp.array([1.0]), jnp.array([0.0]), 2.0)
+    return Scene(System(mass, force), params, array([1.0]), array([0.0]), 2.0)
 
 
 def measured(params, u, q0, v0, duration) -> Scene:

@@ -17,9 +17,10 @@ References:
 """
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.checks import require_integer
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 GRAVITY = 9.81
@@ -66,8 +67,8 @@ def four_bars(loops=2) -> Scene:
     [[0.0, 1.0], [1.0, 1.0], [2.0, 1.0]]
     """
     loops = require_integer("four_bars", "loops", loops)
-    along = jnp.arange(loops + 1, dtype=jnp.result_type(float))
-    ones = jnp.ones_like(along)
+    along = np.arange(loops + 1.0)
+    ones = np.ones_like(along)
     params = {"m": 1.0, "l": 1.0, "g": GRAVITY}
-    q0, v0 = jnp.stack([along, ones], axis=1), jnp.stack([ones, jnp.zeros_like(ones)], axis=1)
+    q0, v0 = (array(np.stack(x, axis=1)) for x in ((along, ones), (ones, 0 * ones)))
     return Scene(System(mass, force, constraint), params, q0, v0, 10.0)

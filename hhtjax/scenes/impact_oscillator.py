@@ -9,7 +9,7 @@ Phys. Lett. A 91 (1982).
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import EventScene
+from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
 
@@ -37,4 +37,4 @@ def driven(restitution=0.8) -> EventScene:
     """
     params = {"m": 1.0, "c": 0.05, "k": 1.0, "A": 1.0, "W": 2.6, "wall": 0.0, "e": restitution}
     events = (Event(room, reset=impact("e")),)
-    return EventScene(System(mass, force), params, jnp.array([-0.5]), jnp.zeros(1), 20.0, events)
+    return EventScene(System(mass, force), params, array([-0.5]), array([0.0]), 20.0, events)

@@ -7,7 +7,7 @@ C. Canudas de Wit, H. Olsson, K. Astrom, P. Lischinsky, IEEE Trans. Automatic Co
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import InternalScene
+from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
 
@@ -34,5 +34,5 @@ def stick_slip() -> InternalScene:
         "m": 1.0, "k": 2.0, "speed": 0.1, "sigma0": 1e5, "sigma1": 1e5**0.5, "sigma2": 0.4,
         "coulomb": 1.0, "static": 1.5, "stribeck": 1e-3,
     }  # fmt: skip
-    zero = jnp.zeros(1)
+    zero = array([0.0])
     return InternalScene(System(mass, force, internal=internal), params, zero, zero, 10.0, zero)

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import InternalScene
+from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
 
@@ -25,7 +25,7 @@ def vibration() -> InternalScene:
     """A rubber mount, driven near its resonance; the branches relax in 1 s, 30 ms and 0.1 ms (SI units)."""
     params = {
         "m": 2.0, "k": 800.0, "amplitude": 5.0, "frequency": 22.0,
-        "stiffness": jnp.array([100.0, 200.0, 1e4]), "tau": jnp.array([1.0, 3e-2, 1e-4]),
+        "stiffness": array([100.0, 200.0, 1e4]), "tau": array([1.0, 3e-2, 1e-4]),
     }  # fmt: skip
     system = System(mass, force, internal=internal)
-    return InternalScene(system, params, jnp.array([0.01]), jnp.zeros(1), 2.0, jnp.array([0.5, 0.0, 0.0]))
+    return InternalScene(system, params, array([0.01]), array([0.0]), 2.0, array([0.5, 0.0, 0.0]))

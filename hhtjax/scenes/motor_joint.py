@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import InternalScene
+from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
@@ -35,7 +35,7 @@ def tracking() -> InternalScene:
         "weight": 1.0 * GRAVITY * 0.25, "torque_constant": 0.05, "resistance": 1.0, "inductance": 1e-3,
         "kp": 60.0, "ki": 40.0, "kd": 2.0, "amplitude": 1.0, "frequency": 3.0,
     }  # fmt: skip
-    zero = jnp.zeros(1)
+    zero = array([0.0])
     return InternalScene(
         System(mass, force, internal=internal), params, zero, zero, 2.0, {"current": zero, "integral": zero}
     )

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.scenes.scene import EventScene, Scene
+from hhtjax.scenes.scene import EventScene, Scene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
 
@@ -61,7 +61,7 @@ def cartesian(speed=2.505, length=0.5) -> Scene:
         TypeError, ValueError: speed is no finite number, length no positive one.
     """
     params = _params("cartesian", speed, length)
-    return Scene(System(point_mass, weight, rod), params, jnp.array([0.0, -length]), jnp.array([speed, 0.0]), DURATION)
+    return Scene(System(point_mass, weight, rod), params, array([0.0, -length]), array([speed, 0.0]), DURATION)
 
 
 def elastic(k=1e6, speed=2.505, length=0.5) -> Scene:
@@ -81,7 +81,7 @@ def elastic(k=1e6, speed=2.505, length=0.5) -> Scene:
     params["k"] = require_number("elastic", "k", k, lambda x: 0 < x < np.inf, "be positive and finite")
     b = k * length + params["m"] * GRAVITY
     r = (b + jnp.sqrt(b**2 + 4 * k * params["m"] * speed**2)) / (2 * k)
-    return Scene(System(point_mass, weight_and_spring), params, jnp.array([0.0, -r]), jnp.array([speed, 0.0]), DURATION)
+    return Scene(System(point_mass, weight_and_spring), params, array([0.0, -r]), array([speed, 0.0]), DURATION)
 
 
 def minimal(speed=2.505, length=0.5) -> Scene:
@@ -94,7 +94,7 @@ def minimal(speed=2.505, length=0.5) -> Scene:
         TypeError, ValueError: as `cartesian`.
     """
     params = _params("minimal", speed, length)
-    return Scene(System(inertia, moment_of_weight), params, jnp.zeros(1), jnp.array([speed / length]), DURATION)
+    return Scene(System(inertia, moment_of_weight), params, array([0.0]), array([speed / length]), DURATION)
 
 
 def room_before_wall(q, v, t, params):

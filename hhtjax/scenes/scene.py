@@ -2,6 +2,11 @@
 
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.description import is_concrete
 from hhtjax.description.presentation import shown
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import LinearSystem, System
@@ -59,3 +64,10 @@ class InternalScene(NamedTuple):
     v0: Any
     duration: float
     z0: Any
+
+
+def array(values):
+    """An array of floats; of numbers by NumPy, which has nothing to compile."""
+    dtype = jnp.result_type(float)
+    known = all(map(is_concrete, jax.tree.leaves(values)))
+    return jnp.asarray(np.asarray(values, dtype) if known else values, dtype)

@@ -9,7 +9,7 @@ g acts along -y. A spring k and a damper c act on the slider, the spring at rest
 
 import jax.numpy as jnp
 
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
@@ -58,5 +58,5 @@ def _turning(speed, **loads):
     l1, l2 = 0.15, 0.45
     params = {"m": (0.5, 1.0, 0.8), "l": (l1, l2), "g": GRAVITY, "rest": l2}
     params |= {"moment": 0.0, "k": 0.0, "c": 0.0} | loads
-    v0 = jnp.array([speed, -speed * l1 / l2, 0.0])
-    return Scene(System(mass, force, constraint), params, jnp.array([0.0, 0.0, l1 + l2]), v0, 1.0)
+    v0 = array([speed, -speed * l1 / l2, 0.0])
+    return Scene(System(mass, force, constraint), params, array([0.0, 0.0, l1 + l2]), v0, 1.0)

@@ -19,7 +19,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import require_number
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
@@ -108,11 +108,11 @@ def squeezer(moment=0.033) -> Scene:
         TypeError, ValueError: moment is no finite number.
     """
     params = {
-        "m": jnp.array([0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498]),
-        "I": jnp.array([2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5]),
-        "A": jnp.array([-0.06934, -0.00227]),
-        "B": jnp.array([-0.03635, 0.03273]),
-        "C": jnp.array([0.014, 0.072]),
+        "m": array([0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498]),
+        "I": array([2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5]),
+        "A": array([-0.06934, -0.00227]),
+        "B": array([-0.03635, 0.03273]),
+        "C": array([0.014, 0.072]),
         "moment": require_number("squeezer", "moment", moment, np.isfinite, "be finite"),
     }
     params |= {"rr": 0.007, "ra": 0.00092, "d": 0.028, "da": 0.0115}  # K1, K2
@@ -120,5 +120,5 @@ def squeezer(moment=0.033) -> Scene:
     params |= {"e": 0.02, "ea": 0.01421, "zt": 0.04, "ta": 0.02308, "tb": 0.00916}  # K4, K5
     params |= {"zf": 0.02, "fa": 0.01421, "u": 0.04, "ua": 0.01228, "ub": 0.00449}  # K6, K7
     gamma, phi, delta, epsilon = 0.455279819163070380, 0.222668390165885885, 0.487364979543842550, 1.23054744454982119
-    q0 = jnp.array([-0.0617138900142764496, 0.0, gamma, phi, delta, -phi, epsilon])
-    return Scene(System(mass, force, constraint), params, q0, jnp.zeros(7), 0.03)
+    q0 = array([-0.0617138900142764496, 0.0, gamma, phi, delta, -phi, epsilon])
+    return Scene(System(mass, force, constraint), params, q0, array(np.zeros(7)), 0.03)

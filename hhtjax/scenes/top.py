@@ -10,13 +10,14 @@ J = I + m l^2 diag(1, 0, 1) that about the origin (kg m^2).
 The first needs 3 unknowns a step and the second 9, or 12 when stabilised. L (N) is the force of the rod on the disk.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.numerics.elimination import matvec
 from hhtjax.rotation import cross
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 DURATION = 0.5
@@ -74,7 +75,7 @@ def minimal(spin=150.0, inclination=0.0) -> Scene:
         TypeError, ValueError: an argument is no finite number.
     """
     params, R, Om = _start("minimal", spin, inclination)
-    return Scene(System(inertia, moment), params, R, Om, DURATION)
+    return Scene(System(inertia, moment), params, array(R), array(spin * Om), DURATION)
 
 
 def constrained(spin=150.0, inclination=0.0) -> Scene:
@@ -87,9 +88,9 @@ def constrained(spin=150.0, inclination=0.0) -> Scene:
         TypeError, ValueError: as `minimal`.
     """
     params, R, Om = _start("constrained", spin, inclination)
-    arm = params["l"] * jnp.array([0.0, 1.0, 0.0])
-    q0 = {"R": R, "x": matvec(R, arm)}
-    return Scene(System(mass, force, rod), params, q0, {"R": Om, "x": matvec(R, cross(Om, arm))}, DURATION)
+    arm = params["l"] * np.array([0.0, 1.0, 0.0])
+    q0, v0 = {"R": R, "x": R @ arm}, {"R": spin * Om, "x": spin * (R @ np.cross(Om, arm))}
+    return Scene(System(mass, force, rod), params, *jax.tree.map(array, (q0, v0)), DURATION)
 
 
 def _start(caller, spin, inclination):
@@ -97,6 +98,6 @@ def _start(caller, spin, inclination):
     require_number(caller, "inclination", inclination, np.isfinite, "be finite")
     a, length = 0.25, 1.0
     c, s = np.cos(inclination), np.sin(inclination)
-    R = jnp.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    Om = spin * jnp.array([0.0, 1.0, -2 * a**2 / (a**2 + 4 * length**2)])
+    R = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    Om = np.array([0.0, 1.0, -2 * a**2 / (a**2 + 4 * length**2)])  # with a spin of 1
     return {"m": 15.0, "a": a, "l": length, "g": 9.81}, R, Om

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.scenes.scene import Scene
+from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.sampled import sampled
 from hhtjax.systems.system import System
 
@@ -135,16 +135,16 @@ def ride(speed=10.0, duration=4.0, roughness=64e-6, bump=0.05, seed=0) -> Scene:
     """
     front, rear, half_track = 1.25, 1.45, 0.75
     params = {
-        "body": jnp.array([1400.0, 2400.0, 560.0]),
-        "wheel": jnp.array([40.0, 40.0, 38.0, 38.0]),
-        "x": jnp.array([front, front, -rear, -rear]),
-        "y": jnp.array([half_track, -half_track, half_track, -half_track]),
-        "k": jnp.array([22e3, 22e3, 23e3, 23e3]),
+        "body": array([1400.0, 2400.0, 560.0]),
+        "wheel": array([40.0, 40.0, 38.0, 38.0]),
+        "x": array([front, front, -rear, -rear]),
+        "y": array([half_track, -half_track, half_track, -half_track]),
+        "k": array([22e3, 22e3, 23e3, 23e3]),
         "k3": 3e6,
-        "c": jnp.array([2000.0, 2000.0, 1900.0, 1900.0]),
+        "c": array([2000.0, 2000.0, 1900.0, 1900.0]),
         "v0": 0.4,
         "r": 0.4,
-        "k_tyre": jnp.full(4, 200e3),
+        "k_tyre": array(np.full(4, 200e3)),
         "road": sampled(road(speed, duration, roughness, bump, seed, front + rear), SAMPLING_PERIOD),
     }
-    return Scene(System(mass, force), params, jnp.zeros(7), jnp.zeros(7), duration)
+    return Scene(System(mass, force), params, array(np.zeros(7)), array(np.zeros(7)), duration)

@@ -55,7 +55,7 @@ def initial_values(caller, system, q0, v0, z0=None, level=3):
             PrecisionWarning,
             stacklevel=level,
         )
-    q0, v0, z0 = (jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), values) for values in (q0, v0, z0))
+    q0, v0, z0 = (jax.tree.map(lambda x: jnp.asarray(x, dtype), values) for values in (q0, v0, z0))
     return q0, None if first_order else v0, z0
 
 
