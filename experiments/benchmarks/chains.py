@@ -2,11 +2,10 @@
 
 from functools import partial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 import hhtjax
+from experiments.benchmarks import obvious
 from experiments.benchmarks.chain import FORMULATIONS, chain
 from experiments.benchmarks.measure import compiled, least_seconds
 
@@ -15,26 +14,9 @@ DT = 1e-4
 STEPPER = hhtjax.hht(ALPHA, linearize="predictor")
 
 
-def obvious(scene, num_steps, q0):
-    """The same method as one writes it down: jacfwd by q, v and w, jnp.linalg.solve, one scan."""
-    system, params = scene.system, scene.params
-    c = STEPPER.coefficients
-    f = 1 - c.alpha_f
-
-    def r(q, v, w):
-        return system.mass(q, params) @ w - system.force(q, v, 0.0, params)
-
-    def step(state, _):
-        q, v, w, a = state
-        q = q + DT * v + DT**2 * ((0.5 - c.beta) * a + c.beta * w)
-        v = v + DT * ((1 - c.gamma) * a + c.gamma * w)
-        K, C, M = (jax.jacfwd(r, i)(q, v, w) for i in range(3))
-        dw = -jnp.linalg.solve(M + f * (c.gamma * DT * C + c.beta * DT**2 * K), r(q, v, w))
-        state = q + f * c.beta * DT**2 * dw, v + f * c.gamma * DT * dw, w + dw, w + f * dw
-        return state, None
-
-    w = jnp.linalg.solve(system.mass(q0, params), system.force(q0, scene.v0, 0.0, params))
-    return jax.lax.scan(step, (q0, scene.v0, w, w), None, num_steps)[0][0]
+def plain(scene, num_steps, q0):
+    """The last position, by the obvious step."""
+    return obvious.run(STEPPER, scene.system, scene.params, q0, scene.v0, DT, num_steps)[0]
 
 
 def ours(scene, num_steps, q0):
@@ -47,7 +29,7 @@ def measure(N, num_steps, repeats, formulations):
     """us per step of both, in every formulation."""
     programs, rows = {}, []
     for formulation in formulations:
-        for name, function in (("ours", ours), ("obvious", obvious)):
+        for name, function in (("ours", ours), ("obvious", plain)):
             scene = chain(N, k=1.0, c=0.01, formulation=formulation)
             program, seconds = compiled(partial(function, scene, num_steps), scene.q0)
             programs[name, formulation] = partial(program, scene.q0)

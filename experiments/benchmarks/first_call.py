@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 
 import hhtjax
+from experiments.benchmarks import obvious
 from experiments.sweeps import large
 from hhtjax.scenes import body_chain, double_pendulum, pendulum, squeezer, top
 
@@ -67,6 +68,18 @@ def gradient(scene, options=None):
     return jax.jit(jax.grad(loss), compiler_options=options)(params)
 
 
+def obvious_simulate(scene):
+    """The same motion in plain JAX, as one writes it down first: what a first call takes at the least."""
+    (system, params, q0, v0), dt, stepper = SCENES[scene]()
+    return jax.jit(lambda *x: obvious.run(stepper, system, *x, dt, NUM_STEPS)[1])(params, q0, v0)
+
+
+def obvious_gradient(scene):
+    """Its gradient."""
+    (system, params, q0, v0), dt, stepper = SCENES[scene]()
+    return jax.jit(jax.grad(lambda p: jnp.sum(obvious.run(stepper, system, p, q0, v0, dt, NUM_STEPS)[1] ** 2)))(params)
+
+
 def quick(scene):
     """The same, compiled as `simulate` is."""
     return gradient(scene, hhtjax.xla.QUICK)
@@ -94,6 +107,8 @@ def sweep(scene):
 
 
 CALLS = {f.__name__: f for f in (simulate, gradient, fit, sweep)} | {"gradient, QUICK": quick}
+OBVIOUS = {"simulate": obvious_simulate, "gradient": obvious_gradient}
+PLAIN = "pendulum", "double pendulum", "beam of 50"  # scenes that need no more: no constraints, no rotations
 
 
 def first(call, scene):
@@ -108,7 +123,7 @@ def first(call, scene):
     jnp.zeros(1).block_until_ready()
     jax.monitoring.register_event_duration_secs_listener(listen)
     start, cpu = time.perf_counter(), time.process_time()
-    jax.block_until_ready(CALLS[call](scene))
+    jax.block_until_ready((CALLS | {f.__name__: f for f in OBVIOUS.values()})[call](scene))
     elapsed, cpu = time.perf_counter() - start, time.process_time() - cpu
     found = {name: cpu * seconds / elapsed for name, seconds in spent.items()}
     return {"total": cpu, "tracing": cpu - sum(found.values()), **found}
@@ -127,6 +142,9 @@ def cell(report, call, scene):
     with tempfile.TemporaryDirectory() as cache:
         once, again = (apart(call, scene, cache) for _ in range(2))
     row = {"scene": scene, "call": call, "cpu_time_s": once, "with_cache_cpu_time_s": again["total"]}
+    if scene in PLAIN and call in OBVIOUS:
+        with tempfile.TemporaryDirectory() as cache:
+            row["obvious_cpu_time_s"] = apart(OBVIOUS[call].__name__, scene, cache)["total"]
     report.progress(str(row))
     return row
 
