@@ -58,26 +58,33 @@ def given_sizes(t0, dt):
 def loop_over(flat, stepper, q, v, t0, params, sizes):
     """The same with steps of any sizes: number of steps taken -> the next, the one before, and where it ends."""
     stepper = stepper.astype(q.dtype)
-    first = sizes(jnp.zeros((), jnp.int32))[0]
+    none = jnp.zeros((), jnp.int32)
+    first = sizes(none)[0]
 
-    def advance(params):
+    def take_step(params):
         @partial(jax.jit, inline=True)  # traced once, wherever it is called
-        def take_step(state, number):
+        def step(state, number):
             h, last, end = sizes(number)
             state, info = resized_step(flat, stepper, params, h, last)(state)
             return state._replace(t=end), info
 
-        def step(carry):
-            state, count, failure = carry
-            state, info = take_step(state, count)
-            return (state, count + 1, first_failure(flat, failure, count + 1, state, info)), info
-
         return step
 
+    step = take_step(params)
+
+    def advance(now):
+        one = step if now is params else take_step(now)
+
+        def next_step(carry):
+            state, count, failure = carry
+            state, info = one(state, count)
+            return (state, count + 1, first_failure(flat, failure, count + 1, state, info)), info
+
+        return next_step
+
     start = stepper.begin(flat, q, v, t0, held.before(params, t0, first), first)
-    one = jax.eval_shape(resized_step(flat, stepper, params, first, first), start)
-    no_info = neutral_info(one[1])
-    carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
+    no_info = neutral_info(jax.eval_shape(step, start, none)[1])
+    carry = start, none, no_failure(no_info)
     return Loop(carry, advance(params), partial(saved, flat), no_info, advance, lambda count: tuple(sizes(count)[:2]))
 
 
