@@ -20,10 +20,9 @@ from jax import lax
 from hhtjax.numerics.elimination import matvec
 from hhtjax.numerics.seldom import seldom
 from hhtjax.steppers.friction_law import Switch
-from hhtjax.systems.friction import solve_some
+from hhtjax.systems.friction import ROUNDING, solve_some
 
 EVENTS = 64  # per joint and step: none needs so many, but without an end are those of a K that is not positive
-ROUNDING = 64  # of a load that a joint at rest bears beyond its limit
 PIECES = 2  # per joint, of a step that is differentiated
 
 
