@@ -94,3 +94,31 @@ def test_loads_at_their_limits_end_the_step():
     sf = s + (K @ (load - sig * f)[..., None])[..., 0]
     _, left = jax.jit(jax.vmap(run_events))(*map(jnp.asarray, (sf, s, sig, tau, f, 0.6 * K, K)))
     assert not np.any(left)
+
+
+def test_derivatives_reach_the_end_of_violent_steps():
+    """In 1 of 100 of these, two joints need more than two pieces each. Against central differences."""
+    rng, m, N, short = np.random.default_rng(5), 2, 4000, 1e-7
+    B = rng.normal(size=(N, m, m + 1))
+    K = B @ B.transpose(0, 2, 1) + 0.01 * np.eye(m)
+    f, s = 10 ** rng.uniform(-1, 1, (N, m)), rng.normal(size=(N, m)) * 10 ** rng.uniform(-1.5, 1, (N, 1))
+    sig = np.where(rng.random((N, m)) < 0.3, 0.0, np.sign(s))
+    s, tau = np.abs(sig) * s, np.where(sig == 0, rng.uniform(-1, 1, (N, m)) * f, sig * f)
+    load = rng.normal(size=(N, m)) * 10 ** rng.uniform(-0.5, 1, (N, 1))
+    sf = s + (K @ (load - sig * f)[..., None])[..., 0]
+    given = tuple(map(jnp.asarray, (sf, s, sig, tau, f, 0.6 * K, K)))
+    dots = jnp.asarray(rng.normal(size=(2, N, m)))
+
+    def moved(x):
+        end, left = jax.vmap(run_events)(given[0] + x * dots[0], *given[1:4], given[4] + x * dots[1], *given[5:])
+        return end.tau, (end.sig, left)
+
+    tau, slope, (sig, left) = jax.jit(lambda: jax.jvp(moved, (0.0,), (1.0,), has_aux=True))()
+    moved = jax.jit(moved)
+    exact, (same, _) = moved(0.0)
+    assert not np.any(left)
+    np.testing.assert_array_equal(sig, same)
+    np.testing.assert_allclose(tau, exact, atol=1e-10)
+    difference = (moved(short)[0] - moved(-short)[0]) / (2 * short)
+    away = np.max(np.abs(slope - difference), axis=1) / (1 + np.max(np.abs(difference), axis=1))
+    assert np.max(away) < 1e-5

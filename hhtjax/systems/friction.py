@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe, require_function
 from hhtjax.numerics.elimination import diagonal, factorize, matvec
-from hhtjax.numerics.linear_solve import solve
+from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems import returned
 from hhtjax.systems.constraints import saddle_point
 from hhtjax.xla import linear_map
@@ -120,11 +120,16 @@ def across(H, G):
 
 def solve_some(K, some, b):
     """y with K y = b on those rows and columns, and 0 elsewhere."""
-    b = jnp.where(some, b, 0)
-    if len(b) == 1:
-        return b / jnp.where(some, K[0], 1)
-    block = some[:, None] & some[None, :]
-    return solve(jnp.where(block, K, jnp.eye(len(b), dtype=K.dtype)), b)
+    return solver_of_some(K, some)(b)
+
+
+def solver_of_some(K, some):
+    """The function b -> y of it, for many b: factorised once."""
+    if len(K) == 1:
+        return lambda b: jnp.where(some, b, 0) / jnp.where(some, K[0], 1)
+    block = jnp.where(some[:, None] & some[None, :], K, jnp.eye(len(K), dtype=K.dtype))
+    solve = solver(block)
+    return lambda b: solve(jnp.where(some, b, 0))
 
 
 def at_rest(K, rests, load, f):
