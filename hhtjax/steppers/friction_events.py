@@ -23,7 +23,7 @@ from hhtjax.steppers.friction_law import Switch
 from hhtjax.systems.friction import ROUNDING, solve_some, solver_of_some
 
 EVENTS = 64  # per joint and step: none needs so many, but without an end are those of a K that is not positive
-PIECES = 4, 3  # and per joint, of a step that is differentiated; of a million violent ones perhaps one needs more
+PIECES = 4, 2  # and per joint, of a step that is differentiated; of 100 000 violent ones about one needs more
 
 
 class Moment(NamedTuple):
