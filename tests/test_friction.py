@@ -14,8 +14,6 @@ from zoo import everywhere
 
 import hhtjax
 from hhtjax.scenes import belt, dry_oscillator
-from hhtjax.steppers.friction_events import run_events
-from hhtjax.steppers.friction_law import switch
 from hhtjax.steppers.residual import Coefficients
 
 FAMILY = [*map(hhtjax.hht, (0.0, -0.05, -0.3)), *map(hhtjax.generalized_alpha, (0.0, 0.5, 1.0))]
@@ -225,55 +223,6 @@ def test_newton_in_the_free_step():
     once, converged = (run(case, hhtjax.hht(iterations=k), 250) for k in (1, None))
     converged.check()
     np.testing.assert_allclose(once.q, converged.q, atol=1e-10)
-
-
-def test_joints_that_do_not_jerk_each_other_switch_each_by_itself():
-    """Also where all of them reverse within a step; with the same derivatives, those of a batch."""
-    rng, m = np.random.default_rng(0), 3
-    s, sf, f, W = np.abs(rng.normal(size=(4, 200, m)))
-    sig = rng.choice([-1.0, 1.0], size=s.shape)
-    s, sf, sig, tau, f, W, Wh = map(jnp.asarray, (sig * s, -sig * (sf + 1), sig, sig * f, f, W, W / 3))
-
-    def alone(s, sf, sig, tau, f, W, Wh):
-        return switch(sf, s, sig, tau, f, W, Wh), 0.0
-
-    def coupled(s, sf, sig, tau, f, W, Wh):
-        return run_events(sf, s, sig, tau, f, jnp.diag(W), jnp.diag(Wh))
-
-    def by(law, *given):
-        def force(*given):
-            end, left = jax.vmap(law)(*given)
-            return jnp.sum(end.tau @ jnp.arange(1.0, 1 + m)), (end, left)
-
-        return jax.jit(jax.grad(force, argnums=(0, 1), has_aux=True))(*given)
-
-    given = s, sf, sig, tau, f, W, Wh
-    (expected, (exact, _)), (found, (end, left)) = by(alone, *given), by(coupled, *given)
-    values, more = jax.jit(jax.vmap(coupled))(*given)
-    assert not np.any(left)
-    assert not np.any(more)
-    np.testing.assert_array_equal(values.sig, end.sig)
-    reverses = exact.sig == -sig
-    assert np.any(np.all(reverses, axis=1))
-    assert not np.all(reverses)
-    for name in ("sig", "tau", "slid"):
-        np.testing.assert_allclose(getattr(end, name), getattr(exact, name), atol=1e-12)
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
-def test_loads_at_their_limits_end_the_step():
-    """Many instances, as only roundings say whether such a joint breaks away."""
-    rng, m, N = np.random.default_rng(7), 4, 4000
-    B = rng.normal(size=(N, m, m + 1))
-    K = B @ B.transpose(0, 2, 1) + 0.01 * np.eye(m)
-    f, s = 10 ** rng.uniform(-1, 1, (N, m)), rng.normal(size=(N, m))
-    sig = np.where(rng.random((N, m)) < 0.3, 0.0, np.sign(s))
-    s = np.abs(sig) * s
-    load = rng.choice([-1.0, 1.0], size=(N, m)) * f * rng.choice([1.0, 1.0, 1.5], size=(N, m))
-    tau = np.where(sig == 0, np.sign(load) * f * rng.choice([1.0, 0.5], size=(N, m)), sig * f)
-    sf = s + (K @ (load - sig * f)[..., None])[..., 0]
-    _, left = jax.jit(jax.vmap(run_events))(*map(jnp.asarray, (sf, s, sig, tau, f, 0.6 * K, K)))
-    assert not np.any(left)
 
 
 @pytest.mark.slow

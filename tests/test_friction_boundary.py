@@ -1,5 +1,7 @@
 """Dry friction: bad input, refusals, held inputs, sweeps, dense output, and what shows itself."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,6 +102,21 @@ def test_a_limit_that_is_none_is_named(worst):
     batch = jax.vmap(run)(jnp.array([0.1, worst]))
     assert batch.failure.step.tolist() == [0, 3]
     assert "the dry friction was not found" in repr(jax.tree.map(lambda x: x[1], batch.failure))
+
+
+@pytest.mark.slow
+def test_joints_that_switch_too_often_are_named():
+    """Forces that drive what slides, so strongly that in a long step friction would too: nothing settles."""
+    driven = two(friction=lambda q, v, t, p: TWO)
+    driven = replace(driven, force=lambda q, v, t, p: 30 * v + jnp.array([5.0, 1.5]) * jnp.sin(3 * t) - q)
+
+    def run(dt):
+        q0, v0 = jnp.array([0.1, -0.2]), jnp.array([0.3, -0.1])
+        return hhtjax.simulate(driven, hhtjax.hht(), q0, v0, dt=dt, num_steps=3)
+
+    run(0.01).check()
+    with pytest.raises(hhtjax.SimulationError, match=r"step 1 .* switch too often: 0\.\d+ of the step is left"):
+        run(0.1).check()
 
 
 @pytest.mark.slow

@@ -57,17 +57,25 @@ def test_the_error_is_what_was_asked_for(reference):
     assert compiled[0] == compiled[1]
 
 
+def slope_over(dt):
+    """Of the last q in K, with these steps."""
+    low, high = (float(hhtjax.simulate(SPRING, STEPPER, ONE, ZERO, K + d, dt=dt).q[-1, 0]) for d in (-1e-2, 1e-2))
+    return (high - low) / 2e-2
+
+
 @pytest.mark.slow
 def test_derivatives_are_those_of_the_accepted_steps():
+    """Also of a jit, which does not know that it will be differentiated."""
     run = controlled(rtol=1e-2)
 
     def end(k):
         return controlled(k, rtol=1e-2).q[-1, 0]
 
-    (value, reverse), (_, forward) = jax.jit(lambda k: (jax.value_and_grad(end)(k), jax.jvp(end, (k,), (1.0,))))(K)
+    (value, reverse), (_, forward) = jax.jit(
+        lambda k: (jax.value_and_grad(end)(k), jax.jvp(jax.jit(end), (k,), (1.0,)))
+    )(K)
     assert float(value) == pytest.approx(float(run.q[-1, 0]), rel=1e-9)
-    low, high = (float(hhtjax.simulate(SPRING, STEPPER, ONE, ZERO, K + d, dt=run.dt).q[-1, 0]) for d in (-1e-2, 1e-2))
-    assert float(reverse) == pytest.approx((high - low) / 2e-2, rel=1e-6)
+    assert float(reverse) == pytest.approx(slope_over(run.dt), rel=1e-6)
     assert float(forward) == pytest.approx(float(reverse), rel=1e-9)
 
 
@@ -90,7 +98,15 @@ def test_members_of_a_sweep_wait_for_each_other():
     """A harmonic one and one whose phase drifts, which takes a round more."""
     stiffness = np.array([0.0, K])
     control = hhtjax.adaptive(1e-2, 1e-5, max_steps=60_000, verify="tighten")
-    runs = hhtjax.sweep(SPRING, STEPPER, ONE, ZERO, stiffness, dts=control, times=TIMES, in_axes=(None, None, None, 0))
+
+    def members(k):
+        return hhtjax.sweep(SPRING, STEPPER, ONE, ZERO, k, dts=control, times=TIMES, in_axes=(None, None, None, 0))
+
+    def end(k):
+        return members(k).q[1, -1, 0]
+
+    runs = members(stiffness)
+    _, slope = jax.jvp(jax.jit(end), (stiffness,), (np.array([0.0, 1.0]),))
     runs.check()
     shares = []
     for i, k in enumerate(stiffness):
@@ -103,6 +119,7 @@ def test_members_of_a_sweep_wait_for_each_other():
         for which in ("q", "v", "error", "allowed"):
             np.testing.assert_allclose(getattr(mine, which), getattr(alone, which), rtol=1e-6, atol=1e-9)
     assert shares[0] > 2 * shares[1]
+    assert float(slope) == pytest.approx(slope_over(alone.dt), rel=1e-6)
 
 
 @pytest.mark.slow

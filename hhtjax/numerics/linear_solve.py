@@ -154,4 +154,10 @@ def solve(A, b, factorize=factorize):
     >>> [round(float(x), 6) for x in solve(jnp.array([[0.0, 2.0], [4.0, 0.0]]), jnp.array([2.0, 8.0]))]
     [2.0, 1.0]
     """
-    return _solve(lambda x: matvec(A, x), b, factorize(A))
+    return solver(A, factorize)(b)
+
+
+def solver(A, factorize=factorize):
+    """The function b -> x of it, for many b: factorised once."""
+    inverse = factorize(A)
+    return lambda b: _solve(partial(matvec, A), b, inverse)

@@ -15,7 +15,7 @@ from hhtjax.runs.choose import choose, trimmed
 from hhtjax.runs.chosen import checked_times, run_over, steps_for
 from hhtjax.runs.freezing import is_pair, run_and_choice
 from hhtjax.runs.solution import Solution
-from hhtjax.runs.tightened import tighten
+from hhtjax.runs.tightened import accepted_run, tighten
 from hhtjax.runs.verified import compared, scaled, verified
 from hhtjax.xla import Programs, is_untouched, one_kernel, or_plain
 
@@ -80,7 +80,13 @@ def run_tightened(start, alone, progress, room):
     problem, times, control, events = choice
     choice = problem, times, unverified(control), events
     last = or_plain(partial(rounds, choice, progress=progress, room=room, rates=problem.rates()))
-    run = last.run if alone else over(start, last.steps, last.ends, room)
+    again = partial(over, room=room)
+    if is_pair():
+        run = again(start, last.steps, last.ends)
+    elif alone and is_concrete(jnp.zeros(())):  # no jit, of which a derivative could be made
+        run = last.run
+    else:
+        run = accepted_run(last, again, start)
     steps = trimmed(last.steps)._replace(tightened=last.share)
     return run._replace(dt=steps.dt, steps=steps, error=last.error, allowed=last.allowed)
 

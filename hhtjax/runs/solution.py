@@ -220,8 +220,8 @@ class Solution(NamedTuple):
             return "a limit of the dry friction is negative or not a number: see `friction` of the System"
         if friction:
             return (
-                f"the dry friction of several joints was found to {friction:.2g} of its limits only. Take a smaller "
-                "dt, or look for joints whose sliding velocities depend on each other"
+                f"joints with dry friction switch too often: {friction:.2g} of the step is left. Take a smaller dt, as "
+                "for forces that drive what slides, or look for joints whose sliding velocities depend on each other"
             )
         if newton:
             return (

@@ -10,10 +10,10 @@ from jax import lax
 from hhtjax.runs.choose import trimmed
 from hhtjax.runs.choose_many import Members, choose_many
 from hhtjax.runs.chosen import Grid, follow
-from hhtjax.runs.freezing import run_and_choice
+from hhtjax.runs.freezing import is_pair, run_and_choice
 from hhtjax.runs.loop import show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
-from hhtjax.runs.tightened import tighten
+from hhtjax.runs.tightened import accepted_run, tighten
 from hhtjax.runs.verified import compared, verified
 from hhtjax.xla import Programs, or_plain
 
@@ -21,15 +21,17 @@ from hhtjax.xla import Programs, or_plain
 def sweep_chosen(inputs, progress):
     """The `Solution` of a sweep whose `dts` are an `Adaptive`."""
     static = {"mapped": inputs.mapped, "size": inputs.size, "lanes": lanes_for(inputs.size), "progress": progress}
+    static |= {"pair": is_pair(), "room": inputs.room}
     starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times, inputs.events))
-    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, room=inputs.room, rates=inputs.sizes()[1]))
+    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, rates=inputs.sizes()[1]))
     steps = trimmed(runs.steps)
     return runs._replace(dt=steps.dt, steps=steps)
 
 
-@partial(Programs, static_argnames=("mapped", "size", "lanes", "progress", "room"))
-def run_chosen(system, start, choice, *, mapped, size, lanes, progress, room):
-    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, of runs, of steps."""
+@partial(Programs, static_argnames=("mapped", "size", "lanes", "progress", "pair", "room"))
+def run_chosen(system, start, choice, *, mapped, size, lanes, progress, pair, room):
+    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, of runs, of steps;
+    pair: whether the two differ."""
 
     def members_of(data, control, t0, times, events):
         dtype = jax.tree.leaves(data[1])[0].dtype
@@ -44,7 +46,11 @@ def run_chosen(system, start, choice, *, mapped, size, lanes, progress, room):
     if control.verify == "tighten":
         last = rounds(frozen, progress)
         steps, told = last.steps._replace(tightened=last.share), {"error": last.error, "allowed": last.allowed}
-        runs = run_many(members, steps, last.ends, progress)
+
+        def again(start, steps, ends):
+            return run_many(members_of(*start), steps, ends, progress)
+
+        runs = again(start, steps, last.ends) if pair else accepted_run(last, again, start)
     else:
         steps, ends = choose_many(frozen)
         runs = run_many(members, steps, ends, progress)

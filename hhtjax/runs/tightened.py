@@ -10,6 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.numerics.hoisted import hoisted
+from hhtjax.numerics.seldom import derivative_by
+
 ENOUGH, AIM = 0.8, 0.6  # of the tolerance: errors are stated to a tenth or two; and for the next round
 LEAST, MOST = 1 / 16, 1 / 4  # of the share before: beyond, the coarser run may be too far off to judge by
 ROUNDS = 8
@@ -65,3 +68,13 @@ def tighten(once, judge, one):
         return jax.tree.map(kept, last, new)
 
     return lax.while_loop(goes_on, following, begun)
+
+
+def accepted_run(last, over, start):
+    """`last.run`, with the derivatives of over(start, steps, ends), a run over its steps that only they ask for."""
+    over, closed_over = hoisted(over, start, last.steps, last.ends)
+
+    def again(_, *args):
+        return over(*args)
+
+    return derivative_by(again, lambda run, *_: run, last.run, closed_over, start, last.steps, last.ends)

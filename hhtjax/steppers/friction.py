@@ -72,13 +72,13 @@ def _settle(system, at, factorize, H, K, own, L):
     """sig and tau at the start. What rests is held, within the limits; what cannot be held slides."""
     q, v, t, params = at
     sig, f = jnp.sign(system.friction.sliding(*at)), system.friction.limit(q, v, L, t, params)
-    rests, zero = sig == 0, jnp.zeros_like(f)
-    free = _smooth(system, sig, zero, L)
+    rests = sig == 0
+    free = _smooth(system, sig, jnp.zeros_like(f), L)
     if system.num_constraints:
         w, _ = acceleration_and_multipliers(free, *at, factorize=factorize)
     else:
         w = free.acceleration(*at, factorize=factorize)
-    slides, tau = at_rest(K, rests, matvec(H, w) + own, f, zero)
+    slides, tau = at_rest(K, rests, matvec(H, w) + own, f)
     return jnp.where(rests, slides, sig), jnp.where(rests, tau, sig * f)
 
 

@@ -12,17 +12,18 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe, require_function
-from hhtjax.numerics.balance import balance
 from hhtjax.numerics.elimination import diagonal, factorize, matvec
-from hhtjax.numerics.linear_solve import solve
+from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems import returned
 from hhtjax.systems.constraints import saddle_point
 from hhtjax.xla import linear_map
 
 MOST = 8  # directions of friction
+ROUNDING = 64  # of a load that a joint at rest bears beyond its limit
 
 
 class FrictionLaw(NamedTuple):
@@ -119,19 +120,55 @@ def across(H, G):
 
 def solve_some(K, some, b):
     """y with K y = b on those rows and columns, and 0 elsewhere."""
-    b = jnp.where(some, b, 0)
-    if len(b) == 1:
-        return b / jnp.where(some, K[0], 1)
-    block = some[:, None] & some[None, :]
-    return solve(jnp.where(block, K, jnp.eye(len(b), dtype=K.dtype)), b)
+    return solver_of_some(K, some)(b)
 
 
-def at_rest(K, rests, load, f, start):
-    """sig and tau of joints at rest: what holds them against their loads, within their limits; the others slide."""
-    alone = diagonal(K)
-    coupling = jnp.where(rests[:, None] & rests[None, :], K, jnp.diag(alone))
-    tau, _ = balance(lambda b: jnp.clip(b / alone, -f, f), jnp.where(rests, load, 0), coupling, start, f)
-    return jnp.where(jnp.abs(tau) >= f, jnp.sign(tau), 0), tau
+def solver_of_some(K, some):
+    """The function b -> y of it, for many b: factorised once."""
+    if len(K) == 1:
+        return lambda b: jnp.where(some, b, 0) / jnp.where(some, K[0], 1)
+    block = jnp.where(some[:, None] & some[None, :], K, jnp.eye(len(K), dtype=K.dtype))
+    solve = solver(block)
+    return lambda b: solve(jnp.where(some, b, 0))
+
+
+def at_rest(K, rests, load, f):
+    """sig and tau of joints at rest: what holds them against their loads, within their limits; the others slide.
+
+    From all of them held on, the first joint of which that is wrong changes: it cannot be held, and slides, or its
+    friction would drive it, and it is held. So no choice comes twice (Murty 1974: K is positive).
+    """
+    if len(f) == 1:
+        tau = jnp.clip(load / K[0], -f, f)
+        return jnp.where(jnp.abs(load) > f * K[0], jnp.sign(load), 0), tau
+    m, fixed = len(f), lax.stop_gradient((K, load, f))
+
+    def unfinished(carry):
+        _, _, wrong, i = carry
+        return jnp.any(wrong) & (i < 3**m)
+
+    def change(carry):
+        sig, to, wrong, i = carry
+        sig = jnp.where(jnp.arange(m) == jnp.argmax(wrong), to, sig)
+        return sig, *_wrong(*fixed, rests, sig), i + 1
+
+    begin = jnp.zeros_like(load)
+    sig, *_ = lax.while_loop(unfinished, change, (begin, *_wrong(*fixed, rests, begin), 0))
+    return sig, _holding(K, load, f, rests, sig)
+
+
+def _holding(K, load, f, rests, sig):
+    """tau of joints that slide in the directions sig, and of the others at rest, which it holds."""
+    slid = sig * f
+    return slid + solve_some(K, rests & (sig == 0), load - matvec(K, slid))
+
+
+def _wrong(K, load, f, rests, sig):
+    """What joints at rest should do instead, and which of them, but for roundings, must."""
+    tau, alone = _holding(K, load, f, rests, sig), diagonal(K)
+    over = jnp.where(sig == 0, jnp.abs(tau) - f, sig * (matvec(K, tau) - load) / alone)
+    noise = ROUNDING * float(jnp.finfo(f.dtype).eps) * (jnp.abs(load) + matvec(jnp.abs(K), f)) / alone
+    return jnp.where(sig == 0, jnp.sign(tau), 0), over > noise
 
 
 def held_back(system, s, params, dw):
@@ -141,6 +178,6 @@ def held_back(system, s, params, dw):
     K, (sig, tau) = across(H, G), s.friction
     rests, f = sig == 0, system.friction.limit(s.q, s.v, s.L, s.t, params)
     load = matvec(H, dw) + matvec(K, jnp.where(rests, tau, 0))
-    slides, held = at_rest(K, rests, load, f, tau)
+    slides, held = at_rest(K, rests, load, f)
     change = jnp.where(rests, held - tau, 0)
     return dw - matvec(G.T, change), s.friction._replace(sig=jnp.where(rests, slides, sig), tau=tau + change)

@@ -95,10 +95,11 @@ def _largest(comparison, recorder, eqn, x):
 
     def better(a, b):
         (i, x), (j, y) = a, b
-        greater = recorder.record(comparison, bool, y, x)
-        ours = recorder.record("eq", bool, x, x)  # not so for what is no number
-        theirs = recorder.record("ne", bool, y, y)
-        take = recorder.record("and", bool, ours, recorder.record("or", bool, greater, theirs))
+        take = recorder.record(comparison, bool, y, x)
+        if y.dtype.kind == "f":
+            ours = recorder.record("eq", bool, x, x)  # not so for what is no number
+            theirs = recorder.record("ne", bool, y, y)
+            take = recorder.record("and", bool, ours, recorder.record("or", bool, take, theirs))
         return tuple(recorder.record("select_n", kind, take, p, q) for kind, p, q in ((dtype, i, j), (y.dtype, x, y)))
 
     rows = np.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
