@@ -11,19 +11,18 @@ from jax import lax
 # exceeds 512 bytes. Short innermost loops keep what they stack below that: on a double pendulum saving every
 # step then costs 1.1 times saving none (2.3 times in one long loop), and a gradient a third.
 CHUNK = 16
+KEPT = 2**20  # bytes; carries of all steps that take no more are kept: a copy of the step less to compile, and to run
 
 checkpoint = partial(jax.checkpoint, prevent_cse=False)  # inside a scan nothing can be merged anyway
 
 
-def checkpointed_scan(body, carry, length, keep_all=False):
+def checkpointed_scan(body, carry, length):
     """`lax.scan(body, carry, None, length)` in blocks of about sqrt(length) steps, each in short chunks.
 
     Reverse mode stores the carry before each block, computes a block again when it comes to it, then keeps
     the carry before each of its steps, and computes what is inside a step once more: memory for about
-    2 sqrt(length) carries. Forward evaluation and forward mode do no extra work.
-
-    keep_all: stores the carry before every step instead, and computes only what is inside a step again: where each
-    step saves as much anyway. That is a step less to compute, and to compile.
+    2 sqrt(length) carries. Where those of all steps take little, it keeps them, and computes no block again.
+    Forward evaluation and forward mode do no extra work.
     """
     if length <= 2 * CHUNK:
         return lax.scan(body, carry, None, length)
@@ -31,6 +30,7 @@ def checkpointed_scan(body, carry, length, keep_all=False):
     blocks, rest = divmod(length, chunk * chunks)
 
     body = checkpoint(body)
+    keeps = length * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(carry)) <= KEPT
 
     def run_chunk(carry, _):
         return lax.scan(body, carry, None, chunk)
@@ -38,7 +38,7 @@ def checkpointed_scan(body, carry, length, keep_all=False):
     def run_block(carry, _):
         return lax.scan(run_chunk, carry, None, chunks)
 
-    carry, ys = lax.scan(run_block if keep_all else checkpoint(run_block), carry, None, blocks)
+    carry, ys = lax.scan(run_block if keeps else checkpoint(run_block), carry, None, blocks)
     ys = jax.tree.map(lambda y: y.reshape(math.prod(y.shape[:3]), *y.shape[3:]), ys)
     if rest:
         carry, tail = lax.scan(body, carry, None, rest)

@@ -81,8 +81,8 @@ def simulate(
         A `Solution`. Nothing raises while the steps run: call `solution.check()`.
 
     Differentiable, forward and reverse, in dt, t0, params, q0, v0, z0 and the numbers of the stepper; reverse
-    mode keeps a state for each saved time and computes the steps between again, in blocks: beside what is saved, its
-    memory grows with the square root of save_every.
+    mode computes the steps again, in blocks, and its memory grows with the square root of num_steps, but for a
+    megabyte that it may take to do so only once.
     Compiled once for each system, stepper, structure, num_steps and save_every; a new dt, q0 or params
     costs no compilation. Functions are told apart by identity, here as in `fit`: one that reads a global variable, or
     data around it, keeps the values of its first call. Pass through params what may change, or define the function
@@ -160,7 +160,7 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
         return (carry, join_info(info, new)), None
 
     def run(carry):
-        return checkpointed_scan(interval, carry, num_steps // save_every, keep_all=True)
+        return checkpointed_scan(interval, carry, num_steps // save_every)
 
     (_, _, failure, *met), (path, info) = one_kernel(run, form.tree)
     start = loop.carry[0]

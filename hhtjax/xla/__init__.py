@@ -17,8 +17,7 @@ C with everything written by hand, 40 ns, and in a batch 8 ns for each member, o
 time, too; inside a jit of the user's its own options hold: `jax.jit(f, compiler_options=hhtjax.xla.QUICK |
 hhtjax.xla.WIDE)` (QUICK: up to 32 unknowns; WIDE: batches of up to four; both for XLA on the CPU). Sines of float64
 numbers in a kernel are polynomials, to 2 units in the last place, where XLA would call a function for each. The
-gradient of a run takes 2.7 to 3.9 times the run, in memory that grows with the number of saved times, and with the
-square root of the number of steps between.
+gradient of a run takes 2.7 to 3.9 times the run, in memory that grows with the square root of the number of steps.
 Systems of few operations are stepped number by number, not array by array, with every sine evaluated once. What is no
 single kernel runs as a list of them, several times slower, with all that the columns of a Jacobian share evaluated
 once: the squeezing mechanism with its 19 unknowns takes 19 microseconds a step. Jacobians keep track of what depends on
