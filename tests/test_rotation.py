@@ -44,6 +44,7 @@ from hhtjax.rotation import (
 
 OPTIMISED: Any = {"xla_backend_optimization_level": 3}  # for a million steps
 
+
 def test_coefficients():
     """Relative errors: of c1 up to 2.4 rad, short of its root at pi, the others up to 6 rad; c5 is worst at 1."""
     exact = np.array([exact_coefficients(x, 0) for x in X]).T
