@@ -22,7 +22,9 @@ QUICK = {
     "xla_cpu_parallel_codegen_split_count": "1",  # two processes leave no core for more
     "xla_llvm_enable_alias_scope_metadata": "false",  # which buffers are not one: a tenth of the time, to optimise by
     "xla_llvm_enable_noalias_metadata": "false",
+    "xla_llvm_enable_invariant_load_metadata": "false",
 }
+SMALL = 0.1  # seconds to compile a program that others load
 LARGE = 1_700_000_000  # bytes of a test process, above which it forgets its compiled programs
 
 
@@ -56,6 +58,18 @@ def share_programs():
     os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 
+def share_small_programs_only():
+    """What takes longer to compile is the program of one test; to write it took a twentieth of the time."""
+    if jax.__version_info__[:2] == (0, 10):
+        from jax._src import compiler
+
+        def write(key, seconds, *program, write=compiler._cache_write):
+            if seconds < SMALL:
+                write(key, seconds, *program)
+
+        compiler._cache_write = write
+
+
 class Contexts(threading.local):
     """Of MLIR, one for many programs. JAX makes one for each, which takes longer than all else about a small program
     that is loaded. What is compiled while another program is lowered has its own, as JAX counts on; and all are renewed
@@ -86,6 +100,7 @@ def share_contexts():
 
 set_flags()
 share_programs()
+share_small_programs_only()
 share_contexts()
 os.environ.setdefault("MPLBACKEND", "Agg")  # charts of doctests need no display
 jax.config.update("jax_enable_x64", True)
@@ -113,7 +128,7 @@ class Forgetting:
 
     @pytest.hookimpl(trylast=True)
     def pytest_runtest_teardown(self, item, nextitem):
-        if (nextitem is None or nextitem.path != item.path) and memory() > LARGE:
+        if nextitem is not None and nextitem.path != item.path and memory() > LARGE:
             jax.clear_caches()
             gc.collect()
             if sys.platform == "linux":  # what is free goes back to the system

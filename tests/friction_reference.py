@@ -1,6 +1,6 @@
 """Dry friction solved from switch to switch: what the steps are measured against, by formulas of its own."""
 
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,6 @@ from hhtjax.rotation import hat
 TOLERANCE = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12, "max_step": 0.02}
 
 
-@partial(jax.jit, static_argnums=(0, 1))
 def terms(system, shapes, t, y, params):
     """M, Q, F, s, H, the part of ds/dt without w, and the rates of q and z, without constraints."""
     ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])
@@ -31,6 +30,22 @@ def terms(system, shapes, t, y, params):
     return M, Q, F, s(q, v, t), jax.jacfwd(s, argnums=1)(q, v, t), own, qdot.ravel(), zdot
 
 
+def state(system, shapes, params, sig, t, y):
+    """Rates of y, tau, F and s; sig as below."""
+    M, Q, F, s, H, own, qdot, zdot = terms(system, shapes, t, y, params)
+    stuck, G = sig == 0, jnp.linalg.solve(M, H.T)
+    w = jnp.linalg.solve(M, Q - H.T @ (sig * F))
+    among = jnp.where(jnp.outer(stuck, stuck), H @ G, jnp.eye(sig.size))
+    held = jnp.where(stuck, jnp.linalg.solve(among, jnp.where(stuck, H @ w + own, 0.0)), 0.0)
+    return jnp.concatenate([qdot, w - G @ held, zdot]), sig * F + held, F, s
+
+
+@cache
+def compiled(system, shapes):
+    """The two functions above, of this system."""
+    return jax.jit(partial(terms, system, shapes)), jax.jit(partial(state, system, shapes))
+
+
 class Motion:
     """A system on its way; sig: the directions in which its joints slide, 0 where they stick."""
 
@@ -38,20 +53,18 @@ class Motion:
         z0 = np.zeros(0) if z0 is None else z0
         self.shapes = tuple(np.shape(x) for x in (q0, v0, z0))
         self.split = np.cumsum([np.size(q0), np.size(v0)])
-        self.terms = partial(terms, system, self.shapes, params=params)
+        self.params = jax.tree.map(jnp.asarray, params)
+        self.of_system = compiled(system, self.shapes)
         self.t, self.y = 0.0, np.concatenate([np.ravel(x) for x in (q0, v0, z0)])
-        s = np.asarray(self.terms(self.t, self.y)[3])
+        _, _, _, s, *_ = self.terms(self.t, self.y)
         self.sig = np.where(np.abs(s) < 1e-14, 0, np.sign(s))
         self.settle()
 
+    def terms(self, t, y):
+        return map(np.asarray, self.of_system[0](t, y, self.params))
+
     def state(self, t, y):
-        """Rates of y, tau, F and s."""
-        M, Q, F, s, H, own, qdot, zdot = (np.asarray(x) for x in self.terms(t, y))
-        stuck, tau, G = self.sig == 0, self.sig * F, np.linalg.solve(M, H.T)
-        w = np.linalg.solve(M, Q - H.T @ tau)
-        if stuck.any():
-            tau[stuck] = np.linalg.solve((H @ G)[np.ix_(stuck, stuck)], (H @ w + own)[stuck])
-        return np.concatenate([qdot, w - G @ np.where(stuck, tau, 0), zdot]), tau, F, s
+        return tuple(map(np.asarray, self.of_system[1](self.params, self.sig, t, y)))
 
     def event(self, i, t, y):
         """Falls through 0 where joint i switches."""
@@ -69,7 +82,7 @@ class Motion:
 
     def stop(self):
         """Sliding velocities of stuck joints 0, but for rounding already."""
-        M, _, _, s, H, *_ = (np.asarray(x) for x in self.terms(self.t, self.y))
+        M, _, _, s, H, *_ = self.terms(self.t, self.y)
         stuck = self.sig == 0
         G = np.linalg.solve(M, H[stuck].T)
         self.y[slice(*self.split)] -= G @ np.linalg.solve(H[stuck] @ G, s[stuck])

@@ -143,7 +143,7 @@ the time among them. `run.events` tells what happened, when, and the velocities 
 >>> def bounce(e):
 ...     params = {"e": e, "floor": 0.0}
 ...     return hhtjax.simulate(
-...         ball, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), params, dt=2e-2, num_steps=30, events=[floor])
+...         ball, hhtjax.rk4(), jnp.ones(1), jnp.zeros(1), params, dt=2e-2, num_steps=30, events=[floor])
 >>> run = bounce(0.8)
 >>> run.check()
 >>> [round(float(v[0, 0]), 4) for v in (run.events.before, run.events.after)]
