@@ -72,7 +72,11 @@ def gradient(scene, options=None):
 def obvious_simulate(scene):
     """The same motion in plain JAX, as one writes it down first: what a first call takes at the least."""
     (system, params, q0, v0), dt, stepper = SCENES[scene]()
-    return jax.jit(lambda *x: obvious.run(stepper, system, *x, dt, NUM_STEPS)[1])(params, q0, v0)
+
+    def path(params, q0, v0):
+        return obvious.run(stepper, system, params, q0, v0, dt, NUM_STEPS)[1]
+
+    return jax.jit(path)(params, q0, v0)
 
 
 def obvious_gradient(scene):

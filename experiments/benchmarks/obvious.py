@@ -1,5 +1,7 @@
 """The method as one writes it down first, in plain JAX: jacfwd by q, v and w, jnp.linalg.solve, one scan."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -10,7 +12,7 @@ def run(stepper, system, params, q0, v0, dt, num_steps):
     f = 1 - c.alpha_f
 
     def mass(q):
-        M = system.mass(q, params) if callable(system.mass) else system.mass
+        M: Any = system.mass(q, params) if callable(system.mass) else system.mass
         return jnp.diag(M) if M.ndim == 1 else M
 
     def r(q, v, w):

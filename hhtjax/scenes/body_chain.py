@@ -66,4 +66,5 @@ def body_chain(bodies=3, spin=5.0) -> Scene:
     x = -length * (np.arange(N) + 0.5)[:, None] * R[:, 2]
     q0, v0 = {"R": np.tile(R, (N, 1, 1)), "x": x}, {"R": array(N * [[0.0, 0.0, spin]]), "x": np.zeros((N, 3))}
     params = {"m": 1.0, "l": length, "r": 0.05, "g": 9.81}
-    return Scene(System(mass, force, joints), *jax.tree.map(array, (params, q0, v0)), 2.0)
+    params, q0, v0 = jax.tree.map(array, (params, q0, v0))
+    return Scene(System(mass, force, joints), params, q0, v0, 2.0)

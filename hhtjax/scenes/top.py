@@ -90,7 +90,8 @@ def constrained(spin=150.0, inclination=0.0) -> Scene:
     params, R, Om = _start("constrained", spin, inclination)
     arm = params["l"] * np.array([0.0, 1.0, 0.0])
     q0, v0 = {"R": R, "x": R @ arm}, {"R": spin * Om, "x": spin * (R @ np.cross(Om, arm))}
-    return Scene(System(mass, force, rod), params, *jax.tree.map(array, (q0, v0)), DURATION)
+    q0, v0 = jax.tree.map(array, (q0, v0))
+    return Scene(System(mass, force, rod), params, q0, v0, DURATION)
 
 
 def _start(caller, spin, inclination):
