@@ -85,7 +85,12 @@ def _pivots_of_few(A):
         d = A[k, k]
         return A - jnp.outer(A[:, k], A[k] / jnp.where(d > 0, d, jnp.nan)), jnp.where(i == k, d, found)
 
-    return lax.fori_loop(0, len(A), eliminate, (A, jnp.zeros_like(A[0])))[1]
+    carry = A, jnp.zeros_like(A[0])
+    if len(A) > 2:
+        return lax.fori_loop(0, len(A), eliminate, carry)[1]
+    for k in range(len(A)):
+        carry = eliminate(k, carry)
+    return carry[1]
 
 
 def _substitute(L, B):
