@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax import lax
 from matrices import spd
 
@@ -33,9 +34,9 @@ def test_factorisations_in_panels():
     assert np.all(np.isnan(pivots[1, n - n % panels.BLOCK :]))
 
 
-def test_pivots_of_few():
+@pytest.mark.parametrize("n", [2, panels.FEW])
+def test_pivots_of_few(n):
     """Those of Cholesky's factor, without LAPACK; none behind one that is not positive."""
-    n = panels.FEW
     S = np.stack([spd(n)[0], np.diag(np.where(np.arange(n) == n - 2, -1.0, 1.0))])
     program = jax.jit(jax.vmap(panels.pivots)).lower(S)
     assert "lapack" not in program.as_text()
