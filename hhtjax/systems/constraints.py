@@ -15,7 +15,7 @@ from jax import lax
 from jax.scipy.linalg import block_diag
 
 from hhtjax.numerics.elimination import UNROLLED, factorize, matvec
-from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, solve, solve_map
+from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, solve
 from hhtjax.xla import linear_map, staged
 
 GRADIENT = 64  # roundings below which the gradient of a constraint is none
@@ -49,26 +49,17 @@ def pull_back(system, q, gradient):
 
 def saddle_point(system, q, t, params, force, rows, factorize=factorize):
     """(x, L) with M x - B^T L = force and B x = rows: the index-1 system for accelerations, and all projections."""
-    n = system.size
-    _, tangent = jax.linearize(lambda q: system.constraint(q, t, params), q)
-
-    def f(z):
-        x, L = z[:n], z[n:]
-        reactions = reaction(system, q, t, params, L)
-        return jnp.concatenate([system.inertia(q, x, params) - reactions, tangent(system.rate(q, x))])
-
-    z = solve_map(f, jnp.concatenate([force, rows]), factorize)
-    return z[:n], z[n:]
-
-
-def acceleration_and_multipliers(system, q, v, t, params, factorize=factorize):
-    """w and L at a state that satisfies Phi = 0 and dPhi/dt = 0; by the matrix itself, which takes less to trace."""
-    Q, rows = system.force(q, v, t, params), -curvature(system, q, v, t, params)
     M, B = system.mass(q, params), jacobian(system, q, t, params)
     M = jnp.diag(system.with_ones(M)) if M.ndim == 1 else block_diag(M, jnp.eye(system.size - len(M), dtype=M.dtype))
     A = jnp.block([[M, -B.T], [B, jnp.zeros((len(B), len(B)), B.dtype)]])
-    z = solve(A, jnp.concatenate([Q, rows]), factorize)
+    z = solve(A, jnp.concatenate([force, rows]), factorize)
     return z[: system.size], z[system.size :]
+
+
+def acceleration_and_multipliers(system, q, v, t, params, factorize=factorize):
+    """w and L at a state that satisfies Phi = 0 and dPhi/dt = 0."""
+    Q = system.force(q, v, t, params)
+    return saddle_point(system, q, t, params, Q, -curvature(system, q, v, t, params), factorize)
 
 
 def jacobian(system, q, t, params):
