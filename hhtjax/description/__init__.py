@@ -20,10 +20,15 @@ def is_concrete(x):
     return not isinstance(x, Tracer)
 
 
+def is_tracing():
+    """Whether a function is being traced, as inside a jit."""
+    return not is_concrete(jnp.zeros(()))
+
+
 def evaluated_now():
     """A context in which what is concrete is computed while a function is being traced, too."""
     # not elsewhere: JAX 0.6 would leak a tracer
-    return nullcontext() if is_concrete(jnp.zeros(())) else jax.ensure_compile_time_eval()
+    return jax.ensure_compile_time_eval() if is_tracing() else nullcontext()
 
 
 def is_real(x):

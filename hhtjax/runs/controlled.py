@@ -4,11 +4,10 @@ from dataclasses import replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from hhtjax.description import is_concrete
+from hhtjax.description import is_concrete, is_tracing
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.choose import choose, trimmed
@@ -83,7 +82,7 @@ def run_tightened(start, alone, progress, room):
     again = partial(over, room=room)
     if is_pair():
         run = again(start, last.steps, last.ends)
-    elif alone and is_concrete(jnp.zeros(())):  # no jit, of which a derivative could be made
+    elif alone and not is_tracing():  # no jit, of which a derivative could be made
         run = last.run
     else:
         run = accepted_run(last, again, start)
@@ -140,7 +139,7 @@ def run_in_one(problem, times, control, progress=False):
         partial(run_recorded, progress=progress, rates=problem.rates()),
         partial(in_two_passes, progress=progress),
     )
-    if is_concrete(jnp.zeros(())):  # there is no jit
+    if not is_tracing():
         return in_one(*data)
     in_one, closed_over = hoisted(in_one, *data)
     if not all(map(is_concrete, closed_over)):
