@@ -113,6 +113,7 @@ def sweep(scene):
 
 CALLS = {f.__name__: f for f in (simulate, gradient, fit, sweep)} | {"gradient, QUICK": quick}
 OBVIOUS = {"simulate": obvious_simulate, "gradient": obvious_gradient}
+PROGRAMS = CALLS | {f.__name__: f for f in OBVIOUS.values()}
 PLAIN = "pendulum", "double pendulum", "beam of 50"  # scenes that need no more: no constraints, no rotations
 
 
@@ -128,7 +129,7 @@ def first(call, scene):
     jnp.zeros(1).block_until_ready()
     jax.monitoring.register_event_duration_secs_listener(listen)
     start, cpu = time.perf_counter(), time.process_time()
-    jax.block_until_ready((CALLS | {f.__name__: f for f in OBVIOUS.values()})[call](scene))
+    jax.block_until_ready(PROGRAMS[call](scene))
     elapsed, cpu = time.perf_counter() - start, time.process_time() - cpu
     found = {name: cpu * seconds / elapsed for name, seconds in spent.items()}
     return {"total": cpu, "tracing": cpu - sum(found.values()), **found}

@@ -86,7 +86,7 @@ def _pivots_of_few(A):
         return A - jnp.outer(A[:, k], A[k] / jnp.where(d > 0, d, jnp.nan)), jnp.where(i == k, d, found)
 
     carry = A, jnp.zeros_like(A[0])
-    if len(A) > 2:
+    if len(A) > 2:  # else the only loop over small arrays in a run that is scalars
         return lax.fori_loop(0, len(A), eliminate, carry)[1]
     for k in range(len(A)):
         carry = eliminate(k, carry)
