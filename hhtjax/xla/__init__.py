@@ -38,10 +38,11 @@ True
 The door
 --------
 
-The rest of the library knows 22 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 23 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
+    part(f)                   f, a kernel of its own where it is in none
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
@@ -90,7 +91,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 from hhtjax.xla.explanation import Explanation, calls, explain
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.host import on_host
-from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, staged, structural
+from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, part, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
 from hhtjax.xla.programs import QUICK, WIDE, Programs
@@ -127,6 +128,7 @@ __all__ = [
     "one_kernel",
     "or_alone",
     "or_plain",
+    "part",
     "plain",
     "polynomial_sines",
     "row_written",

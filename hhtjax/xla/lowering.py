@@ -5,11 +5,13 @@ Attributes of a call change what XLA makes of it. One that is not inlined is com
 knows: with LAPACK, sort, scatter or a large product, compilation fails.
 
 So the called function is looked through, operation by operation, with vmap and autodiff done, and the attribute is
-attached only if all are known; where one is not proven, and XLA refuses the kernel on trial, it is not either.
-Platforms other than the CPU never see it. The verdict is attached too, for `explain` to read. A function may come in
-two forms, one for either case, of which the program keeps one. The sines of a kernel are those of sines.py.
+attached only if all are known; where one is not proven, and XLA refuses the kernel on trial, it is not either. Where
+a fusion outside a kernel takes long to compile, the stages of a function that is none become kernels, as far as they
+can. Platforms other than the CPU never see it. The verdict is attached too, for `explain` to read. A function may come
+in two forms, one for either case, of which the program keeps one. The sines of a kernel are those of sines.py.
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,14 +20,27 @@ from jaxlib.mlir import ir
 from jaxlib.mlir.dialects import func, stablehlo
 
 from hhtjax.xla.gate import is_possible
-from hhtjax.xla.inspection import ATTRIBUTES, Inspection, callee, directly_in, form_inside
-from hhtjax.xla.kernels import AROUND, KERNEL, alone_p, inside_p, largest_p, structural_p, watch_p
-from hhtjax.xla.products import size, written_out
+from hhtjax.xla.inspection import ATTRIBUTES, PROVEN_TYPES, Inspection, callee, directly_in, form_inside
+from hhtjax.xla.kernels import (
+    AROUND,
+    KERNEL,
+    PART,
+    QUICKLY,
+    STAGED,
+    alone_p,
+    inside_p,
+    largest_p,
+    structural_p,
+    watch_p,
+)
+from hhtjax.xla.products import element_type, size, written_out
 from hhtjax.xla.sines import write_sines
 from hhtjax.xla.trial import Module
 
 VERDICT = "hhtjax_kernels"
 UNTOLD = "hhtjax_around"
+LEAST_IN_STAGE = 6  # operations; fewer are one fusion or two anyway
+LARGEST_IN_STAGE = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
 
 
 def _lower_inside(ctx, x):
@@ -47,16 +62,48 @@ def _lower(ctx, x):
 
 
 def _decide(module, call):
-    found = Inspection(module.symbol_table, call, _is_partitioned(module.axis_context))
+    is_partitioned = _is_partitioned(module.axis_context)
+    found = Inspection(module.symbol_table, call, is_partitioned)
     refusal = None if found.objection or found.is_proven else _refusal(module, found, call)
     objection = f"XLA refused: {refusal}" if refusal else found.objection
     told = UNTOLD if callee(call).startswith(AROUND) else VERDICT
     _attach(call, **{told: f"plain: {objection}" if objection else "one kernel"})
-    if objection:
+    if not objection:
+        _cut(module, found, call)
+    elif is_partitioned or QUICKLY in str(module.module.operation.attributes["sym_name"]):
         for stage in (x for calls in found.stages.values() for x in calls):
             _compute_once(stage)
     else:
-        _cut(module, found, call)
+        _cut_stages(module, call, set())
+
+
+def _cut_stages(module, call, seen):
+    """Makes kernels of the stages in the function called. With sines of XLA's own: polynomials, of which a kernel takes
+    many at a time, take longer to compile."""
+    seen.add(callee(call))
+    for inner in _operations(module.symbol_table[callee(call)].operation):
+        if inner.name != "func.call" or ATTRIBUTES in inner.attributes:
+            continue
+        if found := _kernel_alone(module, inner):
+            _cut(module, found, inner, with_sines=False)
+            continue
+        if callee(inner) not in seen:
+            _cut_stages(module, inner, seen)
+        if callee(inner).startswith(STAGED):
+            _compute_once(inner)
+
+
+def _kernel_alone(module, stage):
+    """The `Inspection` of a stage that makes a kernel for certain, and is worth one; None of all else."""
+    if not callee(stage).startswith((STAGED, PART)) or not len(stage.results):
+        return None
+    found = Inspection(module.symbol_table, stage)
+    functions = [module.symbol_table[name].operation for name in found.finished]
+    sizes = [size(x) for function in functions for op in _operations(function) for x in op.results]
+    if not found.is_proven or found.objection or found.operations < LEAST_IN_STAGE:
+        return None
+    found.stages.pop(callee(stage), None)
+    return found if max(sizes) <= LARGEST_IN_STAGE else None
 
 
 def _refusal(module, found, call):
@@ -66,7 +113,7 @@ def _refusal(module, found, call):
     return alone.refusal()
 
 
-def _cut(module, found, call):
+def _cut(module, found, call, with_sines=True):
     """Makes the function called a kernel."""
     for choice in found.choices:
         _take_form_inside(choice)
@@ -74,7 +121,8 @@ def _cut(module, found, call):
         _loop_at_most_once(case)
     for product in found.products:
         _call_stage([product], _insert(module, _as_stage(written_out(module, product))))
-    write_sines(module, found.finished)
+    if with_sines:
+        write_sines(module, found.finished)
     for name in found.finished:  # what a stage calls comes before it
         stages = found.stages.get(name, [])
         if stages and _may_be_divided(stages[0]):
@@ -114,7 +162,8 @@ def _as_stage(function):
     """The function with a second result, an element that costs nothing to have."""
     (body,) = function.regions[0]
     with function.location:
-        _return_also(function, _cheap(body.arguments, body.operations[len(body.operations) - 1].operands))
+        given, made = body.arguments, list(body.operations[len(body.operations) - 1].operands)
+        _return_also(function, lambda: [_one_of(x) for x in _cheap(given, made)])
     return function
 
 
@@ -137,13 +186,13 @@ def _make_kernel(module, call):
     """Lets `call` find a function that calls the one it called, as a kernel.
 
     XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once a constant is put in its place.
-    So the kernel returns an element of each; the function between drops them, and hides the values.
+    So the kernel returns a number that takes an element of each; the function between drops it, and hides the values.
     """
     name = callee(call)
     with call.location:
         kernel = module.symbol_table[name].operation.clone(ip=module.ip)
         old_type = ir.FunctionType(ir.TypeAttr(kernel.attributes["function_type"]).value)
-        types = _return_also(kernel, kernel.regions[0].blocks[0].arguments)
+        types = _return_also(kernel, partial(_of_each, kernel.regions[0].blocks[0].arguments))
         between = func.FuncOp(name, old_type, ip=module.ip)
         with ir.InsertionPoint(between.add_entry_block()):
             hidden = list(stablehlo.OptimizationBarrierOp(between.arguments).results)
@@ -153,20 +202,39 @@ def _make_kernel(module, call):
         call.attributes["callee"] = _insert(module, between.operation)
 
 
-def _return_also(function, values):
-    """Lets a function return an element of each value after what it returned: the types of all."""
+def _of_each(values):
+    """A sum of elements of all, and what no sum takes: to return each by itself would take a buffer each."""
+    real = [x for x in values if size(x) and element_type(x) in PROVEN_TYPES]
+    number, rest = ir.RankedTensorType.get([], ir.F32Type.get()), [x for x in values if x not in real]
+    sums = [stablehlo.convert(number, stablehlo.reshape(_scalar(x), _one_of(x))) for x in real]
+    while len(sums) > 1:
+        sums = [*map(stablehlo.add, sums[::2], sums[1::2]), *sums[len(sums) // 2 * 2 :]]
+    return [*sums, *map(_one_of, rest)]
+
+
+def _one_of(x):
+    """An element, with as many axes; x where it is empty."""
+    return stablehlo.slice(x, *_first(x)) if size(x) else x
+
+
+def _return_also(function, make):
+    """Lets a function return what `make()` makes at its end after what it returned: the types of all."""
     (body,) = function.regions[0]
     end = body.operations[len(body.operations) - 1]
     with ir.InsertionPoint(end):
-        elements = [stablehlo.slice(x, *_first(x)) if size(x) else x for x in values]
-        func.ReturnOp([*end.operands, *elements])
+        more = make()
+        func.ReturnOp([*end.operands, *more])
     end.erase()
     old = ir.FunctionType(ir.TypeAttr(function.attributes["function_type"]).value)
-    types = [*old.results, *(x.type for x in elements)]
+    types = [*old.results, *(x.type for x in more)]
     function.attributes["function_type"] = ir.TypeAttr.get(ir.FunctionType.get(old.inputs, types))
     if "res_attrs" in function.attributes:
         del function.attributes["res_attrs"]
     return types
+
+
+def _scalar(x):
+    return ir.RankedTensorType.get([], ir.RankedTensorType(x.type).element_type)
 
 
 def _element(x):

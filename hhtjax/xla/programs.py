@@ -9,11 +9,13 @@ batch of double pendulums then takes half the time.
 For a jit of one's own: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
 """
 
+from functools import wraps
 from typing import Any
 
 import jax
 
 from hhtjax.xla.gate import is_on
+from hhtjax.xla.kernels import QUICKLY
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 MOST_QUICK = 32  # rates; with 40, steps of a beam take 1.2 times as long
@@ -34,6 +36,7 @@ class Programs:
     def __init__(self, f, **static):
         """static: of `jax.jit`."""
         self.usual: Any = jax.jit(f, **static)
+        f = _quickly(self.usual)  # traced once for all
         self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
 
@@ -60,3 +63,14 @@ class Programs:
     def number(self):
         """Of all that have been compiled."""
         return sum(program._cache_size() for program in (self.usual, self.quick, self.wide))
+
+
+def _quickly(f):
+    """f by a name that tells how it is compiled."""
+
+    @wraps(f)
+    def call(*args, **keywords):
+        return f(*args, **keywords)
+
+    call.__name__ = f"{QUICKLY}_{f.__name__.strip('_')}"
+    return call
