@@ -1,8 +1,9 @@
 """Options for the compiler, of the programs that start here; inside a jit of the user's those of that jit hold.
 
 QUICK: XLA:CPU compiles each fusion that stands outside a kernel by a pipeline of MLIR, some 10 ms for a few sums, and
-gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. What
-it makes of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without.
+gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. So in
+programs without QUICK stages become kernels (lowering.py), which in those with it would take longer. What it makes of
+the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without.
 WIDE: vectors of 512 bits for loops over the members of a batch, where XLA:CPU takes half of that, unless it is asked: a
 batch of double pendulums then takes half the time.
 
