@@ -39,7 +39,7 @@ True
 The door
 --------
 
-The rest of the library knows 23 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 24 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -48,6 +48,7 @@ The rest of the library knows 23 functions of this room, and works as well on pl
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
     is_untouched()            whether neither a derivative nor a batch is being made here
+    is_in_batch()             whether a batch is being made here
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
     in_turn(f, asked, x)      f(x), of which a batch visits only members that ask
     or_alone(x)               x of a member of a batch, True where there is none
@@ -100,7 +101,7 @@ from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.rows import block_written, row_written
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
-from hhtjax.xla.transforms import is_untouched
+from hhtjax.xla.transforms import is_in_batch, is_untouched
 from hhtjax.xla.turns import in_turn
 from hhtjax.xla.two_ways import TwoWays, derivative, together
 
@@ -120,6 +121,7 @@ __all__ = [
     "derivative",
     "explain",
     "in_turn",
+    "is_in_batch",
     "is_untouched",
     "largest_in_batch",
     "linear_map",
