@@ -39,7 +39,8 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
 
 def past_events(trial, tried, walk, h):
     """The try, past the events in its step."""
-    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, trial.params_of(walk), h)
+    now = trial.ways.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
+    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, now, h)
     return seldom_alone(partial(passed, trial), asked, tried, walk, h)
 
 

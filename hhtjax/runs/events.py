@@ -67,7 +67,8 @@ def past_events(ways, params, bound, sizes):
 
 def may_meet(ways, part, h, params):
     """Whether there may be an event in a step."""
-    asked = asks(ways, part.start, part.end, ways.events.with_modes(params, part.met.modes), h)
+    now = ways.during(params, part.start.t, h).params(params, part.met.modes)
+    asked = asks(ways, part.start, part.end, now, h)
     return asked & ~part.met.ended if any(ways.events.ends) else asked
 
 

@@ -38,6 +38,16 @@ class Ways(NamedTuple):
     no_info: Any
     reach: Any  # of `reaching`
     keep: int = 0  # how many events are noted
+    middle: Any = None  # of the step, where inputs are held
+
+    def during(self, params, t, h):
+        """The same in a step h from t on."""
+        return self._replace(middle=t + h / 2) if held.holds(params) else self
+
+    def params(self, params, modes):
+        """Those with these modes, as they are in this step."""
+        params = self.events.with_modes(params, modes)
+        return params if self.middle is None else held.held_at(params, self.middle)
 
 
 class Met(NamedTuple):
@@ -94,10 +104,11 @@ def falls_and_rises(g0, d0, g1, d1):
 def pass_events(ways, params, part, h):
     """The step across all events in it: a `Part`, of which end, info and met are to be used, and what to note of
     up to max_events + 1 of them, rows and whether each is there. Members that have not asked stay as they are."""
-    if held.holds(params):
-        old = held.before(params, part.start.t, part.last)
-        params = held.held_at(params, part.start.t + h / 2)
-        part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, params))
+    ways = ways.during(params, part.start.t, h)
+    if ways.middle is not None:
+        old = held.before(ways.events.with_modes(params, part.met.modes), part.start.t, part.last)
+        new = ways.params(params, part.met.modes)
+        part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new))
 
     def slot(part, number):
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
@@ -109,7 +120,7 @@ def pass_events(ways, params, part, h):
     def anew(s, params):
         return begin(ways, s.q, s.v, s.t, params, h)
 
-    now = ways.events.with_modes(params, met.modes)
+    now = ways.params(params, met.modes)
     end = seldom(anew, part.divided & ~met.ended, part.end, now)
 
     def known(s):
@@ -154,7 +165,7 @@ def begin(ways, q, v, t, params, h):
 def look(ways, part, params, h):
     """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
     part, params = lax.stop_gradient((part, params))
-    now = ways.events.with_modes(params, part.met.modes)
+    now = ways.params(params, part.met.modes)
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, s, now) for s in (part.start, part.end))
     noted = jnp.asarray(ways.events.noted)
     rising = (d0 > 0) & (d1 > 0)
@@ -195,7 +206,7 @@ def meet(ways, now, found, h, params):
     numbers = jnp.arange(found.hit.size, dtype=met.event.dtype)
     i = jnp.min(jnp.where(found.place == jnp.min(found.place), numbers, numbers.size))
     this = (numbers == i).astype(h.dtype)
-    now = events.with_modes(params, met.modes)
+    now = ways.params(params, met.modes)
     tau = locate(ways, now, part, this, found, h)
     e, info = go(ways, now, part.start, tau, part.last, h)
     before = e
@@ -204,14 +215,14 @@ def meet(ways, now, found, h, params):
     noise = 1e3 * float(jnp.finfo(h.dtype).eps)
     missed = ~(jnp.abs(pick(this, g)) <= 1e-3 * jnp.abs(rate) * h + noise * pick(this, found.size))
 
-    v, modes = events.outcome(i, e.q, e.v, e.t, now)
+    v, modes = events.outcome(i, e.q, e.v, e.t, now, events.with_modes(params, met.modes))
     row = row_of(e.t, i, rate, e.q, e.v, v)
     noted, ends = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, events.ends))
     beside = ~noted & jnp.any(is_corner(g, d, h, this, events.noted))
     code = jnp.where(beside, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
     code = jnp.where(missed, STAYS, jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE)).astype(met.code.dtype)
 
-    then = events.with_modes(params, modes)
+    then = ways.params(params, modes)
     beyond = jnp.where(noted, float(jnp.finfo(h.dtype).eps) ** 0.5 * h, 0)  # so that it is not met again
     rest = jnp.where(ends, 0, part.rest - tau - beyond)
     size = jnp.maximum(rest, SHORT * h)
