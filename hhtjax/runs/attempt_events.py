@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from hhtjax.numerics.seldom import choose, seldom_alone
 from hhtjax.runs.attempt import AT_EVENT, Trial, Try, judged, sizes, why_short
 from hhtjax.runs.event_failures import FINE, MANY
+from hhtjax.runs.event_parts import Part, Ways
 from hhtjax.runs.loop import neutral_info, resized_step
-from hhtjax.runs.meeting import SHORT, Part, Ways, asks, pass_events, reaching
+from hhtjax.runs.meeting import SHORT, asks, pass_events, reaching
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 
