@@ -85,8 +85,9 @@ class Sampled:
 
     def constant(self, value):
         """The held input that always has this value."""
-        times = None if self.times is None else self.times[:1]  # as many leaves as before
-        return replace(self, polynomials=value[None, None], times=times)
+        one = jnp.ones((), self.polynomials.dtype)
+        scale = {"dt": one, "t0": one - 1, "times": None} if self.times is not None else {}
+        return replace(self, polynomials=value[None, None], **scale)
 
 
 def _inside(x):
