@@ -163,6 +163,15 @@ def test_many_parameters_take_an_optax_optimiser():
         ({"loss": "hubert"}, ValueError, "`loss` must be one of huber, soft_l1, cauchy, a function .* 'hubert'"),
         ({"prior": {"a": 1.0, "rate": None, "offset": None}}, TypeError, "`prior` must hold Gaussian.* received 1.0"),
         ({"prior": hhtjax.Gaussian(0.0, -1.0)}, ValueError, "`prior` must have a positive deviation; received -1.0"),
+        ({"prior": hhtjax.Gaussian(np.nan, 1.0)}, ValueError, "the mean in `prior` must be finite; received nan"),
+        ({"prior": hhtjax.Gaussian(0.0, "1")}, TypeError, "`prior` must have a real deviation; received '1'"),
+        (
+            {"prior": hhtjax.Gaussian(np.ones(2), 1.0)},
+            ValueError,
+            r"`prior` must have the shape of its parameter, \(\); received \(2,\)",
+        ),
+        ({"prior": {"a": None}}, ValueError, "`prior` must be a prefix of params0"),
+        ({"weights": [1.0] * 40}, ValueError, "`weights` must be a prefix of what `residuals` return"),
         ({"segments": 1}, ValueError, "`segments` must be an integer, 2 or more; received 1"),
     ],
 )

@@ -38,6 +38,8 @@ def test_summary_and_json(result):
     assert jax.tree.structure(again) == jax.tree.structure(result)
     jax.tree.map(np.testing.assert_array_equal, again, result)
     assert again.summary() == result.summary()
+    numbered = result._replace(params={1: result.params["a"], (2, "b"): result.params["rate"]})
+    assert FitResult.from_json(numbered.to_json()).params == numbered.params
 
 
 @pytest.mark.slow
@@ -49,6 +51,9 @@ def test_profile_is_the_parabola_of_the_standard_error(result):
         hhtjax.identification.prediction_errors(lambda p: p["a"], bare)
     with pytest.raises(ValueError, match="profile: `result` must have a covariance"):
         hhtjax.identification.profile(residuals, bare, "rate", [1.0])
+    unknown = result.uncertainty._replace(cluster=jnp.diag(jnp.array([jnp.inf, 4.0])))
+    found = hhtjax.identification.prediction_errors(lambda p: (p["a"], p["rate"]), result._replace(uncertainty=unknown))
+    assert tuple(map(float, found)) == (np.inf, 2.0)
     values = float(result.params["rate"]) + sigma * np.array([-1.0, 0.0, 1.0])
     found = hhtjax.identification.profile(residuals, result, "rate", values)
     np.testing.assert_allclose(found.deviance, [1, 0, 1], atol=0.06)
