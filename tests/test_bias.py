@@ -201,6 +201,21 @@ def test_a_constraint_leaves_the_bias_of_the_minimal_form():
     assert np.min(np.abs(mu - np.exp(s * dt))) < 1e-9
 
 
+def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
+    """alpha = 0 turns a mode of w h into one of 2 arctan(w h/2): exp(2.2i) is nearest to what becomes of 3. Wilson's
+    method leaves no oscillation of the last."""
+    apart = hhtjax.System(jnp.ones(4), lambda q, v, t, params: -params * q)
+    wh = np.array([1.0, 1.02, 2.2, 3.0])
+    found = hhtjax.step_size_bias(apart, hhtjax.hht(alpha=0.0), jnp.asarray(wh**2), 1.0, q=jnp.zeros(4))
+    np.testing.assert_allclose(found.stiffness_bias, (wh / (2 * np.arctan(wh / 2))) ** 2 - 1, rtol=1e-9)
+    stiff = jnp.asarray([0.01, 1.0, 4.0, 2500.0])
+    np.testing.assert_array_equal(
+        np.isnan(hhtjax.step_size_bias(apart, hhtjax.wilson(), stiff, 1.0, q=jnp.zeros(4)).frequency), [0, 0, 0, 1]
+    )
+    with pytest.raises(ValueError, match=r"`dt` must let every mode oscillate, for `correct`; .* in which 1 of 4 do"):
+        hhtjax.step_size_bias(apart, hhtjax.wilson(), stiff, 1.0, q=jnp.zeros(4), correct=True)
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
