@@ -140,7 +140,7 @@ def load_sweep(folder) -> dict[str, np.ndarray]:
     parts = []
     for path in paths:
         try:
-            with np.load(path) as part:
+            with open(path, "rb") as file, np.load(file) as part:
                 parts.append(dict(part))
         except (ValueError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(
