@@ -64,13 +64,22 @@ class FitResult(NamedTuple):
     @property
     def reason(self) -> str:
         """Why it stopped, in words."""
+        self._require_one()
         return REASONS[int(self.code)]
 
     @property
     def free(self) -> np.ndarray:
         """Whether each entry of ravel_pytree(params) was fitted, (p,)."""
+        self._require_one()
         leaves = zip(self.transforms, jax.tree.leaves(freeze(self.params)), strict=True)
         return np.concatenate([np.full(np.size(x), T is not tf.fixed) for T, x in leaves])
+
+    def _require_one(self):
+        if jnp.ndim(self.code):
+            raise ValueError(
+                f"FitResult: must be of one fit; this is a batch, of shape {jnp.shape(self.code)}. Its member i is "
+                "jax.tree.map(lambda x: x[i], result)."
+            )
 
     @property
     def covariance(self) -> Any:
