@@ -178,7 +178,7 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
         noise: standard deviation of a new measurement's noise.
 
     Returns:
-        Numbers and arrays like what predict returns.
+        Numbers and arrays like what predict returns; inf where a parameter matters that the fit left undetermined.
 
     Raises:
         ValueError: a fit without covariance.
@@ -194,4 +194,7 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
     shapes = jax.eval_shape(lambda x: predict(thaw(unravel(x))), x)
     _, unravel_output = ravel_pytree(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
     J = jax.jacfwd(lambda x: ravel_pytree(predict(thaw(unravel(x))))[0])(x)
-    return unravel_output(jnp.sqrt(jnp.einsum("ip,pq,iq->i", J, result.covariance, J) + noise**2))
+    unknown = jnp.isinf(jnp.diagonal(result.covariance))
+    known = jnp.einsum("ip,pq,iq->i", J, jnp.where(unknown, 0, result.covariance), J)
+    variance = jnp.where(jnp.any(unknown[None, :] & (J != 0), axis=1), jnp.inf, known)
+    return unravel_output(jnp.sqrt(variance + noise**2))

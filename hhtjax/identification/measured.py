@@ -119,7 +119,7 @@ def measure(solution: Solution, times: Any, gain: Any = 1.0, offset: Any = 0.0, 
     >>> float(measure(run, jnp.array([0.8]), gain=2.0, offset=0.5, delay=0.3)[0, 0].round(6))
     1.5
     """
-    q = interpolate(solution, jnp.maximum(times - delay, solution.t[0])).q
+    q = interpolate(solution, jnp.maximum(jnp.asarray(times) - delay, solution.t[0])).q
 
     def like_q(x):
         return jax.tree.map(lambda _: x, q) if jax.tree.structure(x) != jax.tree.structure(q) else x

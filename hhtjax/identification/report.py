@@ -136,6 +136,8 @@ def encode(x: Any) -> Any:
     if isinstance(x, tf.Transform):
         return {"transform": next(name for name, T in TRANSFORMS.items() if T is x)}
     if isinstance(x, dict):
+        if not all(isinstance(name, str) for name in x):
+            return {"items": [[encode(name), encode(y)] for name, y in x.items()]}
         return {"dict": {name: encode(y) for name, y in x.items()}}
     if is_dataclass(x):
         return {type(x).__name__: {field.name: encode(getattr(x, field.name)) for field in fields(x)}}
@@ -157,6 +159,8 @@ def decode(x, named) -> Any:
         return tf.bounded(*content)
     if kind == "transform":
         return TRANSFORMS[content]
+    if kind == "items":
+        return {decode(name, named): decode(y, named) for name, y in content}
     if kind in ("list", "tuple"):
         return (list if kind == "list" else tuple)(decode(y, named) for y in content)
     values = {name: decode(y, named) for name, y in content.items()}

@@ -149,16 +149,21 @@ def _clusters(J, r, sizes, segments, variance):
     return score.T @ score + jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U)
 
 
-def variance_inflation(leaves):
-    """tau >= 1 of weighted residual leaves, each along its longest axis of N entries, with L = sqrt(N).
+def time_axis(shape, of_records):
+    """The longest axis, along which residuals follow one another; records, on the first axis, do not."""
+    first = int(of_records and len(shape) > 1)
+    return first + int(np.argmax(shape[first:])) if shape else 0
+
+
+def variance_inflation(leaves, of_records=False):
+    """tau >= 1 of weighted residual leaves, each along its `time_axis` of N entries, with L = sqrt(N).
 
     The sum over lags is sum_w (sum of r in w)^2/(L sum r^2) over all windows w of L entries, the ends padded with 0.
     """
     energy, sums = 0.0, 0.0
     for r in leaves:
         if r.size:
-            axis = int(np.argmax(r.shape)) if r.ndim else 0
-            r = jnp.moveaxis(jnp.atleast_1d(r), axis, 0)
+            r = jnp.moveaxis(jnp.atleast_1d(r), time_axis(r.shape, of_records), 0)
             L = math.isqrt(r.shape[0])
             sums_to = jnp.cumsum(jnp.pad(r, ((L, L - 1), *((0, 0),) * (r.ndim - 1))), axis=0)
             window = sums_to[L:] - sums_to[:-L]
