@@ -144,6 +144,7 @@ class FitResult(NamedTuple):
         parameter  estimate  standard error  95 % interval  error / naive
         a          2  ...
         """
+        self._require_one()
         return report.summary(self)
 
     def _table(self):
