@@ -128,19 +128,23 @@ def _inverse_curvature(J, bend, T, seen):
     return (U * inverse[None, :]) @ U.T, jnp.any(flat[None, :] & (share > 1e-6), axis=1)
 
 
+def in_segments(x, sizes, segments):
+    """Of each leaf in the rows of x, raveled, its equal parts: (segments, rows, ...), the last filled up with zeros."""
+    parts = []
+    for leaf in jnp.split(x, np.cumsum(sizes)[:-1]):
+        if n := len(leaf):
+            length = -(-n // segments)
+            filled = jnp.pad(leaf, ((0, segments * length - n), *((0, 0),) * (leaf.ndim - 1)))
+            parts.append(filled.reshape(segments, length, *leaf.shape[1:]))
+    return parts
+
+
 def _clusters(J, r, sizes, segments, variance):
     """sum_g s_g s_g^T, for J^T J = 1: then J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T with A = J_g^T J_g."""
-    ends = np.cumsum(sizes)[:-1]
-    pieces = zip(jnp.split(J, ends), jnp.split(r, ends), strict=True)
     A, score = 0.0, 0.0
-    for J_leaf, r_leaf in pieces:
-        n, p = J_leaf.shape
-        if n:
-            length = -(-n // segments)
-            rows = jnp.pad(J_leaf, ((0, segments * length - n), (0, 0))).reshape(segments, length, p)
-            A = A + jnp.einsum("glp,glq->gpq", rows, rows)
-            r_rows = jnp.pad(r_leaf, (0, segments * length - n)).reshape(segments, length)
-            score = score + jnp.einsum("glp,gl->gp", rows, r_rows)
+    for rows, r_rows in zip(*(in_segments(x, sizes, segments) for x in (J, r)), strict=True):
+        A = A + jnp.einsum("glp,glq->gpq", rows, rows)
+        score = score + jnp.einsum("glp,gl->gp", rows, r_rows)
     share, U = jnp.linalg.eigh(A)
     alone = share > ALONE
     score = jnp.where(alone, 0, jnp.einsum("gpk,gp->gk", U, score) / jnp.sqrt(jnp.where(alone, 1, 1 - share)))
