@@ -176,6 +176,7 @@ def test_two_driven_modes_with_known_masses_have_their_stiffness_corrected():
         assert float(found.params[name]) == pytest.approx(float(fitted[name]), rel=1e-9)
 
 
+TURNING = hhtjax.System(jnp.ones(3), lambda q, v, t, params: -v)
 HANGING = {"g": 9.81, "c": 0.3}
 hanging = hhtjax.System(
     jnp.full(2, 2.0),
@@ -234,6 +235,21 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
             lambda: hhtjax.step_size_bias(spring, "hht", None, 0.1, q=jnp.zeros(1)),
             TypeError,
             "step_size_bias: `stepper` must be a stepper such as .* received 'hht'",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, jnp.zeros(1), correct="k"),
+            TypeError,
+            "step_size_bias: `correct` must be True, False or a pytree of them; received 'k'",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(hhtjax.FirstOrderSystem(lambda y, t, p: -y), hhtjax.hht(), None, 0.1, 1.0),
+            TypeError,
+            "step_size_bias: `system` must be a System or LinearSystem; received First",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(TURNING, hhtjax.hht(), None, 0.1, q=jnp.eye(3)),
+            NotImplementedError,
+            "step_size_bias: `q` has rotations",
         ),
         (
             lambda: hhtjax.step_size_bias(hanging, hhtjax.hht(), HANGING, 0.1, q=jnp.array([0.0, -0.6])),

@@ -22,6 +22,7 @@ from scipy.optimize import linear_sum_assignment
 from hhtjax.analysis.amplification import amplification_matrix, at_rest, eigenvalues
 from hhtjax.checks import require_number
 from hhtjax.description.presentation import all_known, between, shown
+from hhtjax.identification.arguments import require_prefix
 from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import Stepper, require_stepper
 from hhtjax.systems.sparse_system import require_dense
@@ -101,9 +102,9 @@ def step_size_bias(
         StepSizeWarning: params cannot follow. `refine` takes their bias out, from two fits or three.
 
     Raises:
-        TypeError, ValueError: dt is no positive number; q does not meet the constraint; `correct` with a dt in which a
-            mode does not oscillate.
-        NotImplementedError: a system with internal states.
+        TypeError, ValueError: an argument of a wrong kind; dt is no positive number; q does not meet the constraint;
+            `correct` with a dt in which a mode does not oscillate.
+        NotImplementedError: a system with internal states or rotations.
 
     References:
         Cook, Malkus, Plesha, Witt (2002), Sec. 11.13, for the period error of Newmark's method.
@@ -118,6 +119,9 @@ def step_size_bias(
     """
     require_number("step_size_bias", "dt", dt, lambda x: x > 0, "be positive")
     require_stepper("step_size_bias", stepper)
+    if not isinstance(system, (System, LinearSystem)):
+        raise TypeError(f"step_size_bias: `system` must be a System or LinearSystem; received {system!r}.")
+    _require_flags(correct, params)
     if system.internal is not None:
         raise NotImplementedError(
             "step_size_bias: `system` has internal states, which M, C and K cannot hold; `refine` takes the bias out."
@@ -149,6 +153,13 @@ def step_size_bias(
     return bias._replace(params=corrected)
 
 
+def _require_flags(correct, params):
+    require_prefix("step_size_bias", "correct", correct, params, "params")
+    for flag in jax.tree.leaves(correct):
+        if not isinstance(flag, (bool, np.bool_)):
+            raise TypeError(f"step_size_bias: `correct` must be True, False or a pytree of them; received {flag!r}.")
+
+
 def _is_driven(system, params, q, v, t, dt):
     """Whether the force at a state depends on the time."""
     v = jax.tree.map(jnp.zeros_like, q) if v is None else v
@@ -171,6 +182,8 @@ def _linear_part(system, params, q, v, t):
     M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
     K, C = (-D for D in jax.jacfwd(force, argnums=(0, 1))(q, v))
     M = jnp.diag(M) if M.ndim == 1 else M
+    if len(M) != q.size:
+        raise NotImplementedError("step_size_bias: `q` has rotations, whose displacements are no part of it.")
     if system.constraint is None:
         return M, C, K
 
