@@ -176,6 +176,7 @@ def test_two_driven_modes_with_known_masses_have_their_stiffness_corrected():
         assert float(found.params[name]) == pytest.approx(float(fitted[name]), rel=1e-9)
 
 
+TURNING = hhtjax.System(jnp.ones(3), lambda q, v, t, params: -v)
 HANGING = {"g": 9.81, "c": 0.3}
 hanging = hhtjax.System(
     jnp.full(2, 2.0),
@@ -201,6 +202,21 @@ def test_a_constraint_leaves_the_bias_of_the_minimal_form():
     assert np.min(np.abs(mu - np.exp(s * dt))) < 1e-9
 
 
+def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
+    """alpha = 0 turns a mode of w h into one of 2 arctan(w h/2): exp(2.2i) is nearest to what becomes of 3. Wilson's
+    method leaves no oscillation of the last."""
+    apart = hhtjax.System(jnp.ones(4), lambda q, v, t, params: -params * q)
+    wh = np.array([1.0, 1.02, 2.2, 3.0])
+    found = hhtjax.step_size_bias(apart, hhtjax.hht(alpha=0.0), jnp.asarray(wh**2), 1.0, q=jnp.zeros(4))
+    np.testing.assert_allclose(found.stiffness_bias, (wh / (2 * np.arctan(wh / 2))) ** 2 - 1, rtol=1e-9)
+    stiff = jnp.asarray([0.01, 1.0, 4.0, 2500.0])
+    np.testing.assert_array_equal(
+        np.isnan(hhtjax.step_size_bias(apart, hhtjax.wilson(), stiff, 1.0, q=jnp.zeros(4)).frequency), [0, 0, 0, 1]
+    )
+    with pytest.raises(ValueError, match=r"`dt` must let every mode oscillate, for `correct`; .* in which 1 of 4 do"):
+        hhtjax.step_size_bias(apart, hhtjax.wilson(), stiff, 1.0, q=jnp.zeros(4), correct=True)
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
@@ -219,6 +235,21 @@ def test_a_constraint_leaves_the_bias_of_the_minimal_form():
             lambda: hhtjax.step_size_bias(spring, "hht", None, 0.1, q=jnp.zeros(1)),
             TypeError,
             "step_size_bias: `stepper` must be a stepper such as .* received 'hht'",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, jnp.zeros(1), correct="k"),
+            TypeError,
+            "step_size_bias: `correct` must be True, False or a pytree of them; received 'k'",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(hhtjax.FirstOrderSystem(lambda y, t, p: -y), hhtjax.hht(), None, 0.1, 1.0),
+            TypeError,
+            "step_size_bias: `system` must be a System or LinearSystem; received First",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(TURNING, hhtjax.hht(), None, 0.1, q=jnp.eye(3)),
+            NotImplementedError,
+            "step_size_bias: `q` has rotations",
         ),
         (
             lambda: hhtjax.step_size_bias(hanging, hhtjax.hht(), HANGING, 0.1, q=jnp.array([0.0, -0.6])),

@@ -101,6 +101,22 @@ def test_backward_differences_have_their_characteristic_roots(name):
     assert 0.99 < radii(1e-3)[-1] < 1
 
 
+@pytest.mark.parametrize("name", CHARACTERISTIC)
+def test_the_analyses_are_of_backward_differences_and_not_of_their_starter(name):
+    """Oscillators with w h = 0.1, where a spurious root of Park's oscillates faster, and 1; y' = z y by BDF3."""
+    method = getattr(hhtjax, name)()
+    for W, damping in ((0.1, 0.0), (1.0, 0.02)):
+        roots = np.roots(CHARACTERISTIC[name](1.0, 2 * damping * W, W**2, 1.0))
+        rate = np.log(min(roots, key=lambda x: abs(x - np.exp(1j * W))))
+        assert hhtjax.analysis.spectral_radius(method, W, damping) == pytest.approx(max(abs(roots)), rel=1e-9)
+        assert hhtjax.analysis.damping_ratio(method, W, damping) == pytest.approx(-rate.real / abs(rate), rel=1e-6)
+        assert hhtjax.analysis.period_elongation(method, W, damping) == pytest.approx(W / abs(rate) - 1, rel=1e-6)
+    if name == "houbolt":
+        z = 0.2 + 1j
+        exact = np.abs(np.roots(HOUBOLT[1] - [z, 0, 0, 0])).max()
+        assert hhtjax.analysis.stability_region(method, np.array([z]))[0] == pytest.approx(exact, rel=1e-9)
+
+
 @pytest.mark.slow
 def test_order_with_a_mass_that_changes():
     assert slope("forced double pendulum", hhtjax.park()) == pytest.approx(2, abs=0.15)

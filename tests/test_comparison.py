@@ -9,7 +9,8 @@ from scipy import stats
 from test_uncertainty import coloured
 
 import hhtjax
-from hhtjax.identification.evidence import Residuals, chi_squared_tail, f_tail, whiteness
+from hhtjax.identification.evidence import Residuals, chi_squared_tail, f_tail, residuals_of, whiteness
+from hhtjax.identification.result import student
 
 N, RUNS = 1600, 300
 k = jnp.arange(float(N))
@@ -154,6 +155,8 @@ def test_tails_of_distributions_are_those_of_scipy():
         assert f_tail(x, q, n) == pytest.approx(stats.f.sf(x, q, n), rel=1e-9)
         assert chi_squared_tail(x, q) == pytest.approx(stats.chi2.sf(x, q), rel=1e-9)
     assert np.isnan(f_tail(1.0, 3, 0))
+    for degrees, level in ((1, 0.95), (2, 0.99), (16, 0.95), (17, 0.95), (31, 0.68)):
+        assert student(level, degrees) == pytest.approx(stats.t.ppf((1 + level) / 2, degrees), rel=1e-4)
 
 
 def test_white_noise_is_white_in_19_of_20_records():
@@ -165,6 +168,28 @@ def test_white_noise_is_white_in_19_of_20_records():
         assert np.mean([rho for rho, _, _ in found]) == pytest.approx(0.3 / 1.09 if name == "slow" else 0, abs=0.02)
     assert 0.02 <= share["white"] <= 0.09
     assert share["slow"] > 0.9
+
+
+def test_white_noise_with_gaps_is_white():
+    """A record with a hole, and one of which every second sample and a whole column are missing."""
+    rng, i = np.random.default_rng(0), np.arange(300)
+    hole, second = (i < 80) | (i > 250), np.stack([i % 2 == 0, i < 0], axis=1)
+    for present in (hole[:, None], second):
+        records = present * rng.normal(size=(300, *present.shape))
+        found = [whiteness(Residuals([""], [r], [r], [present]))[1] < 0.05 for r in records]
+        assert 0.02 <= np.mean(found) <= 0.09
+
+
+def test_records_are_no_samples_that_follow_one_another():
+    """More records than samples, each with noise that is slow in itself; nothing is compiled but the fit."""
+    noise = 0.1 * np.random.default_rng(0).normal(size=(60, 24)).cumsum(axis=1)
+    result = hhtjax.fit(
+        lambda p, start, r: p * COLUMNS["rest"][:24] + start - r, 1.0, records=noise, starts=np.zeros(60)
+    )
+    rho, p, _ = whiteness(residuals_of(result))
+    assert rho > 0.5
+    assert p < 1e-6
+    assert float(result.uncertainty.autocorrelated[0, 0]) > 1.5 * float(result.uncertainty.naive[0, 0])
 
 
 @pytest.mark.slow

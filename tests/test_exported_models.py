@@ -194,10 +194,16 @@ def test_single_precision(tmp_path):
 
 
 def test_names_come_from_the_keys(tmp_path):
-    """Pytrees of any shape, keys that C does not allow, and a model without params."""
+    """Pytrees of any shape, keys that C, C++ or <math.h> do not allow, and params of no numbers."""
     q0 = {"left arm": jnp.zeros((2, 2)), "if": jnp.ones(()), "3": [jnp.ones(1)]}
-    system = hhtjax.System(jnp.ones(6), lambda q, v, t, p: jax.tree.map(lambda x: -x, q))
-    model = export_c(system, hhtjax.rk4(), q0, q0, name="odd")
+    params = {"NAN": 0.5, "class": 1.5, "": 2.0, "empty": jnp.zeros(0)}
+
+    def force(q, v, t, p):
+        factor = p["NAN"] * p["class"] * p[""] - 0.5 + jnp.sum(p["empty"])
+        return jax.tree.map(lambda x: -factor * x, q)
+
+    model = export_c(hhtjax.System(jnp.ones(6), force), hhtjax.rk4(), q0, q0, params, name="odd")
+    assert sorted(field.name for field in model.params) == ["NAN_", "class_", "p"]
     names = {field.name: field.shape for field in model.state if field.name[0] == "q"}
     assert names == {"q_3_0": (1,), "q_if": (), "q_left_arm": (2, 2)}
     library = Library(model, tmp_path)

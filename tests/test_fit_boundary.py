@@ -70,6 +70,11 @@ def rooted(p):
             "missing samples the weight False",
         ),
         (
+            lambda: hhtjax.fit(rooted, -1.0, covariance=False, weights={"a": 1.0, "b": np.array([0.0, 1.0, 1.0])}),
+            ValueError,
+            r"`residuals` must be finite at params0; received nan at residuals\['b'\]\[1\] \(2 of 7 entries\)\.",
+        ),
+        (
             lambda: hhtjax.fit(rooted, 0.0, covariance=False),
             ValueError,
             "received a finite residual with a derivative that is not finite",

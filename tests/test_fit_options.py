@@ -132,7 +132,13 @@ def test_a_start_without_influence_is_no_best_one():
     def residuals(p):
         return jnp.where(p < 0, 0.1, p - 2.0 + jnp.array([1.0, -1.0, 1.0]))
 
-    assert float(hhtjax.multistart(residuals, jnp.array([-1.0, 1.0])).best.params) == pytest.approx(5 / 3)
+    found = hhtjax.multistart(residuals, jnp.array([-1.0, 1.0]))
+    assert float(found.best.params) == pytest.approx(5 / 3)
+    for question in (lambda x: x.standard_errors, lambda x: x.reason, lambda x: x.interval(), lambda x: x.summary()):
+        with pytest.raises(ValueError, match=r"FitResult: must be of one fit; this is a batch, of shape \(2,\)"):
+            question(found.all)
+    member = jax.tree.map(lambda x: x[1], found.all)
+    assert member.summary().splitlines()[2] == found.best.summary().splitlines()[2]
     with pytest.raises(ValueError, match="multistart: `residuals` must depend on params"):
         hhtjax.multistart(residuals, jnp.array([-1.0, -2.0]))
 
@@ -163,6 +169,15 @@ def test_many_parameters_take_an_optax_optimiser():
         ({"loss": "hubert"}, ValueError, "`loss` must be one of huber, soft_l1, cauchy, a function .* 'hubert'"),
         ({"prior": {"a": 1.0, "rate": None, "offset": None}}, TypeError, "`prior` must hold Gaussian.* received 1.0"),
         ({"prior": hhtjax.Gaussian(0.0, -1.0)}, ValueError, "`prior` must have a positive deviation; received -1.0"),
+        ({"prior": hhtjax.Gaussian(np.nan, 1.0)}, ValueError, "the mean in `prior` must be finite; received nan"),
+        ({"prior": hhtjax.Gaussian(0.0, "1")}, TypeError, "`prior` must have a real deviation; received '1'"),
+        (
+            {"prior": hhtjax.Gaussian(np.ones(2), 1.0)},
+            ValueError,
+            r"`prior` must have the shape of its parameter, \(\); received \(2,\)",
+        ),
+        ({"prior": {"a": None}}, ValueError, "`prior` must be a prefix of params0"),
+        ({"weights": [1.0] * 40}, ValueError, "`weights` must be a prefix of what `residuals` return"),
         ({"segments": 1}, ValueError, "`segments` must be an integer, 2 or more; received 1"),
     ],
 )

@@ -1,5 +1,7 @@
 """What a reader gets: the table, JSON and back, and answers to what-if questions, against refits."""
 
+from collections import namedtuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +40,16 @@ def test_summary_and_json(result):
     assert jax.tree.structure(again) == jax.tree.structure(result)
     jax.tree.map(np.testing.assert_array_equal, again, result)
     assert again.summary() == result.summary()
+    numbered = result._replace(params={1: result.params["a"], (2, "b"): result.params["rate"]})
+    assert FitResult.from_json(numbered.to_json()).params == numbered.params
+    with pytest.raises(
+        TypeError, match="to_json: `params` must be of dicts, lists, tuples and arrays; received a Mine"
+    ):
+        result._replace(params=namedtuple("Mine", "a")(1.0)).to_json()
+    with pytest.raises(ValueError, match="from_json: `text` must be what to_json wrote; received a part None"):
+        FitResult.from_json("{}")
+    surely = result._replace(uncertainty=jax.tree.map(jnp.zeros_like, result.uncertainty))
+    assert "largest correlation: +0.000 between a and rate" in surely.summary()
 
 
 @pytest.mark.slow
@@ -49,6 +61,9 @@ def test_profile_is_the_parabola_of_the_standard_error(result):
         hhtjax.identification.prediction_errors(lambda p: p["a"], bare)
     with pytest.raises(ValueError, match="profile: `result` must have a covariance"):
         hhtjax.identification.profile(residuals, bare, "rate", [1.0])
+    unknown = result.uncertainty._replace(cluster=jnp.diag(jnp.array([jnp.inf, 4.0])))
+    found = hhtjax.identification.prediction_errors(lambda p: (p["a"], p["rate"]), result._replace(uncertainty=unknown))
+    assert tuple(map(float, found)) == (np.inf, 2.0)
     values = float(result.params["rate"]) + sigma * np.array([-1.0, 0.0, 1.0])
     found = hhtjax.identification.profile(residuals, result, "rate", values)
     np.testing.assert_allclose(found.deviance, [1, 0, 1], atol=0.06)
@@ -70,3 +85,7 @@ def test_the_score_test_predicts_the_refit():
     assert found.statistic[0] > 10.8
     assert found.estimate[0] == pytest.approx(float(both.params[1]["kink"]), rel=0.2)
     assert found.cost_drop[0] == pytest.approx(1 - float(both.cost / without.cost), rel=0.2)
+    there = hhtjax.identification.score_test(lambda p, c: with_kink(p | {"a": p["a"] + c}, absent), without.params, 0.0)
+    assert (there.statistic[0], there.estimate[0]) == (0, 0)  # what is fitted already
+    twice = hhtjax.identification.score_test(lambda *x: [with_kink(*x)] * 2, without.params, absent)
+    assert twice.statistic[0] == pytest.approx(found.statistic[0])  # the same errors again say nothing more

@@ -55,6 +55,14 @@ def test_estimates_are_relative_to_estimate_or_truth(result):
         plot.estimates(result, truth={"a": 2.0, "b": 0.0})
 
 
+def test_a_gap_is_no_step_in_the_spectrum():
+    """Noise about 100, of which a quarter is missing: less of it is left, and nothing more."""
+    noise = np.random.default_rng(0).normal(size=512)
+    gap = np.where(np.arange(512) // 128 == 1, np.nan, 100 + noise)
+    frequency, density = plot.fit_against_data(np.arange(512.0), gap, np.zeros(512))[2].lines[0].get_data()
+    np.testing.assert_allclose(np.sum(density**2) * frequency[0], 0.75, rtol=0.2)
+
+
 def test_a_fit_on_one_page(result):
     axes = plot.fit_overview(result, 10.0, unit="V")
     np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), result.residual)
@@ -65,6 +73,8 @@ def test_a_fit_on_one_page(result):
     np.testing.assert_allclose(axes[3].images[0].get_array(), result.correlation)
     assert [ax.get_ylabel() for ax in result.plot(10.0).axes[:1]] == ["residual"]
     assert len(plot.fit_overview(result._replace(uncertainty=None))) == 2
+    records = result._replace(residual=result.residual.reshape(20, 10), starts=np.zeros(20))
+    np.testing.assert_array_equal(plot.fit_overview(records)[0].lines[0].get_ydata(), records.residual[0])
 
 
 def test_correlations_and_profile(result):

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -115,6 +116,10 @@ def test_a_damaged_chunk_is_written_again(whole):
     before = contents(whole)
     path = whole / "chunk-00003.npz"
     path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(
+        ValueError, match=r"load_sweep: .*chunk-00003\.npz is damaged .*: repeat the call of sweep_to_d"
+    ):
+        hhtjax.load_sweep(whole)
     write(whole)
     assert contents(whole) == before
     path.unlink()
@@ -122,6 +127,18 @@ def test_a_damaged_chunk_is_written_again(whole):
         hhtjax.load_sweep(whole)
     write(whole)
     assert contents(whole) == before
+
+
+def test_files_without_a_manifest_are_of_nobody_knows_which_sweep(whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "copy")
+    (folder / "manifest.json").write_text("{")
+    with pytest.raises(ValueError, match=r"load_sweep: .*manifest\.json is damaged"):
+        hhtjax.load_sweep(folder)
+    (folder / "manifest.json").unlink()
+    with pytest.raises(ValueError, match=r"sweep_to_disk: `folder` .* holds chunk-00000\.npz, but no manifest\.json"):
+        write(folder, k=4.5)
+    with pytest.raises(FileNotFoundError, match="load_sweep: `folder` must hold a sweep"):
+        hhtjax.load_sweep(folder)
 
 
 def test_a_full_disk_is_an_error_and_loses_nothing(whole, tmp_path):

@@ -68,7 +68,8 @@ def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Arra
 
     Args:
         system, stepper, params, dt: as in `simulate`.
-        state: a `State`, of `stepper.init` or `stepper.step`.
+        state: a `State`, of `stepper.init` or `stepper.step`; the first two steps of `houbolt` and `park` are those of
+            another method.
 
     Differentiable; goes under jit and vmap.
 
@@ -99,7 +100,7 @@ def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Arra
 def _amplification_matrix(system, stepper, state, params, dt):
     q, unravel_q = ravel_pytree(state.q)
     blocks = kinematics.layout(state.q, state.v)
-    x, unravel = ravel_pytree(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))
+    x, unravel = _floats(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))
 
     def step(state):
         return stepper.step(system, state, params, dt)[0]
@@ -109,18 +110,31 @@ def _amplification_matrix(system, stepper, state, params, dt):
         dq, _ = ravel_pytree(s.q)
         s1 = step(s._replace(t=state.t, q=unravel_q(kinematics.move(blocks, q, dq))))
         q1, _ = ravel_pytree(s1.q)
-        return ravel_pytree(s1._replace(t=None, q=_tangent_part(blocks, q1, dq)))[0]
+        return _floats(s1._replace(t=None, q=_tangent_part(blocks, q1, dq)))[0]
 
     h = jnp.asarray(dt).astype(q.dtype)
     weights = (1, h, h, h, h, 1) if isinstance(system, FirstOrderSystem) else (1, h, h**2, h**2, h**2, 1)
     weights = weights if state.z is None else (*weights, 1, h, h)
-    sizes = [ravel_pytree(field)[0].size for field in unravel(x)[1 : len(weights) + 1]]
+    sizes = [_floats(field)[0].size for field in unravel(x)[1 : len(weights) + 1]]
     scale = jnp.concatenate([jnp.full(n, w, q.dtype) for n, w in zip(sizes, weights, strict=True)])
     A = scale[:, None] * jax.jacfwd(increments)(x) / scale[None, :]
     if state.memory is None:
         return A
     kept = _carried(step, state, unravel(x))
     return A[kept][:, kept]
+
+
+def _floats(tree):
+    """All but counters as a vector, and the function that puts such a vector beside these."""
+    leaves, structure = jax.tree.flatten(tree)
+    at = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+    x, unravel = ravel_pytree([leaves[i] for i in at])
+
+    def beside(x):
+        changed = dict(zip(at, unravel(x), strict=True))
+        return structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(leaves)])
+
+    return x, beside
 
 
 def _tangent_part(blocks, q1, like):
@@ -136,8 +150,8 @@ def _carried(step, state, increments):
     """Which increments belong to fields that a step changes: (k,), bool."""
     jaxpr = jax.make_jaxpr(step)(state).jaxpr
     changed = [after is not before for before, after in zip(jaxpr.invars, jaxpr.outvars, strict=True)]
-    leaves = jax.tree.leaves(increments)
-    return np.concatenate([np.full(x.size, c) for x, c in zip(leaves, changed[1:], strict=True)])  # without t
+    fields = zip(jax.tree.leaves(increments), changed[1:], strict=True)  # without t
+    return np.concatenate([np.full(x.size, c) for x, c in fields if jnp.issubdtype(x.dtype, jnp.floating)])
 
 
 def oscillator_matrix(stepper, frequency, damping=0.0) -> jax.Array:
@@ -170,11 +184,19 @@ def oscillator_matrix(stepper, frequency, damping=0.0) -> jax.Array:
     return oscillator_tangent(stepper, *oscillator_params("oscillator_matrix", frequency, damping))
 
 
+def at_rest(system, stepper, zero, params, dt):
+    """The state of rest, behind the first steps of a stepper that begins with those of another method."""
+    v = None if isinstance(system, FirstOrderSystem) else zero
+    state = stepper.init(system, zero, v, params, dt)
+    for _ in range(stepper.first_steps):
+        state, _ = stepper.step(system, state, params, dt)
+    return state
+
+
 @jax.jit
 def oscillator_tangent(stepper, c, k):
     """A of the oscillator with damping c and stiffness k, at rest; h = 1."""
-    zero = jnp.zeros(1, c.dtype)
-    state = stepper.init(OSCILLATOR, zero, zero, (c, k), 1.0)
+    state = at_rest(OSCILLATOR, stepper, jnp.zeros(1, c.dtype), (c, k), 1.0)
     return amplification_matrix(OSCILLATOR, stepper, state, (c, k), dt=1.0)
 
 

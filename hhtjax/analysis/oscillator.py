@@ -8,6 +8,7 @@ from hhtjax.analysis.amplification import (
     OSCILLATOR,
     TEST_EQUATION,
     amplification_matrix,
+    at_rest,
     oscillator_params,
     oscillator_roots,
 )
@@ -16,9 +17,10 @@ from hhtjax.steppers.stepper import require_stepper
 
 
 def _principal_rate(caller, stepper, frequency, damping):
-    """log of the root that oscillates fastest; NaN where none oscillates."""
+    """log of the root that decays slowest, of those that oscillate; NaN where none does."""
     roots = oscillator_roots(caller, stepper, frequency, damping)
-    principal = jnp.take_along_axis(roots, jnp.argmax(roots.imag, axis=-1)[..., None], axis=-1)[..., 0]
+    slowest = jnp.argmax(jnp.where(roots.imag > 0, jnp.abs(roots), -1), axis=-1)
+    principal = jnp.take_along_axis(roots, slowest[..., None], axis=-1)[..., 0]
     return jnp.log(jnp.where(principal.imag > 0, principal, jnp.nan))
 
 
@@ -48,8 +50,8 @@ def spectral_radius(stepper, frequency, damping=0.0) -> jax.Array:
 def damping_ratio(stepper, frequency, damping=0.0) -> jax.Array:
     """The damping ratio that the discrete oscillator has, -Re(r)/|r| with r = log(principal eigenvalue).
 
-    For damping = 0 all of it is the method's. The principal eigenvalue is the one that oscillates fastest; NaN where
-    none oscillates, as with the strongly damping methods at large frequencies.
+    For damping = 0 all of it is the method's. Of the eigenvalues that oscillate the principal one decays slowest; NaN
+    where none oscillates, as with the strongly damping methods at large frequencies.
 
     Args:
         stepper, frequency, damping: as in `spectral_radius`.
@@ -167,7 +169,7 @@ def stability_region(stepper, z) -> jax.Array:
 @jax.jit
 def _stability_region(stepper, z):
     def radius(z):
-        state = stepper.init(TEST_EQUATION, jnp.zeros(2, z.real.dtype), None, z, 1.0)
+        state = at_rest(TEST_EQUATION, stepper, jnp.zeros(2, z.real.dtype), z, 1.0)
         A = amplification_matrix(TEST_EQUATION, stepper, state, z, dt=1.0)
         A = jax.lax.complex(A[::2, ::2], A[1::2, ::2])  # the real form of complex numbers, undone
         felt = jnp.arange(len(A)) == 0  # by y

@@ -186,13 +186,18 @@ def _unit_definitions(units):
     return f"\n  <UnitDefinitions>{names}\n  </UnitDefinitions>" if names else ""
 
 
+def _of_xml(x):
+    """A number as XML Schema has it."""
+    return {"inf": "INF", "-inf": "-INF", "nan": "NaN"}.get(repr(x), repr(x))
+
+
 def _variables(kind, found, struct, attributes, values, units, array=None):
     """(element of the description, place in C) of each number. array: that holds them all, in the place of a struct."""
     rows = []
     for field in found:
         for i, place in enumerate(field.places(struct or "")):
             index = f"[{','.join(str(j + 1) for j in np.unravel_index(i, field.shape))}]" if field.shape else ""
-            start = "" if values is None else f' start="{float(values[len(rows)])!r}"'
+            start = "" if values is None else f' start="{_of_xml(float(values[len(rows)]))}"'
             label = quoteattr(f"{field.name}{index}")
             if unit := units.get(field.name):
                 start += f" unit={quoteattr(unit).replace('{', '{{').replace('}', '}}')}"

@@ -6,11 +6,18 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-KEYWORDS = {
+RESERVED = {  # keywords of C and C++, and what compilers and the headers that are included define
     *("auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum"),
     *("extern", "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return"),
     *("short", "signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void"),
-    *("volatile", "while"),
+    *("volatile", "while", "_Alignas", "_Alignof", "_Atomic", "_Bool", "_Complex", "_Generic", "_Imaginary"),
+    *("_Noreturn", "_Static_assert", "_Thread_local", "alignas", "alignof", "and", "and_eq", "asm", "bitand", "bitor"),
+    *("bool", "catch", "char16_t", "char32_t", "char8_t", "class", "co_await", "co_return", "co_yield", "compl"),
+    *("concept", "const_cast", "consteval", "constexpr", "constinit", "decltype", "delete", "dynamic_cast", "explicit"),
+    *("export", "false", "friend", "mutable", "namespace", "new", "noexcept", "not", "not_eq", "nullptr", "operator"),
+    *("or", "or_eq", "private", "protected", "public", "reinterpret_cast", "requires", "static_assert", "static_cast"),
+    *("template", "this", "thread_local", "throw", "true", "try", "typeid", "typename", "typeof", "typeof_unqual"),
+    *("using", "virtual", "wchar_t", "xor", "xor_eq", "HUGE_VAL", "INFINITY", "NAN", "NULL", "linux", "unix"),
 }
 
 
@@ -48,8 +55,8 @@ def fields(tree, prefix, alone):
 def identifier(words):
     """Words, joined, as a name that C allows."""
     text = re.sub(r"\W", "_", "_".join(filter(None, words)), flags=re.ASCII)
-    text = f"p{text}" if text[:1].isdigit() else text
-    return f"{text}_" if text in KEYWORDS else text
+    text = text if re.match(r"[A-Za-z_]", text) else f"p{text}"
+    return f"{text}_" if text in RESERVED else text
 
 
 def units_of(caller, units, found):

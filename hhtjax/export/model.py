@@ -69,7 +69,7 @@ class Numbers:
 
     def __init__(self, caller, params, dtype):
         self.leaves, self.structure = jax.tree.flatten(params, is_leaf=_is_input)
-        self.places = [i for i, x in enumerate(self.leaves) if not _is_input(x) and _is_floating(x)]
+        self.places = [i for i, x in enumerate(self.leaves) if not _is_input(x) and _is_floating(x) and np.size(x)]
         self.input_places = [i for i, x in enumerate(self.leaves) if _is_input(x)]
         kept = self._with(dict.fromkeys(set(range(len(self.leaves))) - set(self.places)))
         self.fields = fields(kept, "", "params")

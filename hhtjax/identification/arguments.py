@@ -147,13 +147,31 @@ def check_prior(caller, prior, params0):
         entry = Gaussian(0.0, np.inf) if entry is None else entry
         if not isinstance(entry, Gaussian):
             raise TypeError(f"{caller}: `prior` must hold Gaussian(mean, deviation) or None; received {entry!r}.")
+        entry = Gaussian(*(jnp.asarray(y) if isinstance(y, (list, tuple)) else y for y in entry))
+        check_real(f"{caller}: the mean in `prior`", entry.mean)
+        if not is_real(entry.deviation):
+            raise TypeError(f"{caller}: `prior` must have a real deviation; received {entry.deviation!r}.")
         if is_concrete(entry.deviation) and not np.all(np.asarray(entry.deviation) > 0):
             raise ValueError(f"{caller}: `prior` must have a positive deviation; received {entry.deviation}.")
-        return jax.tree.map(
-            lambda x: Gaussian(*(jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape) for y in entry)), branch
-        )
+        return jax.tree.map(lambda x: Gaussian(*(spread(y, x) for y in entry)), branch)
 
+    def spread(y, x):
+        if jnp.shape(y) not in ((), x.shape):
+            raise ValueError(
+                f"{caller}: `prior` must have the shape of its parameter, {x.shape}; received {jnp.shape(y)}."
+            )
+        return jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape)
+
+    require_prefix(caller, "prior", prior, params0, "params0", is_prior)
     return jax.tree.map(fill, prior, params0, is_leaf=is_prior)
+
+
+def require_prefix(caller, name, prefix, tree, of, is_leaf=None):
+    """An error unless `prefix` has an entry for each leaf of `tree`, which is `of` something, or for whole branches."""
+    try:
+        jax.tree.map(lambda *_: None, prefix, tree, is_leaf=is_leaf)
+    except ValueError as error:
+        raise ValueError(f"{caller}: `{name}` must be a prefix of {of}: {error}") from None
 
 
 def check_records(caller, records, starts, prior, optimizer):
@@ -215,6 +233,7 @@ def spread_weights(caller, weights, shapes, name="weights"):
 
         return jax.tree.map(lambda leaf: one(leaf).astype(leaf.dtype), branch)
 
+    require_prefix(caller, name, weights, shapes, "what `residuals` return")
     return jax.tree.leaves(jax.tree.map(spread, weights, shapes))
 
 
@@ -241,9 +260,13 @@ def check_real(where, leaf):
         raise ValueError(f"{where} must be finite; received {leaf}.")
 
 
-def first_bad(residual):
-    """Words for the entries of a residual that are not finite."""
-    values = [(path, np.asarray(leaf)) for path, leaf in jax.tree_util.tree_leaves_with_path(residual)]
+def first_bad(residual, weights):
+    """Words for the entries of a residual that are not finite, and not declared missing."""
+    present = spread_weights("fit", weights, residual)
+    values = [
+        (path, np.where(np.asarray(w) == 0, 0, np.asarray(leaf)))
+        for (path, leaf), w in zip(jax.tree_util.tree_leaves_with_path(residual), present, strict=True)
+    ]
     total = sum(x.size for _, x in values)
     bad = sum(int(np.sum(~np.isfinite(x))) for _, x in values)
     for path, x in values:

@@ -17,10 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from scipy.optimize import linear_sum_assignment
 
-from hhtjax.analysis import amplification_matrix
+from hhtjax.analysis.amplification import amplification_matrix, at_rest, eigenvalues
 from hhtjax.checks import require_number
 from hhtjax.description.presentation import all_known, between, shown
+from hhtjax.identification.arguments import require_prefix
 from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import Stepper, require_stepper
 from hhtjax.systems.sparse_system import require_dense
@@ -28,6 +30,7 @@ from hhtjax.systems.system import LinearSystem, System, require_smooth
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
 ON_CONSTRAINT = 1e-6  # largest residual of it
+LOST = 1e3  # distance of an eigenvalue of the steps from that of a mode which does not oscillate in them
 DRIVEN = 64  # steps from t, in which a force that depends on the time has changed
 
 
@@ -75,9 +78,9 @@ def step_size_bias(
     """By how much stiffness and damping are off that were fitted through steps of dt.
 
     The system is linearised about (q, v, t0): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
-    eigenvalues s' is compared with the s = log(mu)/dt of the nearest eigenvalue mu of the real step's amplification
-    matrix: s is what the data have. A constraint is linearised too, and M, C, K, with the stiffness of its forces, are
-    those of the motions that it leaves.
+    eigenvalues s' is compared with the s = log(mu)/dt of the eigenvalue mu of the real step's amplification matrix that
+    belongs to it: s is what the data have. A constraint is linearised too, and M, C, K, with the stiffness of its
+    forces, are those of the motions that it leaves.
 
     Args:
         system, stepper, dt: what the parameters were fitted through.
@@ -93,14 +96,15 @@ def step_size_bias(
             or for whole branches: False for what was not fitted, such as a known mass.
 
     Returns:
-        A `ModeBias`.
+        A `ModeBias`; NaN for a mode that does not oscillate in the steps.
 
     Warns:
         StepSizeWarning: params cannot follow. `refine` takes their bias out, from two fits or three.
 
     Raises:
-        TypeError, ValueError: dt is no positive number; q does not meet the constraint.
-        NotImplementedError: a system with internal states.
+        TypeError, ValueError: an argument of a wrong kind; dt is no positive number; q does not meet the constraint;
+            `correct` with a dt in which a mode does not oscillate.
+        NotImplementedError: a system with internal states or rotations.
 
     References:
         Cook, Malkus, Plesha, Witt (2002), Sec. 11.13, for the period error of Newmark's method.
@@ -115,6 +119,9 @@ def step_size_bias(
     """
     require_number("step_size_bias", "dt", dt, lambda x: x > 0, "be positive")
     require_stepper("step_size_bias", stepper)
+    if not isinstance(system, (System, LinearSystem)):
+        raise TypeError(f"step_size_bias: `system` must be a System or LinearSystem; received {system!r}.")
+    _require_flags(correct, params)
     if system.internal is not None:
         raise NotImplementedError(
             "step_size_bias: `system` has internal states, which M, C and K cannot hold; `refine` takes the bias out."
@@ -131,6 +138,11 @@ def step_size_bias(
     bias = ModeBias(w, -np.real(s) / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
     if correct is False:
         return bias
+    if np.any(np.isnan(w)):
+        raise ValueError(
+            f"step_size_bias: `dt` must let every mode oscillate, for `correct`; received {dt}, in which "
+            f"{np.sum(np.isnan(w))} of {len(w)} do not."
+        )
 
     def linear_part(params):
         return _linear_part(system, params, q, v, t0)
@@ -139,6 +151,13 @@ def step_size_bias(
     free = len(s) == 1 and not _is_driven(system, params, q, v, t0, dt)
     corrected = prewarped(params, correct, linear_part, _rates_of_equations, target, matrices[2], free)
     return bias._replace(params=corrected)
+
+
+def _require_flags(correct, params):
+    require_prefix("step_size_bias", "correct", correct, params, "params")
+    for flag in jax.tree.leaves(correct):
+        if not isinstance(flag, (bool, np.bool_)):
+            raise TypeError(f"step_size_bias: `correct` must be True, False or a pytree of them; received {flag!r}.")
 
 
 def _is_driven(system, params, q, v, t, dt):
@@ -163,6 +182,8 @@ def _linear_part(system, params, q, v, t):
     M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
     K, C = (-D for D in jax.jacfwd(force, argnums=(0, 1))(q, v))
     M = jnp.diag(M) if M.ndim == 1 else M
+    if len(M) != q.size:
+        raise NotImplementedError("step_size_bias: `q` has rotations, whose displacements are no part of it.")
     if system.constraint is None:
         return M, C, K
 
@@ -194,8 +215,24 @@ def _rates_of_equations(M, C, K):
 
 def _rates_of_steps(stepper, dt, M, C, K):
     """log(mu)/dt of the steps, in the order of the equations' eigenvalues."""
-    linear, rest = LinearSystem(M, C, K), jnp.zeros(len(M))
-    state = stepper.init(linear, rest, rest, None, dt)
+    linear = LinearSystem(M, C, K)
+    state = at_rest(linear, stepper, jnp.zeros(len(M)), None, dt)
     mu = np.linalg.eigvals(np.asarray(amplification_matrix(linear, stepper, state, dt=dt)))
     mu = mu[mu.imag > 0]
-    return np.array([np.log(mu[np.argmin(np.abs(mu - np.exp(s * dt)))]) / dt for s in _rates_of_equations(M, C, K)])
+    s = _rates_of_equations(M, C, K)
+    away = np.abs(mu[None, :] - _as_if_alone(stepper, s * dt)[:, None])
+    found = np.full(len(s), np.nan, complex)
+    modes, at = linear_sum_assignment(np.where(np.isnan(away), LOST, away))
+    found[modes] = np.where(np.isnan(away[modes, at]), np.nan, np.log(mu[at]) / dt)
+    return found
+
+
+def _as_if_alone(stepper, s):
+    """Of an oscillator with the eigenvalue s, and steps of 1, what the steps make of exp(s); NaN without oscillation.
+
+    By these the modes of a system are told apart, whose exp(s) may be nearer to what the steps make of another.
+    """
+    mu = np.asarray(eigenvalues(stepper, -2 * s.real, np.abs(s) ** 2))
+    away = np.where(mu.imag > 0, np.abs(mu - np.exp(s)[:, None]), np.inf)
+    nearest = np.argmin(away, axis=1)[:, None]
+    return np.where(np.isinf(away.min(axis=1)), np.nan, np.take_along_axis(mu, nearest, axis=1)[:, 0])

@@ -13,12 +13,13 @@ import numpy as np
 from jax.scipy.special import betainc, gammaincc
 
 from hhtjax.identification.arguments import spread_weights
+from hhtjax.identification.sandwich import time_axis
 
 LAGS = 20  # of the test for white residuals
 
 
 class Residuals(NamedTuple):
-    """Leaves of the residuals, each (entries along its longest axis, others): as returned, weighted with 0 where they
+    """Leaves of the residuals, each (entries along its `time_axis`, others): as returned, weighted with 0 where they
     are missing, and where they are present."""
 
     names: list
@@ -33,7 +34,7 @@ def residuals_of(result) -> Residuals:
     names, plain, weighted, present = [], [], [], []
     for (path, leaf), weight in zip(jax.tree_util.tree_leaves_with_path(result.residual), weights, strict=True):
         r, w = np.asarray(leaf, float), np.asarray(weight, float)
-        axis = int(np.argmax(r.shape)) if r.ndim else 0
+        axis = time_axis(r.shape, result.starts is not None)
         r, w = (np.moveaxis(np.atleast_1d(x), axis, 0) for x in (r, w))
         r, w = (x.reshape(len(x), -1) for x in (r, w))
         names.append(jax.tree_util.keystr(path, simple=True, separator="."))
@@ -69,20 +70,24 @@ def whiteness(residuals: Residuals):
     """Autocorrelation at lag 1, and p value and lags of Ljung and Box's test that there is none; None if too few.
 
     Q = n (n + 2) sum_k rho_k^2/(n - k), k = 1 .. lags, is chi-squared with as many degrees of freedom as there are lags
-    (Biometrika 65, 1978, 297-303). The Q of all columns are added.
+    (Biometrika 65, 1978, 297-303); n - k is the number of pairs, of samples that are present. The Q of all columns are
+    added.
     """
     lags = min(LAGS, min(len(r) for r in residuals.weighted) // 5) if residuals.weighted else 0
     if lags < 1:
         return None
     Q, degrees, products, energy = 0.0, 0, 0.0, 0.0
     for r, present in zip(residuals.weighted, residuals.present, strict=True):
-        r = np.where(present, r - r.sum(axis=0) / np.maximum(present.sum(axis=0), 1), 0)
-        square, n = np.sum(r**2, axis=0), len(r)
-        lagged = np.array([np.sum(r[k:] * r[:-k], axis=0) for k in range(1, lags + 1)])
+        n = present.sum(axis=0)
+        r = np.where(present, r - r.sum(axis=0) / np.maximum(n, 1), 0)
+        square = np.sum(r**2, axis=0)
+        lagged, pairs = (np.array([np.sum(x[k:] * x[:-k], axis=0) for k in range(1, lags + 1)]) for x in (r, present))
         rho = lagged / np.where(square > 0, square, 1)
-        Q += float(np.sum(n * (n + 2) * rho**2 / (n - np.arange(1, lags + 1))[:, None]))
-        degrees += lags * r.shape[1]
+        Q += float(np.sum(n * (n + 2) * rho**2 / np.maximum(pairs, 1)))
+        degrees += np.sum(pairs > 0)
         products, energy = products + lagged[0].sum(), energy + square.sum()
+    if not degrees:
+        return None
     return float(products / energy) if energy else 0.0, chi_squared_tail(Q, degrees), lags
 
 

@@ -214,7 +214,7 @@ def _finished(caller, result, weights):
     if code == BAD_START:
         missing = "" if weights is not True else "; give missing samples the weight False"
         raise ValueError(
-            f"{caller}: `residuals` must be finite at params0; received {first_bad(result.residual)}{missing}."
+            f"{caller}: `residuals` must be finite at params0; received {first_bad(result.residual, weights)}{missing}."
         )
     if code == NO_INFLUENCE:
         raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")

@@ -16,7 +16,7 @@ from hhtjax.identification.gauss_newton import with_jacobian
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
-from hhtjax.identification.sandwich import SEGMENTS
+from hhtjax.identification.sandwich import SEGMENTS, in_segments
 
 
 @shown
@@ -29,6 +29,8 @@ class Score(NamedTuple):
             10.8 the 99.9 % point.
         cost_drop: share of the cost that it would take away.
         estimate: one Gauss-Newton step.
+
+    All are 0 for a term that the fitted parameters make up for.
     """
 
     names: list
@@ -76,13 +78,13 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     )
     both, unravel = ravel_pytree((params, candidates))
     p = ravel_pytree(params)[0].size
+    sizes = [x.size for x in jax.tree.leaves(jax.eval_shape(lambda x: residuals(*thaw(unravel(x))), both))]
     r, J = with_jacobian(lambda x: ravel_pytree(residuals(*thaw(unravel(x))))[0], both)
     Q, _ = jnp.linalg.qr(J[:, :p])
     X = J[:, p:] - Q @ (Q.T @ J[:, p:])
-    length = -(-r.size // segments)
-    scores = (
-        jnp.pad(X * r[:, None], ((0, segments * length - r.size), (0, 0))).reshape(segments, length, -1).sum(axis=1)
-    )
+    rounding = 10 * len(r) * float(jnp.finfo(r.dtype).eps) * jnp.linalg.norm(J[:, p:], axis=0)
+    X = jnp.where(jnp.linalg.norm(X, axis=0) > rounding, X, 0)  # else the fitted parameters do all that it does
+    scores = sum(part.sum(axis=1) for part in in_segments(X * r[:, None], sizes, segments))
     total, square = scores.sum(axis=0), jnp.sum(X**2, axis=0)
     variance = jnp.sum(scores**2, axis=0)
     return Score(
@@ -178,7 +180,7 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
         noise: standard deviation of a new measurement's noise.
 
     Returns:
-        Numbers and arrays like what predict returns.
+        Numbers and arrays like what predict returns; inf where a parameter matters that the fit left undetermined.
 
     Raises:
         ValueError: a fit without covariance.
@@ -194,4 +196,7 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
     shapes = jax.eval_shape(lambda x: predict(thaw(unravel(x))), x)
     _, unravel_output = ravel_pytree(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
     J = jax.jacfwd(lambda x: ravel_pytree(predict(thaw(unravel(x))))[0])(x)
-    return unravel_output(jnp.sqrt(jnp.einsum("ip,pq,iq->i", J, result.covariance, J) + noise**2))
+    unknown = jnp.isinf(jnp.diagonal(result.covariance))
+    known = jnp.einsum("ip,pq,iq->i", J, jnp.where(unknown, 0, result.covariance), J)
+    variance = jnp.where(jnp.any(unknown[None, :] & (J != 0), axis=1), jnp.inf, known)
+    return unravel_output(jnp.sqrt(variance + noise**2))

@@ -55,7 +55,8 @@ def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
     present = np.full(y.shape, True) if present is None else np.asarray(present, bool)
     if t.ndim != 1 or not (len(t) == len(y) == len(present)) or present.shape != y.shape:
         raise ValueError(
-            f"windows: `t`, `y` and `present` must have equal lengths; received {t.shape}, {y.shape}, {present.shape}."
+            "windows: `t`, `y` and `present` must have equal lengths, and `present` the shape of y; received "
+            f"{t.shape}, {y.shape}, {present.shape}."
         )
     falls = np.flatnonzero(np.diff(t) <= 0)
     if not np.all(np.isfinite(t)) or falls.size:
@@ -93,6 +94,7 @@ def wrap_angle(angle: Any) -> Any:
     >>> round(float(wrap_angle(6.0)), 4)                                          # 6 - 2 pi
     -0.2832
     """
+    angle = jnp.asarray(angle)
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
 
 
@@ -119,7 +121,7 @@ def measure(solution: Solution, times: Any, gain: Any = 1.0, offset: Any = 0.0, 
     >>> float(measure(run, jnp.array([0.8]), gain=2.0, offset=0.5, delay=0.3)[0, 0].round(6))
     1.5
     """
-    q = interpolate(solution, jnp.maximum(times - delay, solution.t[0])).q
+    q = interpolate(solution, jnp.maximum(jnp.asarray(times) - delay, solution.t[0])).q
 
     def like_q(x):
         return jax.tree.map(lambda _: x, q) if jax.tree.structure(x) != jax.tree.structure(q) else x

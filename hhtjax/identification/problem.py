@@ -101,7 +101,7 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
     if options.covariance:
         segments = count_segments(found.sizes, options.segments)
         J = found.J / coordinates.slope(found.x)[None, :]
-        tau = variance_inflation(found.leaves)
+        tau = variance_inflation(found.leaves, data.records is not None)
         believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau)
     ended = found.residual, found.cost, found.history, found.iterations, found.code
     params, last = freeze(coordinates.params(found.x)), (found.starts, data.weights, found.choices)

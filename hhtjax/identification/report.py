@@ -112,10 +112,11 @@ def _about_estimates(result, names):
     if unknown:
         remarks.append(f"undetermined: {', '.join(unknown)}: {why}")
     if np.sum(result.free) - len(unknown) > 1:
-        R = np.triu(np.asarray(result.correlation), 1)
-        pairs = np.argsort(-np.abs(R), axis=None)[: max(1, min(MOST_PAIRS, int(np.sum(np.abs(R) > CLOSE))))]
-        rows, columns = np.unravel_index(pairs, R.shape)
-        together = zip(rows, columns, strict=True)
+        R = np.asarray(result.correlation)
+        rows, columns = np.triu_indices(len(R), 1)
+        size = np.abs(R[rows, columns])
+        pairs = np.argsort(-size)[: max(1, min(MOST_PAIRS, int(np.sum(size > CLOSE))))]
+        together = zip(rows[pairs], columns[pairs], strict=True)
         found = [f"{R[i, j]:+.3f} between {names[i]} and {names[j]}" for i, j in together]
         remarks.append(f"largest correlation{'s' * (len(found) > 1)}: {', '.join(found)}")
     s = np.asarray(believed.singular_values)
@@ -136,7 +137,11 @@ def encode(x: Any) -> Any:
     if isinstance(x, tf.Transform):
         return {"transform": next(name for name, T in TRANSFORMS.items() if T is x)}
     if isinstance(x, dict):
+        if not all(isinstance(name, str) for name in x):
+            return {"items": [[encode(name), encode(y)] for name, y in x.items()]}
         return {"dict": {name: encode(y) for name, y in x.items()}}
+    if (is_dataclass(x) or hasattr(x, "_fields")) and not type(x).__module__.startswith("hhtjax."):
+        raise TypeError(f"to_json: `params` must be of dicts, lists, tuples and arrays; received a {type(x).__name__}.")
     if is_dataclass(x):
         return {type(x).__name__: {field.name: encode(getattr(x, field.name)) for field in fields(x)}}
     if names := getattr(x, "_fields", None):
@@ -150,14 +155,18 @@ def decode(x, named) -> Any:
     """The inverse of `encode`; named: the classes of named tuples and steppers, by name."""
     if not isinstance(x, dict):
         return x
-    kind, content = next(iter(x.items()))
+    kind, content = next(iter(x.items()), (None, None))
     if kind == "array":
         return jnp.asarray(np.asarray(content, x["dtype"]))
     if kind == "bounded":
         return tf.bounded(*content)
     if kind == "transform":
         return TRANSFORMS[content]
+    if kind == "items":
+        return {decode(name, named): decode(y, named) for name, y in content}
     if kind in ("list", "tuple"):
         return (list if kind == "list" else tuple)(decode(y, named) for y in content)
+    if kind != "dict" and kind not in named:
+        raise ValueError(f"from_json: `text` must be what to_json wrote; received a part {kind!r}.")
     values = {name: decode(y, named) for name, y in content.items()}
     return values if kind == "dict" else named[kind](**values)

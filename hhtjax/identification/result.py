@@ -1,6 +1,7 @@
 """What `fit` returns."""
 
 import json
+import math
 import statistics
 from typing import Any, NamedTuple
 
@@ -10,12 +11,14 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number
-from hhtjax.description import freeze, thaw
+from hhtjax.description import freeze, is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.progress import COST, GRADIENT, REASONS, STEP, History
 from hhtjax.identification.sandwich import Uncertainty, correlation
+
+FEW = 16  # degrees of freedom
 
 
 @shown
@@ -64,13 +67,22 @@ class FitResult(NamedTuple):
     @property
     def reason(self) -> str:
         """Why it stopped, in words."""
+        self._require_one()
         return REASONS[int(self.code)]
 
     @property
     def free(self) -> np.ndarray:
         """Whether each entry of ravel_pytree(params) was fitted, (p,)."""
+        self._require_one()
         leaves = zip(self.transforms, jax.tree.leaves(freeze(self.params)), strict=True)
         return np.concatenate([np.full(np.size(x), T is not tf.fixed) for T, x in leaves])
+
+    def _require_one(self):
+        if jnp.ndim(self.code):
+            raise ValueError(
+                f"FitResult: must be of one fit; this is a batch, of shape {jnp.shape(self.code)}. Its member i is "
+                "jax.tree.map(lambda x: x[i], result)."
+            )
 
     @property
     def covariance(self) -> Any:
@@ -110,7 +122,7 @@ class FitResult(NamedTuple):
         require_number("interval", "level", level, lambda x: 0 < x < 1, "lie between 0 and 1")
         if self.uncertainty is None:
             raise ValueError("interval: the fit was made with covariance=False.")
-        t = _student(level, self.segments - 1 if self.uncertainty.cluster is not None else None)
+        t = student(level, self.segments - 1 if self.uncertainty.cluster is not None else None)
         leaves, structure = jax.tree.flatten(freeze(self.params))
         errors = jax.tree.leaves(freeze(self.standard_errors))
         ends = [_ends(T, p, t * e) for T, p, e in zip(self.transforms, leaves, errors, strict=True)]
@@ -132,6 +144,7 @@ class FitResult(NamedTuple):
         parameter  estimate  standard error  95 % interval  error / naive
         a          2  ...
         """
+        self._require_one()
         return report.summary(self)
 
     def _table(self):
@@ -165,12 +178,31 @@ def _ends(T, p, reach):
     return T.parameter(x - reach / slope, one), T.parameter(x + reach / slope, one)
 
 
-def _student(level, degrees):
-    """Two-sided quantile of Student's t, by Cornish and Fisher's expansion about the normal one (None: normal)."""
+def student(level, degrees):
+    """Two-sided quantile of Student's t, by Cornish and Fisher's expansion about the normal one (None: normal); of few
+    degrees of freedom, where the expansion is far off, by bisection."""
     z = statistics.NormalDist().inv_cdf((1 + level) / 2)
     if degrees is None:
         return z
     first = (z**3 + z) / 4
     second = (5 * z**5 + 16 * z**3 + 3 * z) / 96
     third = (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384
-    return z + first / degrees + second / degrees**2 + third / degrees**3
+    xp = np if is_concrete(degrees) else jnp
+    few = xp.asarray([_student_of_few(level, n) for n in range(1, FEW + 1)])
+    many = z + first / degrees + second / degrees**2 + third / degrees**3
+    return xp.where(degrees > FEW, many, few[xp.minimum(degrees, FEW) - 1])
+
+
+def _student_of_few(level, degrees):
+    """The t with P(|t'| < t) = level, a finite sum of powers of cos(angle) for t = sqrt(degrees) tan(angle)
+    (Abramowitz and Stegun 1964, 26.7.3 and 26.7.4)."""
+    odd, lower, upper = degrees % 2, 0.0, math.pi / 2
+    for _ in range(60):
+        angle = (lower + upper) / 2
+        term, total = math.cos(angle) ** odd, 0.0
+        for k in range(2 + odd, degrees + 1, 2):
+            total += term
+            term *= math.cos(angle) ** 2 * (k - 1) / k
+        within = 2 / math.pi * (angle + math.sin(angle) * total) if odd else math.sin(angle) * total
+        lower, upper = (angle, upper) if within < level else (lower, angle)
+    return math.sqrt(degrees) * math.tan(lower)

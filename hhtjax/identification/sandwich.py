@@ -128,19 +128,23 @@ def _inverse_curvature(J, bend, T, seen):
     return (U * inverse[None, :]) @ U.T, jnp.any(flat[None, :] & (share > 1e-6), axis=1)
 
 
+def in_segments(x, sizes, segments):
+    """Of each leaf in the rows of x, raveled, its equal parts: (segments, rows, ...), the last filled up with zeros."""
+    parts = []
+    for leaf in jnp.split(x, np.cumsum(sizes)[:-1]):
+        if n := len(leaf):
+            length = -(-n // segments)
+            filled = jnp.pad(leaf, ((0, segments * length - n), *((0, 0),) * (leaf.ndim - 1)))
+            parts.append(filled.reshape(segments, length, *leaf.shape[1:]))
+    return parts
+
+
 def _clusters(J, r, sizes, segments, variance):
     """sum_g s_g s_g^T, for J^T J = 1: then J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T with A = J_g^T J_g."""
-    ends = np.cumsum(sizes)[:-1]
-    pieces = zip(jnp.split(J, ends), jnp.split(r, ends), strict=True)
     A, score = 0.0, 0.0
-    for J_leaf, r_leaf in pieces:
-        n, p = J_leaf.shape
-        if n:
-            length = -(-n // segments)
-            rows = jnp.pad(J_leaf, ((0, segments * length - n), (0, 0))).reshape(segments, length, p)
-            A = A + jnp.einsum("glp,glq->gpq", rows, rows)
-            r_rows = jnp.pad(r_leaf, (0, segments * length - n)).reshape(segments, length)
-            score = score + jnp.einsum("glp,gl->gp", rows, r_rows)
+    for rows, r_rows in zip(*(in_segments(x, sizes, segments) for x in (J, r)), strict=True):
+        A = A + jnp.einsum("glp,glq->gpq", rows, rows)
+        score = score + jnp.einsum("glp,gl->gp", rows, r_rows)
     share, U = jnp.linalg.eigh(A)
     alone = share > ALONE
     score = jnp.where(alone, 0, jnp.einsum("gpk,gp->gk", U, score) / jnp.sqrt(jnp.where(alone, 1, 1 - share)))
@@ -149,16 +153,21 @@ def _clusters(J, r, sizes, segments, variance):
     return score.T @ score + jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U)
 
 
-def variance_inflation(leaves):
-    """tau >= 1 of weighted residual leaves, each along its longest axis of N entries, with L = sqrt(N).
+def time_axis(shape, of_records):
+    """The longest axis, along which residuals follow one another; records, on the first axis, do not."""
+    first = int(of_records and len(shape) > 1)
+    return first + int(np.argmax(shape[first:])) if shape else 0
+
+
+def variance_inflation(leaves, of_records=False):
+    """tau >= 1 of weighted residual leaves, each along its `time_axis` of N entries, with L = sqrt(N).
 
     The sum over lags is sum_w (sum of r in w)^2/(L sum r^2) over all windows w of L entries, the ends padded with 0.
     """
     energy, sums = 0.0, 0.0
     for r in leaves:
         if r.size:
-            axis = int(np.argmax(r.shape)) if r.ndim else 0
-            r = jnp.moveaxis(jnp.atleast_1d(r), axis, 0)
+            r = jnp.moveaxis(jnp.atleast_1d(r), time_axis(r.shape, of_records), 0)
             L = math.isqrt(r.shape[0])
             sums_to = jnp.cumsum(jnp.pad(r, ((L, L - 1), *((0, 0),) * (r.ndim - 1))), axis=0)
             window = sums_to[L:] - sums_to[:-L]

@@ -23,12 +23,12 @@ def fit_overview(
 ) -> Any:
     """What a fit leaves over, in time and frequency, and below it estimates and correlations, where it has any.
 
-    The residual is that of the first channel, as in `FitResult.residual`; its spectrum that of
-    `hhtjax.plot.fit_against_data`. Where the parameters cannot be drawn as in `hhtjax.plot.estimates`, because the
-    estimate is 0, they are left out there.
+    The residual is that of the first channel, of the first record where there are many, as in `FitResult.residual`; its
+    spectrum that of `hhtjax.plot.fit_against_data`. Where the parameters cannot be drawn as in
+    `hhtjax.plot.estimates`, because the estimate is 0, they are left out there.
 
     Args:
-        result: a `FitResult` of one record, whose residuals have time as their first axis, 8 of them or more.
+        result: a `FitResult`, whose residuals (of each record) have time as their first axis, 8 of them or more.
         sampling_rate: residuals in a unit of time.
         unit: of the residual. time_unit, frequency_unit: as in `hhtjax.plot.fit_against_data`.
 
@@ -68,6 +68,7 @@ def fit_overview(
 def _first_channel(result):
     """The residual over time, (N,)."""
     leaf = np.asarray(jax.tree.leaves(result.residual)[0], float)
+    leaf = leaf if result.starts is None else leaf[0]
     residual = leaf.reshape(leaf.shape[0], -1)[:, 0] if leaf.ndim else leaf.reshape(1)
     if len(residual) < 8:
         raise ValueError(f"fit_overview: `result` must have 8 residuals or more; received {len(residual)}.")

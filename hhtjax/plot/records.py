@@ -32,7 +32,7 @@ def fit_against_data(
 
     Args:
         times: (N,), at equal distances, N >= 8.
-        measured, simulated: (N,), in one unit; NaN where nothing was measured, which counts as 0 in the spectra.
+        measured, simulated: (N,), in one unit; NaN where nothing was measured, which counts as the mean in the spectra.
         unit, ylabel: of the output, and its name.
         time_unit: of times. frequency_unit: one over that.
         show: (first, last), the part of the time that is drawn; spectra are of all.
@@ -113,7 +113,8 @@ def _record(times, measured, simulated):
 
 def _spectrum(values, rate):
     """Frequencies, and roots of the power spectral density, by Welch's method."""
-    values = np.where(np.isfinite(values), values, 0.0)
+    there = np.isfinite(values)
+    values = np.where(there, values, np.mean(values[there]) if there.any() else 0.0)
     length = 2 ** int(np.log2(max(8, len(values) // 2)))
     power, frequency = mlab.psd(values, NFFT=length, Fs=rate, noverlap=length // 2, detrend="mean")
     return np.asarray(frequency), np.sqrt(power)

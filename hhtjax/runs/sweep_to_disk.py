@@ -115,7 +115,8 @@ def load_sweep(folder) -> dict[str, np.ndarray]:
         Arrays by name: "t", "q", "v", "dt", "failure.step", ...; their first axis is that of the members.
 
     Raises:
-        FileNotFoundError: a chunk is missing, because the sweep is not finished.
+        FileNotFoundError: the folder holds no sweep, or a chunk is missing, because the sweep is not finished.
+        ValueError: a file is damaged.
 
     >>> import hhtjax
     >>> hhtjax.load_sweep("no such folder")  # doctest: +IGNORE_EXCEPTION_DETAIL
@@ -123,7 +124,12 @@ def load_sweep(folder) -> dict[str, np.ndarray]:
     FileNotFoundError: ...
     """
     folder = Path(folder)
-    chunks = json.loads((folder / "manifest.json").read_text())["chunks"]
+    manifest = folder / "manifest.json"
+    if not manifest.is_file():
+        raise FileNotFoundError(f"load_sweep: `folder` must hold a sweep; received {folder}, without a manifest.json.")
+    chunks = _read(manifest).get("chunks")
+    if not isinstance(chunks, int):
+        raise ValueError(f"load_sweep: {manifest} is damaged: make the sweep anew in another folder.")
     paths = [folder / f"chunk-{number:05d}.npz" for number in range(chunks)]
     missing = [path.name for path in paths if not path.exists()]
     if missing:
@@ -133,8 +139,13 @@ def load_sweep(folder) -> dict[str, np.ndarray]:
         )
     parts = []
     for path in paths:
-        with np.load(path) as part:
-            parts.append(dict(part))
+        try:
+            with open(path, "rb") as file, np.load(file) as part:
+                parts.append(dict(part))
+        except (ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(
+                f"load_sweep: {path} is damaged ({error}): repeat the call of sweep_to_disk, which makes it anew."
+            ) from error
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -162,19 +173,30 @@ def _claim(folder, manifest):
     """Writes the manifest, or compares it with the one that is there."""
     path = folder / "manifest.json"
     if not path.exists():
+        if stray := sorted(folder.glob("chunk-*.npz")):
+            raise ValueError(
+                f"sweep_to_disk: `folder` {folder} holds {stray[0].name}, but no manifest.json that tells of which "
+                "sweep: nothing was changed there; choose another folder, or empty it."
+            )
         folder.mkdir(parents=True, exist_ok=True)
         _write(path, lambda file: file.write(json.dumps(manifest, indent=1).encode() + b"\n"))
         return
-    try:
-        found = json.loads(path.read_text())
-    except ValueError:
-        found = {}
+    found = _read(path)
     differ = [key for key in manifest if found.get(key) != manifest[key]]
     if differ:
         raise ValueError(
             f"sweep_to_disk: `folder` {folder} holds another sweep, whose {', '.join(differ)} differ: nothing was "
             "changed there; choose another folder, or the inputs that it was begun with."
         )
+
+
+def _read(path):
+    """A manifest; nothing of one that is damaged."""
+    try:
+        found = json.loads(path.read_text())
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _is_whole(path):

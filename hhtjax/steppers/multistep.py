@@ -36,6 +36,7 @@ class Multistep(Stepper):
     options: Options
 
     needs_equal_steps = True
+    first_steps = 2
 
     def advance(self, system, s, past, dt, w):
         """q and v at t + dt, given the acceleration there."""
@@ -66,7 +67,7 @@ class Multistep(Stepper):
 
         def step(s):
             past, now = s.memory, s._replace(memory=None)
-            s1, info = lax.cond(past.count < 2, lambda: first(now), lambda: later(now, past))
+            s1, info = lax.cond(past.count < self.first_steps, lambda: first(now), lambda: later(now, past))
             q, v = jnp.stack([s1.q - s.q, past.q[0]]), jnp.stack([s1.v - s.v, past.v[0]])
             return s1._replace(memory=Memory(q, v, past.count + 1)), info
 

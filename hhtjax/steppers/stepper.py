@@ -137,6 +137,7 @@ class Stepper(Description):
     keeps_sparse = False  # whether it never forms the matrix of a step of a system with sparse ones
     meets_events = False  # whether `begin` gives all that a step needs behind an event
     needs_equal_steps = False  # what it remembers belongs to steps of one size
+    first_steps = 0  # those of another method, before it remembers enough
     resizes = False  # whether `resized` does anything
     estimate_order: int | None = None  # power of h with which the estimated error of a step falls; None without
     dense_term = False  # whether its memory is what dense output adds to cubics
