@@ -84,7 +84,7 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     X = J[:, p:] - Q @ (Q.T @ J[:, p:])
     rounding = 10 * len(r) * float(jnp.finfo(r.dtype).eps) * jnp.linalg.norm(J[:, p:], axis=0)
     X = jnp.where(jnp.linalg.norm(X, axis=0) > rounding, X, 0)  # else the fitted parameters do all that it does
-    scores = sum(part.sum(axis=1) for part in in_segments(X * r[:, None], sizes, segments))
+    scores: Any = sum(part.sum(axis=1) for part in in_segments(X * r[:, None], sizes, segments))
     total, square = scores.sum(axis=0), jnp.sum(X**2, axis=0)
     variance = jnp.sum(scores**2, axis=0)
     return Score(
