@@ -123,3 +123,19 @@ def test_a_new_function_of_the_same_code_is_another():
     assert abs(end(lambda t: 1.0 + 0 * t) - end(lambda t: 2.0 + 0 * t)) > 1e-3
     with pytest.raises(TypeError, match=r"simulate: `params\['f'\]` must be an array, a number or a function"):
         end("sine")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grid", [{"dt": 0.05, "num_steps": 20}, {"dt": hhtjax.adaptive(1e-3, 1e-5), "times": [1.0]}])
+def test_with_events(grid):
+    """Guard, reset and switch see the function: down to .1 at t = .9, up with half the velocity, then with a force."""
+    system = hhtjax.System(np.ones(1), lambda q, v, t, p: p["on"] + p["f"](0 * q))
+    stop = hhtjax.Event(
+        lambda q, v, t, p: p["f"](q[0]) - 0.1,
+        lambda q, v, t, p: p["f"](-0.5 * v),
+        switch=lambda p: p | {"on": p["f"](1.0)},
+    )
+    params = {"on": 0.0, "f": jnp.positive}
+    found = hhtjax.simulate(system, hhtjax.dopri5(), START[0], -START[0], params, events=[stop], **grid)
+    found.check()
+    np.testing.assert_allclose(found.q[-1, 0], 0.1 + 0.5 * 0.1 + 0.1**2 / 2, rtol=1e-12)

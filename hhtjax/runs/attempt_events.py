@@ -11,6 +11,7 @@ from functools import partial, reduce
 import jax
 import jax.numpy as jnp
 
+from hhtjax.description import freeze
 from hhtjax.numerics.seldom import choose, seldom_alone
 from hhtjax.runs.attempt import AT_EVENT, Trial, Try, judged, sizes, why_short
 from hhtjax.runs.event_failures import FINE, MANY
@@ -50,7 +51,7 @@ def passed(trial, tried, walk, h):
     ways = trial.ways
     met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE))
     part = Part(walk.state, tried.walk.state, ways.no_info, h, walk.last, met, met.ended, ~met.ended)
-    part, (rows, there) = pass_events(ways, trial.params, part, h)
+    part, (rows, there) = pass_events(ways, freeze(trial.params), part, h)
     times = jnp.where(there, rows[:, 0], jnp.inf)
     first = jnp.min(times)
     later = there & (times > first + SHORT * h)

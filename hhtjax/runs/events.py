@@ -4,6 +4,7 @@ from functools import partial
 
 import jax.numpy as jnp
 
+from hhtjax.description import freeze
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, if_any
 from hhtjax.runs.event_failures import FINE
@@ -59,7 +60,7 @@ def past_events(ways, params, bound, sizes):
         part = Part(state, new, info, h, last, met._replace(log=None), no, no)
         counts = None if here is None else (before, count)
         asked = may_meet(ways, part, h, params)
-        part, log = if_any(pass_them, asked, (part, met.log), counts, h, params, kept=False)
+        part, log = if_any(pass_them, asked, (part, met.log), counts, h, freeze(params), kept=False)
         told = first_failure(ways.flat, failure, count, part.end, part.info)
         return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
 

@@ -57,7 +57,8 @@ def falls_and_rises(g0, d0, g1, d1):
 
 def pass_events(ways, params, part, h):
     """The step across all events in it: a `Part`, of which end, info and met are to be used, and what to note of
-    up to max_events + 1 of them, rows and whether each is there. Members that have not asked stay as they are."""
+    up to max_events + 1 of them, rows and whether each is there. Members that have not asked stay as they are. params
+    are as `freeze` leaves them, here and in what this calls, and `Ways.params` thaws them."""
     ways = ways.during(params, part.start.t, h)
     if ways.middle is not None:
         old = held.before(ways.events.with_modes(params, part.met.modes), part.start.t, part.last)
@@ -72,9 +73,9 @@ def pass_events(ways, params, part, h):
     met = part.met
 
     def anew(s, params):
-        return begin(ways, s.q, s.v, s.t, params, h)
+        return begin(ways, s.q, s.v, s.t, thaw(params), h)
 
-    now = ways.params(params, met.modes)
+    now = freeze(ways.params(params, met.modes))
     end = seldom(anew, part.divided & ~met.ended, part.end, now)
 
     def known(s):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, require_number
-from hhtjax.description import Description, is_array
+from hhtjax.description import Description, freeze, is_array, thaw
 from hhtjax.numerics.seldom import seldom
 from hhtjax.systems.constraints import factorize_constrained, pull_back, saddle_point
 
@@ -123,7 +123,7 @@ class FlatEvents(NamedTuple):
     noted: tuple  # (E,), whether it changes nothing
     ends: tuple  # (E,), whether the run ends there
     modes: Callable  # params -> a list of those of its numbers that a switch changes
-    with_modes: Callable  # params, modes -> params
+    with_modes: Callable  # params, frozen or not, modes -> params
 
     def rates(self, system, s, params):
         """g, and dg/dt along the motion: (E,) each."""
@@ -145,22 +145,22 @@ def flatten_events(system, events, params, redundant=None):
         return [jnp.asarray(leaves[i]) for i in changed]
 
     def with_modes(params, modes):
-        leaves, structure = jax.tree.flatten(params)
+        leaves, structure = jax.tree.flatten(thaw(params))
         for i, x in zip(changed, modes, strict=True):
             leaves[i] = x
         return structure.unflatten(leaves)
 
-    def outcome_of(event, before, q, t, now, params):
-        v, old = before
+    def outcome_of(event, before, q, t, frozen):
+        (v, old), (now, params) = before, thaw(frozen)
         after = params if event.switch is None else event.switch(params)
         new = [x.astype(y.dtype) for x, y in zip(modes(after), old, strict=True)]
         return _reset(system, event, redundant, q, v, t, now), new
 
     def outcome(i, q, v, t, now, params):
-        after = v, modes(params)
+        after, frozen = (v, modes(params)), freeze((now, params))
         for number, event in enumerate(events):
             if not event.is_noted:
-                after = seldom(partial(outcome_of, event), i == number, after, q, t, now, params)
+                after = seldom(partial(outcome_of, event), i == number, after, q, t, frozen)
         return after
 
     noted, ends = tuple(event.is_noted for event in events), tuple(event.terminal for event in events)
