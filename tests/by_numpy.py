@@ -48,7 +48,7 @@ class Numbers:
             results = [ARITHMETIC[name](eqn.params, *values)]
         elif name in MOVES:
             return MOVES[name](eqn, *values)
-        elif name in PLACES and eqn.params.get("update_jaxpr") is None:
+        elif name in PLACES and (name != "scatter" or eqn.params["update_jaxpr"] is None):
             results = PLACES[name](eqn, *values) or by_jax(eqn, values)
         elif name == "dot_general" and all(x.dtype == eqn.outvars[0].aval.dtype for x in values):
             results = [_dot_general(eqn, *values)]
@@ -150,7 +150,7 @@ def _closed(jaxpr):
 
 CALLS = {
     **{"cond": _cond, "while": _while, "scan": _scan, "custom_linear_solve": _solve},
-    **{"jit": _called("jaxpr"), "closed_call": _called("call_jaxpr"), "checkpoint": _called("jaxpr")},
+    **{"jit": _called("jaxpr"), "closed_call": _called("call_jaxpr"), "remat2": _called("jaxpr")},
     "hhtjax_in_turn": lambda self, params, asked, *values: self(params["closed"], *values),
     **{"custom_jvp_call": _called("call_jaxpr"), "custom_vjp_call": _called("call_jaxpr")},
 }
@@ -205,7 +205,8 @@ MOVES = {
     "concatenate": lambda eqn, *x: [np.concatenate(x, eqn.params["dimension"])],
     "stack": lambda eqn, *x: [np.stack(x, eqn.params["axis"])],
     "rev": lambda eqn, x: [np.flip(x, eqn.params["dimensions"])],
-    **dict.fromkeys(("hhtjax_watch", "hhtjax_largest_in_batch"), lambda eqn, x: [x]),
+    "unstack": lambda eqn, x: list(np.moveaxis(x, eqn.params["axis"], 0)),
+    **dict.fromkeys(("hhtjax_watch", "hhtjax_structural", "hhtjax_largest_in_batch"), lambda eqn, x: [x]),
 }
 
 

@@ -1,5 +1,6 @@
 """Dense output: what a run does between its saved times."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.description.presentation import shown
 from hhtjax.systems import kinematics
+from hhtjax.xla import Programs
 
 
 @shown
@@ -68,28 +70,33 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     times = times if is_array(times) else np.asarray(times)
     if not is_real(times):
         raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
-    times = jnp.asarray(times).astype(t.dtype)
+    known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
+    found, outside = _found(known, jnp.asarray(times), equal=not jnp.ndim(solution.dt))
+    if is_concrete(outside) and np.any(outside):
+        bad = np.asarray(times).astype(t.dtype)[np.asarray(outside)].flat[0]
+        raise ValueError(f"interpolate: `times` must lie in [{t[0]:.6g}, {t[-1]:.6g}]; received {bad:.6g}.")
+    v = None if solution.acceleration is None else found.v
+    return Interpolant(found.q, v) if solution.z is None else InternalInterpolant(found.q, v, found.z)
+
+
+@partial(Programs, static_argnames="equal")
+def _found(known, times, equal):
+    """What is saved of a run, at the times, and which of them lie outside of it; equal: whether its intervals are."""
+    t, times = known.t, times.astype(known.t.dtype)
     start, end = t[0], t[-1]
     slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
     outside = ~((times >= start - slack) & (times <= end + slack))
-    if is_concrete(outside) and np.any(outside):
-        bad = np.asarray(times)[np.asarray(outside)].flat[0]
-        raise ValueError(f"interpolate: `times` must lie in [{start:.6g}, {end:.6g}]; received {bad:.6g}.")
-    if jnp.ndim(solution.dt):  # intervals of any lengths
-        i = jnp.clip(jnp.searchsorted(t, times, side="right") - 1, 0, t.shape[0] - 2)
-        H = t[i + 1] - t[i]
-    else:
+    if equal:
         i = jnp.clip(jnp.floor((times - start) / (t[1] - t[0])).astype(jnp.int32), 0, t.shape[0] - 2)
         H = jnp.full_like(times, t[1] - t[0])
+    else:
+        i = jnp.clip(jnp.searchsorted(t, times, side="right") - 1, 0, t.shape[0] - 2)
+        H = t[i + 1] - t[i]
     x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
-
-    known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None, events=None)
-    a, b = (jax.tree.map(lambda y: y[j], known) for j in (i, i + 1))  # noqa: B023 (called at once)
-    if solution.events is not None:
-        a, b, H, x = between_events(solution.events, a, b, H, x, times)
-    found = between(a, b, H, x)
-    v = None if solution.acceleration is None else found.v
-    return Interpolant(found.q, v) if solution.z is None else InternalInterpolant(found.q, v, found.z)
+    a, b = (jax.tree.map(lambda y: y[j], known._replace(events=None)) for j in (i, i + 1))  # noqa: B023 (called at once)
+    if known.events is not None:
+        a, b, H, x = between_events(known.events, a, b, H, x, times)
+    return between(a, b, H, x), outside
 
 
 def between_events(events, a, b, H, x, times):

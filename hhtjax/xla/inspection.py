@@ -22,9 +22,8 @@ KNOWN = {
     *("cbrt", "complex", "count_leading_zeros", "imag", "popcnt", "real", "shift_left", "shift_right_arithmetic"),
     "shift_right_logical",
 }
-# by dialect; those of CHLO become elementwise operations, but for top_k, a sort
-KNOWN_IN = {
-    "stablehlo": PROVEN | KNOWN,
+# in other dialects; those of CHLO become elementwise operations, but for top_k, a sort
+ELSEWHERE = {
     "chlo": {
         *("acos", "acosh", "asin", "asinh", "atan", "atanh", "bessel_i1e", "cosh", "digamma", "erf", "erf_inv"),
         *("erfc", "lgamma", "next_after", "sinh", "square", "zeta"),
@@ -82,7 +81,7 @@ class Inspection:
             if not CHECKS[name](op):
                 self.object(f"{name} of {' and '.join(str(x.type) for x in op.operands)}")
             self._note_types(op)
-        elif name in KNOWN_IN.get(dialect, ()):
+        elif _is_known(dialect, name):
             self.is_proven &= name not in KNOWN
             self._note_types(op)
             if name in ("case", "if"):
@@ -127,6 +126,10 @@ class Inspection:
     def object(self, why):
         """Keeps the first reason."""
         self.objection = self.objection or why
+
+
+def _is_known(dialect, name):
+    return name in PROVEN or name in KNOWN if dialect == "stablehlo" else name in ELSEWHERE.get(dialect, ())
 
 
 def directly_in(op):
