@@ -1,5 +1,6 @@
 """Error control that fails, or is asked for what it cannot give: errors that name what, and when."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -35,6 +36,26 @@ def test_failures_are_named_with_their_time(name):
     assert np.isfinite(found.q[:, 0]).tolist() == [True, True, False]
     with pytest.raises(hhtjax.SimulationError, match=message):
         found.steps.check()
+
+
+TIMES = np.array([[0.2, 0.1, 0.3], [-0.2, 0.1, 0.3], [0.1, 0.2, np.nan]])
+
+
+def test_traced_times_that_do_not_increase_are_named():
+    """Nothing is known before t0, or behind a time that is not a number; what lies between is."""
+
+    @jax.jit
+    def at(times):
+        dt = hhtjax.adaptive(1e-3, 1e-6, max_steps=200)
+        return hhtjax.simulate(hhtjax.System(ONE, lambda q, v, t, p: -q), hhtjax.rowda(), ONE, ZERO, dt=dt, times=times)
+
+    for times in TIMES:
+        found = at(times)
+        with pytest.raises(hhtjax.SimulationError, match="`times` must increase, and lie after t0; with it they were"):
+            found.check()
+        known = np.isfinite(found.q[1:, 0])
+        assert not known[~(times > 0)].any()
+        np.testing.assert_allclose(found.q[1:, 0][known], np.cos(times[known]), atol=1e-3)
 
 
 WRONG = {

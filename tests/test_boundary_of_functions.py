@@ -2,13 +2,14 @@
 
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import EYE, ONE, SINGLE, SPRING, ZERO, check_message, pull, run
 from zoo import STEPPERS
 
-from hhtjax import LinearSystem, PrecisionWarning, System
+from hhtjax import Event, LinearSystem, PrecisionWarning, System, hht, impact, sweep
 
 MASS_SHAPE = "`mass` must give an array of shape (1, 1), or (1,) for a diagonal; received"
 FORCE_LIKE = "`force` must return a pytree like v0, shape (1,) float64; received"
@@ -123,3 +124,52 @@ def test_step_names_itself():
     state = STEPPERS["hht auto"].init(SPRING, ONE, ZERO, None, dt=0.1)
     wrong = System(ONE, lambda q, v, t, params: (q,))
     check_message(ValueError, f"step: {FORCE_LIKE} [0]", lambda: STEPPERS["hht auto"].step(wrong, state, None, dt=0.1))
+
+
+def hung(x):
+    return System(np.ones(2), lambda q, v, t, p: 0 * q, lambda q, t, p: (q @ q - x)[None])
+
+
+def rubs(x):
+    return System(
+        np.ones(2), lambda q, v, t, p: 0 * q, friction=lambda q, v, t, p: ONE, sliding=lambda q, v, t, p: x * v[:1]
+    )
+
+
+def stops(x):
+    return [Event(lambda q, v, t, p: q[0] - x / 2, impact(0.5))]
+
+
+def swept(system, q0, v0, **options):
+    grid = {"dts": [0.1, 0.1], "duration": 0.4, "num_samples": 1, "in_axes": (None, 0, None, None)}
+    return sweep(system, hht(), q0, v0, **grid, **options)
+
+
+# arrays of JAX, which stay known while a function is being traced
+ALONE, BATCH = (jnp.ones(1), jnp.zeros(1)), (jnp.ones((2, 1)), jnp.zeros(1))
+PAIR, PAIRS = (jnp.eye(2)[0], jnp.zeros(2)), (jnp.eye(2), jnp.zeros(2))
+CLOSED = {
+    "guard": lambda x: run(SPRING, hht(), *ALONE, events=stops(x)),
+    "constraint": lambda x: run(hung(x), hht(), *PAIR),
+    "sliding": lambda x: run(rubs(x), hht(), *PAIR),
+}
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_functions_may_close_over_a_tracer(name):
+    """What is not known while a function is being traced passes unchecked, as it does in params."""
+    jax.eval_shape(CLOSED[name], 1.0)
+
+
+SWEPT = {
+    "guard": lambda x: swept(SPRING, *BATCH, events=stops(x)).q,
+    "constraint": lambda x: swept(hung(x), *PAIRS).q,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SWEPT)
+def test_functions_of_a_sweep_may_close_over_what_is_differentiated(name):
+    found, slope = jax.jvp(SWEPT[name], (1.0,), (1.0,))
+    assert np.all(np.isfinite(found))
+    assert np.all(np.isfinite(slope))

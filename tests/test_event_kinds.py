@@ -90,6 +90,38 @@ def test_a_held_input_jumps_between_the_steps():
     assert abs(run.v[-1, 0] - v) < 1e-12
 
 
+@pytest.mark.slow
+def test_a_held_input_jumps_as_the_modes_have_it():
+    """An input that a switch has turned on at t = .11 jumps at .25, where a step begins that meets a wall at .27."""
+    u = hhtjax.sampled(np.array([1.0, -1.0]), times=[0.0, 0.25], order=0)
+    system = System(jnp.ones(1), lambda q, v, t, p: 0 * q + p["zone"] * p["u"](t))
+    on = Event(
+        lambda q, v, t, p: (0.11 - t) * (1 - p["zone"]) + p["zone"], switch=lambda p: p | {"zone": 1 + p["zone"]}
+    )
+    wall = Event(lambda q, v, t, p: 0.1474 - q[0], impact(1.0))
+    start, params = (np.zeros(1), np.full(1, 0.5)), {"u": u, "zone": 0.0}
+    run = simulate(system, hht(0.0), *start, params, dt=0.05, num_steps=20, events=[on, wall])
+    run.check()
+    np.testing.assert_allclose(run.events.t[:3], [0.11, 0.27, np.nan], rtol=1e-12)
+    np.testing.assert_allclose(run.v[-1, 0], -0.62 - 0.73, rtol=1e-12)
+    np.testing.assert_allclose(run.q[-1, 0], 0.1474 - 0.62 * 0.73 - 0.73**2 / 2, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_guard_sees_what_an_input_holds_until_the_end_of_the_step():
+    """A level that rises at t = .1, just behind the time at which q meets it."""
+    level = hhtjax.sampled(np.array([0.95, 5.0]), 0.1, order=0)
+    turn = Event(
+        lambda q, v, t, p: (p["level"](t) - q[0]) * (1 - p["met"]) + p["met"],
+        lambda q, v, t, p: -v,
+        switch=lambda p: p | {"met": 1 + p["met"]},
+    )
+    params = {"level": level, "met": 0.0}
+    run = simulate(FREE, LIGHT, ZERO, 10 * ONE, params, dt=0.01, num_steps=20, events=[turn])
+    run.check()
+    np.testing.assert_allclose([run.events.t[0], run.q[-1, 0]], [0.095, -0.1], rtol=1e-12)
+
+
 ONE, ZERO = np.ones(1), np.zeros(1)
 
 

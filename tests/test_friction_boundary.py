@@ -157,6 +157,21 @@ def test_a_held_input_breaks_a_joint_away_at_its_jump():
     np.testing.assert_allclose(found.friction[1:8, 0], [0.5] * 4 + [0.9] * 3, rtol=1e-12)
 
 
+def test_a_limit_that_jumps_brakes_at_once():
+    """Two coupled masses that slide, and a brake that is held: exact too."""
+    mass, share, brake = np.array([[2.0, 0.7], [0.7, 1.0]]), np.array([1.0, 0.5]), np.array([1.0, 3.0])
+    u = hhtjax.sampled(brake, dt=0.25, order=0)
+    system = hhtjax.System(mass, lambda q, v, t, u: 0 * q, friction=lambda q, v, t, u: share * u(t))
+    q, v = np.zeros(2), np.array([3.0, -3.0])
+    found = hhtjax.simulate(system, hhtjax.hht(), q, v, u, dt=0.05, num_steps=10)
+    found.check()
+    for size in brake:
+        w = -np.linalg.solve(mass, size * share * np.sign(v))
+        q, v = q + 0.25 * v + w * 0.25**2 / 2, v + 0.25 * w
+    np.testing.assert_allclose(found.q[-1], q, rtol=1e-12)
+    np.testing.assert_allclose(found.v[-1], v, rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_a_limit_is_fitted():
     """With a start off by a factor of 1.5."""

@@ -35,14 +35,23 @@ def test_a_row_is_written(batches):
             shapes[0][:2] = shapes[0][1::-1]
     rng = np.random.default_rng(0)
     array, row = (jnp.asarray(rng.normal(size=shape)) for shape in shapes[:2])
-    number = jnp.asarray(rng.integers(0, 4, size=shapes[2]), jnp.int32)
-    expected = g(array, row, number)
-    np.testing.assert_array_equal(jax.jit(f)(array, row, number), expected)
-    weights = jnp.asarray(rng.normal(size=expected.shape))
-    for derivative in (jax.grad, jax.jacfwd):
-        found, known = (derivative(lambda x, f=f: jnp.sum(weights * f(*x, number) ** 2))((array, row)) for f in (f, g))
-        for x, y in zip(found, known, strict=True):
-            np.testing.assert_allclose(x, y, rtol=1e-14)
+    check_the_same(f, g, array, row, jnp.asarray(rng.integers(0, 4, size=shapes[2]), jnp.int32))
+
+
+def check_the_same(f, g, array, block, number):
+    """Values, which are copied, and derivatives, of array and block; in one program."""
+    weights = np.random.default_rng(1).normal(size=jax.eval_shape(g, array, block, number).shape)
+
+    def modes(f, x):
+        def square(x):
+            return jnp.sum(weights * f(*x, number) ** 2)
+
+        return f(*x, number), jax.grad(square)(x), jax.jacfwd(square)(x)
+
+    found, known = jax.jit(lambda *x: (modes(f, x), modes(g, x)))(array, block)
+    np.testing.assert_array_equal(found[0], known[0])
+    for x, y in zip(*map(jax.tree.leaves, (found, known)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-14)
 
 
 @pytest.mark.parametrize("batches", [[], [(0, 0, 0)], [(0, None, 0), (1, 0, None)]], ids=["one", "a batch", "two"])
@@ -62,17 +71,7 @@ def test_a_block_is_written_along_an_axis(batches):
         shapes[1][:0] = [3] if len(batches) == 1 else [2]
     rng = np.random.default_rng(0)
     array, block = (jnp.asarray(rng.normal(size=shape)) for shape in shapes)
-    number = numbers if batches else numbers[1]
-    weights = jnp.asarray(rng.normal(size=g(array, block, number).shape))
-
-    def modes(f):
-        def square(x):
-            return jnp.sum(weights * f(*x, number) ** 2)
-
-        return lambda x: (f(*x, number), jax.grad(square)(x), jax.jacfwd(square)(x))
-
-    for x, y in zip(*(jax.tree.leaves(jax.jit(modes(h))((array, block))) for h in (f, g)), strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-14)
+    check_the_same(f, g, array, block, numbers if batches else numbers[1])
 
 
 def test_a_block_that_does_not_fit():

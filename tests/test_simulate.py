@@ -67,6 +67,23 @@ def test_nested_scan_equals_a_plain_one(length):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
+def test_a_member_of_a_batch_keeps_fewer_states():
+    """And computes more of them again: what many keep takes longer to fill."""
+
+    def loss(q):
+        return jnp.sum(
+            hhtjax.simulate(DUFFING.system, hhtjax.hht(), q, 0 * q, DUFFING.params, dt=0.01, num_steps=2048).q
+        )
+
+    def computed_again(f, q):
+        return str(jax.make_jaxpr(f)(q)).count("remat")
+
+    alone, q = computed_again(jax.grad(loss), jnp.ones(1)), jnp.ones((2, 1))
+    for batch in (jax.vmap(jax.grad(loss)), jax.grad(lambda q: jnp.sum(jax.vmap(loss)(q)))):
+        assert computed_again(batch, q) > alone
+        assert computed_again(jax.jit(batch), q) > alone
+
+
 def test_dense_output_is_of_order_four():
     """Between samples of an exact run: x = cos 2t."""
     spring = hhtjax.System(jnp.array([1.0]), lambda q, v, t, params: -4.0 * q)

@@ -163,7 +163,12 @@ def test_a_failure_is_named_by_step_and_time():
 
 @pytest.mark.parametrize(
     ("times", "good"),
-    [([2.1, 2.2, 2.2, 2.3, 2.4], 2), ([2.1, 2.05, 2.2, 2.3, 2.4], 1), ([2.1, 2.2, 2.3, 2.4, np.inf], 4)],
+    [
+        ([2.1, 2.2, 2.2, 2.3, 2.4], 2),
+        ([2.1, 2.05, 2.2, 2.3, 2.4], 1),
+        ([2.1, 2.2, 2.3, 2.4, np.inf], 4),
+        ([2.1, 2.2, 2.3, 2.4, np.nan], 4),
+    ],
 )
 def test_traced_times_that_do_not_increase_and_step_sizes_that_are_negative_are_failures(times, good):
     runs = broken_runs(np.array(times), np.array([0.02, -1.0]))
@@ -171,6 +176,14 @@ def test_traced_times_that_do_not_increase_and_step_sizes_that_are_negative_are_
     np.testing.assert_array_equal(runs.failure.step, [np.rint((times[good - 1] - 2) / 0.02) + 1, 1])
     with pytest.raises(hhtjax.SimulationError, match=r"member 0 \(2 of 2 failed\), step"):
         runs.check()
+
+
+def test_a_traced_time_that_is_no_number_is_a_failure():
+    """Also of a stepper for which all steps of an interval are alike, and might be none."""
+    start = SPRING, hhtjax.rk4(), ONE, ZERO, PARAMS
+    runs = jax.jit(lambda times: hhtjax.sweep(*start, dts=DTS, times=times))(np.array([0.1, 0.2, np.nan]))
+    np.testing.assert_array_equal(np.isfinite(runs.q[:, :, 0]), len(runs.q) * [[True, True, True, False]])
+    assert np.all(runs.failure.step > 0)
 
 
 @pytest.mark.slow

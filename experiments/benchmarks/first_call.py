@@ -69,20 +69,23 @@ def gradient(scene, options=None):
     return jax.jit(jax.grad(loss), compiler_options=options)(params)
 
 
-def obvious_simulate(scene):
-    """The same motion in plain JAX, as one writes it down first: what a first call takes at the least."""
+def path_of(scene):
+    """The same motion in plain JAX, as one writes it down first, as a function; its arguments."""
     (system, params, q0, v0), dt, stepper = SCENES[scene]()
+    run = obvious.run if system.constraint is None else obvious.run_constrained
+    return lambda params, q0, v0: run(stepper, system, params, q0, v0, dt, NUM_STEPS)[1], (params, q0, v0)
 
-    def path(params, q0, v0):
-        return obvious.run(stepper, system, params, q0, v0, dt, NUM_STEPS)[1]
 
-    return jax.jit(path)(params, q0, v0)
+def obvious_simulate(scene):
+    """What a first call takes at the least."""
+    path, args = path_of(scene)
+    return jax.jit(path)(*args)
 
 
 def obvious_gradient(scene):
     """Its gradient."""
-    (system, params, q0, v0), dt, stepper = SCENES[scene]()
-    return jax.jit(jax.grad(lambda p: jnp.sum(obvious.run(stepper, system, p, q0, v0, dt, NUM_STEPS)[1] ** 2)))(params)
+    path, (params, *start) = path_of(scene)
+    return jax.jit(jax.grad(lambda p: jnp.sum(path(p, *start) ** 2)))(params)
 
 
 def quick(scene):
@@ -114,7 +117,7 @@ def sweep(scene):
 CALLS = {f.__name__: f for f in (simulate, gradient, fit, sweep)} | {"gradient, QUICK": quick}
 OBVIOUS = {"simulate": obvious_simulate, "gradient": obvious_gradient}
 PROGRAMS = CALLS | {f.__name__: f for f in OBVIOUS.values()}
-PLAIN = "pendulum", "double pendulum", "beam of 50"  # scenes that need no more: no constraints, no rotations
+PLAIN = "pendulum", "double pendulum", "squeezer", "beam of 50"  # scenes that need no more: no rotations
 
 
 def first(call, scene):

@@ -233,7 +233,7 @@ def _as_if_alone(stepper, s):
 
     By these the modes of a system are told apart, whose exp(s) may be nearer to what the steps make of another.
     """
-    mu = np.asarray(eigenvalues(stepper, -2 * s.real, np.abs(s) ** 2))
+    mu: Any = np.asarray(eigenvalues(stepper, -2 * s.real, np.abs(s) ** 2))
     away = np.where(mu.imag > 0, np.abs(mu - np.exp(s)[:, None]), np.inf)
     nearest = np.argmin(away, axis=1)[:, None]
     return np.where(np.isinf(away.min(axis=1)), np.nan, np.take_along_axis(mu, nearest, axis=1)[:, 0])

@@ -86,7 +86,7 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     rounding = 10 * len(r) * float(jnp.finfo(r.dtype).eps) * jnp.linalg.norm(J[:, p:], axis=0)
     X = jnp.where(jnp.linalg.norm(X, axis=0) > rounding, X, 0)  # else the fitted parameters do all that it does
     by_time = (X * r[:, None])[in_time(shapes)]
-    scores = sum(part.sum(axis=1) for part in in_segments(by_time, [math.prod(x) for x in shapes], segments))
+    scores: Any = sum(part.sum(axis=1) for part in in_segments(by_time, [math.prod(x) for x in shapes], segments))
     total, square = scores.sum(axis=0), jnp.sum(X**2, axis=0)
     variance = jnp.sum(scores**2, axis=0)
     return Score(

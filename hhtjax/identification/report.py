@@ -155,6 +155,8 @@ def decode(x, named) -> Any:
     """The inverse of `encode`; named: the classes of named tuples and steppers, by name."""
     if not isinstance(x, dict):
         return x
+    kind: Any
+    content: Any
     kind, content = next(iter(x.items()), (None, None))
     if kind == "array":
         return jnp.asarray(np.asarray(content, x["dtype"]))

@@ -10,7 +10,7 @@ from jax import lax
 
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.low_rank import AtState
-from hhtjax.xla import linear_map, staged
+from hhtjax.xla import linear_map, part, staged
 
 RANK_TOLERANCE = (
     1e-9  # relative size of a singular value below which columns count as dependent; 100 roundings in float32
@@ -50,6 +50,7 @@ def invert_and_bound(f, like, factorize):
 
 
 def _solve(f, b, inverse):
+    f = part(f, b.size)  # for its derivatives
     return lax.custom_linear_solve(
         f, b, solve=lambda _, y: inverse(y, trans=0), transpose_solve=lambda _, y: inverse(y, trans=1)
     )

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from hhtjax.numerics.seldom import choose, seldom_alone
 from hhtjax.runs.attempt import AT_EVENT, Trial, Try, judged, sizes, why_short
 from hhtjax.runs.event_failures import FINE, MANY
+from hhtjax.runs.event_parts import Part, Ways
 from hhtjax.runs.loop import neutral_info, resized_step
-from hhtjax.runs.meeting import SHORT, Part, Ways, asks, pass_events, reaching
+from hhtjax.runs.meeting import SHORT, asks, pass_events, reaching
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 
@@ -39,7 +40,8 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
 
 def past_events(trial, tried, walk, h):
     """The try, past the events in its step."""
-    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, trial.params_of(walk), h)
+    now = trial.ways.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
+    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, now, h)
     return seldom_alone(partial(passed, trial), asked, tried, walk, h)
 
 

@@ -30,17 +30,21 @@ def require_events(caller, problem, events):
         _require_shapes(f"{caller}: events[{i}]", problem, event)
     if all(map(is_concrete, jax.tree.leaves((problem, events)))):
         with evaluated_now():
-            _require_start(caller, events, *map(np.asarray, _guards_at_start(problem, tuple(events))[:4]))
+            found = _guards_at_start(problem, tuple(events))[:4]
+        if all(map(is_concrete, found)):  # a function may have closed over a tracer
+            _require_start(caller, events, *map(np.asarray, found))
     return tuple(events)
 
 
 def refused_members(problem_of, arrays, axes, events):
-    """Numbers of those members of a batch that `require_events` refuses for their values.
+    """Numbers of those members of a batch that `require_events` refuses for their values, as far as these are known.
 
     problem_of: arrays -> a member's `Problem`; axes: of the arrays, as for `jax.vmap`.
     """
     with evaluated_now():
         found = jax.vmap(lambda arrays: _guards_at_start(problem_of(arrays), events), (axes,))(arrays)
+    if not all(map(is_concrete, found)):  # a function has closed over a tracer
+        return []
     g, rates, terms, on_velocity, e = map(np.asarray, found)
     impacts = np.array([isinstance(event.reset, Impact) for event in events])
     bad = _is_beyond(events, g, rates, terms) | (impacts & (on_velocity | ~((e >= 0) & (e <= 1))))

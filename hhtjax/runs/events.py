@@ -8,9 +8,10 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, if_any
 from hhtjax.runs.event_failures import FINE
 from hhtjax.runs.event_log import Log
+from hhtjax.runs.event_parts import Met, Part, Ways
 from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.loop import first_failure
-from hhtjax.runs.meeting import Met, Part, Ways, asks, pass_events, reaching, unnoted
+from hhtjax.runs.meeting import asks, pass_events, reaching, unnoted
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 from hhtjax.xla import in_turn
@@ -67,7 +68,8 @@ def past_events(ways, params, bound, sizes):
 
 def may_meet(ways, part, h, params):
     """Whether there may be an event in a step."""
-    asked = asks(ways, part.start, part.end, ways.events.with_modes(params, part.met.modes), h)
+    now = ways.during(params, part.start.t, h).params(params, part.met.modes)
+    asked = asks(ways, part.start, part.end, now, h)
     return asked & ~part.met.ended if any(ways.events.ends) else asked
 
 

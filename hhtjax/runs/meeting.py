@@ -17,6 +17,7 @@ from hhtjax.description import freeze, thaw
 from hhtjax.numerics.seldom import choose, if_any, seldom
 from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, STAYS
 from hhtjax.runs.event_log import row_of
+from hhtjax.runs.event_parts import Met, Part
 from hhtjax.runs.loop import resized_step
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
@@ -26,43 +27,6 @@ SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two 
 ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations, at most
 NEARLY = 1e-8  # part of a step: the next iteration would change a rounding
 ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
-
-
-class Ways(NamedTuple):
-    """How to step, and what to look for."""
-
-    flat: Any
-    stepper: Any
-    events: Any
-    max_events: int
-    no_info: Any
-    reach: Any  # of `reaching`
-    keep: int = 0  # how many events are noted
-
-
-class Met(NamedTuple):
-    """What a run with events carries along: numbers that switches changed, whether it has ended, what went wrong (code
-    and event), the `Log`, and, where it is read off between its steps, the pieces of the last."""
-
-    modes: list
-    ended: Any
-    code: Any
-    event: Any
-    log: Any = None
-    pieces: Any = None
-
-
-class Part(NamedTuple):
-    """What is left of a step: from `start` to `end`, of the size `rest`; `last` is the size start.a is made for."""
-
-    start: Any
-    end: Any
-    info: Any
-    rest: Any
-    last: Any
-    met: Met
-    divided: Any  # whether an event came before
-    asked: Any  # whether there may be one
 
 
 class Found(NamedTuple):
@@ -94,10 +58,11 @@ def falls_and_rises(g0, d0, g1, d1):
 def pass_events(ways, params, part, h):
     """The step across all events in it: a `Part`, of which end, info and met are to be used, and what to note of
     up to max_events + 1 of them, rows and whether each is there. Members that have not asked stay as they are."""
-    if held.holds(params):
-        old = held.before(params, part.start.t, part.last)
-        params = held.held_at(params, part.start.t + h / 2)
-        part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, params))
+    ways = ways.during(params, part.start.t, h)
+    if ways.middle is not None:
+        old = held.before(ways.events.with_modes(params, part.met.modes), part.start.t, part.last)
+        new = ways.params(params, part.met.modes)
+        part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new))
 
     def slot(part, number):
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
@@ -109,7 +74,7 @@ def pass_events(ways, params, part, h):
     def anew(s, params):
         return begin(ways, s.q, s.v, s.t, params, h)
 
-    now = ways.events.with_modes(params, met.modes)
+    now = ways.params(params, met.modes)
     end = seldom(anew, part.divided & ~met.ended, part.end, now)
 
     def known(s):
@@ -154,7 +119,7 @@ def begin(ways, q, v, t, params, h):
 def look(ways, part, params, h):
     """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
     part, params = lax.stop_gradient((part, params))
-    now = ways.events.with_modes(params, part.met.modes)
+    now = ways.params(params, part.met.modes)
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, s, now) for s in (part.start, part.end))
     noted = jnp.asarray(ways.events.noted)
     rising = (d0 > 0) & (d1 > 0)
@@ -195,7 +160,7 @@ def meet(ways, now, found, h, params):
     numbers = jnp.arange(found.hit.size, dtype=met.event.dtype)
     i = jnp.min(jnp.where(found.place == jnp.min(found.place), numbers, numbers.size))
     this = (numbers == i).astype(h.dtype)
-    now = events.with_modes(params, met.modes)
+    now = ways.params(params, met.modes)
     tau = locate(ways, now, part, this, found, h)
     e, info = go(ways, now, part.start, tau, part.last, h)
     before = e
@@ -204,14 +169,14 @@ def meet(ways, now, found, h, params):
     noise = 1e3 * float(jnp.finfo(h.dtype).eps)
     missed = ~(jnp.abs(pick(this, g)) <= 1e-3 * jnp.abs(rate) * h + noise * pick(this, found.size))
 
-    v, modes = events.outcome(i, e.q, e.v, e.t, now)
+    v, modes = events.outcome(i, e.q, e.v, e.t, now, events.with_modes(params, met.modes))
     row = row_of(e.t, i, rate, e.q, e.v, v)
     noted, ends = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, events.ends))
     beside = ~noted & jnp.any(is_corner(g, d, h, this, events.noted))
     code = jnp.where(beside, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
     code = jnp.where(missed, STAYS, jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE)).astype(met.code.dtype)
 
-    then = events.with_modes(params, modes)
+    then = ways.params(params, modes)
     beyond = jnp.where(noted, float(jnp.finfo(h.dtype).eps) ** 0.5 * h, 0)  # so that it is not met again
     rest = jnp.where(ends, 0, part.rest - tau - beyond)
     size = jnp.maximum(rest, SHORT * h)

@@ -21,13 +21,13 @@ def kept(flat, stepper, state):
 
 
 def read_off(flat, pair, extra, times, reached):
-    """The `Solution` at the times, each between the two of a pair; NaN beyond what was reached."""
+    """The `Solution` at the times, each between the two of a pair; NaN beyond what was reached, and before them."""
     a, b = (jax.tree.map(lambda x: x[1:], run._replace(dt=None, info=None, failure=None)) for run in pair)
     start = jax.tree.map(lambda x: x[:1], pair[0]._replace(dt=None, info=None, failure=None))
     # a part of a step that is a rounding, behind an event, is the beginning of a long one
     long = times[-1] - start.t[0]
     H = jnp.where(b.t - a.t > TINY * long, b.t - a.t, long)
-    s = jnp.where(times <= reached, (times - a.t) / H, jnp.nan)
+    s = jnp.where((a.t <= times) & (times <= reached), (times - a.t) / H, jnp.nan)
     found = between(a, b, H, s)
     if extra is not None:
         found = with_dense_term(flat, found, extra, s, H)

@@ -19,7 +19,7 @@ from hhtjax.runs.problem import Problem
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import Programs, on_scalars, one_kernel, or_plain
+from hhtjax.xla import Programs, is_in_batch, on_scalars, one_kernel, or_plain
 
 
 def simulate(
@@ -123,13 +123,13 @@ def simulate(
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
-        return or_plain(partial(_simulate, problem, refined(dt, k), events, **sizes, **kind))
+        return or_plain(partial(_simulate, problem, refined(dt, k), events, in_batch=is_in_batch(), **sizes, **kind))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
 
 
-@partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room"))
-def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
+@partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "in_batch"))
+def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_batch):
     flat, q, v, t0, params = problem.flat()
     dt = jnp.asarray(dt).astype(q.dtype)
     loop_by, sizes = (loop_over, given_sizes(t0, dt)) if dt.ndim else (loop_of, dt)
@@ -151,7 +151,7 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
         if save_every == 1:
             carry, info = step(carry)
         else:
-            (carry, info), _ = checkpointed_scan(joined_step, (carry, loop.no_info), save_every)
+            (carry, info), _ = checkpointed_scan(joined_step, (carry, loop.no_info), save_every, in_batch)
         return carry, (keep(carry[0]), info)
 
     def joined_step(carry, _):
@@ -160,7 +160,7 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room):
         return (carry, join_info(info, new)), None
 
     def run(carry):
-        return checkpointed_scan(interval, carry, num_steps // save_every)
+        return checkpointed_scan(interval, carry, num_steps // save_every, in_batch)
 
     (_, _, failure, *met), (path, info) = one_kernel(run, form.tree)
     start = loop.carry[0]

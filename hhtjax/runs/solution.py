@@ -133,8 +133,11 @@ class Solution(NamedTuple):
 
     def _fault(self, reach=None):
         """What is wrong with the run, in words; None where nothing is."""
-        if self.steps is not None and (fault := self.steps._fault()):
-            return fault
+        if self.steps is not None:
+            if fault := self.steps._fault():
+                return fault
+            if not np.all(np.diff(self.t) >= 0):
+                return f"`times` must increase, and lie after t0; with it they were {np.asarray(self.t)}."
         if self.error is not None and (fault := self._excess()):
             return fault
         dt = np.asarray(self.dt)

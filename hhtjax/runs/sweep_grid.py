@@ -97,7 +97,7 @@ def fit_to_times(dts, times):
     H, eps = jnp.diff(times), float(jnp.finfo(dts.dtype).eps)
     increasing = (H > 0) & jnp.isfinite(H)
     H = jnp.where(increasing, H, 1)
-    size = jnp.maximum(jnp.abs(times[1:]), jnp.abs(times[:-1]))
+    size = jnp.where(increasing, jnp.maximum(jnp.abs(times[1:]), jnp.abs(times[:-1])), 0)
     slack = eps * (64 + 4 * size / H)  # H is a difference of rounded times
     return jax.vmap(lambda dt: _fit(dt, H, (dt > 0) & increasing, slack))(dts)
 

@@ -238,6 +238,8 @@ def _require_consistent(system, data, mapped, t0):
 
         with evaluated_now():
             every = jax.vmap(examined, ([0 if flag else None for flag in mapped],))(leaves)
+        if not all(map(is_concrete, jax.tree.leaves(every))):  # a function has closed over a tracer
+            return
         found = distances(every, data[0].redundant)
         worst |= {int(np.argmax(relative)) for _, _, relative in found}
     for i in sorted(worst):

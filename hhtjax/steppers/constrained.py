@@ -21,6 +21,7 @@ from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import State, join_info
 from hhtjax.systems.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
+from hhtjax.xla import part
 
 
 def begin_constrained(method, system, q, v, t, params, dt):
@@ -61,7 +62,7 @@ def equations(method, system, params, dt, s):
     c, n, m = method.coefficients, system.size, system.num_constraints
     ggl = method.options.formulation == "ggl"
     B = jacobian(system, s.q, s.t, params)
-    D = directions(system, system.mass(s.q, params), B) if ggl else None
+    D = part(lambda q, B: directions(system, system.mass(q, params), B))(s.q, B) if ggl else None
 
     def r(s):
         force = system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
@@ -93,7 +94,7 @@ def bind_constrained(method, system, params, dt):
             for _ in range(options.iterations - 1):
                 z, more = linearized_solve(r, path, z, factorize, again=method.estimating)
                 info = join_info(info, more)
-        s1 = system.tidy(path(z))
+        s1 = part(lambda z: system.tidy(path(z)))(z)
         return s1, report_constraints(method, system, params, dt, s, s1, info, B)
 
     return step

@@ -190,7 +190,10 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
     with evaluated_now():
-        examined = jax.tree.map(np.asarray, examine(system, q0, v0, t0, params, z0))
+        examined = examine(system, q0, v0, t0, params, z0)
+    if not all(map(is_concrete, jax.tree.leaves(examined))):  # a function has closed over a tracer
+        return
+    examined = jax.tree.map(np.asarray, examined)
     if redundant is None:
         require_independent(caller, examined[1])
     found = distances(examined, redundant)

@@ -119,7 +119,7 @@ class FlatEvents(NamedTuple):
     """Events of a system on vectors; made by `flatten_events`. E is their number."""
 
     guards: Callable  # q, v, t, params -> (E,)
-    outcome: Callable  # i, q, v, t, params -> v, and the modes after event i
+    outcome: Callable  # i, q, v, t, params in this step, params -> v, and the modes after event i
     noted: tuple  # (E,), whether it changes nothing
     ends: tuple  # (E,), whether the run ends there
     modes: Callable  # params -> a list of those of its numbers that a switch changes
@@ -150,18 +150,18 @@ def flatten_events(system, events, params, redundant=None):
             leaves[i] = x
         return structure.unflatten(leaves)
 
-    def outcome_of(event, now, q, t, params):
-        v, old = now
+    def outcome_of(event, before, q, t, now, params):
+        v, old = before
         after = params if event.switch is None else event.switch(params)
         new = [x.astype(y.dtype) for x, y in zip(modes(after), old, strict=True)]
-        return _reset(system, event, redundant, q, v, t, params), new
+        return _reset(system, event, redundant, q, v, t, now), new
 
-    def outcome(i, q, v, t, params):
-        now = v, modes(params)
+    def outcome(i, q, v, t, now, params):
+        after = v, modes(params)
         for number, event in enumerate(events):
             if not event.is_noted:
-                now = seldom(partial(outcome_of, event), i == number, now, q, t, params)
-        return now
+                after = seldom(partial(outcome_of, event), i == number, after, q, t, now, params)
+        return after
 
     noted, ends = tuple(event.is_noted for event in events), tuple(event.terminal for event in events)
     return FlatEvents(guards, outcome, noted, ends, modes, with_modes)

@@ -171,13 +171,16 @@ def _wrong(K, load, f, rests, sig):
     return jnp.where(sig == 0, jnp.sign(tau), 0), over > noise
 
 
-def held_back(system, s, params, dw):
-    """A jump dw of the accelerations at a state, with what the friction of joints at rest does about it."""
-    H = directions(system, s.q, s.t, params)
-    G = responses(system, s.q, s.t, params, H)
+def held_back(system, s, L, old, new, dw):
+    """A jump dw of the accelerations at a state, as params jump and multipliers become L, with what friction does about
+    it: of joints at rest, and of those that slide, whose limits may jump too."""
+    H = directions(system, s.q, s.t, new)
+    G = responses(system, s.q, s.t, new, H)
     K, (sig, tau) = across(H, G), s.friction
-    rests, f = sig == 0, system.friction.limit(s.q, s.v, s.L, s.t, params)
-    load = matvec(H, dw) + matvec(K, jnp.where(rests, tau, 0))
+    rests = sig == 0
+    f0, f = (system.friction.limit(s.q, s.v, x, s.t, params) for x, params in ((s.L, old), (L, new)))
+    sliding = sig * (f - f0)
+    load = matvec(H, dw) + matvec(K, jnp.where(rests, tau, -sliding))
     slides, held = at_rest(K, rests, load, f)
-    change = jnp.where(rests, held - tau, 0)
+    change = jnp.where(rests, held - tau, sliding)
     return dw - matvec(G.T, change), s.friction._replace(sig=jnp.where(rests, slides, sig), tau=tau + change)

@@ -64,18 +64,18 @@ def jump_after(params, t):
 
 def jump(stepper, system, s, old, new):
     """The state with the accelerations and multipliers that belong to the new params."""
-    dQ = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old)
+    dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
     if system.num_constraints:
         rows = jnp.zeros(system.num_constraints, dQ.dtype)
         ways = factorize_constrained(system.size, stepper.redundant)
         dw, dL = saddle_point(system, s.q, s.t, new, dQ, rows, ways)
-        s = s._replace(L=s.L + dL)
+        L = s.L + dL
     else:
         dw = system.solve_mass(system.mass(s.q, new), dQ)
     if system.friction is not None:
-        dw, friction = held_back(system, s, new, dw)
+        dw, friction = held_back(system, s, L, old, new, dw)
         s = s._replace(friction=friction)
-    return s._replace(w=s.w + dw, a=None if s.a is None else s.a + dw)
+    return s._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
 
 
 def _is_held(x):

@@ -31,7 +31,10 @@ def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
     if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
         return
     with evaluated_now():
-        B, H, change = map(np.asarray, _rows(system, q0, v0, t0, params, z0))
+        rows = _rows(system, q0, v0, t0, params, z0)
+    if not all(map(is_concrete, rows)):  # a function has closed over a tracer
+        return
+    B, H, change = map(np.asarray, rows)
     if not np.all(np.isfinite(H)):
         raise ValueError(f"{caller}: `sliding` has no finite derivative in v at the start.")
     if np.max(np.abs(change)) > DEPENDENT * np.max(np.abs(H)):

@@ -20,7 +20,8 @@ numbers in a kernel are polynomials, to 2 units in the last place, where XLA wou
 gradient of a run takes 2.7 to 3.9 times the run, in memory that grows with the square root of the number of steps.
 Systems of few operations are stepped number by number, not array by array, with every sine evaluated once. What is no
 single kernel runs as a list of them, several times slower, with all that the columns of a Jacobian share evaluated
-once: the squeezing mechanism with its 19 unknowns takes 19 microseconds a step. Jacobians keep track of what depends on
+once; in a jit of the user's each stage of a step is one: the squeezing mechanism with its 19 unknowns then takes 9
+microseconds a step, its gradient 30. Jacobians keep track of what depends on
 which unknown, so that for a chain of N links, or springs between neighbours, they take N^2 numbers and not N^3; a chain
 or a tree may give the product M(q) w without M: `System(..., inertia=)`.
 Measured, against C, by structure, batches and gradients, on a page, `experiments/benchmarks/README.md`; error against
@@ -38,14 +39,16 @@ True
 The door
 --------
 
-The rest of the library knows 22 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 24 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
+    part(f)                   f, a kernel of its own where it is in none
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
     is_untouched()            whether neither a derivative nor a batch is being made here
+    is_in_batch()             whether a batch is being made here
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
     in_turn(f, asked, x)      f(x), of which a batch visits only members that ask
     or_alone(x)               x of a member of a batch, True where there is none
@@ -90,7 +93,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 from hhtjax.xla.explanation import Explanation, calls, explain
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.host import on_host
-from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, staged, structural
+from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, part, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
 from hhtjax.xla.programs import QUICK, WIDE, Programs
@@ -98,7 +101,7 @@ from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.rows import block_written, row_written
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
-from hhtjax.xla.transforms import is_untouched
+from hhtjax.xla.transforms import is_in_batch, is_untouched
 from hhtjax.xla.turns import in_turn
 from hhtjax.xla.two_ways import TwoWays, derivative, together
 
@@ -118,6 +121,7 @@ __all__ = [
     "derivative",
     "explain",
     "in_turn",
+    "is_in_batch",
     "is_untouched",
     "largest_in_batch",
     "linear_map",
@@ -127,6 +131,7 @@ __all__ = [
     "one_kernel",
     "or_alone",
     "or_plain",
+    "part",
     "plain",
     "polynomial_sines",
     "row_written",

@@ -3,7 +3,7 @@
 from jaxlib.mlir import ir
 
 from hhtjax.xla.kernels import STAGED, inside_p
-from hhtjax.xla.products import element_type, is_small_product, is_small_sum, is_to_write_out
+from hhtjax.xla.products import is_small_product, is_small_sum, is_to_write_out
 
 ATTRIBUTES = "mhlo.frontend_attributes"
 
@@ -22,8 +22,9 @@ KNOWN = {
     *("cbrt", "complex", "count_leading_zeros", "imag", "popcnt", "real", "shift_left", "shift_right_arithmetic"),
     "shift_right_logical",
 }
-# in other dialects; those of CHLO become elementwise operations, but for top_k, a sort
-ELSEWHERE = {
+# by dialect; those of CHLO become elementwise operations, but for top_k, a sort
+KNOWN_IN = {
+    "stablehlo": PROVEN | KNOWN,
     "chlo": {
         *("acos", "acosh", "asin", "asinh", "atan", "atanh", "bessel_i1e", "cosh", "digamma", "erf", "erf_inv"),
         *("erfc", "lgamma", "next_after", "sinh", "square", "zeta"),
@@ -56,9 +57,11 @@ class Inspection:
         self.operations = self.in_branches = 0
         self.most = MOST_OPERATIONS
         self.stages, self.products, self.choices, self.seldom = {}, [], [], []
-        self.is_proven = True
+        self.is_proven, self.types = True, set()
         self.objection = "partitioned over devices; shard_map leaves each its own kernel" if is_partitioned else None
         self.look(call)
+        named = {str(x.element_type) for x in self.types if isinstance(x, ir.RankedTensorType)}
+        self.is_proven &= named <= PROVEN_TYPES
 
     def look(self, op):
         """Notes what `op` is, and looks into it."""
@@ -78,9 +81,10 @@ class Inspection:
         elif dialect == "stablehlo" and name in CHECKS:  # what it holds is scalar
             if not CHECKS[name](op):
                 self.object(f"{name} of {' and '.join(str(x.type) for x in op.operands)}")
-            self.is_proven &= _types(op) <= PROVEN_TYPES
-        elif name in (PROVEN | KNOWN if dialect == "stablehlo" else ELSEWHERE.get(dialect, ())):
-            self.is_proven &= name not in KNOWN and _types(op) <= PROVEN_TYPES
+            self._note_types(op)
+        elif name in KNOWN_IN.get(dialect, ()):
+            self.is_proven &= name not in KNOWN
+            self._note_types(op)
             if name in ("case", "if"):
                 self._look_into_branches(op)
                 if has_idle_branch(op):
@@ -116,6 +120,10 @@ class Inspection:
         for op in operations:
             self.look(op)
 
+    def _note_types(self, op):
+        """Of its results and operands, to be named once each: a type's text takes longer to write than all the rest."""
+        self.types.update(x.type for x in (*op.operands, *op.results))
+
     def object(self, why):
         """Keeps the first reason."""
         self.objection = self.objection or why
@@ -129,11 +137,6 @@ def directly_in(op):
 def callee(call):
     """Name of the function called."""
     return ir.FlatSymbolRefAttr(call.attributes["callee"]).value
-
-
-def _types(op):
-    """Of the elements of its results and operands."""
-    return {element_type(x) for x in (*op.operands, *op.results) if isinstance(x.type, ir.RankedTensorType)}
 
 
 def is_choice(op):

@@ -16,8 +16,9 @@ from jax.interpreters import ad, batching
 from hhtjax.xla.gate import is_on
 
 # names of functions; autodiff and vmap keep them
-KERNEL, STAGED = "hhtjax_one_kernel", "hhtjax_staged"
+KERNEL, STAGED, PART = "hhtjax_one_kernel", "hhtjax_staged", "hhtjax_part"
 AROUND = KERNEL + "_around"
+QUICKLY = "hhtjax_quickly"  # of programs that XLA compiles by its older way
 WRITTEN_OUT = 32  # numbers of a sum in a loop, one after the other
 LOOP = "hhtjax_loop"  # where the machinery is off: a name for `explain` to find, and nothing else
 
@@ -62,6 +63,25 @@ def staged(f, size=None):
     6.0
     """
     return f if size == 1 or not is_on() else named(STAGED, f)
+
+
+def part(f, size=None):
+    """f of pytrees of arrays; a kernel of its own where it is in none, and XLA would take long for its fusions.
+
+    Args:
+        f: a function of pytrees of arrays.
+        size: number of unknowns. With a single one there is a kernel around.
+
+    Returns:
+        A function with the same values.
+
+    Raises:
+        whatever f raises, when it is called.
+
+    >>> float(part(lambda x: 2 * x)(jnp.array(3.0)))
+    6.0
+    """
+    return f if size == 1 or not is_on() else named(PART, f)
 
 
 def choose(inside, outside, *args):

@@ -5,9 +5,10 @@ Attributes of a call change what XLA makes of it. One that is not inlined is com
 knows: with LAPACK, sort, scatter or a large product, compilation fails.
 
 So the called function is looked through, operation by operation, with vmap and autodiff done, and the attribute is
-attached only if all are known; where one is not proven, and XLA refuses the kernel on trial, it is not either.
-Platforms other than the CPU never see it. The verdict is attached too, for `explain` to read. A function may come in
-two forms, one for either case, of which the program keeps one. The sines of a kernel are those of sines.py.
+attached only if all are known; where one is not proven, and XLA refuses the kernel on trial, it is not either. Where
+a fusion outside a kernel takes long to compile, the stages of a function that is none become kernels, as far as they
+can. Platforms other than the CPU never see it. The verdict is attached too, for `explain` to read. A function may come
+in two forms, one for either case, of which the program keeps one. The sines of a kernel are those of sines.py.
 """
 
 from typing import Any
@@ -15,22 +16,44 @@ from typing import Any
 import numpy as np
 from jax.interpreters import mlir
 from jaxlib.mlir import ir
-from jaxlib.mlir.dialects import func, stablehlo
+from jaxlib.mlir.dialects import stablehlo
 
 from hhtjax.xla.gate import is_possible
 from hhtjax.xla.inspection import ATTRIBUTES, Inspection, callee, directly_in, form_inside
-from hhtjax.xla.kernels import AROUND, KERNEL, alone_p, inside_p, largest_p, structural_p, watch_p
+from hhtjax.xla.kernel_calls import (
+    as_stage,
+    attach,
+    call_stage,
+    compute_once,
+    insert,
+    make_kernel,
+    may_be_divided,
+)
+from hhtjax.xla.kernels import (
+    AROUND,
+    KERNEL,
+    PART,
+    QUICKLY,
+    STAGED,
+    alone_p,
+    inside_p,
+    largest_p,
+    structural_p,
+    watch_p,
+)
 from hhtjax.xla.products import size, written_out
 from hhtjax.xla.sines import write_sines
 from hhtjax.xla.trial import Module
 
 VERDICT = "hhtjax_kernels"
 UNTOLD = "hhtjax_around"
+LEAST = 6  # operations of a stage that is a kernel; fewer are one fusion or two anyway
+LARGEST = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
 
 
 def _lower_inside(ctx, x):
     no = mlir.ir_constant(np.bool_(False))
-    _attach(no.owner, **{inside_p.name: "unless a kernel takes the other branch"})
+    attach(no.owner, **{inside_p.name: "unless a kernel takes the other branch"})
     return [no]
 
 
@@ -47,16 +70,53 @@ def _lower(ctx, x):
 
 
 def _decide(module, call):
-    found = Inspection(module.symbol_table, call, _is_partitioned(module.axis_context))
+    is_partitioned = _is_partitioned(module.axis_context)
+    found = Inspection(module.symbol_table, call, is_partitioned)
     refusal = None if found.objection or found.is_proven else _refusal(module, found, call)
     objection = f"XLA refused: {refusal}" if refusal else found.objection
     told = UNTOLD if callee(call).startswith(AROUND) else VERDICT
-    _attach(call, **{told: f"plain: {objection}" if objection else "one kernel"})
-    if objection:
-        for stage in (x for calls in found.stages.values() for x in calls):
-            _compute_once(stage)
-    else:
+    attach(call, **{told: f"plain: {objection}" if objection else "one kernel"})
+    if not objection:
         _cut(module, found, call)
+    elif is_partitioned or QUICKLY in str(module.module.operation.attributes["sym_name"]):
+        for stage in (x for calls in found.stages.values() for x in calls):
+            compute_once(stage)
+    else:
+        _cut_stages(module, call, set(), {})
+
+
+def _cut_stages(module, call, seen, made):
+    """Makes kernels of the stages in the function called. With sines of XLA's own: polynomials, of which a kernel takes
+    many at a time, take longer to compile. seen: names of functions looked into; made: {name of a stage: its kernel}.
+    """
+    seen.add(callee(call))
+    for inner in _operations(module.symbol_table[callee(call)].operation):
+        if inner.name != "func.call" or ATTRIBUTES in inner.attributes:
+            continue
+        name = callee(inner)
+        if name not in made and (found := _kernel_alone(module, inner)):
+            _cut(module, found, inner, with_sines=False)
+            made[name] = inner.attributes["callee"]
+        if name in made:
+            inner.attributes["callee"] = made[name]
+            continue
+        if name not in seen:
+            _cut_stages(module, inner, seen, made)
+        if name.startswith(STAGED):
+            compute_once(inner)
+
+
+def _kernel_alone(module, stage):
+    """The `Inspection` of a stage that makes a kernel for certain, and is worth one; None of all else."""
+    if not callee(stage).startswith((STAGED, PART)) or not len(stage.results):
+        return None
+    found = Inspection(module.symbol_table, stage)
+    functions = [module.symbol_table[name].operation for name in found.finished]
+    sizes = [size(x) for function in functions for op in _operations(function) for x in op.results]
+    if not found.is_proven or found.objection or found.operations < LEAST:
+        return None
+    found.stages.pop(callee(stage), None)
+    return found if max(sizes) <= LARGEST else None
 
 
 def _refusal(module, found, call):
@@ -66,24 +126,25 @@ def _refusal(module, found, call):
     return alone.refusal()
 
 
-def _cut(module, found, call):
+def _cut(module, found, call, with_sines=True):
     """Makes the function called a kernel."""
     for choice in found.choices:
         _take_form_inside(choice)
     for case in found.seldom:
         _loop_at_most_once(case)
     for product in found.products:
-        _call_stage([product], _insert(module, _as_stage(written_out(module, product))))
-    write_sines(module, found.finished)
+        call_stage([product], insert(module, as_stage(written_out(module, product))))
+    if with_sines:
+        write_sines(module, found.finished)
     for name in found.finished:  # what a stage calls comes before it
         stages = found.stages.get(name, [])
-        if stages and _may_be_divided(stages[0]):
+        if stages and may_be_divided(stages[0]):
             copy = module.symbol_table[name].operation.clone(ip=module.ip)
-            _call_stage(stages, _insert(module, _as_stage(copy)))
+            call_stage(stages, insert(module, as_stage(copy)))
         else:
             for stage in stages:
-                _compute_once(stage)
-    _make_kernel(module, call)
+                compute_once(stage)
+    make_kernel(module, call)
 
 
 def _operations(op):
@@ -95,95 +156,6 @@ def _operations(op):
 
 def _is_undecided(op):
     return op.name == "func.call" and ATTRIBUTES not in op.attributes and callee(op).startswith(KERNEL)
-
-
-def _attach(call, **attributes):
-    call.attributes[ATTRIBUTES] = ir.DictAttr.get({key: ir.StringAttr.get(x) for key, x in attributes.items()})
-
-
-def _compute_once(call):
-    _attach(call, inlineable="false")
-
-
-def _may_be_divided(call):
-    """Whether XLA may divide the function among threads, and then the kernel does not link: by its only result."""
-    return len(call.results) == 1 and size(call.results[0]) > 1
-
-
-def _as_stage(function):
-    """The function with a second result, an element that costs nothing to have."""
-    (body,) = function.regions[0]
-    with function.location:
-        _return_also(function, _cheap(body.arguments, body.operations[len(body.operations) - 1].operands))
-    return function
-
-
-def _call_stage(replaced, reference):
-    """A call of the stage in the place of each of these operations."""
-    for op in replaced:
-        (cheap,) = _cheap(op.operands, op.results)
-        with op.location, ir.InsertionPoint(op):
-            call = func.CallOp([op.results[0].type, _element(cheap)], reference, list(op.operands))
-        _compute_once(call.operation)
-        op.results[0].replace_all_uses_with(call.results[0])
-        op.erase()
-
-
-def _cheap(operands, results):
-    return [next((x for x in operands if size(x)), results[0])]
-
-
-def _make_kernel(module, call):
-    """Lets `call` find a function that calls the one it called, as a kernel.
-
-    XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once a constant is put in its place.
-    So the kernel returns an element of each; the function between drops them, and hides the values.
-    """
-    name = callee(call)
-    with call.location:
-        kernel = module.symbol_table[name].operation.clone(ip=module.ip)
-        old_type = ir.FunctionType(ir.TypeAttr(kernel.attributes["function_type"]).value)
-        types = _return_also(kernel, kernel.regions[0].blocks[0].arguments)
-        between = func.FuncOp(name, old_type, ip=module.ip)
-        with ir.InsertionPoint(between.add_entry_block()):
-            hidden = list(stablehlo.OptimizationBarrierOp(between.arguments).results)
-            inner = func.CallOp(types, _insert(module, kernel), hidden)
-            func.ReturnOp(list(inner.results)[: len(old_type.results)])
-        _attach(inner.operation, inlineable="false", xla_cpu_small_call="true")
-        call.attributes["callee"] = _insert(module, between.operation)
-
-
-def _return_also(function, values):
-    """Lets a function return an element of each value after what it returned: the types of all."""
-    (body,) = function.regions[0]
-    end = body.operations[len(body.operations) - 1]
-    with ir.InsertionPoint(end):
-        elements = [stablehlo.slice(x, *_first(x)) if size(x) else x for x in values]
-        func.ReturnOp([*end.operands, *elements])
-    end.erase()
-    old = ir.FunctionType(ir.TypeAttr(function.attributes["function_type"]).value)
-    types = [*old.results, *(x.type for x in elements)]
-    function.attributes["function_type"] = ir.TypeAttr.get(ir.FunctionType.get(old.inputs, types))
-    if "res_attrs" in function.attributes:
-        del function.attributes["res_attrs"]
-    return types
-
-
-def _element(x):
-    """The type of an element of x, with as many axes."""
-    return ir.RankedTensorType.get([1] * ir.RankedTensorType(x.type).rank, ir.RankedTensorType(x.type).element_type)
-
-
-def _first(x):
-    """Bounds and strides of a slice of one element."""
-    rank = ir.RankedTensorType(x.type).rank
-    return [ir.DenseI64ArrayAttr.get([n] * rank) for n in (0, 1, 1)]
-
-
-def _insert(module, function):
-    """Into the module, under a name that is free: the reference to it."""
-    function.attributes["sym_visibility"] = ir.StringAttr.get("private")
-    return ir.FlatSymbolRefAttr.get(module.symbol_table.insert(function).value)
 
 
 def _take_form_inside(case):

@@ -1,19 +1,22 @@
 """Options for the compiler, of the programs that start here; inside a jit of the user's those of that jit hold.
 
 QUICK: XLA:CPU compiles each fusion that stands outside a kernel by a pipeline of MLIR, some 10 ms for a few sums, and
-gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. What
-it makes of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without.
+gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. So in
+programs without QUICK stages become kernels (lowering.py), which in those with it would take longer. What it makes of
+the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without.
 WIDE: vectors of 512 bits for loops over the members of a batch, where XLA:CPU takes half of that, unless it is asked: a
 batch of double pendulums then takes half the time.
 
 For a jit of one's own: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
 """
 
+from functools import wraps
 from typing import Any
 
 import jax
 
 from hhtjax.xla.gate import is_on
+from hhtjax.xla.kernels import QUICKLY
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 MOST_QUICK = 32  # rates; with 40, steps of a beam take 1.2 times as long
@@ -34,6 +37,7 @@ class Programs:
     def __init__(self, f, **static):
         """static: of `jax.jit`."""
         self.usual: Any = jax.jit(f, **static)
+        f = _quickly(self.usual)  # traced once for all
         self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
 
@@ -60,3 +64,14 @@ class Programs:
     def number(self):
         """Of all that have been compiled."""
         return sum(program._cache_size() for program in (self.usual, self.quick, self.wide))
+
+
+def _quickly(f):
+    """f by a name that tells how it is compiled."""
+
+    @wraps(f)
+    def call(*args, **keywords):
+        return f(*args, **keywords)
+
+    call.__name__ = f"{QUICKLY}_{f.__name__.strip('_')}"
+    return call

@@ -27,6 +27,31 @@ def is_untouched():
     return type(_here.bind()).__name__ in KNOWN
 
 
+def is_in_batch():
+    """Whether a batch is being made here, as far as a JAX says so: not of a jit of which one is made when it is traced.
+
+    Args:
+        None.
+
+    Returns:
+        A boolean, known while a function is being traced.
+
+    Raises:
+        Nothing.
+
+    >>> import jax
+    >>> seen, x = [], jax.numpy.ones(1)
+    >>> for change in (jax.jit, jax.vmap, lambda f: jax.jit(jax.vmap(jax.grad(f)))):
+    ...     _ = change(lambda x: seen.append(is_in_batch()) or x.sum())(x)
+    >>> seen
+    [False, True, True]
+    """
+    trace = _here.bind()
+    while trace is not None and type(trace).__name__ != "BatchTrace":
+        trace = getattr(trace, "parent_trace", None)
+    return trace is not None
+
+
 class _Here(Primitive):
     """What evaluates it; an older JAX hands over less beside that."""
 
