@@ -46,6 +46,18 @@ def test_what_a_single_segment_determines_has_an_error_too():
     assert float(result.standard_errors[1]) == pytest.approx(1 / 40, rel=0.4)
 
 
+def test_outputs_may_come_before_the_samples():
+    """Two outputs with the same error: their parts of one time are one segment, in whatever order the axes are."""
+    noise = np.tile(np.random.default_rng(0).normal(size=(400, 1)), 2)
+
+    def errors(residuals):
+        return hhtjax.fit(residuals, jnp.zeros(2)).standard_errors
+
+    first = errors(lambda p: (X[:400, 1] * p[0] + p[1])[:, None] - noise)
+    last = errors(lambda p: ((X[:400, 1] * p[0] + p[1])[:, None] - noise).T)
+    np.testing.assert_allclose(last, first, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("directions", "values", "phrases"),
     [

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from scipy.optimize import linear_sum_assignment
 
 from hhtjax.analysis.amplification import amplification_matrix, at_rest, eigenvalues
 from hhtjax.checks import require_number
@@ -215,6 +214,8 @@ def _rates_of_equations(M, C, K):
 
 def _rates_of_steps(stepper, dt, M, C, K):
     """log(mu)/dt of the steps, in the order of the equations' eigenvalues."""
+    from scipy.optimize import linear_sum_assignment  # which takes as long to import as hhtjax
+
     linear = LinearSystem(M, C, K)
     state = at_rest(linear, stepper, jnp.zeros(len(M)), None, dt)
     mu = np.linalg.eigvals(np.asarray(amplification_matrix(linear, stepper, state, dt=dt)))

@@ -1,5 +1,6 @@
 """Questions to a fit: which term is missing, how far one parameter can go, how sure a prediction is."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from hhtjax.identification.gauss_newton import with_jacobian
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
-from hhtjax.identification.sandwich import SEGMENTS, in_segments
+from hhtjax.identification.sandwich import SEGMENTS, in_segments, in_time
 
 
 @shown
@@ -78,13 +79,14 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     )
     both, unravel = ravel_pytree((params, candidates))
     p = ravel_pytree(params)[0].size
-    sizes = [x.size for x in jax.tree.leaves(jax.eval_shape(lambda x: residuals(*thaw(unravel(x))), both))]
+    shapes = [x.shape for x in jax.tree.leaves(jax.eval_shape(lambda x: residuals(*thaw(unravel(x))), both))]
     r, J = with_jacobian(lambda x: ravel_pytree(residuals(*thaw(unravel(x))))[0], both)
     Q, _ = jnp.linalg.qr(J[:, :p])
     X = J[:, p:] - Q @ (Q.T @ J[:, p:])
     rounding = 10 * len(r) * float(jnp.finfo(r.dtype).eps) * jnp.linalg.norm(J[:, p:], axis=0)
     X = jnp.where(jnp.linalg.norm(X, axis=0) > rounding, X, 0)  # else the fitted parameters do all that it does
-    scores: Any = sum(part.sum(axis=1) for part in in_segments(X * r[:, None], sizes, segments))
+    by_time = (X * r[:, None])[in_time(shapes)]
+    scores: Any = sum(part.sum(axis=1) for part in in_segments(by_time, [math.prod(x) for x in shapes], segments))
     total, square = scores.sum(axis=0), jnp.sum(X**2, axis=0)
     variance = jnp.sum(scores**2, axis=0)
     return Score(

@@ -10,19 +10,27 @@ from hhtjax.description.presentation import overwrite
 from hhtjax.identification.arguments import spread_weights
 from hhtjax.identification.evidence import count, residuals_of
 from hhtjax.identification.identify import fit
+from hhtjax.identification.sandwich import in_time
+
+
+def _segment(shape, folds, fold):
+    """Which entries of a leaf of the residuals are in one of its `folds` segments."""
+    order = in_time([shape])
+    inside = np.zeros(order.size, bool)
+    inside[order] = np.arange(order.size) // -(-order.size // folds) == fold
+    return inside.reshape(shape)
 
 
 def leave_out(name, result, function, folds, always, options, progress):
     """rms of each segment by the parameters fitted to the others, and whether these fits converged."""
     weights = spread_weights("compare", result.weights, result.residual)
     always = spread_weights("compare", False if always is None else always, result.residual, "always")
-    sizes = [w.size for w in weights]
     structure = jax.tree.structure(freeze(result.params))
     structured, errors, converged = jax.tree.structure(result.residual), [], []
     for fold in range(folds):
         if progress:
             overwrite(f"compare: {name}, segment {fold + 1} of {folds} left out", last=fold + 1 == folds)
-        out = [(np.arange(n) // -(-n // folds) == fold).reshape(w.shape) for n, w in zip(sizes, weights, strict=True)]
+        out = [_segment(w.shape, folds, fold) for w in weights]
         out = [x & ~np.asarray(y, bool) for x, y in zip(out, always, strict=True)]
         kept = [np.where(x, 0, w) for x, w in zip(out, weights, strict=True)]
         again = fit(

@@ -18,7 +18,7 @@ from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.rounds import in_rounds
-from hhtjax.identification.sandwich import count_segments, uncertainty, variance_inflation
+from hhtjax.identification.sandwich import count_segments, in_time, uncertainty, variance_inflation
 from hhtjax.runs.freezing import chooses_steps, with_steps_for
 from hhtjax.xla import Programs
 
@@ -144,6 +144,9 @@ def _solve_dense(residuals, options, coordinates, data, limits):
     if J is not None:
         J, pull, bend = objective.estimating(r, J)
     sizes, of_pull = [math.prod(leaf.shape) for leaf in leaves], jax.tree.leaves(unravel(pull[:m]))
+    order = np.concatenate([in_time([leaf.shape for leaf in leaves]), np.arange(m, w.size)])
+    if J is not None and np.any(np.diff(order) < 0):
+        J, pull, bend = (x if x is None else x[order] for x in (J, pull, bend))
     ended = x, cost, history, iterations, code, choices, residual, None
     return _Solved(*ended, J, pull, bend, of_pull, sizes, jnp.sum(w != 0))
 

@@ -153,10 +153,21 @@ def _clusters(J, r, sizes, segments, variance):
     return score.T @ score + jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U)
 
 
-def time_axis(shape, of_records):
+def time_axis(shape, of_records=False):
     """The longest axis, along which residuals follow one another; records, on the first axis, do not."""
     first = int(of_records and len(shape) > 1)
     return first + int(np.argmax(shape[first:])) if shape else 0
+
+
+def in_time(shapes):
+    """The order of the entries of raveled leaves in which each leaf goes along its `time_axis` first: segments are cut
+    from what follows one another, and not from one output after the other."""
+    begin, orders = 0, [np.arange(0)]
+    for shape in shapes:
+        entries = begin + np.arange(math.prod(shape)).reshape(shape)
+        orders.append(np.moveaxis(entries, time_axis(shape), 0).ravel() if shape else entries.ravel())
+        begin += entries.size
+    return np.concatenate(orders)
 
 
 def variance_inflation(leaves, of_records=False):
