@@ -108,9 +108,14 @@ def test_a_jump_leads_to_the_start_under_the_new_force():
     scene = pendulum.cartesian()
     system = pushed(scene)
     stepper, params = hhtjax.hht(-0.3), [{"u": lambda t, u=u: jnp.asarray(u)} for u in VALUES[:2]]
-    old, new = (stepper.init(system, scene.q0, scene.v0, p, dt=0.1) for p in params)
-    flat, _, _ = flatten("test", system, scene.q0, scene.v0, 0.0, params[0])
-    found = held.jump(stepper, flat, old, *params)
+
+    @jax.jit
+    def states():
+        old, new = (stepper.init(system, scene.q0, scene.v0, p, dt=0.1) for p in params)
+        flat, _, _ = flatten("test", system, scene.q0, scene.v0, 0.0, params[0])
+        return old, new, held.jump(stepper, flat, old, *params)
+
+    old, new, found = states()
     for name in ("w", "L"):
         np.testing.assert_allclose(getattr(found, name), getattr(new, name), rtol=1e-12)
         assert not np.allclose(getattr(old, name), getattr(new, name), rtol=0.01)
