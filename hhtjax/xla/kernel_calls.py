@@ -29,14 +29,14 @@ def as_stage(function):
     (body,) = function.regions[0]
     with function.location:
         given, made = body.arguments, list(body.operations[len(body.operations) - 1].operands)
-        _return_also(function, lambda: [_one_of(x) for x in _cheap(given, made)])
+        _return_also(function, lambda: [_one_of(_cheap(given, made))])
     return function
 
 
 def call_stage(replaced, reference):
     """A call of the stage in the place of each of these operations."""
     for op in replaced:
-        (cheap,) = _cheap(op.operands, op.results)
+        cheap = _cheap(op.operands, op.results)
         with op.location, ir.InsertionPoint(op):
             call = func.CallOp([op.results[0].type, _element(cheap)], reference, list(op.operands))
         compute_once(call.operation)
@@ -45,7 +45,8 @@ def call_stage(replaced, reference):
 
 
 def _cheap(operands, results):
-    return [next((x for x in operands if size(x)), results[0])]
+    """What is known before all else, where there is such."""
+    return next((x for x in operands if size(x)), results[0])
 
 
 def make_kernel(module, call):

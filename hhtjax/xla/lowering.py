@@ -111,12 +111,13 @@ def _kernel_alone(module, stage):
     if not callee(stage).startswith((STAGED, PART)) or not len(stage.results):
         return None
     found = Inspection(module.symbol_table, stage)
-    functions = [module.symbol_table[name].operation for name in found.finished]
-    sizes = [size(x) for function in functions for op in _operations(function) for x in op.results]
     if not found.is_proven or found.objection or found.operations < LEAST:
         return None
+    functions = (module.symbol_table[name].operation for name in found.finished)
+    if any(size(x) > LARGEST for function in functions for op in _operations(function) for x in op.results):
+        return None
     found.stages.pop(callee(stage), None)
-    return found if max(sizes) <= LARGEST else None
+    return found
 
 
 def _refusal(module, found, call):
