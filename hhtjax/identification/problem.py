@@ -134,17 +134,17 @@ def _solve_dense(residuals, options, coordinates, data, limits):
         away = [p - mean for p, mean in zip(coordinates.free_leaves(x), means, strict=True)]
         return jnp.concatenate([r, ravel_pytree(away)[0]])
 
-    objective, bend, choices = Objective(w, options.loss, m), coordinates.bend(), None
+    objective, bending, choices = Objective(w, options.loss, m), coordinates.bend(), None
     if options.optimizer == LEVENBERG_MARQUARDT:
 
         def problem_for(y, fresh):
-            return Dense(lambda x: with_steps_for(f, x, jnp.where(fresh, x, y)), objective, bend)
+            return Dense(lambda x: with_steps_for(f, x, jnp.where(fresh, x, y)), objective, bending)
 
         start = coordinates.x0, coordinates.longest, *limits
         if chooses_steps(f, coordinates.x0):
             best, history, iterations, code, choices = in_rounds(problem_for, *start)
         else:
-            best, history, iterations, code = levenberg_marquardt(Dense(f, objective, bend), *start)
+            best, history, iterations, code = levenberg_marquardt(Dense(f, objective, bending), *start)
         x, r, J = best.x, best.r, best.J
     else:
         x, history, iterations, code = descend(f, coordinates.x0, objective, options.optimizer, *limits)
