@@ -166,14 +166,15 @@ def test_first_order_systems_and_internal_states():
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_level")
 def test_derivatives_are_those_of_the_accepted_steps():
-    """Reverse by differences over the same steps, and forward along a direction."""
+    """Reverse by differences over the same steps, and forward along a direction; of what a force closes over, too."""
     stepper, times = hhtjax.hht(linearize="predictor"), np.array([0.7, 0.9, 2.0])
     system = hhtjax.System(ONE, lambda q, v, t, params: -params["k"] * jnp.sin(q) - params["c"] * v**3)
     params = {"k": jnp.asarray(4.0), "c": jnp.asarray(0.3)}
     control = hhtjax.adaptive(1e-3, 1e-6, max_steps=500)
 
     def loss(params):
-        return jnp.sum(hhtjax.simulate(system, stepper, ONE, ZERO, params, dt=control, times=times).q ** 2)
+        by_closure = hhtjax.System(ONE, lambda q, v, t, k: system.force(q, v, t, params | {"k": k}))
+        return jnp.sum(hhtjax.simulate(by_closure, stepper, ONE, ZERO, params["k"], dt=control, times=times).q ** 2)
 
     steps = hhtjax.choose_steps(system, stepper, ONE, ZERO, params, times=times, rtol=1e-3, atol=1e-6, max_steps=500)
     whole = hhtjax.simulate(system, stepper, ONE, ZERO, params, dt=control, times=times)

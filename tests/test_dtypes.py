@@ -43,6 +43,11 @@ def test_float32_stays_float32_and_warns_once_a_call(name):
             str(caught[0].message),
         )
         assert np.isclose(solution.q[-1, 0], np.cos(0.8), atol=0.3)
+    late, _ = run_and_catch(
+        stepper=with_tolerance(STEPPERS[name], 1e-5), q0=SINGLE, v0=0 * SINGLE, save_every=2, t0=1e8
+    )
+    with pytest.raises(hhtjax.SimulationError, match=r"times are alike in float32, near t = 1e\+08: count from a t0"):
+        late.check()
 
 
 @pytest.mark.parametrize("name", ["rk4", "hht auto", "kim_hht"])

@@ -159,6 +159,9 @@ def test_under_jit_and_vmap_and_what_a_traced_step_size_may_be():
     assert runs.q.shape == (2, 5, 5, 1)
     np.testing.assert_array_equal(runs.failure.step > 0, [[False] * 3 + [True] * 2] * 2)
     np.testing.assert_allclose(runs.q[1, :3], sweep({"k": 5.0, "c": 0.1}, dts=DTS).q[:3], rtol=1e-12)
+    told = r"simulate: member 0, 3 \(4 of 10 failed\), `dt` must be positive and finite, and in a sweep at most the dis"
+    with pytest.raises(hhtjax.SimulationError, match=told):
+        runs.check()
 
 
 @pytest.mark.parametrize("dts", [DTS, jnp.asarray(DTS), DTS.tolist()], ids=["NumPy", "JAX", "list"])

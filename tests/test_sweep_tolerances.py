@@ -33,10 +33,10 @@ SCENES = {  # system, stepper, start, params, what differs
 }
 
 
-def sweep(params=PARAMS, rtol=RTOL, scene="spring", in_axes=None, **options):
-    system, stepper, q0, v0, _ = SCENES[scene]
+def sweep(params=PARAMS, rtol=RTOL, scene="spring", in_axes=None, system=None, **options):
+    usual, stepper, q0, v0, _ = SCENES[scene]
     dts = hhtjax.adaptive(rtol, 1e-3 * rtol, **{"max_steps": 4000} | options)
-    return hhtjax.sweep(system, stepper, q0, v0, params, dts=dts, times=TIMES, t0=2.0, in_axes=in_axes)
+    return hhtjax.sweep(system or usual, stepper, q0, v0, params, dts=dts, times=TIMES, t0=2.0, in_axes=in_axes)
 
 
 @pytest.mark.slow
@@ -79,13 +79,14 @@ def test_the_work_is_about_the_sum_over_the_members():
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_level")
 def test_derivatives_are_those_of_the_accepted_steps():
-    """Reverse by differences over the same steps, and forward along a direction."""
+    """Reverse by differences over the same steps, and forward along a direction; of what a force closes over, too."""
     at, rtol = jax.tree.map(jnp.asarray, PARAMS), np.array([1e-3, 1e-2, 3e-3, 2e-3, 5e-3])
     steps = sweep(at, rtol).steps
     padded = jnp.where(jnp.isfinite(steps.dt), steps.dt, 0.01)  # nobody looks behind the last time
 
     def loss(params):
-        return jnp.sum(sweep(params, rtol).q[:, 1:] ** 2)
+        by_closure = hhtjax.System(ONE, lambda q, v, t, k: force(q, v, t, params | {"k": k}))
+        return jnp.sum(sweep(params["k"], rtol, system=by_closure).q[:, 1:] ** 2)
 
     @jax.jit
     def frozen(params):

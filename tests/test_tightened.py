@@ -65,11 +65,11 @@ def slope_over(dt):
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_the_accepted_steps():
-    """Also of a jit, which does not know that it will be differentiated."""
+    """Also of a jit, which does not know that it will be differentiated, and of what a force closes over."""
     run = controlled(rtol=1e-2)
 
     def end(k):
-        return controlled(k, rtol=1e-2).q[-1, 0]
+        return controlled(None, rtol=1e-2, system=hhtjax.System(ONE, lambda q, v, t, _: -100 * q - k * q**3)).q[-1, 0]
 
     (value, reverse), (_, forward) = jax.jit(
         lambda k: (jax.value_and_grad(end)(k), jax.jvp(jax.jit(end), (k,), (1.0,)))

@@ -16,6 +16,7 @@ from hhtjax.runs.choose import Steps, choose, trimmed
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.events import loop_with_events, with_told_events
+from hhtjax.runs.freezing import frozen
 from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, resting
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.read_off import kept, read_off
@@ -36,7 +37,7 @@ def chosen_steps(problem, end, control, events=None, progress=False, room=()):
     def found(problem, end, control, events):
         return choose(problem, problem.times(end), control, progress, events, room)[:2]
 
-    return one_kernel(found, problem, end, control, events, around=True)
+    return frozen(partial(one_kernel, found, around=True), problem, end, control, events)
 
 
 def steps_for(choice, progress, room):

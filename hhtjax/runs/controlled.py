@@ -12,7 +12,7 @@ from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.choose import choose, trimmed
 from hhtjax.runs.chosen import checked_times, run_over, steps_for
-from hhtjax.runs.freezing import is_pair, run_and_choice
+from hhtjax.runs.freezing import frozen, is_pair, run_and_choice
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.tightened import accepted_run, tighten
 from hhtjax.runs.verified import compared, scaled, verified
@@ -80,10 +80,10 @@ def run_tightened(start, alone, progress, room):
     choice = problem, times, unverified(control), events
     last = or_plain(partial(rounds, choice, progress=progress, room=room, rates=problem.rates()))
     again = partial(over, room=room)
-    if is_pair():
-        run = again(start, last.steps, last.ends)
-    elif alone and not is_tracing():  # no jit, of which a derivative could be made
+    if alone and not is_tracing():
         run = last.run
+    elif is_pair() or not is_tracing():  # no jit, of which a derivative may or may not be made
+        run = again(start, last.steps, last.ends)
     else:
         run = accepted_run(last, again, start)
     steps = trimmed(last.steps)._replace(tightened=last.share)
@@ -102,7 +102,7 @@ def rounds(choice, progress, room):
         again = problem, times, tighter, events
         return run_in_two(again, again, progress, room)
 
-    return tighten(once, partial(compared, control=control), problem.times(1.0))
+    return frozen(partial(tighten, once, partial(compared, control=control)), problem.times(1.0))
 
 
 @partial(Programs, static_argnames=("progress",))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description import is_array
+from hhtjax.numerics.hoisted import hoisted
 from hhtjax.xla import calls
 
 PAIR = "hhtjax: a run, and the choice of its steps"
@@ -33,6 +34,18 @@ def run_and_choice(data):
     both = jax.tree.map(lambda x: lax.all_gather(x, PAIR) if is_array(x) else (x, x), data)
     run, choice = (jax.tree.map(lambda x, two, i=i: two[i], data, both) for i in (0, 1))
     return run, lax.stop_gradient(choice)
+
+
+def frozen(f, *args):
+    """f(*args), constant to derivatives also in what f closes over, as a force does over what is differentiated.
+
+    args: the second of `run_and_choice`. To be called inside a jit: it compiles f anew.
+
+    >>> float(jax.grad(lambda x: x * frozen(lambda y: x * y, 5.0))(3.0))
+    15.0
+    """
+    call, closed_over = hoisted(f, *args)
+    return call(run_and_choice(closed_over)[1], *args)
 
 
 def chooses_steps(f, *args):

@@ -10,7 +10,7 @@ from jax import lax
 from hhtjax.runs.choose import trimmed
 from hhtjax.runs.choose_many import Members, choose_many
 from hhtjax.runs.chosen import Grid, follow
-from hhtjax.runs.freezing import is_pair, run_and_choice
+from hhtjax.runs.freezing import frozen, is_pair, run_and_choice
 from hhtjax.runs.loop import show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
 from hhtjax.runs.tightened import accepted_run, tighten
@@ -41,10 +41,10 @@ def run_chosen(system, start, choice, *, mapped, size, lanes, progress, pair, ro
 
     control = start[1]
     axes = [0 if flag else None for flag in mapped] + [0 if jnp.ndim(x) else None for x in jax.tree.leaves(control)]
-    members, frozen = members_of(*start), members_of(*choice)
+    members, choosing = members_of(*start), members_of(*choice)
 
     if control.verify == "tighten":
-        last = rounds(frozen, progress)
+        last = frozen(partial(rounds, choosing, progress))
         steps, told = last.steps._replace(tightened=last.share), {"error": last.error, "allowed": last.allowed}
 
         def again(start, steps, ends):
@@ -52,13 +52,13 @@ def run_chosen(system, start, choice, *, mapped, size, lanes, progress, pair, ro
 
         runs = again(start, steps, last.ends) if pair else accepted_run(last, again, start)
     else:
-        steps, ends = choose_many(frozen)
+        steps, ends = frozen(partial(choose_many, choosing))
         runs = run_many(members, steps, ends, progress)
-        told = errors(members, frozen, control.verify, runs, steps, ends, progress) if control.verify else {}
+        told = errors(members, choosing, control.verify, runs, steps, ends, progress) if control.verify else {}
     return runs._replace(dt=steps.dt, steps=steps, **told)
 
 
-def errors(members, frozen, verify, runs, steps, ends, progress):
+def errors(members, choosing, verify, runs, steps, ends, progress):
     """What the `Solution` tells of its errors, by the runs with halved steps, or with those for a quarter of the
     tolerance."""
 
@@ -67,7 +67,7 @@ def errors(members, frozen, verify, runs, steps, ends, progress):
 
     is_halved = verify != "tolerance"
     if not is_halved:
-        steps, ends = choose_many(frozen.for_share(1 / 4))
+        steps, ends = frozen(partial(choose_many, choosing.for_share(1 / 4)))
     finer = run_many(members, steps, ends, progress, halved=is_halved)
     return jax.vmap(error, (members.axes, 0, 0))(members.arrays, runs, finer)
 
