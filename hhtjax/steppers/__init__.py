@@ -7,7 +7,7 @@ stepper                            order                 solves per step   for
                                                                            picks the point of linearisation
 `hht(alpha, iterations=None)`      2                     Newton's          the converged method, differentiated
                                                                            implicitly
-`newmark(beta, gamma)`             2                     1, or Newton's    the family's ancestor, same options
+`newmark(beta, gamma)`             2; 1 for gamma > 1/2  1, or Newton's    the family's ancestor, same options
 `bossak(alpha)`                    2                     1, or Newton's    the rest of the family, same options
 `generalized_alpha(rho_inf)`       2                     1, or Newton's    the rest of the family, same options
 `kim_hht(alpha)`                   1; 2 for alpha = 0    1                 the paper of 2019, literally

@@ -34,7 +34,7 @@ def bind(stepper, system, params, dt, last=None):
     if system.matrices is not None and not stepper.keeps_sparse:
         raise NotImplementedError(
             f"{type(stepper).__name__} cannot keep the matrices of the system sparse; use hht() or another of its "
-            "family, rosenbrock(), rowda() or rk4(), or hand over arrays: K.toarray()."
+            "family, rosenbrock(), rowda(), rk4() or dopri5(), or hand over arrays: K.toarray()."
         )
     if not holds(params):
         return stepper.bind(system, params, dt)
