@@ -231,6 +231,7 @@ def product(A, B) -> jax.Array:
     >>> print(product(hat(jnp.array([1.0, 0.0, 0.0])), jnp.eye(3))[2])
     [0. 1. 0.]
     """
+    A, B = _real("product", "A", A, (3, 3)), _real("product", "B", B, (3, 3))
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
 
@@ -244,7 +245,7 @@ def cross(x, y) -> jax.Array:
     >>> print(cross(jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])))
     [0. 0. 1.]
     """
-    (a, b, c), (d, e, f) = x, y
+    (a, b, c), (d, e, f) = _real("cross", "x", x, (3,)), _real("cross", "y", y, (3,))
     return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d])
 
 

@@ -203,10 +203,11 @@ def test_scaled_tangent_depends_on_rate_times_dt_only(system, v0):
 
 @pytest.mark.parametrize("alpha", [0.0, -0.3])
 def test_stability_region_of_kims_step(alpha):
-    z = np.array([[-1.0, 2.0 + 1j], [-30j, 1e3]])
+    z = np.array([[-1.0, 3.0 + 1j], [-30j, 1e3]])
     theta = (0.5 - alpha) * (1 + alpha)
-    exact = abs(1 + z / (1 - theta * z))
-    np.testing.assert_allclose(analysis.stability_region(hhtjax.kim_hht(alpha), z), exact, rtol=1e-12)
+    for given in (z, z.real, z.real.astype(int)):
+        exact = abs(1 + given / (1 - theta * given))
+        np.testing.assert_allclose(analysis.stability_region(hhtjax.kim_hht(alpha), given), exact, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("stepper", "order"), [(hhtjax.hht(-0.05), 2), (hhtjax.kim_hht(-0.1), 1)])

@@ -1,5 +1,6 @@
 """What the library says to wrong constraints, and to steppers that do not know them."""
 
+import math
 import re
 from functools import partial
 
@@ -21,8 +22,8 @@ def run_from(phi, q0, v0):
     return lambda: simulate(constrained(phi), hhtjax.hht(), jnp.array(q0), jnp.array(v0))
 
 
-def project(phi):
-    return lambda: hhtjax.consistent_initial(constrained(phi), jnp.ones(2), jnp.ones(2))
+def project(phi, params=None, t0=0.0):
+    return lambda: hhtjax.consistent_initial(constrained(phi), jnp.ones(2), jnp.ones(2), params, t0)
 
 
 def level(q, t, params):
@@ -44,13 +45,15 @@ BAD = [
     ),
     ("consistent_initial: no q with Phi(q, t) = 0 found", project(lambda q, t, params: q[:1] ** 2 + 1.0)),
     ("consistent_initial: `system` must have a constraint", project(None)),
+    ("consistent_initial: `t0` must be finite; received nan", project(level, t0=math.nan)),
+    ("consistent_initial: `params['l']` must be an array, a number or a function", project(level, {"l": "2 m"})),
     ('hht: `formulation` must be "ggl" or "index3"', lambda: hhtjax.hht(formulation="index2")),
 ]
 
 
 @pytest.mark.parametrize(("message", "call"), BAD, ids=lambda x: x[:40] if isinstance(x, str) else "")
 def test_bad_input(message, call):
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises((ValueError, TypeError), match=re.escape(message)):
         call()
 
 

@@ -73,19 +73,20 @@ def test_a_constrained_direction_is_named():
 
 @pytest.mark.slow
 def test_friction_beside_redundant_constraints():
-    """They take one direction, not two; and what friction does is known to the energy balance too."""
+    """They take one direction, not two, at jumps of inputs too; and the energy balance knows what friction does."""
     system = hhtjax.System(
         TWO,
-        force,
+        lambda q, v, t, p: force(q, v, t, p) + p(t),
         lambda q, t, p: jnp.stack([q[1], 2 * q[1]]),
         friction=lambda q, v, L, t, p: 0.2 * ONE,
         sliding=lambda q, v, t, p: v[:1] - 0.1,
     )
     stepper, zero = hhtjax.hht(redundant="least_squares"), 0 * TWO
-    found = hhtjax.simulate(system, stepper, zero, zero, dt=0.01, num_steps=400)
+    held = hhtjax.sampled(jnp.array([[0.0, 0.0], [0.1, 0.1], [-0.1, 0.1]]), dt=1.0, order=0)
+    found = hhtjax.simulate(system, stepper, zero, zero, held, dt=0.01, num_steps=400)
     found.check()
     assert 0.1 < np.mean(found.sticking) < 0.9
-    assert np.max(np.abs(hhtjax.analysis.energy_balance(system, found).error)) < 1e-3
+    assert np.max(np.abs(hhtjax.analysis.energy_balance(system, found, held).error)) < 1e-3
 
 
 @pytest.mark.slow

@@ -93,7 +93,7 @@ def test_a_module_is_fitted():
 
 
 @pytest.mark.slow
-def test_sweeps_and_initial_values_know_modules():
+def test_sweeps_initial_values_and_analyses_know_modules():
     """With a constraint, so that `consistent_initial` and the checks of `simulate` are asked too."""
     bead = hhtjax.System(
         np.ones(2),
@@ -111,6 +111,11 @@ def test_sweeps_and_initial_values_know_modules():
         hhtjax.analysis.energy_balance(bead, one, params).kinetic[0]
         > hhtjax.analysis.energy_balance(bead, one, params).kinetic[-1]
     )
+    orders = hhtjax.analysis.observed_order(bead, STEPPER, start.q, start.v, params, duration=0.3, num_steps=(3, 6, 12))
+    assert abs(orders.slope[0] - 2) < 0.3
+    state = STEPPER.init(bead, start.q, start.v, params, 0.1)
+    A = hhtjax.analysis.amplification_matrix(bead, STEPPER, state, params, dt=0.1)
+    assert np.max(np.abs(np.linalg.eigvals(A))) < 1.1
 
 
 def test_a_new_function_of_the_same_code_is_another():

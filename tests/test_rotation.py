@@ -30,6 +30,7 @@ from rotations import (
 )
 from scipy.spatial.transform import Rotation
 
+from hhtjax import rotation
 from hhtjax.rotation import (
     exp,
     hat,
@@ -205,10 +206,11 @@ def test_vmap_is_a_loop(f):
     assert_close(batched(f)(x), [jax.jit(f)(xi) for xi in x], 1e-15)
 
 
-@pytest.mark.parametrize("f", [*FUNCTIONS, tangent_rate, is_rotation])
+@pytest.mark.parametrize("f", [*FUNCTIONS, tangent_rate, is_rotation, rotation.cross, rotation.product])
 def test_bad_input_is_named(f):
-    shape = (3,) if f in VECTOR_FUNCTIONS or f is tangent_rate else (3, 3)
-    others = {tangent_rate: (np.zeros(3),), is_rotation: (1e-6,)}.get(f, ())
+    shape = (3,) if f in VECTOR_FUNCTIONS or f in (tangent_rate, rotation.cross) else (3, 3)
+    second = {tangent_rate: np.zeros(3), is_rotation: 1e-6, rotation.cross: np.zeros(3), rotation.product: EYE}
+    others = (second[f],) if f in second else ()
     for wrong in ((4,), (1, 3), (), (3, 4), (2, 3, 3)):
         with pytest.raises(ValueError, match=rf"^{f.__name__}: `\w+` must have shape .*; received \("):
             jax.eval_shape(lambda x: f(x, *others), jnp.zeros(wrong))

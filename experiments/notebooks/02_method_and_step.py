@@ -186,6 +186,7 @@ for extrapolate in (1, 2):
 # | no energy may be lost, everything is resolved | `hht(alpha=0.0)` | no numerical damping at all, at any frequency |
 # | smooth and stiff, more than three digits | `rowda()`, or `extrapolate=2` | order 3 |
 # | smooth, nothing stiff | `rk4()` | order 4, no Jacobian |
+# | a tolerance, and no step | the same, with `dt=adaptive(rtol, atol)`; `dopri5()` for `rk4()` | steps by errors |
 #
 # Then ask `suggest_step_size`, or halve the step and compare, as in notebook 1.
 #

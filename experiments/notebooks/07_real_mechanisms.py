@@ -214,11 +214,12 @@ for wanted in (4, 20, 100):
 
 # %% [markdown]
 # The error falls, but not along a clean line: a step that straddles the beginning or the end of a contact loses its
-# order, and where they fall changes with the step. Locating the impact within the step mends that; such **events**,
-# with a restitution coefficient instead of a contact stiffness, are not in the library yet.
+# order, and where they fall changes with the step. Locating the impact within the step mends that. Such **events**,
+# `simulate(..., events=[Event(guard, reset=impact(e))])`, have a restitution coefficient instead of a stiffness,
+# and keep the order of the method: they are on a page of their own, [events](../events/README.md).
 #
 # ## What to try next
 #
-# * Fit `Fs`, `Fk` and `vs` of the belt from a noisy run, as in notebook 3; start with a large `vt` and make it
-# smaller. * Let the frequency of the mount be 30 Hz, closer to its resonance: what becomes of the loops? * Drop the
-# ball with `hht(alpha=0.0)`: is the energy after an impact always less than before?
+# * Fit `Fs`, `Fk` and `vs` of the belt from a noisy run, as in notebook 3.
+# * Let the frequency of the mount be 30 Hz, closer to its resonance: what becomes of the loops?
+# * Drop the ball with `hht(alpha=0.0)`: is the energy after an impact always less than before?

@@ -25,7 +25,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis.checks import require_real
-from hhtjax.checks import require_number
+from hhtjax.checks import require_number, require_params
+from hhtjax.description import thaw
 from hhtjax.steppers.stepper import State, require_stepper, require_system
 from hhtjax.systems import kinematics
 from hhtjax.systems.system import FirstOrderSystem, System
@@ -93,11 +94,13 @@ def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Arra
     if not isinstance(state, State):
         raise TypeError(f"amplification_matrix: `state` must be a State, as of stepper.init; received {state!r}.")
     require_number("amplification_matrix", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    params = require_params("amplification_matrix", params)
     return _amplification_matrix(system, stepper, jax.tree.map(jnp.asarray, state), params, dt)
 
 
 @jax.jit
 def _amplification_matrix(system, stepper, state, params, dt):
+    params = thaw(params)
     q, unravel_q = ravel_pytree(state.q)
     blocks = kinematics.layout(state.q, state.v)
     x, unravel = _floats(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))

@@ -7,7 +7,8 @@ import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_number, require_params
+from hhtjax.description import thaw
 from hhtjax.description.presentation import shown
 from hhtjax.steppers.stepper import require_stepper
 from hhtjax.systems.initial_values import initial_values
@@ -73,6 +74,7 @@ def observed_order(
             "observed_order: `num_steps` must be a geometric sequence where there is no `reference`; "
             f"received {num_steps!r}."
         )
+    params = require_params("observed_order", params)
     q0, v0, z0 = initial_values("observed_order", system, q0, v0, z0)
     ends = [
         np.asarray(_end(system, stepper, q0, v0, params, z0, float(t0), float(duration) / n, n))
@@ -94,6 +96,7 @@ def observed_order(
 @Programs
 def _end(system, stepper, q0, v0, params, z0, t0, dt, num_steps):
     """q at the end as a vector; one compilation for all numbers of steps."""
+    params = thaw(params)
     state = stepper.init(system, q0, v0, params, dt, t0, z0)
     state = jax.lax.fori_loop(0, num_steps, lambda _, s: stepper.step(system, s, params, dt)[0], state)
     return ravel_pytree(state.q)[0]

@@ -45,6 +45,7 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
     The integral is Simpson's over each interval between saved times, on dense output: of order 4. Save every step, or
     some within the shortest period. Dry friction tau jumps where a joint switches: its integral is of order 2 there.
     It takes tau s where a joint slides, nothing where it sticks to what rests, and what a moving belt gives or takes.
+    Of events it knows nothing: what an impact takes, or a switch of params changes, counts as error from there on.
     Where nothing damps or drives, and V is given, work is 0 and the error is the drift of the total energy; without V,
     work counts every force, and the error is another, of the same order.
 

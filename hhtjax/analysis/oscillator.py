@@ -141,7 +141,7 @@ def stability_region(stepper, z) -> jax.Array:
 
     Args:
         stepper: any.
-        z: complex numbers, an array of any shape.
+        z: complex or real numbers, an array of any shape.
 
     Returns:
         Shaped like z.
@@ -163,7 +163,10 @@ def stability_region(stepper, z) -> jax.Array:
     if is_concrete(z) and not np.all(np.isfinite(z)):
         raise ValueError(f"stability_region: `z` must be finite; received {z!r}.")
     z = jnp.asarray(z)
-    return _stability_region(stepper, z if jnp.iscomplexobj(z) else jax.lax.complex(*2 * [z]))
+    if not jnp.iscomplexobj(z):
+        real = z if jnp.issubdtype(z.dtype, jnp.floating) else z.astype(jnp.result_type(float))
+        z = jax.lax.complex(real, jnp.zeros_like(real))
+    return _stability_region(stepper, z)
 
 
 @jax.jit

@@ -85,7 +85,6 @@ def export_c(
         name: of the files and before all names in C.
         sensitivities: names of fields of `NAME_params` in which derivatives are stepped along: with "k", the state has
             dq_dk, dv_dk, ... They are those of a run whose q0 and v0 do not depend on the params.
-
         units: of fields, for comments in the header: {"q": "rad", "k": "N m/rad"}. A name tells for all fields of which
             it is the first word, as "q" for q_arm, but for those that are named themselves.
 

@@ -12,9 +12,7 @@ from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.low_rank import AtState
 from hhtjax.xla import linear_map, part, staged
 
-RANK_TOLERANCE = (
-    1e-9  # relative size of a singular value below which columns count as dependent; 100 roundings in float32
-)
+RANK_TOLERANCE = 1e-9  # relative size of a singular value of dependent columns; in float32 100 roundings
 
 
 def solve_map(f, b, factorize):
@@ -148,7 +146,7 @@ def factorize_least_squares(n):
 def solve(A, b, factorize=factorize):
     """x with A x = b, for A (n, n) and b (n,), differentiable in both.
 
-    LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (module docstring); Cramer's rule for n = 2.
+    LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (elimination.py); Cramer's rule for n = 2.
     A singular A gives inf or NaN.
 
     >>> import jax.numpy as jnp

@@ -52,7 +52,7 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
         times: scalar or array, inside [solution.t[0], solution.t[-1]] up to rounding.
 
     Returns:
-        An `Interpolant`.
+        An `Interpolant`; of a run with internal states an `InternalInterpolant`, which has z too.
 
     Raises:
         TypeError, ValueError: times that are not real; a solution of several runs; a time outside the run, where the

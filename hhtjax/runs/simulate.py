@@ -91,7 +91,8 @@ def simulate(
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate
             a constraint. Values are checked unless they are tracers.
-        NotImplementedError: the system has a constraint, or internal states, and the stepper cannot solve them.
+        NotImplementedError: a constraint, rotations, internal states, dry friction, events, steps of unequal size or
+            error control, where the stepper does not know them.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: -params["k"] * q)

@@ -53,7 +53,7 @@ def sweep_to_disk(
         folder: made if it does not exist.
         chunk: members in a file, which bounds the memory.
         progress: one line on stderr for each file.
-        system, stepper, q0, v0, params, dts, duration, num_samples, times, t0, in_axes, events, max_events,
+        system, stepper, q0, v0, params, z0, dts, duration, num_samples, times, t0, in_axes, events, max_events,
             keep_events: those of `sweep`.
 
     Returns:
@@ -62,7 +62,7 @@ def sweep_to_disk(
     Raises:
         ValueError: the folder holds a sweep of other inputs or versions.
         OSError: a file cannot be written, such as on a full disk; those before it stay, and the same call goes on.
-        TypeError, ValueError: as `sweep`; also for tracers.
+        TypeError, ValueError, NotImplementedError: as `sweep`; also for tracers, and for `adaptive`.
 
     >>> import tempfile, jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: -4.0 * q)

@@ -7,7 +7,7 @@ stepper                            order                 solves per step   for
                                                                            picks the point of linearisation
 `hht(alpha, iterations=None)`      2                     Newton's          the converged method, differentiated
                                                                            implicitly
-`newmark(beta, gamma)`             2                     1, or Newton's    the family's ancestor, same options
+`newmark(beta, gamma)`             2; 1 for gamma > 1/2  1, or Newton's    the family's ancestor, same options
 `bossak(alpha)`                    2                     1, or Newton's    the rest of the family, same options
 `generalized_alpha(rho_inf)`       2                     1, or Newton's    the rest of the family, same options
 `kim_hht(alpha)`                   1; 2 for alpha = 0    1                 the paper of 2019, literally
@@ -28,7 +28,8 @@ stepper                            order                 solves per step   for
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
 Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it. Internal
-states are for the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`. Dry friction is for the `hht` family.
+states are for the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`. Dry friction is for the `hht` family. In all
+of this, but for error control, `implicit_euler` belongs to it.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
 of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it

@@ -41,13 +41,6 @@ def begin_constrained(method, system, q, v, t, params, dt):
     return State(t, q, v, w, method.corrected(system, v, w, wdot, dt), L)
 
 
-def report(system, params, s, info, row):
-    """What the step tells, by how much it violates the constraints, and which row was dependent at its start."""
-    position, rate = violation(system, s.q, s.v, s.t, params)
-    constraint, constraint_rate = (jnp.max(jnp.abs(x)) for x in (position, rate))
-    return info._replace(constraint=constraint, constraint_rate=constraint_rate, dependent_row=row)
-
-
 def directions(system, M, B):
     """D: (n, m)."""
     d = system.with_ones(diagonal(M))
@@ -113,4 +106,6 @@ def report_constraints(method, system, params, dt, s, s1, info, B):
     def dependent():
         return lax.cond(jnp.all(jnp.isfinite(s1.w)), lambda: dependent_row(B), at_end)
 
-    return report(system, params, s1, info, None if method.redundant else dependent())
+    constraint, rate = (jnp.max(jnp.abs(x)) for x in violation(system, s1.q, s1.v, s1.t, params))
+    row = None if method.redundant else dependent()
+    return info._replace(constraint=constraint, constraint_rate=rate, dependent_row=row)

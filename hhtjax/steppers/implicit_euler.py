@@ -20,7 +20,8 @@ class ImplicitEuler(GeneralizedAlpha):
 def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=None) -> ImplicitEuler:
     """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), solved by Newton.
 
-    Order 1, L-stable, strongly damping: the reference for robustness, not for accuracy.
+    Order 1, L-stable, strongly damping: the reference for robustness, not for accuracy. Constraints (GGL), rotations
+    (in charts), internal states and dry friction are solved as by `hht`.
 
     Args:
         iterations: None, Newton until `tolerance`; k, that many Newton iterations.

@@ -206,8 +206,8 @@ def require_capable(caller, system, stepper, q0, v0):
         )
     if system.internal is not None and not stepper.solves_internal:
         raise NotImplementedError(
-            f"{caller}: {name} cannot solve the `internal` states; use hht() or another of its family, rk4(), "
-            "rosenbrock() or rowda()."
+            f"{caller}: {name} cannot solve the `internal` states; use hht() or another of its family, "
+            "rosenbrock(), rowda(), rk4() or dopri5()."
         )
     if system.friction is not None and not stepper.solves_friction:
         raise NotImplementedError(f"{caller}: {name} cannot solve dry `friction`; use hht() or another of its family.")

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import evaluated_now, freeze, is_concrete, thaw
+from hhtjax.checks import require_number, require_params
+from hhtjax.description import evaluated_now, is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, solve_map
 from hhtjax.systems import kinematics
@@ -66,7 +67,8 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
         A `ConsistentInitial`.
 
     Raises:
-        ValueError: constraints that depend on each other (or on no coordinate) at q0, or no q found.
+        TypeError, ValueError: an argument of a wrong kind or value; a system without a constraint; constraints that
+            depend on each other (or on no coordinate) at q0; no q found.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> pendulum = hhtjax.System(
@@ -80,8 +82,10 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
     if getattr(system, "constraint", None) is None:
         raise ValueError("consistent_initial: `system` must have a constraint.")
     check_redundant("consistent_initial", redundant)
+    params = require_params("consistent_initial", params)
+    require_number("consistent_initial", "t0", t0, np.isfinite, "be finite")
     q0, v0, z0 = initial_values("consistent_initial", system, q0, v0, z0)
-    start, B, left = _consistent_initial(system, q0, v0, freeze(params), t0, z0, redundant)
+    start, B, left = _consistent_initial(system, q0, v0, params, t0, z0, redundant)
     if all(map(is_concrete, jax.tree.leaves((start, B)))):
         if redundant is None:
             require_independent("consistent_initial", np.asarray(B))

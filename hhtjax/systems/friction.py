@@ -171,11 +171,11 @@ def _wrong(K, load, f, rests, sig):
     return jnp.where(sig == 0, jnp.sign(tau), 0), over > noise
 
 
-def held_back(system, s, L, old, new, dw):
+def held_back(system, s, L, old, new, dw, factorize):
     """A jump dw of the accelerations at a state, as params jump and multipliers become L, with what friction does about
     it: of joints at rest, and of those that slide, whose limits may jump too."""
     H = directions(system, s.q, s.t, new)
-    G = responses(system, s.q, s.t, new, H)
+    G = responses(system, s.q, s.t, new, H, factorize)
     K, (sig, tau) = across(H, G), s.friction
     rests = sig == 0
     f0, f = (system.friction.limit(s.q, s.v, x, s.t, params) for x, params in ((s.L, old), (L, new)))

@@ -34,7 +34,7 @@ def bind(stepper, system, params, dt, last=None):
     if system.matrices is not None and not stepper.keeps_sparse:
         raise NotImplementedError(
             f"{type(stepper).__name__} cannot keep the matrices of the system sparse; use hht() or another of its "
-            "family, rosenbrock(), rowda() or rk4(), or hand over arrays: K.toarray()."
+            "family, rosenbrock(), rowda(), rk4() or dopri5(), or hand over arrays: K.toarray()."
         )
     if not holds(params):
         return stepper.bind(system, params, dt)
@@ -65,15 +65,15 @@ def jump_after(params, t):
 def jump(stepper, system, s, old, new):
     """The state with the accelerations and multipliers that belong to the new params."""
     dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
+    ways = factorize_constrained(system.size, stepper.redundant if system.num_constraints else None)
     if system.num_constraints:
         rows = jnp.zeros(system.num_constraints, dQ.dtype)
-        ways = factorize_constrained(system.size, stepper.redundant)
         dw, dL = saddle_point(system, s.q, s.t, new, dQ, rows, ways)
         L = s.L + dL
     else:
         dw = system.solve_mass(system.mass(s.q, new), dQ)
     if system.friction is not None:
-        dw, friction = held_back(system, s, L, old, new, dw)
+        dw, friction = held_back(system, s, L, old, new, dw, ways)
         s = s._replace(friction=friction)
     return s._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
 

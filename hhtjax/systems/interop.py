@@ -42,6 +42,7 @@ def ode(system):
 
     Raises:
         TypeError: what is no system; when called, a y that is no (q, v), or (q, v, z).
+        NotImplementedError: when called, dry friction, which is no function of the state.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> pendulum = hhtjax.System(jnp.ones(1), lambda q, v, t, params: {"angle": -params["g"] * jnp.sin(q["angle"])})
@@ -80,6 +81,7 @@ def flat_ode(system, q0, v0=None, z0=None) -> FlatODE:
 
     Raises:
         TypeError, ValueError: as `simulate`, for these.
+        NotImplementedError: when `rate` is called, dry friction.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> body = hhtjax.System(lambda R, params: params, lambda R, Om, t, params: -jnp.cross(Om, params * Om))
@@ -109,6 +111,7 @@ def diffrax_term(system):
 
     Raises:
         TypeError: what is no system.
+        NotImplementedError: when called, dry friction.
         ImportError: diffrax is not installed; it comes with the extra "interop".
 
     >>> import diffrax, jax.numpy as jnp, hhtjax
@@ -156,6 +159,7 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; initial values that violate a constraint; single
             precision.
+        NotImplementedError: dry friction.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> from scipy.integrate import solve_ivp

@@ -3,7 +3,6 @@
 So a parameter, or a value of one, that a later JAX brings makes programs slower, and never wrong.
 """
 
-import jax
 from jax import lax
 
 ELEMENTWISE = {
@@ -115,8 +114,3 @@ def is_understood(eqn):
     """Whether all parameters of an operation are known, with values for which its rules were written."""
     known = UNDERSTOOD.get(eqn.primitive.name)
     return known is not None and all(name in known and known[name](x) for name, x in eqn.params.items())
-
-
-def is_float(dtype):
-    """Whether numbers of this type have a sign of zero, infinities and NaN."""
-    return jax.numpy.issubdtype(dtype, jax.numpy.inexact)

@@ -14,12 +14,8 @@ from jax.extend.core import Literal
 
 from hhtjax.xla.interpreter import alone, evaluate, needed
 from hhtjax.xla.kernels import named
+from hhtjax.xla.listing import FUNCTIONS
 from hhtjax.xla.parameters import ELEMENTWISE, is_understood
-
-FUNCTIONS = {  # that take long
-    *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "erf", "exp", "exp2", "expm1"),
-    *("log", "log1p", "logistic", "pow", "sin", "sinh", "tan", "tanh"),
-}
 
 
 class _Stage(NamedTuple):
