@@ -237,6 +237,13 @@ def test_what_cannot_be_compared_is_named():
         hhtjax.compare({"a": one, "b": one}, residuals, folds=1)
     with pytest.raises(ValueError, match=r"compare: `always` must have the leading axes .* \(1600,\); received \(3,\)"):
         hhtjax.compare({"a": one, "b": one}, residuals, always=np.ones(3, bool))
+    with pytest.raises(ValueError, match="compare: `fits` must have the same weights; those of 'a' and 'b' differ"):
+        hhtjax.compare({"a": one, "b": one._replace(weights=2.0)})
+    both = {"a": one, "b": one}
+    with pytest.raises(ValueError, match=r"`residuals` of 'b' must be those fitted, \(1600,\); received \(1599,\)"):
+        hhtjax.compare(both, {"a": residuals, "b": lambda p: residuals(p)[1:]})
+    with pytest.raises(ValueError, match=r"`residuals` of 'a' must be .* norm is 0.* received others, of 4\."):
+        hhtjax.compare(both, lambda p: residuals(p) + 0.1)
     with pytest.raises(NotImplementedError, match=r"compare: `fits\['a'\]` has records"):
         hhtjax.compare({"a": one._replace(starts=jnp.ones((4, 1))), "b": one}, residuals)
     with pytest.raises(ValueError, match="held_out: `found` has no errors on segments"):

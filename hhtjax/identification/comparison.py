@@ -10,9 +10,9 @@ import numpy as np
 from hhtjax.checks import require_function, require_integer, require_number
 from hhtjax.description import is_concrete
 from hhtjax.description.presentation import Table, as_text, shown
-from hhtjax.identification.evidence import count, effective_observations, f_tail, residuals_of
+from hhtjax.identification.evidence import count, effective_observations, f_tail, residuals_of, weights_of
 from hhtjax.identification.identifiability import parameter_names, parameter_values
-from hhtjax.identification.left_out import leave_out
+from hhtjax.identification.left_out import leave_out, require_residuals_of
 from hhtjax.identification.result import FitResult
 
 
@@ -185,6 +185,7 @@ def compare(
     if len(set(observations.values())) > 1:
         told = ", ".join(f"{n} of {name!r}" for name, n in observations.items())
         raise ValueError(f"compare: `fits` must be of the same measurements; received {told} observations.")
+    _require_equal_weights(names, results)
     n = observations[names[0]]
     k = np.array([int(np.sum(x.free)) + sum(np.size(s) for s in jax.tree.leaves(x.starts)) for x in results])
     square = np.array([sum(np.sum(r**2) for r in x.weighted) for x in all_residuals])
@@ -225,7 +226,16 @@ def _check_functions(residuals, fits):
         require_function("compare", "residuals", function, "residuals(params)")
         if fits[name].starts is not None:
             raise NotImplementedError(f"compare: `fits[{name!r}]` has records: no segments of them can be left out.")
+        require_residuals_of(name, fits[name], function)
     return functions
+
+
+def _require_equal_weights(names, results):
+    """Their sums of squares are not of one kind, where the weights are not; the order is that of each model's."""
+    weights = [np.sort(np.concatenate([np.ravel(w) for w in weights_of(x)])) for x in results]
+    for name, w in zip(names, weights, strict=True):
+        if w.shape != weights[0].shape or not np.allclose(w, weights[0]):
+            raise ValueError(f"compare: `fits` must have the same weights; those of {names[0]!r} and {name!r} differ.")
 
 
 def _nested_tests(fits, costs, n, absent):

@@ -28,9 +28,14 @@ class Residuals(NamedTuple):
     present: list
 
 
+def weights_of(result) -> list:
+    """The weight of every residual, leaf by leaf."""
+    return spread_weights("fit", result.weights, result.residual)
+
+
 def residuals_of(result) -> Residuals:
     """Of a fit that is finished."""
-    weights = jax.tree.leaves(spread_weights("fit", result.weights, result.residual))
+    weights = weights_of(result)
     names, plain, weighted, present = [], [], [], []
     for (path, leaf), weight in zip(jax.tree_util.tree_leaves_with_path(result.residual), weights, strict=True):
         r, w = np.asarray(leaf, float), np.asarray(weight, float)
