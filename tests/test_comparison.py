@@ -155,8 +155,11 @@ def test_tails_of_distributions_are_those_of_scipy():
         assert f_tail(x, q, n) == pytest.approx(stats.f.sf(x, q, n), rel=1e-9)
         assert chi_squared_tail(x, q) == pytest.approx(stats.chi2.sf(x, q), rel=1e-9)
     assert np.isnan(f_tail(1.0, 3, 0))
-    for degrees, level in ((1, 0.95), (2, 0.99), (16, 0.95), (17, 0.95), (31, 0.68)):
-        assert student(level, degrees) == pytest.approx(stats.t.ppf((1 + level) / 2, degrees), rel=1e-4)
+    for degrees, level, rtol in (
+        *((1, 0.95, 1e-4), (2, 0.99, 1e-4), (16, 0.95, 1e-4), (17, 0.95, 1e-4), (31, 0.68, 1e-4), (np.inf, 0.95, 1e-9)),
+        *((1.36, 0.95, 0.03), (2.5, 0.95, 0.01), (16.4, 0.99, 1e-4)),
+    ):
+        assert student(level, degrees) == pytest.approx(stats.t.ppf((1 + level) / 2, degrees), rel=rtol)
 
 
 def test_white_noise_is_white_in_19_of_20_records():

@@ -133,9 +133,10 @@ def compare(
 
         AIC = n_e log(S_m/n) + 2 k_m,        BIC = n_e log(S_m/n) + k_m log n_e,
 
-    and for q further parameters x of a nested model, absent at x0, with G segments (Hotelling's T^2),
+    and for q further parameters x of a nested model, absent at x0, whose variances have f `degrees` of freedom or more
+    (Hotelling's T^2),
 
-        (G - q)/(G - 1) (x - x0)^T C_xx^-1 (x - x0)/q ~ F(q, G - q),
+        (f - q + 1)/f (x - x0)^T C_xx^-1 (x - x0)/q ~ F(q, f - q + 1),
 
     beside the textbook's ((S_0 - S_1)/q)/(S_1/(n - k_1)) ~ F(q, n - k_1). One model is nested in another if the names
     of its fitted parameters are among those of the other.
@@ -253,12 +254,14 @@ def _nested_tests(fits, costs, n, absent):
         x0 = np.array([held.get(names[i], _absent(absent, names[i])) for i in at])
         away = parameter_values(result.params)[free[at]] - x0
         C = np.asarray(result.uncertainty.covariance)[np.ix_(at, at)]
-        known, degrees = bool(np.all(np.isfinite(C)) and np.all(np.diagonal(C) > 0)), result.segments - q
+        known, degrees = bool(np.all(np.isfinite(C)) and np.all(np.diagonal(C) > 0)), result.uncertainty.degrees
         wald = float(away @ np.linalg.solve(C, away)) / q if known else math.nan
-        if result.uncertainty.cluster is None:  # more parameters than segments
+        if degrees is None:  # more parameters than segments
             degrees = effective_observations(n, result.uncertainty) - k1
         else:
-            wald *= degrees / (result.segments - 1)
+            least = min(float(np.min(np.asarray(degrees)[at])), n - k1)
+            degrees = least - q + 1
+            wald *= degrees / least
         naive = float((S0 - S1) / q / (S1 / (n - k1))) if S1 > 0 and n > k1 else math.nan
         p = f_tail(wald, q, degrees), f_tail(naive, q, n - k1)
         yield NestedTest(smaller, larger, q, wald, p[0], naive, p[1])

@@ -14,7 +14,7 @@ from hhtjax.identification.identifiability import parameter_names, parameter_val
 from hhtjax.identification.progress import CONVERGED, REASONS
 
 CLOSE = 0.95  # correlation of two estimates that is worth a word
-MOST_PAIRS = 3
+MOST_NAMED = 3
 
 
 def summary(result) -> str:
@@ -107,6 +107,10 @@ def _about_estimates(result, names):
     segments = f"how much {result.segments} segments of the record disagree (cluster sandwich)"
     kind = f"from {segments}" if believed.cluster is not None else "from the autocorrelation of the residuals"
     remarks = [f"standard errors: {kind}"]
+    if believed.degrees is not None:
+        worth, own = 1 + np.asarray(believed.degrees), names[result.free]
+        few = [i for i in np.argsort(worth)[:MOST_NAMED] if worth[i] < result.segments / 2]
+        remarks[0] += f"; worth {', '.join(f'{worth[i]:.0f} for {own[i]}' for i in few)}" if few else ""
     size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
     unknown, why = why_undetermined(result.params, result.free, believed, size)
     if unknown:
@@ -115,7 +119,7 @@ def _about_estimates(result, names):
         R = np.asarray(result.correlation)
         rows, columns = np.triu_indices(len(R), 1)
         size = np.abs(R[rows, columns])
-        pairs = np.argsort(-size)[: max(1, min(MOST_PAIRS, int(np.sum(size > CLOSE))))]
+        pairs = np.argsort(-size)[: max(1, min(MOST_NAMED, int(np.sum(size > CLOSE))))]
         together = zip(rows[pairs], columns[pairs], strict=True)
         found = [f"{R[i, j]:+.3f} between {names[i]} and {names[j]}" for i, j in together]
         remarks.append(f"largest correlation{'s' * (len(found) > 1)}: {', '.join(found)}")
