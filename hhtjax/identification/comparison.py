@@ -4,13 +4,19 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from hhtjax.checks import require_function, require_integer, require_number
 from hhtjax.description import is_concrete
 from hhtjax.description.presentation import Table, as_text, shown
-from hhtjax.identification.evidence import count, effective_observations, f_tail, residuals_of, weights_of
+from hhtjax.identification.evidence import (
+    count,
+    effective_observations,
+    f_tail,
+    residuals_of,
+    used_by_starts,
+    weights_of,
+)
 from hhtjax.identification.identifiability import parameter_names, parameter_values
 from hhtjax.identification.left_out import leave_out, require_residuals_of
 from hhtjax.identification.result import FitResult
@@ -188,7 +194,7 @@ def compare(
         raise ValueError(f"compare: `fits` must be of the same measurements; received {told} observations.")
     _require_equal_weights(names, results)
     n = observations[names[0]]
-    k = np.array([int(np.sum(x.free)) + sum(np.size(s) for s in jax.tree.leaves(x.starts)) for x in results])
+    k = np.array([int(np.sum(x.free)) + used_by_starts(x) for x in results])
     square = np.array([sum(np.sum(r**2) for r in x.weighted) for x in all_residuals])
     effective = effective_observations(n, results[int(np.argmax(k))].uncertainty)
     with np.errstate(divide="ignore"):

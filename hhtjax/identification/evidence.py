@@ -54,6 +54,15 @@ def count(residuals: Residuals) -> int:
     return int(sum(np.sum(x) for x in residuals.present))
 
 
+def used_by_starts(result) -> int:
+    """Residuals that the starts of records take: of each record as many as its start has entries, or as there are."""
+    if result.starts is None:
+        return 0
+    leaves = jax.tree.leaves(result.starts)
+    present = sum(np.sum(np.reshape(w, (len(leaves[0]), -1)) != 0, axis=1) for w in weights_of(result))
+    return int(np.sum(np.minimum(present, sum(map(np.size, leaves)) // len(leaves[0]))))
+
+
 def design_effect(uncertainty) -> float:
     """tr(naive^-1 C)/p of the p parameters that are determined: the mean factor by which correlated residuals enlarge
     variances (Rao and Scott, J. Am. Stat. Assoc. 76, 1981, 221-230); less than 1 where they make them smaller."""

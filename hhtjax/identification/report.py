@@ -9,12 +9,12 @@ import numpy as np
 
 from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.evidence import count, effective_observations, residuals_of, rms, whiteness
+from hhtjax.identification.evidence import count, effective_observations, residuals_of, rms, used_by_starts, whiteness
 from hhtjax.identification.identifiability import parameter_names, parameter_values, why_undetermined
 from hhtjax.identification.progress import CONVERGED, REASONS
 
 CLOSE = 0.95  # correlation of two estimates that is worth a word
-MOST_NAMED = 3
+MOST_PAIRS = 3
 
 
 def summary(result) -> str:
@@ -86,7 +86,7 @@ def _about_residuals(result):
     leaves = zip(residuals.names, residuals.plain, residuals.present, strict=True)
     words = ["residual: rms " + ", ".join(f"{name} {rms(r, here):.4g}".strip() for name, r, here in leaves)]
     starts = jax.tree.leaves(result.starts)
-    unknowns = int(np.sum(result.free)) + sum(map(np.size, starts))
+    unknowns = int(np.sum(result.free)) + used_by_starts(result)
     if any(np.asarray(w).dtype != bool for w in jax.tree.leaves(result.weights)) and n > unknowns:
         square = sum(np.sum(r**2) for r in residuals.weighted)
         words.append(f"weighted sum of squares {square / (n - unknowns):.3g} per degree of freedom")
@@ -109,7 +109,7 @@ def _about_estimates(result, names):
     remarks = [f"standard errors: {kind}"]
     if believed.degrees is not None:
         worth, own = 1 + np.asarray(believed.degrees), names[result.free]
-        few = [i for i in np.argsort(worth)[:MOST_NAMED] if worth[i] < result.segments / 2]
+        few = [i for i in np.argsort(worth)[:MOST_PAIRS] if worth[i] < result.segments / 2]
         remarks[0] += f"; worth {', '.join(f'{worth[i]:.0f} for {own[i]}' for i in few)}" if few else ""
     size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
     unknown, why = why_undetermined(result.params, result.free, believed, size)
@@ -119,7 +119,7 @@ def _about_estimates(result, names):
         R = np.asarray(result.correlation)
         rows, columns = np.triu_indices(len(R), 1)
         size = np.abs(R[rows, columns])
-        pairs = np.argsort(-size)[: max(1, min(MOST_NAMED, int(np.sum(size > CLOSE))))]
+        pairs = np.argsort(-size)[: max(1, min(MOST_PAIRS, int(np.sum(size > CLOSE))))]
         together = zip(rows[pairs], columns[pairs], strict=True)
         found = [f"{R[i, j]:+.3f} between {names[i]} and {names[j]}" for i, j in together]
         remarks.append(f"largest correlation{'s' * (len(found) > 1)}: {', '.join(found)}")
