@@ -9,7 +9,7 @@ from scipy import stats
 from test_uncertainty import coloured
 
 import hhtjax
-from hhtjax.identification.evidence import Residuals, chi_squared_tail, f_tail, residuals_of, whiteness
+from hhtjax.identification.evidence import Residuals, chi_squared_tail, f_tail, residuals_of, used_by_starts, whiteness
 from hhtjax.identification.result import student
 
 N, RUNS = 1600, 300
@@ -193,6 +193,8 @@ def test_records_are_no_samples_that_follow_one_another():
     assert rho > 0.5
     assert p < 1e-6
     assert float(result.uncertainty.autocorrelated[0, 0]) > 1.5 * float(result.uncertainty.naive[0, 0])
+    assert used_by_starts(result) == 60
+    assert used_by_starts(result._replace(weights=np.arange(60) < 7)) == 7  # of records without data, none
 
 
 @pytest.mark.slow
