@@ -245,6 +245,8 @@ def test_what_cannot_be_compared_is_named():
     with pytest.raises(ValueError, match="compare: `fits` must have the same weights; those of 'a' and 'b' differ"):
         hhtjax.compare({"a": one, "b": one._replace(weights=2.0)})
     both = {"a": one, "b": one}
+    with pytest.raises(ValueError, match="compare: `absent` must be of parameters, rest, slow; received one for 'k'"):
+        hhtjax.compare(both, absent={"k": 1.0})
     with pytest.raises(ValueError, match=r"`residuals` of 'b' must be those fitted, \(1600,\); received \(1599,\)"):
         hhtjax.compare(both, {"a": residuals, "b": lambda p: residuals(p)[1:]})
     with pytest.raises(ValueError, match=r"`residuals` of 'a' must be .* norm is 0.* received others, of 4\."):

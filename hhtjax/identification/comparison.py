@@ -193,6 +193,7 @@ def compare(
         told = ", ".join(f"{n} of {name!r}" for name, n in observations.items())
         raise ValueError(f"compare: `fits` must be of the same measurements; received {told} observations.")
     _require_equal_weights(names, results)
+    _require_known(absent, results)
     n = observations[names[0]]
     k = np.array([int(np.sum(x.free)) + used_by_starts(x) for x in results])
     square = np.array([sum(np.sum(r**2) for r in x.weighted) for x in all_residuals])
@@ -235,6 +236,14 @@ def _check_functions(residuals, fits):
             raise NotImplementedError(f"compare: `fits[{name!r}]` has records: no segments of them can be left out.")
         require_residuals_of(name, fits[name], function)
     return functions
+
+
+def _require_known(absent, results):
+    """An error for a name in `absent` that no model has."""
+    known = {name for result in results for name in parameter_names(result.params)}
+    if isinstance(absent, dict) and (unknown := [name for name in absent if name not in known]):
+        names = ", ".join(sorted(known))
+        raise ValueError(f"compare: `absent` must be of parameters, {names}; received one for {unknown[0]!r}.")
 
 
 def _require_equal_weights(names, results):
