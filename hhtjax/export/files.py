@@ -168,8 +168,8 @@ def local(place, name):
     >>> [local(place, "p") for place in ("p->k", "s->q[3]", "p->k[3]", "u[0]", "(int32_t)s->sign", "dt")]
     ['p_k_', 's3_q', 'p3_k', 'u_0', 's_sign', 'dt']
     """
-    of, member, index = re.fullmatch(r"(?:\(int32_t\))?(\w+?)(?:->(\w+))?(?:\[(\d+)\])?", place).groups("")
-    text = f"{of}{index}_{member}" if member else f"{of}_{index}" if index else of
+    of, *rest = re.findall(r"\w+", place.replace("(int32_t)", ""))
+    text = f"{of}{''.join(rest[1:])}_{rest[0]}" if "->" in place else "_".join([of, *rest])
     return f"{text}_" if text.startswith(f"{name}_") else text
 
 
