@@ -9,7 +9,7 @@ from scipy import stats
 from test_uncertainty import coloured
 
 import hhtjax
-from hhtjax.identification.evidence import Residuals, chi_squared_tail, f_tail, residuals_of, whiteness
+from hhtjax.identification.evidence import Residuals, chi_squared_tail, f_tail, residuals_of, used_by_starts, whiteness
 from hhtjax.identification.result import student
 
 N, RUNS = 1600, 300
@@ -155,8 +155,11 @@ def test_tails_of_distributions_are_those_of_scipy():
         assert f_tail(x, q, n) == pytest.approx(stats.f.sf(x, q, n), rel=1e-9)
         assert chi_squared_tail(x, q) == pytest.approx(stats.chi2.sf(x, q), rel=1e-9)
     assert np.isnan(f_tail(1.0, 3, 0))
-    for degrees, level in ((1, 0.95), (2, 0.99), (16, 0.95), (17, 0.95), (31, 0.68)):
-        assert student(level, degrees) == pytest.approx(stats.t.ppf((1 + level) / 2, degrees), rel=1e-4)
+    for degrees, level, rtol in (
+        *((1, 0.95, 1e-4), (2, 0.99, 1e-4), (16, 0.95, 1e-4), (17, 0.95, 1e-4), (31, 0.68, 1e-4), (np.inf, 0.95, 1e-9)),
+        *((1.36, 0.95, 0.03), (2.5, 0.95, 0.01), (16.4, 0.99, 1e-4)),
+    ):
+        assert student(level, degrees) == pytest.approx(stats.t.ppf((1 + level) / 2, degrees), rel=rtol)
 
 
 def test_white_noise_is_white_in_19_of_20_records():
@@ -190,6 +193,8 @@ def test_records_are_no_samples_that_follow_one_another():
     assert rho > 0.5
     assert p < 1e-6
     assert float(result.uncertainty.autocorrelated[0, 0]) > 1.5 * float(result.uncertainty.naive[0, 0])
+    assert used_by_starts(result) == 60
+    assert used_by_starts(result._replace(weights=np.arange(60) < 7)) == 7  # of records without data, none
 
 
 @pytest.mark.slow
@@ -237,6 +242,15 @@ def test_what_cannot_be_compared_is_named():
         hhtjax.compare({"a": one, "b": one}, residuals, folds=1)
     with pytest.raises(ValueError, match=r"compare: `always` must have the leading axes .* \(1600,\); received \(3,\)"):
         hhtjax.compare({"a": one, "b": one}, residuals, always=np.ones(3, bool))
+    with pytest.raises(ValueError, match="compare: `fits` must have the same weights; those of 'a' and 'b' differ"):
+        hhtjax.compare({"a": one, "b": one._replace(weights=2.0)})
+    both = {"a": one, "b": one}
+    with pytest.raises(ValueError, match="compare: `absent` must be of parameters, rest, slow; received one for 'k'"):
+        hhtjax.compare(both, absent={"k": 1.0})
+    with pytest.raises(ValueError, match=r"`residuals` of 'b' must be those fitted, \(1600,\); received \(1599,\)"):
+        hhtjax.compare(both, {"a": residuals, "b": lambda p: residuals(p)[1:]})
+    with pytest.raises(ValueError, match=r"`residuals` of 'a' must be .* norm is 0.* received others, of 4\."):
+        hhtjax.compare(both, lambda p: residuals(p) + 0.1)
     with pytest.raises(NotImplementedError, match=r"compare: `fits\['a'\]` has records"):
         hhtjax.compare({"a": one._replace(starts=jnp.ones((4, 1))), "b": one}, residuals)
     with pytest.raises(ValueError, match="held_out: `found` has no errors on segments"):

@@ -223,11 +223,13 @@ def test_without_a_compiler_there_are_sources_and_a_warning(unit, tmp_path, monk
     assert not [name for name in names if name.startswith("binaries/")]
 
 
-def test_infinite_params_are_written_as_xml_has_them():
-    spring = hhtjax.System(jnp.ones(1), lambda q, v, t, p: -jnp.minimum(q, p["top"]))
-    unit = export_fmu(spring, hhtjax.rk4(), jnp.ones(1), jnp.ones(1), {"top": np.inf}, dt=DT)
-    (top,) = [x for x in ET.fromstring(unit.description).iter() if x.attrib.get("name") == "top"]
-    assert top.attrib["start"] == "INF"
+def test_params_have_numbers_and_names_as_xml_has_them():
+    """Infinity, and a name that an output has."""
+    spring = hhtjax.System(jnp.ones(1), lambda q, v, t, p: -jnp.minimum(q, p["a"]) - p["time"])
+    unit = export_fmu(spring, STEPPER, 1.0, 1.0, {"a": np.inf, "time": 2.0}, dt=DT)
+    starts = {x.attrib["name"]: x.attrib.get("start") for x in ET.fromstring(unit.description).iter("Float64")}
+    outputs = dict.fromkeys(["time", "q", "v", "w", "a"])
+    assert starts == outputs | {"q0": "1.0", "v0": "1.0", "a_2": "INF", "time_2": "2.0"}
 
 
 def test_wrong_arguments_are_named():

@@ -194,22 +194,25 @@ def test_single_precision(tmp_path):
 
 
 def test_names_come_from_the_keys(tmp_path):
-    """Pytrees of any shape, keys that C, C++ or <math.h> do not allow, and params of no numbers."""
-    q0 = {"left arm": jnp.zeros((2, 2)), "if": jnp.ones(()), "3": [jnp.ones(1)]}
-    params = {"NAN": 0.5, "class": 1.5, "": 2.0, "empty": jnp.zeros(0)}
+    """Pytrees of any shape, keys that C, C++, a compiler or <math.h> do not allow, names that two keys or a helper
+    function share, and params of no numbers."""
+    q0 = {"left arm": jnp.zeros((2, 2)), "if": jnp.ones(()), "3": [jnp.ones(1)], "3_0": jnp.ones(())}
+    params = {"NAN": 0.5, "class": 1.5, "": 2.0, "empty": jnp.zeros(0), "__LINE__": 0.1, "max": 0.1, "real": 0.1}
+    params |= {"k": jnp.array([0.1, 0.05]), "k__0": 0.05, "k_": {"0": jnp.full(1, 0.1)}, "π": 0.1, "ω": {7: 0.2}}
 
     def force(q, v, t, p):
-        factor = p["NAN"] * p["class"] * p[""] - 0.5 + jnp.sum(p["empty"])
-        return jax.tree.map(lambda x: -factor * x, q)
+        return jax.tree.map(lambda x: -jnp.maximum(sum(map(jnp.sum, jax.tree.leaves(p))) - 3.9, 0.5) * x, q)
 
-    model = export_c(hhtjax.System(jnp.ones(6), force), hhtjax.rk4(), q0, q0, params, name="odd")
-    assert sorted(field.name for field in model.params) == ["NAN_", "class_", "p"]
+    model = export_c(hhtjax.System(jnp.ones(7), force), hhtjax.rk4(), q0, q0, params, name="p", sensitivities=("k",))
+    allowed = {"NAN_", "class_", "p", "p__LINE__", "max", "real", "k", "k__0", "k__0_2", "_", "p__7"}
+    assert {field.name for field in model.params} == allowed
     names = {field.name: field.shape for field in model.state if field.name[0] == "q"}
-    assert names == {"q_3_0": (1,), "q_if": (), "q_left_arm": (2, 2)}
+    assert names == {"q_3_0": (1,), "q_3_0_2": (), "q_if": (), "q_left_arm": (2, 2)}
     library = Library(model, tmp_path)
     state, _ = library.begin(ravel_pytree(q0)[0], ravel_pytree(q0)[0], dt=0.1)
     assert library.step(state, dt=0.1) == 0
-    assert state.q_if == pytest.approx(np.cos(0.1) + np.sin(0.1), abs=1e-6)
+    assert state.q_if == state.q_3_0_2 == pytest.approx(np.cos(0.1) + np.sin(0.1), abs=1e-6)
+    assert state.dq_3_0_2_dk_1 == pytest.approx((0.1 * np.cos(0.1) - 1.1 * np.sin(0.1)) / 2, abs=1e-6)
     assert numbers(state, "q_left_arm") == pytest.approx(np.zeros(4))
 
 
@@ -233,13 +236,11 @@ def test_wrong_arguments_are_named():
     start = problem.system, hht(), problem.q0, problem.v0, problem.params
     for options, message in (
         ({"name": "2nd"}, "`name` must be one that C allows"),
+        ({"name": "string"}, "`name` must not be that of a file that is included"),
         ({"sensitivities": ("stiffness",)}, "`sensitivities` must be different names among"),
         ({"z0": 1.0}, "leave `z0` out"),
         ({"units": {"stiffness": "N/m"}}, "`units` must name fields among q, v, w, a, "),
         ({"units": {"q": "m */"}}, "`units` must fit into a comment of C"),
     ):
         check_message(ValueError, f"export_c: {message}", lambda options=options: export_c(*start, **options))
-    same = {"a": {"b": 1.0}, "a_b": 2.0}
-    spring = hhtjax.System(jnp.ones(1), lambda q, v, t, p: -p["a"]["b"] * q)
-    check_message(ValueError, "several for a_b", lambda: export_c(spring, hht(), np.ones(1), np.ones(1), same))
     check_message(TypeError, "received tracers", lambda: jax.jit(lambda x: export_c(*start[:4], {"x": x}).name)(1.0))

@@ -59,6 +59,12 @@ def test_profile_is_the_parabola_of_the_standard_error(result):
     bare = result._replace(uncertainty=None)
     with pytest.raises(ValueError, match="prediction_errors: `result` must have a covariance"):
         hhtjax.identification.prediction_errors(lambda p: p["a"], bare)
+    with pytest.raises(TypeError, match="prediction_errors: `result` must be a FitResult; received dict"):
+        hhtjax.identification.prediction_errors(lambda p: p, {})
+    with pytest.raises(ValueError, match=r"prediction_errors: `noise` must be 0 or more; received -1\.0"):
+        hhtjax.identification.prediction_errors(lambda p: p, {}, noise=-1.0)
+    with pytest.raises(TypeError, match=r"score_test: `residuals` must be a function residuals\(params, candidates\)"):
+        hhtjax.identification.score_test(lambda p: p, 1.0, 0.0)
     with pytest.raises(ValueError, match="profile: `result` must have a covariance"):
         hhtjax.identification.profile(residuals, bare, "rate", [1.0])
     unknown = result.uncertainty._replace(cluster=jnp.diag(jnp.array([jnp.inf, 4.0])))

@@ -74,5 +74,15 @@ def test_bad_input_is_named():
     spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
     with pytest.raises(ValueError, match=r"band_limited_motion: `cutoff` must lie in \(0, 1/\(2 dt\)\]; received 6.0"):
         hhtjax.equation_error(spring, np.ones((9, 1)), 0.1, cutoff=6.0)
-    with pytest.raises(ValueError, match=r"fit_progressively: `horizons` must hold at least one; received \(\)"):
-        hhtjax.fit_progressively(lambda n, before: {}, 1.0, ())
+    with pytest.raises(TypeError, match="measure: `solution` must be what simulate returns; received ArrayImpl"):
+        hhtjax.measure(jnp.ones(3), jnp.ones(3))
+    for horizons, problem_at, message in (
+        ((), lambda n, before: {}, "`horizons` must hold at least one; received none"),
+        (5, lambda n, before: {}, "`horizons` must be a sequence; received 5"),
+        ([5], lambda n: {}, r"`problem_at` must be a function problem_at\(horizon, before\); .* the arguments \(n\)"),
+        ([5], lambda n, before: [jnp.sin], "`problem_at` must return a dict .* received at horizon 5 a list"),
+        ([5], lambda n, before: {"weights": 1.0}, "`problem_at` must .* at horizon 5 weights, without residuals"),
+        ([5], lambda n, before: {"residuals": jnp.sin, "params0": 1.0}, "`problem_at` .* 5 'params0', which is none"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=f"^fit_progressively: {message}"):
+            hhtjax.fit_progressively(problem_at, 1.0, horizons)

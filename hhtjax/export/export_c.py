@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.export import files
-from hhtjax.export.fields import require_different, units_of
+from hhtjax.export.fields import distinct, units_of
 from hhtjax.export.model import Given, Layout, Numbers, begin, derivative_field, given, step, with_derivatives
 from hhtjax.export.statements import NotWritten, Statements
 from hhtjax.xla import Listing, NotListed, listed
@@ -77,10 +77,11 @@ def export_c(
         stepper: `hht()`, `rk4()`, ...
         q0, v0: position and velocity, whose keys name the fields of the state, and whose type, float64 or float32, is
             `NAME_real`. A `FirstOrderSystem` has y0 in the place of q0, no v0, and `NAME_init` no argument for it.
-        params: their floating numbers are the fields of `NAME_params`, these values `NAME_defaults`. Integers and
-            booleans are written out. Each `sampled` is an input: `u` holds their values, one after the other, in the
-            order of the leaves of params; a step holds them from its start to its end, as one with
-            `sampled(..., order=0)` does. `NAME_init` then takes the values before the start, too.
+        params: their floating numbers are the fields of `NAME_params`, these values `NAME_defaults`; keys of which C
+            makes one name are numbered, a_b and a_b_2. Integers and booleans are written out. Each `sampled` is an
+            input: `u` holds their values, one after the other, in the order of the leaves of params; a step holds them
+            from its start to its end, as one with `sampled(..., order=0)` does. `NAME_init` then takes the values
+            before the start, too.
         z0: internal states, where the system has some; `NAME_init` then takes them behind v0.
         name: of the files and before all names in C.
         sensitivities: names of fields of `NAME_params` in which derivatives are stepped along: with "k", the state has
@@ -112,8 +113,10 @@ def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities, u
     """`export_c`, under the name of its caller."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(f"{caller}: `name` must be one that C allows, such as 'pendulum'; received {name!r}.")
+    if name.lower() in files.TAKEN:
+        raise ValueError(f"{caller}: `name` must not be that of a file that is included; received {name!r}.")
     made = given(caller, system, stepper, q0, v0, params, z0)
-    numbers = Numbers(caller, made.params, made.dtype)
+    numbers = Numbers(made.params, made.dtype)
     rows, names = _rows(caller, numbers, sensitivities)
     t, u = jnp.zeros((), made.dtype), numbers.first_inputs()
     functions = begin(made, numbers), step(made, numbers)
@@ -129,7 +132,6 @@ def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities, u
         raise NotImplementedError(f"{caller}: `{error.name}` cannot be written in C{where}.") from None
     except NotWritten as error:
         raise NotImplementedError(f"{caller}: `{error}` cannot be written in C.") from None
-    require_different(caller, code.fields)
     units = units_of(caller, units, [*code.fields, *numbers.fields, *numbers.inputs])
     told = [*texts, code.factors] if code.factors else texts
     helpers = sorted({x for text in told for x in text.helpers}, key=str)
@@ -167,6 +169,9 @@ class _Code:
             if floats
         ]
         own = [field for leaf in layout.leaves[1:] for field in leaf]
+        of_rows = [field for rows in self.derivatives for row in rows for field in row]
+        found = iter(distinct(of_rows, [field.name for field in own]))
+        self.derivatives = [[[next(found) for _ in row] for row in rows] for rows in self.derivatives]
         self.fields = own + [field for rows in self.derivatives for row in rows for field in row]
         self.counts, self.factors = (0, 0), None
 
@@ -229,9 +234,9 @@ class _Code:
         text = Statements({}, self.name, (np.dtype(self.made.dtype), f"{self.name}_real"))
         found = {scalar: place for scalar, place in places.items() if scalar in files.used(listing)}
         for scalar, place in found.items():
-            text.names[scalar] = place if scalar.size else files.local(place)
+            text.names[scalar] = place if scalar.size else files.local(place, self.name)
             if text.names[scalar] != place:
-                text.line(f"const {text.type(scalar.dtype)} {files.local(place)} = {place};")
+                text.line(f"const {text.type(scalar.dtype)} {text.names[scalar]} = {place};")
         text.write(listing.operations)
         return text, set(found.values())
 

@@ -9,6 +9,7 @@ import tempfile
 import warnings
 import zipfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -20,7 +21,7 @@ from hhtjax.checks import require_number
 from hhtjax.description import VERSION
 from hhtjax.export.export_c import ExportedC, exported
 from hhtjax.export.expressions import number
-from hhtjax.export.fields import fields
+from hhtjax.export.fields import Field, distinct, fields
 from hhtjax.export.fmi3 import wrapper
 
 FLAGS = "-std=c99", "-O3", "-fPIC", "-shared", "-fvisibility=hidden"
@@ -119,7 +120,8 @@ def export_fmu(
     Its outputs are the fields of the state of `export_c` (q, v, w, ..., and derivatives), its tunable parameters the
     floating numbers of params, its fixed parameters the initial values (q0, v0, z0), and its inputs each `sampled` of
     params, held over a step. A communication step is as many steps of dt as fit into it, or, where it is no multiple,
-    steps a little shorter. A flag of the step is fmi3Error, from which `fmi3Reset` or an earlier state leads back.
+    steps a little shorter. A name that another variable has already gets a number: beside the outputs a, a parameter a
+    is a_2. A flag of the step is fmi3Error, from which `fmi3Reset` or an earlier state leads back.
 
     Args:
         system, stepper, q0, v0, params, z0, name, sensitivities, units: as in `export_c`.
@@ -149,11 +151,13 @@ def export_fmu(
     single = f"typedef float {name}_real;" in c.header
     kind, dtype = ("Float32", np.float32) if single else ("Float64", np.float64)
     step = repr(float(dt))
+    labels = iter(distinct([Field("time", ()), *c.state, *begin, *c.params, *c.inputs])[1:])
+    variables = partial(_variables, kind, labels)
     groups = [
-        _variables(kind, c.state, "m->s.", 'causality="output" variability="continuous"', None, c.units),
-        _variables(kind, begin, None, 'causality="parameter" variability="fixed"', values, begin_units, "m->start"),
-        _variables(kind, c.params, "m->p.", 'causality="parameter" variability="tunable"', c.values, c.units),
-        _variables(kind, c.inputs, None, 'causality="input" variability="discrete"', c.input_values, c.units, "m->u"),
+        variables(c.state, "m->s.", 'causality="output" variability="continuous"', None, c.units),
+        variables(begin, None, 'causality="parameter" variability="fixed"', values, begin_units, "m->start"),
+        variables(c.params, "m->p.", 'causality="parameter" variability="tunable"', c.values, c.units),
+        variables(c.inputs, None, 'causality="input" variability="discrete"', c.input_values, c.units, "m->u"),
     ]
     first, places, lines = 1, ["m->s.t"], []
     ranges = []
@@ -191,14 +195,15 @@ def _of_xml(x):
     return {"inf": "INF", "-inf": "-INF", "nan": "NaN"}.get(repr(x), repr(x))
 
 
-def _variables(kind, found, struct, attributes, values, units, array=None):
-    """(element of the description, place in C) of each number. array: that holds them all, in the place of a struct."""
+def _variables(kind, labels, found, struct, attributes, values, units, array=None):
+    """(element of the description, place in C) of each number. labels: an iterator of fields with the names of these
+    variables. array: that holds them all, in the place of a struct."""
     rows = []
-    for field in found:
+    for field, named in zip(found, labels, strict=False):
         for i, place in enumerate(field.places(struct or "")):
             index = f"[{','.join(str(j + 1) for j in np.unravel_index(i, field.shape))}]" if field.shape else ""
             start = "" if values is None else f' start="{_of_xml(float(values[len(rows)]))}"'
-            label = quoteattr(f"{field.name}{index}")
+            label = quoteattr(f"{named.name}{index}")
             if unit := units.get(field.name):
                 start += f" unit={quoteattr(unit).replace('{', '{{').replace('}', '}}')}"
             text = f'    <{kind} name={label} valueReference="{{reference}}" {attributes}{start}/>'

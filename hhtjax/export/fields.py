@@ -1,5 +1,6 @@
 """Names in C for the leaves of a pytree: q["arm"]["angle"] is q_arm_angle, an array of numbers if it has a shape."""
 
+import itertools
 import re
 from typing import NamedTuple
 
@@ -18,6 +19,8 @@ RESERVED = {  # keywords of C and C++, and what compilers and the headers that a
     *("or", "or_eq", "private", "protected", "public", "reinterpret_cast", "requires", "static_assert", "static_cast"),
     *("template", "this", "thread_local", "throw", "true", "try", "typeid", "typename", "typeof", "typeof_unqual"),
     *("using", "virtual", "wchar_t", "xor", "xor_eq", "HUGE_VAL", "INFINITY", "NAN", "NULL", "linux", "unix"),
+    *("M_E", "M_LOG2E", "M_LOG10E", "M_LN2", "M_LN10", "M_PI", "M_PI_2", "M_PI_4", "M_1_PI", "M_2_PI", "M_2_SQRTPI"),
+    *("M_SQRT2", "M_SQRT1_2", "HUGE_VALF", "HUGE_VALL", "SIZE_MAX", "MATH_ERRNO", "MATH_ERREXCEPT"),
 }
 
 
@@ -55,7 +58,7 @@ def fields(tree, prefix, alone):
 def identifier(words):
     """Words, joined, as a name that C allows."""
     text = re.sub(r"\W", "_", "_".join(filter(None, words)), flags=re.ASCII)
-    text = text if re.match(r"[A-Za-z_]", text) else f"p{text}"
+    text = text if re.match(r"[A-Za-z]|_(?![A-Z_])", text) else f"p{text}"  # __LINE__ and _Bool are the compiler's
     return f"{text}_" if text in RESERVED else text
 
 
@@ -79,12 +82,15 @@ def units_of(caller, units, found):
     return told
 
 
-def require_different(caller, found):
-    """An error for two fields of one name."""
-    names = [x.name for x in found]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"{caller}: the keys must give different names in C; received several for {', '.join(twice)}.")
+def distinct(found, taken=()):
+    """The fields, each with a name of its own: one that an earlier field has, or that is taken, gets a number."""
+    own, given, result = {field.name for field in found}, set(taken), []
+    for field in found:
+        numbered = (f"{field.name}_{i}" for i in itertools.count(2))
+        free = (name for name in numbered if name not in given | own)
+        result.append(field._replace(name=next(free) if field.name in given else field.name))
+        given.add(result[-1].name)
+    return result
 
 
 def _word(key):

@@ -12,6 +12,8 @@ from hhtjax.export.helpers import helper
 from hhtjax.export.model import FLAGS, Given, Numbers
 from hhtjax.xla import Listing, Scalar
 
+TAKEN = "fmi3", "math", "stdbool", "stddef", "stdint", "stdlib", "string"  # .h or .c
+
 HEADER = """/* {name}: {stepper}
 
    Made by hhtjax {version}. {work}
@@ -160,9 +162,15 @@ def _arrays(tree):
     return [tree] if isinstance(tree, np.ndarray) else [x for y in tree for x in _arrays(y)]
 
 
-def local(place):
-    """The name of a constant for a member of a struct or an element of an array."""
-    return re.sub(r"\W+", "_", place.replace("(int32_t)", "").replace("[", "__").replace("]", ""))
+def local(place, name):
+    """The name of a constant for a member of a struct or an element of an array, unlike those of a model `name`.
+
+    >>> [local(place, "p") for place in ("p->k", "s->q[3]", "p->k[3]", "u[0]", "(int32_t)s->sign", "dt")]
+    ['p_k_', 's3_q', 'p3_k', 'u_0', 's_sign', 'dt']
+    """
+    of, *rest = re.findall(r"\w+", place.replace("(int32_t)", ""))
+    text = f"{of}{''.join(rest[1:])}_{rest[0]}" if "->" in place else "_".join([of, *rest])
+    return f"{text}_" if text.startswith(f"{name}_") else text
 
 
 def header(parts: Parts):

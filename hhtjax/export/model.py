@@ -8,7 +8,7 @@ import numpy as np
 
 from hhtjax.checks import require_params
 from hhtjax.description import is_concrete, thaw
-from hhtjax.export.fields import Field, fields, require_different
+from hhtjax.export.fields import Field, distinct, fields
 from hhtjax.steppers.friction_law import is_settled
 from hhtjax.steppers.stepper import INTERNAL, require_capable, require_stepper, require_system
 from hhtjax.systems import held
@@ -67,18 +67,17 @@ class Numbers:
     Every `sampled` is an input, held over each step. Integers and booleans stay what they are.
     """
 
-    def __init__(self, caller, params, dtype):
+    def __init__(self, params, dtype):
         self.leaves, self.structure = jax.tree.flatten(params, is_leaf=_is_input)
         self.places = [i for i, x in enumerate(self.leaves) if not _is_input(x) and _is_floating(x) and np.size(x)]
         self.input_places = [i for i, x in enumerate(self.leaves) if _is_input(x)]
         kept = self._with(dict.fromkeys(set(range(len(self.leaves))) - set(self.places)))
-        self.fields = fields(kept, "", "params")
+        self.fields = distinct(fields(kept, "", "params"))
         self.values = [self.leaves[i] for i in self.places]
         with_shapes = {i: np.zeros(self.leaves[i].polynomials.shape[2:]) for i in self.input_places}
         rest = dict.fromkeys(set(range(len(self.leaves))) - set(self.input_places))
-        self.inputs = fields(self._with(with_shapes | rest), "", "u")
+        self.inputs = distinct(fields(self._with(with_shapes | rest), "", "u"))
         self.dtype = dtype
-        require_different(f"{caller}: `params`", self.fields)
 
     def _with(self, changes):
         return self.structure.unflatten([changes.get(i, x) for i, x in enumerate(self.leaves)])
@@ -211,7 +210,9 @@ class Layout(NamedTuple):
                 leaves.append([field for prefix, tree in names[name] for field in fields(tree, prefix, prefix)])
             else:
                 leaves.append(fields(leaf, "_".join([name, *map(_index, path[1:])]), name))
-        return cls([field for leaf in leaves for field in leaf], leaves)
+        found = distinct([field for leaf in leaves for field in leaf])
+        own = iter(found)
+        return cls(found, [[next(own) for _ in leaf] for leaf in leaves])
 
     def places(self, struct):
         """C for every number of the state, leaf by leaf."""

@@ -4,15 +4,21 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from hhtjax.checks import require_function, require_integer, require_number
 from hhtjax.description import is_concrete
 from hhtjax.description.presentation import Table, as_text, shown
-from hhtjax.identification.evidence import count, effective_observations, f_tail, residuals_of
+from hhtjax.identification.evidence import (
+    count,
+    effective_observations,
+    f_tail,
+    residuals_of,
+    used_by_starts,
+    weights_of,
+)
 from hhtjax.identification.identifiability import parameter_names, parameter_values
-from hhtjax.identification.left_out import leave_out
+from hhtjax.identification.left_out import leave_out, require_residuals_of
 from hhtjax.identification.result import FitResult
 
 
@@ -133,9 +139,10 @@ def compare(
 
         AIC = n_e log(S_m/n) + 2 k_m,        BIC = n_e log(S_m/n) + k_m log n_e,
 
-    and for q further parameters x of a nested model, absent at x0, with G segments (Hotelling's T^2),
+    and for q further parameters x of a nested model, absent at x0, whose variances have f `degrees` of freedom or more
+    (Hotelling's T^2),
 
-        (G - q)/(G - 1) (x - x0)^T C_xx^-1 (x - x0)/q ~ F(q, G - q),
+        (f - q + 1)/f (x - x0)^T C_xx^-1 (x - x0)/q ~ F(q, f - q + 1),
 
     beside the textbook's ((S_0 - S_1)/q)/(S_1/(n - k_1)) ~ F(q, n - k_1). One model is nested in another if the names
     of its fitted parameters are among those of the other.
@@ -185,8 +192,10 @@ def compare(
     if len(set(observations.values())) > 1:
         told = ", ".join(f"{n} of {name!r}" for name, n in observations.items())
         raise ValueError(f"compare: `fits` must be of the same measurements; received {told} observations.")
+    _require_equal_weights(names, results)
+    _require_known(absent, results)
     n = observations[names[0]]
-    k = np.array([int(np.sum(x.free)) + sum(np.size(s) for s in jax.tree.leaves(x.starts)) for x in results])
+    k = np.array([int(np.sum(x.free)) + used_by_starts(x) for x in results])
     square = np.array([sum(np.sum(r**2) for r in x.weighted) for x in all_residuals])
     effective = effective_observations(n, results[int(np.argmax(k))].uncertainty)
     with np.errstate(divide="ignore"):
@@ -225,7 +234,24 @@ def _check_functions(residuals, fits):
         require_function("compare", "residuals", function, "residuals(params)")
         if fits[name].starts is not None:
             raise NotImplementedError(f"compare: `fits[{name!r}]` has records: no segments of them can be left out.")
+        require_residuals_of(name, fits[name], function)
     return functions
+
+
+def _require_known(absent, results):
+    """An error for a name in `absent` that no model has."""
+    known = {name for result in results for name in parameter_names(result.params)}
+    if isinstance(absent, dict) and (unknown := [name for name in absent if name not in known]):
+        names = ", ".join(sorted(known))
+        raise ValueError(f"compare: `absent` must be of parameters, {names}; received one for {unknown[0]!r}.")
+
+
+def _require_equal_weights(names, results):
+    """Their sums of squares are not of one kind, where the weights are not; the order is that of each model's."""
+    weights = [np.sort(np.concatenate([np.ravel(w) for w in weights_of(x)])) for x in results]
+    for name, w in zip(names, weights, strict=True):
+        if w.shape != weights[0].shape or not np.allclose(w, weights[0]):
+            raise ValueError(f"compare: `fits` must have the same weights; those of {names[0]!r} and {name!r} differ.")
 
 
 def _nested_tests(fits, costs, n, absent):
@@ -243,12 +269,14 @@ def _nested_tests(fits, costs, n, absent):
         x0 = np.array([held.get(names[i], _absent(absent, names[i])) for i in at])
         away = parameter_values(result.params)[free[at]] - x0
         C = np.asarray(result.uncertainty.covariance)[np.ix_(at, at)]
-        known, degrees = bool(np.all(np.isfinite(C)) and np.all(np.diagonal(C) > 0)), result.segments - q
+        known, degrees = bool(np.all(np.isfinite(C)) and np.all(np.diagonal(C) > 0)), result.uncertainty.degrees
         wald = float(away @ np.linalg.solve(C, away)) / q if known else math.nan
-        if result.uncertainty.cluster is None:  # more parameters than segments
+        if degrees is None:  # more parameters than segments
             degrees = effective_observations(n, result.uncertainty) - k1
         else:
-            wald *= degrees / (result.segments - 1)
+            least = min(float(np.min(np.asarray(degrees)[at])), n - k1)
+            degrees = least - q + 1
+            wald *= degrees / least
         naive = float((S0 - S1) / q / (S1 / (n - k1))) if S1 > 0 and n > k1 else math.nan
         p = f_tail(wald, q, degrees), f_tail(naive, q, n - k1)
         yield NestedTest(smaller, larger, q, wald, p[0], naive, p[1])

@@ -28,9 +28,14 @@ class Residuals(NamedTuple):
     present: list
 
 
+def weights_of(result) -> list:
+    """The weight of every residual, leaf by leaf."""
+    return spread_weights("fit", result.weights, result.residual)
+
+
 def residuals_of(result) -> Residuals:
     """Of a fit that is finished."""
-    weights = jax.tree.leaves(spread_weights("fit", result.weights, result.residual))
+    weights = weights_of(result)
     names, plain, weighted, present = [], [], [], []
     for (path, leaf), weight in zip(jax.tree_util.tree_leaves_with_path(result.residual), weights, strict=True):
         r, w = np.asarray(leaf, float), np.asarray(weight, float)
@@ -47,6 +52,15 @@ def residuals_of(result) -> Residuals:
 def count(residuals: Residuals) -> int:
     """Of residuals that are not missing."""
     return int(sum(np.sum(x) for x in residuals.present))
+
+
+def used_by_starts(result) -> int:
+    """Residuals that the starts of records take: of each record as many as its start has entries, or as there are."""
+    if result.starts is None:
+        return 0
+    leaves = jax.tree.leaves(result.starts)
+    present = sum(np.sum(np.reshape(w, (len(leaves[0]), -1)) != 0, axis=1) for w in weights_of(result))
+    return int(np.sum(np.minimum(present, sum(map(np.size, leaves)) // len(leaves[0]))))
 
 
 def design_effect(uncertainty) -> float:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.checks import require_function, require_integer
+from hhtjax.checks import require_function, require_integer, require_number
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification import transforms as tf
@@ -58,7 +58,8 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
         A `Score`.
 
     Raises:
-        TypeError, ValueError: residuals is no function; segments is no integer, 2 or more.
+        TypeError, ValueError: residuals is no function of two; params is a `FitResult`; segments is no integer, 2 or
+            more.
 
     References:
         Rao (1948); with sandwich variance, Boos, Am. Stat. 46 (1992).
@@ -72,7 +73,9 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     >>> dict(zip(found.names, (found.statistic > 10.8).tolist()))
     {'cube': True, 'square': False}
     """
-    require_function("score_test", "residuals", residuals, "residuals(params, candidates)")
+    require_function("score_test", "residuals", residuals, "residuals(params, candidates)", count=2)
+    if isinstance(params, FitResult):
+        raise TypeError("score_test: `params` must be those of a fit, result.params; received the FitResult.")
     segments = require_integer("score_test", "segments", segments, 2)
     params, candidates = (
         jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), freeze(y)) for y in (params, candidates)
@@ -125,7 +128,8 @@ def profile(residuals: Callable[..., Any], result: FitResult, name: str, values:
         A `Profile`.
 
     Raises:
-        ValueError: no parameter of that name, or one that is no scalar leaf or was fixed; a fit without covariance.
+        TypeError, ValueError: result is none of `fit`, or without covariance; no parameter of that name, or one that is
+            no scalar leaf or was fixed.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> x = jnp.linspace(0.0, 1.0, 200)
@@ -147,7 +151,8 @@ def profile(residuals: Callable[..., Any], result: FitResult, name: str, values:
     transforms = [tf.fixed if i == at else T for i, T in enumerate(result.transforms)]
     costs = []
     params = leaves
-    for value in np.asarray(values):
+    values = np.atleast_1d(np.asarray(values))
+    for value in values:
         params = [jnp.asarray(value, x.dtype) if i == at else x for i, x in enumerate(params)]
         held = fit(
             residuals,
@@ -160,10 +165,12 @@ def profile(residuals: Callable[..., Any], result: FitResult, name: str, values:
         params = jax.tree.leaves(freeze(held.params))
     row = int(np.flatnonzero(_flags(leaves, at))[0])
     variance = float(result.covariance[row, row] / result.embed(believed.inverse)[row, row])
-    return Profile(np.asarray(values), np.asarray(costs), 2 * (np.asarray(costs) - float(result.cost)) / variance)
+    return Profile(values, np.asarray(costs), 2 * (np.asarray(costs) - float(result.cost)) / variance)
 
 
 def _uncertainty(caller, result):
+    if not isinstance(result, FitResult):
+        raise TypeError(f"{caller}: `result` must be a FitResult; received {type(result).__name__}.")
     if result.uncertainty is None:
         raise ValueError(f"{caller}: `result` must have a covariance; received a fit made with covariance=False.")
     return result.uncertainty
@@ -185,7 +192,8 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
         Numbers and arrays like what predict returns; inf where a parameter matters that the fit left undetermined.
 
     Raises:
-        ValueError: a fit without covariance.
+        TypeError, ValueError: predict is no function; result is none of `fit`, or without covariance; a noise less than
+            0.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.arange(100.0)
@@ -193,6 +201,8 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
     >>> bool(hhtjax.identification.prediction_errors(lambda p: 3 * p, result) == 3 * result.standard_errors)
     True
     """
+    require_function("prediction_errors", "predict", predict, "predict(params)", count=1)
+    require_number("prediction_errors", "noise", noise, lambda x: x >= 0, "be 0 or more")
     _uncertainty("prediction_errors", result)
     x, unravel = ravel_pytree(freeze(result.params))
     shapes = jax.eval_shape(lambda x: predict(thaw(unravel(x))), x)

@@ -3,7 +3,9 @@
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import overwrite
@@ -19,6 +21,25 @@ def _segment(shape, folds, fold):
     inside = np.zeros(order.size, bool)
     inside[order] = np.arange(order.size) // -(-order.size // folds) == fold
     return inside.reshape(shape)
+
+
+def require_residuals_of(name, result, function):
+    """An error unless the function gives a fit's residuals again, but for a small part of them, or for what a change
+    of the parameters by some 1e-8 does."""
+    x, unravel = ravel_pytree(freeze(result.params))
+    near = x * (1 + result.free * float(jnp.finfo(x.dtype).eps) ** 0.5)
+    again, moved = (function(thaw(unravel(y))) for y in (x, near))
+    given, received = (jax.tree.map(jnp.shape, r) for r in (result.residual, again))
+    if received != given:
+        raise ValueError(f"compare: `residuals` of {name!r} must be those fitted, {given}; received {received}.")
+    every = (residuals_of(result._replace(residual=r)).weighted for r in (result.residual, again, moved))
+    own, again, moved = (np.concatenate([np.ravel(r) for r in rs]) for rs in every)
+    size, reach = np.linalg.norm(own), np.linalg.norm(moved - again)
+    if not np.linalg.norm(again - own) <= size / 10 + reach:
+        raise ValueError(
+            f"compare: `residuals` of {name!r} must be those fitted, whose norm is {size:.6g} at the estimate; "
+            f"received others, of {np.linalg.norm(again):.6g}."
+        )
 
 
 def leave_out(name, result, function, folds, always, options, progress):

@@ -121,6 +121,8 @@ def measure(solution: Solution, times: Any, gain: Any = 1.0, offset: Any = 0.0, 
     >>> float(measure(run, jnp.array([0.8]), gain=2.0, offset=0.5, delay=0.3)[0, 0].round(6))
     1.5
     """
+    if not isinstance(solution, Solution):
+        raise TypeError(f"measure: `solution` must be what simulate returns; received {type(solution).__name__}.")
     q = interpolate(solution, jnp.maximum(jnp.asarray(times) - delay, solution.t[0])).q
 
     def like_q(x):

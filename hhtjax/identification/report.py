@@ -10,7 +10,7 @@ import numpy as np
 from hhtjax.description import freeze
 from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.evidence import count, effective_observations, residuals_of, rms, whiteness
+from hhtjax.identification.evidence import count, effective_observations, residuals_of, rms, used_by_starts, whiteness
 from hhtjax.identification.identifiability import parameter_names, parameter_values, why_undetermined
 from hhtjax.identification.progress import CONVERGED, REASONS
 
@@ -88,7 +88,7 @@ def _about_residuals(result):
     leaves = zip(residuals.names, residuals.plain, residuals.present, strict=True)
     words = ["residual: rms " + ", ".join(f"{name} {rms(r, here):.4g}".strip() for name, r, here in leaves)]
     starts = jax.tree.leaves(result.starts)
-    unknowns = int(np.sum(result.free)) + sum(map(np.size, starts))
+    unknowns = int(np.sum(result.free)) + used_by_starts(result)
     if any(np.asarray(w).dtype != bool for w in jax.tree.leaves(result.weights)) and n > unknowns:
         square = sum(np.sum(r**2) for r in residuals.weighted)
         words.append(f"weighted sum of squares {square / (n - unknowns):.3g} per degree of freedom")
@@ -109,6 +109,10 @@ def _about_estimates(result, names):
     segments = f"how much {result.segments} segments of the record disagree (cluster sandwich)"
     kind = f"from {segments}" if believed.cluster is not None else "from the autocorrelation of the residuals"
     remarks = [f"standard errors: {kind}"]
+    if believed.degrees is not None:
+        worth, own = 1 + np.asarray(believed.degrees), names[result.free]
+        few = [i for i in np.argsort(worth)[:MOST_PAIRS] if worth[i] < result.segments / 2]
+        remarks[0] += f"; worth {', '.join(f'{worth[i]:.0f} for {own[i]}' for i in few)}" if few else ""
     size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
     unknown, why = why_undetermined(result.params, result.free, believed, size)
     if unknown:

@@ -27,6 +27,7 @@ from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import triangle
 
 SEGMENTS = 32
+LEAST = 8  # segments of whole records, below which they are cut
 FLAT = 1e-6  # curvature of the cost beside that of the sum of squares, at which a loss counts as flat
 ALONE = 0.75  # share of the information on a combination of parameters, above which its segment has taken it all
 
@@ -46,6 +47,8 @@ class Uncertainty(NamedTuple):
         undetermined: (p,), parameters in a combination that does not matter at all; their variance is inf, and their
             covariances are 0.
         inverse: of the second derivative of the cost, J^T diag(psi') J.
+        degrees: (p,), of freedom of the cluster variances: one less than there are segments, where each says as much of
+            a parameter, and less where a few say most of it (Satterthwaite, for white residuals); None without.
     """
 
     cluster: Any
@@ -55,6 +58,7 @@ class Uncertainty(NamedTuple):
     directions: Any
     undetermined: Any
     inverse: Any = None
+    degrees: Any = None
 
     @property
     def covariance(self):
@@ -70,12 +74,17 @@ def correlation(covariance):
     return jnp.where(eye == 1, eye, covariance / jnp.outer(safe, safe))
 
 
-def count_segments(sizes, segments):
-    """How many segments leaves of these sizes are cut into, at most `segments`."""
-    return max(-(-n // -(-n // segments)) for n in sizes if n)
+def count_segments(sizes, segments, block=1):
+    """How many segments of whole blocks leaves of these sizes are cut into, at most `segments`."""
+    return max(-(-n // _length(n, segments, block)) for n in sizes if n)
 
 
-def uncertainty(J, r, bend, present, sizes, segments, tau) -> Uncertainty:
+def _length(n, segments, block):
+    """Rows of a segment."""
+    return -(-n // (segments * block)) * block
+
+
+def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertainty:
     """All of the above.
 
     Args:
@@ -86,6 +95,7 @@ def uncertainty(J, r, bend, present, sizes, segments, tau) -> Uncertainty:
         sizes: of the raveled residual leaves, m together. Each is cut into equal parts, and the k-th parts of all
             leaves, which belong to the same times, are one segment; `segments` of them, by `count_segments`.
         tau: of `variance_inflation`.
+        block: rows that stay in one segment: those of a record, which its start has made depend on each other.
     """
     p, m = J.shape[1], sum(sizes)
     eps = float(jnp.finfo(J.dtype).eps)
@@ -111,9 +121,12 @@ def uncertainty(J, r, bend, present, sizes, segments, tau) -> Uncertainty:
         return in_units(inverse @ (S + prior) @ inverse)
 
     white = s2 * J.T @ J
-    cluster = covariance(_clusters(J, r, sizes, segments, tau * s2)) if segments > p else None
+    cluster, degrees = None, None
+    if segments > p:
+        S, degrees = _clusters(J, r, (sizes, segments, block), tau * s2, inverse @ T.T, prior)
+        cluster = covariance(S)
     directions, naive = Vt / column[None, :], covariance(white)
-    return Uncertainty(cluster, naive, covariance(tau * white), s, directions, undetermined, in_units(inverse))
+    return Uncertainty(cluster, naive, covariance(tau * white), s, directions, undetermined, in_units(inverse), degrees)
 
 
 def _inverse_curvature(J, bend, T, seen):
@@ -128,29 +141,49 @@ def _inverse_curvature(J, bend, T, seen):
     return (U * inverse[None, :]) @ U.T, jnp.any(flat[None, :] & (share > 1e-6), axis=1)
 
 
-def in_segments(x, sizes, segments):
+def in_segments(x, sizes, segments, block=1):
     """Of each leaf in the rows of x, raveled, its equal parts: (segments, rows, ...), the last filled up with zeros."""
     parts = []
     for leaf in jnp.split(x, np.cumsum(sizes)[:-1]):
         if n := len(leaf):
-            length = -(-n // segments)
+            length = _length(n, segments, block)
             filled = jnp.pad(leaf, ((0, segments * length - n), *((0, 0),) * (leaf.ndim - 1)))
             parts.append(filled.reshape(segments, length, *leaf.shape[1:]))
     return parts
 
 
-def _clusters(J, r, sizes, segments, variance):
-    """sum_g s_g s_g^T, for J^T J = 1: then J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T with A = J_g^T J_g."""
+def _clusters(J, r, cut, variance, x, prior):
+    """sum_g s_g s_g^T, for J^T J = 1: then J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T with A = J_g^T J_g; and
+    the `_degrees` of its products with the columns of x."""
     A, score = 0.0, 0.0
-    for rows, r_rows in zip(*(in_segments(x, sizes, segments) for x in (J, r)), strict=True):
+    for rows, r_rows in zip(*(in_segments(y, *cut) for y in (J, r)), strict=True):
         A = A + jnp.einsum("glp,glq->gpq", rows, rows)
         score = score + jnp.einsum("glp,gl->gp", rows, r_rows)
     share, U = jnp.linalg.eigh(A)
     alone = share > ALONE
     score = jnp.where(alone, 0, jnp.einsum("gpk,gp->gk", U, score) / jnp.sqrt(jnp.where(alone, 1, 1 - share)))
-    stand_in = jnp.where(alone, share, 0) * variance
+    stand_in = jnp.where(alone, share, 0)
     score = jnp.einsum("gpk,gk->gp", U, score)
-    return score.T @ score + jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U)
+    S = score.T @ score + variance * jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U)
+    known = jnp.einsum("pj,pq,qj->j", x, prior + jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U), x)
+    return S, _degrees(jnp.where(alone, 0, share), U, x, known)
+
+
+def _degrees(share, U, x, known):
+    """2 mean^2/variance of x^T S x, for each column x and white residuals of unit variance (Bell and McCaffrey 2002).
+
+    It is e^T G e, with G_gh = x^T B_g A_g (delta_gh - A_h) B_h x and B = (1 - A)^(-1/2). known: what is in the mean
+    beside it.
+    """
+    y = jnp.einsum("gpk,pj->gkj", U, x)
+    own = jnp.einsum("gk,gkj->gj", share / (1 - share), y**2)
+    shared = jnp.einsum("gpk,gk,gkj->gpj", U, share / jnp.sqrt(1 - share), y)
+    taken = jnp.sum(shared**2, axis=1)
+    mean = jnp.sum(own - taken, axis=0) + known
+    square = jnp.sum(own**2 - 2 * own * taken, axis=0)
+    square = square + jnp.sum(jnp.einsum("gpj,gqj->jpq", shared, shared) ** 2, axis=(1, 2))
+    some = square > float(jnp.finfo(square.dtype).eps) * mean**2
+    return jnp.where(some, jnp.maximum(mean**2 / jnp.where(some, square, 1), 1), jnp.inf)
 
 
 def time_axis(shape, of_records=False):

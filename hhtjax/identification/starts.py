@@ -1,5 +1,6 @@
 """Where a fit starts: parameters from the equation of motion itself, and longer and longer parts of a record."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.sampled import Sampled, sampled
 from hhtjax.systems.system import System, require_smooth
 
+ARGUMENTS = set(inspect.signature(fit).parameters) - {"params0"}
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
 
@@ -100,14 +102,14 @@ def fit_progressively(
         problem_at: (horizon, before) -> the arguments of `fit` for it, a dict with "residuals" and perhaps "records",
             "starts", "weights". before: the `FitResult` of the last horizon, None for the first. With `windows` of that
             duration it is multiple shooting.
-        params0: as in `fit`. horizons: whatever problem_at takes, the shortest first.
-        options: of every fit. Only the last one computes a covariance.
+        params0: as in `fit`. horizons: a sequence of what problem_at takes, the shortest first.
+        options: of every fit, where problem_at says nothing else. Only the last one computes a covariance.
 
     Returns:
         The last `FitResult`.
 
     Raises:
-        TypeError: problem_at is no function. ValueError: no horizon.
+        TypeError, ValueError: problem_at is no function of two, or what it returns no arguments of `fit`; no horizon.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.linspace(0.0, 30.0, 600)
@@ -117,14 +119,30 @@ def fit_progressively(
     >>> [round(float(hhtjax.fit_progressively(problem_at, 1.5, h).params), 3) == 3.0 for h in ([600], [20, 600])]
     [False, True]
     """
-    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)")
-    if not len(horizons):
-        raise ValueError(f"fit_progressively: `horizons` must hold at least one; received {horizons!r}.")
+    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)", count=2)
+    try:
+        horizons = list(horizons)
+    except TypeError:
+        raise TypeError(f"fit_progressively: `horizons` must be a sequence; received {horizons!r}.") from None
+    if not horizons:
+        raise ValueError("fit_progressively: `horizons` must hold at least one; received none.")
     params, result = params0, None
     for i, horizon in enumerate(horizons):
         last = i == len(horizons) - 1
         rest: dict[str, Any] = options if last else options | {"covariance": False}
-        result = fit(params0=params, **problem_at(horizon, result), **rest)
+        result = fit(**{"params0": params} | rest | _problem(problem_at(horizon, result), horizon))
         params = result.params
     assert result is not None
     return result
+
+
+def _problem(found, horizon):
+    """What problem_at returned, if `fit` can take it."""
+    where = f"fit_progressively: `problem_at` must return a dict of arguments of `fit`; received at horizon {horizon!r}"
+    if not isinstance(found, dict):
+        raise TypeError(f"{where} a {type(found).__name__}.")
+    if wrong := [name for name in found if name not in ARGUMENTS]:
+        raise ValueError(f"{where} {wrong[0]!r}, which is none.")
+    if "residuals" not in found:
+        raise ValueError(f"{where} {', '.join(found) or 'an empty one'}, without residuals.")
+    return found
