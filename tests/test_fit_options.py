@@ -57,6 +57,47 @@ def test_no_coordinate_leaves_the_domain_of_its_transform(dtype):
         assert T.contains(p).all()
         assert np.isfinite(T.coordinate(p, 1.0)).all()
         assert T.parameter(T.coordinate(p, 1.0), 1.0)[1] == pytest.approx(float(p[1]))
+        _, slope = jax.jvp(
+            lambda x, T=T: T.parameter(x, 1.0), (jnp.array([-25.0, 25.0], dtype),), (jnp.ones(2, dtype),)
+        )
+        assert np.all(slope > 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("in_records", [False, True])
+def test_parameters_that_end_at_their_bounds(in_records):
+    """An upper and a lower one, beyond which the free optimum lies: found as by SciPy, intervals cut off there."""
+    x = jnp.linspace(-1.0, 1.0, 40).reshape(2, 20)
+    measured = 2 * x - jnp.cos(3 * x) + jnp.array([[0.3], [0.4]]) + NOISE.reshape(2, 20)
+    bounds = {"a": hhtjax.bounded(0.0, 1.5), "c": hhtjax.positive}
+
+    def off(params, offset, record):
+        x, measured = record
+        return params["a"] * x + params["c"] * jnp.cos(3 * x) + offset - measured
+
+    def one_by_one(params):
+        return off(params, params["b"][:, None], (x, measured))
+
+    if in_records:
+        result = hhtjax.fit(off, {"a": 1.0, "c": 1.0}, records=(x, measured), starts=jnp.zeros(2), transforms=bounds)
+        found = result.starts
+    else:
+        result = hhtjax.fit(one_by_one, {"a": 1.0, "b": jnp.zeros(2), "c": 1.0}, transforms=bounds | {"b": None})
+        found = result.params["b"]
+    known = least_squares(
+        lambda y: np.asarray(one_by_one({"a": y[0], "c": y[1], "b": y[2:]})).ravel(),
+        [1.0, 1.0, 0.0, 0.0],
+        bounds=([0, 0, -np.inf, -np.inf], [1.5, np.inf, np.inf, np.inf]),
+        xtol=1e-14,
+    )
+    assert result.converged
+    assert int(result.iterations) < 30
+    assert float(result.cost) == pytest.approx(known.cost, rel=1e-7)
+    np.testing.assert_allclose(found, known.x[2:], rtol=1e-6)
+    lower, upper = result.interval()
+    assert (float(upper["a"]), float(lower["c"])) == (1.5, 0.0)
+    assert float(upper["c"]) == pytest.approx(2.09 * float(result.standard_errors["c"]), rel=0.01)
+    assert "at a bound: a, c; " in result.summary()
 
 
 @pytest.mark.slow

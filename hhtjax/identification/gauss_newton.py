@@ -5,6 +5,9 @@ A problem evaluates a point x into a trial with its cost, and finds from it the 
     min_dx |r + J dx|^2 + lam |D dx|^2,      D: the largest norms that the columns of J have had (More 1978)
 
 so that a parameter which loses its influence on the way does not run away.
+
+Towards a bound of a parameter, which a transform has put at an infinite x, J^T J vanishes faster than the slope J^T r.
+What makes a good step there is the second derivative of the transform itself: see `_bent`.
 """
 
 from collections.abc import Callable
@@ -58,16 +61,17 @@ class DenseTrial(NamedTuple):
     length: Any  # of the residual of the least-squares problem
     D: Any
     column: Any  # norms of the columns of J, at most D
-    s: Any  # singular values of J/D
+    s: Any  # singular values of J/D, here and below with the rows of `_bent`
     V: Any
     z: Any  # residual in the basis of the left singular vectors
 
 
 class Dense(NamedTuple):
-    """Residuals f(x) (m,) of which each may depend on every unknown."""
+    """Residuals f(x) (m,) of which each may depend on every unknown; bend(x): p''/p' of each."""
 
     f: Callable
     objective: Objective
+    bend: Callable | None
 
     def look(self, x, D) -> DenseTrial:
         """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
@@ -75,9 +79,12 @@ class Dense(NamedTuple):
         r_hat, J_hat = self.objective.least_squares(r, J)
         finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
         r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
+        p = x.size
+        if self.bend is not None:
+            further = _bent(self.bend(x), J_hat.T @ r_hat, jnp.sum(J_hat**2, axis=0))
+            J_hat, r_hat = jnp.concatenate([J_hat, jnp.diag(further)]), jnp.pad(r_hat, (0, p))
         column = jnp.linalg.norm(J_hat, axis=0)
         D = jnp.maximum(D, column)
-        p = x.size
         R = triangle(jnp.concatenate([J_hat / _or_one(D)[None, :], r_hat[:, None]], axis=1))
         U, s, Vt = jnp.linalg.svd(R[:p, :p])
         cost = jnp.where(finite, self.objective.cost(r), jnp.inf)
@@ -95,7 +102,7 @@ class Dense(NamedTuple):
 
     def deviation(self, trial):
         """Standard deviation of the residuals."""
-        return _deviation(jnp.hypot(trial.length, jnp.linalg.norm(trial.z)), trial.r.size, trial.x.size)
+        return _deviation(trial.length, trial.r.size, trial.x.size)
 
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
@@ -130,6 +137,7 @@ class Arrow(NamedTuple):
     objective: Objective
     records: Any
     p: int
+    bend: Callable | None  # of the shared unknowns
 
     def split(self, x):
         """Shared unknowns (p,) and own ones (records, k)."""
@@ -150,13 +158,18 @@ class Arrow(NamedTuple):
         r_hat, both = self.objective.least_squares(r.ravel(), both)
         finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(both))
         r_hat, both = (jnp.where(finite, y, 0) for y in (r_hat, both))
-        both = both.reshape(count, m, -1)
+        both, r_hat = both.reshape(count, m, -1), r_hat.reshape(count, m)
+        if self.bend is not None:
+            slopes, squares = jnp.einsum("bmp,bm->p", both[:, :, k:], r_hat), jnp.sum(both[:, :, k:] ** 2, axis=(0, 1))
+            further = jnp.diag(_bent(self.bend(shared), slopes, squares) / count**0.5)  # a part in each record
+            further = jnp.broadcast_to(jnp.pad(further, ((0, 0), (k, 0))), (count, self.p, k + self.p))
+            both, r_hat = jnp.concatenate([both, further], axis=1), jnp.pad(r_hat, ((0, 0), (0, self.p)))
         norms = jnp.linalg.norm(both[:, :, k:], axis=(0, 1)), jnp.linalg.norm(both[:, :, :k], axis=1)
         column = jnp.concatenate([norms[0], norms[1].ravel()])
         D = jnp.maximum(D, column)
         shared, own = self.split(_or_one(D))
         columns = jnp.concatenate([own, jnp.broadcast_to(shared, (count, self.p))], axis=1)
-        R = jnp.linalg.qr(jnp.concatenate([both / columns[:, None, :], r_hat.reshape(count, m, 1)], axis=2), mode="r")
+        R = jnp.linalg.qr(jnp.concatenate([both / columns[:, None, :], r_hat[:, :, None]], axis=2), mode="r")
         cost = jnp.where(finite, self.objective.cost(r.ravel()), jnp.inf)
         length = jnp.linalg.norm(r_hat)
         return ArrowTrial(x, r, J, J_own, cost, length, D, column, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
@@ -216,6 +229,16 @@ class Arrow(NamedTuple):
         bends = None if bend is None else bend.reshape(count, m)
         rest = jax.vmap(project, in_axes=(0, None if bend is None else 0))(both.reshape(count, m, -1), bends)
         return rest.reshape(count * m, -1), pull, bend
+
+
+def _bent(bend, slope, square):
+    """Roots of what is added to the diagonal of J^T J (`square`) for transformed unknowns whose bound is ahead.
+
+    A transform p(x) gives the second derivative of the cost a part of its own, `slope` p''/p' with slope = J^T r, which
+    is positive on the way to a bound: J^T J is made as large, so that the step there is 1/|bend|, not J^T r/J^T J. At
+    a minimum inside the bounds it is 0 (Coleman, Li 1996: the same term, for bounds on p itself).
+    """
+    return jnp.sqrt(jnp.maximum(slope * bend - square, 0))
 
 
 def _deviation(length, m, p):

@@ -78,6 +78,15 @@ class Coordinates:
         changed = dict(zip(self.free, self.free_leaves(x), strict=True))
         return thaw(self.structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(self.leaves)]))
 
+    def bend(self):
+        """x -> p''/p' of the fitted entries; None where no bound makes it differ from 0."""
+
+        def of(x):
+            leaves = zip(self.free, self.unravel(x), strict=True)
+            return ravel_pytree([self.transforms[i].bend(y) for i, y in leaves])[0]
+
+        return None if np.all(np.isinf(self.longest)) else of
+
     def slope(self, x):
         """dp/dx of the fitted entries."""
         return jax.jvp(lambda x: ravel_pytree(self.free_leaves(x))[0], (x,), (jnp.ones_like(x),))[1]
@@ -125,17 +134,17 @@ def _solve_dense(residuals, options, coordinates, data, limits):
         away = [p - mean for p, mean in zip(coordinates.free_leaves(x), means, strict=True)]
         return jnp.concatenate([r, ravel_pytree(away)[0]])
 
-    objective, choices = Objective(w, options.loss, m), None
+    objective, bend, choices = Objective(w, options.loss, m), coordinates.bend(), None
     if options.optimizer == LEVENBERG_MARQUARDT:
 
         def problem_for(y, fresh):
-            return Dense(lambda x: with_steps_for(f, x, jnp.where(fresh, x, y)), objective)
+            return Dense(lambda x: with_steps_for(f, x, jnp.where(fresh, x, y)), objective, bend)
 
         start = coordinates.x0, coordinates.longest, *limits
         if chooses_steps(f, coordinates.x0):
             best, history, iterations, code, choices = in_rounds(problem_for, *start)
         else:
-            best, history, iterations, code = levenberg_marquardt(Dense(f, objective), *start)
+            best, history, iterations, code = levenberg_marquardt(Dense(f, objective, bend), *start)
         x, r, J = best.x, best.r, best.J
     else:
         x, history, iterations, code = descend(f, coordinates.x0, objective, options.optimizer, *limits)
@@ -171,7 +180,7 @@ def _solve_records(residuals, options, coordinates, data, limits):
     def f(x, own, record):
         return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
 
-    problem = Arrow(f, Objective(w.ravel(), options.loss, w.size), data.records, p)
+    problem = Arrow(f, Objective(w.ravel(), options.loss, w.size), data.records, p, coordinates.bend())
     x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
     longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
     if chooses_steps(every, params0, data.starts, data.records):

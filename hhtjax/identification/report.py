@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.description import freeze
 from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.evidence import count, effective_observations, residuals_of, rms, whiteness
@@ -15,6 +16,7 @@ from hhtjax.identification.progress import CONVERGED, REASONS
 
 CLOSE = 0.95  # correlation of two estimates that is worth a word
 MOST_PAIRS = 3
+AT_BOUND = 0.01  # standard errors
 
 
 def summary(result) -> str:
@@ -111,6 +113,8 @@ def _about_estimates(result, names):
     unknown, why = why_undetermined(result.params, result.free, believed, size)
     if unknown:
         remarks.append(f"undetermined: {', '.join(unknown)}: {why}")
+    if bound := names[_at_bound(result)].tolist():
+        remarks.append(f"at a bound: {', '.join(bound)}; standard errors are those without it")
     if np.sum(result.free) - len(unknown) > 1:
         R = np.asarray(result.correlation)
         rows, columns = np.triu_indices(len(R), 1)
@@ -123,6 +127,13 @@ def _about_estimates(result, names):
     condition = s[0] / s[-1] if s[-1] > 0 else np.inf
     remarks.append(f"condition number of the scaled Jacobian: {condition:.3g}")
     return remarks
+
+
+def _at_bound(result):
+    """Flags of the parameters that are closer to a bound than a hundredth of their standard error."""
+    leaves = zip(result.transforms, jax.tree.leaves(freeze(result.params)), strict=True)
+    distance = np.concatenate([np.ravel(np.minimum(p - T.lower, T.upper - p)) for T, p in leaves])
+    return result.free & (distance < AT_BOUND * parameter_values(result.standard_errors))
 
 
 TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}

@@ -114,7 +114,8 @@ class FitResult(NamedTuple):
         """Lower and upper ends of each parameter's confidence interval, two pytrees like params.
 
         Student's t with segments - 1 degrees of freedom, symmetric in the coordinate that was fitted: for a
-        `positive` parameter p exp(-+ t sigma/p), which stays positive.
+        `positive` parameter p exp(-+ t sigma/p), which stays positive. A parameter closer than t sigma to a bound has
+        p -+ t sigma, cut off there: it cannot be told from the bound.
 
         Raises:
             TypeError, ValueError: level is no number between 0 and 1; a fit without covariance.
@@ -175,7 +176,10 @@ def _ends(T, p, reach):
     one = jnp.ones_like(p)
     x = T.coordinate(p, one)
     _, slope = jax.jvp(lambda x: T.parameter(x, one), (x,), (one,))
-    return T.parameter(x - reach / slope, one), T.parameter(x + reach / slope, one)
+    by_x = T.parameter(x - reach / slope, one), T.parameter(x + reach / slope, one)
+    cut = jnp.maximum(p - reach, T.lower), jnp.minimum(p + reach, T.upper)
+    near = jnp.minimum(p - T.lower, T.upper - p) < reach
+    return tuple(jnp.where(near, *ends) for ends in zip(cut, by_x, strict=True))
 
 
 def student(level, degrees):

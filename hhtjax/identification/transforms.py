@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from hhtjax.checks import require_number
 
@@ -25,6 +26,7 @@ class Transform:
 
     expectation = "be real"
     longest_step = 1.0  # in x
+    lower, upper = -np.inf, np.inf  # of p
 
     def __init_subclass__(cls):
         jax.tree_util.register_static(cls)
@@ -39,6 +41,10 @@ class Transform:
 
     def coordinate(self, p, scale):
         """x of p."""
+        raise NotImplementedError
+
+    def bend(self, x):
+        """p''/p' at x."""
         raise NotImplementedError
 
 
@@ -56,12 +62,17 @@ class Scaled(Transform):
         """p/scale."""
         return p / scale
 
+    def bend(self, x):
+        """0."""
+        return jnp.zeros_like(x)
+
 
 @dataclass(frozen=True)
 class Positive(Transform):
     """p = exp(x)."""
 
     expectation = "be positive, for its transform"
+    lower = 0.0
 
     def contains(self, p):
         """p > 0."""
@@ -75,6 +86,10 @@ class Positive(Transform):
     def coordinate(self, p, scale):
         """log(p)."""
         return jnp.log(p)
+
+    def bend(self, x):
+        """1."""
+        return jnp.ones_like(x)
 
 
 @dataclass(frozen=True)
@@ -95,15 +110,22 @@ class Bounded(Transform):
 
     def parameter(self, x, scale):
         """lower + (upper - lower)/(1 + exp(-x))."""
-        p = self.lower + (self.upper - self.lower) * jax.nn.sigmoid(x)
+        share = jax.nn.sigmoid(jnp.where(x > 0, -x, x))  # from the nearer bound on: so its derivative is never 0
+        away = (self.upper - self.lower) * share
+        p = jnp.where(x > 0, self.upper - away, self.lower + away)
         lower, upper = (np.asarray(bound, p.dtype) for bound in (self.lower, self.upper))
         tiny = jnp.finfo(p.dtype).tiny
         least, most = np.nextafter(lower, upper), np.nextafter(upper, lower)  # what rounds to a bound stays inside
-        return jnp.clip(p, np.maximum(least, lower + tiny), np.minimum(most, upper - tiny))
+        inside = jnp.clip(p, np.maximum(least, lower + tiny), np.minimum(most, upper - tiny))
+        return p + lax.stop_gradient(inside - p)  # with the derivative of p
 
     def coordinate(self, p, scale):
         """log((p - lower)/(upper - p))."""
         return jnp.log((p - self.lower) / (self.upper - p))
+
+    def bend(self, x):
+        """-tanh(x/2)."""
+        return -jnp.tanh(x / 2)
 
 
 @dataclass(frozen=True)
