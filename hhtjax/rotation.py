@@ -231,8 +231,7 @@ def product(A, B) -> jax.Array:
     >>> print(product(hat(jnp.array([1.0, 0.0, 0.0])), jnp.eye(3))[2])
     [0. 1. 0.]
     """
-    A, B = _real("product", "A", A, (3, 3)), _real("product", "B", B, (3, 3))
-    return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
+    return jnp.sum(_real("product", "A", A, (3, 3))[:, :, None] * _real("product", "B", B, (3, 3))[None], axis=1)
 
 
 def cross(x, y) -> jax.Array:

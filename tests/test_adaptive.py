@@ -185,13 +185,12 @@ def test_derivatives_are_those_of_the_accepted_steps():
         path = hhtjax.simulate(system, stepper, ONE, ZERO, params, dt=steps.dt)
         return jnp.sum(hhtjax.interpolate(path, times).q ** 2)
 
-    along = {"k": 1.0, "c": 0.5}
+    along, h = {"k": 1.0, "c": 0.5}, 1e-5
     reverse = jax.grad(jax.jit(loss))(params)  # where a derivative is not known of when steps are chosen
     value, forward = jax.jit(lambda x: jax.jvp(loss, (x,), (along,)))(params)
     for found in (value, jnp.sum(whole.q**2)):
         assert float(found) == pytest.approx(float(frozen(params)) + 1.0, rel=1e-12)  # and the start
     for name in params:
-        h = 1e-5
         at = [float(frozen(params | {name: params[name] + s * h})) for s in (-1, 1)]
         assert float(reverse[name]) == pytest.approx((at[1] - at[0]) / (2 * h), rel=1e-7)
     assert float(forward) == pytest.approx(sum(along[name] * float(reverse[name]) for name in params), rel=1e-10)
