@@ -38,7 +38,8 @@ class Sampled:
 
     def _uniform(self, t, intervals, terms):
         """Number of the interval of t, and the place in it, from 0 to 1."""
-        x = (jnp.asarray(t).astype(self.dt.dtype) - self.t0) / self.dt
+        # a division: in some copies XLA makes it a product, and one number rounds to two on both sides of a sample
+        x = (jnp.asarray(t).astype(self.dt.dtype) - self.t0) * (1 / self.dt)
         if terms == 1:  # a jump: at a sample, up to rounding, the new value
             x = x + SLOP * float(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + jnp.abs(self.t0 / self.dt))
         i = jnp.clip(jnp.floor(x), 0, intervals - 1)
