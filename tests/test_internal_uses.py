@@ -221,3 +221,21 @@ BAD = [
 @pytest.mark.parametrize(("kind", "message", "call"), BAD, ids=lambda x: x[:40] if isinstance(x, str) else "")
 def test_bad_input(kind, message, call):
     check_message(kind, message, call)
+
+
+@pytest.mark.slow
+def test_at_a_sample_all_copies_of_a_time_are_in_one_interval():
+    """3 * .1/.1 by a division is 3, and by a product with 10 a little more or less: XLA makes some of them products."""
+    drive = hhtjax.sampled(np.sin(np.linspace(0, 1, 11)), 0.1, order=1)
+    system = hhtjax.System(
+        np.ones(1),
+        lambda q, v, z, t, params: -params["k"] * q - z + params["u"](t),
+        internal=lambda q, v, z, t, params: v - z,
+    )
+
+    def run(k):
+        start = np.ones(1), np.zeros(1), {"k": k, "u": drive}
+        return hhtjax.simulate(system, hhtjax.hht(0.0), *start, z0=np.zeros(1), dt=2e-3, num_steps=160).acceleration
+
+    batch, _ = jax.vmap(lambda k: jax.jvp(run, (k,), (1.0,)))(jnp.array([3.0, 5.0]))
+    np.testing.assert_allclose(batch[0], run(3.0), atol=1e-12)
