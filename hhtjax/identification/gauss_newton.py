@@ -100,10 +100,6 @@ class Dense(NamedTuple):
         """Of J dx."""
         return jnp.linalg.norm(trial.s * (trial.V.T @ (trial.D * dx)))
 
-    def deviation(self, trial):
-        """Standard deviation of the residuals."""
-        return _deviation(trial.length, trial.r.size, trial.x.size)
-
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
         return _cosine(trial.V @ (trial.s * trial.z), trial)
@@ -202,10 +198,6 @@ class Arrow(NamedTuple):
         Jdx = jnp.einsum("bip,p->bi", trial.R, shared) + jnp.einsum("bik,bk->bi", trial.R_own, own)
         return jnp.linalg.norm(Jdx)
 
-    def deviation(self, trial):
-        """Standard deviation of the residuals."""
-        return _deviation(trial.length, trial.r.size, trial.x.size)
-
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
         shared = jnp.einsum("bip,bi->p", trial.R, trial.z)
@@ -241,8 +233,9 @@ def _bent(bend, slope, square):
     return jnp.sqrt(jnp.maximum(slope * bend - square, 0))
 
 
-def _deviation(length, m, p):
-    return length / max(m - p, 1) ** 0.5
+def deviation(trial):
+    """Standard deviation of the residuals."""
+    return trial.length / max(trial.r.size - trial.x.size, 1) ** 0.5
 
 
 def _or_one(x):

@@ -136,7 +136,7 @@ def _about_estimates(result, names):
 def _at_bound(result):
     """Flags of the parameters that are closer to a bound than a hundredth of their standard error."""
     leaves = zip(result.transforms, jax.tree.leaves(freeze(result.params)), strict=True)
-    distance = np.concatenate([np.ravel(np.minimum(p - T.lower, T.upper - p)) for T, p in leaves])
+    distance = np.concatenate([np.ravel(T.distance(p)) for T, p in leaves])
     return result.free & (distance < AT_BOUND * parameter_values(result.standard_errors))
 
 

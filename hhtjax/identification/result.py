@@ -180,7 +180,7 @@ def _ends(T, p, reach):
     _, slope = jax.jvp(lambda x: T.parameter(x, one), (x,), (one,))
     by_x = T.parameter(x - reach / slope, one), T.parameter(x + reach / slope, one)
     cut = jnp.maximum(p - reach, T.lower), jnp.minimum(p + reach, T.upper)
-    near = jnp.minimum(p - T.lower, T.upper - p) < reach
+    near = T.distance(p) < reach
     return tuple(jnp.where(near, *ends) for ends in zip(cut, by_x, strict=True))
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.identification.gauss_newton import deviation
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.progress import BAD_START, NO_INFLUENCE, RUNNING, UNSETTLED, History
 
@@ -35,12 +36,12 @@ def in_rounds(problem_for, x, longest, tolerance, max_iterations, progress):
         limits = tolerance, max_iterations - before, progress, max_iterations
 
         def near(trial, step, problem=problem, fresh=fresh):
-            return fresh & (problem.length(trial, step) <= SMALL * problem.deviation(trial))
+            return fresh & (problem.length(trial, step) <= SMALL * deviation(trial))
 
         found, new, iterations, code = levenberg_marquardt(problem, best.x, longest, *limits, near)
         history = History(*map(partial(joined, before, fresh), history, new))
         moved = problem.length(found, found.x - best.x)
-        small = SMALL * problem.deviation(found) + tolerance * problem.length(found, found.x)
+        small = SMALL * deviation(found) + tolerance * problem.length(found, found.x)
         choices, before = choices + 1, before + iterations
         failed = (code == BAD_START) | (code == NO_INFLUENCE) | (before >= max_iterations)
         settled = (moved <= small) & ~fresh

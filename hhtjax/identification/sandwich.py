@@ -27,7 +27,6 @@ from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import triangle
 
 SEGMENTS = 32
-LEAST = 8  # segments of whole records, below which they are cut
 FLAT = 1e-6  # curvature of the cost beside that of the sum of squares, at which a loss counts as flat
 ALONE = 0.75  # share of the information on a combination of parameters, above which its segment has taken it all
 
@@ -74,17 +73,12 @@ def correlation(covariance):
     return jnp.where(eye == 1, eye, covariance / jnp.outer(safe, safe))
 
 
-def count_segments(sizes, segments, block=1):
-    """How many segments of whole blocks leaves of these sizes are cut into, at most `segments`."""
-    return max(-(-n // _length(n, segments, block)) for n in sizes if n)
+def count_segments(sizes, segments):
+    """How many segments leaves of these sizes are cut into, at most `segments`."""
+    return max(-(-n // -(-n // segments)) for n in sizes if n)
 
 
-def _length(n, segments, block):
-    """Rows of a segment."""
-    return -(-n // (segments * block)) * block
-
-
-def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertainty:
+def uncertainty(J, r, bend, present, sizes, segments, tau) -> Uncertainty:
     """All of the above.
 
     Args:
@@ -95,7 +89,6 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
         sizes: of the raveled residual leaves, m together. Each is cut into equal parts, and the k-th parts of all
             leaves, which belong to the same times, are one segment; `segments` of them, by `count_segments`.
         tau: of `variance_inflation`.
-        block: rows that stay in one segment: those of a record, which its start has made depend on each other.
     """
     p, m = J.shape[1], sum(sizes)
     eps = float(jnp.finfo(J.dtype).eps)
@@ -123,7 +116,7 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
     white = s2 * J.T @ J
     cluster, degrees = None, None
     if segments > p:
-        S, degrees = _clusters(J, r, (sizes, segments, block), tau * s2, inverse @ T.T, prior)
+        S, degrees = _clusters(J, r, (sizes, segments), tau * s2, inverse @ T.T, prior)
         cluster = covariance(S)
     directions, naive = Vt / column[None, :], covariance(white)
     return Uncertainty(cluster, naive, covariance(tau * white), s, directions, undetermined, in_units(inverse), degrees)
@@ -141,12 +134,12 @@ def _inverse_curvature(J, bend, T, seen):
     return (U * inverse[None, :]) @ U.T, jnp.any(flat[None, :] & (share > 1e-6), axis=1)
 
 
-def in_segments(x, sizes, segments, block=1):
+def in_segments(x, sizes, segments):
     """Of each leaf in the rows of x, raveled, its equal parts: (segments, rows, ...), the last filled up with zeros."""
     parts = []
     for leaf in jnp.split(x, np.cumsum(sizes)[:-1]):
         if n := len(leaf):
-            length = _length(n, segments, block)
+            length = -(-n // segments)
             filled = jnp.pad(leaf, ((0, segments * length - n), *((0, 0),) * (leaf.ndim - 1)))
             parts.append(filled.reshape(segments, length, *leaf.shape[1:]))
     return parts

@@ -47,6 +47,10 @@ class Transform:
         """p''/p' at x."""
         raise NotImplementedError
 
+    def distance(self, p):
+        """Of p from the nearer bound."""
+        return jnp.minimum(p - self.lower, self.upper - p)
+
 
 @dataclass(frozen=True)
 class Scaled(Transform):
