@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.description import is_concrete
+from hhtjax.description import all_concrete, is_concrete
 from hhtjax.description.presentation import Table, all_known, between, brief, known, leaf_rows, shown
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
@@ -120,7 +120,7 @@ class Solution(NamedTuple):
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
-        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t, self.steps, self.error)))):
+        if not all_concrete((self.failure, self.dt, self.t, self.steps, self.error)):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         if fault := self._fault(reach):
             raise SimulationError(f"simulate: {fault}")
