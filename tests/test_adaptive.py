@@ -11,7 +11,7 @@ from helpers import ONE, SPRING, ZERO, run
 from scipy.integrate import solve_ivp
 
 import hhtjax
-from hhtjax.runs.chosen import chosen_steps
+from hhtjax.runs.chosen import Grid, chosen_steps
 from hhtjax.runs.controlled import run_recorded
 from hhtjax.scenes import pendulum, top
 
@@ -263,6 +263,19 @@ def test_the_stages_of_many_unknowns_are_a_loop():
         (_, found), found_slopes = jax.jit(jax.value_and_grad(partial(end, many), has_aux=True))(k)
         np.testing.assert_allclose(found, alone[:, 0], rtol=1e-13)
         np.testing.assert_allclose(found_slopes, slopes, rtol=1e-11)
+
+
+def test_a_sample_is_read_off_in_the_step_that_ends_at_it_or_beyond():
+    """Whole or halved, and before the first step none; where steps end too early the last one counts."""
+    ends, t0 = jnp.array([1.0, 2.0, 3.0, jnp.inf]), jnp.array(0.0)
+    times = jnp.array([0.0, 0.4, 0.6, 1.0, 2.5, 2.7, 3.0, 9.0])
+    for halved, needed in ((False, [0, 1, 1, 1, 3, 3, 3, 3]), (True, [0, 1, 2, 2, 5, 6, 6, 6])):
+        grid = Grid.of(t0, times, ends, 3, halved)
+        assert np.cumsum(grid.counts).tolist() == needed
+        assert grid.reached == 3.0
+        size = 1 - 0.5 * halved
+        assert [float(x) for x in grid.sizes(1)] == [size, size, 2 * size]
+        assert [float(x) for x in grid.sizes(3 * (1 + halved))] == [1.0, size, np.inf]
 
 
 @pytest.mark.slow

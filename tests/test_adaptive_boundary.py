@@ -85,3 +85,12 @@ def test_bad_input_is_named(name):
         run(**{"num_steps": None, "dt": dt, "times": [0.5, 1.0], "stepper": hhtjax.hht()} | changed)
 
     check_message((ValueError, TypeError, NotImplementedError), message, call)
+
+
+@pytest.mark.parametrize("verify", [True, "tolerance", "tighten"])
+def test_steps_alone_have_no_error_to_verify(verify):
+    def call():
+        hhtjax.choose_steps(hhtjax.LinearSystem(ONE), hhtjax.hht(), ONE, ZERO, times=[1.0], **tolerances)
+
+    tolerances = {"rtol": 1e-3, "atol": 1e-6, "verify": verify}
+    check_message(ValueError, f"choose_steps: leave `verify` out; received {verify!r}. It takes runs", call)

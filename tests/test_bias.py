@@ -66,18 +66,21 @@ def test_only_numerical_damping_needs_a_third_level():
 
 @pytest.mark.slow
 def test_the_response_to_forces_is_corrected_too():
-    """m, c, k of a driven oscillator at w h = 0.35: the closed forms, of k and c relative to m, and of the gain 1/m."""
+    """m, c, k of a driven oscillator at w h = 0.35: the closed forms, of k and c relative to m, and of the gain 1/m.
+
+    A function in params stays as it is.
+    """
     driven = hhtjax.System(
-        lambda q, p: p["m"] * jnp.ones(1), lambda q, v, t, p: -p["k"] * q - p["c"] * v - p["cubic"] * q**3
+        lambda q, p: p["m"] * jnp.ones(1), lambda q, v, t, p: -p["k"] * q - p["c"] * v - p["cubic"] * p["law"](q)
     )
-    fitted = {"m": 2.0, "c": 0.01, "k": 3.0, "cubic": 5.0}
+    fitted = {"m": 2.0, "c": 0.01, "k": 3.0, "cubic": 5.0, "law": lambda q: q**3}
     bias = hhtjax.step_size_bias(driven, hhtjax.hht(alpha=0.0), fitted, 0.3, q=jnp.zeros(1), correct=True)
     x = float(bias.wh[0]) / 2
     gain = np.tan(x) / x / np.cos(x) ** 2
     assert float(bias.params["m"]) == pytest.approx(2.0 * gain, rel=1e-4)
     assert float(bias.params["k"] / bias.params["m"]) == pytest.approx(1.5 * (x / np.tan(x)) ** 2, rel=1e-5)
     assert float(bias.params["c"] / bias.params["m"]) == pytest.approx(0.005 * np.cos(x) ** 2, rel=1e-4)
-    assert bias.params["cubic"] == 5.0
+    assert (bias.params["cubic"], bias.params["law"]) == (5.0, fitted["law"])
     held = hhtjax.step_size_bias(
         driven, hhtjax.hht(alpha=0.0), fitted, 0.3, jnp.zeros(1), correct=dict.fromkeys(fitted, True) | {"m": False}
     )
@@ -251,6 +254,21 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
             lambda: hhtjax.step_size_bias(TURNING, hhtjax.hht(), None, 0.1, q=jnp.eye(3)),
             NotImplementedError,
             "step_size_bias: `q` has rotations",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, q=jnp.zeros(2)),
+            ValueError,
+            r"step_size_bias: `q` must be of the size of the mass, 1; received shape \(2,\)",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, q=None),
+            ValueError,
+            "step_size_bias: `q` must hold at least one number; received None",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, jnp.zeros(1), jnp.zeros(2)),
+            ValueError,
+            r"step_size_bias: `v` must have the shapes of q, shape \(1,\) float64; received shape \(2,\)",
         ),
         (
             lambda: hhtjax.step_size_bias(hanging, hhtjax.hht(), HANGING, 0.1, q=jnp.array([0.0, -0.6])),

@@ -142,12 +142,15 @@ def test_where_a_term_is_absent():
     small = hhtjax.fit(lambda p: residuals(p | {"slow": 0.3}), {"rest": 0.1})
     held = hhtjax.fit(residuals, start, transforms={"rest": None, "slow": hhtjax.fixed})
     large = hhtjax.fit(residuals, start)
-    (at_zero,) = hhtjax.compare({"small": small, "large": large}).tests
-    (given,) = hhtjax.compare({"small": small, "large": large}, absent={"slow": 0.3}).tests
+    unaware = hhtjax.compare({"small": small, "large": large})
+    aware = hhtjax.compare({"small": small, "large": large}, absent={"slow": 0.3})
+    (at_zero,), (given,) = unaware.tests, aware.tests
     (own,) = hhtjax.compare({"small": held, "large": large}).tests
     assert at_zero.p_value < 1e-6
     assert given.p_value == own.p_value > 0.01
     assert given.naive_p_value == own.naive_p_value > 0.01
+    assert "against small, if `absent` is right" in unaware.summary()
+    assert "absent" not in aware.summary()
 
 
 def test_tails_of_distributions_are_those_of_scipy():

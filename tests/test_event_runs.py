@@ -120,11 +120,12 @@ def test_the_same_numbers_on_plain_jax():
 
 def test_float32_stays_float32():
     params = {"g": np.float32(9.81), "floor": np.float32(0), "e": np.float32(0.8)}
+    start, grid = (np.ones(1, np.float32), np.zeros(1, np.float32), params), {"dt": 0.01, "num_steps": 100}
     with pytest.warns(hhtjax.PrecisionWarning):
-        run = simulate(
-            BALL, LIGHT, np.ones(1, np.float32), np.zeros(1, np.float32), params, dt=0.01, num_steps=100, events=[FLOOR]
-        )
+        run, late = (simulate(BALL, LIGHT, *start, **grid, t0=t0, events=[FLOOR]) for t0 in (0.0, 1e6))
     run.check()
+    with pytest.raises(hhtjax.SimulationError, match=r"times are alike in float32, near t = 1e\+06"):
+        late.check()
     assert {x.dtype for x in jax.tree.leaves((run.q, run.v, run.events.t, run.events.after))} == {np.dtype(np.float32)}
     assert abs(float(run.events.t[0]) - np.sqrt(2 / 9.81)) < 1e-7  # three roundings of t
 

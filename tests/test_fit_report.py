@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hhtjax
+from hhtjax.identification.refinement import Refined
 from hhtjax.identification.result import FitResult
 
 x = jnp.linspace(0.0, 1.0, 200)
@@ -48,6 +49,9 @@ def test_summary_and_json(result):
         result._replace(params=namedtuple("Mine", "a")(1.0)).to_json()
     with pytest.raises(ValueError, match="from_json: `text` must be what to_json wrote; received a part None"):
         FitResult.from_json("{}")
+    for kind, text, other in ((FitResult, "[1]", "list"), (Refined, result.to_json(), "FitResult")):
+        with pytest.raises(ValueError, match=f"to_json of a {kind.__name__} wrote; received a {other}"):
+            kind.from_json(text)
     surely = result._replace(uncertainty=jax.tree.map(jnp.zeros_like, result.uncertainty))
     assert "largest correlation: +0.000 between a and rate" in surely.summary()
 

@@ -1,5 +1,6 @@
 """README's Python blocks run, in order, as a reader would paste them; what it names and links exists."""
 
+import json
 import re
 from pathlib import Path
 
@@ -42,6 +43,28 @@ def test_the_two_commands_are_there():
     assert len(commands) == 2
     assert commands[0].endswith("-m experiments silverbox\n")
     assert commands[1].endswith("-m pytest\n")
+
+
+def test_the_times_of_other_packages_are_those_of_their_page():
+    """Of the best of their methods at 1e-3, to the digits that are printed; and how often the default takes theirs."""
+    times = json.loads((ROOT / "experiments/work_precision/work_precision.json").read_text())["times"]
+
+    def least(scene, package, level="0.001"):
+        every = (x["time_s"][level] for x in times[scene] if x["package"] == package)
+        return min(t for t in every if t is not None)
+
+    def ours(scene, level, name):
+        return next(x["time_s"][level] for x in times[scene] if x["method"] == name)
+
+    stiff = "stiff double pendulum"
+    told = re.findall(r"`(hht|extrapolate=2)`(?: takes)? ([\d.]+) ms", README)
+    told = [("hht, " * (name != "hht") + name, ms) for name, ms in told]
+    assert told == [(name, f"{1e3 * ours(stiff, '0.001', name):.3f}") for name in ("hht", "hht, extrapolate=2")]
+    rows = dict(re.findall(r"^\| \[(\w+)\].*?\(([\d.]+) ms\)", README, flags=re.MULTILINE))
+    assert rows == {name: f"{1e3 * least(stiff, name):.1f}" for name in ("diffrax", "MuJoCo", "exudyn", "SciPy")}
+    squeezer, top = re.search(r"to 1e-6 (\d+) times as fast on a squeezer, (\d+) on a top", README).groups()
+    for scene, ratio in (("squeezer", squeezer), ("top", top)):
+        assert ratio == f"{ours(scene, '1e-06', 'hht') / least(scene, 'diffrax', '1e-06'):.0f}"
 
 
 def test_it_is_short():

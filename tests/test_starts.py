@@ -74,6 +74,8 @@ def test_bad_input_is_named():
     spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
     with pytest.raises(ValueError, match=r"band_limited_motion: `cutoff` must lie in \(0, 1/\(2 dt\)\]; received 6.0"):
         hhtjax.equation_error(spring, np.ones((9, 1)), 0.1, cutoff=6.0)
+    with pytest.raises(ValueError, match=r"equation_error: `values` must have more than 20 samples, .* received 20"):
+        hhtjax.equation_error(spring, np.ones((20, 1)), 0.1, cutoff=1.0)
     with pytest.raises(TypeError, match="measure: `solution` must be what simulate returns; received ArrayImpl"):
         hhtjax.measure(jnp.ones(3), jnp.ones(3))
     for horizons, problem_at, message in (

@@ -20,15 +20,24 @@ def is_concrete(x):
     return not isinstance(x, Tracer)
 
 
+def all_concrete(tree):
+    """Whether no leaf of a pytree is a tracer."""
+    return all(map(is_concrete, jax.tree.leaves(tree)))
+
+
 def is_tracing():
     """Whether a function is being traced, as inside a jit."""
     return not is_concrete(jnp.zeros(()))
 
 
-def evaluated_now():
-    """A context in which what is concrete is computed while a function is being traced, too."""
+def known_now(f, *args):
+    """f(*args) in arrays of NumPy, while something is traced, too; None where it has tracers, closed over or not."""
+    if not all_concrete(args):
+        return None
     # not elsewhere: JAX 0.6 would leak a tracer
-    return jax.ensure_compile_time_eval() if is_tracing() else nullcontext()
+    with jax.ensure_compile_time_eval() if is_tracing() else nullcontext():
+        found = f(*args)
+    return jax.tree.map(np.asarray, found) if all_concrete(found) else None
 
 
 def is_real(x):

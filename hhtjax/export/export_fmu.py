@@ -10,6 +10,7 @@ import warnings
 import zipfile
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -21,7 +22,7 @@ from hhtjax.checks import require_number
 from hhtjax.description import VERSION
 from hhtjax.export.export_c import ExportedC, exported
 from hhtjax.export.expressions import number
-from hhtjax.export.fields import Field, distinct, fields
+from hhtjax.export.fields import distinct, fields
 from hhtjax.export.fmi3 import wrapper
 
 FLAGS = "-std=c99", "-O3", "-fPIC", "-shared", "-fvisibility=hidden"
@@ -151,13 +152,13 @@ def export_fmu(
     single = f"typedef float {name}_real;" in c.header
     kind, dtype = ("Float32", np.float32) if single else ("Float64", np.float64)
     step = repr(float(dt))
-    labels = iter(distinct([Field("time", ()), *c.state, *begin, *c.params, *c.inputs])[1:])
-    variables = partial(_variables, kind, labels)
+    state, begin, params, inputs = _named(c.state, begin, c.params, c.inputs)
+    variables = partial(_variables, kind)
     groups = [
-        variables(c.state, "m->s.", 'causality="output" variability="continuous"', None, c.units),
+        variables(state, "m->s.", 'causality="output" variability="continuous"', None, c.units),
         variables(begin, None, 'causality="parameter" variability="fixed"', values, begin_units, "m->start"),
-        variables(c.params, "m->p.", 'causality="parameter" variability="tunable"', c.values, c.units),
-        variables(c.inputs, None, 'causality="input" variability="discrete"', c.input_values, c.units, "m->u"),
+        variables(params, "m->p.", 'causality="parameter" variability="tunable"', c.values, c.units),
+        variables(inputs, None, 'causality="input" variability="discrete"', c.input_values, c.units, "m->u"),
     ]
     first, places, lines = 1, ["m->s.t"], []
     ranges = []
@@ -195,11 +196,17 @@ def _of_xml(x):
     return {"inf": "INF", "-inf": "-INF", "nan": "NaN"}.get(repr(x), repr(x))
 
 
-def _variables(kind, labels, found, struct, attributes, values, units, array=None):
-    """(element of the description, place in C) of each number. labels: an iterator of fields with the names of these
-    variables. array: that holds them all, in the place of a struct."""
+def _named(*groups):
+    """Pairs of each field and one with the name of its variable: of all groups no two are alike, and none is "time"."""
+    names = iter(distinct([*chain(*groups)], taken=["time"]))
+    return [[(field, next(names)) for field in group] for group in groups]
+
+
+def _variables(kind, found, struct, attributes, values, units, array=None):
+    """(element of the description, place in C) of each number. found: of `_named`. array: that holds them all, in the
+    place of a struct."""
     rows = []
-    for field, named in zip(found, labels, strict=False):
+    for field, named in found:
         for i, place in enumerate(field.places(struct or "")):
             index = f"[{','.join(str(j + 1) for j in np.unravel_index(i, field.shape))}]" if field.shape else ""
             start = "" if values is None else f' start="{_of_xml(float(values[len(rows)]))}"'

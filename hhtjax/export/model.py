@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_params
-from hhtjax.description import is_concrete, thaw
+from hhtjax.description import all_concrete, thaw
 from hhtjax.export.fields import Field, distinct, fields
 from hhtjax.steppers.friction_law import is_settled
 from hhtjax.steppers.stepper import INTERNAL, require_capable, require_stepper, require_system
@@ -55,7 +55,7 @@ def given(caller, system, stepper, q0, v0, params, z0):
     require_dense(caller, system, params)
     if system.friction is not None:
         require_independent_friction(caller, system, q0, v0, 0.0, params, z0)
-    if not all(map(is_concrete, jax.tree.leaves((system, stepper, q0, v0, params, z0)))):
+    if not all_concrete((system, stepper, q0, v0, params, z0)):
         raise TypeError(f"{caller}: all arguments must be numbers, because they are written out; received tracers.")
     starts = {name: x for name, x in (("q0", q0), ("v0", v0), ("z0", z0)) if x is not None}
     return Given(caller, system, stepper, starts, params, jax.tree.leaves(q0)[0].dtype)

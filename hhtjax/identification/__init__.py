@@ -61,8 +61,8 @@ The step size is part of the model
 
 A fitted stiffness belongs to its step size, because a method makes every vibration a little slower or more damped than
 it is. `step_size_bias` predicts by how much a parameter is off, and takes it out (`correct=True`) of stiffness, and of
-damping where masses were fitted too or a single mode vibrates freely; `refine` fits with dt, dt/2, ... and extrapolates
-all parameters to zero.
+damping where masses were fitted too or a single mode vibrates freely, from motion near resonance; `refine` fits with
+dt, dt/2, ... and extrapolates all parameters to zero, whatever the motion was.
 
 What comes of it in two measured systems, `silverbox` and `double_pendulum_measured`, and what can be found in
 principle, in stiff joints, a vehicle and a mechanism with six constraints, is on a page,

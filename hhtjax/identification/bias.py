@@ -8,8 +8,12 @@ parameters have eigenvalues s' that are wrong by as much. For HHT with alpha = 0
     Re s'/Re s   = 1/cos(x)^2  = 1 + (w h)^2/4 + ...        damping over mass
 
 and the response to a force is wrong too, by 1 + (w h)^2/3 + ...: where the force is known, so is the mass.
+
+All of it is for motion at the modes' own frequencies, free or near resonance. A force at another one, W, is answered at
+W: k fitted beside a known mass is off by m W^2 (W h)^2/6 then, and no eigenvalue knows of W.
 """
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,9 +23,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis.amplification import amplification_matrix, at_rest, eigenvalues
-from hhtjax.checks import require_number
+from hhtjax.checks import describe, require_number, require_params
+from hhtjax.description import thaw
 from hhtjax.description.presentation import all_known, between, shown
-from hhtjax.identification.arguments import require_prefix
+from hhtjax.identification.arguments import check_real, require_prefix
 from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import Stepper, require_stepper
 from hhtjax.systems.sparse_system import require_dense
@@ -79,13 +84,14 @@ def step_size_bias(
     The system is linearised about (q, v, t0): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
     eigenvalues s' is compared with the s = log(mu)/dt of the eigenvalue mu of the real step's amplification matrix that
     belongs to it: s is what the data have. A constraint is linearised too, and M, C, K, with the stiffness of its
-    forces, are those of the motions that it leaves.
+    forces, are those of the motions that it leaves. What was fitted to a motion far from the frequencies of all modes,
+    as under a force off resonance, has another bias, by that motion: `refine` knows it, this does not.
 
     Args:
         system, stepper, dt: what the parameters were fitted through.
         params: the fitted ones.
         q: an equilibrium, or another point about which the motion is small, on the constraint.
-        v: velocity there, 0 by default. t0: time there.
+        v: velocity there, structured like q, 0 by default. t0: time there.
         correct: True returns `params` with the smallest relative changes that give the equations the eigenvalues s
             and the steps' response to forces ("pre-warped"). That takes the bias out of all of them where they can
             follow: with masses fitted as well, entry by entry of M if there are several modes; or in the free
@@ -101,8 +107,9 @@ def step_size_bias(
         StepSizeWarning: params cannot follow. `refine` takes their bias out, from two fits or three.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind; dt is no positive number; q does not meet the constraint;
-            `correct` with a dt in which a mode does not oscillate.
+        TypeError, ValueError: an argument of a wrong kind; dt is no positive number; q has another number of
+            coordinates than the mass, or does not meet the constraint; `correct` with a dt in which a mode does not
+            oscillate.
         NotImplementedError: a system with internal states or rotations.
 
     References:
@@ -120,15 +127,17 @@ def step_size_bias(
     require_stepper("step_size_bias", stepper)
     if not isinstance(system, (System, LinearSystem)):
         raise TypeError(f"step_size_bias: `system` must be a System or LinearSystem; received {system!r}.")
+    frozen = require_params("step_size_bias", params)
     _require_flags(correct, params)
+    _require_point(q, v)
     if system.internal is not None:
         raise NotImplementedError(
             "step_size_bias: `system` has internal states, which M, C and K cannot hold; `refine` takes the bias out."
         )
     require_smooth("step_size_bias", system)
     require_dense("step_size_bias", system, params)
-    _require_on_constraint(system, params, q, t0)
     matrices = _linear_part(system, params, q, v, t0)
+    _require_on_constraint(system, params, q, t0)
     fitted = _rates_of_equations(*matrices)
     s = _rates_of_steps(stepper, dt, *matrices)
     w = np.abs(s)
@@ -143,13 +152,13 @@ def step_size_bias(
             f"{np.sum(np.isnan(w))} of {len(w)} do not."
         )
 
-    def linear_part(params):
-        return _linear_part(system, params, q, v, t0)
+    def linear_part(frozen):
+        return _linear_part(system, thaw(frozen), q, v, t0)
 
     target = motion(partial(_rates_of_steps, stepper, dt), *matrices, matrices[2])
     free = len(s) == 1 and not _is_driven(system, params, q, v, t0, dt)
-    corrected = prewarped(params, correct, linear_part, _rates_of_equations, target, matrices[2], free)
-    return bias._replace(params=corrected)
+    corrected = prewarped(frozen, correct, linear_part, _rates_of_equations, target, matrices[2], free)
+    return bias._replace(params=thaw(corrected))
 
 
 def _require_flags(correct, params):
@@ -157,6 +166,14 @@ def _require_flags(correct, params):
     for flag in jax.tree.leaves(correct):
         if not isinstance(flag, (bool, np.bool_)):
             raise TypeError(f"step_size_bias: `correct` must be True, False or a pytree of them; received {flag!r}.")
+
+
+def _require_point(q, v):
+    for name, values in (("q", q), ("v", v)):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
+            check_real(f"step_size_bias: `{name}{jax.tree_util.keystr(path)}`", leaf)
+    if not sum(map(np.size, jax.tree.leaves(q))):
+        raise ValueError(f"step_size_bias: `q` must hold at least one number; received {q!r}.")
 
 
 def _is_driven(system, params, q, v, t, dt):
@@ -172,17 +189,16 @@ def _is_driven(system, params, q, v, t, dt):
 
 def _linear_part(system, params, q, v, t):
     """M, C, K about a state, (n, n) each; with a constraint, of the n - m motions that it leaves."""
-    q, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
+    given, (q, unravel) = q, ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
+    M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
+    M = jnp.diag(M) if M.ndim == 1 else M
+    _require_coordinates(len(M), given, v)
     v = jnp.zeros_like(q) if v is None else ravel_pytree(v)[0]
 
     def force(q, v):
         return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0]
 
-    M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
     K, C = (-D for D in jax.jacfwd(force, argnums=(0, 1))(q, v))
-    M = jnp.diag(M) if M.ndim == 1 else M
-    if len(M) != q.size:
-        raise NotImplementedError("step_size_bias: `q` has rotations, whose displacements are no part of it.")
     if system.constraint is None:
         return M, C, K
 
@@ -194,6 +210,18 @@ def _linear_part(system, params, q, v, t):
     K = K - jax.jacfwd(lambda q: jax.vjp(constraint, q)[1](L)[0])(q)
     N = jnp.linalg.svd(B)[2][len(B) :].T  # B N = 0
     return N.T @ M @ N, N.T @ C @ N, N.T @ K @ N
+
+
+def _require_coordinates(n, q, v):
+    """An error for rotations, and for a q or v of another size than the mass."""
+    shapes = [jnp.shape(x) for x in jax.tree.leaves(q)]
+    size = sum(map(math.prod, shapes))
+    if size != n and any(shape[-2:] == (3, 3) for shape in shapes):
+        raise NotImplementedError("step_size_bias: `q` has rotations, whose displacements are no part of it.")
+    if size != n:
+        raise ValueError(f"step_size_bias: `q` must be of the size of the mass, {n}; received {describe(q)}.")
+    if v is not None and [jnp.shape(x) for x in jax.tree.leaves(v)] != shapes:
+        raise ValueError(f"step_size_bias: `v` must have the shapes of q, {describe(q)}; received {describe(v)}.")
 
 
 def _require_on_constraint(system, params, q, t):

@@ -41,6 +41,12 @@ class NestedTest(NamedTuple):
     naive_p_value: float
 
 
+def _told(test):
+    """A test in words, with a doubt where both answers cannot be right, as those of two smaller models."""
+    doubt = ", if `absent` is right" if 1e3 * test.p_value < test.naive_p_value > 0.05 else ""
+    return f"{test.p_value:.2g} ({test.naive_p_value:.2g}) against {test.smaller}{doubt}"
+
+
 @shown
 class Comparison(NamedTuple):
     """What `compare` found; arrays have an entry for each of the M models.
@@ -109,8 +115,7 @@ class Comparison(NamedTuple):
             rows[0].append("F test: p (naive p)")
             for i, name in enumerate(self.names):
                 found = [test for test in self.tests if test.larger == name]
-                words = (f"{x.p_value:.2g} ({x.naive_p_value:.2g}) against {x.smaller}" for x in found)
-                rows[i + 1].append("; ".join(words))
+                rows[i + 1].append("; ".join(map(_told, found)))
         if self.held_out is not None:
             rows[0] += ["held-out rms", "behind the best"]
             for i, (away, error) in enumerate(self.behind):
@@ -156,7 +161,8 @@ def compare(
         residuals: the function that was fitted, or {name: function}; for errors on segments left out. None: without.
         folds: how many segments, cut as those of the covariance; each long against the correlation time.
         absent: the value at which a parameter of nested models has no effect, or {parameter: value}, by the names in
-            `FitResult.summary()`, 0 for others. Where the smaller model holds it fixed, that value is taken.
+            `FitResult.summary()`, 0 for others, such as a constant in the smaller model's function. Where that model
+            holds it fixed, its value is taken. The summary doubts it where only the first of two p values is tiny.
         always: Booleans, as `weights` of `fit`: True for residuals that no fit leaves out, and by which none is judged,
             such as the first samples, where they alone tell the initial state.
         progress: show in one line on stderr which fit is running.

@@ -84,7 +84,8 @@ def prewarped(params, flags, linear_part, rates, target, stiffness, free):
 def _compromise(left):
     return (
         f"step_size_bias: no values of params have the steps' response to forces ({100 * left:.2g} % of it is left): "
-        "damping was fitted as a compromise that depends on the motion, and stays as it is; `refine` corrects it."
+        "damping was fitted as a compromise that depends on the motion, and stays as it is; `refine` corrects it, and "
+        "stiffness that was fitted to motion far from the resonances."
     )
 
 

@@ -62,7 +62,7 @@ class Refined(NamedTuple):
     def from_json(text: str) -> "Refined":
         """What `to_json` wrote."""
         classes = Refined, Coefficients, Options, *_subclasses(Stepper)
-        return report.decode(json.loads(text), NAMED | {c.__name__: c for c in classes})
+        return report.read(text, Refined, NAMED | {c.__name__: c for c in classes})
 
 
 def _subclasses(base):

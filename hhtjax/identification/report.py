@@ -1,5 +1,6 @@
 """A fit for readers: a text table, and JSON."""
 
+import json
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -164,6 +165,16 @@ def encode(x: Any) -> Any:
     if isinstance(x, (list, tuple)):
         return {type(x).__name__: [encode(y) for y in x]}
     return {"array": np.asarray(x).tolist(), "dtype": str(np.asarray(x).dtype)}
+
+
+def read(text, kind, named) -> Any:
+    """What the to_json of a kind wrote; named: as for `decode`."""
+    found = decode(json.loads(text), named)
+    if not isinstance(found, kind):
+        raise ValueError(
+            f"from_json: `text` must be what to_json of a {kind.__name__} wrote; received a {type(found).__name__}."
+        )
+    return found
 
 
 def decode(x, named) -> Any:

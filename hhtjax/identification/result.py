@@ -166,7 +166,7 @@ class FitResult(NamedTuple):
     @staticmethod
     def from_json(text: str) -> "FitResult":
         """What `to_json` wrote. params of dicts, lists and tuples."""
-        return report.decode(json.loads(text), NAMED)
+        return report.read(text, FitResult, NAMED)
 
 
 NAMED: dict[str, Any] = {c.__name__: c for c in (FitResult, History, Uncertainty)}

@@ -42,8 +42,8 @@ def equation_error(
         A function of params, whose result is (samples without both ends, n), in units of force.
 
     Raises:
-        TypeError, ValueError: as `band_limited_motion` and `sampled`. NotImplementedError: a system with constraints
-            or internal states.
+        TypeError, ValueError: as `band_limited_motion` and `sampled`; no samples between the ends. NotImplementedError:
+            a system with constraints or internal states.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -64,6 +64,11 @@ def equation_error(
     q, v, a = jax.tree.transpose(jax.tree.structure(values), jax.tree.structure((0, 0, 0)), motion)
     samples = jax.tree.leaves(q)[0].shape[0]
     left_out = int(jnp.ceil(MARGIN / (cutoff * dt)))
+    if samples <= 2 * left_out:
+        raise ValueError(
+            f"equation_error: `values` must have more than {2 * left_out} samples, because at both ends a period of "
+            f"the cutoff is left out; received {samples}."
+        )
     t = t0 + jnp.linspace(0, dt * (samples - 1), samples)
     inside = jax.tree.map(lambda y: y[left_out : samples - left_out], (q, v, a, t))
 

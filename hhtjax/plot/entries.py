@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from hhtjax.description import is_concrete
+from hhtjax.description import all_concrete
 from hhtjax.runs.solution import Solution
 
 SYMBOLS = {"q": "q", "v": "v", "acceleration": "w", "multipliers": "L", "z": "z"}
@@ -13,7 +13,7 @@ def require_run(caller, solution):
     """An error unless it is the solution of one run, with numbers."""
     if not isinstance(solution, Solution):
         raise TypeError(f"{caller}: `solution` must be a Solution, as of simulate; received {type(solution).__name__}.")
-    if not all(map(is_concrete, jax.tree.leaves(solution))):
+    if not all_concrete(solution):
         raise TypeError(f"{caller}: `solution` is a tracer: draw outside jit, vmap and grad.")
     if np.ndim(solution.t) != 1:
         raise ValueError(

@@ -13,8 +13,9 @@ from hhtjax.description.presentation import overwrite, shown
 from hhtjax.runs.attempt import AT_EVENT, BROKEN, PI, TOO_MANY, TOO_SHORT, Bounds, attempt, begin, is_walking
 from hhtjax.runs.attempt_events import trial_of
 from hhtjax.runs.event_failures import EVENTS
+from hhtjax.runs.faults import first_bad
 from hhtjax.runs.recorded import Recorder, solution
-from hhtjax.runs.solution import SimulationError, first_bad
+from hhtjax.runs.solution import SimulationError
 from hhtjax.xla import on_scalars, one_kernel
 
 WHY = {

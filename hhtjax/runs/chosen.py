@@ -175,7 +175,7 @@ def choose_steps(
     Args:
         system, stepper, q0, v0, params, z0, t0, progress, events, max_events: those of `simulate`.
         times: (K,); steps go to the last, and end at no other.
-        **tolerances: those of `adaptive`: rtol, atol, and others; not `verify`.
+        **tolerances: those of `adaptive`: rtol, atol, and others; not `verify`, which takes runs.
 
     Returns:
         `Steps`, constant to derivatives. Nothing raises while they are chosen: call `steps.check()`.
@@ -194,6 +194,11 @@ def choose_steps(
     """
     problem = Problem.checked("choose_steps", system, stepper, q0, v0, params, t0, z0)
     control = adaptive(**tolerances)
+    if control.verify:
+        raise ValueError(
+            f"choose_steps: leave `verify` out; received {control.verify!r}. It takes runs: `simulate` with "
+            f"dt=adaptive(..., verify={control.verify!r}) returns its steps as `run.steps`."
+        )
     times = checked_times("choose_steps", problem, times, control)
     room = (require_integer("choose_steps", "max_events", max_events),)
     if events is not None:

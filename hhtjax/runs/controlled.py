@@ -7,7 +7,7 @@ import jax
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from hhtjax.description import is_concrete, is_tracing
+from hhtjax.description import all_concrete, is_tracing
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.choose import choose, trimmed
@@ -142,6 +142,6 @@ def run_in_one(problem, times, control, progress=False):
     if not is_tracing():
         return in_one(*data)
     in_one, closed_over = hoisted(in_one, *data)
-    if not all(map(is_concrete, closed_over)):
+    if not all_concrete(closed_over):
         return in_two(*data)
     return derivative_by(in_two, partial(in_one, closed_over), *data)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import describe, require_function, require_number
-from hhtjax.description import evaluated_now, freeze, is_concrete, thaw
+from hhtjax.description import freeze, known_now, thaw
 from hhtjax.systems import held, returned
 from hhtjax.systems.events import Event, Impact, flatten_events
 from hhtjax.systems.system import FirstOrderSystem
@@ -28,11 +28,9 @@ def require_events(caller, problem, events):
         )
     for i, event in enumerate(events):
         _require_shapes(f"{caller}: events[{i}]", problem, event)
-    if all(map(is_concrete, jax.tree.leaves((problem, events)))):
-        with evaluated_now():
-            found = _guards_at_start(problem, tuple(events))[:4]
-        if all(map(is_concrete, found)):  # a function may have closed over a tracer
-            _require_start(caller, events, *map(np.asarray, found))
+    found = known_now(_guards_at_start, problem, tuple(events))
+    if found is not None:
+        _require_start(caller, events, *found[:4])
     return tuple(events)
 
 
@@ -41,11 +39,10 @@ def refused_members(problem_of, arrays, axes, events):
 
     problem_of: arrays -> a member's `Problem`; axes: of the arrays, as for `jax.vmap`.
     """
-    with evaluated_now():
-        found = jax.vmap(lambda arrays: _guards_at_start(problem_of(arrays), events), (axes,))(arrays)
-    if not all(map(is_concrete, found)):  # a function has closed over a tracer
+    found = known_now(jax.vmap(lambda arrays: _guards_at_start(problem_of(arrays), events), (axes,)), arrays)
+    if found is None:
         return []
-    g, rates, terms, on_velocity, e = map(np.asarray, found)
+    g, rates, terms, on_velocity, e = found
     impacts = np.array([isinstance(event.reset, Impact) for event in events])
     bad = _is_beyond(events, g, rates, terms) | (impacts & (on_velocity | ~((e >= 0) & (e <= 1))))
     return np.flatnonzero(bad.any(axis=1))

@@ -6,17 +6,11 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.description import is_concrete
+from hhtjax.description import all_concrete, is_concrete
 from hhtjax.description.presentation import Table, all_known, between, brief, known, leaf_rows, shown
 from hhtjax.runs.event_failures import EVENTS
+from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
 from hhtjax.steppers.stepper import Info
-
-
-def first_bad(bad):
-    """The index of the first bad member of a batch, and words for it; () and none where there is no batch."""
-    member = tuple(int(i) for i in np.argwhere(bad)[0])
-    words = f"member {', '.join(map(str, member))} ({np.count_nonzero(bad)} of {bad.size} failed), "
-    return member, words if member else ""
 
 
 class SimulationError(RuntimeError):
@@ -126,14 +120,19 @@ class Solution(NamedTuple):
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
-        if not all(map(is_concrete, jax.tree.leaves((self.failure, self.dt, self.t, self.steps, self.error)))):
+        if not all_concrete((self.failure, self.dt, self.t, self.steps, self.error)):
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         if fault := self._fault(reach):
             raise SimulationError(f"simulate: {fault}")
 
     def _fault(self, reach=None):
         """What is wrong with the run, in words; None where nothing is."""
-        if fault := (self.steps and self.steps._fault()) or self._bad_grid():
+        t, dt = np.asarray(self.t), np.asarray(self.dt)
+        if self.steps is None:
+            fault = bad_steps(t, dt, self.events is not None)
+        else:
+            fault = self.steps._fault() or bad_samples(t, dt)
+        if fault:
             return fault
         if self.error is not None and (fault := self._excess()):
             return fault
@@ -154,22 +153,6 @@ class Solution(NamedTuple):
             else self._why(member)
         )
         return f"{which}step {step} (to t = {time:.6g}) failed: {why}."
-
-    def _bad_grid(self):
-        """What is wrong with times or step sizes that were traced, and with times that rounding has made equal."""
-        t, dt, is_chosen = np.asarray(self.t), np.asarray(self.dt), self.steps is not None
-        gaps, unknown = np.diff(t), np.isnan(dt) & (not is_chosen)
-        are_given = is_chosen or (t.ndim > 1 and dt.shape == gaps.shape and unknown.any())
-        if are_given and not np.all(gaps >= 0 if is_chosen else (gaps > 0) & np.isfinite(gaps)):
-            return f"`times` must increase, and lie after t0; with it they were {t}."
-        if not is_chosen and np.any(dt <= 0):
-            return f"`dt` must be positive and finite; it was {dt[dt <= 0].flat[0]:g}."
-        if unknown.any():
-            which = first_bad(unknown.reshape(*t.shape[:-1], -1).any(axis=-1))[1]
-            return f"{which}`dt` must be positive and finite, and in a sweep at most the distance of the samples."
-        if np.any(dt == 0 if is_chosen else gaps == 0) and self.events is None:
-            return f"times are alike in {t.dtype}, near t = {t.flat[0]:g}: count from a t0 near zero, or take float64."
-        return None
 
     def _excess(self):
         """Where the error of the whole run is more than what was asked for, in words."""

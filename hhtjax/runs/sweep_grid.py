@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_integer, require_number
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import all_concrete, is_array, is_concrete, is_real
 
 
 def require_one_grid(stepper, duration, num_samples, times):
@@ -69,7 +69,7 @@ def require_step_sizes(dts):
 
 def require_steps_within(dts, start, end, num_samples=None):
     """An error for step sizes that are not positive, take too many steps, or exceed the distance of equal samples."""
-    if not all(map(is_concrete, (dts, start, end))):
+    if not all_concrete((dts, start, end)):
         return
     h, span = np.asarray(dts, float), float(end) - float(start)
     limit, at_most = np.inf, ""

@@ -9,7 +9,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hhtjax.checks import require_integer, require_number, require_params
-from hhtjax.description import evaluated_now, is_array, is_concrete
+from hhtjax.description import all_concrete, is_array, is_concrete, known_now
 from hhtjax.runs.adaptive import Adaptive, lengths, require_controlled
 from hhtjax.runs.event_checks import refused_members, require_events
 from hhtjax.runs.problem import Problem
@@ -99,7 +99,7 @@ class Inputs(NamedTuple):
 
         events = require(0)
         leaves, structure = jax.tree.flatten(self.data)
-        if any(self.mapped) and all(map(is_concrete, jax.tree.leaves((self.system, leaves, self.t0, events)))):
+        if any(self.mapped) and all_concrete((self.system, leaves, self.t0, events)):
             axes = [0 if flag else None for flag in self.mapped]
             for i in refused_members(lambda x: problem_of(structure.unflatten(x)), leaves, axes, events)[:1]:
                 require(i)
@@ -227,8 +227,6 @@ def _member(data, mapped, i):
 def _require_consistent(system, data, mapped, t0):
     """An error for the members that are farthest from the constraint, and for the first; tracers pass."""
     leaves, structure = jax.tree.flatten(data)
-    if not all(map(is_concrete, leaves)):
-        return
     worst = {0}
     if any(mapped):
 
@@ -236,9 +234,8 @@ def _require_consistent(system, data, mapped, t0):
             _, q0, v0, params, z0 = jax.tree.unflatten(structure, leaves)
             return examine(system, q0, v0, t0, params, z0)
 
-        with evaluated_now():
-            every = jax.vmap(examined, ([0 if flag else None for flag in mapped],))(leaves)
-        if not all(map(is_concrete, jax.tree.leaves(every))):  # a function has closed over a tracer
+        every = known_now(jax.vmap(examined, ([0 if flag else None for flag in mapped],)), leaves)
+        if every is None:
             return
         found = distances(every, data[0].redundant)
         worst |= {int(np.argmax(relative)) for _, _, relative in found}

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_integer
-from hhtjax.description import VERSION, is_concrete
+from hhtjax.description import VERSION, all_concrete
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
@@ -80,7 +80,7 @@ def sweep_to_disk(
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
     inputs = inputs.with_events(events, max_events, keep_events)
-    if not all(map(is_concrete, jax.tree.leaves(inputs))):
+    if not all_concrete(inputs):
         raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
     folder, size = Path(folder), inputs.dts.size
     places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up

@@ -2,11 +2,10 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import is_concrete
+from hhtjax.description import all_concrete
 from hhtjax.description.presentation import shown
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import LinearSystem, System
@@ -69,5 +68,5 @@ class InternalScene(NamedTuple):
 def array(values):
     """An array of floats; of numbers by NumPy, which has nothing to compile."""
     dtype = jnp.result_type(float)
-    known = all(map(is_concrete, jax.tree.leaves(values)))
+    known = all_concrete(values)
     return jnp.asarray(np.asarray(values, dtype) if known else values, dtype)

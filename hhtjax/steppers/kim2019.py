@@ -33,8 +33,7 @@ def linearize_at_state(system, params, s):
     Q_q = linear_map(lambda x: tangent(system.located(x), zero), zero)
     Q_v = linear_map(lambda x: tangent(system.located(zero), x), zero)
     Ma_q = system.widened(jax.jacfwd(lambda q: system.inertia(q, s.w, params))(s.q))
-    M = system.mass(s.q, params)
-    return jnp.diag(system.with_ones(M)) if M.ndim == 1 else M, Q, Q_q, Q_v, Ma_q
+    return system.full_mass(s.q, params), Q, Q_q, Q_v, Ma_q
 
 
 @dataclass(frozen=True, eq=False)

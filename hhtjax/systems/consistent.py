@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import evaluated_now, is_concrete, thaw
+from hhtjax.description import all_concrete, known_now, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, solve_map
 from hhtjax.systems import kinematics
@@ -86,7 +86,7 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
     require_number("consistent_initial", "t0", t0, np.isfinite, "be finite")
     q0, v0, z0 = initial_values("consistent_initial", system, q0, v0, z0)
     start, B, left = _consistent_initial(system, q0, v0, params, t0, z0, redundant)
-    if all(map(is_concrete, jax.tree.leaves((start, B)))):
+    if all_concrete((start, B)):
         if redundant is None:
             require_independent("consistent_initial", np.asarray(B))
         if not start.converged:
@@ -191,13 +191,9 @@ def _solved(A, b, n, redundant):
 
 def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None):
     """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
-    if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
+    examined = known_now(examine, system, q0, v0, t0, params, z0)
+    if examined is None:
         return
-    with evaluated_now():
-        examined = examine(system, q0, v0, t0, params, z0)
-    if not all(map(is_concrete, jax.tree.leaves(examined))):  # a function has closed over a tracer
-        return
-    examined = jax.tree.map(np.asarray, examined)
     if redundant is None:
         require_independent(caller, examined[1])
     found = distances(examined, redundant)

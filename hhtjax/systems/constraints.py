@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.scipy.linalg import block_diag
 
 from hhtjax.numerics.elimination import UNROLLED, factorize, matvec
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, solve
@@ -49,8 +48,7 @@ def pull_back(system, q, gradient):
 
 def saddle_point(system, q, t, params, force, rows, factorize=factorize):
     """(x, L) with M x - B^T L = force and B x = rows: the index-1 system for accelerations, and all projections."""
-    M, B = system.mass(q, params), jacobian(system, q, t, params)
-    M = jnp.diag(system.with_ones(M)) if M.ndim == 1 else block_diag(M, jnp.eye(system.size - len(M), dtype=M.dtype))
+    M, B = system.full_mass(q, params), jacobian(system, q, t, params)
     A = jnp.block([[M, -B.T], [B, jnp.zeros((len(B), len(B)), B.dtype)]])
     z = solve(A, jnp.concatenate([force, rows]), factorize)
     return z[: system.size], z[system.size :]

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import block_diag
 
 from hhtjax.numerics.elimination import factorize, matvec
 from hhtjax.numerics.linear_solve import solve
@@ -73,6 +74,13 @@ class FlatSystem(NamedTuple):
     def with_ones(self, d):
         """d (n,), of M, and ones for z: (N,)."""
         return d if self.positions == self.size else jnp.concatenate([d, jnp.ones(self.size - self.positions, d.dtype)])
+
+    def full_mass(self, q, params):
+        """M(q), and ones for z, as a matrix (N, N)."""
+        M = self.mass(q, params)
+        if M.ndim == 1:
+            return jnp.diag(self.with_ones(M))
+        return M if self.positions == self.size else block_diag(M, jnp.eye(self.size - self.positions, dtype=M.dtype))
 
     def located(self, x):
         """Those entries of a vector (N,) of rates that have positions."""

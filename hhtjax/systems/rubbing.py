@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import evaluated_now, is_concrete, thaw
+from hhtjax.description import known_now, thaw
 from hhtjax.systems.constraints import jacobian
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.friction import directions
@@ -28,13 +28,10 @@ def _rows(system, q0, v0, t0, params, z0):
 
 def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
     """An error that names directions of friction that others, or constraints, make redundant; tracers pass."""
-    if not all(map(is_concrete, jax.tree.leaves((system, q0, v0, t0, params, z0)))):
+    rows = known_now(_rows, system, q0, v0, t0, params, z0)
+    if rows is None:
         return
-    with evaluated_now():
-        rows = _rows(system, q0, v0, t0, params, z0)
-    if not all(map(is_concrete, rows)):  # a function has closed over a tracer
-        return
-    B, H, change = map(np.asarray, rows)
+    B, H, change = rows
     if not np.all(np.isfinite(H)):
         raise ValueError(f"{caller}: `sliding` has no finite derivative in v at the start.")
     if np.max(np.abs(change)) > DEPENDENT * np.max(np.abs(H)):
