@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from test_held import SYSTEM, VALUES
 
 import hhtjax
+from hhtjax.runs.chosen import Grid
 from hhtjax.scenes import belt, dry_oscillator
 
 START = np.array([0.4, -0.3]), np.array([0.0, 1.0])
@@ -251,3 +252,16 @@ def test_derivatives_through_switches():
     frozen = jax.jit(lambda F: hhtjax.interpolate(run(F, dt=taken(steps)), 0.5).q[0])
     high, low = (float(frozen(F + h)) for h in (1e-6, -1e-6))
     assert (high - low) / 2e-6 == pytest.approx(float(forward), rel=1e-6)
+
+
+def test_a_sample_is_read_off_in_the_step_that_ends_at_it_or_beyond():
+    """Whole or halved, and before the first step none; where steps end too early the last one counts."""
+    ends, t0 = jnp.array([1.0, 2.0, 3.0, jnp.inf]), jnp.array(0.0)
+    times = jnp.array([0.0, 0.4, 0.6, 1.0, 2.5, 2.7, 3.0, 9.0])
+    for halved, needed in ((False, [0, 1, 1, 1, 3, 3, 3, 3]), (True, [0, 1, 2, 2, 5, 6, 6, 6])):
+        grid = Grid.of(t0, times, ends, 3, halved)
+        assert np.cumsum(grid.counts).tolist() == needed
+        assert grid.reached == 3.0
+        size = 1 - 0.5 * halved
+        assert [float(x) for x in grid.sizes(1)] == [size, size, 2 * size]
+        assert [float(x) for x in grid.sizes(3 * (1 + halved))] == [1.0, size, np.inf]
