@@ -144,12 +144,21 @@ def test_a_prior_is_one_more_measurement():
     """Linear, so that Bayes' rule gives mean and covariance."""
     X = np.random.default_rng(2).normal(size=(30, 2))
     y = X @ [1.0, -2.0] + np.random.default_rng(3).normal(size=30)
-    result = hhtjax.fit(
-        lambda p: X @ p - y, jnp.zeros(2), prior=hhtjax.Gaussian(jnp.array([1.1, 0.0]), np.array([0.1, np.inf]))
-    )
+
+    def residuals(p):
+        return X @ p - y
+
+    result = hhtjax.fit(residuals, jnp.zeros(2), prior=hhtjax.Gaussian(jnp.array([1.1, 0.0]), np.array([0.1, np.inf])))
     precision = X.T @ X + np.diag([100.0, 0.0])
     np.testing.assert_allclose(result.params, np.linalg.solve(precision, X.T @ y + [110.0, 0.0]), rtol=1e-6)
     assert float(result.standard_errors[0]) < 0.1 < np.sqrt(np.linalg.inv(X.T @ X)[0, 0])
+    for deviation, unknowns in ((1e6, 2), (1e-6, 1)):  # that says nothing of the first parameter, or all
+        prior = hhtjax.Gaussian(jnp.array([1.1, 0.0]), np.array([deviation, np.inf]))
+        result = hhtjax.fit(residuals, jnp.zeros(2), prior=prior)
+        variance = (
+            np.sum(result.residual**2) / (30 - unknowns) * np.linalg.inv((X.T @ X)[2 - unknowns :, 2 - unknowns :])
+        )
+        np.testing.assert_allclose(result.uncertainty.naive[-1, -1], variance[-1, -1], rtol=1e-6)
 
 
 @pytest.mark.slow

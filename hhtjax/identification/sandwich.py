@@ -4,7 +4,8 @@ With the Jacobian J and the residual r at the estimate, each covariance is a san
 
     (J^T J)^-1 S (J^T J)^-1,      S = variance of J^T r:
 
-    naive            S = s^2 J^T J,  s^2 = sum r^2/(m - p):  independent residuals of equal variance
+    naive            S = s^2 J^T J,  s^2 = sum r^2/(m - p):  independent residuals of equal variance; p less what
+                     priors tell of the parameters
     autocorrelated   S = tau s^2 J^T J,  tau = 1 + 2 sum_k (1 - k/L) rho_k,  rho_k the autocorrelation of r (Bartlett)
     cluster          S = sum_g s_g s_g^T,  s_g = J_g^T (1 - H_g)^(-1/2) r_g,  over segments g of the residual that are
                      long against its correlation time; H_g = J_g (J^T J)^-1 J_g^T is the part of r_g that the fit took
@@ -91,7 +92,7 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
         J, r: (m + k, p), (m + k,), in units of parameters; the last k rows are priors, and missing rows are zero. With
             a loss, r is psi.
         bend: psi', (m + k,); None for 1.
-        present: number of rows that are not missing.
+        present: number of rows that are not missing, priors among them.
         sizes: of the raveled residual leaves, m together. Each is cut into equal parts, and the k-th parts of all
             leaves, which belong to the same times, are one segment; `segments` of them, by `count_segments`.
         tau: of `variance_inflation`.
@@ -107,9 +108,11 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
     J = J @ (T / column[:, None])
     inverse, flat = _inverse_curvature(J, bend, T, seen)
     undetermined = jnp.any(~seen[:, None] & (jnp.abs(Vt) > 1e-6), axis=0) | flat | (present == p)
+    told = jnp.sum(J[m:] ** 2, axis=1)  # share of a parameter that a prior tells, and residuals do not
     prior = J[m:].T @ J[m:]
     J, r = J[:m], r[:m]
-    s2 = jnp.sum(r**2) / jnp.maximum(present - p, 1).astype(J.dtype)
+    spare = (present - p).astype(J.dtype) - jnp.sum(jnp.where(told > 0, 1 - told, 0))
+    s2 = jnp.sum(r**2) / jnp.maximum(spare, 1)
 
     def in_units(C):
         C = T @ C @ T.T / jnp.outer(column, column)
