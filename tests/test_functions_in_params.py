@@ -11,6 +11,7 @@ import hhtjax
 
 TRACES = []
 START = jnp.array([1.0]), jnp.array([0.0])
+TWO = jnp.ones(2), jnp.zeros(2)  # unknowns, of which a step has stages
 
 
 def network(seed):
@@ -121,7 +122,7 @@ def test_sweeps_initial_values_and_analyses_know_modules():
 def test_a_new_function_of_the_same_code_is_another():
     def end(function):
         return hhtjax.simulate(
-            hhtjax.System(np.ones(1), lambda q, v, t, params: params["f"](t) - q), hhtjax.rk4(), *START,
+            hhtjax.System(np.ones(2), lambda q, v, t, params: params["f"](t) - q), hhtjax.rk4(), *TWO,
             {"f": function}, dt=0.1, num_steps=2,
         ).q[-1, 0]  # fmt: skip
 
@@ -134,13 +135,13 @@ def test_a_new_function_of_the_same_code_is_another():
 @pytest.mark.parametrize("grid", [{"dt": 0.05, "num_steps": 20}, {"dt": hhtjax.adaptive(1e-3, 1e-5), "times": [1.0]}])
 def test_with_events(grid):
     """Guard, reset and switch see the function: down to .1 at t = .9, up with half the velocity, then with a force."""
-    system = hhtjax.System(np.ones(1), lambda q, v, t, p: p["on"] + p["f"](0 * q))
+    system = hhtjax.System(np.ones(2), lambda q, v, t, p: p["on"] + p["f"](0 * q))
     stop = hhtjax.Event(
         lambda q, v, t, p: p["f"](q[0]) - 0.1,
         lambda q, v, t, p: p["f"](-0.5 * v),
         switch=lambda p: p | {"on": p["f"](1.0)},
     )
     params = {"on": 0.0, "f": jnp.positive}
-    found = hhtjax.simulate(system, hhtjax.dopri5(), START[0], -START[0], params, events=[stop], **grid)
+    found = hhtjax.simulate(system, hhtjax.dopri5(), TWO[0], -TWO[0], params, events=[stop], **grid)
     found.check()
-    np.testing.assert_allclose(found.q[-1, 0], 0.1 + 0.5 * 0.1 + 0.1**2 / 2, rtol=1e-12)
+    np.testing.assert_allclose(found.q[-1], 0.1 + 0.5 * 0.1 + 0.1**2 / 2, rtol=1e-12)

@@ -53,6 +53,28 @@ def test_eliminated_starts_are_those_of_the_dense_fit():
     np.testing.assert_allclose(result.uncertainty.naive, expected.uncertainty.naive[:2, :2], rtol=1e-4)
 
 
+@pytest.mark.slow
+def test_segments_are_whole_records_and_empty_ones_have_no_starts():
+    """The slope of lines with offsets of their own, 6 of 24 records without data: its errors are those of NumPy."""
+    y, x = np.random.default_rng(0).normal(size=(24, 10)), np.arange(10) - 4.5
+    present = np.arange(24) % 4 > 0
+
+    def residuals(slope, start, record):
+        return slope * x + start - record
+
+    result = hhtjax.fit(residuals, 0.0, records=y, starts=np.zeros(24), weights=present)
+    r = (y - y.mean(axis=1, keepdims=True))[present]
+    information = 18 * x @ x
+    slope = np.sum(r @ x) / information
+    r = r - slope * x
+    assert float(result.params) == pytest.approx(slope, rel=1e-6)
+    naive = np.sum(r**2) / (180 - 18 - 1) / information
+    cluster = np.sum((r @ x) ** 2) / (1 - 1 / 18) / information**2
+    assert float(result.uncertainty.naive[0, 0]) == pytest.approx(naive, rel=1e-6)
+    assert float(result.uncertainty.cluster[0, 0]) == pytest.approx(cluster, rel=1e-6)
+    assert float(result.uncertainty.degrees[0]) == pytest.approx(17, rel=1e-6)
+
+
 def test_windows_follow_the_clock():
     clock = np.array([0.0, 0.1, 0.2, 0.45, 0.5, 0.6, 0.8, 0.9])
     y = np.stack([clock, np.where(clock == 0.2, np.nan, 10 * clock)], axis=1)

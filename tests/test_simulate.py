@@ -143,6 +143,17 @@ def test_dense_output_outside_a_traced_run_is_nan():
     np.testing.assert_array_equal(np.isnan(values), [True, False, True])
 
 
+def test_dense_output_far_from_zero():
+    """In float32 the times of a run from t0 = 1000 are rounded to 6e-5: a part of dt that must not pile up."""
+    since = np.linspace(0.0, 1.0, 1001, dtype=np.float32)[:, None]
+    t, q = since[:, 0] + np.float32(1000), np.cos(5 * since)
+    path = hhtjax.Solution(
+        *map(jnp.asarray, (t, q, -5 * np.sin(5 * since), -25 * q)), None, jnp.asarray(1e-3), *2 * [None]
+    )
+    times = np.linspace(1000.01, 1000.99, 99, dtype=np.float32)
+    np.testing.assert_allclose(hhtjax.interpolate(path, times).q[:, 0], np.cos(5 * (times - 1000)), atol=1e-3)
+
+
 @pytest.mark.slow
 def test_progress_changes_neither_result_nor_gradient(capfd):
     @partial(jax.jit, static_argnums=1)

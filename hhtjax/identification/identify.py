@@ -87,7 +87,7 @@ def fit(
         covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
         segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
             residuals are cut: how much these disagree gives the standard errors (the cluster covariance of
-            `Uncertainty`).
+            `Uncertainty`). Of `records` whole ones, where that makes 8 and more than there are parameters.
         progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
 
     A function is traced once, and then known by its identity: data that it reads from outside are part of the program,

@@ -18,7 +18,7 @@ from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.rounds import in_rounds
-from hhtjax.identification.sandwich import count_segments, in_time, uncertainty, variance_inflation
+from hhtjax.identification.sandwich import LEAST, count_segments, in_time, uncertainty, variance_inflation
 from hhtjax.runs.freezing import chooses_steps, with_steps_for
 from hhtjax.xla import Programs
 
@@ -36,7 +36,8 @@ class Data(NamedTuple):
 
 class _Solved(NamedTuple):
     """x and what belongs to it. J, pull, bend: of `Objective.estimating` there, J None if not asked for; leaves: pull
-    as a pytree's leaves, of the given sizes; present: how many rows are not missing."""
+    as a pytree's leaves, of the given sizes; present: how many rows are not missing; block: how many stay in one
+    segment."""
 
     x: Any
     cost: Any
@@ -52,6 +53,7 @@ class _Solved(NamedTuple):
     leaves: Any
     sizes: list
     present: Any
+    block: int = 1
 
 
 class Coordinates:
@@ -108,10 +110,10 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
     found = branch(residuals, options, coordinates, data, limits)
     believed, segments = None, 0
     if options.covariance:
-        segments = count_segments(found.sizes, options.segments)
+        segments = count_segments(found.sizes, options.segments, found.block)
         J = found.J / coordinates.slope(found.x)[None, :]
         tau = variance_inflation(found.leaves, data.records is not None)
-        believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau)
+        believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau, found.block)
     ended = found.residual, found.cost, found.history, found.iterations, found.code
     params, last = freeze(coordinates.params(found.x)), (found.starts, data.weights, found.choices)
     return FitResult(params, *ended, options.transforms, believed, segments, *last)
@@ -193,9 +195,12 @@ def _solve_records(residuals, options, coordinates, data, limits):
     cost = problem.objective.cost(best.r.ravel())
     J, pull, bend = problem.free_of_own(best)
     of_pull = jax.tree.leaves(jax.vmap(unravel)(pull.reshape(w.shape)))
-    present = jnp.sum(w != 0) - own0.size  # each start has used up as many residuals as it has entries
+    there = jnp.sum(w != 0, axis=1)
+    present = jnp.sum(there - jnp.minimum(there, own0.shape[1]))  # a start uses up as many residuals as it has entries
+    whole = w.shape[1]
+    block = whole if count_segments([w.size], options.segments, whole) >= max(LEAST, p + 1) else 1
     ended = x, cost, history, iterations, code, choices, residual, starts
-    return _Solved(*ended, J, pull, bend, of_pull, [w.size], present)
+    return _Solved(*ended, J, pull, bend, of_pull, [w.size], present, block)
 
 
 def _with_frozen_steps(problem, y, fresh):

@@ -27,6 +27,7 @@ from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import triangle
 
 SEGMENTS = 32
+LEAST = 8  # segments that tell of a variance by how much they disagree
 FLAT = 1e-6  # curvature of the cost beside that of the sum of squares, at which a loss counts as flat
 ALONE = 0.75  # share of the information on a combination of parameters, above which its segment has taken it all
 
@@ -73,12 +74,17 @@ def correlation(covariance):
     return jnp.where(eye == 1, eye, covariance / jnp.outer(safe, safe))
 
 
-def count_segments(sizes, segments):
+def _length(n, segments, block):
+    """Of each of at most `segments` equal parts of n rows, of which `block` after another stay together."""
+    return -(-n // (segments * block)) * block
+
+
+def count_segments(sizes, segments, block=1):
     """How many segments leaves of these sizes are cut into, at most `segments`."""
-    return max(-(-n // -(-n // segments)) for n in sizes if n)
+    return max(-(-n // _length(n, segments, block)) for n in sizes if n)
 
 
-def uncertainty(J, r, bend, present, sizes, segments, tau) -> Uncertainty:
+def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertainty:
     """All of the above.
 
     Args:
@@ -89,6 +95,7 @@ def uncertainty(J, r, bend, present, sizes, segments, tau) -> Uncertainty:
         sizes: of the raveled residual leaves, m together. Each is cut into equal parts, and the k-th parts of all
             leaves, which belong to the same times, are one segment; `segments` of them, by `count_segments`.
         tau: of `variance_inflation`.
+        block: how many rows stay together, such as those of a record.
     """
     p, m = J.shape[1], sum(sizes)
     eps = float(jnp.finfo(J.dtype).eps)
@@ -116,7 +123,7 @@ def uncertainty(J, r, bend, present, sizes, segments, tau) -> Uncertainty:
     white = s2 * J.T @ J
     cluster, degrees = None, None
     if segments > p:
-        S, degrees = _clusters(J, r, (sizes, segments), tau * s2, inverse @ T.T, prior)
+        S, degrees = _clusters(J, r, (sizes, segments, block), tau * s2, inverse @ T.T, prior)
         cluster = covariance(S)
     directions, naive = Vt / column[None, :], covariance(white)
     return Uncertainty(cluster, naive, covariance(tau * white), s, directions, undetermined, in_units(inverse), degrees)
@@ -134,12 +141,12 @@ def _inverse_curvature(J, bend, T, seen):
     return (U * inverse[None, :]) @ U.T, jnp.any(flat[None, :] & (share > 1e-6), axis=1)
 
 
-def in_segments(x, sizes, segments):
+def in_segments(x, sizes, segments, block=1):
     """Of each leaf in the rows of x, raveled, its equal parts: (segments, rows, ...), the last filled up with zeros."""
     parts = []
     for leaf in jnp.split(x, np.cumsum(sizes)[:-1]):
         if n := len(leaf):
-            length = -(-n // segments)
+            length = _length(n, segments, block)
             filled = jnp.pad(leaf, ((0, segments * length - n), *((0, 0),) * (leaf.ndim - 1)))
             parts.append(filled.reshape(segments, length, *leaf.shape[1:]))
     return parts

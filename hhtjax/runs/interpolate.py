@@ -71,7 +71,8 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     if not is_real(times):
         raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
     known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
-    found, outside = _found(known, jnp.asarray(times), equal=not jnp.ndim(solution.dt))
+    equal = not jnp.ndim(solution.dt) and solution.events is None  # an event may end a run early
+    found, outside = _found(known, jnp.asarray(times), equal=equal)
     if is_concrete(outside) and np.any(outside):
         bad = np.asarray(times).astype(t.dtype)[np.asarray(outside)].flat[0]
         raise ValueError(f"interpolate: `times` must lie in [{t[0]:.6g}, {t[-1]:.6g}]; received {bad:.6g}.")
@@ -87,8 +88,9 @@ def _found(known, times, equal):
     slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
     outside = ~((times >= start - slack) & (times <= end + slack))
     if equal:
-        i = jnp.clip(jnp.floor((times - start) / (t[1] - t[0])).astype(jnp.int32), 0, t.shape[0] - 2)
-        H = jnp.full_like(times, t[1] - t[0])
+        mean = (end - start) / (t.shape[0] - 1)  # a single difference has lost digits, far from t = 0
+        i = jnp.clip(jnp.floor((times - start) / mean).astype(jnp.int32), 0, t.shape[0] - 2)
+        H = jnp.full_like(times, mean)
     else:
         i = jnp.clip(jnp.searchsorted(t, times, side="right") - 1, 0, t.shape[0] - 2)
         H = t[i + 1] - t[i]

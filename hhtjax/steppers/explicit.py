@@ -22,12 +22,12 @@ class RK4(Stepper):
 
     def bind(self, system, params, dt):
         """Four stages; the first is the acceleration that the step before ended with."""
-        acceleration = staged(system.acceleration, system.size)
+        acceleration = staged(lambda q, v, t: system.acceleration(q, v, t, params), system.size)
 
         def step(s):
             def stage(t, dq, dv):
                 v = s.v + dv
-                return v, acceleration(s.q + system.located(dq), v, t, params)
+                return v, acceleration(s.q + system.located(dq), v, t)
 
             v1, w1 = s.v, s.w
             v2, w2 = stage(s.t + dt / 2, dt / 2 * v1, dt / 2 * w1)
@@ -35,7 +35,7 @@ class RK4(Stepper):
             v4, w4 = stage(s.t + dt, dt * v3, dt * w3)
             q = s.q + system.located(dt / 6 * (v1 + 2 * v2 + 2 * v3 + v4))
             v = s.v + dt / 6 * (w1 + 2 * w2 + 2 * w3 + w4)
-            return State(s.t + dt, q, v, acceleration(q, v, s.t + dt, params)), Info()
+            return State(s.t + dt, q, v, acceleration(q, v, s.t + dt)), Info()
 
         return step
 

@@ -67,12 +67,12 @@ class DormandPrince(Embedded, Stepper):
 
     def bind_pair(self, system, params, dt):
         """Six stages; the first is the acceleration that the step before ended with."""
-        acceleration = staged(system.acceleration, system.size)
+        acceleration = staged(lambda q, v, t: system.acceleration(q, v, t, params), system.size)
 
         def stage(s, node, weights, V, W):
             """q, v and w of a stage, from the v and w of those before it."""
             q, v = s.q + system.located(dt * mean(weights, V)), s.v + dt * mean(weights, W)
-            return q, v, acceleration(q, v, s.t + node * dt, params)
+            return q, v, acceleration(q, v, s.t + node * dt)
 
         def step(s):
             q, V, W = (in_a_loop if system.size > SCALAR else written_out)(stage, s)
