@@ -12,8 +12,8 @@ c1, c2 and c3 are functions of Stumpff, ck = 1/k! - x/(k + 2)! + x^2/(k + 4)! - 
     c(k) = 1/k! - x c(k + 2),        dc(k)/dx = (k c(k + 2) - c(k + 1))/2
 
 Analytic in x, and computed so that values and derivatives, forward and reverse, are right at psi = 0 too. Every
-function keeps the dtype, but integers become floats, and raises TypeError for what is not an array of real numbers,
-ValueError for another shape.
+function keeps the dtype, but integers become floats, and raises TypeError for what is no array of real numbers,
+ValueError for another shape. From and to quaternions: `from_quat`, `as_quat` of jax.scipy.spatial.transform.Rotation.
 
 Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """

@@ -25,7 +25,12 @@ def test_bad_input():
             "simulate: `q0` must be a rotation; received a reflection, det R = -1",
             lambda: simulate(-jnp.eye(3)),
         ),
-        (ValueError, "but (3,) for a rotation (3, 3); received shape (2,)", lambda: simulate(v0=jnp.zeros(2))),
+        (
+            ValueError,
+            "but (3,) for a rotation, a matrix (3, 3); received shape (2,)",
+            lambda: simulate(v0=jnp.zeros(2)),
+        ),
+        (ValueError, "but (3,) for a rotation, a matrix (3, 3); received shape (3,)", lambda: simulate(jnp.ones(4))),
         (
             NotImplementedError,
             "simulate: RK4 cannot move the rotations in `q0`",

@@ -76,7 +76,8 @@ def export_c(
         system: a `System`, `LinearSystem` or `FirstOrderSystem`. What is constant in it is written out.
         stepper: `hht()`, `rk4()`, ...
         q0, v0: position and velocity, whose keys name the fields of the state, and whose type, float64 or float32, is
-            `NAME_real`. A `FirstOrderSystem` has y0 in the place of q0, no v0, and `NAME_init` no argument for it.
+            `NAME_real`. `NAME_init` takes their numbers in the order of these fields, matrices row by row. A
+            `FirstOrderSystem` has y0 in the place of q0, no v0, and `NAME_init` no argument for it.
         params: their floating numbers are the fields of `NAME_params`, these values `NAME_defaults`; keys of which C
             makes one name are numbered, a_b and a_b_2. Integers and booleans are written out. Each `sampled` is an
             input: `u` holds their values, one after the other, in the order of the leaves of params; a step holds them

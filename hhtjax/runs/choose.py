@@ -15,8 +15,13 @@ from hhtjax.runs.attempt_events import trial_of
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import first_bad
 from hhtjax.runs.recorded import Recorder, solution
+<<<<<<< HEAD
 from hhtjax.runs.solution import SimulationError
 from hhtjax.xla import on_scalars, one_kernel
+=======
+from hhtjax.runs.solution import SimulationError, first_bad
+from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, row_written
+>>>>>>> reader
 
 WHY = {
     TOO_SHORT: "the step size fell below dt_min={:.3g}, the error estimate being {:.3g} times the tolerance",
@@ -89,16 +94,18 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     if times is not None:
         recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, start)[1].info)
 
-    def unfinished(carry):
-        return is_walking(carry[0], end)
+    def unfinished(carry):  # one answer for a batch: else vmap has each try copy the ends of all members
+        return largest_in_batch(is_walking(carry[0], end))
 
     def body(carry):
         walk, ends, since = carry
         new, begun = one_try(walk)
+        here = or_alone(is_walking(walk, end))
+        new = jax.tree.map(partial(jnp.where, here), new, walk)
         if progress:
             show(walk.state.t, new.state.t, t0, end)
         accepted = new.accepted > walk.accepted
-        ends = lax.dynamic_update_index_in_dim(ends, jnp.where(accepted, begun.end, jnp.inf), walk.accepted, 0)
+        ends = row_written(ends, jnp.where(accepted, begun.end, jnp.inf), walk.accepted)
         return new, ends, recorder and recorder.add(since, begun, accepted)
 
     def to_sample(carry, time):

@@ -84,7 +84,7 @@ class Solution(NamedTuple):
         dt: the step size; (N,) of steps that were given, one for each; (K,) of a sweep over `times`, one for each
             interval.
         info: `Info` for each of the K intervals between saved times: largest residual, number of Newton iterations, all
-            converged; None where the method has nothing to tell.
+            converged, how far the constraints drift; None where the method has nothing to tell.
         failure: the first step that failed, a `Failure`; `check` turns it into an error.
         z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without.
         friction: tau (K + 1, m), dry friction, positive against positive sliding; None without.

@@ -43,7 +43,9 @@ def initial_values(caller, system, q0, v0, z0=None, level=3):
         if kinematics.is_rotation(jnp.shape(q), jnp.shape(v)):
             _require_rotations(f"{caller}: `q0{jax.tree_util.keystr(path)}`", q)
         elif jnp.shape(q) != jnp.shape(v):
-            rotation = ", but (3,) for a rotation (3, 3)" if jnp.shape(q)[-2:] == (3, 3) else ""
+            a, b = jnp.shape(q), jnp.shape(v)
+            turns = a[-2:] == (3, 3) or (a[-1:], b[-1:]) == ((4,), (3,))  # or is a quaternion
+            rotation = ", but (3,) for a rotation, a matrix (3, 3)" if turns else ""
             raise ValueError(
                 f"{caller}: `v0` must have the shapes of q0, {describe(q0)}{rotation}; received {describe(v0)}."
             )
