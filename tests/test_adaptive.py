@@ -213,18 +213,11 @@ def test_tolerances_and_all_else_are_data():
     few, many = (go(rtol, 2e5, 0.4) for rtol in (1e-2, 1e-5))
     assert (run_recorded.number(), chosen_steps.number()) == compiled
     assert few.steps.accepted < many.steps.accepted
-<<<<<<< HEAD
-    batch = jax.vmap(jax.jit(go), (0, None, None))(np.array([1e-2, 1e-5]), 2e5, 0.4)
-    batch.check()
-    np.testing.assert_allclose(batch.q, [few.q, many.q], rtol=1e-9)
-    assert batch.dt.shape == (2, 10_000)
-=======
     go_all, rtol = jax.jit(jax.vmap(lambda rtol: go(rtol, 2e5, 0.4))), np.array([1e-2, 1e-5])
     program = go_all.lower(rtol).as_text().splitlines()
     assert sum("select" in x and "2x10000xf64" in x for x in program) == 1  # behind the loop, of `dt`; not in each try
     (batch := go_all(rtol)).check()
     np.testing.assert_allclose(batch.q[1], many.q, rtol=1e-9)
->>>>>>> reader
     assert np.sum(np.isfinite(batch.dt), 1).tolist() == batch.steps.accepted.tolist()
 
 

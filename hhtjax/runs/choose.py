@@ -15,13 +15,8 @@ from hhtjax.runs.attempt_events import trial_of
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import first_bad
 from hhtjax.runs.recorded import Recorder, solution
-<<<<<<< HEAD
 from hhtjax.runs.solution import SimulationError
-from hhtjax.xla import on_scalars, one_kernel
-=======
-from hhtjax.runs.solution import SimulationError, first_bad
 from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, row_written
->>>>>>> reader
 
 WHY = {
     TOO_SHORT: "the step size fell below dt_min={:.3g}, the error estimate being {:.3g} times the tolerance",
