@@ -13,7 +13,7 @@ import numpy as np
 from jax.scipy.special import betainc, gammaincc
 
 from hhtjax.identification.arguments import spread_weights
-from hhtjax.identification.sandwich import time_axis
+from hhtjax.identification.sandwich import time_axis, used_up
 
 LAGS = 20  # of the test for white residuals
 
@@ -55,12 +55,13 @@ def count(residuals: Residuals) -> int:
 
 
 def used_by_starts(result) -> int:
-    """Residuals that the starts of records take: of each record as many as its start has entries, or as there are."""
+    """Residuals that the starts of records take; 0 without."""
     if result.starts is None:
         return 0
-    leaves = jax.tree.leaves(result.starts)
-    present = sum(np.sum(np.reshape(w, (len(leaves[0]), -1)) != 0, axis=1) for w in weights_of(result))
-    return int(np.sum(np.minimum(present, sum(map(np.size, leaves)) // len(leaves[0]))))
+    starts = jax.tree.leaves(result.starts)
+    records = len(starts[0])
+    present = np.concatenate([np.reshape(w, (records, -1)) != 0 for w in weights_of(result)], axis=1)
+    return int(used_up(present, sum(map(np.size, starts)) // records))
 
 
 def design_effect(uncertainty) -> float:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete, thaw
@@ -219,7 +218,6 @@ def _finished(caller, result, weights):
     if code == NO_INFLUENCE:
         raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")
     if result.uncertainty is not None:
-        size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
-        warn_undetermined(caller, result.params, result.free, result.uncertainty, size, stacklevel=4)
+        warn_undetermined(caller, result, stacklevel=4)
     done = int(result.iterations) + 1
     return result._replace(history=jax.tree.map(lambda x: x[:done], result.history), segments=int(result.segments))
