@@ -225,6 +225,23 @@ def test_a_summary_says_what_the_residuals_are_worth():
     assert worth == pytest.approx(1500 * 2 / np.trace(np.linalg.solve(u.naive, u.cluster)), rel=0.02)
 
 
+def test_segments_without_residuals_are_none():
+    """Of 10 samples, 8 segments of 2: five; and three where the first four are missing."""
+    y = COLUMNS["rest"][:10] + 0.1 * jnp.sin(7.0 * jnp.arange(10.0))
+
+    def residuals(p):
+        return p["a"] * COLUMNS["rest"][:10] - y
+
+    fits = {}
+    for first, segments in ((0, 5), (4, 3)):
+        fits = dict.fromkeys("ab", hhtjax.fit(residuals, {"a": 0.5}, weights=np.arange(10) >= first))
+        found = hhtjax.compare(fits, residuals)
+        assert found.held_out.shape == found.converged.shape == (2, segments)
+        assert found.held_out.all()
+    with pytest.raises(ValueError, match=r"`folds` must leave two segments or more .* received 8, which leaves 1"):
+        hhtjax.compare(fits, residuals, always=np.arange(10) < 8)
+
+
 def test_what_cannot_be_compared_is_named():
     y = model({"rest": 0.5})
 

@@ -159,7 +159,8 @@ def compare(
     Args:
         fits: {name: `FitResult`, with covariance}, all of the same measurements with the same weights.
         residuals: the function that was fitted, or {name: function}; for errors on segments left out. None: without.
-        folds: how many segments, cut as those of the covariance; each long against the correlation time.
+        folds: how many segments, cut as those of the covariance; each long against the correlation time. Fewer where
+            some would have no residual to judge by.
         absent: the value at which a parameter of nested models has no effect, or {parameter: value}, by the names in
             `FitResult.summary()`, 0 for others, such as a constant in the smaller model's function. Where that model
             holds it fixed, its value is taken. The summary doubts it where only the first of two p values is tiny.
@@ -214,8 +215,7 @@ def compare(
         return found
     functions = _check_functions(residuals, fits)
     folds = require_integer("compare", "folds", folds, 2)
-    left = [leave_out(name, fits[name], functions[name], folds, always, options, progress) for name in names]
-    held_out, converged = (np.array(x) for x in zip(*left, strict=True))
+    held_out, converged = leave_out(fits, functions, folds, always, options, progress)
     return found._replace(held_out=held_out, converged=converged)
 
 
