@@ -256,6 +256,11 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
             "step_size_bias: `q` has rotations",
         ),
         (
+            lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 9.0}, 0.1, jnp.zeros(1), correct=True),
+            ValueError,
+            "step_size_bias: `params` must let a mode oscillate",
+        ),
+        (
             lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, q=jnp.zeros(2)),
             ValueError,
             r"step_size_bias: `q` must be of the size of the mass, 1; received shape \(2,\)",

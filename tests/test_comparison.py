@@ -177,12 +177,16 @@ def test_white_noise_is_white_in_19_of_20_records():
 
 
 def test_white_noise_with_gaps_is_white():
-    """A record with a hole, and one of which every second sample and a whole column are missing."""
+    """A record with a hole, and one of which every second sample and a whole column are missing; beside a few numbers
+    and none."""
     rng, i = np.random.default_rng(0), np.arange(300)
+    few = Residuals(["", ""], [], [np.ones((3, 1)), np.zeros((0, 2))], [np.ones((3, 1), bool), np.zeros((0, 2), bool)])
+    assert whiteness(few) is None
     hole, second = (i < 80) | (i > 250), np.stack([i % 2 == 0, i < 0], axis=1)
     for present in (hole[:, None], second):
         records = present * rng.normal(size=(300, *present.shape))
-        found = [whiteness(Residuals([""], [r], [r], [present]))[1] < 0.05 for r in records]
+        beside = [few._replace(weighted=[r, *few.weighted], present=[present, *few.present]) for r in records]
+        found = [whiteness(x)[1] < 0.05 for x in beside]
         assert 0.02 <= np.mean(found) <= 0.09
 
 

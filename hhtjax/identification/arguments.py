@@ -93,10 +93,10 @@ def check_parameters(caller, params0, name="params0"):
     """params0 as a pytree of float arrays, functions among them hidden."""
     given, params0 = params0, freeze(params0)
     leaves = jax.tree_util.tree_leaves_with_path(params0) or jax.tree_util.tree_leaves_with_path(given)
-    if not leaves:
-        raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
     for path, leaf in leaves:
         check_real(f"{caller}: `{name}{jax.tree_util.keystr(path)}`", leaf)
+    if not sum(np.size(leaf) for _, leaf in leaves):
+        raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
 
     def as_float(x):
         x = jnp.asarray(x)
@@ -179,12 +179,17 @@ def check_records(caller, records, starts, prior, optimizer):
     if records is None or starts is None:
         raise ValueError(f"{caller}: `records` and `starts` must be given together; received one of them.")
     starts = check_parameters(caller, starts, "starts")
-    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves((records, starts))}
-    if len(counts) != 1 or counts == {()}:
-        raise ValueError(f"{caller}: `records` and `starts` must have one leading axis; received {sorted(counts)}.")
+    require_leading_axis(caller, "`records` and `starts`", (records, starts))
     if optimizer != LEVENBERG_MARQUARDT or prior is not None:
         raise ValueError(f"{caller}: `records` must go with Levenberg-Marquardt and without a prior.")
     return starts
+
+
+def require_leading_axis(caller, names, tree):
+    """An error unless the leaves, of the arguments so named, have a leading axis of one length."""
+    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves(tree)}
+    if len(counts) != 1 or counts == {()}:
+        raise ValueError(f"{caller}: {names} must have one leading axis in all leaves; received {sorted(counts)}.")
 
 
 def check_residuals(caller, residuals, p, *args):

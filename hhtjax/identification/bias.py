@@ -109,7 +109,7 @@ def step_size_bias(
     Raises:
         TypeError, ValueError: an argument of a wrong kind; dt is no positive number; q has another number of
             coordinates than the mass, or does not meet the constraint; `correct` with a dt in which a mode does not
-            oscillate.
+            oscillate, or without a mode that does.
         NotImplementedError: a system with internal states or rotations.
 
     References:
@@ -146,6 +146,8 @@ def step_size_bias(
     bias = ModeBias(w, -np.real(s) / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
     if correct is False:
         return bias
+    if not w.size:
+        raise ValueError("step_size_bias: `params` must let a mode oscillate, for `correct`; none does.")
     if np.any(np.isnan(w)):
         raise ValueError(
             f"step_size_bias: `dt` must let every mode oscillate, for `correct`; received {dt}, in which "

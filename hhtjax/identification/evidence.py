@@ -16,6 +16,7 @@ from hhtjax.identification.arguments import spread_weights
 from hhtjax.identification.sandwich import time_axis, used_up
 
 LAGS = 20  # of the test for white residuals
+LEAST = 5  # samples for each lag
 
 
 class Residuals(NamedTuple):
@@ -86,13 +87,13 @@ def whiteness(residuals: Residuals):
 
     Q = n (n + 2) sum_k rho_k^2/(n - k), k = 1 .. lags, is chi-squared with as many degrees of freedom as there are lags
     (Biometrika 65, 1978, 297-303); n - k is the number of pairs, of samples that are present. The Q of all columns are
-    added.
+    added, but for leaves that are no record, of fewer than 5 samples.
     """
-    lags = min(LAGS, min(len(r) for r in residuals.weighted) // 5) if residuals.weighted else 0
-    if lags < 1:
-        return None
+    leaves = zip(residuals.weighted, residuals.present, strict=True)
+    records = [(r, present) for r, present in leaves if len(r) >= LEAST]
+    lags = min([LAGS, *(len(r) // LEAST for r, _ in records)])
     Q, degrees, products, energy = 0.0, 0, 0.0, 0.0
-    for r, present in zip(residuals.weighted, residuals.present, strict=True):
+    for r, present in records:
         n = present.sum(axis=0)
         r = np.where(present, r - r.sum(axis=0) / np.maximum(n, 1), 0)
         square = np.sum(r**2, axis=0)

@@ -25,6 +25,7 @@ from hhtjax.identification.arguments import (
     check_transforms,
     check_weights,
     first_bad,
+    require_leading_axis,
 )
 from hhtjax.identification.identifiability import warn_undetermined
 from hhtjax.identification.problem import Data, solve
@@ -181,11 +182,7 @@ def multistart(
     (3.0, 1)
     """
     starts = check_parameters("multistart", starts, "starts")
-    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves(starts)}
-    if len(counts) != 1 or counts == {()}:
-        raise ValueError(
-            f"multistart: `starts` must have one leading axis in all its leaves; received {sorted(counts)}."
-        )
+    require_leading_axis("multistart", "`starts`", starts)
     first = jax.tree.map(lambda x: x[0], starts)
     options = check_options(
         "multistart", residuals, first, optimizer, transforms, loss, max_iterations, covariance, segments, False

@@ -31,7 +31,7 @@ class Score(NamedTuple):
         cost_drop: share of the cost that it would take away.
         estimate: one Gauss-Newton step.
 
-    All are 0 for a term that the fitted parameters make up for.
+    All are 0 for a term that the fitted parameters make up for, and where no residual is left.
     """
 
     names: list
@@ -91,11 +91,11 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     by_time = (X * r[:, None])[in_time(shapes)]
     scores: Any = sum(part.sum(axis=1) for part in in_segments(by_time, [math.prod(x) for x in shapes], segments))
     total, square = scores.sum(axis=0), jnp.sum(X**2, axis=0)
-    variance = jnp.sum(scores**2, axis=0)
+    variance, left = jnp.sum(scores**2, axis=0), jnp.sum(r**2)
     return Score(
         parameter_names(candidates),
         np.asarray(total**2 / jnp.where(variance == 0, 1, variance)),
-        np.asarray(total**2 / jnp.where(square == 0, 1, square) / jnp.sum(r**2)),
+        np.asarray(total**2 / jnp.where(square * left == 0, 1, square * left)),
         np.asarray(-total / jnp.where(square == 0, 1, square)),
     )
 
@@ -108,7 +108,7 @@ class Profile(NamedTuple):
         values: of the parameter, (values,).
         cost: the least one with the parameter held there, (values,).
         deviance: 2 (cost - that of the fit)/variance, (values,), scaled so that its parabola is that of the standard
-            error; 3.84 bounds the 95 % interval.
+            error; 3.84 bounds the 95 % interval. NaN for a parameter without one.
     """
 
     values: Any
