@@ -217,7 +217,9 @@ def _is_far(examined, away, start):
     _, B, _, (sizes, _) = examined
     if np.all(away <= ROUNDINGS * np.finfo(B.dtype).eps * (1 + sizes)):
         return False
-    turns, d = known_now(_turns, *start)
+    found = known_now(_turns, *start)
+    assert found is not None  # as what was examined
+    turns, d = found
     return bool(np.any(turns * np.max(np.where(B == 0, 0, np.sqrt(d) * away), axis=1) > SMALL))
 
 
