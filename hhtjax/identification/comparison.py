@@ -174,8 +174,8 @@ def compare(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; fewer than two fits; fits without covariance, made inside
-            jit, or with different numbers of observations; residuals not of these fits. NotImplementedError: segments
-            left out of fits with records.
+            jit, or with different numbers of observations; residuals not of these fits; fewer than two segments to
+            judge by. NotImplementedError: segments left out of fits with records.
 
     References:
         Akaike, IEEE Trans. Autom. Control 19 (1974); Schwarz, Ann. Stat. 6 (1978); Rao, Scott, J. Am. Stat. Assoc. 76
