@@ -193,17 +193,20 @@ def _solved(A, b, n, redundant):
         return np.stack([_solved(*one, n, redundant) for one in zip(A, b, strict=True)])
 
 
-def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None):
-    """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
+def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None, checked=CHECKED):
+    """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass.
+
+    checked: what the caller names q0, and v0 if it is to be looked at, and what they violate.
+    """
     examined = known_now(examine, system, q0, v0, t0, params, z0)
     if examined is None:
         return
     if redundant is None:
         require_independent(caller, examined[1])
     found = distances(examined, redundant)
-    for (name, meaning), (violated, distance, relative, away) in zip(CHECKED, found, strict=True):
+    for (name, meaning), (violated, distance, relative, away) in zip(checked, found, strict=False):
         small = relative <= CONSISTENT
-        if not small or (name == "q0" and _is_far(examined, away, (system, q0, v0, t0, params, z0))):
+        if not small or (meaning == "Phi" and _is_far(examined, away, (system, q0, v0, t0, params, z0))):
             beside = ", which is much in so small a mechanism" if small else ""
             raise ValueError(
                 f"{caller}: `{name}` violates the constraint: max|{meaning}| = {violated:.3g}, {distance:.3g} away "
