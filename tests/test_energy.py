@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from event_problems import G, bounce
 from friction_problems import free_vibration_exact
 from scipy.integrate import simpson
 from zoo import PROBLEMS, run
@@ -132,6 +133,37 @@ def test_a_belt_drives_what_sticks_to_it():
     order = np.log2(np.max(np.abs(coarse.error)) / np.max(np.abs(fine.error))) / 2
     assert order > 1.85
     assert np.max(np.abs(fine.error)) < 1e-3 * np.max(fine.kinetic)
+
+
+def test_an_impact_takes_what_it_leaves_out_of_the_velocity():
+    """A ball that drags and rubs, twice on the floor: only what the method makes is error, of its order."""
+    ball = hhtjax.System(
+        jnp.ones(1),
+        lambda q, v, t, p: -G - 0.3 * v,
+        friction=lambda q, v, t, p: jnp.array([0.5]),
+        sliding=lambda q, v, t, p: v,
+    )
+    events = [hhtjax.Event(lambda q, v, t, p: q[0], hhtjax.impact(0.8))]
+    end = bounce(
+        lambda t, y: [y[1], -G - 0.3 * y[1] - 0.5 * np.sign(y[1])],
+        [1.0, 0.0], 1.5, lambda y: y[0], lambda y: [0, -0.8 * y[1]],
+    )  # fmt: skip
+
+    def potential(q, t, p):
+        return G * q[0]
+
+    errors = []
+    for n in (100, 400):
+        path = hhtjax.simulate(
+            ball, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=1.5 / n, num_steps=n, save_every=n // 100, events=events
+        )
+        found = energy_balance(ball, path, potential=potential)
+        np.testing.assert_array_equal(found.t, path.t)
+        errors.append([np.max(np.abs(found.error)), abs(found.work[-1] - (end[1] ** 2 / 2 + G * (end[0] - 1)))])
+    assert int(path.events.count) == 2
+    assert np.all(np.array(errors) < [[1e-2], [1e-3]]), errors
+    slope = jax.grad(lambda v: energy_balance(ball, path._replace(v=v), potential=potential).work[-1])(path.v)
+    assert np.all(np.isfinite(slope))
 
 
 SPRING = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from hhtjax.analysis.event_rows import with_event_rows
 from hhtjax.analysis.friction_work import friction_work, switches
 from hhtjax.checks import require_function
 from hhtjax.description import freeze, thaw
@@ -25,7 +26,7 @@ class EnergyBalance(NamedTuple):
         t: s.
         kinetic: v' M v/2.
         potential: V, 0 without.
-        work: of all other forces since the start.
+        work: of all other forces since the start, and of impacts.
         error: kinetic + potential - their sum at the start - work, which the motion itself leaves at 0.
     """
 
@@ -45,7 +46,8 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
     The integral is Simpson's over each interval between saved times, on dense output: of order 4. Save every step, or
     some within the shortest period. Dry friction tau jumps where a joint switches: its integral is of order 2 there.
     It takes tau s where a joint slides, nothing where it sticks to what rests, and what a moving belt gives or takes.
-    Of events it knows nothing: what an impact takes, or a switch of params changes, counts as error from there on.
+    What an impact takes from T is work; the integral ends there and begins anew, with an error of H^3 around it.
+    A switch of params it does not know: what that changes, in V or in forces, counts as error from there on.
     Where nothing damps or drives, and V is given, work is 0 and the error is the drift of the total energy; without V,
     work counts every force, and the error is another, of the same order.
 
@@ -83,6 +85,14 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
 
 @partial(jax.jit, static_argnames="potential")
 def _energy_balance(system, solution, params, potential):
+    if solution.events is None:
+        return _balance(system, solution, solution, None, params, potential)
+    run, across, saved = with_event_rows(solution)
+    return jax.tree.map(lambda x: x[saved], _balance(system, solution, run, across, params, potential))
+
+
+def _balance(system, solution, run, across, params, potential):
+    """At the times of the run, the solution with its events, if it has some; across: whether an interval is one."""
     q0, v0, t0, z0 = (jax.tree.map(lambda x: x[0], y) for y in (solution.q, solution.v, solution.t, solution.z))
     params = thaw(params)
     flat, _, _ = flatten("energy_balance", system, q0, v0, t0, params, z0)
@@ -105,7 +115,7 @@ def _energy_balance(system, solution, params, potential):
         _, stretching = jax.jvp(lambda q: flat.constraint(q, t, params), (q,), motion[:1])
         return P + jnp.dot(L, stretching)
 
-    ends, middles = _points(flat, solution, params)
+    ends, middles = _points(flat, solution, run, params)
 
     def over_interval(first, between, last, H):
         """Simpson's rule; a held input has the value that it has inside."""
@@ -113,35 +123,41 @@ def _energy_balance(system, solution, params, potential):
         P, P_middle, P_end = (power(q, v, t, L, inside) for q, v, t, L in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
 
-    t, with_L = solution.t, (*ends, solution.multipliers)
+    t, with_L = run.t, (*ends, run.multipliers)
     first, last = (jax.tree.map(lambda x, part=part: x[part], with_L) for part in (slice(-1), slice(1, None)))
     work = jax.vmap(over_interval)(first, middles, last, jnp.diff(t))
     if flat.friction:
-        w = _vectors((solution.acceleration, solution.zdot))
-        work = work + friction_work(flat, solution, ends, middles, w, params)
+        w = _vectors((run.acceleration, run.zdot))
+        work = work + friction_work(flat, run, ends, middles, w, params)
+    return _summed(t, *jax.vmap(energies)(*ends), work, across)
+
+
+def _summed(t, T, V, work, across):
+    """The balance, from the work in each interval; that of an impact is all that T loses."""
+    if across is not None:
+        work = jnp.where(across, jnp.diff(T), work)
     work = jnp.concatenate([jnp.zeros_like(t[:1]), jnp.cumsum(work)])
-    T, V = jax.vmap(energies)(*ends)
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
 
 
-def _points(flat, solution, params):
-    """q, v and t at the saved times, and q, v, t and L between them."""
-    t, L = solution.t, solution.multipliers
+def _points(flat, solution, run, params):
+    """q, v and t at the saved times of the run, which is the solution with its events, and q, v, t and L between."""
+    t, L = run.t, run.multipliers
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
-    jumps = held.holds(params) or (switches(solution) if flat.friction else False)
-    q, v = _between(solution, H, middle, jumps if not flat.blocks else False)
-    ends = _vectors(solution.q), _vectors((solution.v, solution.z)), t
+    jumps = held.holds(params) or (switches(run) if flat.friction else False)
+    q, v = _between(solution, run, H, middle, jumps if not flat.blocks else False)
+    ends = _vectors(run.q), _vectors((run.v, run.z)), t
     between = q, v, middle, None if L is None else (L[1:] + L[:-1]) / 2
     return ends, between
 
 
-def _between(solution, H, middle, jumps):
+def _between(solution, run, H, middle, jumps):
     """Positions and rates in the middle of each interval, of length H; jumps: whether, or where, accelerations do."""
     found = interpolate(solution, middle)
     rates = _vectors(found[1:])
     if jumps is not False:  # of the cubic through q and v the slope
-        q, v = _vectors(solution.q), _vectors(solution.v)
-        slope = 1.5 * jnp.diff(q, axis=0) / H[:, None] - (v[1:] + v[:-1]) / 4
+        q, v = _vectors(run.q), _vectors(run.v)
+        slope = 1.5 * jnp.diff(q, axis=0) / jnp.where(H > 0, H, 1)[:, None] - (v[1:] + v[:-1]) / 4
         n = v.shape[1]
         rates = jnp.concatenate([jnp.where(jumps, slope, rates[:, :n]), rates[:, n:]], axis=1)
     return _vectors(found.q), rates

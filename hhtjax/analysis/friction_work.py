@@ -36,7 +36,7 @@ def friction_work(flat, solution, ends, middles, w, params):
     ends: q, v, t at the saved times, middles: q, v, t, L between; w: (K + 1, N).
     """
     h, v = jnp.diff(solution.t), ends[1]
-    unseen = (w[1:] + w[:-1]) / 2 - jnp.diff(v, axis=0) / h[:, None]
+    unseen = (w[1:] + w[:-1]) / 2 - jnp.diff(v, axis=0) / jnp.where(h > 0, h, 1)[:, None]
     saved = (*ends, solution.friction, directions_of(solution))
     first, last = (jax.tree.map(lambda x, part=part: x[part], saved) for part in (slice(-1), slice(1, None)))
     return -h * jax.vmap(partial(_power, flat, params))(first, middles, last, unseen)
