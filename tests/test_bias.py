@@ -188,6 +188,9 @@ hanging = hhtjax.System(
 )
 
 
+twice = hhtjax.System(hanging.mass, hanging.force, lambda q, t, p: jnp.tile(hanging.constraint(q, t, p), 2))
+
+
 @pytest.mark.slow
 def test_a_constraint_leaves_the_bias_of_the_minimal_form():
     """A point mass on a circle of 0.5 m: the multiplier's stiffness is all it has. s is in its real step, too."""
@@ -256,6 +259,11 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
             "step_size_bias: `q` has rotations",
         ),
         (
+            lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 9.0}, 0.1, jnp.zeros(1), correct=True),
+            ValueError,
+            "step_size_bias: `params` must let a mode oscillate",
+        ),
+        (
             lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, q=jnp.zeros(2)),
             ValueError,
             r"step_size_bias: `q` must be of the size of the mass, 1; received shape \(2,\)",
@@ -273,7 +281,12 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
         (
             lambda: hhtjax.step_size_bias(hanging, hhtjax.hht(), HANGING, 0.1, q=jnp.array([0.0, -0.6])),
             ValueError,
-            "step_size_bias: `q` must meet the constraint; received one that is 0.11 away",
+            r"step_size_bias: `q` violates the constraint: max\|Phi\| = 0.11, 0.0917 away",
+        ),
+        (
+            lambda: hhtjax.step_size_bias(twice, hhtjax.hht(), HANGING, 0.1, q=jnp.array([0.0, -0.5])),
+            ValueError,
+            r"step_size_bias: `constraint` rows \[0, 1\] depend on each other",
         ),
     ],
 )

@@ -21,6 +21,7 @@ NOT_A_MATRIX = [
     (TypeError, "must be real; received an array of bool", np.array([True])),
     (TypeError, "must be real; received an array of <U1", np.array(["a"])),
     (ValueError, "must have shape (n, n), or (n,) for a diagonal; received shape (2, 3)", np.ones((2, 3))),
+    (ValueError, "must have shape (n, n), or (n,) for a diagonal; received shape (0,)", np.ones(0)),
     (ValueError, "must have shape (n, n), or (n,) for a diagonal; received shape (2, 2, 2)", np.ones((2, 2, 2))),
     (ValueError, "must be finite; received array([nan])", np.array([NAN])),
     (ValueError, "must be finite; received array([inf])", np.array([INF])),

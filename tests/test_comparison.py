@@ -177,12 +177,16 @@ def test_white_noise_is_white_in_19_of_20_records():
 
 
 def test_white_noise_with_gaps_is_white():
-    """A record with a hole, and one of which every second sample and a whole column are missing."""
+    """A record with a hole, and one of which every second sample and a whole column are missing; beside a few numbers
+    and none."""
     rng, i = np.random.default_rng(0), np.arange(300)
+    few = Residuals(["", ""], [], [np.ones((3, 1)), np.zeros((0, 2))], [np.ones((3, 1), bool), np.zeros((0, 2), bool)])
+    assert whiteness(few) is None
     hole, second = (i < 80) | (i > 250), np.stack([i % 2 == 0, i < 0], axis=1)
     for present in (hole[:, None], second):
         records = present * rng.normal(size=(300, *present.shape))
-        found = [whiteness(Residuals([""], [r], [r], [present]))[1] < 0.05 for r in records]
+        beside = [few._replace(weighted=[r, *few.weighted], present=[present, *few.present]) for r in records]
+        found = [whiteness(x)[1] < 0.05 for x in beside]
         assert 0.02 <= np.mean(found) <= 0.09
 
 
@@ -223,6 +227,23 @@ def test_a_summary_says_what_the_residuals_are_worth():
     worth = float(text.partition("worth ")[2].split()[0])
     u = result.uncertainty
     assert worth == pytest.approx(1500 * 2 / np.trace(np.linalg.solve(u.naive, u.cluster)), rel=0.02)
+
+
+def test_segments_without_residuals_are_none():
+    """Of 10 samples, 8 segments of 2: five; and three where the first four are missing."""
+    y = COLUMNS["rest"][:10] + 0.1 * jnp.sin(7.0 * jnp.arange(10.0))
+
+    def residuals(p):
+        return p["a"] * COLUMNS["rest"][:10] - y
+
+    fits = {}
+    for first, segments in ((0, 5), (4, 3)):
+        fits = dict.fromkeys("ab", hhtjax.fit(residuals, {"a": 0.5}, weights=np.arange(10) >= first))
+        found = hhtjax.compare(fits, residuals)
+        assert found.held_out.shape == found.converged.shape == (2, segments)
+        assert found.held_out.all()
+    with pytest.raises(ValueError, match=r"`folds` must leave two segments or more .* received 8, which leaves 1"):
+        hhtjax.compare(fits, residuals, always=np.arange(10) < 8)
 
 
 def test_what_cannot_be_compared_is_named():

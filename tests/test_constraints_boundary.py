@@ -51,6 +51,25 @@ BAD = [
 ]
 
 
+def bead(size, off, origin=0.0):
+    """On a circle of this radius, and off it by that part of it; q counts from the origin."""
+    center = jnp.array([origin, 0.0])
+
+    def circle(q, t, params):
+        return jnp.sqrt(jnp.sum((q - center) ** 2, keepdims=True)) - size
+
+    return run_from(circle, (origin, -size * (1 + off)), ZERO)
+
+
+@pytest.mark.parametrize(("size", "off"), [(1e-6, 5e-3), (1.0, 1e-5)])
+def test_a_small_mechanism_is_off_by_its_own_measure(size, off):
+    bead(size, off / 10)().check()
+    beside = "" if size == 1 else ", which is much in so small a mechanism"
+    with pytest.raises(ValueError, match=f"`q0` violates .* away from consistent values{beside}; hhtjax"):
+        bead(size, off)()
+    run_from(lambda q, t, params: q[:1] - 1e-9, ZERO, ZERO)().check()  # of a plane nothing tells the size
+
+
 @pytest.mark.parametrize(("message", "call"), BAD, ids=lambda x: x[:40] if isinstance(x, str) else "")
 def test_bad_input(message, call):
     with pytest.raises((ValueError, TypeError), match=re.escape(message)):

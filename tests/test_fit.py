@@ -223,11 +223,14 @@ def test_undetermined_parameters_are_named():
     assert not np.isnan(result.covariance).any()
 
 
-def test_as_many_residuals_as_parameters():
+@pytest.mark.parametrize("weights", [True, np.array([True, True, False])])
+def test_as_many_residuals_as_parameters(weights):
+    target = np.array([1.0, 2.0, 5.0])[: np.size(weights) if np.ndim(weights) else 2]
     with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match="as many residuals as parameters"):
-        result = hhtjax.fit(lambda p: p - jnp.array([1.0, 2.0]), jnp.zeros(2))
+        result = hhtjax.fit(lambda p: jnp.append(p, p[0])[: len(target)] - target, jnp.zeros(2), weights=weights)
     np.testing.assert_allclose(result.params, [1.0, 2.0])
     assert np.isinf(result.standard_errors).all()
+    assert "as many residuals as parameters" in result.summary()
 
 
 DATA = jnp.zeros(5)

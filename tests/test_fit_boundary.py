@@ -22,6 +22,7 @@ def rooted(p):
         (lambda: hhtjax.fit(3, 1.0), TypeError, r"`residuals` must be a function residuals\(params\); received 3"),
         (lambda: hhtjax.fit(lambda p: GOOD, 1.0, "adam"), TypeError, "`optimizer` must be an optax .* received 'adam'"),
         (lambda: hhtjax.fit(lambda p: GOOD, {}), ValueError, "`params0` must hold at least one number; received {}"),
+        (lambda: hhtjax.fit(lambda p: GOOD, np.ones(0)), ValueError, "`params0` must hold at least one number"),
         (lambda: hhtjax.fit(lambda p: GOOD, {"k": 1j}), TypeError, r"`params0\['k'\]` must be a real .* received 1j"),
         (lambda: hhtjax.fit(lambda p: GOOD, {"k": "1"}), TypeError, r"`params0\['k'\]` must be a real .* received '1'"),
         (

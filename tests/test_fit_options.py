@@ -242,8 +242,10 @@ def test_bad_options_are_named(options, error, message):
 def test_bad_starts_and_bounds_are_named():
     with pytest.raises(ValueError, match="bounded: `lower` must be less than upper; received 2 and 1"):
         hhtjax.bounded(2, 1)
-    with pytest.raises(ValueError, match="multistart: `starts` must have one leading axis in all its leaves"):
+    with pytest.raises(ValueError, match="multistart: `starts` must have one leading axis in all leaves"):
         hhtjax.multistart(residuals, TRUE)
+    with pytest.raises(ValueError, match="multistart: `starts` must hold at least one number"):
+        hhtjax.multistart(residuals, jnp.zeros(0))
     with pytest.raises(
         ValueError, match=r"multistart: `starts` must be positive, for its transform; received \[ 1. -1.\]"
     ):

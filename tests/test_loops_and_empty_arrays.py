@@ -46,10 +46,10 @@ def test_they_give_what_plain_jax_gives(force):
 
 @pytest.mark.slow
 def test_a_leaf_of_no_coordinates():
-    """In a long run, in its gradient, and in a sweep; alone it would be no system."""
-    system = hhtjax.System(jnp.ones(2), lambda q, v, t, params: {"a": -params * q["a"], "none": q["none"]})
-    q0 = {"a": jnp.array([1.0, 2.0]), "none": jnp.zeros(0)}
-    v0 = jax.tree.map(jnp.zeros_like, q0)
+    """In a long run, in its gradient, and in a sweep; alone it would be no system. And rotations of no body."""
+    system = hhtjax.System(jnp.ones(2), lambda q, v, t, params: v | {"a": -params * q["a"]})
+    q0 = {"a": jnp.array([1.0, 2.0]), "none": jnp.zeros(0), "turns": jnp.zeros((0, 3, 3))}
+    v0 = {"a": jnp.zeros(2), "none": jnp.zeros(0), "turns": jnp.zeros((0, 3))}
 
     def run(params):
         return hhtjax.simulate(system, hhtjax.hht(), q0, v0, params, dt=0.01, num_steps=80)
@@ -58,6 +58,7 @@ def test_a_leaf_of_no_coordinates():
     assert jnp.isfinite(jax.grad(lambda params: jnp.sum(run(params).q["a"]))(1.0))
     sweep = hhtjax.sweep(system, hhtjax.hht(), q0, v0, 1.0, dts=jnp.array([0.01, 0.02]), duration=0.8, num_samples=40)
     assert sweep.q["none"].shape == (2, 41, 0)
+    assert hhtjax.interpolate(run(1.0), jnp.array([0.123])).q["turns"].shape == (1, 0, 3, 3)
     assert np.allclose(sweep.q["a"][0], run(1.0).q["a"][::2], rtol=1e-12)
 
 

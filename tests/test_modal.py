@@ -123,6 +123,20 @@ def test_proportional_damping_stays_uncoupled_and_local_forces_stay():
     np.testing.assert_allclose(reduced.expand(ours.q), exact.q, atol=1e-9)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_modes_are_uncoupled_but_for_rounding(dtype):
+    """Few of many, free ones, and damped in proportion to M and K; a damper at one end couples them."""
+    K = chain(200).toarray()
+    K[0, 0], K[-1, -1] = -K[0, 1], -K[-1, -2]
+    M, K = np.linspace(1.0, 2.0, 200).astype(dtype), K.astype(dtype)
+    C = (0.01 * K + 0.1 * np.diag(M)).astype(dtype)
+    assert modal_reduction((M, C, K), 5).system.C.shape == (5,)
+    C[0, 0] += 0.1
+    reduced = modal_reduction((M, C, K), 5)
+    assert reduced.system.C.shape == (5, 5)
+    assert reduced.system.C.dtype == reduced.shapes.dtype == dtype
+
+
 def test_under_jit_the_reduced_system_is_data():
     reduced = modal_reduction(LinearSystem(np.ones(4), None, chain(4).toarray(), lambda t, p: p * jnp.ones(4)), 2)
     run = jax.jit(lambda system, q: hhtjax.simulate(system, hhtjax.hht(), q, q, 1.0, dt=0.1, num_steps=3).q)

@@ -83,6 +83,9 @@ def test_windows_follow_the_clock():
     np.testing.assert_allclose(cut.t + cut.begin[:, None], [[0.0, 0.1, 0.2, 0.2], [0.45, 0.5, 0.6, 0.8]])
     np.testing.assert_array_equal(cut.present[0], [[1, 1], [1, 1], [1, 0], [0, 0]])
     np.testing.assert_allclose(cut.y[1, :, 1], [4.5, 5.0, 6.0, 8.0])
+    assert hhtjax.windows([1e9, 1e9 + 1, 1e9 + 2], np.zeros(3), duration=1e-9).present.sum() == 2  # one sample each
+    with pytest.raises(ValueError, match="windows: `t`, `y` and `present` must have equal lengths, not 0"):
+        hhtjax.windows([], [], duration=0.3)
     with pytest.raises(ValueError, match="windows: `y` must be finite, or declared missing"):
         hhtjax.windows(clock, y, duration=0.3)
     with pytest.raises(ValueError, match=r"windows: `t` must increase; received 0.05 at sample 2"):
@@ -104,7 +107,7 @@ def test_bad_records_are_named():
 
     with pytest.raises(ValueError, match="fit: `records` and `starts` must be given together"):
         hhtjax.fit(residuals, GUESS, records=MEASURED)
-    with pytest.raises(ValueError, match=r"fit: `records` and `starts` must have one leading axis; .*\(2,\), \(3,\)"):
+    with pytest.raises(ValueError, match=r"`starts` must have one leading axis in all leaves; .*\(2,\), \(3,\)"):
         hhtjax.fit(residuals, GUESS, records=MEASURED[:2], starts=STARTS)
     with pytest.raises(ValueError, match="fit: `records` must go with Levenberg-Marquardt and without a prior"):
         hhtjax.fit(residuals, GUESS, records=MEASURED, starts=STARTS, prior=hhtjax.Gaussian(0.0, 1.0))

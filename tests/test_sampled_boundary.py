@@ -3,6 +3,7 @@
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import INF, NAN
@@ -74,7 +75,16 @@ def test_the_sample_that_is_not_finite_is_named():
 
 @pytest.mark.parametrize(
     "values",
-    ["sine", None, np.array(["a"] * 4), np.ones(4, object), {"u": VALUES}, np.ones(4, np.float16), np.zeros((4, 0))],
+    [
+        "sine",
+        None,
+        np.array(["a"] * 4),
+        np.ones(4, object),
+        {"u": VALUES},
+        np.ones(4, np.float16),
+        jnp.ones(4, jnp.bfloat16),
+        np.zeros((4, 0)),
+    ],
     ids=repr,
 )
 def test_values_that_are_no_signal_are_named(values):

@@ -67,7 +67,19 @@ def test_sensors_show_a_delayed_signal():
     assert float(slope) == pytest.approx(-2 * 0.3, rel=1e-9)
 
 
+def test_a_rate_is_compared_with_that_of_a_first_order_system():
+    """y' = -k y + t, with y of a frequency that the cutoff passes; nothing is compiled but the residuals."""
+    t = 2.0 + 0.01 * np.arange(400)
+    y = np.sin(6.0 * t)
+    system = hhtjax.FirstOrderSystem(lambda y, t, params: -params * y + t)
+    found = hhtjax.equation_error(system, y[:, None], 0.01, cutoff=4.0, t0=2.0)(3.0)
+    inside = t[25:-25]
+    np.testing.assert_allclose(found[:, 0], 6 * np.cos(6 * inside) + 3 * np.sin(6 * inside) - inside, atol=0.2)
+
+
 def test_bad_input_is_named():
+    with pytest.raises(TypeError, match="equation_error: `system` must be a System, LinearSystem or First"):
+        hhtjax.equation_error(jnp.sin, np.ones((9, 2)), 0.1, cutoff=1.0)
     four_bars = hhtjax.scenes.pendulum.cartesian().system
     with pytest.raises(NotImplementedError, match="equation_error: `system` has a constraint"):
         hhtjax.equation_error(four_bars, np.ones((9, 2)), 0.1, cutoff=1.0)

@@ -27,7 +27,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.analysis.checks import require_real
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import thaw
-from hhtjax.steppers.stepper import State, require_stepper, require_system
+from hhtjax.steppers.stepper import State, begun, require_stepper, require_system
 from hhtjax.systems import kinematics
 from hhtjax.systems.system import FirstOrderSystem, System
 
@@ -190,7 +190,7 @@ def oscillator_matrix(stepper, frequency, damping=0.0) -> jax.Array:
 def at_rest(system, stepper, zero, params, dt):
     """The state of rest, behind the first steps of a stepper that begins with those of another method."""
     v = None if isinstance(system, FirstOrderSystem) else zero
-    state = stepper.init(system, zero, v, params, dt)
+    state = begun("at_rest", system, stepper, zero, v, None, params, dt)
     for _ in range(stepper.first_steps):
         state, _ = stepper.step(system, state, params, dt)
     return state
@@ -247,7 +247,7 @@ def constraint_matrix(stepper) -> jax.Array:
 @jax.jit
 def _constraint(stepper):
     zero = jnp.zeros(1)
-    state = stepper.init(CONSTRAINT, zero, zero, None, 1.0)
+    state = begun("constraint_matrix", CONSTRAINT, stepper, zero, zero, None, None, 1.0)
     return amplification_matrix(CONSTRAINT, stepper, state, dt=1.0)
 
 

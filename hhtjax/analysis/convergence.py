@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import thaw
 from hhtjax.description.presentation import shown
-from hhtjax.steppers.stepper import require_stepper
+from hhtjax.steppers.stepper import begun, require_stepper
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.xla import Programs
 
@@ -97,6 +97,6 @@ def observed_order(
 def _end(system, stepper, q0, v0, params, z0, t0, dt, num_steps):
     """q at the end as a vector; one compilation for all numbers of steps."""
     params = thaw(params)
-    state = stepper.init(system, q0, v0, params, dt, t0, z0)
+    state = begun("observed_order", system, stepper, q0, v0, z0, params, dt, t0)
     state = jax.lax.fori_loop(0, num_steps, lambda _, s: stepper.step(system, s, params, dt)[0], state)
     return ravel_pytree(state.q)[0]

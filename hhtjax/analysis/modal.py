@@ -17,7 +17,8 @@ from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import SYMMETRIC, constant_matrix, is_sparse, require_mass
 
 DENSE = 1000  # rows up to which a sparse problem is solved as a dense one
-UNCOUPLED = 1e-9  # size of what couples modes, relative to their damping, that is rounding
+UNCOUPLED = 1e-9  # size of what couples modes, relative to their damping, that is rounding, with all dtypes
+ROUNDINGS = 100  # as many of the terms that a number is the sum of, too
 SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first that is no eigenvalue
 
 
@@ -92,10 +93,10 @@ def modes(M, K, count=None) -> NormalModes:
         raise ValueError(f"modes: `count` must be at most {n}, the number of coordinates; received {count}.")
     by_lanczos = (is_sparse(M) or is_sparse(K)) and DENSE < n != count
     squares, T, scale = (_by_lanczos if by_lanczos else _by_numpy)(M, K, count)
-    if squares[0] < -1e-9 * scale:
+    if squares[0] < -max(1e-9, ROUNDINGS * _eps(T, M, K)) * scale:
         raise ValueError(f"modes: `K` must be positive semidefinite; received one with frequency^2 = {squares[0]:.4g}.")
     largest = np.take_along_axis(T, np.argmax(np.abs(T), axis=0)[None], axis=0)
-    return NormalModes(np.sqrt(np.maximum(squares, 0)), T * np.where(largest < 0, -1, 1))
+    return NormalModes(np.sqrt(np.maximum(squares, 0)), np.where(largest < 0, -T, T))
 
 
 def modal_reduction(system, count, params=None) -> ModalReduction:
@@ -149,7 +150,7 @@ def modal_reduction(system, count, params=None) -> ModalReduction:
     frequencies, T = modes(mass, stiffness, count)
     reduced = LinearSystem(
         _Projected(T, M) if callable(M) else np.ones(count),
-        C if C is None else _Projected(T, C) if callable(C) else _uncoupled(_project(T, C)),
+        C if C is None else _Projected(T, C) if callable(C) else _uncoupled(T, C),
         _Projected(T, K) if callable(K) else frequencies**2,
         None if load is None else _ProjectedLoad(T, load),
         None if nonlinear is None else _ProjectedForce(T if at is None else T[list(at)], nonlinear),
@@ -221,11 +222,19 @@ def _project(T, A):
     return T.T @ _times(A, T)
 
 
-def _uncoupled(D):
-    """The diagonal, if all the rest is rounding."""
+def _uncoupled(T, C):
+    """T^T C T, or its diagonal, if all the rest is rounding."""
+    C = C if is_sparse(C) else np.asarray(C)
+    D = _project(T, C)
     d = np.diagonal(D)
     rest = np.abs(D - np.diag(d))
-    return np.array(d) if np.all(rest <= UNCOUPLED * np.max(np.abs(d), initial=0)) else D
+    rounding = ROUNDINGS * _eps(T, C) * _project(abs(T), abs(C))
+    return np.array(d) if np.all(rest <= np.maximum(UNCOUPLED * np.max(np.abs(d), initial=0), rounding)) else D
+
+
+def _eps(*matrices):
+    """The coarsest of their roundings."""
+    return max(float(np.finfo(np.result_type(getattr(A, "dtype", float), np.float32)).eps) for A in matrices)
 
 
 def _rows(name, A):

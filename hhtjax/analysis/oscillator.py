@@ -13,7 +13,7 @@ from hhtjax.analysis.amplification import (
     oscillator_roots,
 )
 from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.steppers.stepper import require_stepper
+from hhtjax.steppers.stepper import begun, require_stepper
 
 
 def _principal_rate(caller, stepper, frequency, damping):
@@ -125,7 +125,7 @@ def _overshoot(stepper, c, k):
         W = jnp.sqrt(k)
 
         def step(x):
-            state = stepper.init(OSCILLATOR, x[:1] / W, x[1:], (c, k), 1.0)
+            state = begun("overshoot", OSCILLATOR, stepper, x[:1] / W, x[1:], None, (c, k), 1.0)
             state, _ = stepper.step(OSCILLATOR, state, (c, k), 1.0)
             return jnp.concatenate([W * state.q, state.v])
 

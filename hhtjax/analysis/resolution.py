@@ -8,6 +8,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import thaw
+from hhtjax.steppers.stepper import begun
 
 SAMPLES = 64  # times at which runs are compared; a power of two, so that the coarsest hit a part of them
 FEWEST, ENOUGH, MOST = 8, 1024, 2**20  # steps of the first run, and at least and at most of the last
@@ -74,5 +75,5 @@ def _samples(system, stepper, q0, v0, params, z0, t0, duration, num_steps):
         return state, path.at[i // between].set(ravel_pytree(state.q)[0])  # the last to write is the one on time
 
     q, _ = ravel_pytree(q0)
-    start = stepper.init(system, q0, v0, params, dt, t0, z0), jnp.zeros((SAMPLES, q.size), q.dtype)
-    return jax.lax.fori_loop(0, num_steps, step, start)[1]
+    state = begun("suggest_step_size", system, stepper, q0, v0, z0, params, dt, t0)
+    return jax.lax.fori_loop(0, num_steps, step, (state, jnp.zeros((SAMPLES, q.size), q.dtype)))[1]

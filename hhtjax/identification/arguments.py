@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_function, require_integer
+from hhtjax.checks import require_integer
 from hhtjax.description import freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
@@ -63,11 +63,8 @@ def is_of_optax(optimizer):
     return optax is not None and isinstance(optimizer, optax.GradientTransformation)
 
 
-def check_options(
-    caller, residuals, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress
-):
+def check_options(caller, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress):
     """`Options` with the defaults filled in, or an error that names what is wrong."""
-    require_function(caller, "residuals", residuals, "residuals(params)")
     if not (optimizer is None or optimizer == LEVENBERG_MARQUARDT or is_of_optax(optimizer)):
         raise TypeError(
             f'{caller}: `optimizer` must be an optax optimiser, "{LEVENBERG_MARQUARDT}" or None; '
@@ -93,10 +90,10 @@ def check_parameters(caller, params0, name="params0"):
     """params0 as a pytree of float arrays, functions among them hidden."""
     given, params0 = params0, freeze(params0)
     leaves = jax.tree_util.tree_leaves_with_path(params0) or jax.tree_util.tree_leaves_with_path(given)
-    if not leaves:
-        raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
     for path, leaf in leaves:
         check_real(f"{caller}: `{name}{jax.tree_util.keystr(path)}`", leaf)
+    if not sum(np.size(leaf) for _, leaf in leaves):
+        raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
 
     def as_float(x):
         x = jnp.asarray(x)
@@ -179,12 +176,17 @@ def check_records(caller, records, starts, prior, optimizer):
     if records is None or starts is None:
         raise ValueError(f"{caller}: `records` and `starts` must be given together; received one of them.")
     starts = check_parameters(caller, starts, "starts")
-    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves((records, starts))}
-    if len(counts) != 1 or counts == {()}:
-        raise ValueError(f"{caller}: `records` and `starts` must have one leading axis; received {sorted(counts)}.")
+    require_leading_axis(caller, "`records` and `starts`", (records, starts))
     if optimizer != LEVENBERG_MARQUARDT or prior is not None:
         raise ValueError(f"{caller}: `records` must go with Levenberg-Marquardt and without a prior.")
     return starts
+
+
+def require_leading_axis(caller, names, tree):
+    """An error unless the leaves, of the arguments so named, have a leading axis of one length."""
+    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves(tree)}
+    if len(counts) != 1 or counts == {()}:
+        raise ValueError(f"{caller}: {names} must have one leading axis in all leaves; received {sorted(counts)}.")
 
 
 def check_residuals(caller, residuals, p, *args):

@@ -29,11 +29,11 @@ from hhtjax.description.presentation import all_known, between, shown
 from hhtjax.identification.arguments import check_real, require_prefix
 from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import Stepper, require_stepper
+from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.sparse_system import require_dense
 from hhtjax.systems.system import LinearSystem, System, require_smooth
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
-ON_CONSTRAINT = 1e-6  # largest residual of it
 LOST = 1e3  # distance of an eigenvalue of the steps from that of a mode which does not oscillate in them
 DRIVEN = 64  # steps from t, in which a force that depends on the time has changed
 
@@ -108,8 +108,8 @@ def step_size_bias(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; dt is no positive number; q has another number of
-            coordinates than the mass, or does not meet the constraint; `correct` with a dt in which a mode does not
-            oscillate.
+            coordinates than the mass, or violates a constraint; constraints that depend on each other; `correct` with
+            a dt in which a mode does not oscillate, or without a mode that does.
         NotImplementedError: a system with internal states or rotations.
 
     References:
@@ -137,7 +137,7 @@ def step_size_bias(
     require_smooth("step_size_bias", system)
     require_dense("step_size_bias", system, params)
     matrices = _linear_part(system, params, q, v, t0)
-    _require_on_constraint(system, params, q, t0)
+    _require_on_constraint(system, frozen, q, t0)
     fitted = _rates_of_equations(*matrices)
     s = _rates_of_steps(stepper, dt, *matrices)
     w = np.abs(s)
@@ -146,6 +146,8 @@ def step_size_bias(
     bias = ModeBias(w, -np.real(s) / w, w * dt, np.abs(fitted) ** 2 / w**2 - 1, damping_bias)
     if correct is False:
         return bias
+    if not w.size:
+        raise ValueError("step_size_bias: `params` must let a mode oscillate, for `correct`; none does.")
     if np.any(np.isnan(w)):
         raise ValueError(
             f"step_size_bias: `dt` must let every mode oscillate, for `correct`; received {dt}, in which "
@@ -226,9 +228,9 @@ def _require_coordinates(n, q, v):
 
 def _require_on_constraint(system, params, q, t):
     if system.constraint is not None:
-        off = np.max(np.abs(system.constraint(q, t, params)))
-        if not off <= ON_CONSTRAINT:
-            raise ValueError(f"step_size_bias: `q` must meet the constraint; received one that is {off:.3g} away.")
+        q = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q)
+        rest = jax.tree.map(jnp.zeros_like, q)
+        require_consistent("step_size_bias", system, q, rest, t, params, checked=(("q", "Phi"),))
 
 
 def _rates_of_equations(M, C, K):

@@ -159,7 +159,8 @@ def compare(
     Args:
         fits: {name: `FitResult`, with covariance}, all of the same measurements with the same weights.
         residuals: the function that was fitted, or {name: function}; for errors on segments left out. None: without.
-        folds: how many segments, cut as those of the covariance; each long against the correlation time.
+        folds: how many segments, cut as those of the covariance; each long against the correlation time. Fewer where
+            some would have no residual to judge by.
         absent: the value at which a parameter of nested models has no effect, or {parameter: value}, by the names in
             `FitResult.summary()`, 0 for others, such as a constant in the smaller model's function. Where that model
             holds it fixed, its value is taken. The summary doubts it where only the first of two p values is tiny.
@@ -173,8 +174,8 @@ def compare(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; fewer than two fits; fits without covariance, made inside
-            jit, or with different numbers of observations; residuals not of these fits. NotImplementedError: segments
-            left out of fits with records.
+            jit, or with different numbers of observations; residuals not of these fits; fewer than two segments to
+            judge by. NotImplementedError: segments left out of fits with records.
 
     References:
         Akaike, IEEE Trans. Autom. Control 19 (1974); Schwarz, Ann. Stat. 6 (1978); Rao, Scott, J. Am. Stat. Assoc. 76
@@ -214,8 +215,7 @@ def compare(
         return found
     functions = _check_functions(residuals, fits)
     folds = require_integer("compare", "folds", folds, 2)
-    left = [leave_out(name, fits[name], functions[name], folds, always, options, progress) for name in names]
-    held_out, converged = (np.array(x) for x in zip(*left, strict=True))
+    held_out, converged = leave_out(fits, functions, folds, always, options, progress)
     return found._replace(held_out=held_out, converged=converged)
 
 
@@ -237,9 +237,9 @@ def _check_functions(residuals, fits):
     if functions.keys() != fits.keys():
         raise ValueError(f"compare: `residuals` must be of {', '.join(fits)}; received {', '.join(functions)}.")
     for name, function in functions.items():
-        require_function("compare", "residuals", function, "residuals(params)")
         if fits[name].starts is not None:
             raise NotImplementedError(f"compare: `fits[{name!r}]` has records: no segments of them can be left out.")
+        require_function("compare", "residuals", function, "residuals(params)")
         require_residuals_of(name, fits[name], function)
     return functions
 

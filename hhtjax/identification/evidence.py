@@ -13,9 +13,10 @@ import numpy as np
 from jax.scipy.special import betainc, gammaincc
 
 from hhtjax.identification.arguments import spread_weights
-from hhtjax.identification.sandwich import time_axis
+from hhtjax.identification.sandwich import time_axis, used_up
 
 LAGS = 20  # of the test for white residuals
+LEAST = 5  # samples for each lag
 
 
 class Residuals(NamedTuple):
@@ -55,12 +56,13 @@ def count(residuals: Residuals) -> int:
 
 
 def used_by_starts(result) -> int:
-    """Residuals that the starts of records take: of each record as many as its start has entries, or as there are."""
+    """Residuals that the starts of records take; 0 without."""
     if result.starts is None:
         return 0
-    leaves = jax.tree.leaves(result.starts)
-    present = sum(np.sum(np.reshape(w, (len(leaves[0]), -1)) != 0, axis=1) for w in weights_of(result))
-    return int(np.sum(np.minimum(present, sum(map(np.size, leaves)) // len(leaves[0]))))
+    starts = jax.tree.leaves(result.starts)
+    records = len(starts[0])
+    present = np.concatenate([np.reshape(w, (records, -1)) != 0 for w in weights_of(result)], axis=1)
+    return int(used_up(present, sum(map(np.size, starts)) // records))
 
 
 def design_effect(uncertainty) -> float:
@@ -85,13 +87,13 @@ def whiteness(residuals: Residuals):
 
     Q = n (n + 2) sum_k rho_k^2/(n - k), k = 1 .. lags, is chi-squared with as many degrees of freedom as there are lags
     (Biometrika 65, 1978, 297-303); n - k is the number of pairs, of samples that are present. The Q of all columns are
-    added.
+    added, but for leaves that are no record, of fewer than 5 samples.
     """
-    lags = min(LAGS, min(len(r) for r in residuals.weighted) // 5) if residuals.weighted else 0
-    if lags < 1:
-        return None
+    leaves = zip(residuals.weighted, residuals.present, strict=True)
+    records = [(r, present) for r, present in leaves if len(r) >= LEAST]
+    lags = min([LAGS, *(len(r) // LEAST for r, _ in records)])
     Q, degrees, products, energy = 0.0, 0, 0.0, 0.0
-    for r, present in zip(residuals.weighted, residuals.present, strict=True):
+    for r, present in records:
         n = present.sum(axis=0)
         r = np.where(present, r - r.sum(axis=0) / np.maximum(n, 1), 0)
         square = np.sum(r**2, axis=0)

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from hhtjax.description import freeze
+from hhtjax.identification.evidence import count, residuals_of, used_by_starts
 
 BEYOND = "the loss is flat there, with residuals beyond its bend (`weights` is one over the noise)"
 
@@ -76,26 +77,27 @@ def _phrase(names, direction, values):
     return f"{joined} not along {terms}"
 
 
-def why_undetermined(params, free, uncertainty, num_residuals):
-    """Names of the parameters without a standard error, and why: "the residuals determine a, b only through their
-    product". Nothing, where all have one."""
-    flags = np.asarray(uncertainty.undetermined)
-    names = np.asarray(parameter_names(params))[free]
+def why_undetermined(result):
+    """Names of the parameters of a fit without a standard error, and why: "the residuals determine a, b only through
+    their product". Nothing, where all have one."""
+    believed, free = result.uncertainty, result.free
+    flags = np.asarray(believed.undetermined)
     if not flags.any():
         return [], ""
-    if num_residuals == len(names):
+    names, residuals = np.asarray(parameter_names(result.params))[free], residuals_of(result)
+    s, directions, size = believed.singular_values, believed.directions, sum(r.size for r in residuals.plain)
+    combinations = undetermined_combinations(names, parameter_values(result.params)[free], s, directions, size)
+    why = BEYOND
+    if combinations:
+        why = f"the residuals determine {'; '.join(combinations)}"
+    elif count(residuals) - used_by_starts(result) <= len(names):
         why = "there are as many residuals as parameters, so their variance cannot be estimated"
-    else:
-        values = np.concatenate([np.ravel(x) for x in jax.tree.leaves(freeze(params))])[free]
-        s, directions = uncertainty.singular_values, uncertainty.directions
-        combinations = undetermined_combinations(names, values, s, directions, num_residuals)
-        why = f"the residuals determine {'; '.join(combinations)}" if combinations else BEYOND
     return names[flags].tolist(), why
 
 
-def warn_undetermined(caller, params, free, uncertainty, num_residuals, stacklevel):
+def warn_undetermined(caller, result, stacklevel):
     """An `IdentifiabilityWarning` that names parameters and combinations; silent where all are determined."""
-    names, why = why_undetermined(params, free, uncertainty, num_residuals)
+    names, why = why_undetermined(result)
     if names:
         message = f"{caller}: no standard error for {', '.join(names)}: {why}."
         warnings.warn(message, IdentifiabilityWarning, stacklevel=stacklevel)

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_function, require_number
 from hhtjax.description import is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
@@ -26,6 +25,7 @@ from hhtjax.identification.arguments import (
     check_transforms,
     check_weights,
     first_bad,
+    require_leading_axis,
 )
 from hhtjax.identification.identifiability import warn_undetermined
 from hhtjax.identification.problem import Data, solve
@@ -94,6 +94,9 @@ def fit(
     and that an array has changed in place or a name been bound anew goes unnoticed. For other data make another
     function, `lambda params: residuals(params, data)`, or pass them as `records`.
 
+    Derivatives of an estimate in what the residuals read, by `jax.jacfwd` alone, are those of the iterations that found
+    it: nearly its own, but 0 where the fit starts at the estimate.
+
     Residuals may simulate under error control, `dt=adaptive(...)`, in `sweep` too: Levenberg-Marquardt freezes the
     steps, fits, and chooses again, until the estimates stay to a tenth of their standard errors; `result.choices` tells
     how often. Tolerances that leave more than the noise end as "the estimates change whenever steps are chosen anew".
@@ -121,12 +124,13 @@ def fit(
     >>> round(float(result.params["a"]), 3), round(float(result.params["rate"]), 3)
     (3.0, 2.0)
     """
+    of_records = records is not None or starts is not None
+    signature = "residuals(params, start, record)" if of_records else "residuals(params)"
+    require_function("fit", "residuals", residuals, signature)
     params0 = check_parameters("fit", params0)
-    options = check_options(
-        "fit", residuals, params0, optimizer, transforms, loss, max_iterations, covariance, segments, progress
-    )
+    options = check_options("fit", params0, optimizer, transforms, loss, max_iterations, covariance, segments, progress)
     data = _check_data("fit", params0, scale, weights, prior, tolerance)
-    if records is not None or starts is not None:
+    if of_records:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
     result = or_plain(partial(solve, residuals, options, params0, data))
     result = result._replace(params=thaw(result.params))
@@ -181,15 +185,12 @@ def multistart(
     >>> round(float(found.best.params), 6), int(jnp.sum(found.all.cost < 1e-9))
     (3.0, 1)
     """
+    require_function("multistart", "residuals", residuals, "residuals(params)")
     starts = check_parameters("multistart", starts, "starts")
-    counts = {jnp.shape(x)[:1] for x in jax.tree.leaves(starts)}
-    if len(counts) != 1 or counts == {()}:
-        raise ValueError(
-            f"multistart: `starts` must have one leading axis in all its leaves; received {sorted(counts)}."
-        )
+    require_leading_axis("multistart", "`starts`", starts)
     first = jax.tree.map(lambda x: x[0], starts)
     options = check_options(
-        "multistart", residuals, first, optimizer, transforms, loss, max_iterations, covariance, segments, False
+        "multistart", first, optimizer, transforms, loss, max_iterations, covariance, segments, False
     )
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
@@ -219,7 +220,6 @@ def _finished(caller, result, weights):
     if code == NO_INFLUENCE:
         raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")
     if result.uncertainty is not None:
-        size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
-        warn_undetermined(caller, result.params, result.free, result.uncertainty, size, stacklevel=4)
+        warn_undetermined(caller, result, stacklevel=4)
     done = int(result.iterations) + 1
     return result._replace(history=jax.tree.map(lambda x: x[:done], result.history), segments=int(result.segments))

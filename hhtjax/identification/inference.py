@@ -31,7 +31,7 @@ class Score(NamedTuple):
         cost_drop: share of the cost that it would take away.
         estimate: one Gauss-Newton step.
 
-    All are 0 for a term that the fitted parameters make up for.
+    All are 0 for a term that the fitted parameters make up for, and where no residual is left.
     """
 
     names: list
@@ -73,7 +73,7 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     >>> dict(zip(found.names, (found.statistic > 10.8).tolist()))
     {'cube': True, 'square': False}
     """
-    require_function("score_test", "residuals", residuals, "residuals(params, candidates)", count=2)
+    require_function("score_test", "residuals", residuals, "residuals(params, candidates)")
     if isinstance(params, FitResult):
         raise TypeError("score_test: `params` must be those of a fit, result.params; received the FitResult.")
     segments = require_integer("score_test", "segments", segments, 2)
@@ -91,11 +91,11 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     by_time = (X * r[:, None])[in_time(shapes)]
     scores: Any = sum(part.sum(axis=1) for part in in_segments(by_time, [math.prod(x) for x in shapes], segments))
     total, square = scores.sum(axis=0), jnp.sum(X**2, axis=0)
-    variance = jnp.sum(scores**2, axis=0)
+    variance, left = jnp.sum(scores**2, axis=0), jnp.sum(r**2)
     return Score(
         parameter_names(candidates),
         np.asarray(total**2 / jnp.where(variance == 0, 1, variance)),
-        np.asarray(total**2 / jnp.where(square == 0, 1, square) / jnp.sum(r**2)),
+        np.asarray(total**2 / jnp.where(square * left == 0, 1, square * left)),
         np.asarray(-total / jnp.where(square == 0, 1, square)),
     )
 
@@ -108,7 +108,7 @@ class Profile(NamedTuple):
         values: of the parameter, (values,).
         cost: the least one with the parameter held there, (values,).
         deviance: 2 (cost - that of the fit)/variance, (values,), scaled so that its parabola is that of the standard
-            error; 3.84 bounds the 95 % interval.
+            error; 3.84 bounds the 95 % interval. NaN for a parameter without one.
     """
 
     values: Any
@@ -201,7 +201,7 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
     >>> bool(hhtjax.identification.prediction_errors(lambda p: 3 * p, result) == 3 * result.standard_errors)
     True
     """
-    require_function("prediction_errors", "predict", predict, "predict(params)", count=1)
+    require_function("prediction_errors", "predict", predict, "predict(params)")
     require_number("prediction_errors", "noise", noise, lambda x: x >= 0, "be 0 or more")
     _uncertainty("prediction_errors", result)
     x, unravel = ravel_pytree(freeze(result.params))

@@ -42,17 +42,34 @@ def require_residuals_of(name, result, function):
         )
 
 
-def leave_out(name, result, function, folds, always, options, progress):
-    """rms of each segment by the parameters fitted to the others, and whether these fits converged."""
+def leave_out(fits, functions, folds, always, options, progress):
+    """For each fit, and each segment, what `_leave_out` says: two arrays."""
+    left = [_leave_out(name, fits[name], functions[name], folds, always, options, progress) for name in fits]
+    segments = sorted({len(errors) for errors, _ in left})
+    if len(segments) > 1 or segments[0] < 2:
+        raise ValueError(
+            "compare: `folds` must leave two segments or more with residuals to judge by, as many in all fits; "
+            f"received {folds}, which leaves {', '.join(map(str, segments))}."
+        )
+    errors, converged = zip(*left, strict=True)
+    return np.array(errors), np.array(converged)
+
+
+def _leave_out(name, result, function, folds, always, options, progress):
+    """rms of each segment by the parameters fitted to the others, and whether these fits converged.
+
+    A segment without a residual to judge by is none: few residuals make fewer segments than `folds`.
+    """
     weights = spread_weights("compare", result.weights, result.residual)
     always = spread_weights("compare", False if always is None else always, result.residual, "always")
     structure = jax.tree.structure(freeze(result.params))
     structured, errors, converged = jax.tree.structure(result.residual), [], []
-    for fold in range(folds):
+    judges = [np.asarray((w != 0) & (y == 0)) for w, y in zip(weights, always, strict=True)]
+    cuts = [[_segment(x.shape, folds, fold) & x for x in judges] for fold in range(folds)]
+    cuts = [out for out in cuts if any(map(np.any, out))]
+    for number, out in enumerate(cuts, 1):
         if progress:
-            overwrite(f"compare: {name}, segment {fold + 1} of {folds} left out", last=fold + 1 == folds)
-        out = [_segment(w.shape, folds, fold) for w in weights]
-        out = [x & ~np.asarray(y, bool) for x, y in zip(out, always, strict=True)]
+            overwrite(f"compare: {name}, segment {number} of {len(cuts)} left out", last=number == len(cuts))
         kept = [np.where(x, 0, w) for x, w in zip(out, weights, strict=True)]
         again = fit(
             function,
@@ -65,6 +82,6 @@ def leave_out(name, result, function, folds, always, options, progress):
         left = [np.where(x, w, 0) for x, w in zip(out, weights, strict=True)]
         judged = residuals_of(again._replace(weights=structured.unflatten(left)))
         square = sum(np.sum(r**2) for r in judged.weighted)
-        errors.append(math.sqrt(square / max(count(judged), 1)))
+        errors.append(math.sqrt(square / count(judged)))
         converged.append(bool(again.converged))
     return errors, converged

@@ -53,9 +53,9 @@ def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
     """
     t, y = np.asarray(t, float), np.asarray(y, float)
     present = np.full(y.shape, True) if present is None else np.asarray(present, bool)
-    if t.ndim != 1 or not (len(t) == len(y) == len(present)) or present.shape != y.shape:
+    if t.ndim != 1 or t.size == 0 or t.shape != y.shape[:1] or present.shape != y.shape:
         raise ValueError(
-            "windows: `t`, `y` and `present` must have equal lengths, and `present` the shape of y; received "
+            "windows: `t`, `y` and `present` must have equal lengths, not 0, and `present` the shape of y; received "
             f"{t.shape}, {y.shape}, {present.shape}."
         )
     falls = np.flatnonzero(np.diff(t) <= 0)
@@ -66,7 +66,7 @@ def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
         raise ValueError("windows: `y` must be finite, or declared missing by `present`; received NaN or inf.")
     require_number("windows", "duration", duration, lambda x: x > 0, "be positive")
     first = [0]
-    while (following := int(np.searchsorted(t, t[first[-1]] + duration * (1 - 1e-9)))) < len(t):
+    while (following := max(first[-1] + 1, int(np.searchsorted(t, t[first[-1]] + duration * (1 - 1e-9))))) < len(t):
         first.append(following)
     if len(first) == 1:
         raise ValueError(f"windows: `duration` must be less than the record's, {t[-1] - t[0]}; received {duration}.")

@@ -18,7 +18,7 @@ from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.rounds import in_rounds
-from hhtjax.identification.sandwich import LEAST, count_segments, in_time, uncertainty, variance_inflation
+from hhtjax.identification.sandwich import LEAST, count_segments, in_time, uncertainty, used_up, variance_inflation
 from hhtjax.runs.freezing import chooses_steps, with_steps_for
 from hhtjax.xla import Programs
 
@@ -195,8 +195,7 @@ def _solve_records(residuals, options, coordinates, data, limits):
     cost = problem.objective.cost(best.r.ravel())
     J, pull, bend = problem.free_of_own(best)
     of_pull = jax.tree.leaves(jax.vmap(unravel)(pull.reshape(w.shape)))
-    there = jnp.sum(w != 0, axis=1)
-    present = jnp.sum(there - jnp.minimum(there, own0.shape[1]))  # a start uses up as many residuals as it has entries
+    present = jnp.sum(w != 0) - used_up(w != 0, own0.shape[1])
     whole = w.shape[1]
     block = whole if count_segments([w.size], options.segments, whole) >= max(LEAST, p + 1) else 1
     ended = x, cost, history, iterations, code, choices, residual, starts

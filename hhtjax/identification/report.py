@@ -114,8 +114,7 @@ def _about_estimates(result, names):
         worth, own = 1 + np.asarray(believed.degrees), names[result.free]
         few = [i for i in np.argsort(worth)[:MOST_PAIRS] if worth[i] < result.segments / 2]
         remarks[0] += f"; worth {', '.join(f'{worth[i]:.0f} for {own[i]}' for i in few)}" if few else ""
-    size = sum(np.size(x) for x in jax.tree.leaves(result.residual))
-    unknown, why = why_undetermined(result.params, result.free, believed, size)
+    unknown, why = why_undetermined(result)
     if unknown:
         remarks.append(f"undetermined: {', '.join(unknown)}: {why}")
     if bound := names[_at_bound(result)].tolist():

@@ -75,6 +75,14 @@ def correlation(covariance):
     return jnp.where(eye == 1, eye, covariance / jnp.outer(safe, safe))
 
 
+def used_up(present, entries):
+    """How many residuals the starts of records take: of each as many as a start has entries, or as there are.
+
+    present: (records, m), whether a residual is there; of NumPy or JAX.
+    """
+    return present.sum(axis=1).clip(max=entries).sum()
+
+
 def _length(n, segments, block):
     """Of each of at most `segments` equal parts of n rows, of which `block` after another stay together."""
     return -(-n // (segments * block)) * block

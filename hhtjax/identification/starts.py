@@ -15,16 +15,24 @@ from hhtjax.identification.result import FitResult
 from hhtjax.systems.band_limited import band_limited_motion
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.sampled import Sampled, sampled
-from hhtjax.systems.system import System, require_smooth
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_smooth, require_system
 
 ARGUMENTS = set(inspect.signature(fit).parameters) - {"params0"}
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
 
 def equation_error(
-    system: System, values: Any, dt: Any = None, cutoff: Any = None, t0: float = 0.0, *, times: Any = None
+    system: System | LinearSystem | FirstOrderSystem,
+    values: Any,
+    dt: Any = None,
+    cutoff: Any = None,
+    t0: float = 0.0,
+    *,
+    times: Any = None,
 ) -> Callable[[Any], Any]:
     """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
+
+    Of a `FirstOrderSystem` y' - f(y, t, params), for a measured y.
 
     Nothing is simulated, and most parameters enter linearly: so the fit converges from anywhere, and its estimate is a
     start for the fit through the simulation. It is no more than that, because noise and filter bias it.
@@ -42,8 +50,8 @@ def equation_error(
         A function of params, whose result is (samples without both ends, n), in units of force.
 
     Raises:
-        TypeError, ValueError: as `band_limited_motion` and `sampled`; no samples between the ends. NotImplementedError:
-            a system with constraints or internal states.
+        TypeError, ValueError: what is no system; as `band_limited_motion` and `sampled`; no samples between the ends.
+        NotImplementedError: a system with constraints, internal states or dry friction.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -53,6 +61,7 @@ def equation_error(
     >>> f"{float(found.params['k']):.1f} {float(found.params['c']):.1f}"
     '9.0 0.2'
     """
+    require_system("equation_error", system)
     if system.constraint is not None:
         raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
     if system.internal is not None:
@@ -75,8 +84,8 @@ def equation_error(
     def residuals(params):
         def one(q, v, a, t):
             flat, x, rate = flatten("equation_error", system, q, v, t, params)
-            acceleration, _ = ravel_pytree(a)
-            return flat.inertia(x, acceleration, params) - flat.force(x, rate, t.astype(x.dtype), params)
+            known = flat.force(x, rate, t.astype(rate.dtype), params)
+            return flat.inertia(x, ravel_pytree(a if flat.positions else v)[0], params) - known
 
         return jax.vmap(one)(*inside)
 
@@ -124,7 +133,7 @@ def fit_progressively(
     >>> [round(float(hhtjax.fit_progressively(problem_at, 1.5, h).params), 3) == 3.0 for h in ([600], [20, 600])]
     [False, True]
     """
-    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)", count=2)
+    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)")
     try:
         horizons = list(horizons)
     except TypeError:

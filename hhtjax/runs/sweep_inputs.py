@@ -261,7 +261,7 @@ def _require_consistent(system, data, mapped, t0):
         if every is None:
             return
         found = distances(every, data[0].redundant)
-        worst |= {int(np.argmax(relative)) for _, _, relative in found}
+        worst |= {int(np.argmax(relative)) for _, _, relative, _ in found}
     for i in sorted(worst):
         stepper, q0, v0, params, z0 = _member(data, mapped, i)
         require_consistent(f"sweep: member {i}", system, q0, v0, t0, params, stepper.redundant, z0)

@@ -27,11 +27,11 @@ def linear_part(method, system, params, dt):
     local = system.local
     if method.options.solve is not None:
         return None
-    if local is None:
-        kept = system.linear and system.friction is not None
-        return Constant(step_matrix(method, system, params, dt)) if kept else None
-
-    return with_local(step_matrix(method, local.linear, params, dt), local, params)
+    if local is not None:
+        return with_local(step_matrix(method, local.linear, params, dt), local, params)
+    if system.linear and system.friction is not None:
+        return Constant(step_matrix(method, system, params, dt))
+    return None
 
 
 def with_local(A, local, params):

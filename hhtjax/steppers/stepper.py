@@ -171,11 +171,7 @@ class Stepper(Description):
 
     def init(self, system, q0, v0, params, dt, t0=0.0, z0=None) -> State:
         """State at t0, from position q0, velocity v0 (None for a `FirstOrderSystem`) and internal states z0."""
-        q0, v0, z0 = initial_values("init", system, q0, v0, z0)
-        require_capable("init", system, self, q0, v0)
-        flat, q, v = flatten("init", system, q0, v0, t0, params, z0)
-        dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
-        return _unravel(flat, self.astype(q.dtype).begin(flat, q, v, t0, held.before(params, t0, dt), dt))
+        return begun("init", system, self, *initial_values("init", system, q0, v0, z0), params, dt, t0)
 
     def step(self, system, state, params, dt) -> tuple[State, Info]:
         """State one step dt after `state`, and what the step tells about itself."""
@@ -185,6 +181,14 @@ class Stepper(Description):
         step = held.bind(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
         state, info = step(State(state.t, q, v, w, a, state.L, state.memory, friction=state.friction))
         return _unravel(flat, state), info
+
+
+def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
+    """What `Stepper.init` makes of checked initial values."""
+    require_capable(caller, system, stepper, q0, v0)
+    flat, q, v = flatten(caller, system, q0, v0, t0, params, z0)
+    dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
+    return _unravel(flat, stepper.astype(q.dtype).begin(flat, q, v, t0, held.before(params, t0, dt), dt))
 
 
 def require_stepper(caller, stepper):

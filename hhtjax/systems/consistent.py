@@ -12,6 +12,7 @@ from jax import lax
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import all_concrete, known_now, thaw
 from hhtjax.description.presentation import shown
+from hhtjax.numerics.elimination import diagonal
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, solve_map
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import (
@@ -29,6 +30,9 @@ from hhtjax.xla import Programs
 
 MAX_ITERATIONS = 50
 CONSISTENT = 1e-6  # distance of initial values from consistent ones that passes, beside 1 + |q|, each coordinate
+SMALL = 1e-3  # of a mechanism's size, if that is so small that the former does not tell
+ROUNDINGS = 1000  # of q, which nobody asks about
+CHECKED = ("q0", "Phi"), ("v0", "dPhi/dt")
 
 
 @shown
@@ -159,7 +163,7 @@ def examine(system, q0, v0, t0, params, z0):
 
 def distances(examined, redundant):
     """For Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not, in the coordinate that
-    is farthest, and in that which is farthest beside its own size; by NumPy, which has nothing to compile."""
+    is farthest, in that which is farthest beside its own size, and in each; by NumPy, which has nothing to compile."""
     M, B, both, sizes = jax.tree.map(np.asarray, examined)
     n, end = M.shape[-1], M.shape[-1] + B.shape[-2]
     A = np.zeros((*M.shape[:-2], end, end), M.dtype)
@@ -167,7 +171,7 @@ def distances(examined, redundant):
     for x, size in zip(both, sizes, strict=True):
         b = np.concatenate([np.zeros_like(size), x], axis=-1)
         away = np.abs(_solved(A, b, n, redundant)[..., :n])
-        yield tuple(np.max(y, axis=-1) for y in (np.abs(x), away, away / (1 + size)))
+        yield *(np.max(y, axis=-1) for y in (np.abs(x), away, away / (1 + size))), away
 
 
 @np.errstate(all="ignore")
@@ -189,17 +193,49 @@ def _solved(A, b, n, redundant):
         return np.stack([_solved(*one, n, redundant) for one in zip(A, b, strict=True)])
 
 
-def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None):
-    """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass."""
+def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None, checked=CHECKED):
+    """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass.
+
+    checked: what the caller names q0, and v0 if it is to be looked at, and what they violate.
+    """
     examined = known_now(examine, system, q0, v0, t0, params, z0)
     if examined is None:
         return
     if redundant is None:
         require_independent(caller, examined[1])
     found = distances(examined, redundant)
-    for name, meaning, (violated, distance, relative) in zip(("q0", "v0"), ("Phi", "dPhi/dt"), found, strict=True):
-        if not relative <= CONSISTENT:
+    for (name, meaning), (violated, distance, relative, away) in zip(checked, found, strict=False):
+        small = relative <= CONSISTENT
+        if not small or (meaning == "Phi" and _is_far(examined, away, (system, q0, v0, t0, params, z0))):
+            beside = ", which is much in so small a mechanism" if small else ""
             raise ValueError(
                 f"{caller}: `{name}` violates the constraint: max|{meaning}| = {violated:.3g}, {distance:.3g} away "
-                "from consistent values; hhtjax.consistent_initial gives them."
+                f"from consistent values{beside}; hhtjax.consistent_initial gives them."
             )
+
+
+def _is_far(examined, away, start):
+    """Whether a displacement of this size turns a constraint's gradient by more than SMALL: the size of a mechanism is
+    in nothing but that. Asked of what is more than rounding."""
+    _, B, _, (sizes, _) = examined
+    if np.all(away <= ROUNDINGS * np.finfo(B.dtype).eps * (1 + sizes)):
+        return False
+    found = known_now(_turns, *start)
+    assert found is not None  # as what was examined
+    turns, d = found
+    return bool(np.any(turns * np.max(np.where(B == 0, 0, np.sqrt(d) * away), axis=1) > SMALL))
+
+
+@Programs
+def _turns(system, q0, v0, t0, params, z0):
+    """By how much a displacement of size 1 turns the gradient of each constraint, in the norm of diag(M), and that."""
+    params = thaw(params)
+    flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
+    t = jnp.asarray(t0).astype(q.dtype)
+    d = diagonal(flat.mass(q, params))
+    d = jnp.where(d == 0, 1, d)
+    unit = flat.with_ones(1 / jnp.sqrt(d))
+    uneven = np.where(np.arange(flat.size) % 2, -1, 1) * (0.75 + 0.618034 * np.arange(flat.size) % 0.5)
+    along = flat.rate(q, unit * jnp.asarray(uneven, q.dtype))
+    B, change = (x * unit[None, :] for x in jax.jvp(lambda q: jacobian(flat, q, t, params), (q,), (along,)))
+    return jnp.linalg.norm(change, axis=1) / jnp.linalg.norm(B, axis=1), d

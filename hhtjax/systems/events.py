@@ -65,7 +65,7 @@ class Event(Description):
         if self.reset is not None and not isinstance(self.reset, Impact):
             require_function("Event", "reset", self.reset, "reset(...)")
         if self.switch is not None:
-            require_function("Event", "switch", self.switch, "switch(params)", count=1)
+            require_function("Event", "switch", self.switch, "switch(params)")
         if not isinstance(self.terminal, bool):
             raise TypeError(f"Event: `terminal` must be True or False; received {self.terminal!r}.")
 

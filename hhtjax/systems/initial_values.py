@@ -99,7 +99,7 @@ def _require_rotations(where, R):
         return
     R = np.asarray(R)
     tolerance = max(ORTHOGONAL, 100 * np.finfo(R.dtype).eps) if R.dtype.kind == "f" else ORTHOGONAL
-    error = np.max(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)))
+    error = np.max(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)), initial=0)
     if error > tolerance:
         raise ValueError(
             f"{where} must be a rotation, because its velocity has 3 components; received a matrix R whose "

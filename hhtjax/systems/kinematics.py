@@ -35,7 +35,7 @@ def layout(q0, v0):
     blocks, nq, nv = [], 0, 0
     for R, Om in zip(jax.tree.leaves(q0), jax.tree.leaves(v0), strict=True):
         q, v = slice(nq, nq + R.size), slice(nv, nv + Om.size)
-        blocks.append(Block(is_rotation(R.shape, Om.shape), q, v))
+        blocks.append(Block(R.size > 0 and is_rotation(R.shape, Om.shape), q, v))
         nq, nv = q.stop, v.stop
     return tuple(blocks) if any(block.is_rotation for block in blocks) else ()
 

@@ -89,7 +89,7 @@ def constant_matrix(caller, name, received, keep=False):
         value = value.astype(float)
     if value.ndim == 0:
         value = value.reshape(1)
-    if value.ndim not in (1, 2) or value.shape[0] != value.shape[-1]:
+    if value.ndim not in (1, 2) or value.shape[0] != value.shape[-1] or not value.size:
         raise ValueError(
             f"{caller}: `{name}` must have shape (n, n), or (n,) for a diagonal; received shape {value.shape}."
         )

@@ -133,7 +133,7 @@ def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
     if order not in (0, 1, 3) or isinstance(order, bool):
         raise ValueError(f"sampled: `order` must be 0 (held), 1 (linear) or 3 (cubic); received {order!r}.")
     values = values if is_array(values) else np.asarray(values)
-    if not is_real(values) or values.dtype == jnp.float16:
+    if not is_real(values) or values.dtype in (jnp.float16, jnp.bfloat16):
         raise TypeError(f"sampled: `values` must be real numbers; received an array of {values.dtype}.")
     values = jnp.asarray(values)
     if not jnp.issubdtype(values.dtype, jnp.floating):
