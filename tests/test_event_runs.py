@@ -51,6 +51,13 @@ def test_resting_contact_fails_by_name():
     assert np.nanmin(run.q) > -1e-9
 
 
+def test_a_guard_that_is_no_number_fails_by_name():
+    root = Event(lambda q, v, t, p: jnp.sqrt(q[0]), terminal=True)
+    run = simulate(BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": G}, dt=0.01, num_steps=100, events=[root])
+    message = "step 46 (to t = 0.46) failed: q and v are numbers, but not the guard of event 0"
+    check_message(SimulationError, message, run.check)
+
+
 def test_a_corner_fails_by_name():
     walls = [Event(lambda q, v, t, p, i=i: q[i], impact(0.5)) for i in range(2)]
     free = System(jnp.ones(2), lambda q, v, t, p: 0 * q)

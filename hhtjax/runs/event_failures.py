@@ -1,6 +1,6 @@
 """What may go wrong at an event, as data and in words."""
 
-FINE, MANY, STAYS, ALONG, CORNER, DIFFER = range(6)
+FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER = range(7)
 EVENTS = {  # what it is, before the number of the event, and what to do about it
     MANY: (
         "more than max_events in a step, the first of them event",
@@ -23,5 +23,9 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
     DIFFER: (
         "the runs that extrapolate joins do not meet the same events, the first of them event",
         "Take a smaller dt, or leave extrapolate out",
+    ),
+    NO_NUMBER: (
+        "q and v are numbers, but not the guard of event",
+        "A guard must be a number beyond its zero, too: q, not sqrt(q)",
     ),
 }

@@ -15,7 +15,7 @@ from jax import lax
 
 from hhtjax.description import freeze, thaw
 from hhtjax.numerics.seldom import choose, if_any, seldom
-from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, STAYS
+from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NO_NUMBER, STAYS
 from hhtjax.runs.event_log import row_of
 from hhtjax.runs.event_parts import Met, Part
 from hhtjax.runs.loop import resized_step
@@ -31,13 +31,14 @@ ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, qua
 
 class Found(NamedTuple):
     """Of each event: whether it falls into the part of a step, where about (0 to 1), before where, whether it only
-    touches there, whether the motion stays beyond it, and how large the guard is."""
+    touches there, whether the motion stays beyond it, whether it is no number, and how large the guard is."""
 
     hit: Any
     place: Any
     limit: Any
     touches: Any
     stays: Any
+    unknown: Any
     size: Any
 
 
@@ -45,7 +46,7 @@ def asks(ways, s, s1, params, h):
     """Whether an event may fall into the step from s to s1: no more than a look at both ends, in few operations."""
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in lax.stop_gradient((s, s1)))
     noted = jnp.asarray(ways.events.noted)
-    below = (g1 <= 0) & (~noted | (g0 > 0))
+    below = ~(g1 > 0) & (~noted | (g0 > 0))
     cross_below = g0 * (d1 - d0) <= d0 * (g1 - g0 - d1 * h)  # tangents at both ends; a division is dear
     return jnp.any(below | ((d0 < 0) & (d1 > 0) & cross_below))
 
@@ -99,6 +100,7 @@ def meet_or_flag(ways, now, going, number, h, params):
     found = look(ways, part, params, h)
     here = going & jnp.any(found.hit)
     part = flag(part, going & ~here, STAYS, found.stays)
+    part = flag(part, going & ~here, NO_NUMBER, found.unknown)
     part = flag(part, here & (number == ways.max_events), MANY, found.hit & ~found.touches)
     return seldom(partial(meet, ways), here & (number < ways.max_events), (part, noted), found, h, params)
 
@@ -151,7 +153,8 @@ def look(ways, part, params, h):
     first = jnp.zeros_like(g0), lowest, lowest / 2, jnp.full_like(part.rest, jnp.inf), 0
     place = lax.while_loop(unfinished, improve, first)[2]
     stays = (g1 < 0) & ~hit & ~left & ~noted
-    return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, jnp.abs(g0) + jnp.abs(g1))
+    unknown = jnp.isnan(g1) & jnp.all(jnp.isfinite(part.end.q)) & jnp.all(jnp.isfinite(part.end.v))
+    return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, unknown, jnp.abs(g0) + jnp.abs(g1))
 
 
 def meet(ways, now, found, h, params):

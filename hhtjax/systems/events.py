@@ -25,9 +25,10 @@ class Event(Description):
     """Something that happens where a guard falls to zero: `simulate(..., events=[Event(...)])`.
 
     Args:
-        guard: g, `guard(q, v, t, params)` -> a number, positive where the motion is allowed; smooth. It counts where it
-            falls from positive to zero, not where it rises: for the other direction give -g, for both a mode that turns
-            the sign, see `switch`. With internal states z stands behind v; of a `FirstOrderSystem` guard(y, t, params).
+        guard: g, `guard(q, v, t, params)` -> a number, positive where the motion is allowed, and negative beyond; smooth.
+            It counts where it falls from positive to zero, not where it rises: for the other direction give -g, for
+            both a mode that turns the sign, see `switch`. With internal states z stands behind v; of a
+            `FirstOrderSystem` guard(y, t, params).
         reset: what the velocity becomes, `reset(q, v, t, params)` -> a pytree like v; or `impact(restitution)`. Of a
             `FirstOrderSystem` what y becomes. By default nothing changes. q cannot: it has to be continuous.
         switch: what the params become, `switch(params)`, of the same structure, shapes and dtypes. So a force that
