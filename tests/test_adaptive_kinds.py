@@ -81,7 +81,7 @@ def test_steps_end_where_held_inputs_jump(method, name):
 
 @pytest.mark.slow
 def test_a_batch_takes_the_steps_of_its_members():
-    """To the last digit, through 39 jumps: from one to the next a difference in rounding would grow tenfold."""
+    """To the last digit, through 39 jumps: a difference in rounding would grow with each."""
     pattern, rtol = jnp.sign(jnp.sin(jnp.arange(40.0) ** 2)), jnp.logspace(-4, -2, 16)
     inputs = jax.vmap(lambda x: {"u": hhtjax.sampled(x * pattern, 0.07, order=0)})(jnp.linspace(3.0, 30.0, rtol.size))
     start, times = (SYSTEM, METHODS["hht"], *START), [1.0, 2.8]
