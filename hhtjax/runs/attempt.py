@@ -159,8 +159,8 @@ def is_walking(walk, end):
 def next_end(trial, params, walk):
     """The next step, and the time at which it ends: that of the walk, or one or two halves, to the end, or a jump.
 
-    Without rounding: what is left until a jump, less than the steps, and halved, would differ several times as much between
-    a run and a batch as the steps before, and so on from jump to jump.
+    Without rounding: what is left until a jump, less than the steps, and halved, would differ between a run and a batch
+    by more than the steps before, and so on from jump to jump.
     """
     t, end = walk.state.t, trial.end
     h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
