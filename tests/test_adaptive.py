@@ -271,7 +271,7 @@ def test_the_error_of_the_whole_run(references):
     """Of a resolved motion it is stated to a tenth; where no estimate of a step sees it, as here, `check` does."""
     found = controlled("double pendulum", METHODS["hht"], 1e-3, verify=True)
     found.check()
-    assert (found.error.shape, found.error[0]) == ((SAMPLES + 1,), 0)
+    assert (found.error.shape, found.error[0], found.failed) == ((SAMPLES + 1,), 0, False)
     true = float(np.max(abs(found.q[1:] - references["double pendulum"])))
     assert float(np.max(found.error)) == pytest.approx(true, rel=0.1)
     assert float(found.allowed) == pytest.approx(10 * (1e-3 * float(np.max(abs(found.q))) + 1e-6))
@@ -286,7 +286,7 @@ def test_the_error_of_the_whole_run(references):
             hhtjax.SimulationError, match=r"at t = 0.\d+ the error of the run is 0.01\d+, by a finer run"
         ):
             run.check()
-        assert 0.1 < np.max(run.error) < 0.3
+        assert 0.1 < float(np.max(run.error)) * bool(run.failed) < 0.3
         programs.add((run_recorded.number(), chosen_steps.number()))
     assert len(programs) == 1
 

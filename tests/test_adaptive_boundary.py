@@ -60,6 +60,7 @@ def test_traced_times_that_do_not_increase_are_named():
 
 WRONG = {
     "no times": ({}, {"times": None}, "simulate: with dt=adaptive(...), give `times`"),
+    "the start": ({}, {"times": [0.0, 1.0]}, "Leave t0 out: the start is saved in any case."),
     "times back": ({}, {"times": [1.0, 0.5]}, "simulate: `times` must be strictly increasing"),
     "steps too": ({}, {"num_steps": 4}, "simulate: with dt=adaptive(...), leave `num_steps` out; received 4."),
     "extrapolate": ({}, {"extrapolate": 2}, "simulate: with dt=adaptive(...), leave `extrapolate` out; received 2."),

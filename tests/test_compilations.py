@@ -11,6 +11,7 @@ from descriptions import DESCRIPTIONS, ONE, TWO, lagrangian, pull, run
 
 import hhtjax
 from hhtjax import LinearSystem, System
+from hhtjax.runs.choose import Steps, trimmed
 from hhtjax.scenes import double_pendulum
 
 # ---------------------------------------------------------------------------------------------- jit
@@ -215,3 +216,12 @@ def test_both_solves_of_a_step_are_one_traced_function():
     solves = [eqn.params["jaxpr"] for eqn in zoo.everywhere(step.jaxpr) if eqn.params.get("name") == "solution"]
     assert len(solves) == 2
     assert solves[0] is solves[1]
+
+
+def test_no_number_of_chosen_steps_is_compiled_for(caplog):
+    """Outside of a jit, where `dt` has as many numbers as there are steps."""
+    steps = Steps(jnp.ones(50), *6 * [jnp.ones((), jnp.int32)])
+    with jax.log_compiles():
+        found = [trimmed(steps._replace(accepted=jnp.array(n, jnp.int32))).dt for n in (7, 11)]
+    assert [x.shape for x in found] == [(7,), (11,)]
+    assert not [record for record in caplog.records if "Compiling" in record.getMessage()]

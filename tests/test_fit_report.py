@@ -49,6 +49,9 @@ def test_summary_and_json(result):
         result._replace(params=namedtuple("Mine", "a")(1.0)).to_json()
     with pytest.raises(ValueError, match="from_json: `text` must be what to_json wrote; received a part None"):
         FitResult.from_json("{}")
+    for text in ('{"array": 1}', '{"list": 3}', '{"FitResult": {"a": 1}}', '{"dict": [1]}'):
+        with pytest.raises(ValueError, match="from_json: `text` must be what to_json wrote; a part of it is not"):
+            FitResult.from_json(text)
     for kind, text, other in ((FitResult, "[1]", "list"), (Refined, result.to_json(), "FitResult")):
         with pytest.raises(ValueError, match=f"to_json of a {kind.__name__} wrote; received a {other}"):
             kind.from_json(text)

@@ -158,6 +158,7 @@ def test_under_jit_and_vmap_and_what_a_traced_step_size_may_be():
     runs = both(np.array([4.0, 5.0]), dts)
     assert runs.q.shape == (2, 5, 5, 1)
     np.testing.assert_array_equal(runs.failure.step > 0, [[False] * 3 + [True] * 2] * 2)
+    np.testing.assert_array_equal(runs.failed, runs.failure.step > 0)
     np.testing.assert_allclose(runs.q[1, :3], sweep({"k": 5.0, "c": 0.1}, dts=DTS).q[:3], rtol=1e-12)
     told = r"simulate: member 0, 3 \(4 of 10 failed\), `dt` must be positive and finite, and in a sweep at most the dis"
     with pytest.raises(hhtjax.SimulationError, match=told):
@@ -198,7 +199,11 @@ WRONG = {
     "samples as times": ({"num_samples": [0.1, 0.1]}, "`num_samples` must be a positive integer"),
     "no time": ({"duration": 0.0}, "`duration` must be positive"),
     "axes of another form": ({"in_axes": (0, 0)}, "`in_axes` must be a tuple of four"),
-    "axes of another structure": ({"in_axes": (None, None, None, {"m": 0})}, "in_axes` for params must be a prefix"),
+    "axes of another structure": (
+        {"in_axes": (None, None, None, {"m": 0})},
+        r"`in_axes` for params must be a prefix of its structure, PyTreeDef\(.*\); received PyTreeDef\({'m': \*}\).",
+    ),
+    "no axes": ({"params": PARAMS | {"k": np.ones(5)}}, r"`in_axes` is missing, and params\['k'\] may have one row"),
     "another axis": ({"in_axes": (None, 1, None, None)}, "must hold 0 and None"),
     "too few members": ({"in_axes": (None, 0, 0, None)}, "`q0` must have a leading axis of 5 members"),
     "mixed dtypes": ({"v0": np.zeros(1, np.float32)}, "must share one dtype"),

@@ -117,6 +117,7 @@ def test_what_differs_is_data_and_failures_are_alone():
     again = sweep(stiffness, np.array(1e-4), in_axes=axes)
     assert run_chosen.number() == compiled
     assert runs.steps.stop.tolist() == [0, 2, 3, 0, 0]
+    assert runs.failed.tolist() == [False, True, True, False, False]
     with pytest.raises(hhtjax.SimulationError, match=r"member 1 \(2 of 5 failed\), stopped at t = .*max_steps=4000"):
         again.check()
     assert np.all(np.isnan(again.q[2, 1:]))

@@ -168,7 +168,10 @@ def encode(x: Any) -> Any:
 
 def read(text, kind, named) -> Any:
     """What the to_json of a kind wrote; named: as for `decode`."""
-    found = decode(json.loads(text), named)
+    try:
+        found = decode(json.loads(text), named)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"from_json: `text` must be what to_json wrote; a part of it is not: {error}.") from None
     if not isinstance(found, kind):
         raise ValueError(
             f"from_json: `text` must be what to_json of a {kind.__name__} wrote; received a {type(found).__name__}."

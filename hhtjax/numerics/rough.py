@@ -1,10 +1,14 @@
-"""Logarithm and exponential to four digits, for a loop that waits for them: XLA's own would take half of a step."""
+"""Logarithm and exponential to four digits, for a loop that waits for them: XLA's own would take half of a step.
+
+And numbers of few digits, on which programs agree that round differently.
+"""
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 LN2 = float(np.log(2))
+DIGITS = 16  # binary: fewer than rounding, grown along a run, mostly reaches; a step need not be known better
 # minimax: ln m on [1, 2], to 2e-7; and exp x on [-2.4, 0.9], to 1e-5 of it
 LOG = (
     *(-2.24963549223, 4.94489123887, -5.1945355416, 4.0073884961),
@@ -43,15 +47,20 @@ def rough_exp(x):
     return _polynomial(EXP, x)
 
 
-def without_rounding(x):
-    """x of 28 binary digits, behind which numbers that differ by rounding are mostly one; float32 as it is.
+def without_rounding(x, more=0):
+    """x, positive, to the nearest number of 16 binary digits, and `more` units in its last place.
+
+    Numbers that differ by rounding are mostly one behind it.
 
     >>> bool(without_rounding(jnp.asarray(1.3)) == without_rounding(jnp.asarray(1.3) * (1 + jnp.finfo(float).eps)))
     True
+    >>> print(without_rounding(jnp.array([1.0, 1.3])), without_rounding(jnp.ones(1), more=1) - 1 == 2.0**-DIGITS)
+    [1.         1.30000305] [ True]
     """
-    behind = max(jnp.finfo(x.dtype).nmant - 28, 0)
+    unit = 1 << (jnp.finfo(x.dtype).nmant - DIGITS)
     integers = np.dtype(f"i{x.dtype.itemsize}")
-    return lax.bitcast_convert_type(lax.bitcast_convert_type(x, integers) & np.array(-(1 << behind), integers), x.dtype)
+    bits = lax.bitcast_convert_type(x, integers) + np.array(unit // 2 + more * unit, integers)
+    return lax.bitcast_convert_type(bits & np.array(-unit, integers), x.dtype)
 
 
 def _polynomial(coefficients, x):

@@ -136,7 +136,7 @@ def next_step(h, error, before, accept, order, pi=PI):
     exponent = slope * now + jnp.where(accept, pi.integral / order * before, 0)
     least, most = jnp.where(accept, pi.least, 0.1), jnp.where(accept, pi.most, 0.9)
     factor = jnp.clip(pi.safety * rough_exp(exponent), least, most)
-    return h * without_rounding(factor), jnp.maximum(now, float(np.log(LOWEST)))
+    return h * factor, jnp.maximum(now, float(np.log(LOWEST)))
 
 
 def judged(state, info, error):
@@ -156,20 +156,25 @@ def is_walking(walk, end):
     return going if walk.met is None else going & ~walk.met.ended
 
 
-def next_end(params, end, walk):
-    """The next step, and the time at which it ends: that of the walk, or one or two halves, to the end, or a jump."""
-    t, h = walk.state.t, walk.h
+def next_end(trial, params, walk):
+    """The next step, and the time at which it ends: that of the walk, or one or two halves, to the end, or a jump.
+
+    Without rounding: what is left until a jump, less than the steps, and halved, would differ between a run and a batch
+    by more than the steps before, and so on from jump to jump.
+    """
+    t, end = walk.state.t, trial.end
+    h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
     due = jnp.minimum(end, held.jump_after(params, t)) if held.holds(params) else end
     left = due - t
-    lands = left <= h
-    h = jnp.where(lands, left, jnp.minimum(h, left / 2))
+    lands = left <= reach  # what has doubled does, where jumps are equally far apart
+    h = jnp.where(lands, left, jnp.minimum(h, without_rounding(left / 2, more=1)))  # the second half is no longer
     return h, jnp.where(lands, due, t + h)
 
 
 def attempt(trial, walk):
     """Walk -> Walk after one try, and how that began."""
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
-    h, t1 = next_end(params, trial.end, walk)
+    h, t1 = next_end(trial, params, walk)
     resized, state = trial.stepper.resized(walk.state, h / walk.last)
     now, state = held.entered(resized, trial.flat, params, h, walk.last, state)
     s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, walk.past)(state)

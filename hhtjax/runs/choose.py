@@ -143,4 +143,5 @@ def trimmed(steps):
     """Without what is behind the accepted ones, of a batch the most, where their numbers are known."""
     if not is_concrete(steps.accepted):
         return steps
-    return steps._replace(dt=steps.dt[..., : int(np.max(steps.accepted))])
+    dt, accepted = map(np.asarray, (steps.dt, steps.accepted))  # jnp would compile a program for each number
+    return steps._replace(dt=jax.device_put(dt[..., : np.max(accepted)]))

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
@@ -91,6 +92,7 @@ class Solution(NamedTuple):
         sticking: (K + 1, m), whether a joint sticks; None without.
         steps: what error control chose, the `Steps`; dt are those accepted. None without.
         error: (K + 1,) of a run with `adaptive(verify=)`, that of q at each saved time, in its largest coordinate.
+        failed: whether the run failed, a property; (B,) of a batch: which members did.
         allowed: what `check` lets pass of it, 10 (rtol max|q| + atol); a tenth of that with verify="tighten".
         events: what happened on the way, `Events`; None without.
     """
@@ -111,6 +113,19 @@ class Solution(NamedTuple):
     error: Any = None
     allowed: Any = None
     events: Any = None
+
+    @property
+    def failed(self):
+        """Whether the run failed, or, of a batch, which members did: those that `check` would raise for, but for
+        `reach` and times that float32 cannot tell apart. Data, inside jit too."""
+        batch = self.t.shape[:-1]
+        failed = (self.failure.step > 0) | ~jnp.all(jnp.diff(self.t) >= 0, axis=-1)
+        failed |= jnp.any((self.dt <= 0).reshape(*batch, -1), axis=-1)
+        if self.steps is not None:
+            failed |= self.steps.stop > 0
+        if self.error is not None:
+            failed |= ~jnp.all(self.error <= self.allowed[..., None], axis=-1)
+        return failed
 
     def check(self, reach=None):
         """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.

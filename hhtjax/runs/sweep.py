@@ -93,27 +93,28 @@ def sweep(
     >>> [round(float(q), 4) for q in runs.q[:, -1, 0]]                        # cos(2) = -0.4161
     [-0.4101, -0.4157, -0.4161]
 
-    Other parameters for each, and which members failed (under error control those of `runs.steps.stop > 0` too):
+    Other parameters for each, and which members failed:
 
     >>> runs = hhtjax.sweep(
     ...     spring, hhtjax.hht(alpha=0.0), jnp.array([1.0]), jnp.array([0.0]), {"k": jnp.array([4.0, 9.0])},
     ...     dts=jnp.full(2, 0.01), duration=1.0, num_samples=5, in_axes=(None, None, None, 0))
-    >>> [round(float(q), 2) for q in runs.q[:, -1, 0]], (runs.failure.step > 0).tolist()          # cos(2), cos(3)
+    >>> [round(float(q), 2) for q in runs.q[:, -1, 0]], runs.failed.tolist()          # cos(2), cos(3)
     ([-0.42, -0.99], [False, False])
     """
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
     inputs = inputs.with_events(events, max_events, keep_events)
-    if isinstance(dts, Adaptive):
-        if mesh is not None:
-            raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
-        return sweep_chosen(inputs, progress)
-    arguments, keywords = inputs.call(mesh=mesh, progress=progress)
-    runs = partial(run_sweep, **keywords)
-    if events is None or keywords["lanes"] <= VECTORS:
-        return or_plain(partial(runs, *arguments))
-    # derivatives keep many states, of so many members more than a cache holds
-    return or_plain(partial(derivative_by, partial(runs, lanes=VECTORS), runs, *arguments))
+    with inputs.telling_of_axes():
+        if isinstance(dts, Adaptive):
+            if mesh is not None:
+                raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
+            return sweep_chosen(inputs, progress)
+        arguments, keywords = inputs.call(mesh=mesh, progress=progress)
+        runs = partial(run_sweep, **keywords)
+        if events is None or keywords["lanes"] <= VECTORS:
+            return or_plain(partial(runs, *arguments))
+        # derivatives keep many states, of so many members more than a cache holds
+        return or_plain(partial(derivative_by, partial(runs, lanes=VECTORS), runs, *arguments))
 
 
 @partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))

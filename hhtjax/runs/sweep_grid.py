@@ -50,9 +50,10 @@ def require_times(times, t0, dtype, caller="sweep"):
     if not late.all():
         bad = int(np.argmin(late))
         last = f"times[{bad - 1}] = {times[bad - 1]}" if bad else f"t0 = {before[0]}"
+        at_start = " Leave t0 out: the start is saved in any case." if not bad and times[0] == before[0] else ""
         raise ValueError(
             f"{caller}: `times` must be strictly increasing, and after t0, in {times.dtype}; "
-            f"received times[{bad}] = {times[bad]} after {last}."
+            f"received times[{bad}] = {times[bad]} after {last}.{at_start}"
         )
     return times
 

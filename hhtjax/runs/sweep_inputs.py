@@ -1,6 +1,7 @@
 """What a sweep is made from: the checks of what a user hands over, and which of it differs between members."""
 
 import math
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
@@ -105,6 +106,25 @@ class Inputs(NamedTuple):
                 require(i)
         return self._replace(events=events, room=room)
 
+    @contextmanager
+    def telling_of_axes(self):
+        """Adds to an error of shapes which arrays are as long as there are members, where in_axes says of none."""
+        try:
+            yield
+        except (TypeError, ValueError) as error:
+            long = [
+                f"{name}{jax.tree_util.keystr(path)}"
+                for name, tree in zip(NAMES, self.data, strict=True)
+                for path, x in jax.tree_util.tree_leaves_with_path(tree)
+                if jnp.shape(x)[:1] == (self.size,)
+            ]
+            if self.size > 1 and long and not any(self.mapped):
+                error.add_note(
+                    f"sweep: `in_axes` is missing, and {', '.join(long)} may have one row for each of the {self.size} "
+                    "members: then give 0 in it, in (stepper, q0, v0, params)."
+                )
+            raise
+
     def chunk(self, members):
         """The same for the members of these numbers."""
         dts = self.dts[members]
@@ -200,8 +220,11 @@ def _flags(name, tree, axes, size=None):
     """For each leaf of `tree` whether it has an axis of members, from a prefix of 0 and None as for `jax.vmap`."""
     try:
         flags = jax.tree.map(lambda axis, part: [axis] * len(jax.tree.leaves(part)), axes, tree, is_leaf=_is_none)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"sweep: `in_axes` for {name} must be a prefix of its structure: {error}") from None
+    except (ValueError, TypeError):
+        like, received = jax.tree.structure(tree), jax.tree.structure(axes, is_leaf=_is_none)
+        raise ValueError(
+            f"sweep: `in_axes` for {name} must be a prefix of its structure, {like}; received {received}."
+        ) from None
     flags = jax.tree.leaves(flags, is_leaf=_is_none)
     for x, flag in zip(jax.tree.leaves(tree), flags, strict=True):
         if flag is not None and (flag != 0 or isinstance(flag, bool)):
