@@ -28,8 +28,11 @@ def require_integer(caller, name, value, least=1):
     return int(value)
 
 
-def require_function(caller, name, value, signature):
-    """An error unless `value` can be called so, and is hashable, as a static argument of jit has to be."""
+def require_function(caller, name, value, signature, count=None):
+    """An error unless `value` can be called, and is hashable, as a static argument of jit has to be.
+
+    count: of its arguments, where another number is likely.
+    """
     if not callable(value):
         raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
     try:
@@ -41,7 +44,7 @@ def require_function(caller, name, value, signature):
         ) from None
     names = _argument_names(value)
     expected = signature[signature.index("(") + 1 : -1].split(", ")
-    if _in_other_order(names, expected) or (expected != ["..."] and not _takes(value, len(expected))):
+    if _in_other_order(names, expected) or (count is not None and not _takes(value, count)):
         raise TypeError(
             f"{caller}: `{name}` must be a function {signature}; received one with the arguments ({', '.join(names)})."
         )

@@ -83,13 +83,6 @@ def test_so_are_those_of_other_functions_and_any_other_names_pass():
         System(np.ones(2), pull, lambda t, q, p: q[:1])
     with pytest.raises(TypeError, match=re.escape("rate(y, t, params); received one with the arguments (t, y, p)")):
         hhtjax.FirstOrderSystem(lambda t, y, p: y)
-    with pytest.raises(
-        TypeError, match=re.escape("lagrangian(q, v, t, params); received one with the arguments (q, v, p)")
-    ):
-        System.from_lagrangian(lambda q, v, p: v @ v)
-    for found in (lambda p: hhtjax.fit(lambda p, x: p, p), lambda p: hhtjax.fit(lambda p: p, p, records=p, starts=p)):
-        with pytest.raises(TypeError, match="fit: `residuals` must be a function residuals"):
-            found(np.ones(1))
     for force in (lambda x, xdot, s, p: -x, lambda *args: -args[0], lambda a, b, t, c=1: -a, partial(pull)):
         System(np.ones(2), force)
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_integer
+from hhtjax.checks import require_function, require_integer
 from hhtjax.description import freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
@@ -63,8 +63,11 @@ def is_of_optax(optimizer):
     return optax is not None and isinstance(optimizer, optax.GradientTransformation)
 
 
-def check_options(caller, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress):
+def check_options(
+    caller, residuals, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress
+):
     """`Options` with the defaults filled in, or an error that names what is wrong."""
+    require_function(caller, "residuals", residuals, "residuals(params)")
     if not (optimizer is None or optimizer == LEVENBERG_MARQUARDT or is_of_optax(optimizer)):
         raise TypeError(
             f'{caller}: `optimizer` must be an optax optimiser, "{LEVENBERG_MARQUARDT}" or None; '

@@ -25,7 +25,7 @@ class Event(Description):
     """Something that happens where a guard falls to zero: `simulate(..., events=[Event(...)])`.
 
     Args:
-        guard: g, `guard(q, v, t, params)` -> a number, positive where the motion is allowed, and negative beyond; smooth.
+        guard: g, `guard(q, v, t, params)` -> a number, smooth, positive where the motion is allowed, negative beyond.
             It counts where it falls from positive to zero, not where it rises: for the other direction give -g, for
             both a mode that turns the sign, see `switch`. With internal states z stands behind v; of a
             `FirstOrderSystem` guard(y, t, params).
@@ -66,7 +66,7 @@ class Event(Description):
         if self.reset is not None and not isinstance(self.reset, Impact):
             require_function("Event", "reset", self.reset, "reset(...)")
         if self.switch is not None:
-            require_function("Event", "switch", self.switch, "switch(params)")
+            require_function("Event", "switch", self.switch, "switch(params)", count=1)
         if not isinstance(self.terminal, bool):
             raise TypeError(f"Event: `terminal` must be True or False; received {self.terminal!r}.")
 

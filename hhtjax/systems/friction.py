@@ -40,9 +40,9 @@ def require_friction(caller, friction, sliding, *more):
         if sliding is not None:
             raise ValueError(f"{caller}: `sliding` must go with `friction`, the limits of the forces there.")
         return
-    require_function(caller, "friction", friction, f"friction({', '.join(('q, v', *more))}, t, params)")
+    require_function(caller, "friction", friction, f"friction({', '.join(('q, v', *more))}, t, params)", 4 + len(more))
     if sliding is not None:
-        require_function(caller, "sliding", sliding, "sliding(q, v, t, params)")
+        require_function(caller, "sliding", sliding, "sliding(q, v, t, params)", count=4)
 
 
 def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
