@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 
+from hhtjax.runs.interpolate import on_axes
+
 VALUES = "t", "q", "v", "acceleration", "multipliers", "z", "zdot", "friction", "sticking"
 
 
@@ -18,11 +20,14 @@ def with_event_rows(solution):
     behind = jnp.where(met, jnp.clip(jnp.searchsorted(solution.t, events.t), 1, last), last)
     told = {"t": (events.t,) * 2, "q": (events.q,) * 2, "v": (events.before, events.after), "z": (events.z,) * 2}
 
+    def known(new, old):
+        return jnp.where(on_axes(met, new), new, old)
+
     def rows(name):
         saved = getattr(solution, name)
         sides = [jax.tree.map(lambda x, i=i: x[i], saved) for i in (jnp.where(met, behind - 1, last), behind)]
         if name in told:
-            sides = [jax.tree.map(_where(met), new, old) for new, old in zip(told[name], sides, strict=True)]
+            sides = [jax.tree.map(known, new, old) for new, old in zip(told[name], sides, strict=True)]
         return jax.tree.map(lambda x, y, z: jnp.concatenate([_alternating(x, y), z]), *sides, saved)
 
     found = {name: rows(name) for name in VALUES}
@@ -31,11 +36,6 @@ def with_event_rows(solution):
     across = (order[:-1] < 2 * met.size) & (order[:-1] % 2 == 0)
     saved = jnp.argsort(order)[2 * met.size :]
     return solution._replace(**jax.tree.map(lambda x: x[order], found)), across, saved
-
-
-def _where(here):
-    """A choice for each event, between arrays with further axes."""
-    return lambda x, y: jnp.where(here.reshape(here.shape + (1,) * (x.ndim - 1)), x, y)
 
 
 def _alternating(x, y):

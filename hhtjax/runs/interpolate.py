@@ -101,12 +101,13 @@ def _found(known, times, equal):
     return between(a, b, H, x), outside
 
 
+def on_axes(x, y):
+    """x with as many axes as y, whose leading ones it has."""
+    return x.reshape(x.shape + (1,) * (y.ndim - x.ndim))
+
+
 def between_events(events, a, b, H, x, times):
     """What `between` takes, with the events that lie between a and b for ends."""
-
-    def on_axes(x, y):
-        return x.reshape(x.shape + (1,) * (y.ndim - x.ndim))
-
     t = jnp.where(jnp.isnan(events.t), jnp.inf, events.t)
     last = jnp.searchsorted(t, times, side="right") - 1
     earlier, later = jnp.maximum(last, 0), jnp.minimum(last + 1, t.size - 1)
@@ -144,9 +145,6 @@ def between(a, b, H, x):
 
     Rates are those of the polynomials where nothing else is known; multipliers are linear.
     """
-
-    def on_axes(x, y):
-        return x.reshape(x.shape + (1,) * (y.ndim - x.ndim))
 
     def hermite(y0, y1, slope0, slope1):
         s, h = on_axes(x, y0), on_axes(H, y0)

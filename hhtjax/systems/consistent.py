@@ -235,6 +235,7 @@ def _turns(system, q0, v0, t0, params, z0):
     d = diagonal(flat.mass(q, params))
     d = jnp.where(d == 0, 1, d)
     unit = flat.with_ones(1 / jnp.sqrt(d))
+    # one direction for all constraints, of no symmetry: along an axis many of them turn nothing
     uneven = np.where(np.arange(flat.size) % 2, -1, 1) * (0.75 + 0.618034 * np.arange(flat.size) % 0.5)
     along = flat.rate(q, unit * jnp.asarray(uneven, q.dtype))
     B, change = (x * unit[None, :] for x in jax.jvp(lambda q: jacobian(flat, q, t, params), (q,), (along,)))
