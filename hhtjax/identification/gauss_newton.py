@@ -73,9 +73,18 @@ class Dense(NamedTuple):
     objective: Objective
     bend: Callable | None
 
+    def read(self, x):
+        """Residuals and their Jacobian."""
+        return with_jacobian(self.f, x)
+
+    def slopes(self, x):
+        """The gradient of the cost, of all that there is: (1, p)."""
+        J, pull, _ = self.objective.estimating(*self.read(x))
+        return (pull @ J)[None, :]
+
     def look(self, x, D) -> DenseTrial:
         """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
-        r, J = with_jacobian(self.f, x)
+        r, J = self.read(x)
         r_hat, J_hat = self.objective.least_squares(r, J)
         finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
         r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
@@ -140,15 +149,26 @@ class Arrow(NamedTuple):
         count = jax.tree.leaves(self.records)[0].shape[0]
         return x[: self.p], x[self.p :].reshape(count, -1)
 
-    def look(self, x, D) -> ArrowTrial:
-        """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
+    def read(self, x):
+        """Residuals of each record, and their Jacobians by the shared and by their own unknowns."""
         shared, own = self.split(x)
 
         def one(own, record):
             r, J = with_jacobian(lambda y: self.f(y[: self.p], y[self.p :], record), jnp.concatenate([shared, own]))
             return r, J[:, : self.p], J[:, self.p :]
 
-        r, J, J_own = jax.vmap(one)(own, self.records)
+        return jax.vmap(one)(own, self.records)
+
+    def slopes(self, x):
+        """The gradient of each record's cost by the shared and by its own unknowns: (records, p + k)."""
+        r, *J = self.read(x)
+        J = jnp.concatenate(J, axis=2)
+        wJ, pull, _ = self.objective.estimating(r.ravel(), J.reshape(r.size, -1))
+        return jnp.einsum("bm,bmp->bp", pull.reshape(r.shape), wJ.reshape(J.shape))
+
+    def look(self, x, D) -> ArrowTrial:
+        """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
+        r, J, J_own = self.read(x)
         count, m, k = J_own.shape
         both = jnp.concatenate([J_own, J], axis=2).reshape(count * m, -1)
         r_hat, both = self.objective.least_squares(r.ravel(), both)
@@ -204,11 +224,11 @@ class Arrow(NamedTuple):
         own = jnp.einsum("bik,bi->bk", trial.R_own, trial.z)
         return _cosine(jnp.concatenate([shared, own.ravel()]), trial)
 
-    def free_of_own(self, trial):
+    def free_of_own(self, r, J, J_own):
         """What `Objective.estimating` says of the residuals, with the part of J that no own unknown can make up for."""
-        count, m, k = trial.J_own.shape
-        both = jnp.concatenate([trial.J_own, trial.J], axis=2).reshape(count * m, -1)
-        both, pull, bend = self.objective.estimating(trial.r.ravel(), both)
+        count, m, k = J_own.shape
+        both = jnp.concatenate([J_own, J], axis=2).reshape(count * m, -1)
+        both, pull, bend = self.objective.estimating(r.ravel(), both)
 
         def project(both, bend):
             Q, J = jnp.linalg.qr(both[:, :k])[0], both[:, k:]
