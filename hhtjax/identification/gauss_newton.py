@@ -65,6 +65,11 @@ class DenseTrial(NamedTuple):
     V: Any
     z: Any  # residual in the basis of the left singular vectors
 
+    @property
+    def read(self):
+        """Of the problem, there."""
+        return self.r, self.J
+
 
 class Dense(NamedTuple):
     """Residuals f(x) (m,) of which each may depend on every unknown; bend(x): p''/p' of each."""
@@ -129,6 +134,11 @@ class ArrowTrial(NamedTuple):
     R_own: Any
     z: Any  # (records, k + p + 1)
 
+    @property
+    def read(self):
+        """Of the problem, there."""
+        return self.r, self.J, self.J_own
+
 
 class Arrow(NamedTuple):
     """Residuals f(shared, own, record) (m,) of each record, with k unknowns of its own, which are eliminated.
@@ -177,7 +187,7 @@ class Arrow(NamedTuple):
         both, r_hat = both.reshape(count, m, -1), r_hat.reshape(count, m)
         if self.bend is not None:
             slopes, squares = jnp.einsum("bmp,bm->p", both[:, :, k:], r_hat), jnp.sum(both[:, :, k:] ** 2, axis=(0, 1))
-            further = jnp.diag(_bent(self.bend(shared), slopes, squares) / count**0.5)  # a part in each record
+            further = jnp.diag(_bent(self.bend(x[: self.p]), slopes, squares) / count**0.5)  # a part in each record
             further = jnp.broadcast_to(jnp.pad(further, ((0, 0), (k, 0))), (count, self.p, k + self.p))
             both, r_hat = jnp.concatenate([both, further], axis=1), jnp.pad(r_hat, ((0, 0), (0, self.p)))
         norms = jnp.linalg.norm(both[:, :, k:], axis=(0, 1)), jnp.linalg.norm(both[:, :, :k], axis=1)

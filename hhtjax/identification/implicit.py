@@ -64,4 +64,5 @@ def _inverse(H):
     """Of a symmetric H whose unknowns differ in size; 0 in directions of which it says nothing."""
     D = jnp.sqrt(jnp.abs(jnp.diagonal(H)))
     D = jnp.where(D == 0, 1, D)
-    return jnp.linalg.pinv(H / (D[:, None] * D), hermitian=True) / (D[:, None] * D)
+    sizes = jnp.outer(D, D)
+    return jnp.linalg.pinv(H / sizes, hermitian=True) / sizes

@@ -145,28 +145,15 @@ def _solve_dense(residuals, options, coordinates, data, limits):
         f, objective = f or partial(call, given), Objective(w, options.loss, m)
         return Dense(f, objective, coordinates.bend()) if by_jacobians else Smooth(f, objective)
 
-    def find():
-        problem = problem_of(given, w, f)
-        if not by_jacobians:
-            x, *ended = descend(problem, coordinates.x0, options.optimizer, *limits)
-            return x, (), (*ended, None)
-
-        def problem_for(y, fresh):
-            return problem._replace(f=lambda x: with_steps_for(f, x, jnp.where(fresh, x, y)))
-
-        start = coordinates.x0, coordinates.longest, *limits
-        if chooses_steps(call, given, coordinates.x0):
-            best, *ended = in_rounds(problem_for, *start)
-        else:
-            best, *ended = *levenberg_marquardt(problem, *start), None
-        return best.x, (best.r, best.J), tuple(ended)
-
+    problem, frozen = problem_of(given, w, f), None
+    if by_jacobians and chooses_steps(call, given, coordinates.x0):
+        frozen = partial(_dense_with_frozen_steps, problem)
+    find = partial(_minimise, problem, frozen, coordinates.x0, coordinates.longest, options.optimizer, limits)
     x, read, (history, iterations, code, choices) = at_minimum(find, problem_of, coordinates.x0.size, given, w)
     r, J = read or (with_jacobian(f, x) if options.covariance else (f(x), None))
-    objective = Objective(w, options.loss, m)
-    residual, cost, pull, bend = unravel(r[:m]), objective.cost(r), r, None
+    residual, cost, pull, bend = unravel(r[:m]), problem.objective.cost(r), r, None
     if J is not None:
-        J, pull, bend = objective.estimating(r, J)
+        J, pull, bend = problem.objective.estimating(r, J)
     sizes, of_pull = [math.prod(leaf.shape) for leaf in leaves], jax.tree.leaves(unravel(pull[:m]))
     order = np.concatenate([in_time([leaf.shape for leaf in leaves]), np.arange(m, w.size)])
     if J is not None and np.any(np.diff(order) < 0):
@@ -177,8 +164,7 @@ def _solve_dense(residuals, options, coordinates, data, limits):
 
 def _solve_records(residuals, options, coordinates, data, limits):
     """One residual function of each record, with a start of its own."""
-    one = jax.tree.map(lambda x: x[0], data.starts)
-    _, unravel_start = ravel_pytree(one)
+    _, unravel_start = ravel_pytree(_first(data.starts))
     own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
 
     def every(params, starts, records):
@@ -188,14 +174,13 @@ def _solve_records(residuals, options, coordinates, data, limits):
     shapes = check_residuals("fit", every, unknowns, params0, data.starts, data.records)
     weights = jax.tree.unflatten(jax.tree.structure(shapes), spread_weights("fit", data.weights, shapes))
     w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)
-    _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], weights))
-
+    _, unravel = ravel_pytree(_first(weights))
     p = coordinates.x0.size
 
     def f(x, own, record):
         return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
 
-    first = coordinates.x0, own0[0], jax.tree.map(lambda x: x[0], data.records)
+    first = coordinates.x0, own0[0], _first(data.records)
     call, given = hoisted(f, *first)
 
     def problem_of(given, w, records, f=None):
@@ -204,15 +189,10 @@ def _solve_records(residuals, options, coordinates, data, limits):
 
     problem = problem_of(given, w, data.records, f)
 
-    def find():
-        x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
-        longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
-        if chooses_steps(call, given, *first):
-            best, *ended = in_rounds(partial(_with_frozen_steps, problem), x0, longest, *limits)
-        else:
-            best, *ended = *levenberg_marquardt(problem, x0, longest, *limits), None
-        return best.x, (best.r, best.J, best.J_own), tuple(ended)
-
+    frozen = partial(_with_frozen_steps, problem) if chooses_steps(call, given, *first) else None
+    x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
+    longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
+    find = partial(_minimise, problem, frozen, x0, longest, options.optimizer, limits)
     x, read, (history, iterations, code, choices) = at_minimum(find, problem_of, p, given, w, data.records)
     residual, starts = jax.vmap(unravel)(read[0]), jax.vmap(unravel_start)(problem.split(x)[1])
     cost = problem.objective.cost(read[0].ravel())
@@ -224,6 +204,31 @@ def _solve_records(residuals, options, coordinates, data, limits):
     block = whole if count_segments([w.size], options.segments, whole) >= max(LEAST, p + 1) else 1
     ended = x, cost, history, iterations, code, choices, residual, starts
     return _Solved(*ended, J, pull, bend, of_pull, [w.size], present, block)
+
+
+def _first(tree):
+    """Of its leading axis."""
+    return jax.tree.map(lambda x: x[0], tree)
+
+
+def _minimise(problem, frozen, x0, longest, optimizer, limits):
+    """x, what the problem reads there, and the history, its length, the code, and how often steps were chosen.
+
+    frozen: y, fresh -> the problem with steps as for y, unless they are chosen anew; None where runs choose none.
+    """
+    if isinstance(problem, Smooth):
+        x, *ended = descend(problem, x0, optimizer, *limits)
+        return x, (), (*ended, None)
+    if frozen is None:
+        best, *ended = *levenberg_marquardt(problem, x0, longest, *limits), None
+    else:
+        best, *ended = in_rounds(frozen, x0, longest, *limits)
+    return best.x, best.read, tuple(ended)
+
+
+def _dense_with_frozen_steps(problem, y, fresh):
+    """A `Dense` problem with steps of its runs as for y, unless they are chosen anew."""
+    return problem._replace(f=lambda x: with_steps_for(problem.f, x, jnp.where(fresh, x, y)))
 
 
 def _with_frozen_steps(problem, y, fresh):
