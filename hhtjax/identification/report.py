@@ -134,10 +134,11 @@ def _about_estimates(result, names):
 
 
 def _at_bound(result):
-    """Flags of the parameters that are closer to a bound than a hundredth of their standard error."""
+    """Flags of the parameters that are closer to a bound than a hundredth of their standard error, where that is known."""
     leaves = zip(result.transforms, jax.tree.leaves(freeze(result.params)), strict=True)
     distance = np.concatenate([np.ravel(T.distance(p)) for T, p in leaves])
-    return result.free & (distance < AT_BOUND * parameter_values(result.standard_errors))
+    errors = parameter_values(result.standard_errors)
+    return result.free & np.isfinite(errors) & (distance < AT_BOUND * errors)
 
 
 TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}
