@@ -208,10 +208,11 @@ def test_undetermined_parameters_are_named():
     def residuals(params):
         return {"r": params["a"] * params["b"] * t - 2.0 * t + params["c"] - 1.0}
 
+    start = {"a": 1.0, "b": 1.5, "c": 0.3, "unused": jnp.ones(1)}
+    transforms = {"a": None, "b": None, "c": None, "unused": hhtjax.positive}
     said = r"no standard error for a, b, unused\[0\]: .* a, b only through their product; unused\[0\] not at all"
     with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=said) as warned:
-        start = {"a": 1.0, "b": 1.5, "c": 0.3, "unused": jnp.ones(1)}
-        result = hhtjax.fit(residuals, start, transforms={"a": None, "b": None, "c": None, "unused": hhtjax.positive})
+        result = hhtjax.fit(residuals, start, transforms=transforms)
     assert warned[0].filename == __file__
     lines = result.summary().splitlines()
     assert lines[2].split() == ["a", f"{float(result.params['a']):.6g}", "undetermined"]

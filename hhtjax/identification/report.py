@@ -134,7 +134,7 @@ def _about_estimates(result, names):
 
 
 def _at_bound(result):
-    """Flags of the parameters that are closer to a bound than a hundredth of their standard error, where that is known."""
+    """Flags of the parameters that are closer to a bound than a hundredth of their standard error, where it is finite."""
     leaves = zip(result.transforms, jax.tree.leaves(freeze(result.params)), strict=True)
     distance = np.concatenate([np.ravel(T.distance(p)) for T, p in leaves])
     errors = parameter_values(result.standard_errors)
