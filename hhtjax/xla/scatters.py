@@ -6,6 +6,7 @@ update for each window; places that are known are folded into them.
 
 import math
 from functools import reduce
+from typing import Any
 
 import numpy as np
 from jax.interpreters import mlir
@@ -28,7 +29,7 @@ class Scatter:
     def __init__(self, op):
         dims = stablehlo.ScatterDimensionNumbers(op.attributes["scatter_dimension_numbers"])
         self.x, self.indices, self.updates, *others = op.operands
-        self.number = INTEGERS.get(str(_type(self.indices).element_type))
+        self.number: Any = INTEGERS.get(str(_type(self.indices).element_type))
         self.is_usual = bool(self.number) and not (others or list(dims.input_batching_dims))
         self.to, self.vector = list(dims.scattered_dims_to_operand_dims), dims.index_vector_dim
         inside, missing = list(dims.update_window_dims), {*dims.inserted_window_dims}
