@@ -65,7 +65,8 @@ def is_of_few_windows(op):
 
 def write_out(op):
     """A slice, an operation and an update for each window, in its place."""
-    found, combine = Scatter(op), _combination(op)
+    found = Scatter(op)
+    combine: Any = _combination(op)
     x = found.x
     with op.location, ir.InsertionPoint(op):
         for which in found.windows():
