@@ -157,6 +157,9 @@ def test_tails_of_distributions_are_those_of_scipy():
     for x, q, n in ((4.17, 1, 30), (0.3, 2, 29), (12.0, 3, 1500)):
         assert f_tail(x, q, n) == pytest.approx(stats.f.sf(x, q, n), rel=1e-9)
         assert chi_squared_tail(x, q) == pytest.approx(stats.chi2.sf(x, q), rel=1e-9)
+    for x, q in ((0.0, 3), (1e-3, 1), (31.0, 20), (900.0, 401), (6000.0, 5000), (np.inf, 2)):
+        assert chi_squared_tail(x, q) == pytest.approx(stats.chi2.sf(x, q), rel=1e-9)
+    assert np.isnan(chi_squared_tail(np.nan, 3))
     assert np.isnan(f_tail(1.0, 3, 0))
     for degrees, level, rtol in (
         *((1, 0.95, 1e-4), (2, 0.99, 1e-4), (16, 0.95, 1e-4), (17, 0.95, 1e-4), (31, 0.68, 1e-4), (np.inf, 0.95, 1e-9)),

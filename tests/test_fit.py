@@ -208,15 +208,18 @@ def test_undetermined_parameters_are_named():
     def residuals(params):
         return {"r": params["a"] * params["b"] * t - 2.0 * t + params["c"] - 1.0}
 
+    start = {"a": 1.0, "b": 1.5, "c": 0.3, "unused": jnp.ones(1)}
+    transforms = {"a": None, "b": None, "c": None, "unused": hhtjax.positive}
     said = r"no standard error for a, b, unused\[0\]: .* a, b only through their product; unused\[0\] not at all"
     with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=said) as warned:
-        result = hhtjax.fit(residuals, {"a": 1.0, "b": 1.5, "c": 0.3, "unused": jnp.ones(1)})
+        result = hhtjax.fit(residuals, start, transforms=transforms)
     assert warned[0].filename == __file__
     lines = result.summary().splitlines()
     assert lines[2].split() == ["a", f"{float(result.params['a']):.6g}", "undetermined"]
     why = "undetermined: a, b, unused[0]: the residuals determine a, b only through their product; unused[0] not at all"
     assert why in lines
     assert "largest correlation" not in result.summary()
+    assert "at a bound" not in result.summary()
     assert float(result.params["a"] * result.params["b"]) == pytest.approx(2.0, rel=1e-6)
     assert np.isinf(result.standard_errors["a"])
     assert np.isfinite(result.standard_errors["c"])

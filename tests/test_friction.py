@@ -109,6 +109,29 @@ def test_stuck_joints_of_a_mechanism_stay_to_the_order_of_the_step():
         assert np.max(np.abs(np.asarray(found.acceleration)[stuck[:, joint], joint]), initial=0) < 1e-13
 
 
+def test_a_start_that_slides_by_a_rounding_sticks():
+    """A sleigh on a knife edge, a behind its centre, whose limit is never reached (Chaplygin): u = U tanh(a U t/I + c).
+
+    It starts with a lateral velocity of 0.4, or one of the numbers beside it."""
+
+    def lateral(q, v, t, params):
+        return -jnp.sin(q[2:]) * v[0] + jnp.cos(q[2:]) * v[1] - 0.2 * v[2]
+
+    def limit(q, v, t, params):
+        return 1e3 + 0 * q[:1]
+
+    sleigh = hhtjax.System(jnp.array([1.0, 1.0, 0.06]), lambda q, v, t, p: 0 * q, friction=limit, sliding=lateral)
+    for speed in (0.4, np.nextafter(0.4, 1), np.nextafter(0.4, 0)):
+        start = jnp.zeros(3), jnp.array([1.0, speed, 2.0])
+        found = hhtjax.simulate(sleigh, hhtjax.hht(), *start, dt=1e-2, num_steps=100)
+        found.check()
+        assert found.sticking.all()
+        forward = jnp.cos(found.q[:, 2]) * found.v[:, 0] + jnp.sin(found.q[:, 2]) * found.v[:, 1]
+        U = np.sqrt(1.4)
+        np.testing.assert_allclose(forward, U * np.tanh(2 * U * np.asarray(found.t) + np.arctanh(1 / U)), atol=2e-4)
+        assert np.max(np.abs(found.friction)) == pytest.approx(1.2, rel=1e-12)  # u w J/I, the largest at the start
+
+
 def test_without_limit_it_is_the_step_without_friction():
     case = of_scene(dry_oscillator.driven(0.0))
     smooth = replace(case.system, friction=None)

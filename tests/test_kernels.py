@@ -83,6 +83,11 @@ SUPPORTED = {
     "and of two": lambda c: (
         c / 2 + (jnp.arccosh(2 + c) + jax.lax.zeta(c + 2, c + 1) + jax.lax.nextafter(c, c + 1)) / 99
     ),
+    "gather, in reverse": lambda c: c[(3 * c).astype(int) % 4] / 2,
+    "scatter": lambda c: c.at[order].add(c) / 3,
+    "scatter of numbers twice": lambda c: c.at[jnp.array([1, 3, 1])].set(c[:3] / 2).at[0].multiply(0.9),
+    "scatter of blocks": lambda c: jnp.ones((6, 6)).at[1:5, :3].set(c[:, None]).at[:2].min(c[1])[:4].sum(1) / 9,
+    "scatter that drops": lambda c: c.at[(9 * c).astype(int) - 2].add(-c / 3, mode="drop", wrap_negative_indices=False),
     "interpolation": lambda c: jnp.interp(c, jnp.arange(10.0), jnp.arange(10.0) ** 2) / 9,
     "random numbers": lambda c: c / 2 + jax.random.normal(jax.random.key(3), (4,)),
     "float32": lambda c: jnp.sin(c.astype(jnp.float32)).astype(c.dtype),
@@ -90,14 +95,15 @@ SUPPORTED = {
 UNSUPPORTED = {
     "sort": lambda c: jnp.sort(c) / 2,
     "top_k": lambda c: jax.lax.top_k(c, 4)[0] / 2,
-    "scatter": lambda c: c.at[order].add(c) / 3,
+    "a scatter into 4097": lambda c: c / 2 + jnp.zeros(4097).at[(3 * c).astype(int)].add(c / 9)[:4],
+    "a scatter of 33": lambda c: c / 2 + jnp.zeros(4).at[jnp.arange(33) % 4].add(c[0]) / 99,
+    "a scatter that computes": lambda c: c.at[1].apply(jnp.sin) / 2,
     "lapack": lambda c: jnp.linalg.solve(jnp.eye(4) + jnp.outer(c, c), c),
     "fft": lambda c: jnp.abs(jnp.fft.fft(c)) / 9,
     "callback": lambda c: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(c.shape, c.dtype), c),
     "dot_general": lambda c: jnp.sum(jnp.ones((40, 40)) @ jnp.ones((40, 40)) * c[0], 1)[:4] / 999,
     "reduce": lambda c: c / 2 + jnp.sum(jnp.sin(jnp.arange(4096.0) * c[0])) / 9999,
     "a product of 4096": lambda c: c / 2 + jnp.arange(4096.0) @ jnp.sin(jnp.arange(4096.0) * c[0]) / 1e8,
-    "gather, in reverse": lambda c: c[(3 * c).astype(int) % 4] / 2,
 }
 
 

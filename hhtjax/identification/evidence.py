@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import betainc, gammaincc
+from jax.scipy.special import betainc
 
 from hhtjax.identification.arguments import spread_weights
 from hhtjax.identification.sandwich import time_axis, used_up
@@ -108,8 +108,12 @@ def whiteness(residuals: Residuals):
 
 
 def chi_squared_tail(x, degrees) -> float:
-    """Probability of more than x."""
-    return float(gammaincc(jnp.asarray(degrees / 2), jnp.asarray(x / 2)))
+    """Probability of more than x, of an integer number of degrees of freedom: a finite sum."""
+    y, odd = float(x) / 2, degrees % 2
+    if not 0 < y < math.inf:
+        return math.nan if math.isnan(y) else float(y <= 0)
+    terms = (math.exp(k * math.log(y) - y - math.lgamma(k + 1)) for k in np.arange(odd / 2, degrees / 2))
+    return min((math.erfc(math.sqrt(y)) if odd else 0.0) + sum(terms), 1.0)
 
 
 def f_tail(x, numerator, denominator) -> float:

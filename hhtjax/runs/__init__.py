@@ -59,6 +59,31 @@ second process has only to trace, in a quarter to two thirds of the time. Before
 After the imports, `import gc; gc.freeze()` spares the garbage collector all that they have made, which it else looks
 through again and again while functions are traced: 5 to 20 % of a first call. The library leaves the collector alone.
 
+A controller that samples
+-------------------------
+
+It reads the state every so often, and holds its force in between. That is a scan over short runs, one for each period,
+each from the end of the one before, with the force in params. What the controller remembers (an integral, the last
+force, for a limit on its rate) goes along in the carry. This one takes a mass to zero, and to rest, in two periods:
+
+>>> def controlled(params, period=0.1):
+...     def run_for_a_period(carry, t0):
+...         q, v = carry
+...         held = params | {"u": -q / period**2 - 1.5 * v / period}
+...         run = hhtjax.simulate(cart, hhtjax.hht(), q, v, held, t0=t0, dt=period / 5, num_steps=5)
+...         return (run.q[-1], run.v[-1]), run
+...     return jax.lax.scan(run_for_a_period, (jnp.ones(1), jnp.zeros(1)), period * jnp.arange(4.0))[1]
+>>> cart = hhtjax.System(jnp.ones(1), lambda q, v, t, params: params["u"] - params["c"] * v)
+>>> runs = jax.jit(controlled)({"c": 0.0})                               # without jit each call traces it again
+>>> runs.check()                                                         # what it calls members are the periods
+>>> runs.q.shape, [round(abs(float(q)), 6) for q in runs.q[:, -1, 0]]    # start and steps of each; its end
+((4, 6, 1), [0.5, 0.0, 0.0, 0.0])
+
+Each run begins anew, where the force jumps, so that the method keeps its order; derivatives pass through all, and each
+is one kernel: 1500 periods of a crane, of five steps each, take half the time of the same on plain JAX, where their
+ends alone are kept (`save_every=5`), and .7 of it where all steps are.
+Internal states go on from `run.z[-1]`. What is held, but known before, is `sampled(order=0)`.
+
 Sweeps
 ------
 

@@ -225,7 +225,7 @@ class Solution(NamedTuple):
                 f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "
                 "half_bandwidth of banded(), more iterations of conjugate_gradients(), or another solve(A, b); a "
                 "larger `tolerance` of the first two accepts it. With sparse matrices M, C and K are too far apart in "
-                "size for this step"
+                "size for this step, or for float32"
             )
         if np.isinf(friction):
             return "a limit of the dry friction is negative or not a number: see `friction` of the System"

@@ -71,7 +71,7 @@ def _smooth(system, sig, tau, L):
 def _settle(system, at, factorize, H, K, own, L):
     """sig and tau at the start. What rests is held, within the limits; what cannot be held slides."""
     q, v, t, params = at
-    sig, f = jnp.sign(system.friction.sliding(*at)), system.friction.limit(q, v, L, t, params)
+    sig, f = _direction(system, at, H), system.friction.limit(q, v, L, t, params)
     rests = sig == 0
     free = _smooth(system, sig, jnp.zeros_like(f), L)
     if system.num_constraints:
@@ -80,6 +80,15 @@ def _settle(system, at, factorize, H, K, own, L):
         w = free.acceleration(*at, factorize=factorize)
     slides, tau = at_rest(K, rests, matvec(H, w) + own, f)
     return jnp.where(rests, slides, sig), jnp.where(rests, tau, sig * f)
+
+
+def _direction(system, at, H):
+    """In which direction each joint slides: 0 where its velocity is a rounding of the velocities it is made of, which
+    would begin with the whole limit, and the accelerations of that."""
+    q, v, t, params = at
+    s, own = (system.friction.sliding(q, x, t, params) for x in (v, jnp.zeros_like(v)))
+    noise = NOISE * float(jnp.finfo(s.dtype).eps) * (matvec(jnp.abs(H), jnp.abs(v)) + jnp.abs(own))
+    return jnp.where(jnp.abs(s) <= noise, 0, jnp.sign(s))
 
 
 def bind_friction(method, system, params, dt, kept=None):

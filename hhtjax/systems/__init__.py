@@ -145,6 +145,10 @@ switch to switch within the step, as the switch of one jerks the others.
 >>> run.friction.shape, round(float(run.sticking.mean()), 2)                       # tau; part of the time it sticks
 ((801, 1), 0.32)
 
+What rolls, or glides on a knife edge, is held in its velocities, for which `constraint` has no place: it is a joint
+that never slides, with those velocities as `sliding`, and a limit beyond all forces; tau are then the forces that hold
+it. It has to start without sliding.
+
 On a belt with the speed u, `sliding=lambda q, v, t, params: v - params["u"]`; between two bodies it is the difference
 of their velocities. s must be affine in v, and its rows independent of each other and of constraints. A limit in a
 system with internal states is called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F is

@@ -2,7 +2,7 @@
 
 On the CPU, with JAX 0.10.2, the whole loop over the steps becomes one kernel, that is, one compiled function without
 calls to others; gradients and batches too, wherever XLA can compile it so: up to 16 unknowns, without sorting,
-scattering, LAPACK or callbacks in your functions. `explain` tells which, and why not:
+scattering of many numbers, LAPACK or callbacks in your functions. `explain` tells which, and why not:
 
 >>> import jax.numpy as jnp, hhtjax
 >>> ball = hhtjax.System(mass=jnp.ones(2), force=lambda q, v, t, c: -9.81 - c * v)

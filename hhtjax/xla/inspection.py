@@ -4,6 +4,7 @@ from jaxlib.mlir import ir
 
 from hhtjax.xla.kernels import STAGED, inside_p
 from hhtjax.xla.products import is_small_product, is_small_sum, is_to_write_out
+from hhtjax.xla.scatters import is_of_few_windows
 
 ATTRIBUTES = "mhlo.frontend_attributes"
 
@@ -46,8 +47,8 @@ class Inspection:
 
     objection: the first thing that cannot be in one kernel, in words, or None; is_proven: all else is known to compile;
     finished: names of the functions, each after those that it calls; stages: {name of a staged function: its calls};
-    products: to be written out; choices: between two forms of a function; seldom: conditionals with nothing to do in
-    one branch.
+    products, scatters: to be written out; choices: between two forms of a function; seldom: conditionals with nothing
+    to do in one branch.
     """
 
     def __init__(self, functions, call, is_partitioned=False):
@@ -55,7 +56,7 @@ class Inspection:
         self.seen, self.finished = set(), []
         self.operations = self.in_branches = 0
         self.most = MOST_OPERATIONS
-        self.stages, self.products, self.choices, self.seldom = {}, [], [], []
+        self.stages, self.products, self.scatters, self.choices, self.seldom = {}, [], [], [], []
         self.is_proven, self.types = True, set()
         self.objection = "partitioned over devices; shard_map leaves each its own kernel" if is_partitioned else None
         self.look(call)
@@ -77,6 +78,9 @@ class Inspection:
             self.look_into_custom_call(op)
         elif name == "dot_general" and is_to_write_out(op):
             self.products.append(op)
+        elif name == "scatter" and is_of_few_windows(op):
+            self.scatters.append(op)
+            self._note_types(op)
         elif dialect == "stablehlo" and name in CHECKS:  # what it holds is scalar
             if not CHECKS[name](op):
                 self.object(f"{name} of {' and '.join(str(x.type) for x in op.operands)}")

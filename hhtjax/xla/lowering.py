@@ -2,7 +2,7 @@
 
 Attributes of a call change what XLA makes of it. One that is not inlined is computed once; one that bears
 `xla_cpu_small_call` is compiled into one kernel, with all its loops. Such a kernel must hold only what its emitter
-knows: with LAPACK, sort, scatter or a large product, compilation fails.
+knows: with LAPACK, sort, a large scatter or product, compilation fails.
 
 So the called function is looked through, operation by operation, with vmap and autodiff done, and the attribute is
 attached only if all are known; where one is not proven, and XLA refuses the kernel on trial, it is not either. Where
@@ -42,6 +42,7 @@ from hhtjax.xla.kernels import (
     watch_p,
 )
 from hhtjax.xla.products import size, written_out
+from hhtjax.xla.scatters import write_out
 from hhtjax.xla.sines import write_sines
 from hhtjax.xla.trial import Module
 
@@ -133,6 +134,8 @@ def _cut(module, found, call, with_sines=True):
         _take_form_inside(choice)
     for case in found.seldom:
         _loop_at_most_once(case)
+    for scatter in found.scatters:
+        write_out(scatter)
     for product in found.products:
         call_stage([product], insert(module, as_stage(written_out(module, product))))
     if with_sines:
