@@ -63,11 +63,8 @@ def is_of_optax(optimizer):
     return optax is not None and isinstance(optimizer, optax.GradientTransformation)
 
 
-def check_options(
-    caller, residuals, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress
-):
+def check_options(caller, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress):
     """`Options` with the defaults filled in, or an error that names what is wrong."""
-    require_function(caller, "residuals", residuals, "residuals(params)")
     if not (optimizer is None or optimizer == LEVENBERG_MARQUARDT or is_of_optax(optimizer)):
         raise TypeError(
             f'{caller}: `optimizer` must be an optax optimiser, "{LEVENBERG_MARQUARDT}" or None; '
@@ -79,7 +76,9 @@ def check_options(
         raise ValueError(f"{caller}: `transforms` must leave a parameter free; received {tf.fixed} for all.")
     if optimizer is None:
         optimizer = LEVENBERG_MARQUARDT if free <= FEW else for_many()
-    if loss is not None and not callable(loss) and loss not in LOSSES:
+    if callable(loss):
+        require_function(caller, "loss", loss, "loss(z)")
+    elif loss is not None and loss not in LOSSES:
         raise ValueError(f"{caller}: `loss` must be one of {', '.join(LOSSES)}, a function or None; received {loss!r}.")
     if max_iterations is None:
         max_iterations = 50 if optimizer == LEVENBERG_MARQUARDT else 1000

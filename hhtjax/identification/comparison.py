@@ -237,9 +237,9 @@ def _check_functions(residuals, fits):
     if functions.keys() != fits.keys():
         raise ValueError(f"compare: `residuals` must be of {', '.join(fits)}; received {', '.join(functions)}.")
     for name, function in functions.items():
-        require_function("compare", "residuals", function, "residuals(params)")
         if fits[name].starts is not None:
             raise NotImplementedError(f"compare: `fits[{name!r}]` has records: no segments of them can be left out.")
+        require_function("compare", "residuals", function, "residuals(params)")
         require_residuals_of(name, fits[name], function)
     return functions
 

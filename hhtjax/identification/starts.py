@@ -133,7 +133,7 @@ def fit_progressively(
     >>> [round(float(hhtjax.fit_progressively(problem_at, 1.5, h).params), 3) == 3.0 for h in ([600], [20, 600])]
     [False, True]
     """
-    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)", count=2)
+    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)")
     try:
         horizons = list(horizons)
     except TypeError:
