@@ -208,6 +208,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
         interop.diffrax_term(ARM)
 
 
+ONE = np.ones(1)
 BEAD = pendulum.cartesian()
 MOTOR = motor_joint.tracking()
 
@@ -236,7 +237,19 @@ MOTOR = motor_joint.tracking()
         ),
         (
             ValueError,
-            r"ode: `force` must return a pytree like v0",
+            r"scipy_rhs: `constraint` must return an array \(m,\)",
+            lambda: interop.scipy_rhs(hhtjax.System(np.ones(1), lambda q, v, t, p: -q, lambda q, t, p: 0.0), ONE, ONE),
+        ),
+        (
+            NotImplementedError,
+            r"scipy_rhs: `system` has dry friction",
+            lambda: interop.scipy_rhs(
+                hhtjax.System(ONE, lambda q, v, t, p: -q, friction=lambda q, v, t, p: 1 + 0 * q), ONE, ONE
+            ),
+        ),
+        (
+            ValueError,
+            r"scipy_rhs: `force` must return a pytree like v0",
             lambda: interop.scipy_rhs(
                 hhtjax.System(np.ones(1), lambda q, v, t, p: jnp.ones(2)), np.ones(1), np.ones(1)
             ),
