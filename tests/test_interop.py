@@ -176,6 +176,17 @@ def test_the_field_of_equal_systems_is_equal():
     assert hash(a) == hash(b)
 
 
+def test_integers_are_numbers_as_others():
+    """Rates are not cut to integers, where y is a state of these."""
+    system = hhtjax.System(np.ones(1), lambda q, v, t, params: -0.5 * q + jnp.sin(t))
+    first = hhtjax.FirstOrderSystem(lambda y, t, params: -0.5 * y + jnp.sin(t))
+    expected = -1.5 + np.sin(0.3)
+    for three in (3, np.array([3])):
+        q = np.atleast_1d(three)
+        np.testing.assert_allclose(interop.ode(system)(0.3, (q, 0 * q), None)[1], expected, rtol=1e-15)
+        np.testing.assert_allclose(interop.ode(first)(0.3, three, None), np.full(np.shape(three), expected))
+
+
 @pytest.mark.slow
 def test_derivatives_through_diffrax():
     """Of the end in a parameter, against central differences through SciPy."""

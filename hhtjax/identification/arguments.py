@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_function, require_integer
-from hhtjax.description import freeze, is_array, is_concrete, is_real, thaw
+from hhtjax.description import as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
 
@@ -96,11 +96,6 @@ def check_parameters(caller, params0, name="params0"):
         check_real(f"{caller}: `{name}{jax.tree_util.keystr(path)}`", leaf)
     if not sum(np.size(leaf) for _, leaf in leaves):
         raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
-
-    def as_float(x):
-        x = jnp.asarray(x)
-        return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
-
     return jax.tree.map(as_float, params0)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import Description, thaw
+from hhtjax.description import Description, as_float, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.constraints import acceleration_and_multipliers
@@ -196,7 +196,7 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
 
 def _ode(system, t, y, params):
     """y' of a pytree y."""
-    y = jax.tree.map(jnp.asarray, y)
+    y = jax.tree.map(as_float, y)
     if isinstance(system, FirstOrderSystem):
         flat, q, v = flatten("ode", system, y, None, t, params)
         return flat.unravel(flat.force(q, v, jnp.asarray(t).astype(v.dtype), params))
