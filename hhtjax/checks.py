@@ -28,11 +28,8 @@ def require_integer(caller, name, value, least=1):
     return int(value)
 
 
-def require_function(caller, name, value, signature, count=None):
-    """An error unless `value` can be called, and is hashable, as a static argument of jit has to be.
-
-    count: of its arguments, where another number is likely.
-    """
+def require_function(caller, name, value, signature):
+    """An error unless `value` can be called so, and is hashable, as a static argument of jit has to be."""
     if not callable(value):
         raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
     try:
@@ -42,30 +39,41 @@ def require_function(caller, name, value, signature, count=None):
             f"{caller}: `{name}` must be hashable, because it is static under jit; received {value!r}. "
             "Pass arrays through params."
         ) from None
-    names = _argument_names(value)
     expected = signature[signature.index("(") + 1 : -1].split(", ")
-    if _in_other_order(names, expected) or (count is not None and not _takes(value, count)):
+    known = _signature(value)
+    if known is not None and _in_other_order(list(known.parameters), expected):
+        names = ", ".join(known.parameters)
         raise TypeError(
-            f"{caller}: `{name}` must be a function {signature}; received one with the arguments ({', '.join(names)})."
+            f"{caller}: `{name}` must be a function {signature}; received one with the arguments ({names})."
         )
+    called = _signature(value, follow_wrapped=False)  # a decorator may have filled in some of them
+    if expected != ["..."] and called is not None and not _takes(called, len(expected)):
+        raise TypeError(f"{caller}: `{name}` is called as {signature}; received a function of {_arguments(called)}.")
 
 
-def _argument_names(function):
+def _signature(function, **options):
+    """None where it does not tell."""
     try:
-        return list(inspect.signature(function).parameters)
-    except (TypeError, ValueError):  # it does not tell
-        return []
+        return inspect.signature(function, **options)
+    except (TypeError, ValueError):
+        return None
 
 
-def _takes(function, count):
-    """Whether a function can be called with so many arguments; True where it does not tell."""
+def _takes(called, count):
+    """Whether a function of this signature can be called with so many arguments."""
     try:
-        inspect.signature(function).bind(*range(count))
-    except ValueError:
-        return True
+        called.bind(*range(count))
     except TypeError:
         return False
     return True
+
+
+def _arguments(called):
+    """The arguments of a signature in words; those that have to be given by name are not positional."""
+    named = [name for name, x in called.parameters.items() if x.kind is x.KEYWORD_ONLY]
+    first = [name for name in called.parameters if name not in named]
+    words = f"{len(first)} positional argument{'s' * (len(first) != 1)} ({', '.join(first)})"
+    return words + f" and the keyword{'s' * (len(named) != 1)} {', '.join(named)}" * bool(named)
 
 
 def _in_other_order(names, expected):

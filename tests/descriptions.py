@@ -14,6 +14,11 @@ def pull(q, v, t, params):
     return -4.0 * q
 
 
+def drag(q, v, t, params, c):
+    """A damper."""
+    return -c * v
+
+
 def push(q, v, t, params):
     """The opposite of `pull`."""
     return 4.0 * q
@@ -86,7 +91,7 @@ DESCRIPTIONS = {
     "kim_implicit_euler": lambda: hhtjax.kim_implicit_euler(),
     "rk4": lambda: hhtjax.rk4(),
 }
-partial_pull = partial(pull, params=None)
+partial_pull = partial(drag, c=0.5)
 
 
 def lambda_matrix(params):

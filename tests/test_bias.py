@@ -227,7 +227,11 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
     ("call", "error", "message"),
     [
         (lambda: hhtjax.refine(3, 1.0, None, 0.1), TypeError, r"refine: `residuals_at` must be a function"),
-        (lambda: hhtjax.refine(lambda p: p, 1.0, None, 0.1), TypeError, r"refine: `residuals_at` .* arguments \(p\)"),
+        (
+            lambda: hhtjax.refine(lambda p: p, 1.0, None, 0.1),
+            TypeError,
+            r"refine: `residuals_at` is called as .* argument \(p\)",
+        ),
         (
             lambda: hhtjax.refine(through, 1.0, hhtjax.hht(), -0.1),
             ValueError,

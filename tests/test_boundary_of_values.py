@@ -2,7 +2,7 @@
 
 import re
 from contextlib import nullcontext
-from functools import partial
+from functools import partial, wraps
 
 import jax
 import jax.numpy as jnp
@@ -85,6 +85,84 @@ def test_so_are_those_of_other_functions_and_any_other_names_pass():
         hhtjax.FirstOrderSystem(lambda t, y, p: y)
     for force in (lambda x, xdot, s, p: -x, lambda *args: -args[0], lambda a, b, t, c=1: -a, partial(pull)):
         System(np.ones(2), force)
+
+
+Q, Z, RUN = np.ones(2), np.zeros(2), {"dt": 0.1, "num_steps": 2}
+BALL = System(np.ones(2), pull)
+
+
+def fit_records(residuals):
+    """Of two records."""
+    return hhtjax.fit(residuals, 1.0, records=np.ones((2, 3)), starts=np.ones(2))
+
+
+def meet(**event):
+    """A run with an event."""
+    return hhtjax.simulate(BALL, hhtjax.hht(), Q, Z, **RUN, events=[hhtjax.Event(**event)])
+
+
+def height(q, v, t, params):
+    """A guard."""
+    return q[0] + 2
+
+
+WRONG = {  # what is called, how, and one that takes a function, with one that takes an argument less
+    "System: `force`": ("force(q, v, t, params)", lambda f: System(Q, f), lambda q, v, p: -q, "3", "(q, v, p)"),
+    "System: `mass`": ("mass(q, params)", lambda f: System(f, pull), lambda p: p, "1", "(p)"),
+    "System: `constraint`": ("constraint(q, t, params)", lambda f: System(Q, pull, f), lambda q, p: q, "2", "(q, p)"),
+    "System: `inertia`": ("inertia(q, w, params)", lambda f: System(Q, pull, inertia=f), lambda q, w: w, "2", "(q, w)"),
+    "System: `friction`": ("friction(q, v, t, params)", lambda f: System(Q, pull, friction=f), lambda: 1, "0", "()"),
+    "System.from_lagrangian: `lagrangian`": (
+        "lagrangian(q, v, t, params)", System.from_lagrangian, jax.jit(lambda q, v, p: 0.0), "3", "(q, v, p)"),
+    "LinearSystem: `K`": ("K(params)", lambda f: hhtjax.LinearSystem(Q, K=f), lambda q, p: 1, "2", "(q, p)"),
+    "LinearSystem: `force`": ("force(t, params)", lambda f: hhtjax.LinearSystem(Q, force=f), lambda t: 1, "1", "(t)"),
+    "FirstOrderSystem: `rate`": ("rate(y, t, params)", hhtjax.FirstOrderSystem, lambda y, p: y, "2", "(y, p)"),
+    "Event: `switch`": ("switch(params)", lambda f: meet(guard=height, switch=f), lambda: 0, "0", "()"),
+    "simulate: events[0]: `guard`": (
+        "guard(q, v, t, params)", lambda f: meet(guard=f), lambda q, v: q[0], "2", "(q, v)"),
+    "simulate: events[0]: `reset`": (
+        "reset(q, v, t, params)", lambda f: meet(guard=height, reset=f), lambda v: -v, "1", "(v)"),
+    "impact: `restitution`": ("restitution(params)", hhtjax.impact, lambda p, v: 0.5, "2", "(p, v)"),
+    "fit: `residuals`": ("residuals(params)", lambda f: hhtjax.fit(f, 1.0), lambda p, record: p, "2", "(p, record)"),
+    "fit: `residuals` of records": ("residuals(params, start, record)", fit_records, lambda p, r: p, "2", "(p, r)"),
+    "fit: `loss`": ("loss(z)", lambda f: hhtjax.fit(abs, 1.0, loss=f), lambda z, c: z, "2", "(z, c)"),
+    "multistart: `residuals`": (
+        "residuals(params)", lambda f: hhtjax.multistart(f, np.ones(2)), lambda p, q: p, "2", "(p, q)"),
+    "hht: `solve`": ("solve(A, b)", lambda f: hhtjax.hht(solve=f), lambda A: A, "1", "(A)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_function_of_the_wrong_number_of_arguments_is_refused_where_it_is_given(name):
+    called, give, function, count, names = WRONG[name]
+    plural = "" if count == "1" else "s"
+    message = f"{name.removesuffix(' of records')} is called as {called}; received a function of {count} positional "
+    with pytest.raises(TypeError, match=re.escape(f"{message}argument{plural} {names}.")):
+        give(function)
+
+
+def test_arguments_that_are_given_by_name_are_no_positional_ones():
+    with pytest.raises(TypeError, match=re.escape("of 4 positional arguments (q, v, t, params) and the keyword c.")):
+        System(Q, lambda q, v, t, params, *, c: -c * v)
+    with pytest.raises(TypeError, match=re.escape("of 3 positional arguments (q, v, t) and the keyword params.")):
+        System(Q, partial(pull, params=None))
+
+
+def test_a_function_that_can_be_called_so_or_does_not_tell_is_none_of_these():
+    @wraps(pull)
+    def filled(q, v, t):
+        return pull(q, v, t, None)
+
+    @wraps(filled)
+    def any_number(*args):
+        return filled(*args[:3])
+
+    for force in (any_number, jax.vmap(pull), jax.jit(pull), jax.tree_util.Partial(pull), np.frompyfunc(max, 4, 1)):
+        System(Q, force)
+    for solve in (hhtjax.banded(1), hhtjax.conjugate_gradients(2)):
+        hhtjax.hht(solve=solve)
+    with pytest.raises(TypeError, match=re.escape("of 3 positional arguments (q, v, t).")):
+        System(Q, filled)
 
 
 NO_DATA = [("steel", "'steel'"), (np.array(["a"]), "an array of <U1"), (np.array([None]), "an array of object")]

@@ -249,6 +249,18 @@ def test_segments_without_residuals_are_none():
         hhtjax.compare(fits, residuals, always=np.arange(10) < 8)
 
 
+def test_of_models_that_leave_nothing_the_one_of_fewer_parameters_is_chosen():
+    def residuals(p):
+        return p["a"] * COLUMNS["rest"] + p.get("b", 0.0) * COLUMNS["slow"] - 2.0 * COLUMNS["rest"]
+
+    starts = {"larger": {"a": 2.0, "b": 0.0}, "smaller": {"a": 2.0}}
+    found = hhtjax.compare({name: hhtjax.fit(residuals, start) for name, start in starts.items()})
+    assert found.rms.tolist() == [0, 0]
+    assert found.chosen == "smaller"
+    assert found.aic[0] - found.aic[1] == pytest.approx(2.0)
+    assert "nan" not in found.summary().partition("F test")[0]
+
+
 def test_what_cannot_be_compared_is_named():
     y = model({"rest": 0.5})
 

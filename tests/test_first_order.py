@@ -59,7 +59,6 @@ def order(system, stepper, steps=(400, 800)):
 
 LITERAL = ("kim_hht", "conventional_hht", "kim_implicit_euler", "implicit_euler", "rowda", "rk4")
 ORDERS = {name: STEPPERS[name].order if name in LITERAL else 2 for name in STEPPERS}
-ORDERS["operator_splitting"] = 1  # y is its velocity, and f_y changes
 ORDERS["houbolt"] = 3  # its formula for the velocity alone
 
 

@@ -70,7 +70,7 @@ def test_profile_is_the_parabola_of_the_standard_error(result):
         hhtjax.identification.prediction_errors(lambda p: p, {})
     with pytest.raises(ValueError, match=r"prediction_errors: `noise` must be 0 or more; received -1\.0"):
         hhtjax.identification.prediction_errors(lambda p: p, {}, noise=-1.0)
-    with pytest.raises(TypeError, match=r"score_test: `residuals` must be a function residuals\(params, candidates\)"):
+    with pytest.raises(TypeError, match=r"score_test: `residuals` is called as residuals\(params, candidates\)"):
         hhtjax.identification.score_test(lambda p: p, 1.0, 0.0)
     with pytest.raises(ValueError, match="profile: `result` must have a covariance"):
         hhtjax.identification.profile(residuals, bare, "rate", [1.0])

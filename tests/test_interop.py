@@ -176,6 +176,17 @@ def test_the_field_of_equal_systems_is_equal():
     assert hash(a) == hash(b)
 
 
+def test_integers_are_numbers_as_others():
+    """Rates are not cut to integers, where y is a state of these."""
+    system = hhtjax.System(np.ones(1), lambda q, v, t, params: -0.5 * q + jnp.sin(t))
+    first = hhtjax.FirstOrderSystem(lambda y, t, params: -0.5 * y + jnp.sin(t))
+    expected = -1.5 + np.sin(0.3)
+    for three in (3, np.array([3])):
+        q = np.atleast_1d(three)
+        np.testing.assert_allclose(interop.ode(system)(0.3, (q, 0 * q), None)[1], expected, rtol=1e-15)
+        np.testing.assert_allclose(interop.ode(first)(0.3, three, None), np.full(np.shape(three), expected))
+
+
 @pytest.mark.slow
 def test_derivatives_through_diffrax():
     """Of the end in a parameter, against central differences through SciPy."""
@@ -208,6 +219,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
         interop.diffrax_term(ARM)
 
 
+ONE = np.ones(1)
 BEAD = pendulum.cartesian()
 MOTOR = motor_joint.tracking()
 
@@ -236,7 +248,19 @@ MOTOR = motor_joint.tracking()
         ),
         (
             ValueError,
-            r"ode: `force` must return a pytree like v0",
+            r"scipy_rhs: `constraint` must return an array \(m,\)",
+            lambda: interop.scipy_rhs(hhtjax.System(np.ones(1), lambda q, v, t, p: -q, lambda q, t, p: 0.0), ONE, ONE),
+        ),
+        (
+            NotImplementedError,
+            r"scipy_rhs: `system` has dry friction",
+            lambda: interop.scipy_rhs(
+                hhtjax.System(ONE, lambda q, v, t, p: -q, friction=lambda q, v, t, p: 1 + 0 * q), ONE, ONE
+            ),
+        ),
+        (
+            ValueError,
+            r"scipy_rhs: `force` must return a pytree like v0",
             lambda: interop.scipy_rhs(
                 hhtjax.System(np.ones(1), lambda q, v, t, p: jnp.ones(2)), np.ones(1), np.ones(1)
             ),

@@ -25,6 +25,13 @@ def free_chain(n, k=100.0):
     return K.tocsc()
 
 
+def bent(n, k):
+    """A chain that one spring to the ground, of a negative stiffness, makes unstable, far from its lowest modes."""
+    K = chain(n).tolil()
+    K[n // 2, n // 2] = k
+    return K.tocsc()
+
+
 @pytest.mark.parametrize("n", [12, 3000])
 def test_frequencies_of_chains(n):
     """12: dense; 3000: Lanczos, also of a K that is singular."""
@@ -154,6 +161,7 @@ def test_under_jit_the_reduced_system_is_data():
         (ValueError, r"`K` must have the shape of M, 3 rows; received 2", lambda: modes(np.ones(3), np.ones(2))),
         (ValueError, r"`K` must be symmetric", lambda: modes(np.ones(2), np.array([[1.0, 0.5], [0.0, 1.0]]))),
         (ValueError, r"`K` must be positive semidefinite; .* = -1", lambda: modes(np.ones(2), np.array([1.0, -1.0]))),
+        (ValueError, r"`K` must be positive semidefinite", lambda: modes(np.ones(1001), bent(1001, 1.5), 2)),
         (ValueError, r"`M` must be positive definite", lambda: modes(np.array([1.0, 0.0]), np.ones(2))),
         (ValueError, r"`K` must have shape \(n, n\)", lambda: modes(np.ones(2), sparse.csr_matrix(np.ones((2, 3))))),
         (TypeError, r"`K` must be known", lambda: jax.jit(lambda K: modes(np.ones(2), K))(np.ones(2))),

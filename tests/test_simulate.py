@@ -115,6 +115,11 @@ def test_dense_output_meets_the_saved_states_and_keeps_trees():
     for ours, saved in ((at_nodes.q, path.q), (at_nodes.v, path.v)):
         assert jax.tree.structure(ours) == jax.tree.structure(q0)
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-14), ours, saved)
+    rows = np.array([0, 1, 4, 5, 10])
+    picked = path._replace(**{
+        name: jax.tree.map(lambda x: x[rows], getattr(path, name)) for name in ("t", "q", "v", "acceleration")
+    })  # fmt: skip
+    np.testing.assert_allclose(hhtjax.interpolate(picked, path.t[4]).q["b"], path.q["b"][4], rtol=1e-12)
     for times, shape in ((0.33, (1, 2)), (jnp.zeros((3, 4)), (3, 4, 1, 2))):
         assert jax.eval_shape(partial(hhtjax.interpolate, path), times).q["a"].shape == shape
 

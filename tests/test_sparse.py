@@ -138,6 +138,16 @@ def test_products_and_solves_of_any_pattern():
             np.testing.assert_allclose(factorize(found)(jnp.asarray(x), trans=trans), expected, rtol=1e-10)
 
 
+def test_a_step_along_a_gradient_is_one_of_entries():
+    """Those that a matrix has: what else is kept beside them is no part of it."""
+    A, x = of_scipy(K), jnp.asarray(RAMP)
+    assert A.pattern.size > A.nnz
+    slope = jax.grad(lambda A: jnp.sum((A @ x) ** 2))(A)
+    assert jnp.sum(slope.values**2) == pytest.approx(np.sum(slope.tocoo().data ** 2), rel=1e-14)
+    for moved in (jax.tree.map(lambda a, g: a - 0.1 * g, A, slope), jax.tree.map(lambda a: a + 1.0, A)):
+        np.testing.assert_allclose(moved @ x, moved.tocoo() @ x, rtol=1e-12, atol=1e-10)
+
+
 def test_pivots_are_free_where_the_diagonal_is_none():
     """And a factor that is not there any more is made again."""
     A = of_scipy(sparse.csr_array(np.array([[0.0, 2.0, 0.0], [1.0, 0.0, 1e-3], [0.0, 5.0, 1.0]])))

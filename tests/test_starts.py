@@ -88,12 +88,21 @@ def test_bad_input_is_named():
         hhtjax.equation_error(spring, np.ones((9, 1)), 0.1, cutoff=6.0)
     with pytest.raises(ValueError, match=r"equation_error: `values` must have more than 20 samples, .* received 20"):
         hhtjax.equation_error(spring, np.ones((20, 1)), 0.1, cutoff=1.0)
+    turned = {"body": np.tile(np.eye(3), (50, 1, 1)), "cart": np.ones((50, 2))}
+    for mass in (np.ones(5), lambda q, params: jnp.eye(5)):
+        body = hhtjax.System(mass, lambda q, v, t, params: v)
+        with pytest.raises(NotImplementedError, match="equation_error: `system` has rotations"):
+            hhtjax.equation_error(body, turned, 0.1, cutoff=1.0)(None)
+    for mass, many in ((np.ones(11), 1), (np.ones(5), -1)):
+        flat = hhtjax.System(mass, lambda q, v, t, params: v)
+        values = turned if many > 0 else turned["cart"].repeat(3, axis=1)[:, :5]
+        assert hhtjax.equation_error(flat, values, 0.1, cutoff=1.0)(None).shape == (30, mass.size)
     with pytest.raises(TypeError, match="measure: `solution` must be what simulate returns; received ArrayImpl"):
         hhtjax.measure(jnp.ones(3), jnp.ones(3))
     for horizons, problem_at, message in (
         ((), lambda n, before: {}, "`horizons` must hold at least one; received none"),
         (5, lambda n, before: {}, "`horizons` must be a sequence; received 5"),
-        ([5], lambda n: {}, r"`problem_at` must be a function problem_at\(horizon, before\); .* the arguments \(n\)"),
+        ([5], lambda n: {}, r"`problem_at` is called as problem_at\(horizon, before\); .* 1 positional argument \(n\)"),
         ([5], lambda n, before: [jnp.sin], "`problem_at` must return a dict .* received at horizon 5 a list"),
         ([5], lambda n, before: {"weights": 1.0}, "`problem_at` must .* at horizon 5 weights, without residuals"),
         ([5], lambda n, before: {"residuals": jnp.sin, "params0": 1.0}, "`problem_at` .* 5 'params0', which is none"),

@@ -60,7 +60,7 @@ TEST_EQUATION = FirstOrderSystem(_complex_product)
 def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Array:
     """A, the derivative of one step at a state, with respect to x: (k, k).
 
-        x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za)
+        x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za),    of a first-order system (q, h v, h a, memory)
 
     Constrained or not: of a nonlinear system it is the tangent of the flow of the step, which near an equilibrium, or
     for a small dt, tells how perturbations of the run grow. There each constraint adds the eigenvalues of infinite

@@ -79,7 +79,7 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
     if not isinstance(solution, Solution) or solution.t.ndim != 1:
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
     if potential is not None:
-        require_function(caller, "potential", potential, "potential(q, t, params)", count=3)
+        require_function(caller, "potential", potential, "potential(q, t, params)")
     return _energy_balance(system, solution, freeze(params), potential)
 
 

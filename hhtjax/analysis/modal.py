@@ -13,6 +13,7 @@ from hhtjax.checks import require_integer
 from hhtjax.description import Description, is_concrete
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.sparse_matrix import Sparse
+from hhtjax.numerics.superlu import is_positive_definite
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import SYMMETRIC, constant_matrix, is_sparse, require_mass
 
@@ -92,8 +93,9 @@ def modes(M, K, count=None) -> NormalModes:
     if count > n:
         raise ValueError(f"modes: `count` must be at most {n}, the number of coordinates; received {count}.")
     by_lanczos = (is_sparse(M) or is_sparse(K)) and DENSE < n != count
-    squares, T, scale = (_by_lanczos if by_lanczos else _by_numpy)(M, K, count)
-    if squares[0] < -max(1e-9, ROUNDINGS * _eps(T, M, K)) * scale:
+    rounding = max(1e-9, ROUNDINGS * _eps(M, K))
+    squares, T, scale = _by_lanczos(M, K, count, rounding) if by_lanczos else _by_numpy(M, K, count)
+    if squares[0] < -rounding * scale:
         raise ValueError(f"modes: `K` must be positive semidefinite; received one with frequency^2 = {squares[0]:.4g}.")
     largest = np.take_along_axis(T, np.argmax(np.abs(T), axis=0)[None], axis=0)
     return NormalModes(np.sqrt(np.maximum(squares, 0)), np.where(largest < 0, -T, T))
@@ -264,8 +266,8 @@ def _by_numpy(M, K, count):
     return squares[:count], to_unit @ Y[:, :count], np.max(np.abs(squares))
 
 
-def _by_lanczos(M, K, count):
-    """The same by SciPy, for sparse matrices."""
+def _by_lanczos(M, K, count, rounding):
+    """The same by SciPy, for sparse matrices; rounding: of squares, relative to the largest."""
     from scipy import sparse
     from scipy.sparse.linalg import ArpackError, eigsh
 
@@ -276,6 +278,8 @@ def _by_lanczos(M, K, count):
     if not np.min(diagonals[1]) > 0:
         raise ValueError("modes: `M` must be positive definite; received one with a diagonal that is not positive.")
     scale = np.max(diagonals[0] / diagonals[1])
+    if not is_positive_definite(K + rounding * scale * M):  # Lanczos finds no negative square far from the shift
+        raise ValueError("modes: `K` must be positive semidefinite; received one that is not.")
     start = np.random.default_rng(0).standard_normal(len(diagonals[0]))
     for shift in SHIFTS:
         try:
@@ -285,8 +289,8 @@ def _by_lanczos(M, K, count):
         order = np.argsort(squares)
         squares, T = squares[order], T[:, order]
         T = T / np.sqrt(np.sum(T * (M @ T), axis=0))
-        left, rounding = np.abs(K @ T - (M @ T) * squares), np.finfo(float).eps * (abs(K) @ np.abs(T))
-        if np.all(left <= 1e-6 * np.abs(squares[-1]) * np.max(np.abs(M @ T), axis=0) + 1e3 * rounding):
+        left, terms = np.abs(K @ T - (M @ T) * squares), np.finfo(float).eps * (abs(K) @ np.abs(T))
+        if np.all(left <= 1e-6 * np.abs(squares[-1]) * np.max(np.abs(M @ T), axis=0) + 1e3 * terms):
             return squares, T, scale
     raise ValueError(
         f"modes: {count} modes of the sparse `M` and `K` were not found: M may be singular, or K indefinite."

@@ -40,6 +40,12 @@ def known_now(f, *args):
     return jax.tree.map(np.asarray, found) if all_concrete(found) else None
 
 
+def as_float(x):
+    """An array of floats: of numbers of other kinds in the default precision."""
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
+
+
 def is_real(x):
     """A real number, or an array of them; no booleans, text, objects or complex numbers."""
     if is_array(x):

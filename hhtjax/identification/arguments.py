@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_function, require_integer
-from hhtjax.description import freeze, is_array, is_concrete, is_real, thaw
+from hhtjax.description import as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
 
@@ -63,11 +63,8 @@ def is_of_optax(optimizer):
     return optax is not None and isinstance(optimizer, optax.GradientTransformation)
 
 
-def check_options(
-    caller, residuals, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress
-):
+def check_options(caller, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress):
     """`Options` with the defaults filled in, or an error that names what is wrong."""
-    require_function(caller, "residuals", residuals, "residuals(params)")
     if not (optimizer is None or optimizer == LEVENBERG_MARQUARDT or is_of_optax(optimizer)):
         raise TypeError(
             f'{caller}: `optimizer` must be an optax optimiser, "{LEVENBERG_MARQUARDT}" or None; '
@@ -79,7 +76,9 @@ def check_options(
         raise ValueError(f"{caller}: `transforms` must leave a parameter free; received {tf.fixed} for all.")
     if optimizer is None:
         optimizer = LEVENBERG_MARQUARDT if free <= FEW else for_many()
-    if loss is not None and not callable(loss) and loss not in LOSSES:
+    if callable(loss):
+        require_function(caller, "loss", loss, "loss(z)")
+    elif loss is not None and loss not in LOSSES:
         raise ValueError(f"{caller}: `loss` must be one of {', '.join(LOSSES)}, a function or None; received {loss!r}.")
     if max_iterations is None:
         max_iterations = 50 if optimizer == LEVENBERG_MARQUARDT else 1000
@@ -97,11 +96,6 @@ def check_parameters(caller, params0, name="params0"):
         check_real(f"{caller}: `{name}{jax.tree_util.keystr(path)}`", leaf)
     if not sum(np.size(leaf) for _, leaf in leaves):
         raise ValueError(f"{caller}: `{name}` must hold at least one number; received {params0!r}.")
-
-    def as_float(x):
-        x = jnp.asarray(x)
-        return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
-
     return jax.tree.map(as_float, params0)
 
 

@@ -205,8 +205,7 @@ def compare(
     k = np.array([int(np.sum(x.free)) + used_by_starts(x) for x in results])
     square = np.array([sum(np.sum(r**2) for r in x.weighted) for x in all_residuals])
     effective = effective_observations(n, results[int(np.argmax(k))].uncertainty)
-    with np.errstate(divide="ignore"):
-        likelihood = effective * np.log(square / n)
+    likelihood = effective * np.log(np.maximum(square / n, np.finfo(float).tiny))  # of exact fits, k decides
     tests = tuple(_nested_tests(fits, dict(zip(names, zip(k, square, strict=True), strict=True)), n, absent))
     found = Comparison(
         names, k, n, effective, np.sqrt(square / n), likelihood + 2 * k, likelihood + k * np.log(effective), tests
@@ -237,9 +236,9 @@ def _check_functions(residuals, fits):
     if functions.keys() != fits.keys():
         raise ValueError(f"compare: `residuals` must be of {', '.join(fits)}; received {', '.join(functions)}.")
     for name, function in functions.items():
-        require_function("compare", "residuals", function, "residuals(params)")
         if fits[name].starts is not None:
             raise NotImplementedError(f"compare: `fits[{name!r}]` has records: no segments of them can be left out.")
+        require_function("compare", "residuals", function, "residuals(params)")
         require_residuals_of(name, fits[name], function)
     return functions
 

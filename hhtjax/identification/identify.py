@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.checks import require_number
+from hhtjax.checks import require_function, require_number
 from hhtjax.description import is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
@@ -125,12 +125,13 @@ def fit(
     >>> round(float(result.params["a"]), 3), round(float(result.params["rate"]), 3)
     (3.0, 2.0)
     """
+    of_records = records is not None or starts is not None
+    signature = "residuals(params, start, record)" if of_records else "residuals(params)"
+    require_function("fit", "residuals", residuals, signature)
     params0 = check_parameters("fit", params0)
-    options = check_options(
-        "fit", residuals, params0, optimizer, transforms, loss, max_iterations, covariance, segments, progress
-    )
+    options = check_options("fit", params0, optimizer, transforms, loss, max_iterations, covariance, segments, progress)
     data = _check_data("fit", params0, scale, weights, prior, tolerance)
-    if records is not None or starts is not None:
+    if of_records:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
     result = or_plain(partial(solve, residuals, options, params0, data))
     result = result._replace(params=thaw(result.params))
@@ -185,11 +186,12 @@ def multistart(
     >>> round(float(found.best.params), 6), int(jnp.sum(found.all.cost < 1e-9))
     (3.0, 1)
     """
+    require_function("multistart", "residuals", residuals, "residuals(params)")
     starts = check_parameters("multistart", starts, "starts")
     require_leading_axis("multistart", "`starts`", starts)
     first = jax.tree.map(lambda x: x[0], starts)
     options = check_options(
-        "multistart", residuals, first, optimizer, transforms, loss, max_iterations, covariance, segments, False
+        "multistart", first, optimizer, transforms, loss, max_iterations, covariance, segments, False
     )
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)

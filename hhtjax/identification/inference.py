@@ -73,7 +73,7 @@ def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: An
     >>> dict(zip(found.names, (found.statistic > 10.8).tolist()))
     {'cube': True, 'square': False}
     """
-    require_function("score_test", "residuals", residuals, "residuals(params, candidates)", count=2)
+    require_function("score_test", "residuals", residuals, "residuals(params, candidates)")
     if isinstance(params, FitResult):
         raise TypeError("score_test: `params` must be those of a fit, result.params; received the FitResult.")
     segments = require_integer("score_test", "segments", segments, 2)
@@ -201,7 +201,7 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
     >>> bool(hhtjax.identification.prediction_errors(lambda p: 3 * p, result) == 3 * result.standard_errors)
     True
     """
-    require_function("prediction_errors", "predict", predict, "predict(params)", count=1)
+    require_function("prediction_errors", "predict", predict, "predict(params)")
     require_number("prediction_errors", "noise", noise, lambda x: x >= 0, "be 0 or more")
     _uncertainty("prediction_errors", result)
     x, unravel = ravel_pytree(freeze(result.params))

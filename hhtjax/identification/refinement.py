@@ -124,7 +124,7 @@ def refine(
     >>> f"{found.fits[0].params['k']:.2f} {found.params['k']:.4f}"
     '9.03 9.0000'
     """
-    require_function("refine", "residuals_at", residuals_at, "residuals_at(stepper, dt)", count=2)
+    require_function("refine", "residuals_at", residuals_at, "residuals_at(stepper, dt)")
     require_stepper("refine", stepper)
     require_number("refine", "dt", dt, lambda x: x > 0, "be positive")
     if not options.get("covariance", True):

@@ -14,6 +14,7 @@ from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.band_limited import band_limited_motion
 from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.returned import evaluate
 from hhtjax.systems.sampled import Sampled, sampled
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_smooth, require_system
 
@@ -51,7 +52,7 @@ def equation_error(
 
     Raises:
         TypeError, ValueError: what is no system; as `band_limited_motion` and `sampled`; no samples between the ends.
-        NotImplementedError: a system with constraints, internal states or dry friction.
+        NotImplementedError: a system with constraints, internal states or dry friction; when called, with rotations.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -83,6 +84,7 @@ def equation_error(
 
     def residuals(params):
         def one(q, v, a, t):
+            _require_no_rotations(system, q, params)
             flat, x, rate = flatten("equation_error", system, q, v, t, params)
             known = flat.force(x, rate, t.astype(rate.dtype), params)
             return flat.inertia(x, ravel_pytree(a if flat.positions else v)[0], params) - known
@@ -90,6 +92,19 @@ def equation_error(
         return jax.vmap(one)(*inside)
 
     return residuals
+
+
+def _require_no_rotations(system, q, params):
+    """An error for positions (3, 3) whose mass is that of angular velocities (3,)."""
+    turning = sum(x.size for x in jax.tree.leaves(q) if x.shape[-2:] == (3, 3))
+    if turning and isinstance(system, System):
+        M = evaluate("equation_error", "mass", system.mass, q, params) if callable(system.mass) else system.mass
+        rows = sum(x.size for x in jax.tree.leaves(q)) - turning + turning // 3
+        if getattr(M, "shape", None) in ((rows,), (rows, rows)):
+            raise NotImplementedError(
+                "equation_error: `system` has rotations, whose angular velocities are no derivatives of what `values` "
+                "holds."
+            )
 
 
 def _at_equal_distances(values, dt, t0, times):
@@ -133,7 +148,7 @@ def fit_progressively(
     >>> [round(float(hhtjax.fit_progressively(problem_at, 1.5, h).params), 3) == 3.0 for h in ([600], [20, 600])]
     [False, True]
     """
-    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)", count=2)
+    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)")
     try:
         horizons = list(horizons)
     except TypeError:

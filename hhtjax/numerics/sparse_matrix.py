@@ -51,6 +51,13 @@ class Pattern:
         found[self.slots[early]] = self.columns[early]
         return found.reshape(self.width, self.n)
 
+    @cached_property
+    def filled(self):
+        """Which slots hold an entry: what others hold is none, as after a step along a gradient."""
+        found = np.zeros(self.size, bool)
+        found[self.slots] = True
+        return found
+
     def spread(self, numbers):
         """Those of the entries, in their slots."""
         found = np.zeros(self.size, np.result_type(numbers))
@@ -146,14 +153,15 @@ class Sparse:
     def __matmul__(self, x):
         """A x, for x (n,)."""
         p = self.pattern
-        layers = self.values[: p.width * p.n].reshape(p.width, p.n)
+        values = jnp.where(p.filled, self.values, 0) if p.size > self.nnz else self.values
+        layers = values[: p.width * p.n].reshape(p.width, p.n)
         if p.width <= WRITTEN_OUT:
             y = sum((a * gather(x, i) for a, i in zip(layers, p.layers, strict=True)), jnp.zeros_like(x))
         else:
             step = lambda y, layer: (y + layer[0] * gather(x, layer[1]), None)  # noqa: E731
             y, _ = lax.scan(step, jnp.zeros_like(layers[0]), (layers, jnp.asarray(p.layers)))
         rows, columns = p.tail
-        return y.at[rows].add(self.values[p.width * p.n :] * gather(x, columns)) if len(rows) else y
+        return y.at[rows].add(values[p.width * p.n :] * gather(x, columns)) if len(rows) else y
 
 
 def gather(x, i):

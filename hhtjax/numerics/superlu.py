@@ -113,3 +113,14 @@ def superlu(pattern, values):
         if np.max(np.abs(A @ factors.solve(b) - b)) <= enough:
             return factors
     return None
+
+
+def is_positive_definite(A):
+    """Whether a symmetric matrix of scipy.sparse is so, by the signs of its pivots."""
+    from scipy.sparse.linalg import splu
+
+    try:
+        factors = splu(A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError:  # singular
+        return False
+    return np.array_equal(factors.perm_r, factors.perm_c) and np.min(factors.U.diagonal()) > 0

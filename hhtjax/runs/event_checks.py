@@ -57,7 +57,7 @@ def _require_shapes(caller, problem, event):
     for name in ("guard", "reset"):
         function = getattr(event, name)
         if function is not None and not isinstance(function, Impact):
-            require_function(caller, name, function, f"{name}({arguments})", count=len(at))
+            require_function(caller, name, function, f"{name}({arguments})")
     g = returned.evaluate(caller, "guard", event.guard, *at)
     if not hasattr(g, "shape") or g.shape not in [(), (1,)]:
         raise TypeError(f"{caller}: `guard` must return a number; received {describe(g)}.")

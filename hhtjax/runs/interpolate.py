@@ -71,13 +71,22 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     if not is_real(times):
         raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
     known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
-    equal = not jnp.ndim(solution.dt) and solution.events is None  # an event may end a run early
+    equal = not jnp.ndim(solution.dt) and solution.events is None and not _are_uneven(t)  # an event may end a run early
     found, outside = _found(known, jnp.asarray(times), equal=equal)
     if is_concrete(outside) and np.any(outside):
         bad = np.asarray(times).astype(t.dtype)[np.asarray(outside)].flat[0]
         raise ValueError(f"interpolate: `times` must lie in [{t[0]:.6g}, {t[-1]:.6g}]; received {bad:.6g}.")
     v = None if solution.acceleration is None else found.v
     return Interpolant(found.q, v) if solution.z is None else InternalInterpolant(found.q, v, found.z)
+
+
+def _are_uneven(t):
+    """Whether saved times, where they are known, are at other distances than those of a run: of rows picked out."""
+    if not is_concrete(t) or len(t) < 2:
+        return False
+    t = np.asarray(t)
+    mean, rounding = (t[-1] - t[0]) / (len(t) - 1), 4 * np.finfo(t.dtype).eps * np.max(np.abs(t))
+    return bool(np.max(np.abs(np.diff(t) - mean)) > mean / 2 + rounding)
 
 
 @partial(Programs, static_argnames="equal")

@@ -228,7 +228,7 @@ class Solution(NamedTuple):
                 "size for this step, or for float32"
             )
         if np.isinf(friction):
-            return "a limit of the dry friction is negative or not a number: see `friction` of the System"
+            return "a limit of the dry friction is negative or not finite: see `friction` of the System"
         if friction:
             return (
                 f"joints with dry friction switch too often: {friction:.2g} of the step is left. Take a smaller dt, as "

@@ -132,7 +132,7 @@ def bind_friction(method, system, params, dt, kept=None):
         if method.estimating:
             defect = _defect(method, system, params, rubbing, path(z), end.tau, inverse)
             info = info._replace(defect=defect, switched=_switched(system, s, s1, end, G))
-        info = _told(info, left, _is_limit(law, at, params) & ~jnp.any(f < 0))
+        info = _told(info, left, _is_limit(law, at, params) & ~jnp.any((f < 0) | (f == jnp.inf)))
         return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
 
     return step
@@ -226,9 +226,9 @@ def _each(f, rows):
 
 
 def _is_limit(law, s, params):
-    """Whether the limits at a state are numbers >= 0; of a state that is not finite others tell."""
+    """Whether the limits at a state are finite and >= 0; of a state that is not finite others tell."""
     f = law.limit(s.q, s.v, s.L, s.t, params)
-    return jnp.all(f >= 0) | ~(jnp.all(jnp.isfinite(s.q)) & jnp.all(jnp.isfinite(s.v)))
+    return jnp.all((f >= 0) & (f < jnp.inf)) | ~(jnp.all(jnp.isfinite(s.q)) & jnp.all(jnp.isfinite(s.v)))
 
 
 def _told(info, left, is_limit):

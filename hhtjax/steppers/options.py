@@ -9,6 +9,7 @@ from typing import Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
 import jax
 
 from hhtjax.checks import require_function, require_integer, require_number
+from hhtjax.numerics.linear_solve import Structured
 from hhtjax.systems.constraints import check_redundant
 
 Constructor = TypeVar("Constructor", bound=Callable)
@@ -89,7 +90,8 @@ def check_options(caller, **keywords: Any) -> Options:
     if options.redundant is not None and options.solve is not None:
         raise ValueError(f"{caller}: `redundant` brings its own solver: leave out `solve`, or `redundant`.")
     if options.solve is not None:
-        require_function(caller, "solve", options.solve, "solve(A, b)")
+        structured = isinstance(options.solve, Structured)
+        require_function(caller, "solve", options.solve, "solve(...)" if structured else "solve(A, b)")
     return options
 
 

@@ -57,13 +57,14 @@ class OperatorSplitting(Stepper):
             weighted = stiffness if self.modified else implicit
 
             t = s.t + dt
+            guess = s.w if system.positions == 0 else jnp.zeros_like(s.w)  # of a1; of y', whose M is 1, as it was
             q = s.q + system.located(dt * s.v) + system.located(dt**2 * (0.5 - beta) * s.w)
-            v = s.v + dt * (1 - gamma) * s.w
+            v = s.v + dt * ((1 - gamma) * s.w + gamma * guess)
             Q = system.force(q, v, t, params)
             P = self.weighted_force(system, q, v, t, params)
-            a = solve(system.full_mass(q, params) + implicit + alpha * weighted, Q + alpha * (P - P0))
+            a = solve(system.full_mass(q, params) + implicit + alpha * weighted, Q - guess + alpha * (P - P0))
             memory = Memory(K, C, P - matvec(weighted, a))
-            return State(t, q + system.located(dt**2 * beta * a), v + dt * gamma * a, a, memory=memory), Info()
+            return State(t, q + system.located(dt**2 * beta * a), v + dt * gamma * a, guess + a, memory=memory), Info()
 
         return step
 
@@ -82,6 +83,7 @@ def operator_splitting(alpha: Any = -0.05, modified=False) -> OperatorSplitting:
     Order 2 for constant M and C = -Q_v, with any stiffness and explicit time; `modified` with alpha other than 0 only
     where C = 0. Else 1: v~ is O(h) off, and so is every force of velocity that C0 does not hold (centrifugal ones:
     every mechanism). `order` is the one for constant M and C. On linear systems the standard form is `hht(alpha)`.
+    Of a `FirstOrderSystem` v~ = y + h (1 - gamma) y' + h gamma y' = y + h y', and the order the same for any f(y, t).
 
     An undamped oscillator m, of stiffness k now and k0 at the start, is stable for
 

@@ -66,7 +66,7 @@ class Event(Description):
         if self.reset is not None and not isinstance(self.reset, Impact):
             require_function("Event", "reset", self.reset, "reset(...)")
         if self.switch is not None:
-            require_function("Event", "switch", self.switch, "switch(params)", count=1)
+            require_function("Event", "switch", self.switch, "switch(params)")
         if not isinstance(self.terminal, bool):
             raise TypeError(f"Event: `terminal` must be True or False; received {self.terminal!r}.")
 
@@ -111,7 +111,9 @@ def impact(restitution: Any = 1.0) -> Impact:
     Traceback (most recent call last):
     ValueError: impact: `restitution` must lie in [0, 1]; received 1.2.
     """
-    if not isinstance(restitution, str) and not (callable(restitution) and not is_array(restitution)):
+    if callable(restitution) and not is_array(restitution):
+        require_function("impact", "restitution", restitution, "restitution(params)")
+    elif not isinstance(restitution, str):
         require_number("impact", "restitution", restitution, lambda e: 0 <= e <= 1, "lie in [0, 1]")
     return Impact(restitution)
 

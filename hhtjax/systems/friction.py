@@ -40,9 +40,9 @@ def require_friction(caller, friction, sliding, *more):
         if sliding is not None:
             raise ValueError(f"{caller}: `sliding` must go with `friction`, the limits of the forces there.")
         return
-    require_function(caller, "friction", friction, f"friction({', '.join(('q, v', *more))}, t, params)", 4 + len(more))
+    require_function(caller, "friction", friction, f"friction({', '.join(('q, v', *more))}, t, params)")
     if sliding is not None:
-        require_function(caller, "sliding", sliding, "sliding(q, v, t, params)", count=4)
+        require_function(caller, "sliding", sliding, "sliding(q, v, t, params)")
 
 
 def flat_friction(caller, system, flat, q0, v0, z0, t0, params):

@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import Description, thaw
+from hhtjax.description import Description, as_float, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.constraints import acceleration_and_multipliers
@@ -177,12 +177,13 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
     q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
     if jax.tree.leaves(q0)[0].dtype != np.float64:
         raise ValueError(f"{caller}: SciPy computes in double precision: `q0` and `v0` must be float64 (with x64 on).")
+    require_smooth(caller, system)
+    flatten(caller, system, q0, v0, t0, thaw(params), z0)
     if system.constraint is not None:
         require_consistent(caller, system, q0, v0, t0, params, z0=z0)
     flat = flat_ode(system, q0, v0, z0)
     packed, unpack = _packed(params)
     rate, jacobian = _compiled(flat.rate, unpack)
-    jax.eval_shape(rate, t0, flat.y0, packed)  # raises here and not inside SciPy
 
     def call(program, t, y):
         return np.asarray(program(np.float64(t), y, packed))
@@ -195,7 +196,7 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
 
 def _ode(system, t, y, params):
     """y' of a pytree y."""
-    y = jax.tree.map(jnp.asarray, y)
+    y = jax.tree.map(as_float, y)
     if isinstance(system, FirstOrderSystem):
         flat, q, v = flatten("ode", system, y, None, t, params)
         return flat.unravel(flat.force(q, v, jnp.asarray(t).astype(v.dtype), params))

@@ -111,7 +111,7 @@ class System(Description):
             require_function("System", "force", self.force, "force(q, v, t, params)")
         else:
             for name in ("force", "internal"):
-                require_function("System", name, getattr(self, name), f"{name}(q, v, z, t, params)", count=5)
+                require_function("System", name, getattr(self, name), f"{name}(q, v, z, t, params)")
         if self.inertia is not None:
             require_function("System", "inertia", self.inertia, "inertia(q, w, params)")
         if self.constraint is not None:
@@ -147,8 +147,8 @@ class System(Description):
         """
         require_function("System.from_lagrangian", "lagrangian", lagrangian, "lagrangian(q, v, t, params)")
         if force is not None:
-            arguments, count = ("q, v, t, params", None) if internal is None else ("q, v, z, t, params", 5)
-            require_function("System.from_lagrangian", "force", force, f"force({arguments})", count)
+            arguments = "q, v, t, params" if internal is None else "q, v, z, t, params"
+            require_function("System.from_lagrangian", "force", force, f"force({arguments})")
         own_force = (LagrangianForce if internal is None else InternalLagrangianForce)(lagrangian, force)
         inertia = LagrangianInertia(lagrangian)
         more = {"inertia": inertia, "internal": internal, "friction": friction, "sliding": sliding}
