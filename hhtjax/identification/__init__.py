@@ -29,6 +29,18 @@ are long against that correlation, and the error comes from how much the segment
 literature: a cluster-robust, or "cluster sandwich", covariance.) `result.summary()` shows how many times larger it is
 than the textbook's.
 
+What an estimate depends on
+---------------------------
+
+Estimates have derivatives in what a fit is given: in samples, weights, priors, and in all that the residuals read. By
+how much the stiffness changes with the mass, which was taken for known (the motion tells k/m):
+
+>>> def stiffness(m):
+...     known = lambda unknown: simulated(unknown | {"m": m}) - measured
+...     return hhtjax.fit(known, result.params, covariance=False).params["k"]
+>>> round(float(jax.jacfwd(stiffness)(1.0)), 2)                              # k/m; by jax.grad too
+2.0
+
 What a fit can be told
 ----------------------
 

@@ -65,6 +65,11 @@ class DenseTrial(NamedTuple):
     V: Any
     z: Any  # residual in the basis of the left singular vectors
 
+    @property
+    def read(self):
+        """Of the problem, there."""
+        return self.r, self.J
+
 
 class Dense(NamedTuple):
     """Residuals f(x) (m,) of which each may depend on every unknown; bend(x): p''/p' of each."""
@@ -73,9 +78,18 @@ class Dense(NamedTuple):
     objective: Objective
     bend: Callable | None
 
+    def read(self, x):
+        """Residuals and their Jacobian."""
+        return with_jacobian(self.f, x)
+
+    def slopes(self, x):
+        """The gradient of the cost, of all that there is: (1, p)."""
+        J, pull, _ = self.objective.estimating(*self.read(x))
+        return (pull @ J)[None, :]
+
     def look(self, x, D) -> DenseTrial:
         """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
-        r, J = with_jacobian(self.f, x)
+        r, J = self.read(x)
         r_hat, J_hat = self.objective.least_squares(r, J)
         finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
         r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
@@ -120,6 +134,11 @@ class ArrowTrial(NamedTuple):
     R_own: Any
     z: Any  # (records, k + p + 1)
 
+    @property
+    def read(self):
+        """Of the problem, there."""
+        return self.r, self.J, self.J_own
+
 
 class Arrow(NamedTuple):
     """Residuals f(shared, own, record) (m,) of each record, with k unknowns of its own, which are eliminated.
@@ -140,15 +159,26 @@ class Arrow(NamedTuple):
         count = jax.tree.leaves(self.records)[0].shape[0]
         return x[: self.p], x[self.p :].reshape(count, -1)
 
-    def look(self, x, D) -> ArrowTrial:
-        """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
+    def read(self, x):
+        """Residuals of each record, and their Jacobians by the shared and by their own unknowns."""
         shared, own = self.split(x)
 
         def one(own, record):
             r, J = with_jacobian(lambda y: self.f(y[: self.p], y[self.p :], record), jnp.concatenate([shared, own]))
             return r, J[:, : self.p], J[:, self.p :]
 
-        r, J, J_own = jax.vmap(one)(own, self.records)
+        return jax.vmap(one)(own, self.records)
+
+    def slopes(self, x):
+        """The gradient of each record's cost by the shared and by its own unknowns: (records, p + k)."""
+        r, *J = self.read(x)
+        J = jnp.concatenate(J, axis=2)
+        wJ, pull, _ = self.objective.estimating(r.ravel(), J.reshape(r.size, -1))
+        return jnp.einsum("bm,bmp->bp", pull.reshape(r.shape), wJ.reshape(J.shape))
+
+    def look(self, x, D) -> ArrowTrial:
+        """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
+        r, J, J_own = self.read(x)
         count, m, k = J_own.shape
         both = jnp.concatenate([J_own, J], axis=2).reshape(count * m, -1)
         r_hat, both = self.objective.least_squares(r.ravel(), both)
@@ -157,7 +187,7 @@ class Arrow(NamedTuple):
         both, r_hat = both.reshape(count, m, -1), r_hat.reshape(count, m)
         if self.bend is not None:
             slopes, squares = jnp.einsum("bmp,bm->p", both[:, :, k:], r_hat), jnp.sum(both[:, :, k:] ** 2, axis=(0, 1))
-            further = jnp.diag(_bent(self.bend(shared), slopes, squares) / count**0.5)  # a part in each record
+            further = jnp.diag(_bent(self.bend(x[: self.p]), slopes, squares) / count**0.5)  # a part in each record
             further = jnp.broadcast_to(jnp.pad(further, ((0, 0), (k, 0))), (count, self.p, k + self.p))
             both, r_hat = jnp.concatenate([both, further], axis=1), jnp.pad(r_hat, ((0, 0), (0, self.p)))
         norms = jnp.linalg.norm(both[:, :, k:], axis=(0, 1)), jnp.linalg.norm(both[:, :, :k], axis=1)
@@ -204,11 +234,11 @@ class Arrow(NamedTuple):
         own = jnp.einsum("bik,bi->bk", trial.R_own, trial.z)
         return _cosine(jnp.concatenate([shared, own.ravel()]), trial)
 
-    def free_of_own(self, trial):
+    def free_of_own(self, r, J, J_own):
         """What `Objective.estimating` says of the residuals, with the part of J that no own unknown can make up for."""
-        count, m, k = trial.J_own.shape
-        both = jnp.concatenate([trial.J_own, trial.J], axis=2).reshape(count * m, -1)
-        both, pull, bend = self.objective.estimating(trial.r.ravel(), both)
+        count, m, k = J_own.shape
+        both = jnp.concatenate([J_own, J], axis=2).reshape(count * m, -1)
+        both, pull, bend = self.objective.estimating(r.ravel(), both)
 
         def project(both, bend):
             Q, J = jnp.linalg.qr(both[:, :k])[0], both[:, k:]

@@ -94,8 +94,9 @@ def fit(
     and that an array has changed in place or a name been bound anew goes unnoticed. For other data make another
     function, `lambda params: residuals(params, data)`, or pass them as `records`.
 
-    Derivatives of an estimate in what the residuals read, by `jax.jacfwd` alone, are those of the iterations that found
-    it: nearly its own, but 0 where the fit starts at the estimate.
+    Estimates have derivatives, forward and reverse, in all that a fit is given and its residuals read, but where it
+    starts: those of the minimum, H dx + (dg/dd) dd = 0 with g = dc/dx the slope of the cost and H = dg/dx, by the
+    implicit function theorem. They need a fit that has converged: look at `result.code`, make `tolerance` small.
 
     Residuals may simulate under error control, `dt=adaptive(...)`, in `sweep` too: Levenberg-Marquardt freezes the
     steps, fits, and chooses again, until the estimates stay to a tenth of their standard errors; `result.choices` tells

@@ -12,13 +12,15 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.description import freeze, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options, check_residuals, spread_weights
-from hhtjax.identification.descent import descend
+from hhtjax.identification.descent import Smooth, descend
 from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
+from hhtjax.identification.implicit import at_minimum
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.rounds import in_rounds
 from hhtjax.identification.sandwich import LEAST, count_segments, in_time, uncertainty, used_up, variance_inflation
+from hhtjax.numerics.hoisted import hoisted
 from hhtjax.runs.freezing import chooses_steps, with_steps_for
 from hhtjax.xla import Programs
 
@@ -136,24 +138,22 @@ def _solve_dense(residuals, options, coordinates, data, limits):
         away = [p - mean for p, mean in zip(coordinates.free_leaves(x), means, strict=True)]
         return jnp.concatenate([r, ravel_pytree(away)[0]])
 
-    objective, bending, choices = Objective(w, options.loss, m), coordinates.bend(), None
-    if options.optimizer == LEVENBERG_MARQUARDT:
+    call, given = hoisted(f, coordinates.x0)
+    by_jacobians = options.optimizer == LEVENBERG_MARQUARDT
 
-        def problem_for(y, fresh):
-            return Dense(lambda x: with_steps_for(f, x, jnp.where(fresh, x, y)), objective, bending)
+    def problem_of(given, w, f=None):
+        f, objective = f or partial(call, given), Objective(w, options.loss, m)
+        return Dense(f, objective, coordinates.bend()) if by_jacobians else Smooth(f, objective)
 
-        start = coordinates.x0, coordinates.longest, *limits
-        if chooses_steps(f, coordinates.x0):
-            best, history, iterations, code, choices = in_rounds(problem_for, *start)
-        else:
-            best, history, iterations, code = levenberg_marquardt(Dense(f, objective, bending), *start)
-        x, r, J = best.x, best.r, best.J
-    else:
-        x, history, iterations, code = descend(f, coordinates.x0, objective, options.optimizer, *limits)
-        r, J = with_jacobian(f, x) if options.covariance else (f(x), None)
-    residual, cost, pull, bend = unravel(r[:m]), objective.cost(r), r, None
+    problem, frozen = problem_of(given, w, f), None
+    if by_jacobians and chooses_steps(call, given, coordinates.x0):
+        frozen = partial(_dense_with_frozen_steps, problem)
+    find = partial(_minimise, problem, frozen, coordinates.x0, coordinates.longest, options.optimizer, limits)
+    x, read, (history, iterations, code, choices) = at_minimum(find, problem_of, coordinates.x0.size, given, w)
+    r, J = read or (with_jacobian(f, x) if options.covariance else (f(x), None))
+    residual, cost, pull, bend = unravel(r[:m]), problem.objective.cost(r), r, None
     if J is not None:
-        J, pull, bend = objective.estimating(r, J)
+        J, pull, bend = problem.objective.estimating(r, J)
     sizes, of_pull = [math.prod(leaf.shape) for leaf in leaves], jax.tree.leaves(unravel(pull[:m]))
     order = np.concatenate([in_time([leaf.shape for leaf in leaves]), np.arange(m, w.size)])
     if J is not None and np.any(np.diff(order) < 0):
@@ -164,8 +164,7 @@ def _solve_dense(residuals, options, coordinates, data, limits):
 
 def _solve_records(residuals, options, coordinates, data, limits):
     """One residual function of each record, with a start of its own."""
-    one = jax.tree.map(lambda x: x[0], data.starts)
-    _, unravel_start = ravel_pytree(one)
+    _, unravel_start = ravel_pytree(_first(data.starts))
     own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
 
     def every(params, starts, records):
@@ -175,31 +174,61 @@ def _solve_records(residuals, options, coordinates, data, limits):
     shapes = check_residuals("fit", every, unknowns, params0, data.starts, data.records)
     weights = jax.tree.unflatten(jax.tree.structure(shapes), spread_weights("fit", data.weights, shapes))
     w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)
-    _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], weights))
-
+    _, unravel = ravel_pytree(_first(weights))
     p = coordinates.x0.size
 
     def f(x, own, record):
         return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
 
-    problem = Arrow(f, Objective(w.ravel(), options.loss, w.size), data.records, p, coordinates.bend())
+    first = coordinates.x0, own0[0], _first(data.records)
+    call, given = hoisted(f, *first)
+
+    def problem_of(given, w, records, f=None):
+        objective = Objective(w.ravel(), options.loss, w.size)
+        return Arrow(f or partial(call, given), objective, records, p, coordinates.bend())
+
+    problem = problem_of(given, w, data.records, f)
+
+    frozen = partial(_with_frozen_steps, problem) if chooses_steps(call, given, *first) else None
     x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
     longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
-    if chooses_steps(every, params0, data.starts, data.records):
-        found = in_rounds(partial(_with_frozen_steps, problem), x0, longest, *limits)
-    else:
-        found = *levenberg_marquardt(problem, x0, longest, *limits), None
-    best, history, iterations, code, choices = found
-    x, own = problem.split(best.x)
-    residual, starts = jax.vmap(unravel)(best.r), jax.vmap(unravel_start)(own)
-    cost = problem.objective.cost(best.r.ravel())
-    J, pull, bend = problem.free_of_own(best)
+    find = partial(_minimise, problem, frozen, x0, longest, options.optimizer, limits)
+    x, read, (history, iterations, code, choices) = at_minimum(find, problem_of, p, given, w, data.records)
+    residual, starts = jax.vmap(unravel)(read[0]), jax.vmap(unravel_start)(problem.split(x)[1])
+    cost = problem.objective.cost(read[0].ravel())
+    J, pull, bend = problem.free_of_own(*read)
+    x = x[:p]
     of_pull = jax.tree.leaves(jax.vmap(unravel)(pull.reshape(w.shape)))
     present = jnp.sum(w != 0) - used_up(w != 0, own0.shape[1])
     whole = w.shape[1]
     block = whole if count_segments([w.size], options.segments, whole) >= max(LEAST, p + 1) else 1
     ended = x, cost, history, iterations, code, choices, residual, starts
     return _Solved(*ended, J, pull, bend, of_pull, [w.size], present, block)
+
+
+def _first(tree):
+    """Of its leading axis."""
+    return jax.tree.map(lambda x: x[0], tree)
+
+
+def _minimise(problem, frozen, x0, longest, optimizer, limits):
+    """x, what the problem reads there, and the history, its length, the code, and how often steps were chosen.
+
+    frozen: y, fresh -> the problem with steps as for y, unless they are chosen anew; None where runs choose none.
+    """
+    if isinstance(problem, Smooth):
+        x, *ended = descend(problem, x0, optimizer, *limits)
+        return x, (), (*ended, None)
+    if frozen is None:
+        best, *ended = *levenberg_marquardt(problem, x0, longest, *limits), None
+    else:
+        best, *ended = in_rounds(frozen, x0, longest, *limits)
+    return best.x, best.read, tuple(ended)
+
+
+def _dense_with_frozen_steps(problem, y, fresh):
+    """A `Dense` problem with steps of its runs as for y, unless they are chosen anew."""
+    return problem._replace(f=lambda x: with_steps_for(problem.f, x, jnp.where(fresh, x, y)))
 
 
 def _with_frozen_steps(problem, y, fresh):
