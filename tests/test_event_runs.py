@@ -58,13 +58,48 @@ def test_a_guard_that_is_no_number_fails_by_name():
     check_message(SimulationError, message, run.check)
 
 
-def test_a_corner_fails_by_name():
-    walls = [Event(lambda q, v, t, p, i=i: q[i], impact(0.5)) for i in range(2)]
+WALLS = [Event(lambda q, v, t, p, i=i: q[i], impact(0.5)) for i in range(2)]
+OBLIQUE = Event(lambda q, v, t, p: q[0] + q[1], impact(0.5))
+
+
+def into_the_corner(events):
+    """From .35 with -1 m/s, to both walls at once, at a rounding from a grid point."""
     free = System(jnp.ones(2), lambda q, v, t, p: 0 * q)
-    run = simulate(free, LIGHT, jnp.full(2, 0.35), jnp.full(2, -1.0), dt=0.1, num_steps=10, events=walls)
-    with pytest.raises(SimulationError, match=r"step 4 .* failed: another event happens at the same time as event"):
+    options = {"dt": 0.05, "num_steps": 20, "events": events, "max_events": 3}
+    return simulate(free, LIGHT, jnp.full(2, 0.35), jnp.full(2, -1.0), **options)
+
+
+def test_impacts_at_one_time_that_do_not_change_each_other_both_act():
+    """And one that is noted beside them sees the motion as it comes."""
+    run = into_the_corner([*WALLS, Event(OBLIQUE.guard)])
+    run.check()
+    assert run.events.which[:4].tolist() == [2, 0, 1, -1]
+    np.testing.assert_allclose(run.events.t[:3], 0.35, rtol=1e-12)
+    np.testing.assert_allclose(run.events.after[:3], [[-1, -1], [0.5, -1], [0.5, 0.5]], rtol=1e-12)
+    np.testing.assert_allclose(run.q[-1], 0.65 / 2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("events", [[WALLS[0], OBLIQUE], [OBLIQUE, WALLS[0]]], ids=["oblique last", "oblique first"])
+def test_a_corner_fails_by_name(events):
+    run = into_the_corner(events)
+    with pytest.raises(SimulationError, match=r"step \d .* failed: another event happens at the same time as event"):
         run.check()
-    assert np.isnan(run.q[4:]).all()
+    assert np.isnan(run.q[8:]).all()
+
+
+@pytest.mark.parametrize("noted_first", [True, False])
+def test_a_log_of_impacts_has_them_all_and_changes_nothing(noted_first):
+    """On the guard of the impact itself, before it in the list or behind."""
+    log = Event(DRAGGED.events[0].guard)
+    events = [log, *DRAGGED.events] if noted_first else [*DRAGGED.events, log]
+    alone, run = dragged(), dragged(events=events)
+    run.check()
+    np.testing.assert_array_equal(run.q, alone.q)
+    which = np.array([0, 1, 0, 1]) if noted_first else np.array([1, 0, 1, 0])  # the log sees v before the impact
+    assert run.events.which[:5].tolist() == [*which, -1]
+    np.testing.assert_array_equal(run.events.t[:4], np.repeat(alone.events.t[:2], 2))
+    np.testing.assert_array_equal(run.events.after[:4:2], run.events.before[:4:2])
+    np.testing.assert_array_equal(run.events.after[1:4:2], alone.events.after[:2])
 
 
 def test_an_impact_that_nothing_can_follow_fails_by_name():
@@ -243,7 +278,7 @@ def test_an_event_that_is_noted_changes_nothing_and_is_met_once():
     t = np.asarray(runs[1].events.t[:4])
     assert runs[1].events.count == 3
     assert abs(t[:3] - np.pi * np.array([0.5, 2.5, 4.5])).max() < 1e-3
-    assert abs(runs[0].q - runs[1].q).max() < 1e-5
+    np.testing.assert_array_equal(runs[0].q, runs[1].q)
 
 
 def test_every_member_of_a_sweep_is_looked_at():

@@ -15,9 +15,9 @@ from hhtjax.description import freeze
 from hhtjax.numerics.seldom import choose, seldom_alone
 from hhtjax.runs.attempt import AT_EVENT, Trial, Try, judged, sizes, why_short
 from hhtjax.runs.event_failures import FINE, MANY
-from hhtjax.runs.event_parts import Part, Ways
+from hhtjax.runs.event_parts import SHORT, Part, Ways, reaching
 from hhtjax.runs.loop import neutral_info, resized_step
-from hhtjax.runs.meeting import SHORT, asks, pass_events, reaching
+from hhtjax.runs.meeting import asks, pass_events
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 
@@ -50,8 +50,10 @@ def passed(trial, tried, walk, h):
     """The same where there may be one."""
     ways = trial.ways
     met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE))
-    part = Part(walk.state, tried.walk.state, ways.no_info, h, walk.last, met, met.ended, ~met.ended)
+    part = Part.whole(ways, walk.state, tried.walk.state, ways.no_info, h, walk.last, met, ~met.ended)
     part, (rows, there) = pass_events(ways, freeze(trial.params), part, h)
+    noted = jnp.asarray((*ways.events.noted, True))[rows[:, 1].astype(jnp.int32)]
+    there = there & ~noted  # which have nothing behind them
     times = jnp.where(there, rows[:, 0], jnp.inf)
     first = jnp.min(times)
     later = there & (times > first + SHORT * h)

@@ -51,6 +51,11 @@ class Log(NamedTuple):
 
     def with_more(self, rows, there, keep):
         """With the first of these, as many as are there, as long as there is room; the others are NaN."""
+        places = jnp.cumsum(there, dtype=self.count.dtype) - 1
+        numbers = jnp.arange(len(places), dtype=places.dtype)
+        here = there[None, :] & (places[None, :] == numbers[:, None])  # some that are not there may be before
+        rows = jnp.sum(jnp.where(here[:, :, None], rows[None], 0), axis=1)
+        rows = jnp.where(jnp.any(here, axis=1)[:, None], rows, jnp.nan)
         columns = block_written(self.columns, rows.T, jnp.minimum(self.count, keep), axis=1)
         return Log(self.count + jnp.sum(there, dtype=self.count.dtype), columns)
 

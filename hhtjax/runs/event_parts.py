@@ -2,7 +2,15 @@
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+
+from hhtjax.description import freeze, thaw
+from hhtjax.numerics.seldom import choose
+from hhtjax.runs.loop import resized_step
 from hhtjax.systems import held
+from hhtjax.xla import staged
+
+SHORT = 1e-6  # part of a step: a rest that needs no step
 
 
 class Ways(NamedTuple):
@@ -40,7 +48,10 @@ class Met(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What is left of a step: from `start` to `end`, of the size `rest`; `last` is the size start.a is made for."""
+    """What is left of a step: from `start` to `end`, of the size `rest`; `last` is the size start.a is made for.
+
+    Of each event: whether it is behind the motion, though the guard may not say so; whether it was met at the start,
+    beside others; whether it is still to happen there."""
 
     start: Any
     end: Any
@@ -50,3 +61,35 @@ class Part(NamedTuple):
     met: Met
     divided: Any  # whether an event came before
     asked: Any  # whether there may be one
+    passed: Any
+    beside: Any
+    due: Any
+
+    @classmethod
+    def whole(cls, ways, start, end, info, h, last, met, asked=False):
+        """A step."""
+        none, no = jnp.zeros(len(ways.events.noted), bool), jnp.zeros_like(met.ended)
+        return cls(start, end, info, h, last, met, no, no | asked, none, none, none)
+
+
+def go(ways, params, s, tau, last, h):
+    """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
+    return ways.reach(freeze(params), s, tau, last, h)
+
+
+def reaching(flat, stepper, no_info):
+    """What `go` calls: one function for all places of a program, so that it is traced once."""
+
+    @staged
+    def reach(params, s, tau, last, h):
+        short = tau <= SHORT * h
+        s1, info = resized_step(flat, stepper, thaw(params), jnp.maximum(tau, SHORT * h), last)(s)
+        return choose(short, drifted(flat, s, tau), s1), choose(short, no_info, info)
+
+    return reach
+
+
+def drifted(flat, s, h):
+    """The state a very short time h later."""
+    s1 = s._replace(t=s.t + h, q=flat.move(s.q, h * (s.v + h / 2 * s.w)), v=s.v + h * s.w)
+    return flat.tidy(s1)

@@ -9,10 +9,10 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, if_any
 from hhtjax.runs.event_failures import FINE
 from hhtjax.runs.event_log import Log
-from hhtjax.runs.event_parts import Met, Part, Ways
+from hhtjax.runs.event_parts import Met, Part, Ways, reaching
 from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.loop import first_failure
-from hhtjax.runs.meeting import asks, pass_events, reaching, unnoted
+from hhtjax.runs.meeting import asks, pass_events, unnoted
 from hhtjax.systems import held
 from hhtjax.systems.events import flatten_events
 from hhtjax.xla import in_turn
@@ -56,8 +56,7 @@ def past_events(ways, params, bound, sizes):
         if met.pieces is not None:
             begun = held.entered(ways.stepper, ways.flat, now, h, last, state)[1]
             met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new), met.pieces))
-        no = jnp.zeros_like(met.ended)
-        part = Part(state, new, info, h, last, met._replace(log=None), no, no)
+        part = Part.whole(ways, state, new, info, h, last, met._replace(log=None))
         counts = None if here is None else (before, count)
         asked = may_meet(ways, part, h, params)
         part, log = if_any(pass_them, asked, (part, met.log), counts, h, freeze(params), kept=False)

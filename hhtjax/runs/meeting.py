@@ -8,7 +8,6 @@ A rest of a millionth of the step is a Taylor polynomial: skipping it would lose
 """
 
 from functools import partial
-from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -17,43 +16,20 @@ from hhtjax.description import freeze, thaw
 from hhtjax.numerics.seldom import choose, if_any, seldom
 from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NO_NUMBER, STAYS
 from hhtjax.runs.event_log import row_of
-from hhtjax.runs.event_parts import Met, Part
-from hhtjax.runs.loop import resized_step
+from hhtjax.runs.event_parts import SHORT, Met, Part, go
+from hhtjax.runs.event_times import first_of, first_time, located, look, nearness, pick
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
 from hhtjax.xla import staged
-
-SHORT, TOGETHER = 1e-6, 1e-9  # parts of a step: a rest that needs no step; two events that are one
-ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations, at most
-NEARLY = 1e-8  # part of a step: the next iteration would change a rounding
-ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
-
-
-class Found(NamedTuple):
-    """Of each event: whether it falls into the part of a step, where about (0 to 1), before where, whether it only
-    touches there, whether the motion stays beyond it, whether it is no number, and how large the guard is."""
-
-    hit: Any
-    place: Any
-    limit: Any
-    touches: Any
-    stays: Any
-    unknown: Any
-    size: Any
 
 
 def asks(ways, s, s1, params, h):
     """Whether an event may fall into the step from s to s1: no more than a look at both ends, in few operations."""
     (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in lax.stop_gradient((s, s1)))
     noted = jnp.asarray(ways.events.noted)
-    below = ~(g1 > 0) & (~noted | (g0 > 0))
+    below = ~(g1 > 0) & (~noted | (g0 > 0) | (d0 > 0))
     cross_below = g0 * (d1 - d0) <= d0 * (g1 - g0 - d1 * h)  # tangents at both ends; a division is dear
     return jnp.any(below | ((d0 < 0) & (d1 > 0) & cross_below))
-
-
-def falls_and_rises(g0, d0, g1, d1):
-    """Whether a guard that is positive at both ends may be zero between them."""
-    return (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
 
 
 def pass_events(ways, params, part, h):
@@ -119,151 +95,57 @@ def begin(ways, q, v, t, params, h):
     return staged(lambda q, v, t, h: ways.stepper.begin(ways.flat, q, v, t, params, h))(q, v, t, h)
 
 
-def look(ways, part, params, h):
-    """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
-    part, params = lax.stop_gradient((part, params))
-    now = ways.params(params, part.met.modes)
-    (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, s, now) for s in (part.start, part.end))
-    noted = jnp.asarray(ways.events.noted)
-    rising = (d0 > 0) & (d1 > 0)
-    left = rising & (g1 > -nearness(g1) * h * d1)  # behind an event g is a rounding of either sign
-    d0, d1 = d0 * part.rest, d1 * part.rest
-    a, b = 3 * (g1 - g0) - 2 * d0 - d1, 2 * (g0 - g1) + d0 + d1
-
-    def cubic(x):
-        return g0 + x * (d0 + x * (a + x * b))
-
-    turns = falls_and_rises(g0, d0, g1, d1)
-    root = jnp.sqrt(jnp.maximum(a * a - 3 * b * d0, 0))
-    lowest = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
-    touches = turns & (cubic(lowest) < 0)
-    hit = touches | ((g1 <= 0) & ((g0 > 0) | ((d0 > 0) & ~rising & ~noted)))
-
-    def improve(now):
-        low, high, x, _, k = now
-        y, slope = cubic(x), d0 + x * (2 * a + x * 3 * b)
-        low, high = jnp.where(y > 0, x, low), jnp.where(y > 0, high, x)
-        new = improved(x, y, slope, low, high)
-        return low, high, new, jnp.max(jnp.where(hit, jnp.abs(new - x), 0)), k + 1
-
-    def unfinished(now):
-        *_, change, k = now
-        return (change > NEARLY) & (k < ON_CUBIC)
-
-    first = jnp.zeros_like(g0), lowest, lowest / 2, jnp.full_like(part.rest, jnp.inf), 0
-    place = lax.while_loop(unfinished, improve, first)[2]
-    stays = (g1 < 0) & ~hit & ~left & ~noted
-    unknown = jnp.isnan(g1) & jnp.all(jnp.isfinite(part.end.q)) & jnp.all(jnp.isfinite(part.end.v))
-    return Found(hit, jnp.where(hit, place, jnp.inf), lowest, touches, stays, unknown, jnp.abs(g0) + jnp.abs(g1))
-
-
 def meet(ways, now, found, h, params):
     """The part of the step behind its first event, and what to note of that."""
     part, *_ = now
-    events, flat, met = ways.events, ways.flat, part.met
-    numbers = jnp.arange(found.hit.size, dtype=met.event.dtype)
-    i = jnp.min(jnp.where(found.place == jnp.min(found.place), numbers, numbers.size))
-    this = (numbers == i).astype(h.dtype)
+    events, met = ways.events, part.met
+    known = lax.stop_gradient((params, met.modes, part))
+    tau, near = lax.stop_gradient(first_time(ways, ways.params(*known[:2]), known[2], found, h))
+    i, this = first_of(events, part, found, near)
     now = ways.params(params, met.modes)
-    tau = locate(ways, now, part, this, found, h)
+    tau = located(ways, now, part, this, tau, h)
     e, info = go(ways, now, part.start, tau, part.last, h)
-    before = e
-    g, d = events.rates(flat, e, now)
+    g, d = events.rates(ways.flat, e, now)
     rate = pick(this, d)
     noise = 1e3 * float(jnp.finfo(h.dtype).eps)
     missed = ~(jnp.abs(pick(this, g)) <= 1e-3 * jnp.abs(rate) * h + noise * pick(this, found.size))
-
     v, modes = events.outcome(i, e.q, e.v, e.t, now, events.with_modes(params, met.modes))
     row = row_of(e.t, i, rate, e.q, e.v, v)
-    noted, ends = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, events.ends))
-    beside = ~noted & jnp.any(is_corner(g, d, h, this, events.noted))
-    code = jnp.where(beside, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
-    code = jnp.where(missed, STAYS, jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE)).astype(met.code.dtype)
 
+    passed = part._replace(passed=part.passed | (this > 0))
+    new = behind(ways, part, (e, info, tau, g, d), (v, modes), i, this, near, h, params)
+    noted, touches = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, found.touches))
+    new = choose(noted, passed, new)  # what changes nothing divides no step
+    code = jnp.where(missed & jnp.all(jnp.isfinite(e.v)), STAYS, new.met.code).astype(met.code.dtype)
+    new = new._replace(met=new.met._replace(code=code, event=i))
+    none = missed & touches
+    return choose(none, passed, new), (row, ~none)
+
+
+def behind(ways, part, at, outcome, i, this, near, h, params):
+    """The part of the step behind event i. at: the state and the `Info` before it, when, and g and dg/dt of all."""
+    events, (e, info, tau, g, d), (v, modes) = ways.events, at, outcome
     then = ways.params(params, modes)
-    beyond = jnp.where(noted, float(jnp.finfo(h.dtype).eps) ** 0.5 * h, 0)  # so that it is not met again
-    rest = jnp.where(ends, 0, part.rest - tau - beyond)
+    ends = pick(this, jnp.asarray(events.ends, h.dtype)) > 0
+    rest = jnp.where(ends, 0, part.rest - tau)
     size = jnp.maximum(rest, SHORT * h)
-    e = drifted(flat, e._replace(v=v), beyond)
-    start = begin(ways, e.q, e.v, e.t, then, size)
+    start = begin(ways, e.q, v, e.t, then, size)
     end, more = go(ways, then, start, rest, size, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
-    pieces = None if met.pieces is None else met.pieces.divided(before, start, end)
-    after = Met(modes, ends, code, i, pieces=pieces)
+
+    g1, d1 = events.rates(ways.flat, start, then)
+    near_and_due = near & ~part.passed & ~jnp.asarray(events.noted)
+    going_on = jnp.any(part.due)
+    beside = jnp.where(going_on, part.beside, near_and_due)
+    due = jnp.where(going_on, part.due, near_and_due) & ~(this > 0)
+    same = (jnp.abs(d1 - d) <= nearness(h) * jnp.abs(d)) & (jnp.abs(g1 - g) <= nearness(h) * h * jnp.abs(d))
+    corner = jnp.any(beside & ~(this > 0) & ~same)  # in another order they might have other outcomes
+    code = jnp.where(corner, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
+    code = jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE).astype(part.met.code.dtype)
+
+    pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end)
+    met = Met(modes, ends, code, i, pieces=pieces)
     infos = join_info(join_info(choose(part.divided, part.info, ways.no_info), info), more)
-    new = Part(start, end, infos, rest, size, after, jnp.ones_like(part.divided), asks(ways, start, end, then, rest))
-    none = missed & (pick(this, found.touches.astype(h.dtype)) > 0)
-    return choose(none, part, new), (row, ~none)
-
-
-def go(ways, params, s, tau, last, h):
-    """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
-    return ways.reach(freeze(params), s, tau, last, h)
-
-
-def reaching(flat, stepper, no_info):
-    """What `go` calls: one function for all places of a program, so that it is traced once."""
-
-    @staged
-    def reach(params, s, tau, last, h):
-        short = tau <= SHORT * h
-        s1, info = resized_step(flat, stepper, thaw(params), jnp.maximum(tau, SHORT * h), last)(s)
-        return choose(short, drifted(flat, s, tau), s1), choose(short, no_info, info)
-
-    return reach
-
-
-def locate(ways, params, part, this, found, h):
-    """tau, by Newton, kept between what is above and below, from where the cubic has its zero; differentiable."""
-
-    def reached(tau):
-        return go(ways, params, part.start, tau, part.last, h)[0]
-
-    def guard(tau):
-        s = reached(tau)
-        return pick(this, ways.events.guards(s.q, s.v, s.t, params))
-
-    def search(_, tau):
-        def unfinished(carry):
-            _, _, _, change, k = carry
-            return (change > ENOUGH * h) & (k < IMPROVEMENTS)
-
-        def improve(carry):
-            low, high, tau, _, k = carry
-            g, d = (pick(this, x) for x in ways.events.rates(ways.flat, reached(tau), params))
-            low, high = jnp.where(g > 0, tau, low), jnp.where(g > 0, high, tau)
-            new = improved(tau, g, d, low, high)
-            return low, high, new, jnp.abs(new - tau), k + 1
-
-        begin = jnp.zeros_like(tau), pick(this, found.limit) * part.rest, tau, jnp.full_like(tau, jnp.inf), 0
-        return lax.while_loop(unfinished, improve, begin)[2]
-
-    start = jnp.clip(jnp.min(found.place), 0, 1) * part.rest
-    return lax.custom_root(guard, lax.stop_gradient(start), search, lambda g, y: y / g(jnp.ones_like(y)))
-
-
-def improved(x, y, slope, low, high):
-    """A zero by a step of Newton's method from x, where y falls; the middle where it does not, or leaves its bounds."""
-    new = x - y / jnp.where(slope < 0, slope, 1)
-    return jnp.where((slope < 0) & (new >= low) & (new <= high), new, (low + high) / 2)
-
-
-def is_corner(g, d, h, this, noted):
-    """Whether another event, of those that change something, is met at the same time."""
-    return (this == 0) & ~jnp.asarray(noted) & (d < 0) & (jnp.abs(g) <= nearness(g) * h * jnp.abs(d))
-
-
-def nearness(x):
-    """The part of a step within which two times are one."""
-    return max(TOGETHER, 1e3 * float(jnp.finfo(x.dtype).eps))
-
-
-def drifted(flat, s, h):
-    """The state a very short time h later."""
-    s1 = s._replace(t=s.t + h, q=flat.move(s.q, h * (s.v + h / 2 * s.w)), v=s.v + h * s.w)
-    return flat.tidy(s1)
-
-
-def pick(this, x):
-    """The number of this event; others may be anything."""
-    return jnp.sum(jnp.where(this > 0, x, 0))
+    asked = asks(ways, start, end, then, rest) | jnp.any(due)
+    passed = part.passed & near & (d1 < 0)
+    return Part(start, end, infos, rest, size, met, jnp.ones_like(part.divided), asked, passed, beside, due)

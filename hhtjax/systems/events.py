@@ -37,7 +37,9 @@ class Event(Description):
             turns nothing back the guard would be negative: let it depend on the mode.
         terminal: whether the run ends there. The state stays what it was, time included.
 
-    An event with none of the three is noted, and changes nothing: sections of a Poincare map, times of passage.
+    An event with none of the three is noted, and changes nothing: sections of a Poincare map, times of passage. Of
+    events at one time those come first. Others happen one after the other, where none changes the rate of another's
+    guard, as impacts of bodies that do not touch; else their order would matter, and the run fails by name.
 
     Resting contact is no event: a ball that comes to rest on the floor bounces infinitely often in a finite time, and
     the run fails by name when more than `max_events` fall into a step. Give contacts that last a stiff force, or a
