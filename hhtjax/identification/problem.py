@@ -188,7 +188,6 @@ def _solve_records(residuals, options, coordinates, data, limits):
         return Arrow(f or partial(call, given), objective, records, p, coordinates.bend())
 
     problem = problem_of(given, w, data.records, f)
-
     frozen = partial(_with_frozen_steps, problem) if chooses_steps(call, given, *first) else None
     x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
     longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
