@@ -19,6 +19,7 @@ from jaxlib.mlir import ir
 from jaxlib.mlir.dialects import stablehlo
 
 from hhtjax.xla.gate import is_possible
+from hhtjax.xla.holding import hold
 from hhtjax.xla.inspection import ATTRIBUTES, Inspection, callee, directly_in, form_inside
 from hhtjax.xla.kernel_calls import (
     as_stage,
@@ -78,8 +79,9 @@ def _decide(module, call):
     told = UNTOLD if callee(call).startswith(AROUND) else VERDICT
     attach(call, **{told: f"plain: {objection}" if objection else "one kernel"})
     if not objection:
-        _cut(module, found, call)
-    elif is_partitioned or QUICKLY in str(module.module.operation.attributes["sym_name"]):
+        return _cut(module, found, call)
+    hold(module, found.finished)
+    if is_partitioned or QUICKLY in str(module.module.operation.attributes["sym_name"]):
         for stage in (x for calls in found.stages.values() for x in calls):
             compute_once(stage)
     else:
@@ -87,8 +89,10 @@ def _decide(module, call):
 
 
 def _cut_stages(module, call, seen, made):
-    """Makes kernels of the stages in the function called. With sines of XLA's own: polynomials, of which a kernel takes
-    many at a time, take longer to compile. seen: names of functions looked into; made: {name of a stage: its kernel}.
+    """Makes kernels of the stages in the function called, of which values have been handed on. With sines of XLA's own:
+    polynomials, of which a kernel takes many at a time, take longer to compile.
+
+    seen: names of functions looked into; made: {name of a stage: its kernel}.
     """
     seen.add(callee(call))
     for inner in _operations(module.symbol_table[callee(call)].operation):
@@ -96,7 +100,7 @@ def _cut_stages(module, call, seen, made):
             continue
         name = callee(inner)
         if name not in made and (found := _kernel_alone(module, inner)):
-            _cut(module, found, inner, with_sines=False)
+            _cut(module, found, inner, whole=False)
             made[name] = inner.attributes["callee"]
         if name in made:
             inner.attributes["callee"] = made[name]
@@ -128,8 +132,8 @@ def _refusal(module, found, call):
     return alone.refusal()
 
 
-def _cut(module, found, call, with_sines=True):
-    """Makes the function called a kernel."""
+def _cut(module, found, call, whole=True):
+    """Makes the function called a kernel. whole: and not a stage of one that is none."""
     for choice in found.choices:
         _take_form_inside(choice)
     for case in found.seldom:
@@ -138,8 +142,9 @@ def _cut(module, found, call, with_sines=True):
         write_out(scatter)
     for product in found.products:
         call_stage([product], insert(module, as_stage(written_out(module, product))))
-    if with_sines:
+    if whole:
         write_sines(module, found.finished)
+        hold(module, found.finished)
     for name in found.finished:  # what a stage calls comes before it
         stages = found.stages.get(name, [])
         if stages and may_be_divided(stages[0]):
