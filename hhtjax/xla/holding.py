@@ -17,7 +17,8 @@ from hhtjax.xla.products import size
 LEAST = 40  # operations that are evaluated once more without a call; of fewer, nothing is gained
 WITH_REGIONS = {"stablehlo.case", "stablehlo.if", "stablehlo.while"}
 MADE_ONCE = WITH_REGIONS | {"stablehlo.custom_call", "stablehlo.dot_general"}  # by XLA in any case
-FREE = {"stablehlo." + x for x in ("broadcast_in_dim", "constant", "convert", "reshape", "slice", "transpose")}
+BROADCAST = "stablehlo.broadcast_in_dim"  # handed on before it is one
+FREE = {BROADCAST, *(f"stablehlo.{x}" for x in ("constant", "convert", "reshape", "slice", "transpose"))}
 SHORT = 512  # numbers; XLA divides no work on so few among threads
 
 
@@ -41,7 +42,7 @@ def _hold_in(module, block, calls, costs):
                 for inner in region:
                     _hold_in(module, inner, calls, costs)
         for x, taken in zip(op.results, _costs_of(op, cost, costs), strict=True):
-            if taken and taken * (len({use.owner for use in x.uses}) - 1) >= LEAST and op.name != "stablehlo.broadcast_in_dim":
+            if taken and op.name != BROADCAST and taken * (len({use.owner for use in x.uses}) - 1) >= LEAST:
                 _hand_on(module, op, x, calls)
                 taken = 0
             cost[x] = taken
@@ -51,7 +52,7 @@ def _hold_in(module, block, calls, costs):
 def _costs_of(op, cost, costs):
     """Of its results, where it is evaluated anew with all that its operands take."""
     is_call = op.name == "func.call"
-    if op.name in MADE_ONCE or is_call and (ATTRIBUTES in op.attributes or callee(op).startswith(STAGED)):
+    if op.name in MADE_ONCE or (is_call and (ATTRIBUTES in op.attributes or callee(op).startswith(STAGED))):
         return [0] * len(op.results)
     before = sum(cost.get(x, 0) for x in {*op.operands})
     own = costs[callee(op)] if is_call else [op.name not in FREE] * len(op.results)
