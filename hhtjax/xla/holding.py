@@ -55,7 +55,8 @@ def _costs_of(op, cost, costs):
     if op.name in MADE_ONCE or (is_call and (ATTRIBUTES in op.attributes or callee(op).startswith(STAGED))):
         return [0] * len(op.results)
     before = sum(cost.get(x, 0) for x in {*op.operands})
-    own = costs[callee(op)] if is_call else [op.name not in FREE] * len(op.results)
+    one_each = [op.name not in FREE] * len(op.results)
+    own = costs.get(callee(op), one_each) if is_call else one_each
     return [before + x for x in own]
 
 
