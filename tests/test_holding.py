@@ -12,15 +12,23 @@ import hhtjax
 from hhtjax.xla import holding, kernels
 
 x = jnp.linspace(0.4, 1.1, 3)
-LONG = holding.LEAST  # products in a chain
+LONG = holding.LEAST  # products in the chain
 
 
-def shared(x):
-    """A chain of products with three users, of two elements in one."""
+def chain(x):
     y = x
     for i in range(LONG):
         y = y * (x + i)
+    return y
+
+
+def used(y, x):
+    """By three operations, one of them of two elements."""
     return y[0] - y[1], y + x, y / x
+
+
+def shared(x):
+    return used(chain(x), x)
 
 
 def in_kernel(x):
@@ -34,13 +42,9 @@ def beside_a_sort(x):
 
 def in_a_loop(x):
     """In a loop, of what a function gives that XLA inlines."""
-    inner = jax.jit(shared)
-
-    def body(i, carry):
-        a, y, z = inner(carry)
-        return 1e-3 * (jnp.sign(a) + jnp.sqrt(y) - z)
-
-    return kernels.one_kernel(lambda x: jax.lax.fori_loop(0, 2, body, x), x)
+    inner = jax.jit(chain)
+    start = used(x, x)
+    return kernels.one_kernel(lambda x: jax.lax.fori_loop(0, 2, lambda i, carry: used(inner(carry[1]), x), start), x)
 
 
 def products(f):
