@@ -61,6 +61,44 @@ def test_runs(case):
     np.testing.assert_allclose(paths, np.broadcast_to(paths[0], np.shape(paths)), rtol=0, atol=atol)
 
 
+def linked(q, params):
+    c = 0.5 * jnp.cos(q[0] - q[1])
+    return params["J"] * (jnp.eye(2, dtype=q.dtype) + c * jnp.array([[1.0, 1.0], [1.0, 0.0]], q.dtype))
+
+
+def stiffening(q, v, t, params):
+    return -params["k"] * jnp.stack([q[0] ** 3, jnp.sin(q[1])])
+
+
+LINKED = hhtjax.System(linked, stiffening)
+
+
+def linked_run(inertia, dt, **options):
+    """Of 50 steps in float32."""
+    params = {"J": jnp.float32(inertia), "k": jnp.float32(10 * inertia)}
+    q0 = jnp.array([3.0, -0.5], jnp.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hhtjax.PrecisionWarning)
+        return hhtjax.simulate(LINKED, hhtjax.hht(**options), q0, 0 * q0, params, dt=jnp.float32(dt), num_steps=50)
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.3])
+def test_inertias_whose_squares_are_no_numbers_in_float32(dt):
+    """Of links of micrometres, 8e-28 kg m^2: neither the solve may square them, nor what "auto" compares in long steps.
+    Powers of 2, which round nothing, as steps so long make all of a difference."""
+    runs = [linked_run(inertia, dt) for inertia in (1.0, 2.0**-90, 2.0**80)]
+    for run in runs:
+        run.check()
+        np.testing.assert_allclose(run.q[:12], runs[0].q[:12], rtol=1e-6)
+
+
+@pytest.mark.parametrize("inertia", [1.0, 1e-27])
+def test_a_solve_that_solves_nothing_is_told_in_float32(inertia):
+    run = linked_run(inertia, 0.02, linearize="predictor", solve=lambda A, b: 0 * b)
+    with pytest.raises(hhtjax.SimulationError, match="solve"):
+        run.check()
+
+
 def circle(q, t, length):
     return (jnp.sum(q**2, keepdims=True) - length**2) / 2
 
@@ -89,3 +127,17 @@ def test_gradients_that_are_rounding(size):
     other = hhtjax.System(jnp.ones(2), lambda q, v, t, p: 0 * q, crank)
     with pytest.raises(ValueError, match=r"rows \[0\] have no gradient in q"):
         start(other, hhtjax.hht(), jnp.array([0.0, np.pi / 2]), jnp.zeros(2), size)
+
+
+@pytest.mark.parametrize(("size", "off"), [(1e-6, 5e-3), (1.0, 1e-5)])
+def test_velocities_that_violate_the_constraint(size, off):
+    """By so much of the mechanism's size in a second, and of the velocity."""
+    bead = hhtjax.System(jnp.ones(2), lambda q, v, t, p: 0 * q, circle)
+
+    def start(off):
+        q0, v0 = jnp.array([0.0, -size]), jnp.array([0.1 * size, off * size])
+        return hhtjax.simulate(bead, hhtjax.hht(), q0, v0, size, dt=1e-3, num_steps=1)
+
+    start(off / 100).check()
+    with pytest.raises(ValueError, match=r"`v0` violates the constraint"):
+        start(off)

@@ -64,7 +64,9 @@ class Trusted:
 
     def leaves(self, f, b, x):
         """What x leaves of b = f(x), relative to b."""
-        left, size = (jnp.sqrt(jnp.sum(y**2)) for y in (f(x) - b, b))
+        largest = jnp.max(jnp.abs(b))  # whose square may be 0 in float32
+        unit = jnp.where(largest == 0, 1, largest)
+        left, size = (jnp.sqrt(jnp.sum((y / unit) ** 2)) for y in (f(x) - b, b))
         return lax.stop_gradient(jnp.where(left == 0, 0, left / size))
 
     def accepts(self, left):

@@ -209,9 +209,12 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
     if redundant is None:
         require_independent(caller, examined[1], examined[4])
     found = distances(examined, redundant)
-    for (name, meaning), (violated, distance, relative, away) in zip(checked, found, strict=False):
+    floors = ROUNDINGS * np.finfo(examined[1].dtype).eps, SMALL  # that v0 is, is no error while it is small beside v0
+    for (name, meaning), floor, sizes, values in zip(checked, floors, examined[3], found, strict=False):
+        violated, distance, relative, away = values
         small = relative <= CONSISTENT
-        if not small or (meaning == "Phi" and _is_far(examined, away, (system, q0, v0, t0, params, z0))):
+        beside = floor * np.max(sizes)
+        if not small or (np.any(away > beside) and _is_far(examined[1], away, (system, q0, v0, t0, params, z0))):
             beside = ", which is much in so small a mechanism" if small else ""
             raise ValueError(
                 f"{caller}: `{name}` violates the constraint: max|{meaning}| = {violated:.3g}, {distance:.3g} away "
@@ -219,12 +222,9 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
             )
 
 
-def _is_far(examined, away, start):
-    """Whether a displacement of this size turns a constraint's gradient by more than SMALL: the size of a mechanism is
-    in nothing but that. Asked of what is more than rounding."""
-    _, B, _, (sizes, _), _ = examined
-    if np.all(away <= ROUNDINGS * np.finfo(B.dtype).eps * (1 + sizes)):
-        return False
+def _is_far(B, away, start):
+    """Whether a displacement of this size, or one in a unit of time, turns a constraint's gradient by more than SMALL:
+    the size of a mechanism is in nothing but that. Asked of what is more than rounding."""
     found = known_now(_turns, *start)
     assert found is not None  # as what was examined
     turns, d = found
@@ -239,6 +239,7 @@ def _turns(system, q0, v0, t0, params, z0):
     t = jnp.asarray(t0).astype(q.dtype)
     d = diagonal(flat.mass(q, params))
     d = jnp.where(d == 0, 1, d)
+    d = d / jnp.min(d)  # which may be too small to be squared
     unit = flat.with_ones(1 / jnp.sqrt(d))
     # one direction for all constraints, of no symmetry: along an axis many of them turn nothing
     uneven = np.where(np.arange(flat.size) % 2, -1, 1) * (0.75 + 0.618034 * np.arange(flat.size) % 0.5)
