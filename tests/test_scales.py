@@ -74,12 +74,12 @@ LINKED = hhtjax.System(linked, stiffening)
 
 
 def linked_run(inertia, dt, **options):
-    """Of 50 steps in float32."""
+    """Of 12 steps in float32."""
     params = {"J": jnp.float32(inertia), "k": jnp.float32(10 * inertia)}
     q0 = jnp.array([3.0, -0.5], jnp.float32)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", hhtjax.PrecisionWarning)
-        return hhtjax.simulate(LINKED, hhtjax.hht(**options), q0, 0 * q0, params, dt=jnp.float32(dt), num_steps=50)
+        return hhtjax.simulate(LINKED, hhtjax.hht(**options), q0, 0 * q0, params, dt=jnp.float32(dt), num_steps=12)
 
 
 @pytest.mark.parametrize("dt", [0.02, 0.3])
@@ -89,7 +89,7 @@ def test_inertias_whose_squares_are_no_numbers_in_float32(dt):
     runs = [linked_run(inertia, dt) for inertia in (1.0, 2.0**-90, 2.0**80)]
     for run in runs:
         run.check()
-        np.testing.assert_allclose(run.q[:12], runs[0].q[:12], rtol=1e-6)
+        np.testing.assert_allclose(run.q, runs[0].q, rtol=1e-6)
 
 
 @pytest.mark.parametrize("inertia", [1.0, 1e-27])
