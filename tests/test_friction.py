@@ -109,27 +109,45 @@ def test_stuck_joints_of_a_mechanism_stay_to_the_order_of_the_step():
         assert np.max(np.abs(np.asarray(found.acceleration)[stuck[:, joint], joint]), initial=0) < 1e-13
 
 
-def test_a_start_that_slides_by_a_rounding_sticks():
-    """A sleigh on a knife edge, a behind its centre, whose limit is never reached (Chaplygin): u = U tanh(a U t/I + c).
-
-    It starts with a lateral velocity of 0.4, or one of the numbers beside it."""
+def sleigh():
+    """On a knife edge, a behind its centre."""
 
     def lateral(q, v, t, params):
         return -jnp.sin(q[2:]) * v[0] + jnp.cos(q[2:]) * v[1] - 0.2 * v[2]
 
-    def limit(q, v, t, params):
-        return 1e3 + 0 * q[:1]
+    mass, limit = jnp.array([1.0, 1.0, 0.06]), lambda q, v, t, params: 1e3 + 0 * q[:1]
+    return hhtjax.System(mass, lambda q, v, t, p: 0 * q, friction=limit, sliding=lateral)
 
-    sleigh = hhtjax.System(jnp.array([1.0, 1.0, 0.06]), lambda q, v, t, p: 0 * q, friction=limit, sliding=lateral)
+
+SLEIGH = sleigh()
+
+
+def sledge(speed, dt=1e-2):
+    """A run with this lateral velocity, 0.4 to stick, and how far its forward velocity is from one whose limit is never
+    reached (Chaplygin): u = U tanh(a U t/I + c)."""
+    start = jnp.zeros(3), jnp.array([1.0, speed, 2.0])
+    found = hhtjax.simulate(SLEIGH, hhtjax.hht(), *start, dt=dt, num_steps=100)
+    found.check()
+    forward = jnp.cos(found.q[:, 2]) * found.v[:, 0] + jnp.sin(found.q[:, 2]) * found.v[:, 1]
+    U = np.sqrt(1.4)
+    return found, np.abs(forward - U * np.tanh(2 * U * np.asarray(found.t) + np.arctanh(1 / U)))
+
+
+def test_a_start_that_slides_by_a_rounding_sticks():
+    """With one of the numbers beside it."""
     for speed in (0.4, np.nextafter(0.4, 1), np.nextafter(0.4, 0)):
-        start = jnp.zeros(3), jnp.array([1.0, speed, 2.0])
-        found = hhtjax.simulate(sleigh, hhtjax.hht(), *start, dt=1e-2, num_steps=100)
-        found.check()
+        found, error = sledge(speed)
         assert found.sticking.all()
-        forward = jnp.cos(found.q[:, 2]) * found.v[:, 0] + jnp.sin(found.q[:, 2]) * found.v[:, 1]
-        U = np.sqrt(1.4)
-        np.testing.assert_allclose(forward, U * np.tanh(2 * U * np.asarray(found.t) + np.arctanh(1 / U)), atol=2e-4)
+        assert np.max(error) < 2e-4
         assert np.max(np.abs(found.friction)) == pytest.approx(1.2, rel=1e-12)  # u w J/I, the largest at the start
+
+
+def test_a_joint_that_stops_at_once_is_not_thrown_by_its_limit():
+    """A thousand times the load, it acts for some nanoseconds, and would turn the sleigh by 1 rad in a step."""
+    for speed in (0.4 + 1e-9, 0.4 - 1e-9):
+        error = [np.max(sledge(speed, dt)[1][: n + 1]) for dt, n in ((1e-2, 50), (5e-3, 100))]
+        assert error[0] < 0.15
+        assert np.log2(error[0] / error[1]) == pytest.approx(2, abs=0.15)
 
 
 def test_without_limit_it_is_the_step_without_friction():

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from friction_problems import CASES
+from friction_problems import CASES, arm_force, arm_mass
 from friction_reference import Motion
 from zoo import each
 
@@ -58,3 +58,21 @@ def test_order_two_through_every_switch(name):
 @pytest.mark.slow
 def test_order_two_in_index_3():
     check_order("a constraint, H(q), a load", formulation="index3")
+
+
+@pytest.mark.slow
+def test_a_mass_that_turns_is_not_linearised_about_what_stops_it():
+    """A joint that slides by a rounding, and a limit of 100 times the load: its accelerations do not enter M(q) w."""
+
+    def limit(q, v, t, F):
+        return F + 0 * v[1:]
+
+    system = hhtjax.System(arm_mass, arm_force, friction=limit, sliding=lambda q, v, t, F: v[1:])
+
+    def end(dt, slides=0.0):
+        start = jnp.array([1.0, -0.5]), jnp.array([2.0, slides])
+        return hhtjax.simulate(system, hhtjax.hht(), *start, 1e3, dt=dt, num_steps=100).q
+
+    error = [np.max(np.abs(end(dt, 1e-9) - end(dt))[: n + 1]) for dt, n in ((1e-2, 50), (5e-3, 100))]
+    assert error[0] < 0.05
+    assert np.log2(error[0] / error[1]) == pytest.approx(2, abs=0.15)

@@ -138,7 +138,14 @@ def _by_lapack(factors, b, trans=0):
 
 
 def _cramer(A, b, trans=0):
-    """Cramer's rule for two unknowns: forward stable (Higham 2002, Sec. 1.10.1), with one division."""
+    """Cramer's rule for two unknowns: forward stable (Higham 2002, Sec. 1.10.1), with one division.
+
+    Products of two entries of small mechanisms, as inertias of 1e-20, are less than the least float32.
+    """
+    if A.dtype == jnp.float32:
+        size = jnp.abs(A[0, 0]) + jnp.abs(A[0, 1]) + jnp.abs(A[1, 0]) + jnp.abs(A[1, 1])
+        unit = 1 / size
+        A, b = A * unit, b * unit
     (p, q), (r, s) = [[A[i, j] for j in range(2)] for i in range(2)]
     if trans:
         q, r = r, q

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.elimination import factorize, matvec
+from hhtjax.numerics.elimination import diagonal, factorize, matvec
 from hhtjax.numerics.low_rank import AtState
 from hhtjax.xla import linear_map, part, staged
 
@@ -64,7 +64,9 @@ class Trusted:
 
     def leaves(self, f, b, x):
         """What x leaves of b = f(x), relative to b."""
-        left, size = (jnp.sqrt(jnp.sum(y**2)) for y in (f(x) - b, b))
+        largest = jnp.max(jnp.abs(b))  # whose square may be 0 in float32
+        unit = jnp.where(largest == 0, 1, largest)
+        left, size = (jnp.sqrt(jnp.sum((y / unit) ** 2)) for y in (f(x) - b, b))
         return lax.stop_gradient(jnp.where(left == 0, 0, left / size))
 
     def accepts(self, left):
@@ -118,10 +120,27 @@ def reuse(factorize, inverse):
     return Given(known, factorize.tolerance) if isinstance(factorize, Trusted) else known
 
 
-def factorize_least_squares(n):
-    """The same for A = [[M, -B^T], [B, 0]] whose B may have lost rank: the least-squares solution of least norm.
+def factorize_saddle_point(n):
+    """The same for A = [[M, -B^T], [B, .]], the first n unknowns and equations measured by the diagonal of A, and the
+    rows below by that: so no units of mass, length or time choose the pivots, with which single precision can fail.
+    """
 
-    The first n unknowns and equations are measured by the diagonal of A, all others alike.
+    def factorize_rows(A):
+        A = lax.stop_gradient(A)
+        d = jnp.abs(diagonal(A)[:n])
+        first = 1 / jnp.sqrt(jnp.where(d == 0, 1, d))
+        size = matvec(jnp.abs(A[n:, :n]), first)
+        rows = jnp.concatenate([first, 1 / jnp.where(size == 0, 1, size)])
+        inverse = factorize(rows[:, None] * A)
+        return lambda b, trans=0: rows * inverse(b, trans=1) if trans else inverse(rows * b, trans=0)
+
+    return factorize_rows
+
+
+def factorize_least_squares(n):
+    """The same where B may have lost rank: the least-squares solution of least norm.
+
+    The first n unknowns and equations are measured as above, all others alike.
     """
 
     def factorize(A):

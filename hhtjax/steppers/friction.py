@@ -9,6 +9,10 @@ by the one factorisation of A, f standing for the free step, with sig. A switch 
 motion on either side of it (friction_law.py; of several joints, friction_events.py). Behind it w, a, v and q go along G
 to where the new branch has them: the jump of the acceleration never enters the recursion, which therefore does not
 ring, and what sticks stays where it is.
+
+A joint whose predicted velocity changes sign has no friction in that residual, which is expanded about a state before
+it does: all of its friction is dtau. Else a limit far above the load would turn the predictor, and with it the
+directions of all forces, through as much as it could in a whole step.
 """
 
 from functools import partial
@@ -100,37 +104,37 @@ def bind_friction(method, system, params, dt, kept=None):
 
     def step(s):
         r, path, z, shift, B = _equations(method, system, params, dt, s)
+        stops, at = _foreseen(system, params, dt, s, path(z))
+        sig, tau = s.friction
+        smooth = jnp.where(stops, 0, sig)
 
         def rubbing(s1):
             f = law.limit(s1.q, s1.v, s1.L, s1.t, params)
-            force = reaction(system, s1.q, s1.t, params, s.friction.sig * f)
+            force = reaction(system, s1.q, s1.t, params, smooth * f)
             return r(s1) + jnp.pad(force, (0, z.size - size))
 
-        at = path(z)
         factorize = method.factorize_for(system) if system.num_constraints else method.factorize
         if kept is not None:
-            factorize = _with_slope(kept, system, s, at, params)
-        z, info, inverse, along = _free_step(method.options, system, rubbing, path, z, s, factorize)
+            factorize = _with_slope(kept, system, smooth, at, params)
+        z, info, inverse, along = _free_step(method.options, system, rubbing, path, z, s, factorize, at)
         H = directions(system, at.q, at.t, params)
         G = _each(inverse, jnp.pad(H, ((0, 0), (0, z.size - size))))
-        free, W = path(z), across(H, _each(along, G).v)
+        K, W = across(H, G[:, :size]), across(H, _each(along, G).v)
 
-        s0, sf = (law.sliding(x.q, x.v, x.t, params) for x in (s, free))
-        sig, tau = s.friction
-        held = path(z - matvec(G.T, solve_some(W, sig == 0, sf)))
+        def sliding(z):
+            return law.sliding(at.q, path(z).v, at.t, params)  # with H as in W
+
+        held = path(z - matvec(G.T, solve_some(W, smooth == 0, sliding(z))))
         f = law.limit(held.q, held.v, held.L, held.t, params)
-        K = across(H, G[:, :size])
-        if law.size == 1:
-            end, left = switch(sf, s0, sig, tau, f, diagonal(W), dt * diagonal(K)), jnp.zeros((), sf.dtype)
-        else:
-            end, left = run_events(sf, s0, sig, tau, f, W, dt * K)
+        z = z - matvec(G.T, jnp.where(stops, sig * f, 0))
+        end, left = _switches(sliding(z), law.sliding(s.q, s.v, s.t, params), sig, tau, f, W, dt * K)
         z = z - matvec(G.T, end.tau)
         x = method.advance(s, dt, z[:size])[0]
         taken = None if shift is None else shift(z[size + system.num_constraints :])
         x = x if taken is None else x - taken
         s1 = system.tidy(_behind(system, params, s, path(z), x, end, f, G, K))
         if method.estimating:
-            defect = _defect(method, system, params, rubbing, path(z), end.tau, inverse)
+            defect = _defect(method, system, params, rubbing, path(z), end.tau + jnp.where(stops, sig * f, 0), inverse)
             info = info._replace(defect=defect, switched=_switched(system, s, s1, end, G))
         info = _told(info, left, _is_limit(law, at, params) & ~jnp.any((f < 0) | (f == jnp.inf)))
         return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
@@ -145,27 +149,46 @@ def _equations(method, system, params, dt, s):
     return lambda s: residual(system, params, s), lambda w: method.arrive(system, s, dt, w), s.w, None, None
 
 
-def _with_slope(kept, system, s, at, params):
+def _foreseen(system, params, h, s, predicted):
+    """Which joints come to rest within the step, if nothing changes, and the state to linearise about: the predicted
+    one, but when the first of them rests all accelerations end: with them its whole friction would go on to act."""
+    sliding, (sig, tau) = system.friction.sliding, s.friction
+    s0, s1 = (sliding(x.q, x.v, x.t, params) for x in (s, predicted))
+    stops = (sig * s1 < 0) & (tau != 0)
+    theta = jnp.min(jnp.clip(jnp.where(stops, s0 / jnp.where(stops, s0 - s1, 1), 1), 0, 1))
+    q = system.move(s.q, h * s.v + h**2 * theta * (1 - theta / 2) * s.a)
+    ended = predicted._replace(q=q, v=s.v + h * theta * s.a, w=theta * s.w)
+    return stops, jax.tree.map(partial(jnp.where, jnp.any(stops)), ended, predicted)
+
+
+def _with_slope(kept, system, sig, at, params):
     """`kept`, with the slopes of limits where joints slide."""
     limit = partial(system.friction.limit, params=params)
 
     def slope(x):
-        return jax.linearize(lambda x: s.friction.sig * limit(x.q, x.v, x.L, x.t), x)[1]
+        return jax.linearize(lambda x: sig * limit(x.q, x.v, x.L, x.t), x)[1]
 
     return Updated(kept, directions(system, at.q, at.t, params), slope)
 
 
-def _free_step(options, system, r, path, z, s, factorize):
+def _free_step(options, system, r, path, z, s, factorize, at):
     """The step in which every joint keeps its friction, and those that stuck have none; its factors are kept."""
     if options.iterations is None:
         z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
         z, _, inverse, along = solve_and_keep(r, path, z, factorize)
         return z, info, inverse, along
-    z, info, inverse, along = solve_and_keep(r, path, z, factorize)
+    z, info, inverse, along = solve_and_keep(r, path, z, factorize, at)
     for _ in range(options.iterations - 1):
         z, more, inverse, along = solve_and_keep(r, path, z, factorize)
         info = join_info(info, more)
     return z, info, inverse, along
+
+
+def _switches(sf, s, sig, tau, f, W, Wh):
+    """How joints come out of the step, and what part of it is left where there were too many events."""
+    if len(f) == 1:
+        return switch(sf, s, sig, tau, f, diagonal(W), diagonal(Wh)), jnp.zeros((), sf.dtype)
+    return run_events(sf, s, sig, tau, f, W, Wh)
 
 
 def _behind(system, params, s, s1, x, end, f, G, K):

@@ -107,7 +107,9 @@ class GeneralizedAlpha(Controlled, Stepper):
         """The same for constrained systems, whose rows may be redundant."""
         if isinstance(self.options.solve, Structured):
             raise NotImplementedError(f"hht: leave out `solve` with constraints; received {self.options.solve!r}.")
-        return self.factorize if self.redundant is None else factorize_constrained(system.size, self.redundant)
+        if self.redundant is None and self.options.solve is not None:
+            return self.factorize
+        return factorize_constrained(system.size, self.redundant)
 
     def advance(self, s, dt, w):
         """Displacement, velocity, acceleration and algorithmic acceleration at t + dt."""
@@ -161,7 +163,8 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
             alphas, auto stayed bounded in 91 % of the runs, predictor in 85, held in 95, the converged
             method in 94; auto and predictor are equally accurate (`python -m experiments linearization`).
         tolerance: on each row of the residual M w - Q, in units of force, and never more than a millionth of the
-            row's own terms; a residual that is rounding ends the iteration too (iterations=None only).
+            row's own terms, or tolerance times these if that is less; a residual that is rounding ends the iteration
+            too (iterations=None only).
         max_iterations: Newton iterations before a step counts as failed (iterations=None only).
         start: "simple", a0 = w0; "corrected", a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order
             value. q, v and w are of order 2 with both; only a needs the correction, which blows up when

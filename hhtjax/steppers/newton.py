@@ -14,7 +14,7 @@ from hhtjax.steppers.stepper import Info
 from hhtjax.systems import kinematics
 from hhtjax.xla import staged
 
-RELATIVE = 1e-6  # of the terms of a row, above which its residual is never small
+RELATIVE = 1e-6  # of the terms of a row, above which its residual is never small; nor above what `tolerance` is of 1
 SHAKE, NOISE, SHAKES = 2, 32, 3  # roundings by which a state is changed; how much more than that passes; how often
 
 
@@ -93,12 +93,16 @@ def told(factorize, left, info=Info()):  # noqa: B008 (a tuple)
 def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
     """Newton on r(path(w)) from w, s being the state before, until each row of r is small beside its own terms:
 
-        |r_i| <= tolerance and |r_i| <= RELATIVE (|A| |w|)_i,    or each is no larger than rounding makes it.
+        |r_i| <= tolerance and |r_i| <= relative (|A| |w|)_i,    or each is no larger than rounding makes it,
+
+    relative being RELATIVE, or the tolerance if that is less: so units in which all terms are small do not loosen it.
 
     So no row is measured by the forces of another. The second is asked where an iteration no longer halves a row.
 
     Differentiated by the implicit-function theorem, forward and reverse.
     """
+
+    relative = jnp.minimum(RELATIVE, jnp.maximum(tolerance, SHAKE * NOISE * float(jnp.finfo(w.dtype).eps)))
 
     def search(f, w):
         def unfinished(carry):
@@ -113,7 +117,7 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
             dw = inverse(before, trans=0)
             w1 = w0 - dw
             value = f(w1)
-            limit = jnp.minimum(tolerance, RELATIVE * terms(w1))
+            limit = jnp.minimum(tolerance, relative * terms(w1))
             large = jnp.abs(value) > limit
             stalled = jnp.any(large & (jnp.abs(value) > 0.5 * jnp.abs(before)))
             small = ~jnp.any(large) | is_rounding(system, r, s, path(w1), value, limit, stalled)

@@ -19,6 +19,7 @@ from hhtjax.systems.constraints import (
     acceleration_and_multipliers,
     check_redundant,
     factorize_constrained,
+    gradient,
     jacobian,
     require_independent,
     saddle_point,
@@ -89,10 +90,10 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
     params = require_params("consistent_initial", params)
     require_number("consistent_initial", "t0", t0, np.isfinite, "be finite")
     q0, v0, z0 = initial_values("consistent_initial", system, q0, v0, z0)
-    start, B, left = _consistent_initial(system, q0, v0, params, t0, z0, redundant)
-    if all_concrete((start, B)):
+    start, rows, left = _consistent_initial(system, q0, v0, params, t0, z0, redundant)
+    if all_concrete((start, rows)):
         if redundant is None:
-            require_independent("consistent_initial", np.asarray(B))
+            require_independent("consistent_initial", *map(np.asarray, rows))
         if not start.converged:
             raise ValueError(
                 f"consistent_initial: no q with Phi(q, t) = 0 found near `q0`: {left:.3g} is left of it. Start nearer."
@@ -102,18 +103,18 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
 
 @partial(Programs, static_argnames="redundant")
 def _consistent_initial(system, q0, v0, params, t0, z0, redundant):
-    """The result, B at q0, and max|Phi| at the end."""
+    """The result, B at q0 and which rows are clear, and max|Phi| at the end."""
     params = thaw(params)
     flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params, z0)
     factorize = factorize_constrained(flat.size, redundant)
     t = jnp.asarray(t0).astype(q.dtype)
-    B = jacobian(flat, q, t, params)
+    rows = gradient(flat, q, t, params)
     q, converged = nearest_position(flat, q, t, params, factorize)
     left = jnp.max(jnp.abs(flat.constraint(q, t, params)))
     v = v + correction(flat, q, t, params, -violation(flat, q, v, t, params)[1], factorize)
     w, L = acceleration_and_multipliers(flat, q, v, t, params, factorize)
     v, w = (flat.unravel_rates(flat.located(x)) for x in (v, w))
-    return ConsistentInitial(flat.unravel(q), v, w, L, converged), B, left
+    return ConsistentInitial(flat.unravel(q), v, w, L, converged), rows, left
 
 
 def correction(system, q, t, params, rows, factorize):
@@ -135,15 +136,18 @@ def nearest_position(system, q0, t, params, factorize):
 
     def search(f, z):
         def unfinished(carry):
-            z, change, iterations = carry
-            return (change > 16 * eps * (1 + size + jnp.max(jnp.abs(z[:n])))) & (iterations < MAX_ITERATIONS)
+            z, change, last, iterations = carry
+            largest = size + jnp.max(jnp.abs(z[:n]))
+            ends = change <= jnp.where(change > last / 2, 16 * eps * (1 + largest), 16 * eps * largest)
+            return ~ends & (iterations < MAX_ITERATIONS)
 
         def improve(carry):
-            z, _, iterations = carry
+            z, last, _, iterations = carry
             dz = factorize(jax.jacfwd(f)(z))(f(z), trans=0)
-            return z - dz, jnp.max(jnp.abs(dz[:n])), iterations + 1
+            return z - dz, jnp.max(jnp.abs(dz[:n])), last, iterations + 1
 
-        z, change, _ = lax.while_loop(unfinished, improve, (z, jnp.asarray(jnp.inf, z.dtype), 0))
+        far = jnp.asarray(jnp.inf, z.dtype)
+        z, change, *_ = lax.while_loop(unfinished, improve, (z, far, far, 0))
         return z, change
 
     z, change = lax.custom_root(f, z0, search, lambda g, y: solve_map(g, y, factorize), has_aux=True)
@@ -152,19 +156,20 @@ def nearest_position(system, q0, t, params, factorize):
 
 @Programs
 def examine(system, q0, v0, t0, params, z0):
-    """M and B, Phi and dPhi/dt, and the sizes of the coordinates and of their rates."""
+    """M and B, Phi and dPhi/dt, the sizes of the coordinates and of their rates, and which rows of B are clear."""
     params = thaw(params)
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
-    M, B = flat.mass(q, params), jacobian(flat, q, t, params)
+    M, (B, clear) = flat.mass(q, params), gradient(flat, q, t, params)
     sizes = kinematics.sizes(flat.blocks, q), flat.located(jnp.abs(v))
-    return jnp.diag(M) if M.ndim == 1 else M, B[:, : flat.positions], violation(flat, q, v, t, params), sizes
+    M = jnp.diag(M) if M.ndim == 1 else M
+    return M, B[:, : flat.positions], violation(flat, q, v, t, params), sizes, clear
 
 
 def distances(examined, redundant):
     """For Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not, in the coordinate that
     is farthest, in that which is farthest beside its own size, and in each; by NumPy, which has nothing to compile."""
-    M, B, both, sizes = jax.tree.map(np.asarray, examined)
+    M, B, both, sizes, _ = jax.tree.map(np.asarray, examined)
     n, end = M.shape[-1], M.shape[-1] + B.shape[-2]
     A = np.zeros((*M.shape[:-2], end, end), M.dtype)
     A[..., :n, :n], A[..., n:, :n], A[..., :n, n:] = M, B, -np.swapaxes(B, -1, -2)
@@ -202,11 +207,14 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
     if examined is None:
         return
     if redundant is None:
-        require_independent(caller, examined[1])
+        require_independent(caller, examined[1], examined[4])
     found = distances(examined, redundant)
-    for (name, meaning), (violated, distance, relative, away) in zip(checked, found, strict=False):
+    floors = ROUNDINGS * np.finfo(examined[1].dtype).eps, SMALL  # that v0 is, is no error while it is small beside v0
+    for (name, meaning), floor, sizes, values in zip(checked, floors, examined[3], found, strict=False):
+        violated, distance, relative, away = values
         small = relative <= CONSISTENT
-        if not small or (meaning == "Phi" and _is_far(examined, away, (system, q0, v0, t0, params, z0))):
+        beside = floor * np.max(sizes)
+        if not small or (np.any(away > beside) and _is_far(examined[1], away, (system, q0, v0, t0, params, z0))):
             beside = ", which is much in so small a mechanism" if small else ""
             raise ValueError(
                 f"{caller}: `{name}` violates the constraint: max|{meaning}| = {violated:.3g}, {distance:.3g} away "
@@ -214,12 +222,9 @@ def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=No
             )
 
 
-def _is_far(examined, away, start):
-    """Whether a displacement of this size turns a constraint's gradient by more than SMALL: the size of a mechanism is
-    in nothing but that. Asked of what is more than rounding."""
-    _, B, _, (sizes, _) = examined
-    if np.all(away <= ROUNDINGS * np.finfo(B.dtype).eps * (1 + sizes)):
-        return False
+def _is_far(B, away, start):
+    """Whether a displacement of this size, or one in a unit of time, turns a constraint's gradient by more than SMALL:
+    the size of a mechanism is in nothing but that. Asked of what is more than rounding."""
     found = known_now(_turns, *start)
     assert found is not None  # as what was examined
     turns, d = found
@@ -234,6 +239,7 @@ def _turns(system, q0, v0, t0, params, z0):
     t = jnp.asarray(t0).astype(q.dtype)
     d = diagonal(flat.mass(q, params))
     d = jnp.where(d == 0, 1, d)
+    d = d / jnp.min(d)  # which may be too small to be squared
     unit = flat.with_ones(1 / jnp.sqrt(d))
     # one direction for all constraints, of no symmetry: along an axis many of them turn nothing
     uneven = np.where(np.arange(flat.size) % 2, -1, 1) * (0.75 + 0.618034 * np.arange(flat.size) % 0.5)

@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.numerics.elimination import UNROLLED, factorize, matvec
-from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, solve
+from hhtjax.numerics.elimination import UNROLLED, matvec
+from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, factorize_saddle_point, solve
+from hhtjax.systems import kinematics
 from hhtjax.xla import linear_map, staged
 
-GRADIENT = 64  # roundings below which the gradient of a constraint is none
+GRADIENT = 64  # times what roundings of q change a constraint and its gradient, below which it has none
+SHAKES = 3  # by a rounding
 
 
 def violation(system, q, v, t, params):
@@ -46,15 +48,15 @@ def pull_back(system, q, gradient):
     return jax.linear_transpose(lambda v: system.rate(q, v), zero)(gradient)[0]
 
 
-def saddle_point(system, q, t, params, force, rows, factorize=factorize):
+def saddle_point(system, q, t, params, force, rows, factorize=None):
     """(x, L) with M x - B^T L = force and B x = rows: the index-1 system for accelerations, and all projections."""
     M, B = system.full_mass(q, params), jacobian(system, q, t, params)
     A = jnp.block([[M, -B.T], [B, jnp.zeros((len(B), len(B)), B.dtype)]])
-    z = solve(A, jnp.concatenate([force, rows]), factorize)
+    z = solve(A, jnp.concatenate([force, rows]), factorize or factorize_constrained(system.size, None))
     return z[: system.size], z[system.size :]
 
 
-def acceleration_and_multipliers(system, q, v, t, params, factorize=factorize):
+def acceleration_and_multipliers(system, q, v, t, params, factorize=None):
     """w and L at a state that satisfies Phi = 0 and dPhi/dt = 0."""
     Q = system.force(q, v, t, params)
     return saddle_point(system, q, t, params, Q, -curvature(system, q, v, t, params), factorize)
@@ -75,13 +77,31 @@ def check_redundant(caller, redundant):
 
 def factorize_constrained(n, redundant):
     """The factorisation for n coordinates and their multipliers."""
-    return factorize if redundant is None else factorize_least_squares(n)
+    return factorize_saddle_point(n) if redundant is None else factorize_least_squares(n)
 
 
-def require_independent(caller, B):
-    """An error that names the rows of B that depend on each other."""
+def gradient(system, q, t, params):
+    """B, and which of its rows, (m,), are more than rounding, whatever the units: of those that are not, q changed by a
+    rounding changes the row, or the constraint by as much as q would if it changed by all of its size."""
+    k, sizes = np.arange(system.positions), kinematics.sizes(system.blocks, q)
+    uneven = [np.where(k // 2**i % 2, -1, 1) * (0.75 + 0.618034 * (i + 1) * k % 0.5) for i in range(SHAKES)]
+    shakes = float(jnp.finfo(q.dtype).eps) * jnp.asarray(np.stack([0 * k, *uneven]), q.dtype) * sizes[None, :]
+
+    def at(x):
+        moved = system.move(q, x)
+        return system.constraint(moved, t, params), jacobian(system, moved, t, params)
+
+    Phi, B = jax.vmap(at)(shakes)
+    size, turned = (jnp.sqrt(jnp.sum(x**2, axis=-1)) for x in (B[0], B[1:] - B[:1]))
+    reach, changed = jnp.max(sizes) * size, jnp.max(jnp.abs(Phi[1:] - Phi[:1]), axis=0)
+    clear = (size > GRADIENT * jnp.max(turned, axis=0)) & (reach >= GRADIENT * changed)
+    return B[0], jnp.isfinite(size) & (size > 0) & clear
+
+
+def require_independent(caller, B, clear):
+    """An error that names the rows of B that depend on each other, or are not clear (`gradient`)."""
     size = np.linalg.norm(B, axis=1)
-    empty = np.flatnonzero(~(np.isfinite(size) & (size > GRADIENT * np.finfo(B.dtype).eps))).tolist()
+    empty = np.flatnonzero(~np.asarray(clear)).tolist()
     if empty:
         raise ValueError(
             f"{caller}: `constraint` rows {empty} have no gradient in q at the start but for rounding, or not a finite "

@@ -16,7 +16,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe, require_function
-from hhtjax.numerics.elimination import diagonal, factorize, matvec
+from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems import returned
 from hhtjax.systems.constraints import saddle_point
@@ -104,13 +104,14 @@ def own_rate(system, q, v, t, params):
     return jax.jvp(s, (q, t), (system.rate(q, v), jnp.ones_like(t)))[1]
 
 
-def responses(system, q, t, params, H, factorize=factorize):
+def responses(system, q, t, params, H, factorize=None):
     """G (m, N): the accelerations that a unit of force in each direction of H makes, M^-1 H^T, with constraints."""
     if system.num_constraints:
         rows = jnp.zeros(system.num_constraints, q.dtype)
         return jax.vmap(lambda h: saddle_point(system, q, t, params, h, rows, factorize)[0])(H)
     M = system.mass(q, params)
-    return jax.vmap(lambda h: system.solve_mass(M, h, factorize))(H)
+    ways = () if factorize is None else (factorize,)
+    return jax.vmap(lambda h: system.solve_mass(M, h, *ways))(H)
 
 
 def across(H, G):
