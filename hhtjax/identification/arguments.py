@@ -13,6 +13,7 @@ from hhtjax.checks import require_function, require_integer
 from hhtjax.description import as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
+from hhtjax.identification.progress import NO_SLOPE
 
 FEW = 64  # parameters up to which a forward-mode Jacobian is the cheaper derivative
 LEVENBERG_MARQUARDT = "levenberg_marquardt"
@@ -284,7 +285,7 @@ def first_bad(residual, weights):
         if not np.all(np.isfinite(x)):
             index = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             return f"{x[index]} at residuals{jax.tree_util.keystr(path)}{list(index)} ({bad} of {total} entries)"
-    return "a finite residual with a derivative that is not finite"
+    return NO_SLOPE
 
 
 def check_transforms(caller, transforms, params, name="params0"):

@@ -23,7 +23,9 @@ class System(Description):
             Shape (n, n), symmetric positive definite, or (n,) for a diagonal. Its rows follow
             `jax.flatten_util.ravel_pytree(v)`; for a dict that is the order of the *sorted* keys. What is no such
             matrix is an error here if it is an array, and named by `Solution.check` if it is so where a run starts.
-        force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v.
+        force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v. Steps take its slopes,
+            derivatives of runs its second derivatives: a contact max(x, 0)**1.5, whose second one is infinite at 0,
+            gives NaN there, and max(x, 1e-12)**1.5 does not.
         constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), m <= n, rows independent. Then
             M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.
         inertia: M(q) w without M, `inertia(q, w, params)`, a pytree structured like v: for chains and trees, whose
