@@ -117,7 +117,7 @@ def simulate(
     if isinstance(dt, Adaptive) or times is not None:
         require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
         return run_controlled(problem, times, dt, progress, events, room)
-    dt, num_steps = require_steps("simulate", stepper, dt, num_steps)
+    dt, num_steps = require_steps("simulate", stepper, dt, num_steps, 2 ** (extrapolate - 1))
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
