@@ -186,6 +186,8 @@ ARGUMENTS = [
     *((ValueError, f"`dt` must be positive and finite; received {x}.", {"dt": x}) for x in (INF, -INF)),
     (ValueError, "`dt` must be positive and finite; received -0.5.", {"dt": jnp.array(-0.5)}),
     *((TypeError, f"`dt` {REAL} {x!r}.", {"dt": x}) for x in ("fast", None, True, 1j)),
+    (ValueError, "`num_steps` must be less than 2147483648, because", {"num_steps": 2**31}),
+    (ValueError, "`num_steps` must be less than 268435456, because", {"num_steps": 2**28, "extrapolate": 4}),
     (ValueError, "`num_steps` must be the length of dt, 1, or left out; received 4.", {"dt": np.array([0.1])}),
     *((ValueError, f"`t0` must be finite; received {x}.", {"t0": x}) for x in (NAN, INF, -INF)),
     *((TypeError, f"`t0` {REAL} {x!r}.", {"t0": x}) for x in ("now", None, True, 1j, np.array([0.1]))),

@@ -98,7 +98,7 @@ def test_an_error_inside_mass_or_force_keeps_its_kind_and_says_where(name):
     with pytest.raises(KeyError, match="k") as caught:
         run(system, params={"stiffness": 1.0})
     notes = " ".join(caught.value.__notes__)
-    assert f"simulate: raised while tracing `{name}` with shape (1,) float64" in notes
+    assert f"simulate: raised while tracing `{name}` with {2 if name == 'mass' else 4} arguments: shape (1,)" in notes
     assert "['stiffness']: shape () float64" in notes
 
 

@@ -209,12 +209,26 @@ def test_many_parameters_take_an_optax_optimiser():
     ("options", "error", "message"),
     [
         ({"transforms": hhtjax.fixed}, ValueError, "`transforms` must leave a parameter free"),
-        ({"transforms": {"a": hhtjax.positive, "b": None}}, ValueError, "`transforms` must be a prefix of params0"),
+        (
+            {"transforms": {"a": hhtjax.positive, "b": None}},
+            ValueError,
+            "`transforms` must be a prefix of params0: pytree structure error: .*\n *transforms\n",
+        ),
         ({"transforms": "log"}, TypeError, "`transforms` must hold hhtjax.positive, .* received 'log'"),
         (
             {"transforms": {"a": None, "rate": hhtjax.bounded(2, 3), "offset": None}},
             ValueError,
             r"`params0\['rate'\]` must lie between 2.0 and 3.0, for its transform; received 1.5",
+        ),
+        (
+            {"transforms": {"a": None, "rate": (0, 5), "offset": None}},
+            TypeError,
+            r"`transforms` must hold hhtjax.positive, .* or None; received 0 as transforms\['rate'\]\[0\]",
+        ),
+        (
+            {"prior": {"a": None, "rate": (1.0, 0.5), "offset": None}},
+            TypeError,
+            r"`prior` must hold Gaussian\(mean, deviation\) or None; received 1.0 as prior\['rate'\]\[0\]",
         ),
         ({"weights": None}, TypeError, "`weights` must be a number, an array or a pytree of them; received None"),
         ({"weights": -1.0}, ValueError, "`weights` must not be negative; received -1.0"),

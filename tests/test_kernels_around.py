@@ -15,7 +15,7 @@ from linked_pendulums import on_cpu, paths
 
 import hhtjax
 from hhtjax.xla import kernels
-from hhtjax.xla.lowering import UNTOLD
+from hhtjax.xla.lowering import UNTOLD, VERDICT
 
 x = jnp.linspace(0.1, 1.0, 4)
 
@@ -48,6 +48,22 @@ def test_kernels_of_a_controlled_run_hold_all_that_is_around_their_loops(derivat
 
     lowered = jax.jit(derivative(end)).lower(1.0).as_text()
     assert re.findall(f'{UNTOLD} = "([^"]*)"', lowered) == number * ["one kernel"]
+
+
+def in_order(q, v, t, params):
+    return -jnp.sort(q)
+
+
+@on_cpu
+def test_the_users_line_that_stands_against_a_kernel_is_told():
+    """Of the default step, which takes the force apart; and not in the program, whose key on disk it would change."""
+
+    def end(q):
+        return hhtjax.simulate(hhtjax.System(np.ones(2), in_order), hhtjax.hht(), q, q, dt=0.1, num_steps=2).q[-1]
+
+    line = in_order.__code__.co_firstlineno + 1
+    assert paths(end, x[:2]) == (f"plain: stablehlo.sort, test_kernels_around.py, line {line}, in in_order",)
+    assert f'{VERDICT} = "plain: stablehlo.sort"' in jax.jit(end).lower(x[:2]).as_text()
 
 
 def test_who_is_alone_goes_on():

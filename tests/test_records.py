@@ -105,7 +105,7 @@ def test_bad_records_are_named():
     def residuals(params, start, record):
         return wave(params, start, t) - record
 
-    with pytest.raises(ValueError, match="fit: `records` and `starts` must be given together"):
+    with pytest.raises(ValueError, match=r"fit: `records` and `starts` must be given together; .* by jax\.vmap\."):
         hhtjax.fit(residuals, GUESS, records=MEASURED)
     with pytest.raises(ValueError, match=r"`starts` must have one leading axis in all leaves; .*\(2,\), \(3,\)"):
         hhtjax.fit(residuals, GUESS, records=MEASURED[:2], starts=STARTS)

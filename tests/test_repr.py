@@ -216,6 +216,12 @@ def test_every_result_with_arrays_is_shown():
     assert shown.__doc__
 
 
+def test_an_exported_model_does_not_show_its_text():
+    model = hhtjax.ExportedC("spring", "the header", "the source", (), (), (), (), (), {}, 9, 0)
+    assert repr(model).startswith("ExportedC(name='spring', state=()")
+    assert repr(hhtjax.ExportedFMU(model, "the description", "the wrapper")) == f"ExportedFMU(c={model!r})"
+
+
 def test_a_line_of_progress_takes_the_place_of_the_one_before(capsys):
     overwrite("a longer one", last=False)
     overwrite("short", last=True)

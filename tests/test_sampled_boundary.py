@@ -32,6 +32,7 @@ ERRORS = [
     (ValueError, "`values` must be finite; received", {"values": np.array([[0, 0], [0, 0], [0, 0], [1, INF]])}),
     *((ValueError, f"`dt` must be positive and finite; received {x}.", {"dt": x}) for x in (0, -0.1, NAN, INF)),
     *((TypeError, f"`dt` {REAL} {x!r}.", {"dt": x}) for x in ("slow", None, True, 1j, np.array([0.1]))),
+    (TypeError, "`dt` must be a number; received one for each sample: give times as `times=`.", {"dt": VALUES}),
     *((ValueError, f"`t0` must be finite; received {x}.", {"t0": x}) for x in (NAN, INF, -INF)),
     *((TypeError, f"`t0` {REAL} {x!r}.", {"t0": x}) for x in ("now", None, True, 1j, np.array([0.1]))),
 ]

@@ -159,6 +159,22 @@ def test_dense_output_far_from_zero():
     np.testing.assert_allclose(hhtjax.interpolate(path, times).q[:, 0], np.cos(5 * (times - 1000)), atol=1e-3)
 
 
+@pytest.mark.parametrize("program", [lambda f: f, jax.jit, jax.vmap])
+def test_dense_output_of_rows_that_were_picked_out(program):
+    """At distances that differ by a fifth of their mean, known before the program runs or not; of a batch with equal
+    ones, too."""
+    t = jnp.stack([jnp.array([0.0, 0.18, 0.42, 0.6, 0.78, 1.02, 1.2]), jnp.linspace(0.0, 1.2, 7)])[..., None]
+    times = jnp.linspace(0.0, 1.2, 37)
+
+    def position(t):
+        path = hhtjax.Solution(t[:, 0], jnp.cos(t), -jnp.sin(t), -jnp.cos(t), None, jnp.asarray(0.2), *2 * [None])
+        return hhtjax.interpolate(path, times).q[:, 0]
+
+    found = program(position)(t) if program is jax.vmap else [program(position)(x) for x in t]
+    for q in found:
+        np.testing.assert_allclose(q, np.cos(times), atol=2e-5)
+
+
 @pytest.mark.slow
 def test_progress_changes_neither_result_nor_gradient(capfd):
     @partial(jax.jit, static_argnums=1)

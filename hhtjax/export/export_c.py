@@ -1,7 +1,7 @@
 """A system, a stepper and parameters as one file of C99, and its header."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +32,8 @@ class ExportedC:
     """
 
     name: str
-    header: str
-    source: str
+    header: str = field(repr=False)
+    source: str = field(repr=False)
     state: tuple
     params: tuple
     inputs: tuple

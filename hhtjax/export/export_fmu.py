@@ -9,6 +9,7 @@ import tempfile
 import warnings
 import zipfile
 from dataclasses import dataclass
+from dataclasses import field as entry
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -68,8 +69,8 @@ class ExportedFMU:
     """
 
     c: ExportedC
-    description: str
-    wrapper: str
+    description: str = entry(repr=False)
+    wrapper: str = entry(repr=False)
 
     def write(self, folder) -> Path:
         """Writes name.fmu into a folder, with sources, and a binary of this platform; its path.

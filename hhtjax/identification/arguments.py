@@ -13,6 +13,7 @@ from hhtjax.checks import require_function, require_integer
 from hhtjax.description import as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
+from hhtjax.identification.progress import NO_SLOPE
 
 FEW = 64  # parameters up to which a forward-mode Jacobian is the cheaper derivative
 LEVENBERG_MARQUARDT = "levenberg_marquardt"
@@ -139,8 +140,6 @@ def check_prior(caller, prior, params0):
 
     def fill(entry, branch):
         entry = Gaussian(0.0, np.inf) if entry is None else entry
-        if not isinstance(entry, Gaussian):
-            raise TypeError(f"{caller}: `prior` must hold Gaussian(mean, deviation) or None; received {entry!r}.")
         entry = Gaussian(*(jnp.asarray(y) if isinstance(y, (list, tuple)) else y for y in entry))
         check_real(f"{caller}: the mean in `prior`", entry.mean)
         if not is_real(entry.deviation):
@@ -156,22 +155,36 @@ def check_prior(caller, prior, params0):
             )
         return jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape)
 
-    require_prefix(caller, "prior", prior, params0, "params0", is_prior)
+    require_entries(caller, "prior", prior, params0, "params0", is_prior, "Gaussian(mean, deviation)")
     return jax.tree.map(fill, prior, params0, is_leaf=is_prior)
 
 
 def require_prefix(caller, name, prefix, tree, of, is_leaf=None):
     """An error unless `prefix` has an entry for each leaf of `tree`, which is `of` something, or for whole branches."""
+    entries = prefix if is_leaf is None else jax.tree.map(lambda _: 0, prefix, is_leaf=is_leaf)  # None is one, too
     try:
-        jax.tree.map(lambda *_: None, prefix, tree, is_leaf=is_leaf)
+        jax.tree.map(lambda *_: None, entries, tree)
     except ValueError as error:
-        raise ValueError(f"{caller}: `{name}` must be a prefix of {of}: {error}") from None
+        why = str(error).replace("tree_map tree", name)
+        raise ValueError(f"{caller}: `{name}` must be a prefix of {of}: {why}") from None
+
+
+def require_entries(caller, name, prefix, tree, of, is_entry, kinds):
+    """The same, and an error that names the first entry that is none."""
+    for path, entry in jax.tree_util.tree_leaves_with_path(prefix, is_leaf=is_entry):
+        if not is_entry(entry):
+            where = f"{name}{jax.tree_util.keystr(path)}"
+            raise TypeError(f"{caller}: `{name}` must hold {kinds} or None; received {entry!r} as {where}.")
+    require_prefix(caller, name, prefix, tree, of, is_entry)
 
 
 def check_records(caller, records, starts, prior, optimizer):
     """The starts as float arrays; they and the records have one leading axis."""
     if records is None or starts is None:
-        raise ValueError(f"{caller}: `records` and `starts` must be given together; received one of them.")
+        raise ValueError(
+            f"{caller}: `records` and `starts` must be given together; received one of them. Records without "
+            "starts of their own go into residuals(params), all of them by jax.vmap."
+        )
     starts = check_parameters(caller, starts, "starts")
     require_leading_axis(caller, "`records` and `starts`", (records, starts))
     if optimizer != LEVENBERG_MARQUARDT or prior is not None:
@@ -272,21 +285,16 @@ def first_bad(residual, weights):
         if not np.all(np.isfinite(x)):
             index = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             return f"{x[index]} at residuals{jax.tree_util.keystr(path)}{list(index)} ({bad} of {total} entries)"
-    return "a finite residual with a derivative that is not finite"
+    return NO_SLOPE
 
 
 def check_transforms(caller, transforms, params, name="params0"):
     """The transform of each leaf of params, which have to be reachable by it."""
-    try:
-        transforms = tf.per_leaf(transforms, params)
-    except ValueError as error:
-        raise ValueError(f"{caller}: `transforms` must be a prefix of {name}: {error}") from None
+    kinds = "hhtjax.positive, bounded(), fixed"
+    require_entries(caller, "transforms", transforms, params, name, tf.is_transform, kinds)
+    transforms = tf.per_leaf(transforms, params)
     for (path, leaf), T in zip(jax.tree_util.tree_leaves_with_path(params), transforms, strict=True):
         where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
-        if not isinstance(T, tf.Transform):
-            raise TypeError(
-                f"{caller}: `transforms` must hold hhtjax.positive, bounded(), fixed or None; received {T!r}."
-            )
         if is_concrete(leaf) and not np.all(T.contains(leaf)):
             raise ValueError(f"{where} must {T.expectation}; received {leaf}.")
     return transforms

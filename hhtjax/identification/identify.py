@@ -29,7 +29,7 @@ from hhtjax.identification.arguments import (
 )
 from hhtjax.identification.identifiability import warn_undetermined
 from hhtjax.identification.problem import Data, solve
-from hhtjax.identification.progress import BAD_START, NO_INFLUENCE
+from hhtjax.identification.progress import BAD_START, NO_INFLUENCE, NO_SLOPE
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 from hhtjax.xla import or_plain
@@ -214,10 +214,9 @@ def _finished(caller, result, weights):
     """The result of a fit outside of jit: trouble told, and the history cut to what happened."""
     code = int(result.code)
     if code == BAD_START:
-        missing = "" if weights is not True else "; give missing samples the weight False"
-        raise ValueError(
-            f"{caller}: `residuals` must be finite at params0; received {first_bad(result.residual, weights)}{missing}."
-        )
+        bad = first_bad(result.residual, weights)
+        missing = "" if weights is not True or bad == NO_SLOPE else "; give missing samples the weight False"
+        raise ValueError(f"{caller}: `residuals` must be finite at params0; received {bad}{missing}.")
     if code == NO_INFLUENCE:
         raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")
     if result.uncertainty is not None:

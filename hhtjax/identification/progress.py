@@ -19,6 +19,10 @@ REASONS = {
     NO_INFLUENCE: "failed: no parameter changes the residual at params0",
     UNSETTLED: "stopped: the estimates change whenever steps are chosen anew; take a smaller rtol",
 }
+NO_SLOPE = (
+    "a finite residual with a derivative that is not finite: roots, norms and max(x, 0)**1.5 have none, or no second "
+    "one, at 0, where max(x, 1e-12) has"
+)
 
 
 @shown

@@ -166,12 +166,13 @@ def bounded(lower: float, upper: float) -> Bounded:
     return Bounded(float(lower), float(upper))
 
 
+def is_transform(x):
+    """Whether it is one, or None for none."""
+    return x is None or isinstance(x, Transform)
+
+
 def per_leaf(prefix, tree):
     """The transform of each leaf of `tree`, given for leaves or whole branches; None stands for `scaled`."""
-
-    def is_transform(x):
-        return x is None or isinstance(x, Transform)
-
     repeated = jax.tree.map(
         lambda T, branch: [scaled if T is None else T] * len(jax.tree.leaves(branch)),
         prefix,

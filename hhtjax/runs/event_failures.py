@@ -1,6 +1,6 @@
 """What may go wrong at an event, as data and in words."""
 
-FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER = range(7)
+FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE = range(8)
 EVENTS = {  # what it is, before the number of the event, and what to do about it
     MANY: (
         "more than max_events in a step, the first of them event",
@@ -27,5 +27,10 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
     NO_NUMBER: (
         "q and v are numbers, but not the guard of event",
         "A guard must be a number beyond its zero, too: q, not sqrt(q)",
+    ),
+    NEGATIVE: (
+        "behind an event, with the params of its switch and the v of its reset, negative is the guard of event",
+        "Guards are positive where the motion goes on: behind its event one may need the other sign, by the mode that "
+        "the switch changes, or another level",
     ),
 }

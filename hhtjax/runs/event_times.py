@@ -16,13 +16,15 @@ ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, qua
 
 class Found(NamedTuple):
     """Of each event: whether it falls into the part of a step, where about (0 to 1), before where, whether it only
-    touches there, whether the motion stays beyond it, whether it is no number, and how large the guard is."""
+    touches there, whether the motion stays beyond it, and was made to by the event before, whether it is no number, and
+    how large the guard is."""
 
     hit: Any
     place: Any
     limit: Any
     touches: Any
     stays: Any
+    negative: Any
     unknown: Any
     size: Any
 
@@ -40,6 +42,7 @@ def look(ways, part, params, h):
     noted = jnp.asarray(ways.events.noted)
     rising = (d0 > 0) & (d1 > 0)
     left = rising & (g1 > -nearness(g1) * h * d1)  # behind an event g is a rounding of either sign
+    negative = part.divided & (g0 < -beside_zero(d0, h, jnp.abs(g0) + jnp.abs(g1)))
     returns = (d0 > 0) & ~rising & (~noted | (g0 > -nearness(g0) * h * d0))
     d0, d1 = d0 * part.rest, d1 * part.rest
     a, b = 3 * (g1 - g0) - 2 * d0 - d1, 2 * (g0 - g1) + d0 + d1
@@ -70,7 +73,8 @@ def look(ways, part, params, h):
     stays = (g1 < 0) & ~hit & ~left & ~noted
     unknown = jnp.isnan(g1) & jnp.all(jnp.isfinite(part.end.q)) & jnp.all(jnp.isfinite(part.end.v))
     place = jnp.where(hit, place, jnp.inf)
-    return lax.stop_gradient(Found(hit, place, lowest, touches, stays, unknown, jnp.abs(g0) + jnp.abs(g1)))
+    found = Found(hit, place, lowest, touches, stays, stays & negative, unknown, jnp.abs(g0) + jnp.abs(g1))
+    return lax.stop_gradient(found)
 
 
 def first_time(ways, params, part, found, h):
@@ -128,6 +132,11 @@ def improved(x, y, slope, low, high):
     """A zero by a step of Newton's method from x, where y falls; the middle where it does not, or leaves its bounds."""
     new = x - y / jnp.where(slope < 0, slope, 1)
     return jnp.where((slope < 0) & (new >= low) & (new <= high), new, (low + high) / 2)
+
+
+def beside_zero(rate, h, size):
+    """How far from zero a guard may be where its event was found, of numbers of this size."""
+    return 1e-3 * jnp.abs(rate) * h + 1e3 * float(jnp.finfo(h.dtype).eps) * size
 
 
 def nearness(x):

@@ -8,11 +8,14 @@ from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.runs.adaptive import Adaptive
 
 
-def require_steps(caller, stepper, dt, num_steps):
-    """dt, a number or (N,), and the number of steps."""
+def require_steps(caller, stepper, dt, num_steps, parts=1):
+    """dt, a number or (N,), and the number of steps, each of which may be divided into so many parts."""
     dt = np.asarray(dt) if isinstance(dt, (list, tuple)) else dt
     if not (is_array(dt) and dt.ndim):
         num_steps = require_integer(caller, "num_steps", num_steps)
+        if num_steps * parts >= 2**31:
+            most = f"be less than {2**31 // parts}, because steps are counted in 32 bits"
+            raise ValueError(f"{caller}: `num_steps` must {most}; received {num_steps}.")
         require_number(caller, "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
         return float(dt) if is_concrete(dt) else dt, num_steps  # other number types would be compiled anew
     if not is_real(dt):

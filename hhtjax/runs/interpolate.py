@@ -9,6 +9,7 @@ import numpy as np
 
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.description.presentation import shown
+from hhtjax.numerics.seldom import choose, if_any
 from hhtjax.systems import kinematics
 from hhtjax.xla import Programs
 
@@ -71,7 +72,8 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     if not is_real(times):
         raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
     known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
-    equal = not jnp.ndim(solution.dt) and solution.events is None and not _are_uneven(t)  # an event may end a run early
+    equal = not jnp.ndim(solution.dt) and solution.events is None  # an event may end a run early
+    equal = None if equal and not is_concrete(t) else equal and not _are_uneven(t)
     found, outside = _found(known, jnp.asarray(times), equal=equal)
     if is_concrete(outside) and np.any(outside):
         bad = np.asarray(times).astype(t.dtype)[np.asarray(outside)].flat[0]
@@ -81,28 +83,36 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
 
 
 def _are_uneven(t):
-    """Whether saved times, where they are known, are at other distances than those of a run: of rows picked out."""
-    if not is_concrete(t) or len(t) < 2:
-        return False
-    t = np.asarray(t)
-    mean, rounding = (t[-1] - t[0]) / (len(t) - 1), 4 * np.finfo(t.dtype).eps * np.max(np.abs(t))
-    return bool(np.max(np.abs(np.diff(t) - mean)) > mean / 2 + rounding)
+    """Whether saved times are at other distances than those of a run, beside rounding: of rows picked out."""
+    xp = np if is_concrete(t) else jnp
+    t = xp.asarray(t)
+    mean, rounding = (t[-1] - t[0]) / max(len(t) - 1, 1), 4 * float(np.finfo(t.dtype).eps) * xp.max(xp.abs(t))
+    return xp.max(xp.abs(xp.diff(t) - mean), initial=0) > rounding
 
 
 @partial(Programs, static_argnames="equal")
 def _found(known, times, equal):
-    """What is saved of a run, at the times, and which of them lie outside of it; equal: whether its intervals are."""
+    """What is saved of a run, at the times, and which of them lie outside of it; equal: whether its intervals are, None
+    where that is known when the program runs."""
     t, times = known.t, times.astype(known.t.dtype)
     start, end = t[0], t[-1]
     slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
     outside = ~((times >= start - slack) & (times <= end + slack))
-    if equal:
+
+    def of_equal():
         mean = (end - start) / (t.shape[0] - 1)  # a single difference has lost digits, far from t = 0
         i = jnp.clip(jnp.floor((times - start) / mean).astype(jnp.int32), 0, t.shape[0] - 2)
-        H = jnp.full_like(times, mean)
+        return i, jnp.full_like(times, mean)
+
+    def of_any():
+        i = jnp.clip(jnp.searchsorted(t, times, side="right").astype(jnp.int32) - 1, 0, t.shape[0] - 2)
+        return i, t[i + 1] - t[i]
+
+    if equal is None:
+        uneven = _are_uneven(t)
+        i, H = if_any(lambda found: choose(uneven, of_any(), found), uneven, of_equal())
     else:
-        i = jnp.clip(jnp.searchsorted(t, times, side="right") - 1, 0, t.shape[0] - 2)
-        H = t[i + 1] - t[i]
+        i, H = of_equal() if equal else of_any()
     x = jnp.where(outside, jnp.nan, (times - t[i]) / H)
     a, b = (jax.tree.map(lambda y: y[j], known._replace(events=None)) for j in (i, i + 1))  # noqa: B023 (called at once)
     if known.events is not None:

@@ -14,10 +14,10 @@ from jax import lax
 
 from hhtjax.description import freeze, thaw
 from hhtjax.numerics.seldom import choose, if_any, seldom
-from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NO_NUMBER, STAYS
+from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, STAYS
 from hhtjax.runs.event_log import row_of
 from hhtjax.runs.event_parts import SHORT, Met, Part, go
-from hhtjax.runs.event_times import first_of, first_time, located, look, nearness, pick
+from hhtjax.runs.event_times import beside_zero, first_of, first_time, located, look, nearness, pick
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
 from hhtjax.xla import staged
@@ -75,6 +75,7 @@ def meet_or_flag(ways, now, going, number, h, params):
     part, noted = now
     found = look(ways, part, params, h)
     here = going & jnp.any(found.hit)
+    part = flag(part, going & ~here, NEGATIVE, found.negative)
     part = flag(part, going & ~here, STAYS, found.stays)
     part = flag(part, going & ~here, NO_NUMBER, found.unknown)
     part = flag(part, here & (number == ways.max_events), MANY, found.hit & ~found.touches)
@@ -107,8 +108,7 @@ def meet(ways, now, found, h, params):
     e, info = go(ways, now, part.start, tau, part.last, h)
     g, d = events.rates(ways.flat, e, now)
     rate = pick(this, d)
-    noise = 1e3 * float(jnp.finfo(h.dtype).eps)
-    missed = ~(jnp.abs(pick(this, g)) <= 1e-3 * jnp.abs(rate) * h + noise * pick(this, found.size))
+    missed = ~(jnp.abs(pick(this, g)) <= beside_zero(rate, h, pick(this, found.size)))
     v, modes = events.outcome(i, e.q, e.v, e.t, now, events.with_modes(params, met.modes))
     row = row_of(e.t, i, rate, e.q, e.v, v)
 

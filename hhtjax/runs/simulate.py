@@ -84,9 +84,10 @@ def simulate(
     mode computes the steps again, in blocks, and its memory grows with the square root of num_steps, but for a
     megabyte that it may take to do so only once.
     Compiled once for each system, stepper, structure, num_steps and save_every; a new dt, q0 or params
-    costs no compilation. Functions are told apart by identity, here as in `fit`: one that reads a global variable, or
-    data around it, keeps the values of its first call. Pass through params what may change, or define the function
-    anew, or call `jax.clear_caches()`.
+    costs no compilation, but for numbers of another type: 4 after 4.0, or np.float64(4.0), is another program, and
+    so is an array after a number. Functions are told apart by identity, here as in `fit`: one that reads a global
+    variable, or data around it, keeps the values of its first call. Pass through params what may change, or define the
+    function anew, or call `jax.clear_caches()`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate
@@ -116,7 +117,7 @@ def simulate(
     if isinstance(dt, Adaptive) or times is not None:
         require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
         return run_controlled(problem, times, dt, progress, events, room)
-    dt, num_steps = require_steps("simulate", stepper, dt, num_steps)
+    dt, num_steps = require_steps("simulate", stepper, dt, num_steps, 2 ** (extrapolate - 1))
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.elimination import diagonal
-from hhtjax.numerics.hoisted import hoisted
+from hhtjax.numerics.hoisted import hoisted, traced
 from hhtjax.numerics.seldom import choose, derivative_of, seldom
 from hhtjax.steppers.newton import Expand, left_by, linearized_solve, solve_expanded, told
 from hhtjax.xla import staged
@@ -27,8 +27,7 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
         return linearized_solve(r, path, s.w, factorize, held, again)
 
     # each traced once, for both states that r is expanded about
-    of_r, of_path = (jax.jit(partial(linearize, f), inline=True) for f in (r, path))
-    expand = Expand(of_r, of_path, s.w)
+    expand = Expand(traced(partial(linearize, r), now), traced(partial(linearize, path), s.w), s.w)
 
     @jax.jit
     def solution(expansion):

@@ -59,5 +59,6 @@ def evaluate(caller, name, function, *args):
     try:
         return jax.eval_shape(lambda *args: function(*thaw(args)), *freeze(args))
     except Exception as error:
-        error.add_note(f"{caller}: raised while tracing `{name}` with " + ", ".join(describe(x) for x in args) + ".")
+        received = ", ".join(describe(x) for x in args)
+        error.add_note(f"{caller}: raised while tracing `{name}` with {len(args)} arguments: {received}.")
         raise

@@ -166,6 +166,8 @@ def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
 def _grid(values, dt, t0, times):
     """times, dt and t0, checked, in the dtype of the values: either times, or the other two."""
     if times is None:
+        if is_array(dt) and dt.ndim and dt.shape == values.shape[:1]:
+            raise TypeError("sampled: `dt` must be a number; received one for each sample: give times as `times=`.")
         require_number("sampled", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
         require_number("sampled", "t0", t0, np.isfinite, "be finite")
         return None, *(jnp.asarray(x).astype(values.dtype) for x in (dt, t0))

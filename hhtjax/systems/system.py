@@ -23,7 +23,9 @@ class System(Description):
             Shape (n, n), symmetric positive definite, or (n,) for a diagonal. Its rows follow
             `jax.flatten_util.ravel_pytree(v)`; for a dict that is the order of the *sorted* keys. What is no such
             matrix is an error here if it is an array, and named by `Solution.check` if it is so where a run starts.
-        force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v.
+        force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v. Steps take its slopes,
+            derivatives of runs its second derivatives: a contact max(x, 0)**1.5, whose second one is infinite at 0,
+            gives NaN there, and max(x, 1e-12)**1.5 does not.
         constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), m <= n, rows independent. Then
             M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.
         inertia: M(q) w without M, `inertia(q, w, params)`, a pytree structured like v: for chains and trees, whose
@@ -51,7 +53,8 @@ class System(Description):
             Friction that differs from one direction to the other, from -F1 to F2, is F = (F1 + F2)/2 with the constant
             force (F1 - F2)/2 in `force`. For the `hht` family; see `hhtjax.systems`.
         sliding: s, the sliding velocities, `sliding(q, v, t, params)` -> (m,), m <= 8, affine in v, H = ds/dv. Relative
-            velocities of bodies, v - u(t) on a moving belt. Rows must be independent. Default: v itself.
+            velocities of bodies, v - u(t) on a moving belt. Rows must be independent. Default: v itself. Where F is
+            larger than all that comes, s = 0 holds throughout: a constraint of velocities, as of a wheel that rolls.
 
     q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
     leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
@@ -115,7 +118,7 @@ class System(Description):
         if self.inertia is not None:
             require_function("System", "inertia", self.inertia, "inertia(q, w, params)")
         if self.constraint is not None:
-            require_function("System", "constraint", self.constraint, "constraint(q, t, params)")
+            _require_constraint(self.constraint)
         more = (self.internal is not None) * ("z",) + (self.constraint is not None) * ("L",)
         require_friction("System", self.friction, self.sliding, *more)
         if callable(self.mass):
@@ -192,6 +195,19 @@ class FirstOrderSystem(Description):
 
     def __post_init__(self):
         require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")
+
+
+def _require_constraint(constraint):
+    """An error for what is no function constraint(q, t, params); for one of velocities with the way to it."""
+    try:
+        require_function("System", "constraint", constraint, "constraint(q, t, params)")
+    except TypeError as error:
+        code = getattr(constraint, "__code__", None)
+        if code is None or "v" not in code.co_varnames[: code.co_argcount]:
+            raise
+        raise TypeError(
+            f"{error} Velocities that are held, as where a wheel rolls, are `sliding` with a large `friction`."
+        ) from None
 
 
 def require_system(caller, system):

@@ -9,13 +9,14 @@ import jax
 from hhtjax.xla.gate import why_off
 from hhtjax.xla.kernels import LOOP
 from hhtjax.xla.lowering import VERDICT
+from hhtjax.xla.source_lines import asked
 
 
 class Explanation(NamedTuple):
     """What `explain` found; as text, a line for each loop.
 
     Attributes:
-        paths: for each loop over steps "one kernel", or "plain: " and what stood against it.
+        paths: for each loop over steps "one kernel", or "plain: ", what stood against it, and where in your files.
         compile_seconds: time to compile, s.
         temporary_bytes: memory beside arguments and results; None where XLA does not tell.
     """
@@ -58,13 +59,18 @@ def explain(f, *args) -> Explanation:
     >>> forward == back == "one kernel" or forward.startswith("plain: JAX")     # too old, or too new
     True
     """
-    start = time.perf_counter()
-    lowered = jax.jit(f).lower(*args)
+    start, lines = time.perf_counter(), {}
+    token = asked.set(lines)
+    try:
+        lowered = jax.jit(f).lower(*args)
+    finally:
+        asked.reset(token)
     compiled = lowered.compile()
     seconds = time.perf_counter() - start
     off = f"plain: {why_off() or 'inside hhtjax.plain()'}"
-    found = [re.findall(rf'{VERDICT} = "([^"]*)"|call @{LOOP}', text) for text in _called(lowered.as_text())]
-    paths = tuple(verdict or off for verdicts in found for verdict in verdicts)
+    told = rf'call @([^\s(]+)\([^\n]*{VERDICT} = "([^"]*)"|call @{LOOP}'
+    found = [x for text in _called(lowered.as_text()) for x in re.findall(told, text)]
+    paths = tuple(f"{verdict or off}{', ' * (name in lines)}{lines.get(name, '')}" for name, verdict in found)
     memory: Any = compiled.memory_analysis()
     return Explanation(paths, seconds, None if memory is None else memory.temp_size_in_bytes)
 

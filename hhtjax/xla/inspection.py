@@ -5,6 +5,7 @@ from jaxlib.mlir import ir
 from hhtjax.xla.kernels import STAGED, inside_p
 from hhtjax.xla.products import is_small_product, is_small_sum, is_to_write_out
 from hhtjax.xla.scatters import is_of_few_windows
+from hhtjax.xla.source_lines import asked, line_in
 
 ATTRIBUTES = "mhlo.frontend_attributes"
 
@@ -45,10 +46,10 @@ MOST_IN_BRANCHES = 15_000  # of all together, minutes too
 class Inspection:
     """Looks through a function and all it calls.
 
-    objection: the first thing that cannot be in one kernel, in words, or None; is_proven: all else is known to compile;
-    finished: names of the functions, each after those that it calls; stages: {name of a staged function: its calls};
-    products, scatters: to be written out; choices: between two forms of a function; seldom: conditionals with nothing
-    to do in one branch.
+    objection: the first thing that cannot be in one kernel, in words, or None; line: of the user's, where it is, while
+    `explain` asks; is_proven: all else is known to compile; finished: names of the functions, each after those that it
+    calls; stages: {name of a staged function: its calls}; products, scatters: to be written out; choices: between two
+    forms of a function; seldom: conditionals with nothing to do in one branch.
     """
 
     def __init__(self, functions, call, is_partitioned=False):
@@ -58,6 +59,7 @@ class Inspection:
         self.most = MOST_OPERATIONS
         self.stages, self.products, self.scatters, self.choices, self.seldom = {}, [], [], [], []
         self.is_proven, self.types = True, set()
+        self.line = None
         self.objection = "partitioned over devices; shard_map leaves each its own kernel" if is_partitioned else None
         self.look(call)
         named = {str(x.element_type) for x in self.types if isinstance(x, ir.RankedTensorType)}
@@ -65,9 +67,15 @@ class Inspection:
 
     def look(self, op):
         """Notes what `op` is, and looks into it."""
+        none_before = self.objection is None
+        self._look(op)
+        if none_before and self.objection and self.line is None and asked.get() is not None:
+            self.line = line_in(op.location)  # of the innermost operation that knows
+
+    def _look(self, op):
         self.operations += 1
         if self.operations > self.most:
-            self.object(f"more than {self.most} operations")
+            self.object(f"more than {self.most} operations", "")
         dialect, _, name = op.name.partition(".")
         if op.name == "func.call":
             self._look_into_call(op)
@@ -117,7 +125,7 @@ class Inspection:
             self.in_branches += self.operations
         self.operations, self.most = around
         if self.in_branches > MOST_IN_BRANCHES:
-            self.object(f"more than {MOST_IN_BRANCHES} operations in branches")
+            self.object(f"more than {MOST_IN_BRANCHES} operations in branches", "")
 
     def _look_at_all(self, operations):
         for op in operations:
@@ -127,9 +135,10 @@ class Inspection:
         """Of its results and operands, to be named once each: a type's text takes longer to write than all the rest."""
         self.types.update(x.type for x in (*op.operands, *op.results))
 
-    def object(self, why):
-        """Keeps the first reason."""
-        self.objection = self.objection or why
+    def object(self, why, line=None):
+        """Keeps the first reason; line: "" of what is of no single operation."""
+        if self.objection is None:
+            self.objection, self.line = why, line
 
 
 def _is_known(dialect, name):

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from jax.extend.core import Literal
+from jax.extend.source_info_util import user_context
 
 
 def evaluate(jaxpr, values, apply, of_literal=lambda x: x):
@@ -35,7 +36,7 @@ def alone(eqn) -> Callable:
     """One operation of a jaxpr as a function of its arrays, to a list."""
 
     def f(*arrays):
-        with eqn.ctx.manager:
+        with eqn.ctx.manager, user_context(eqn.source_info.traceback):  # `explain` names the line that it comes from
             results = eqn.primitive.bind(*arrays, **eqn.primitive.get_bind_params(eqn.params))
         return results if eqn.primitive.multiple_results else [results]
 

@@ -45,6 +45,7 @@ from hhtjax.xla.kernels import (
 from hhtjax.xla.products import size, written_out
 from hhtjax.xla.scatters import write_out
 from hhtjax.xla.sines import write_sines
+from hhtjax.xla.source_lines import asked
 from hhtjax.xla.trial import Module
 
 VERDICT = "hhtjax_kernels"
@@ -78,6 +79,8 @@ def _decide(module, call):
     objection = f"XLA refused: {refusal}" if refusal else found.objection
     told = UNTOLD if callee(call).startswith(AROUND) else VERDICT
     attach(call, **{told: f"plain: {objection}" if objection else "one kernel"})
+    if found.line and (lines := asked.get()) is not None:
+        lines[callee(call)] = found.line
     if not objection:
         return _cut(module, found, call)
     hold(module, found.finished)
