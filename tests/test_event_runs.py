@@ -89,9 +89,9 @@ def test_a_corner_fails_by_name(events):
 
 @pytest.mark.parametrize("noted_first", [True, False])
 def test_a_log_of_impacts_has_them_all_and_changes_nothing(noted_first):
-    """On the guard of the impact itself, before it in the list or behind."""
-    log = Event(DRAGGED.events[0].guard)
-    events = [log, *DRAGGED.events] if noted_first else [*DRAGGED.events, log]
+    """On the guard of the impact itself, before it in the list or behind; one that the impact throws back is not met."""
+    log, turned = Event(DRAGGED.events[0].guard), Event(lambda q, v, t, p: -v[0])
+    events = [log, *DRAGGED.events, turned] if noted_first else [*DRAGGED.events, log, turned]
     alone, run = dragged(), dragged(events=events)
     run.check()
     np.testing.assert_array_equal(run.q, alone.q)
@@ -100,6 +100,21 @@ def test_a_log_of_impacts_has_them_all_and_changes_nothing(noted_first):
     np.testing.assert_array_equal(run.events.t[:4], np.repeat(alone.events.t[:2], 2))
     np.testing.assert_array_equal(run.events.after[:4:2], run.events.before[:4:2])
     np.testing.assert_array_equal(run.events.after[1:4:2], alone.events.after[:2])
+    often = dragged(dt=1.2, events=events, c=0.0, e=1.0)  # the same program: two impacts in most steps, both noted
+    often.check()
+    assert often.events.count == 80
+    np.testing.assert_allclose(often.events.t[:80:2], np.sqrt(2 / G) * np.arange(1, 80, 2), rtol=1e-12)
+
+
+def test_a_guard_that_an_impact_throws_back_fails_by_name():
+    """That of a rebound, though the ball is falling again at the end of the step."""
+    rebound = Event(lambda q, v, t, p: -v[0], terminal=True)
+    params, events = {"g": G, "floor": 0.0, "e": 0.8}, [FLOOR, rebound]
+    run = simulate(BALL, LIGHT, jnp.ones(1), -jnp.ones(1), params, dt=0.9, num_steps=1, events=events)
+    message = (
+        "step 1 (to t = 0.9) failed: what another event changes takes the motion at once beyond the guard of event 1"
+    )
+    check_message(SimulationError, message, run.check)
 
 
 def test_an_impact_that_nothing_can_follow_fails_by_name():
@@ -220,6 +235,9 @@ def test_what_is_between_the_saved_times():
     found = hhtjax.interpolate(run, times)
     assert abs(found.q[:, 0] - q).max() < 1e-12
     assert abs(found.v[:, 0] - (up - G * since)).max() < 1e-12
+    outside = jax.jit(lambda times: hhtjax.interpolate(run, times))(np.array([-0.1, 1.201, 1.3]))
+    assert np.isnan(outside.q).all()
+    assert np.isnan(outside.v).all()
 
 
 @pytest.mark.slow

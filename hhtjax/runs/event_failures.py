@@ -1,6 +1,6 @@
 """What may go wrong at an event, as data and in words."""
 
-FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER = range(7)
+FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, THROWN = range(8)
 EVENTS = {  # what it is, before the number of the event, and what to do about it
     MANY: (
         "more than max_events in a step, the first of them event",
@@ -27,5 +27,10 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
     NO_NUMBER: (
         "q and v are numbers, but not the guard of event",
         "A guard must be a number beyond its zero, too: q, not sqrt(q)",
+    ),
+    THROWN: (
+        "what another event changes takes the motion at once beyond the guard of event",
+        "A guard of the velocity jumps with it, and one of params with a switch: say what happens by one event with its "
+        "own reset and switch, or let the guard depend on a mode",
     ),
 }

@@ -132,7 +132,7 @@ def between_events(events, a, b, H, x, times):
         })  # fmt: skip
 
     a, b = put(behind, earlier, events.after, a), put(ahead, later, events.before, b)
-    unknown = (events.count > t.size) & (last + 1 >= t.size)
+    unknown = jnp.isnan(x) | ((events.count > t.size) & (last + 1 >= t.size))  # outside of the run, or not kept
     inside, H = behind | ahead, jnp.where(behind | ahead, b.t - a.t, H)
     x = jnp.where(unknown, jnp.nan, jnp.where(inside, (times - a.t) / jnp.where(H > 0, H, 1), x))
 
