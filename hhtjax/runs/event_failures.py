@@ -30,7 +30,7 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
     ),
     THROWN: (
         "what another event changes takes the motion at once beyond the guard of event",
-        "A guard of the velocity jumps with it, and one of params with a switch: say what happens by one event with its "
-        "own reset and switch, or let the guard depend on a mode",
+        "A guard of the velocity jumps with that, and one of params with a switch: say what happens by one event with "
+        "a reset and a switch of its own, or let the guard depend on a mode",
     ),
 }
