@@ -44,8 +44,8 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
     through (z, zdot); for a rotation, of the rotation vector from the saved one before. Their error is O(H^4), H the
     spacing of the saved times. Where events lie between two saved times, the polynomials end there: q with O(H^4), v
-    and z straight lines with O(H^2); at the event itself v is that behind it. NaN behind the last of `keep_events`, if
-    there were more.
+    and z (and y of a first-order system) straight lines with O(H^2); at the event itself v is that behind it. NaN
+    behind the last of `keep_events`, if there were more.
 
     Args:
         solution: of one run (vmap this function for a batch).
