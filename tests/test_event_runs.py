@@ -26,9 +26,9 @@ def dragged(stepper=LIGHT, dt=0.05, q0=DRAGGED.q0, events=DRAGGED.events, extrap
         events=events, extrapolate=extrapolate)  # fmt: skip
 
 
-def come_to_rest(e, num_steps):
+def come_to_rest(e, num_steps, floor=0.0):
     return simulate(
-        BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": G, "floor": 0.0, "e": e}, dt=2.0 / num_steps,
+        BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": G, "floor": floor, "e": e}, dt=2.0 / num_steps,
         num_steps=num_steps, events=[FLOOR])  # fmt: skip
 
 
@@ -49,6 +49,13 @@ def test_resting_contact_fails_by_name():
     )
     assert np.isnan(run.q[46:]).all()
     assert np.nanmin(run.q) > -1e-9
+
+
+def test_impacts_at_the_ends_of_steps_are_at_their_times():
+    """Where rounding puts the zero of the guard before the end, or behind it."""
+    times = 0.01 * np.arange(5, 100)
+    found = np.array([come_to_rest(1.0, 200, 1 - G * t**2 / 2).events.t[0] for t in times])
+    assert np.abs(found - times).max() < 1e-14
 
 
 def test_a_guard_that_is_no_number_fails_by_name():
