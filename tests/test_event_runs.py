@@ -26,9 +26,9 @@ def dragged(stepper=LIGHT, dt=0.05, q0=DRAGGED.q0, events=DRAGGED.events, extrap
         events=events, extrapolate=extrapolate)  # fmt: skip
 
 
-def come_to_rest(e, num_steps):
+def come_to_rest(e, num_steps, floor=0.0):
     return simulate(
-        BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": G, "floor": 0.0, "e": e}, dt=2.0 / num_steps,
+        BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": G, "floor": floor, "e": e}, dt=2.0 / num_steps,
         num_steps=num_steps, events=[FLOOR])  # fmt: skip
 
 
@@ -51,6 +51,13 @@ def test_resting_contact_fails_by_name():
     assert np.nanmin(run.q) > -1e-9
 
 
+def test_impacts_at_the_ends_of_steps_are_at_their_times():
+    """Where rounding puts the zero of the guard before the end, or behind it."""
+    times = 0.01 * np.arange(5, 100)
+    found = np.array([come_to_rest(1.0, 200, 1 - G * t**2 / 2).events.t[0] for t in times])
+    assert np.abs(found - times).max() < 1e-14
+
+
 def test_a_guard_that_is_no_number_fails_by_name():
     root = Event(lambda q, v, t, p: jnp.sqrt(q[0]), terminal=True)
     run = simulate(BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": G}, dt=0.01, num_steps=100, events=[root])
@@ -58,40 +65,11 @@ def test_a_guard_that_is_no_number_fails_by_name():
     check_message(SimulationError, message, run.check)
 
 
-WALLS = [Event(lambda q, v, t, p, i=i: q[i], impact(0.5)) for i in range(2)]
-OBLIQUE = Event(lambda q, v, t, p: q[0] + q[1], impact(0.5))
-
-
-def into_the_corner(events):
-    """From .35 with -1 m/s, to both walls at once, at a rounding from a grid point."""
-    free = System(jnp.ones(2), lambda q, v, t, p: 0 * q)
-    options = {"dt": 0.05, "num_steps": 20, "events": events, "max_events": 3}
-    return simulate(free, LIGHT, jnp.full(2, 0.35), jnp.full(2, -1.0), **options)
-
-
-def test_impacts_at_one_time_that_do_not_change_each_other_both_act():
-    """And one that is noted beside them sees the motion as it comes."""
-    run = into_the_corner([*WALLS, Event(OBLIQUE.guard)])
-    run.check()
-    assert run.events.which[:4].tolist() == [2, 0, 1, -1]
-    np.testing.assert_allclose(run.events.t[:3], 0.35, rtol=1e-12)
-    np.testing.assert_allclose(run.events.after[:3], [[-1, -1], [0.5, -1], [0.5, 0.5]], rtol=1e-12)
-    np.testing.assert_allclose(run.q[-1], 0.65 / 2, rtol=1e-12)
-
-
-@pytest.mark.parametrize("events", [[WALLS[0], OBLIQUE], [OBLIQUE, WALLS[0]]], ids=["oblique last", "oblique first"])
-def test_a_corner_fails_by_name(events):
-    run = into_the_corner(events)
-    with pytest.raises(SimulationError, match=r"step \d .* failed: another event happens at the same time as event"):
-        run.check()
-    assert np.isnan(run.q[8:]).all()
-
-
 @pytest.mark.parametrize("noted_first", [True, False])
 def test_a_log_of_impacts_has_them_all_and_changes_nothing(noted_first):
-    """On the guard of the impact itself, before it in the list or behind."""
-    log = Event(DRAGGED.events[0].guard)
-    events = [log, *DRAGGED.events] if noted_first else [*DRAGGED.events, log]
+    """On the guard of the impact itself, before it in the list or behind; one that it throws back is not met."""
+    log, turned = Event(DRAGGED.events[0].guard), Event(lambda q, v, t, p: -v[0])
+    events = [log, *DRAGGED.events, turned] if noted_first else [*DRAGGED.events, log, turned]
     alone, run = dragged(), dragged(events=events)
     run.check()
     np.testing.assert_array_equal(run.q, alone.q)
@@ -100,6 +78,10 @@ def test_a_log_of_impacts_has_them_all_and_changes_nothing(noted_first):
     np.testing.assert_array_equal(run.events.t[:4], np.repeat(alone.events.t[:2], 2))
     np.testing.assert_array_equal(run.events.after[:4:2], run.events.before[:4:2])
     np.testing.assert_array_equal(run.events.after[1:4:2], alone.events.after[:2])
+    often = dragged(dt=1.2, events=events, c=0.0, e=1.0)  # the same program: two impacts in most steps, both noted
+    often.check()
+    assert often.events.count == 80
+    np.testing.assert_allclose(often.events.t[:80:2], np.sqrt(2 / G) * np.arange(1, 80, 2), rtol=1e-12)
 
 
 def test_an_impact_that_nothing_can_follow_fails_by_name():
@@ -220,6 +202,9 @@ def test_what_is_between_the_saved_times():
     found = hhtjax.interpolate(run, times)
     assert abs(found.q[:, 0] - q).max() < 1e-12
     assert abs(found.v[:, 0] - (up - G * since)).max() < 1e-12
+    outside = jax.jit(lambda times: hhtjax.interpolate(run, times))(np.array([-0.1, 1.201, 1.3]))
+    assert np.isnan(outside.q).all()
+    assert np.isnan(outside.v).all()
 
 
 @pytest.mark.slow

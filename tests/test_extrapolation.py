@@ -8,6 +8,7 @@ from zoo import PROBLEMS, as_data, ends_of_two, reference, run
 
 import hhtjax
 from hhtjax import rotation
+from hhtjax.runs.event_log import Events
 from hhtjax.runs.extrapolate import extrapolated
 from hhtjax.runs.solution import Failure, Solution
 from hhtjax.steppers.stepper import Info
@@ -96,3 +97,46 @@ def test_a_failure_of_the_fine_run_is_named_by_the_step_of_the_coarse_one():
 def test_other_numbers_of_levels_are_refused(levels):
     with pytest.raises(ValueError, match="simulate: `extrapolate` must be an integer from 1 to 4; received"):
         run(DUFFING, hhtjax.hht(), 4, extrapolate=levels)
+
+
+def with_events(t, v, found):
+    """A `Solution` at these times of q = 3 t, whose events at the times found turn v back."""
+    none, q = jnp.zeros((), jnp.int32), 3.0 * t[:, None]
+    told, at = jnp.full(found.shape, 0, jnp.int32), 3.0 * found[:, None]
+    events = Events(none + found.size, found, told, at, v[:1] + 0 * at, -v[:1] + 0 * at, None, 0 * found)
+    return Solution(
+        t,
+        q,
+        v,
+        0 * v,
+        None,
+        jnp.array(0.5),
+        Info(),
+        Failure(none, jnp.array(False), none, event=none, guard=none),
+        events=events,
+    )
+
+
+def test_the_end_at_a_terminal_event_is_extrapolated_with_its_time():
+    """At 1.2, of which the runs miss .1 and .025."""
+
+    def run(k):
+        end = 1.2 + 0.1 / k**2
+        return with_events(jnp.minimum(jnp.array([0.0, 0.5, 1.0, 1.5]), end), jnp.ones((4, 1)), jnp.array([end]))
+
+    found = extrapolated(run, 2, 2, lambda info, _: info)
+    for t, q in ((found.t[-1:], found.q[-1]), (found.events.t, found.events.q[0])):
+        np.testing.assert_allclose(np.concatenate([t, q]), [1.2, 3.6], rtol=1e-15)
+
+
+def test_a_velocity_is_not_made_of_those_before_and_behind_an_impact():
+    """Which the long steps meet behind the saved time 1, and the short ones before it."""
+
+    def run(k):
+        hit = jnp.array([0.98 + 0.05 / k**2])
+        t = jnp.array([0.0, 0.5, 1.0, 1.5])
+        return with_events(t, jnp.where(t < hit, 1.0, -1.0)[:, None], hit)
+
+    found = extrapolated(run, 2, 2, lambda info, _: info)
+    np.testing.assert_array_equal(found.v[:, 0], [1, 1, -1, -1])
+    np.testing.assert_allclose(found.events.t, 0.98, rtol=1e-15)

@@ -188,10 +188,10 @@ Here a spring that is only there beyond q = 1:
 >>> int(run.events.count), round(float(run.events.after[1, 0]), 2)
 (2, -0.73)
 
-What fails is named, and never ends behind the wall: more events in a step than `max_events`, as of a ball that comes to
-rest; a motion that stays beyond its guard; two impacts at one time; a start beyond a guard. Derivatives belong to the
-order in which events happen; where a motion only grazes a guard they grow without bound (`run.events.rate` tells), and
-a guard that falls and rises again within a step is seen where the cubic through its ends sees it.
+What fails is named, and never ends behind the wall: more changes in a step than `max_events`, as of a ball that comes
+to rest; a motion that stays beyond its guard; two impacts at one time; a start beyond a guard. Derivatives belong to
+the order in which events happen; where a motion only grazes a guard they grow without bound (`run.events.rate` tells),
+and a guard that falls and rises again within a step is seen where the cubic through its ends sees it.
 
 Events work with mass matrices, constraints (the impulse obeys them), rotations, internal states, dry friction, held
 inputs, uneven steps, `interpolate`, `sweep`, `fit`, `extrapolate` (of which the order is 3 then), and with error

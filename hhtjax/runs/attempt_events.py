@@ -65,7 +65,7 @@ def passed(trial, tried, walk, h):
         walk=tried.walk._replace(met=part.met), error=jnp.full_like(tried.error, jnp.inf), h=middle, shortest=middle,
         why=jnp.full_like(tried.why, AT_EVENT),
     )  # fmt: skip
-    judged = choose(part.divided, behind(trial, tried, walk, part, h), tried)
+    judged = choose(part.divided > 0, behind(trial, tried, walk, part, h), tried)
     return choose(code == FINE, judged, lost)
 
 

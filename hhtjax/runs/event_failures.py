@@ -1,6 +1,6 @@
 """What may go wrong at an event, as data and in words."""
 
-FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE = range(8)
+FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE, THROWN = range(9)
 EVENTS = {  # what it is, before the number of the event, and what to do about it
     MANY: (
         "more than max_events in a step, the first of them event",
@@ -32,5 +32,10 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
         "behind an event, with the params of its switch and the v of its reset, negative is the guard of event",
         "Guards are positive where the motion goes on: behind its event one may need the other sign, by the mode that "
         "the switch changes, or another level",
+    ),
+    THROWN: (
+        "what another event changes takes the motion at once beyond the guard of event",
+        "A guard of the velocity jumps with that, and one of params with a switch: say what happens by one event with "
+        "a reset and a switch of its own, or let the guard depend on a mode",
     ),
 }

@@ -29,6 +29,12 @@ class Ways(NamedTuple):
         """The same in a step h from t on."""
         return self._replace(middle=t + h / 2) if held.holds(params) else self
 
+    @property
+    def slots(self):
+        """How often a step is looked at. Between events that divide it, of which there may be max_events, each noted
+        one may happen once, and one that only seemed to touch its guard; in the end there is none."""
+        return (self.max_events + 1) * (2 + sum(self.events.noted))
+
     def params(self, params, modes):
         """Those with these modes, as they are in this step."""
         params = self.events.with_modes(params, modes)
@@ -59,7 +65,7 @@ class Part(NamedTuple):
     rest: Any
     last: Any
     met: Met
-    divided: Any  # whether an event came before
+    divided: Any  # number of events that came before and divided the step
     asked: Any  # whether there may be one
     passed: Any
     beside: Any
@@ -69,7 +75,7 @@ class Part(NamedTuple):
     def whole(cls, ways, start, end, info, h, last, met, asked=False):
         """A step."""
         none, no = jnp.zeros(len(ways.events.noted), bool), jnp.zeros_like(met.ended)
-        return cls(start, end, info, h, last, met, no, no | asked, none, none, none)
+        return cls(start, end, info, h, last, met, jnp.zeros_like(met.event), no | asked, none, none, none)
 
 
 def go(ways, params, s, tau, last, h):

@@ -92,6 +92,7 @@ def first_time(ways, params, part, found, h):
         above = jnp.all((g > 0) | ~found.hit)
         low, high = jnp.where(above, tau, low), jnp.where(above, high, tau)
         times = jnp.where(d < 0, tau - g / jnp.where(d < 0, d, 1), jnp.inf)
+        times = jnp.where(jnp.abs(times - high) <= nearness(h) * h, jnp.minimum(times, high), times)  # but for rounding
         within = found.hit & ((times > low) | (times == tau)) & (times <= high)
         new = jnp.min(jnp.where(within, times, jnp.inf))
         new = jnp.where(new < jnp.inf, new, (low + high) / 2)

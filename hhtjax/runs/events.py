@@ -28,7 +28,7 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     flat_events, no_info = flatten_events(flat, events, params, stepper.redundant), loop.no_info
     ways = Ways(flat, stepper, flat_events, max_events, no_info, reaching(flat, stepper, no_info), keep)
     met = before_any(ways, params)
-    met = met._replace(log=Log.empty(unnoted(start)[0], keep, max_events + 1))
+    met = met._replace(log=Log.empty(unnoted(start)[0], keep, ways.slots))
     if in_pieces:
         met = met._replace(pieces=Pieces.none(start, max_events + 1))
     step = past_events(ways, params, loop.bound, loop.sizes)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from hhtjax import rotation
 from hhtjax.numerics.richardson import richardson, take_out
 from hhtjax.runs.event_failures import DIFFER
+from hhtjax.runs.interpolate import on_axes
 from hhtjax.systems import kinematics
 from hhtjax.xla import Programs
 
@@ -25,28 +26,41 @@ def extrapolated(run, levels, order, join):
 
 @partial(Programs, static_argnames=("order", "join"))
 def _combine(solutions, order, join):
-    first = solutions[0]
+    first, finest = solutions[0], solutions[-1]
+    together = None if first.events is None else _together(solutions)
 
     def value(name, combine=None):
-        return richardson([getattr(solution, name) for solution in solutions], order, combine)
+        better = richardson([getattr(solution, name) for solution in solutions], order, combine)
+        if together is None:
+            return better
+        return jax.tree.map(lambda x, y: jnp.where(on_axes(together, y), x, y), better, getattr(finest, name))
 
     turns = first.acceleration is not None  # a first-order system has no rotations
     q = value("q", partial(_positions, first.v) if turns else None)
     rest = {name: value(name) for name in ("v", "acceleration", "multipliers", "z", "zdot")}
     if first.friction is not None:  # which jump, at times that each run has for itself
-        rest |= {name: getattr(solutions[-1], name) for name in ("friction", "sticking")}
+        rest |= {name: getattr(finest, name) for name in ("friction", "sticking")}
     failure = _first([solution.failure for solution in solutions])
     if first.events is not None:
-        rest["events"], same = _events([solution.events for solution in solutions], order)
+        rest["t"] = value("t")  # behind a terminal event its time
+        combine = partial(_positions, first.events.before) if turns else None
+        rest["events"], same = _events([solution.events for solution in solutions], order, combine)
         failure = _told_apart(first, failure, same)
     return first._replace(q=q, **rest, info=reduce(join, [solution.info for solution in solutions]), failure=failure)
 
 
-def _events(runs, order):
-    """The `Events` without their leading errors, places as in the finest run, and whether all runs met each."""
+def _together(solutions):
+    """Of each saved time, whether as many events come before it in all runs: else some are behind a jump there."""
+    before = [jnp.sum(run.events.t[None, :] <= run.t[:, None], axis=1, dtype=jnp.int32) for run in solutions]
+    return reduce(jnp.logical_and, [number == before[-1] for number in before])
+
+
+def _events(runs, order, combine):
+    """The `Events` without their leading errors, and whether all runs met each. combine: their positions."""
     finest = runs[-1]
     names = "t", "before", "after", "z", "rate"
     better = {name: richardson([getattr(events, name) for events in runs], order) for name in names}
+    better["q"] = richardson([events.q for events in runs], order, combine)
     same = [(events.which == finest.which) & (events.count == finest.count) for events in runs]
     return finest._replace(**better), reduce(jnp.logical_and, same)
 

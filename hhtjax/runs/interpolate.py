@@ -45,8 +45,8 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
     through (z, zdot); for a rotation, of the rotation vector from the saved one before. Their error is O(H^4), H the
     spacing of the saved times. Where events lie between two saved times, the polynomials end there: q with O(H^4), v
-    and z straight lines with O(H^2); at the event itself v is that behind it. NaN behind the last of `keep_events`, if
-    there were more.
+    and z (and y of a first-order system) straight lines with O(H^2); at the event itself v is that behind it. NaN
+    behind the last of `keep_events`, if there were more.
 
     Args:
         solution: of one run (vmap this function for a batch).
@@ -142,7 +142,7 @@ def between_events(events, a, b, H, x, times):
         })  # fmt: skip
 
     a, b = put(behind, earlier, events.after, a), put(ahead, later, events.before, b)
-    unknown = (events.count > t.size) & (last + 1 >= t.size)
+    unknown = jnp.isnan(x) | ((events.count > t.size) & (last + 1 >= t.size))  # outside of the run, or not kept
     inside, H = behind | ahead, jnp.where(behind | ahead, b.t - a.t, H)
     x = jnp.where(unknown, jnp.nan, jnp.where(inside, (times - a.t) / jnp.where(H > 0, H, 1), x))
 

@@ -14,7 +14,7 @@ from jax import lax
 
 from hhtjax.description import freeze, thaw
 from hhtjax.numerics.seldom import choose, if_any, seldom
-from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, STAYS
+from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, STAYS, THROWN
 from hhtjax.runs.event_log import row_of
 from hhtjax.runs.event_parts import SHORT, Met, Part, go
 from hhtjax.runs.event_times import beside_zero, first_of, first_time, located, look, nearness, pick
@@ -34,7 +34,7 @@ def asks(ways, s, s1, params, h):
 
 def pass_events(ways, params, part, h):
     """The step across all events in it: a `Part`, of which end, info and met are to be used, and what to note of
-    up to max_events + 1 of them, rows and whether each is there. Members that have not asked stay as they are. params
+    them, rows and whether each is there. Members that have not asked stay as they are. params
     are as `freeze` leaves them, here and in what this calls, and `Ways.params` thaws them."""
     ways = ways.during(params, part.start.t, h)
     if ways.middle is not None:
@@ -42,18 +42,19 @@ def pass_events(ways, params, part, h):
         new = ways.params(params, part.met.modes)
         part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new))
 
-    def slot(part, number):
+    def slot(part, _):
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
-        return if_any(partial(meet_or_flag, ways), going, (part, unnoted(part.start)), going, number, h, params)
+        return if_any(partial(meet_or_flag, ways), going, (part, unnoted(part.start)), going, h, params)
 
-    part, noted = lax.scan(slot, part, jnp.arange(ways.max_events + 1, dtype=jnp.int32))
+    part, noted = lax.scan(slot, part, length=ways.slots)
+    part = flag(part, part.asked & ~part.met.ended, MANY, jnp.ones_like(part.passed))
     met = part.met
 
     def anew(s, params):
         return begin(ways, s.q, s.v, s.t, thaw(params), h)
 
     now = freeze(ways.params(params, met.modes))
-    end = seldom(anew, part.divided & ~met.ended, part.end, now)
+    end = seldom(anew, (part.divided > 0) & ~met.ended, part.end, now)
 
     def known(s):
         lost = {name: jnp.where(met.code == FINE, getattr(s, name), jnp.nan) for name in ("q", "v", "w")}
@@ -70,7 +71,7 @@ def unnoted(s):
     return jnp.full_like(row, jnp.nan), jnp.array(False)
 
 
-def meet_or_flag(ways, now, going, number, h, params):
+def meet_or_flag(ways, now, going, h, params):
     """The part behind its first event, if it has one, and what to note; with what is wrong, if something is."""
     part, noted = now
     found = look(ways, part, params, h)
@@ -78,8 +79,8 @@ def meet_or_flag(ways, now, going, number, h, params):
     part = flag(part, going & ~here, NEGATIVE, found.negative)
     part = flag(part, going & ~here, STAYS, found.stays)
     part = flag(part, going & ~here, NO_NUMBER, found.unknown)
-    part = flag(part, here & (number == ways.max_events), MANY, found.hit & ~found.touches)
-    return seldom(partial(meet, ways), here & (number < ways.max_events), (part, noted), found, h, params)
+    part = part._replace(asked=jnp.where(going, here, part.asked))
+    return seldom(partial(meet, ways), here, (part, noted), found, h, params)
 
 
 def flag(part, bad, code, which):
@@ -116,10 +117,11 @@ def meet(ways, now, found, h, params):
     new = behind(ways, part, (e, info, tau, g, d), (v, modes), i, this, near, h, params)
     noted, touches = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, found.touches))
     new = choose(noted, passed, new)  # what changes nothing divides no step
-    code = jnp.where(missed & jnp.all(jnp.isfinite(e.v)), STAYS, new.met.code).astype(met.code.dtype)
-    new = new._replace(met=new.met._replace(code=code, event=i))
+    stays, many = missed & jnp.all(jnp.isfinite(e.v)), ~noted & (part.divided == ways.max_events)
+    code = jnp.where(many, MANY, jnp.where(stays, STAYS, new.met.code)).astype(met.code.dtype)
+    new = new._replace(met=new.met._replace(code=code, event=jnp.where(stays | many, i, new.met.event)))
     none = missed & touches
-    return choose(none, passed, new), (row, ~none)
+    return choose(none, passed, new), (row, ~none & ~many)
 
 
 def behind(ways, part, at, outcome, i, this, near, h, params):
@@ -145,7 +147,10 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
 
     pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end)
     met = Met(modes, ends, code, i, pieces=pieces)
-    infos = join_info(join_info(choose(part.divided, part.info, ways.no_info), info), more)
+    infos = join_info(join_info(choose(part.divided > 0, part.info, ways.no_info), info), more)
     asked = asks(ways, start, end, then, rest) | jnp.any(due)
     passed = part.passed & near & (d1 < 0)
-    return Part(start, end, infos, rest, size, met, jnp.ones_like(part.divided), asked, passed, beside, due)
+    new = Part(start, end, infos, rest, size, met, part.divided + 1, asked, passed, beside, due)
+    slack = nearness(h) * h * (jnp.abs(d) + jnp.abs(d1))
+    jumps = (g > slack) & (g1 < -slack) & ~near & ~(this > 0) & ~jnp.asarray(events.noted)
+    return flag(new, ~ends, THROWN, jumps)

@@ -68,13 +68,13 @@ def simulate(
             uneven steps only alpha = 0, of order 3). For motions that dt resolves, elsewhere it makes errors larger;
             and for smooth steps, such as linearize="predictor": where "auto" changes its choice, dt^3 is left, as it
             is where an event, or a switch of dry friction, falls into a step; `friction` and `sticking` are then those
-            of the run with the shortest steps.
+            of the run with the shortest steps, as is all at a saved time that an event comes before in some runs only.
         t0: time of the start.
         events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
             happen; the grid stays what it is. Steps without one take as long as before, and a look at the guards. For
             the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`.
-        max_events: how many may fall into one step; more are a failure. With `adaptive` steps become shorter first, and
-            what lies behind an event has an error of its own.
+        max_events: how many of those that change something may fall into one step; more are a failure. With `adaptive`
+            steps become shorter first, and what lies behind an event has an error of its own.
         keep_events: how many `run.events` has room for.
 
     Returns:

@@ -41,6 +41,10 @@ class Event(Description):
     events at one time those come first. Others happen one after the other, where none changes the rate of another's
     guard, as impacts of bodies that do not touch; else their order would matter, and the run fails by name.
 
+    A guard that jumps below zero with what another event changes, as -v does in a rebound, has not fallen there: a
+    noted event is not met, as in a run of SciPy's that begins anew behind the other, and any other fails by name. Note
+    the rebounds by the guard of the impact.
+
     Resting contact is no event: a ball that comes to rest on the floor bounces infinitely often in a finite time, and
     the run fails by name when more than `max_events` fall into a step. Give contacts that last a stiff force, or a
     constraint in a run of its own that begins there.
