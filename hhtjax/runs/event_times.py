@@ -42,7 +42,7 @@ def look(ways, part, params, h):
     noted = jnp.asarray(ways.events.noted)
     rising = (d0 > 0) & (d1 > 0)
     left = rising & (g1 > -nearness(g1) * h * d1)  # behind an event g is a rounding of either sign
-    negative = part.divided & (g0 < -beside_zero(d0, h, jnp.abs(g0) + jnp.abs(g1)))
+    negative = (part.divided > 0) & (g0 < -beside_zero(d0, h, jnp.abs(g0) + jnp.abs(g1)))
     returns = (d0 > 0) & ~rising & (~noted | (g0 > -nearness(g0) * h * d0))
     d0, d1 = d0 * part.rest, d1 * part.rest
     a, b = 3 * (g1 - g0) - 2 * d0 - d1, 2 * (g0 - g1) + d0 + d1
