@@ -51,9 +51,8 @@ def __dir__():
 GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
 )
-TERMS = range(11)  # of c4 and c5: to rounding for x < 1, third derivatives too
-C4, C5 = (tuple(1 / factorial(2 * j + k) for j in TERMS) for k in (4, 5))
-ARCTANGENT = tuple(1 / (2 * k + 1) for k in range(16))  # arctan(z) / z in powers of -z^2: likewise for z < 1/4
+NEAR, TERMS = 4, 11  # |psi|^2 below which c4, c5, ... are series, of so many terms
+ARCTANGENT = tuple(1 / (2 * k + 1) for k in range(16))  # arctan(z) / z in powers of -z^2: to rounding for z < 1/4
 
 
 def hat(x) -> jax.Array:
@@ -249,21 +248,45 @@ def cross(x, y) -> jax.Array:
 
 
 def coefficients(x):
-    """c1, ..., c5 at x = |psi|^2, a scalar >= 0: power series and recursion down for x < 1, definitions and up beyond.
+    """c1, ..., c5 at x = |psi|^2, a scalar >= 0.
 
     >>> [round(1 / float(c)) for c in coefficients(jnp.array(0.0))]
     [1, 2, 6, 24, 120]
     """
-    small = x < 1
-    y, x = jnp.where(small, x, 0), jnp.where(small, 1, x)  # both finite in the branch not taken, for derivatives
-    c4, c5 = _power_series(C4, -y), _power_series(C5, -y)
-    c2, c3 = 0.5 - y * c4, 1 / 6 - y * c5
-    near = 1 - y * c3, c2, c3, c4, c5
+    return _stumpff(5, x)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _stumpff(n, x):
+    """c1, ..., cn: power series and recursion down for x < NEAR, definitions and recursion up beyond."""
+    small = x < NEAR
+    y, x = jnp.where(small, x, 0), jnp.where(small, NEAR, x)  # both finite in the branch not taken
+    near = [_series(n, y), _series(n - 1, y)]
+    for k in range(n - 2, 0, -1):
+        near.append(1 / factorial(k) - y * near[-2])
     t = jnp.sqrt(x)
-    c1, c2 = jnp.sin(t) / t, 2 * (jnp.sin(t / 2) / t) ** 2  # 1 - cos t would cancel towards 2 pi
-    c3, c4 = (1 - c1) / x, (0.5 - c2) / x
-    far = c1, c2, c3, c4, (1 / 6 - c3) / x
-    return tuple(jnp.where(small, n, f) for n, f in zip(near, far, strict=True))
+    s, c = jnp.sin(t / 2) / t, jnp.cos(t / 2)
+    far, inverse = [2 * s * c, 2 * s**2], 1 / x  # 1 - cos t would cancel towards 2 pi
+    for k in range(1, n - 1):
+        far.append((1 / factorial(k) - far[-2]) * inverse)
+    return tuple(jnp.where(small, a, b) for a, b in zip(reversed(near), far, strict=True))
+
+
+@_stumpff.defjvp
+def _(n, primals, tangents):
+    """So derivatives of any order take one pair of series, and no derivative of a sine."""
+    c = (None, *_stumpff(n + 2, *primals))
+    return c[1 : n + 1], tuple((k * c[k + 2] - c[k + 1]) * (tangents[0] / 2) for k in range(1, n + 1))
+
+
+def _series(k, y):
+    """1/k! - y/(k + 2)! + y^2/(k + 4)! - ..., to rounding for y < NEAR."""
+    return _horner([(-1) ** j / factorial(2 * j + k) for j in range(TERMS)], y)
+
+
+def _horner(coefficients, x):
+    """Their power series in x."""
+    return reduce(lambda value, c: value * x + c, coefficients[-2::-1], jnp.full_like(x, coefficients[-1]))
 
 
 def inverse_coefficient(x):
@@ -275,8 +298,8 @@ def inverse_coefficient(x):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _power_series(coefficients, x):
-    """Its derivatives are series too: through this recursion, each would be three times as long as the one before."""
-    return reduce(lambda value, c: value * x + c, coefficients[-2::-1], jnp.full_like(x, coefficients[-1]))
+    """Its derivatives are series too: through the recursion, each would be three times as long as the one before."""
+    return _horner(coefficients, x)
 
 
 @_power_series.defjvp

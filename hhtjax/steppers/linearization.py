@@ -33,9 +33,9 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
     def solution(expansion):
         return solve_expanded(r, path, s.w, factorize, again, expansion)[:2]
 
-    def about(at):
-        expansion = expand(at)
-        return *solution(expansion), expansion.here
+    def about(at, first=None):
+        expansion = expand(at, first)
+        return *solution(expansion), expansion
 
     D = system.with_ones(diagonal(system.mass(s.q, params)))
     limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
@@ -64,12 +64,12 @@ def better_solve(about, held, size, limit):
 
     A branch around it all, and no choice of a state before it: the processor goes on while it waits for the residual.
     """
-    w, info, here = about(None)
-    predicted_size = size(here)
+    w, info, first = about(None)
+    predicted_size = size(first.here)
 
     def better(found):
-        w, info, here = about(held)
-        return choose(predicted_size <= size(here), found, (w, info))
+        w, info, expansion = about(held, first)
+        return choose(predicted_size <= size(expansion.here), found, (w, info))
 
     return seldom(better, ~(predicted_size <= limit), (w, info))
 

@@ -51,19 +51,22 @@ class Expand:
         self.r, self.path, self.w = r, path, w
         self.predicted, self.other = staged(self._predicted, w.size), staged(self._other, w.size)
 
-    def __call__(self, at=None):
-        """The `Expansion`; each in one stage."""
-        return Expansion(*(self.predicted(self.w) if at is None else self.other(self.w, at)))
+    def __call__(self, at=None, first=None):
+        """The `Expansion`; first: that about path(w) where it is known, and with it the path."""
+        if at is None:
+            return Expansion(*self.predicted(self.w))
+        start, along = staged(self.path, self.w.size)(self.w) if first is None else (first.at, first.along)
+        value, tangent, here = self.other(start, at)
+        return Expansion(value, at, tangent, along, here)
 
     def _predicted(self, w):
         start, along = self.path(w)
         here, tangent = self.r(start)
         return here, start, tangent, along, here
 
-    def _other(self, w, at):
-        start, along = self.path(w)
+    def _other(self, start, at):
         here, tangent = self.r(at)
-        return here + tangent(jax.tree.map(jnp.subtract, start, at)), at, tangent, along, here
+        return here + tangent(jax.tree.map(jnp.subtract, start, at)), tangent, here
 
 
 def solve_expanded(r, path, w, factorize, again, expansion):
