@@ -7,19 +7,15 @@ psi (3,), in rad, is a rotation vector: a turn by the angle |psi| about psi. Wit
          T    = I - c2 P + c3 P^2    c3 = (t - sin t) / t^3
          T^-1 = I + P/2 + d P^2      d = (1 - (t/2) cot(t/2)) / t^2
 
-c1, c2 and c3 are functions of Stumpff, ck = 1/k! - x/(k + 2)! + x^2/(k + 4)! - ..., with
-
-    c(k) = 1/k! - x c(k + 2),        dc(k)/dx = (k c(k + 2) - c(k + 1))/2
-
-Analytic in x, and computed so that values and derivatives, forward and reverse, are right at psi = 0 too. Every
-function keeps the dtype, but integers become floats, and raises TypeError for what is no array of real numbers,
-ValueError for another shape. From and to quaternions: `from_quat`, `as_quat` of jax.scipy.spatial.transform.Rotation.
+c1, c2 and c3 are functions of Stumpff (numerics/stumpff.py), analytic in x: values and derivatives, forward and
+reverse, are right at psi = 0 too. Every function keeps the dtype, but integers become floats, and raises TypeError for
+what is no array of real numbers, ValueError for another shape. From and to quaternions: `from_quat`, `as_quat` of
+jax.scipy.spatial.transform.Rotation.
 
 Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """
 
 from functools import partial, reduce
-from math import factorial
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +23,7 @@ import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_real
+from hhtjax.numerics.stumpff import coefficients
 from hhtjax.xla import structural
 
 __all__ = [
@@ -51,7 +48,6 @@ def __dir__():
 GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
 )
-NEAR, TERMS = 4, 11  # |psi|^2 below which c4, c5, ... are series, of so many terms
 ARCTANGENT = tuple(1 / (2 * k + 1) for k in range(16))  # arctan(z) / z in powers of -z^2: to rounding for z < 1/4
 
 
@@ -230,7 +226,12 @@ def product(A, B) -> jax.Array:
     >>> print(product(hat(jnp.array([1.0, 0.0, 0.0])), jnp.eye(3))[2])
     [0. 1. 0.]
     """
-    return jnp.sum(_real("product", "A", A, (3, 3))[:, :, None] * _real("product", "B", B, (3, 3))[None], axis=1)
+    return _product(_real("product", "A", A, (3, 3)), _real("product", "B", B, (3, 3)))
+
+
+@jax.jit  # and so traced once, however often it is called: rotations are most of what a step of theirs takes to trace
+def _product(A, B):
+    return jnp.sum(A[:, :, None] * B[None], axis=1)
 
 
 def cross(x, y) -> jax.Array:
@@ -243,50 +244,13 @@ def cross(x, y) -> jax.Array:
     >>> print(cross(jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])))
     [0. 0. 1.]
     """
-    (a, b, c), (d, e, f) = _real("cross", "x", x, (3,)), _real("cross", "y", y, (3,))
+    return _cross(_real("cross", "x", x, (3,)), _real("cross", "y", y, (3,)))
+
+
+@jax.jit
+def _cross(x, y):
+    (a, b, c), (d, e, f) = x, y
     return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d])
-
-
-def coefficients(x):
-    """c1, ..., c5 at x = |psi|^2, a scalar >= 0.
-
-    >>> [round(1 / float(c)) for c in coefficients(jnp.array(0.0))]
-    [1, 2, 6, 24, 120]
-    """
-    return _stumpff(5, x)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _stumpff(n, x):
-    """c1, ..., cn: power series and recursion down for x < NEAR, definitions and recursion up beyond."""
-    small = x < NEAR
-    y, x = jnp.where(small, x, 0), jnp.where(small, NEAR, x)  # both finite in the branch not taken
-    near = [_series(n, y), _series(n - 1, y)]
-    for k in range(n - 2, 0, -1):
-        near.append(1 / factorial(k) - y * near[-2])
-    t = jnp.sqrt(x)
-    s, c = jnp.sin(t / 2) / t, jnp.cos(t / 2)
-    far, inverse = [2 * s * c, 2 * s**2], 1 / x  # 1 - cos t would cancel towards 2 pi
-    for k in range(1, n - 1):
-        far.append((1 / factorial(k) - far[-2]) * inverse)
-    return tuple(jnp.where(small, a, b) for a, b in zip(reversed(near), far, strict=True))
-
-
-@_stumpff.defjvp
-def _(n, primals, tangents):
-    """So derivatives of any order take one pair of series, and no derivative of a sine."""
-    c = (None, *_stumpff(n + 2, *primals))
-    return c[1 : n + 1], tuple((k * c[k + 2] - c[k + 1]) * (tangents[0] / 2) for k in range(1, n + 1))
-
-
-def _series(k, y):
-    """1/k! - y/(k + 2)! + y^2/(k + 4)! - ..., to rounding for y < NEAR."""
-    return _horner([(-1) ** j / factorial(2 * j + k) for j in range(TERMS)], y)
-
-
-def _horner(coefficients, x):
-    """Their power series in x."""
-    return reduce(lambda value, c: value * x + c, coefficients[-2::-1], jnp.full_like(x, coefficients[-1]))
 
 
 def inverse_coefficient(x):
@@ -299,7 +263,7 @@ def inverse_coefficient(x):
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _power_series(coefficients, x):
     """Its derivatives are series too: through the recursion, each would be three times as long as the one before."""
-    return _horner(coefficients, x)
+    return reduce(lambda value, c: value * x + c, coefficients[-2::-1], jnp.full_like(x, coefficients[-1]))
 
 
 @_power_series.defjvp
@@ -308,6 +272,7 @@ def _(coefficients, primals, tangents):
     return _power_series(coefficients, *primals), _power_series(slope, *primals) * tangents[0]
 
 
+@jax.jit
 def _polynomial(psi, f, g):
     """I + f P + g P^2."""
     eye = structural(np.eye(3, dtype=psi.dtype))

@@ -25,7 +25,21 @@ from hhtjax.rotation import (
 EPS = np.finfo(float).eps
 EYE = np.eye(3)
 AXES = np.concatenate([EYE, -EYE, Rotation.random(6, rng=1).as_matrix()[:, 0]])
-ANGLES = 0.0, 1e-160, 1e-12, 1e-8, 1e-5, 1e-3, 0.489, 0.491, 0.999, 1.001, 2.0, 3.0  # rad; the branches meet inside
+ANGLES = (
+    0.0,
+    1e-160,
+    1e-12,
+    1e-8,
+    1e-5,
+    1e-3,
+    0.489,
+    0.491,
+    0.999,
+    1.001,
+    1.999,
+    2.001,
+    3.0,
+)  # rad; the branches meet inside
 VECTORS = np.concatenate([angle * AXES for angle in ANGLES])
 NEAR_PI = np.concatenate([angle * AXES for angle in (pi - 1e-3, pi - 1e-6, pi - 1e-9, pi - 1e-12)])
 LONG = np.concatenate([angle * AXES for angle in (pi, 4.0, 6.0, 7.0, 20.0)])
@@ -79,4 +93,5 @@ def exact_coefficients(x, derivative):
         return [float(f) for f in (*(value(c[n], derivative) for n in c), d[-1])]
 
 
-X = np.concatenate([[0.0], np.geomspace(1e-16, 0.9, 40), 1 + np.linspace(-1e-9, 1e-9, 5), np.linspace(1.1, 36.0, 40)])
+BRANCHES = np.ravel([x + np.linspace(-1e-9, 1e-9, 5) for x in (1, 4)])
+X = np.concatenate([[0.0], np.geomspace(1e-16, 0.9, 40), BRANCHES, np.linspace(1.1, 36.0, 40)])

@@ -47,6 +47,12 @@ def in_a_loop(x):
     return kernels.one_kernel(lambda x: jax.lax.fori_loop(0, 2, lambda i, carry: used(inner(carry[1]), x), start), x)
 
 
+def in_a_function(x):
+    """Of a value that a single operation takes, a call of a function that uses it three times."""
+    inner = jax.jit(used)
+    return kernels.one_kernel(lambda x: inner(chain(x), x), x)
+
+
 def products(f):
     """Numbers of multiplications, of what XLA compiles."""
 
@@ -58,7 +64,7 @@ def products(f):
 
 
 @on_cpu
-@pytest.mark.parametrize("f", [in_kernel, beside_a_sort, in_a_loop])
+@pytest.mark.parametrize("f", [in_kernel, beside_a_sort, in_a_loop, in_a_function])
 def test_what_several_operations_use_is_evaluated_once(monkeypatch, f):
     once = products(f)
     assert LONG <= once < 1.2 * LONG
@@ -68,7 +74,7 @@ def test_what_several_operations_use_is_evaluated_once(monkeypatch, f):
 
 @on_cpu
 def test_it_changes_no_values():
-    for f in in_kernel, beside_a_sort, in_a_loop:
+    for f in in_kernel, beside_a_sort, in_a_loop, in_a_function:
         with hhtjax.plain():
             expected = f(x)
         for value, plain in zip(jax.tree.leaves(jax.jit(f)(x)), jax.tree.leaves(expected), strict=True):

@@ -8,6 +8,7 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -28,6 +29,11 @@ def matvec(A, x) -> Any:
         return A * x
     if A.shape[-1] > UNROLLED or isinstance(A, Sparse):
         return A @ x
+    return _by_columns(A, x)
+
+
+@jax.jit  # traced once for each size
+def _by_columns(A, x):
     return sum(A[:, j] * x[j] for j in range(1, A.shape[-1])) + A[:, 0] * x[0]
 
 

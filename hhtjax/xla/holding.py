@@ -24,25 +24,36 @@ SHORT = 512  # numbers; XLA divides no work on so few among threads
 
 def hold(module, names):
     """Hands values on by calls in the functions of these names, each of which comes after those that it calls."""
-    calls, costs = {}, {}
+    calls, costs, uses = {}, {}, {}
     for name in names:
         (body,) = module.symbol_table[name].operation.regions[0]
-        costs[name] = _hold_in(module, body, calls, costs)
+        costs[name] = _hold_in(module, body, calls, costs, uses)
+        uses[name] = [_number_of_uses(x, uses) for x in body.arguments]
 
 
-def _hold_in(module, block, calls, costs):
+def _number_of_uses(x, uses):
+    """Operations that take x, those in functions called with it too. uses: of arguments of these, by names."""
+    number = {}
+    for use in x.uses:
+        op = use.owner
+        is_open = op.name == "func.call" and ATTRIBUTES not in op.attributes and callee(op) in uses
+        number[op] = number.get(op, 0) + uses[callee(op)][use.operand_number] if is_open else 1
+    return sum(number.values())
+
+
+def _hold_in(module, block, calls, costs, uses):
     """The same in a block: what each of its results takes where it is evaluated anew, in operations.
 
-    calls: those that hand on, by types; costs: results of the functions before, by names.
+    calls: those that hand on, by types; costs, uses: of results and arguments of the functions before, by names.
     """
     cost = {}
     for op in [x.operation for x in block]:
         if op.name in WITH_REGIONS:
             for region in op.regions:
                 for inner in region:
-                    _hold_in(module, inner, calls, costs)
+                    _hold_in(module, inner, calls, costs, uses)
         for x, taken in zip(op.results, _costs_of(op, cost, costs), strict=True):
-            if taken and op.name != BROADCAST and taken * (len({use.owner for use in x.uses}) - 1) >= LEAST:
+            if taken and op.name != BROADCAST and taken * (_number_of_uses(x, uses) - 1) >= LEAST:
                 _hand_on(module, op, x, calls)
                 taken = 0
             cost[x] = taken
