@@ -12,7 +12,8 @@ HOUSE = ROOT / "hhtjax"
 FLOORS = [  # each imports from those before it, and from its own room
     ["description", "checks"],
     ["xla"],
-    ["numerics", "rotation", "trigonometry"],
+    ["numerics", "trigonometry"],
+    ["rotation"],
     ["systems"],
     ["steppers"],
     ["runs"],
