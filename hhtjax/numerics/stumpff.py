@@ -47,8 +47,9 @@ def stumpff(n, x):
 
 @stumpff.defjvp
 def _(n, primals, tangents):
-    c = (None, *stumpff(n + 2, *primals))
-    return c[1 : n + 1], tuple((k * c[k + 2] - c[k + 1]) * (tangents[0] / 2) for k in range(1, n + 1))
+    c1, *c = stumpff(n + 2, *primals)
+    half = tangents[0] / 2
+    return (c1, *c[: n - 1]), tuple((k * c[k] - c[k - 1]) * half for k in range(1, n + 1))
 
 
 def series(k, y):
