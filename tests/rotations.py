@@ -25,21 +25,8 @@ from hhtjax.rotation import (
 EPS = np.finfo(float).eps
 EYE = np.eye(3)
 AXES = np.concatenate([EYE, -EYE, Rotation.random(6, rng=1).as_matrix()[:, 0]])
-ANGLES = (
-    0.0,
-    1e-160,
-    1e-12,
-    1e-8,
-    1e-5,
-    1e-3,
-    0.489,
-    0.491,
-    0.999,
-    1.001,
-    1.999,
-    2.001,
-    3.0,
-)  # rad; the branches meet inside
+# rad; the branches meet inside
+ANGLES = 0.0, 1e-160, 1e-12, 1e-8, 1e-5, 1e-3, 0.489, 0.491, 0.999, 1.001, 1.999, 2.0, 2.001, 3.0
 VECTORS = np.concatenate([angle * AXES for angle in ANGLES])
 NEAR_PI = np.concatenate([angle * AXES for angle in (pi - 1e-3, pi - 1e-6, pi - 1e-9, pi - 1e-12)])
 LONG = np.concatenate([angle * AXES for angle in (pi, 4.0, 6.0, 7.0, 20.0)])

@@ -36,12 +36,9 @@ def run(stepper, system, params, q0, v0, dt, num_steps):
     return q, path
 
 
-def moved(q, x):
-    """q + x, and R exp(x) of a rotation, or of several."""
-    if q.ndim == x.ndim:
-        return q + x
-    move = lambda R, psi: R @ rotation.exp(psi)  # noqa: E731
-    return (move if x.ndim == 1 else jax.vmap(move))(q, x)
+def turned(R, psi):
+    """R exp(psi), of one rotation, or of several."""
+    return R @ rotation.exp(psi) if psi.ndim == 1 else jax.vmap(turned)(R, psi)
 
 
 def run_bodies(stepper, system, params, q0, v0, dt, num_steps):
@@ -53,7 +50,7 @@ def run_bodies(stepper, system, params, q0, v0, dt, num_steps):
     n = v0.size
 
     def move(q, x):
-        return jax.tree.map(moved, q, tree(x))
+        return jax.tree.map(lambda q, x: q + x if q.ndim == x.ndim else turned(q, x), q, tree(x))
 
     def Phi(q, x):
         return jnp.zeros(0) if system.constraint is None else system.constraint(move(q, x), 0.0, params)
@@ -82,8 +79,7 @@ def run_bodies(stepper, system, params, q0, v0, dt, num_steps):
 
     B = jax.jacfwd(partial(Phi, q0))(jnp.zeros(n))
     A = jnp.block([[mass(q0), -B.T], [B, jnp.zeros((len(B), len(B)))]])
-    rate = lambda s: jax.jvp(lambda s: Phi(q0, s * v0), (s,), (1.0,))[1]  # noqa: E731
-    curvature = jax.jvp(rate, (0.0,), (1.0,))[1]
+    curvature = jax.jvp(lambda x: jax.jvp(partial(Phi, q0), (x,), (v0,))[1], (jnp.zeros(n),), (v0,))[1]
     w, L = jnp.split(jnp.linalg.solve(A, jnp.concatenate([force(q0, v0), -curvature])), [n])
     (q, *_), path = jax.lax.scan(step, (q0, v0, w, w, L), None, num_steps)
     return q, path

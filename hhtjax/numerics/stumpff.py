@@ -12,10 +12,10 @@ from math import factorial
 import jax
 import jax.numpy as jnp
 
-NEAR, TERMS = 4, 11  # x below which two neighbours are series, of so many terms; beyond, c3, c4, ... would cancel less
+NEAR, TERMS = 4, 11  # x below which two neighbours are series, of so many terms; the recursion up cancels towards 0
 
 
-@jax.jit
+@jax.jit  # traced once
 def coefficients(x):
     """c1, ..., c5 at a scalar x >= 0.
 
