@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.identification.losses import LEAST_BEND, Objective
+from hhtjax.numerics.either import namespace_of
 
 PART = 512  # rows
 
@@ -41,22 +42,31 @@ def triangle(A):
     >>> R.shape, bool(jnp.allclose(R.T @ R, A.T @ A))
     ((3, 3), True)
     """
-    m, k = A.shape
+    xp, (m, k) = namespace_of(A), A.shape
     rows = max(PART, 4 * k)
     while m > 2 * rows:
         parts = -(-m // rows)
-        A = jnp.pad(A, ((0, parts * rows - m), (0, 0))).reshape(parts, rows, k)
-        A = jnp.linalg.qr(A, mode="r").reshape(-1, k)
+        A = xp.pad(A, ((0, parts * rows - m), (0, 0))).reshape(parts, rows, k)
+        A = xp.linalg.qr(A, mode="r").reshape(-1, k)
         m = A.shape[0]
-    return jnp.linalg.qr(A, mode="r")
+    return xp.linalg.qr(A, mode="r")
+
+
+class Seen(NamedTuple):
+    """What an evaluation at a point tells."""
+
+    r: Any  # of the least-squares problem, (m,)
+    J: Any  # (m, p)
+    cost: Any
+    bend: Any  # p''/p' of each unknown; None for 0
+    read: Any  # more, to be kept
 
 
 class DenseTrial(NamedTuple):
     """A point, and the least-squares problem there, its columns over D and reduced to p rows."""
 
     x: Any
-    r: Any
-    J: Any
+    read: Any  # of a `Dense` problem: r, J
     cost: Any
     length: Any  # of the residual of the least-squares problem
     D: Any
@@ -66,9 +76,25 @@ class DenseTrial(NamedTuple):
     z: Any  # residual in the basis of the left singular vectors
 
     @property
-    def read(self):
-        """Of the problem, there."""
-        return self.r, self.J
+    def r(self):
+        """Residuals."""
+        return self.read[0]
+
+
+def dense_trial(x, seen, D) -> DenseTrial:
+    """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
+    xp, p = namespace_of(x), x.size
+    finite = xp.all(xp.isfinite(seen.r)) & xp.all(xp.isfinite(seen.J))
+    r, J = (xp.where(finite, y, 0) for y in (seen.r, seen.J))
+    if seen.bend is not None:
+        further = _bent(seen.bend, J.T @ r, xp.sum(J**2, axis=0))
+        J, r = xp.concatenate([J, xp.diag(further)]), xp.pad(r, (0, p))
+    column = xp.linalg.norm(J, axis=0)
+    D = xp.maximum(D, column)
+    R = triangle(xp.concatenate([J / _or_one(D)[None, :], r[:, None]], axis=1))
+    U, s, Vt = xp.linalg.svd(R[:p, :p])
+    cost = xp.where(finite, seen.cost, xp.inf)
+    return DenseTrial(x, seen.read, cost, xp.linalg.norm(R[:, p]), D, column, s, Vt.T, U.T @ R[:p, p])
 
 
 class Dense(NamedTuple):
@@ -87,32 +113,30 @@ class Dense(NamedTuple):
         J, pull, _ = self.objective.estimating(*self.read(x))
         return (pull @ J)[None, :]
 
+    def see(self, x) -> Seen:
+        """What `dense_trial` has to know of x."""
+        r, J = self.read(x)
+        bend = None if self.bend is None else self.bend(x)
+        return Seen(*self.objective.least_squares(r, J), self.objective.cost(r), bend, (r, J))
+
     def look(self, x, D) -> DenseTrial:
         """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
-        r, J = self.read(x)
-        r_hat, J_hat = self.objective.least_squares(r, J)
-        finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(J_hat))
-        r_hat, J_hat = (jnp.where(finite, y, 0) for y in (r_hat, J_hat))
-        p = x.size
-        if self.bend is not None:
-            further = _bent(self.bend(x), J_hat.T @ r_hat, jnp.sum(J_hat**2, axis=0))
-            J_hat, r_hat = jnp.concatenate([J_hat, jnp.diag(further)]), jnp.pad(r_hat, (0, p))
-        column = jnp.linalg.norm(J_hat, axis=0)
-        D = jnp.maximum(D, column)
-        R = triangle(jnp.concatenate([J_hat / _or_one(D)[None, :], r_hat[:, None]], axis=1))
-        U, s, Vt = jnp.linalg.svd(R[:p, :p])
-        cost = jnp.where(finite, self.objective.cost(r), jnp.inf)
-        return DenseTrial(x, r, J, cost, jnp.linalg.norm(R[:, p]), D, column, s, Vt.T, U.T @ R[:p, p])
+        return dense_trial(x, self.see(x), D)
+
+    def nothing(self, x):
+        """A trial before the first evaluation."""
+        return _blank(self, x)
 
     def step(self, trial, lam):
         """The damped step, and the decrease of the cost that the linear problem predicts."""
-        weight = trial.s / jnp.maximum(trial.s**2 + lam, float(jnp.finfo(lam.dtype).tiny))
+        xp = namespace_of(trial.x)
+        weight = trial.s / xp.maximum(trial.s**2 + lam, float(jnp.finfo(trial.s.dtype).tiny))
         dx = -(trial.V @ (weight * trial.z)) / _or_one(trial.D)
-        return dx, jnp.sum(trial.z**2 * (1 - (1 - trial.s * weight) ** 2)) / 2
+        return dx, xp.sum(trial.z**2 * (1 - (1 - trial.s * weight) ** 2)) / 2
 
     def length(self, trial, dx):
         """Of J dx."""
-        return jnp.linalg.norm(trial.s * (trial.V.T @ (trial.D * dx)))
+        return namespace_of(trial.x).linalg.norm(trial.s * (trial.V.T @ (trial.D * dx)))
 
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
@@ -200,6 +224,10 @@ class Arrow(NamedTuple):
         length = jnp.linalg.norm(r_hat)
         return ArrowTrial(x, r, J, J_own, cost, length, D, column, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
 
+    def nothing(self, x):
+        """A trial before the first evaluation."""
+        return _blank(self, x)
+
     def step(self, trial, lam):
         """The damped step, and the decrease of the cost that the linear problem predicts."""
         k, p = trial.R_own.shape[-1], self.p
@@ -253,6 +281,12 @@ class Arrow(NamedTuple):
         return rest.reshape(count * m, -1), pull, bend
 
 
+def _blank(problem, x):
+    """Zeros in the form of a trial, without evaluating anything."""
+    zeros = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(problem.look, x, x))
+    return zeros._replace(x=x, cost=jnp.asarray(jnp.inf, x.dtype))
+
+
 def _bent(bend, slope, square):
     """Roots of what is added to the diagonal of J^T J (`square`) for transformed unknowns whose bound is ahead.
 
@@ -260,7 +294,8 @@ def _bent(bend, slope, square):
     is positive on the way to a bound: J^T J is made as large, so that the step there is 1/|bend|, not J^T r/J^T J. At
     a minimum inside the bounds it is 0 (Coleman, Li 1996: the same term, for bounds on p itself).
     """
-    return jnp.sqrt(jnp.maximum(slope * bend - square, 0))
+    xp = namespace_of(bend)
+    return xp.sqrt(xp.maximum(slope * bend - square, 0))
 
 
 def deviation(trial):
@@ -269,9 +304,10 @@ def deviation(trial):
 
 
 def _or_one(x):
-    return jnp.where(x == 0, 1, x)
+    return namespace_of(x).where(x == 0, 1, x)
 
 
 def _cosine(slopes, trial):
     """slopes: (J/D)^T r."""
-    return jnp.max(jnp.abs(slopes) * trial.D / _or_one(trial.column)) / _or_one(trial.length)
+    largest = namespace_of(slopes).max(abs(slopes) * trial.D / _or_one(trial.column))
+    return largest / _or_one(trial.length)

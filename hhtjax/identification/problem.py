@@ -20,6 +20,7 @@ from hhtjax.identification.losses import Objective
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.rounds import in_rounds
 from hhtjax.identification.sandwich import LEAST, count_segments, in_time, uncertainty, used_up, variance_inflation
+from hhtjax.numerics.either import namespace_of
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.runs.freezing import chooses_steps, with_steps_for
 from hhtjax.xla import Programs
@@ -69,7 +70,7 @@ class Coordinates:
         start = [transforms[i].coordinate(self.leaves[i], self.scales[i]) for i in self.free]
         x0, self.unravel = ravel_pytree(start)
         self.x0 = x0.astype(x0.dtype)  # as x is later: what is traced for a Python number is traced anew
-        self.longest = np.repeat([transforms[i].longest_step for i in self.free], [x.size for x in start])
+        self.longest = longest_steps(transforms, self.leaves)
 
     def free_leaves(self, x):
         """The fitted leaves."""
@@ -101,6 +102,12 @@ class Coordinates:
         return [pair.mean for pair in pairs], [pair.deviation for pair in pairs]
 
 
+def longest_steps(transforms, leaves):
+    """Of the vector x, within which a transform is about straight, (p,)."""
+    steps = [np.full(np.size(x), T.longest_step) for T, x in zip(transforms, leaves, strict=True) if T is not tf.fixed]
+    return np.concatenate(steps)
+
+
 @partial(Programs, static_argnums=(0, 1))
 def solve(residuals, options: Options, params0, data: Data) -> FitResult:
     """The fit, with what it says about itself as data."""
@@ -110,23 +117,41 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
     limits = tolerance, options.max_iterations, options.progress
     branch = _solve_dense if data.records is None else _solve_records
     found = branch(residuals, options, coordinates, data, limits)
+    params, slope = freeze(coordinates.params(found.x)), coordinates.slope(found.x)
+    return result_of(options, data, found, params, slope)
+
+
+def result_of(options, data, found, params, slope):
+    """What is known of a solution. slope: dp/dx of the fitted entries."""
     believed, segments = None, 0
     if options.covariance:
         segments = count_segments(found.sizes, options.segments, found.block)
-        J = found.J / coordinates.slope(found.x)[None, :]
+        J = found.J / slope[None, :]
         tau = variance_inflation(found.leaves, data.records is not None)
         believed = uncertainty(J, found.pull, found.bend, found.present, found.sizes, segments, tau, found.block)
     ended = found.residual, found.cost, found.history, found.iterations, found.code
-    params, last = freeze(coordinates.params(found.x)), (found.starts, data.weights, found.choices)
-    return FitResult(params, *ended, options.transforms, believed, segments, *last)
+    return FitResult(params, *ended, options.transforms, believed, segments, found.starts, data.weights, found.choices)
 
 
-def _solve_dense(residuals, options, coordinates, data, limits):
+class DenseParts(NamedTuple):
+    """Of a fit without records: residuals and priors f(x) (m + k,), their weights w, and the first m as a pytree."""
+
+    f: Any
+    w: Any
+    unravel: Any
+    shapes: tuple  # of the leaves of the residuals
+
+    @property
+    def m(self):
+        """How many are no priors."""
+        return sum(map(math.prod, self.shapes))
+
+
+def dense_parts(residuals, coordinates, data) -> DenseParts:
     """One residual function of all parameters, with priors as further rows."""
     shapes = check_residuals("fit", residuals, coordinates.x0.size, coordinates.params(coordinates.x0))
     leaves = spread_weights("fit", data.weights, shapes)
     w, unravel = ravel_pytree(jax.tree.unflatten(jax.tree.structure(shapes), leaves))
-    m = w.size
     if data.prior is not None:
         means, deviations = coordinates.of_prior(data.prior)
         w = jnp.concatenate([w, 1 / ravel_pytree(deviations)[0]])
@@ -138,6 +163,12 @@ def _solve_dense(residuals, options, coordinates, data, limits):
         away = [p - mean for p, mean in zip(coordinates.free_leaves(x), means, strict=True)]
         return jnp.concatenate([r, ravel_pytree(away)[0]])
 
+    return DenseParts(f, w, unravel, tuple(leaf.shape for leaf in leaves))
+
+
+def _solve_dense(residuals, options, coordinates, data, limits):
+    parts = dense_parts(residuals, coordinates, data)
+    f, w, m = parts.f, parts.w, parts.m
     call, given = hoisted(f, coordinates.x0)
     by_jacobians = options.optimizer == LEVENBERG_MARQUARDT
 
@@ -149,17 +180,24 @@ def _solve_dense(residuals, options, coordinates, data, limits):
     if by_jacobians and chooses_steps(call, given, coordinates.x0):
         frozen = partial(_dense_with_frozen_steps, problem)
     find = partial(_minimise, problem, frozen, coordinates.x0, coordinates.longest, options.optimizer, limits)
-    x, read, (history, iterations, code, choices) = at_minimum(find, problem_of, coordinates.x0.size, given, w)
+    x, read, ended = at_minimum(find, problem_of, coordinates.x0.size, given, w)
     r, J = read or (with_jacobian(f, x) if options.covariance else (f(x), None))
-    residual, cost, pull, bend = unravel(r[:m]), problem.objective.cost(r), r, None
-    if J is not None:
-        J, pull, bend = problem.objective.estimating(r, J)
-    sizes, of_pull = [math.prod(leaf.shape) for leaf in leaves], jax.tree.leaves(unravel(pull[:m]))
-    order = np.concatenate([in_time([leaf.shape for leaf in leaves]), np.arange(m, w.size)])
+    estimates = (None, r, None) if J is None else problem.objective.estimating(r, J)
+    return dense_solution(x, problem.objective.cost(r), ended, parts.unravel(r[:m]), estimates, parts.shapes, w)
+
+
+def dense_solution(x, cost, ended, residual, estimates, shapes, w) -> _Solved:
+    """ended: history, its length, the code, and how often steps were chosen; estimates: of `Objective.estimating`;
+    shapes: of the leaves of the residuals."""
+    (J, pull, bend), (history, iterations, code, choices) = estimates, ended
+    xp, sizes = namespace_of(w), [math.prod(shape) for shape in shapes]
+    m = sum(sizes)
+    leaves = [y.reshape(shape) for y, shape in zip(xp.split(pull[:m], np.cumsum(sizes)[:-1]), shapes, strict=True)]
+    order = np.concatenate([in_time(shapes), np.arange(m, w.size)])
     if J is not None and np.any(np.diff(order) < 0):
-        J, pull, bend = (x if x is None else x[order] for x in (J, pull, bend))
+        J, pull, bend = (y if y is None else y[order] for y in (J, pull, bend))
     ended = x, cost, history, iterations, code, choices, residual, None
-    return _Solved(*ended, J, pull, bend, of_pull, sizes, jnp.sum(w != 0))
+    return _Solved(*ended, J, pull, bend, leaves, sizes, xp.sum(w != 0))
 
 
 def _solve_records(residuals, options, coordinates, data, limits):

@@ -3,8 +3,10 @@
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from hhtjax.description.presentation import overwrite, shown
+from hhtjax.numerics.either import with_entry
 
 RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE, UNSETTLED = range(9)
 CONVERGED = COST, STEP, GRADIENT
@@ -42,7 +44,7 @@ class History(NamedTuple):
 
 def record(history, i, *values):
     """The history with the values of iteration i; None where there are none."""
-    return History(*(None if x is None else x.at[i].set(value) for x, value in zip(history, values, strict=True)))
+    return History(*(None if x is None else with_entry(x, i, y) for x, y in zip(history, values, strict=True)))
 
 
 def show(iteration, cost, step, code):
@@ -53,4 +55,7 @@ def show(iteration, cost, step, code):
         what = what if code == RUNNING else REASONS[int(code)]
         overwrite(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", last=code != RUNNING)
 
-    jax.debug.callback(tell, iteration, cost, step, code)
+    if isinstance(cost, np.ndarray):
+        tell(iteration, cost, step, code)
+    else:
+        jax.debug.callback(tell, iteration, cost, step, code)

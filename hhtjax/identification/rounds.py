@@ -8,7 +8,6 @@ and wrong far away: a frozen round that moves the estimates by no more than such
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -50,10 +49,9 @@ def in_rounds(problem_for, x, longest, tolerance, max_iterations, progress):
         return found, history, before, code, choices, ~(failed | settled | last)
 
     start = problem_for(x, jnp.array(True))
-    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(start.look, x, x))._replace(x=x)
     empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
     zero = jnp.zeros((), jnp.int32)
-    carry = nothing, History(empty, empty, empty), zero, zero + RUNNING, zero - 1, jnp.array(True)
+    carry = start.nothing(x), History(empty, empty, empty), zero, zero + RUNNING, zero - 1, jnp.array(True)
     best, history, iterations, code, choices, _ = lax.while_loop(unfinished, one, carry)
     return best, history, iterations, code, choices
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import triangle
+from hhtjax.numerics.either import namespace_of
 
 SEGMENTS = 32
 LEAST = 8  # segments that tell of a variance by how much they disagree
@@ -106,27 +107,27 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
         tau: of `variance_inflation`.
         block: how many rows stay together, such as those of a record.
     """
-    p, m = J.shape[1], sum(sizes)
+    xp, p, m = namespace_of(J), J.shape[1], sum(sizes)
     eps = float(jnp.finfo(J.dtype).eps)
-    norms = jnp.linalg.norm(J, axis=0)
-    column = jnp.where(norms == 0, 1, norms)
-    _, s, Vt = jnp.linalg.svd(triangle(J / column[None, :]))
+    norms = xp.linalg.norm(J, axis=0)
+    column = xp.where(norms == 0, 1, norms)
+    _, s, Vt = xp.linalg.svd(triangle(J / column[None, :]))
     seen = s > 10 * J.shape[0] * eps * s[0]
-    T = Vt.T * jnp.where(seen, 1 / jnp.where(seen, s, 1), 0)[None, :]  # coordinates in which J^T J = 1
+    T = Vt.T * xp.where(seen, 1 / xp.where(seen, s, 1), 0)[None, :]  # coordinates in which J^T J = 1
     J = J @ (T / column[:, None])
     inverse, flat = _inverse_curvature(J, bend, T, seen)
-    undetermined = jnp.any(~seen[:, None] & (jnp.abs(Vt) > 1e-6), axis=0) | flat | (present == p)
-    told = jnp.sum(J[m:] ** 2, axis=1)  # share of a parameter that a prior tells, and residuals do not
+    undetermined = xp.any(~seen[:, None] & (xp.abs(Vt) > 1e-6), axis=0) | flat | (present == p)
+    told = xp.sum(J[m:] ** 2, axis=1)  # share of a parameter that a prior tells, and residuals do not
     prior = J[m:].T @ J[m:]
     J, r = J[:m], r[:m]
-    spare = (present - p).astype(J.dtype) - jnp.sum(jnp.where(told > 0, 1 - told, 0))
-    s2 = jnp.sum(r**2) / jnp.maximum(spare, 1)
+    spare = (present - p).astype(J.dtype) - xp.sum(xp.where(told > 0, 1 - told, 0))
+    s2 = xp.sum(r**2) / xp.maximum(spare, 1)
 
     def in_units(C):
-        C = T @ C @ T.T / jnp.outer(column, column)
+        C = T @ C @ T.T / xp.outer(column, column)
         both = undetermined[:, None] & undetermined[None, :]
-        C = jnp.where(undetermined[:, None] | undetermined[None, :], 0, C)
-        return jnp.where(both & jnp.eye(p, dtype=bool), jnp.inf, C)
+        C = xp.where(undetermined[:, None] | undetermined[None, :], 0, C)
+        return xp.where(both & xp.eye(p, dtype=bool), xp.inf, C)
 
     def covariance(S):
         return in_units(inverse @ (S + prior) @ inverse)
@@ -142,23 +143,23 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
 
 def _inverse_curvature(J, bend, T, seen):
     """(J^T diag(bend) J)^-1 for J^T J = 1, and whether a parameter is part of a direction in which it vanishes."""
-    p = len(seen)
+    xp, p = namespace_of(J), len(seen)
     if bend is None:
-        return jnp.eye(p, dtype=J.dtype), jnp.zeros(p, bool)
-    h, U = jnp.linalg.eigh(J.T @ (bend[:, None] * J) + jnp.diag(jnp.where(seen, 0, 1).astype(J.dtype)))
+        return xp.eye(p, dtype=J.dtype), xp.zeros(p, bool)
+    h, U = xp.linalg.eigh(J.T @ (bend[:, None] * J) + xp.diag(xp.where(seen, 0, 1).astype(J.dtype)))
     flat = h <= FLAT
-    share = jnp.abs(T @ U) / jnp.max(jnp.abs(T), initial=1e-300)
-    inverse = jnp.where(flat, 0, 1 / jnp.where(flat, 1, h))
-    return (U * inverse[None, :]) @ U.T, jnp.any(flat[None, :] & (share > 1e-6), axis=1)
+    share = xp.abs(T @ U) / xp.max(xp.abs(T), initial=1e-300)
+    inverse = xp.where(flat, 0, 1 / xp.where(flat, 1, h))
+    return (U * inverse[None, :]) @ U.T, xp.any(flat[None, :] & (share > 1e-6), axis=1)
 
 
 def in_segments(x, sizes, segments, block=1):
     """Of each leaf in the rows of x, raveled, its equal parts: (segments, rows, ...), the last filled up with zeros."""
-    parts = []
-    for leaf in jnp.split(x, np.cumsum(sizes)[:-1]):
+    xp, parts = namespace_of(x), []
+    for leaf in xp.split(x, np.cumsum(sizes)[:-1]):
         if n := len(leaf):
             length = _length(n, segments, block)
-            filled = jnp.pad(leaf, ((0, segments * length - n), *((0, 0),) * (leaf.ndim - 1)))
+            filled = xp.pad(leaf, ((0, segments * length - n), *((0, 0),) * (leaf.ndim - 1)))
             parts.append(filled.reshape(segments, length, *leaf.shape[1:]))
     return parts
 
@@ -166,18 +167,18 @@ def in_segments(x, sizes, segments, block=1):
 def _clusters(J, r, cut, variance, x, prior):
     """sum_g s_g s_g^T, for J^T J = 1: then J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T with A = J_g^T J_g; and
     the `_degrees` of its products with the columns of x."""
-    A, score = 0.0, 0.0
+    xp, A, score = namespace_of(J), 0.0, 0.0
     for rows, r_rows in zip(*(in_segments(y, *cut) for y in (J, r)), strict=True):
-        A = A + jnp.einsum("glp,glq->gpq", rows, rows)
-        score = score + jnp.einsum("glp,gl->gp", rows, r_rows)
-    share, U = jnp.linalg.eigh(A)
+        A = A + xp.einsum("glp,glq->gpq", rows, rows)
+        score = score + xp.einsum("glp,gl->gp", rows, r_rows)
+    share, U = xp.linalg.eigh(A)
     alone = share > ALONE
-    score = jnp.where(alone, 0, jnp.einsum("gpk,gp->gk", U, score) / jnp.sqrt(jnp.where(alone, 1, 1 - share)))
-    stand_in = jnp.where(alone, share, 0)
-    score = jnp.einsum("gpk,gk->gp", U, score)
-    S = score.T @ score + variance * jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U)
-    known = jnp.einsum("pj,pq,qj->j", x, prior + jnp.einsum("gpk,gk,gqk->pq", U, stand_in, U), x)
-    return S, _degrees(jnp.where(alone, 0, share), U, x, known)
+    score = xp.where(alone, 0, xp.einsum("gpk,gp->gk", U, score) / xp.sqrt(xp.where(alone, 1, 1 - share)))
+    stand_in = xp.where(alone, share, 0)
+    score = xp.einsum("gpk,gk->gp", U, score)
+    S = score.T @ score + variance * xp.einsum("gpk,gk,gqk->pq", U, stand_in, U)
+    known = xp.einsum("pj,pq,qj->j", x, prior + xp.einsum("gpk,gk,gqk->pq", U, stand_in, U), x)
+    return S, _degrees(xp.where(alone, 0, share), U, x, known)
 
 
 def _degrees(share, U, x, known):
@@ -186,15 +187,16 @@ def _degrees(share, U, x, known):
     It is e^T G e, with G_gh = x^T B_g A_g (delta_gh - A_h) B_h x and B = (1 - A)^(-1/2). known: what is in the mean
     beside it.
     """
-    y = jnp.einsum("gpk,pj->gkj", U, x)
-    own = jnp.einsum("gk,gkj->gj", share / (1 - share), y**2)
-    shared = jnp.einsum("gpk,gk,gkj->gpj", U, share / jnp.sqrt(1 - share), y)
-    taken = jnp.sum(shared**2, axis=1)
-    mean = jnp.sum(own - taken, axis=0) + known
-    square = jnp.sum(own**2 - 2 * own * taken, axis=0)
-    square = square + jnp.sum(jnp.einsum("gpj,gqj->jpq", shared, shared) ** 2, axis=(1, 2))
+    xp = namespace_of(x)
+    y = xp.einsum("gpk,pj->gkj", U, x)
+    own = xp.einsum("gk,gkj->gj", share / (1 - share), y**2)
+    shared = xp.einsum("gpk,gk,gkj->gpj", U, share / xp.sqrt(1 - share), y)
+    taken = xp.sum(shared**2, axis=1)
+    mean = xp.sum(own - taken, axis=0) + known
+    square = xp.sum(own**2 - 2 * own * taken, axis=0)
+    square = square + xp.sum(xp.einsum("gpj,gqj->jpq", shared, shared) ** 2, axis=(1, 2))
     some = square > float(jnp.finfo(square.dtype).eps) * mean**2
-    return jnp.where(some, jnp.maximum(mean**2 / jnp.where(some, square, 1), 1), jnp.inf)
+    return xp.where(some, xp.maximum(mean**2 / xp.where(some, square, 1), 1), xp.inf)
 
 
 def time_axis(shape, of_records=False):
@@ -219,12 +221,12 @@ def variance_inflation(leaves, of_records=False):
 
     The sum over lags is sum_w (sum of r in w)^2/(L sum r^2) over all windows w of L entries, the ends padded with 0.
     """
-    energy, sums = 0.0, 0.0
+    xp, energy, sums = namespace_of(leaves[0]), 0.0, 0.0
     for r in leaves:
         if r.size:
-            r = jnp.moveaxis(jnp.atleast_1d(r), time_axis(r.shape, of_records), 0)
+            r = xp.moveaxis(xp.atleast_1d(r), time_axis(r.shape, of_records), 0)
             L = math.isqrt(r.shape[0])
-            sums_to = jnp.cumsum(jnp.pad(r, ((L, L - 1), *((0, 0),) * (r.ndim - 1))), axis=0)
+            sums_to = xp.cumsum(xp.pad(r, ((L, L - 1), *((0, 0),) * (r.ndim - 1))), axis=0)
             window = sums_to[L:] - sums_to[:-L]
-            energy, sums = energy + jnp.sum(r**2), sums + jnp.sum(window**2) / L
-    return jnp.maximum(sums / jnp.where(energy > 0, energy, 1), 1)  # a fit takes the slow part of white residuals away
+            energy, sums = energy + xp.sum(r**2), sums + xp.sum(window**2) / L
+    return xp.maximum(sums / xp.where(energy > 0, energy, 1), 1)  # a fit takes the slow part of white residuals away

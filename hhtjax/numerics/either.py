@@ -1,0 +1,59 @@
+"""The same algorithm on arrays of JAX, to be compiled, or of NumPy, which need no compilation.
+
+A new program costs XLA some 10 ms for every few operations: where an algorithm goes through many small ones, a few
+times, and nothing is being traced, NumPy is done before. Written against the module that `namespace_of` names, and with
+the three functions below, it takes either.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+
+def namespace_of(x):
+    """`numpy` of its arrays and numbers, else `jax.numpy`.
+
+    >>> namespace_of(np.ones(2)).__name__, namespace_of(jnp.ones(2)).__name__
+    ('numpy', 'jax.numpy')
+    """
+    return np if isinstance(x, (np.ndarray, np.generic)) else jnp
+
+
+def choose(condition, x, y):
+    """x where a condition, a single one, holds, else y: pytrees.
+
+    >>> int(choose(np.array(True), 1, 2)), int(choose(jnp.array(False), 1, 2))
+    (1, 2)
+    """
+    if namespace_of(condition) is np:
+        return x if condition else y
+    return jax.tree.map(partial(jnp.where, condition), x, y)
+
+
+def with_entry(x, i, value):
+    """x with another entry i.
+
+    >>> with_entry(np.zeros(2), 1, 3.0)
+    array([0., 3.])
+    """
+    if namespace_of(x) is jnp:
+        return x.at[i].set(value)
+    x = x.copy()
+    x[i] = value
+    return x
+
+
+def while_loop(unfinished, body, carry):
+    """`lax.while_loop`; where `unfinished(carry)` is of NumPy, a loop of Python.
+
+    >>> int(while_loop(lambda n: n < 100, lambda n: 3 * n, np.array(2)))
+    162
+    """
+    if namespace_of(jax.tree.leaves(carry)[0]) is jnp:
+        return lax.while_loop(unfinished, body, carry)
+    while unfinished(carry):
+        carry = body(carry)
+    return carry
