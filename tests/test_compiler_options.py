@@ -54,9 +54,14 @@ def test_programs_of_the_library_are_chosen_by_their_unknowns(monkeypatch):
     start = spring, hhtjax.hht(), jnp.ones(3), jnp.zeros(3), 1.0
     hhtjax.simulate(*start, dt=0.1, num_steps=2)
     hhtjax.sweep(*start, dts=jnp.array([0.1, 0.2]), duration=0.4, num_samples=2)
-    hhtjax.fit(lambda k: k - jnp.ones(2), 2.0)
     hhtjax.choose_steps(*start, times=jnp.array([0.1]), rtol=1e-2, atol=1e-2)
-    assert chosen == [(3, 3), (3, None), (0, None), (3, None)]
+    assert chosen == [(3, 3), (3, None), (3, None)]
+    chosen.clear()
+    result = hhtjax.fit(lambda k: k - jnp.ones(2), 2.0)
+    assert chosen == [(0, None)] * (int(result.iterations) + 1)  # a call for each trial
+    chosen.clear()
+    hhtjax.fit(lambda k, start, record: k * start - record, 2.0, records=jnp.ones((2, 3)), starts=jnp.ones((2, 1)))
+    assert chosen == [(0, None)]
 
 
 def test_errors_of_the_function_are_its_own():

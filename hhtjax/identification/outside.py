@@ -104,7 +104,7 @@ def solve_outside(residuals, options, params0, data):
         best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
         r, J, kept = best.read
         estimates = (J, r, None) if kept.estimates is None else jax.tree.map(np.asarray, kept.estimates)
-        ended = history, iterations, code, None
+        ended = history, iterations, code.astype(np.int32), None
         found = dense_solution(best.x, best.cost, ended, kept.residual, estimates, kind.shapes, w)
         if code == BAD_START:
             options = options._replace(covariance=False)  # of numbers that are not finite

@@ -12,8 +12,9 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.description import freeze, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options, check_residuals, spread_weights
+from hhtjax.identification.arrow import Arrow
 from hhtjax.identification.descent import Smooth, descend
-from hhtjax.identification.gauss_newton import Arrow, Dense, with_jacobian
+from hhtjax.identification.gauss_newton import Dense, with_jacobian
 from hhtjax.identification.implicit import at_minimum
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective

@@ -6,6 +6,7 @@ the three functions below, it takes either.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import numpy as np
 from jax import lax
 
 
-def namespace_of(x):
+def namespace_of(x) -> Any:
     """`numpy` of its arrays and numbers, else `jax.numpy`.
 
     >>> namespace_of(np.ones(2)).__name__, namespace_of(jnp.ones(2)).__name__
