@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.identification.losses import Objective
-from hhtjax.numerics.either import namespace_of
+from hhtjax.numerics.either import choose, namespace_of
 
 PART = 512  # rows
 
@@ -120,15 +120,15 @@ class DenseTrial(NamedTuple):
 def dense_trial(x, seen, D) -> DenseTrial:
     """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
     xp, p = namespace_of(x), x.size
-    finite = xp.all(xp.isfinite(seen.r)) & xp.all(xp.isfinite(seen.J))
-    r, J = (xp.where(finite, y, 0) for y in (seen.r, seen.J))
+    both = xp.concatenate([seen.J, seen.r[:, None]], axis=1)
+    finite = xp.all(xp.isfinite(both))
+    R = triangle(choose(finite, both, xp.zeros_like(both)))
     if seen.bend is not None:
-        further = bent(seen.bend, J.T @ r, xp.sum(J**2, axis=0))
-        J, r = xp.concatenate([J, xp.diag(further)]), xp.pad(r, (0, p))
-    column = xp.linalg.norm(J, axis=0)
+        further = bent(seen.bend, R[:, :p].T @ R[:, p], xp.sum(R[:, :p] ** 2, axis=0))
+        R = triangle(xp.concatenate([R, xp.pad(xp.diag(further), ((0, 0), (0, 1)))]))
+    column = xp.linalg.norm(R[:, :p], axis=0)
     D = xp.maximum(D, column)
-    R = triangle(xp.concatenate([J / or_one(D)[None, :], r[:, None]], axis=1))
-    U, s, Vt = xp.linalg.svd(R[:p, :p])
+    U, s, Vt = xp.linalg.svd(R[:p, :p] / or_one(D)[None, :])
     cost = xp.where(finite, seen.cost, xp.inf)
     return DenseTrial(x, seen.read, cost, xp.linalg.norm(R[:, p]), D, column, s, Vt.T, U.T @ R[:p, p])
 

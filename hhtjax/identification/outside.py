@@ -2,7 +2,8 @@
 
 Levenberg-Marquardt and the covariances are a thousand small operations, which XLA would compile anew with every
 function of residuals, half a second each time, and which run once an iteration. They are the same lines as inside a jit
-(`hhtjax.numerics.either`). Where runs choose their steps, and for records, there is the one program of `solve`.
+(`hhtjax.numerics.either`). Where runs choose their steps, for records, and for many residuals, there is the one program
+of `solve`.
 """
 
 from dataclasses import dataclass
@@ -10,7 +11,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.description import all_concrete, freeze, is_tracing
@@ -23,6 +23,9 @@ from hhtjax.identification.progress import BAD_START
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.runs.freezing import chooses_steps
 from hhtjax.xla import Programs, is_untouched
+
+MANY = 100_000  # entries of a Jacobian; with more, memory that one program keeps saves more time than compiling takes
+NUMBERS = "cost", "history", "iterations", "code", "uncertainty"  # of a `FitResult`, from NumPy
 
 
 class Kept(NamedTuple):
@@ -93,7 +96,7 @@ def is_outside(options, *given):
 def solve_outside(residuals, options, params0, data):
     """`solve`, where nothing is being traced."""
     x0, w, kind = _begin(residuals, options, params0, data)
-    if kind.chooses_steps:
+    if kind.chooses_steps or w.size * x0.size > MANY:
         return solve(residuals, options, params0, data)
     x0, w = np.asarray(x0), np.asarray(w)
     tolerance = np.maximum(np.asarray(data.tolerance, x0.dtype), 10 * np.finfo(x0.dtype).eps)
@@ -109,4 +112,5 @@ def solve_outside(residuals, options, params0, data):
         if code == BAD_START:
             options = options._replace(covariance=False)  # of numbers that are not finite
         result = result_of(options, data, found, kept.params, np.asarray(kept.slope))
-    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, (np.ndarray, np.generic)) else x, result)
+    numbers = {name: getattr(result, name) for name in NUMBERS}
+    return result._replace(**jax.device_put(numbers))
