@@ -11,14 +11,19 @@ from hhtjax.xla import Programs, gate, plain
 ARE_TAKEN = gate.is_on() and jax.default_backend() == "cpu"
 
 
-def twice(x):
-    if isinstance(x, str):
-        raise ValueError(x)
-    return 2 * x
+def of_twice(**static):
+    """Programs of a function of their own: jits of the same one share what they have compiled."""
+
+    def twice(x):
+        if isinstance(x, str):
+            raise ValueError(x)
+        return 2 * x
+
+    return Programs(twice, **static)
 
 
 def test_few_unknowns_take_options_and_no_jit_of_a_user_has_them():
-    programs = Programs(twice)
+    programs = of_twice()
     quick, wide = (programs.quick, programs.wide) if ARE_TAKEN else (programs.usual, programs.usual)
     found = programs.of(2, 2), programs.of(3, 9), programs.of(2), programs.of()
     assert found == (wide, quick, quick, quick)
@@ -37,7 +42,7 @@ def test_few_unknowns_take_options_and_no_jit_of_a_user_has_them():
 def test_an_option_that_xla_does_not_know_is_tried_once(numbers, monkeypatch):
     monkeypatch.setattr("hhtjax.xla.programs.QUICK", {"xla_cpu_of_another_time": True})
     monkeypatch.setattr(Programs, "are_refused", False)
-    programs = Programs(twice)
+    programs = of_twice()
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_of_another_time"):  # so it reaches the compiler
         programs.of(2, numbers)(3.0)
     assert programs(3.0, rates=2, numbers=numbers) == 6
@@ -65,7 +70,7 @@ def test_programs_of_the_library_are_chosen_by_their_unknowns(monkeypatch):
 
 
 def test_errors_of_the_function_are_its_own():
-    programs = Programs(twice, static_argnames="x")
+    programs = of_twice(static_argnames="x")
     with pytest.raises(ValueError, match="mine"):
         programs(x="mine")
 
