@@ -91,9 +91,9 @@ def fit(
             `Uncertainty`). Of `records` whole ones, where that makes 8 and more than there are parameters.
         progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
 
-    A function is traced once, and then known by its identity: data that it reads from outside are part of the program,
-    and that an array has changed in place or a name been bound anew goes unnoticed. For other data make another
-    function, `lambda params: residuals(params, data)`, or pass them as `records`.
+    A function is traced and compiled once, and then known by its identity: data that it reads from outside are part of
+    the program, and that an array has changed in place or a name been bound anew goes unnoticed. For other data make
+    another function, `lambda params: residuals(params, data)`, or pass them as `records`.
 
     Estimates have derivatives, forward and reverse, in all that a fit is given and its residuals read, but where it
     starts: those of the minimum, H dx + (dg/dd) dd = 0 with g = dc/dx the slope of the cost and H = dg/dx, by the
