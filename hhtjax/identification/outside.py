@@ -1,9 +1,9 @@
 """A fit outside of all transformations: residuals and Jacobians by a compiled program, all around them in NumPy.
 
 Levenberg-Marquardt and the covariances are a thousand small operations, which run once an iteration, and which XLA
-would compile anew with every function of residuals: of a pendulum's fit that was two thirds of the time. They are the lines
-of a fit inside a jit (`hhtjax.numerics.either`). Where runs choose their steps, for records, and for many residuals,
-the whole fit is one program, `solve`, as it is there.
+would compile anew with every function of residuals: of a pendulum's fit that was two thirds of the time. They are the
+lines of a fit inside a jit (`hhtjax.numerics.either`). Where runs choose their steps, for records, and for many
+residuals, the whole fit is one program, `solve`, as it is there.
 """
 
 from dataclasses import dataclass
