@@ -64,9 +64,6 @@ def test_programs_of_the_library_are_chosen_by_their_unknowns(monkeypatch):
     chosen.clear()
     result = hhtjax.fit(lambda k: k - jnp.ones(2), 2.0)
     assert chosen == [(0, None)] * (int(result.iterations) + 1)  # a call for each trial
-    chosen.clear()
-    hhtjax.fit(lambda k, start, record: k * start - record, 2.0, records=jnp.ones((2, 3)), starts=jnp.ones((2, 1)))
-    assert chosen == [(0, None)]
 
 
 def test_errors_of_the_function_are_its_own():

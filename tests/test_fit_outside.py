@@ -40,10 +40,35 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+OFFSETS = {"b": jnp.array([0.1, 0.0, -0.3]), "c": jnp.zeros((3, 1))}
+RECORDS = jnp.stack([MEASURED + 0.1, MEASURED - 0.02 * T, MEASURED - 0.3]).at[1, 5].set(jnp.nan)
+PRESENT = {"y": jnp.isfinite(RECORDS), "few": jnp.array([1.0, 0.5, 2.0])}
+
+
+def of_record(p, start, record):
+    """With an offset and a drift of its own."""
+    y = p["a"] * jnp.exp(-p["rate"] * T) + start["b"] + start["c"] * T - record
+    return {"y": y, "few": p["gain"] * y[::7] * jnp.ones(6)}
+
+
+OF_RECORDS = {
+    "records": {"transforms": TWO},
+    "records, bounds": {"transforms": {"a": positive, "rate": bounded(0.0, 1.2), "gain": fixed}},
+    "records, loss": {"transforms": TWO, "loss": "huber"},
+    "records, a parameter": {"transforms": ONE, "segments": 2},
+    "records, no covariance": {"transforms": TWO, "covariance": False, "max_iterations": 2},
+}
+OF_RECORDS = {
+    kind: {"records": RECORDS, "starts": OFFSETS, "weights": PRESENT} | options for kind, options in OF_RECORDS.items()
+}
+EVERY = KINDS | OF_RECORDS
+
+
+@pytest.mark.parametrize("kind", EVERY)
 def test_outside_as_inside(kind):
-    here = hhtjax.fit(decay, START, **KINDS[kind])
-    there = jax.jit(lambda start: hhtjax.fit(decay, start, **KINDS[kind]))(START)
+    residuals = of_record if kind in OF_RECORDS else decay
+    here = hhtjax.fit(residuals, START, **EVERY[kind])
+    there = jax.jit(lambda start: hhtjax.fit(residuals, start, **EVERY[kind]))(START)
     assert (int(here.code), int(here.iterations)) == (int(there.code), int(there.iterations))
     length = int(here.iterations) + 1
     there = there._replace(history=jax.tree.map(lambda x: x[:length], there.history), segments=here.segments)

@@ -6,17 +6,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.identification.gauss_newton import bent, blank, largest_cosine, or_one, with_jacobian
+from hhtjax.identification.gauss_newton import Seen, bent, blank, largest_cosine, or_one, with_jacobian
 from hhtjax.identification.losses import LEAST_BEND, Objective
+from hhtjax.numerics.either import choose, namespace_of, solve_upper
 
 
 class ArrowTrial(NamedTuple):
     """A point, and each record's problem, columns over D and reduced to k + p + 1 rows."""
 
     x: Any
-    r: Any  # (records, m)
-    J: Any  # of the shared unknowns, (records, m, p)
-    J_own: Any  # (records, m, k)
+    read: Any  # of an `Arrow` problem: r (records, m), J by the shared unknowns, (records, m, p), and by their own
     cost: Any
     length: Any
     D: Any  # like x
@@ -26,9 +25,38 @@ class ArrowTrial(NamedTuple):
     z: Any  # (records, k + p + 1)
 
     @property
-    def read(self):
-        """Of the problem, there."""
-        return self.r, self.J, self.J_own
+    def r(self):
+        """Residuals."""
+        return self.read[0]
+
+
+def split(x, count, p):
+    """The p shared unknowns, and those of the `count` records, (count, k)."""
+    return x[:p], x[p:].reshape(count, -1)
+
+
+def arrow_trial(x, seen, D, p) -> ArrowTrial:
+    """The trial at x, with D from the trials before; its cost is inf where something is not finite.
+
+    seen: of residuals (records, m), and of their derivatives by k own unknowns and then p shared ones.
+    """
+    xp, both, r = namespace_of(x), seen.J, seen.r
+    count, k = len(both), both.shape[2] - p
+    finite = xp.all(xp.isfinite(r)) & xp.all(xp.isfinite(both))
+    both, r = choose(finite, (both, r), (xp.zeros_like(both), xp.zeros_like(r)))
+    if seen.bend is not None:
+        slopes, squares = xp.einsum("bmp,bm->p", both[:, :, k:], r), xp.sum(both[:, :, k:] ** 2, axis=(0, 1))
+        further = xp.diag(bent(seen.bend, slopes, squares) / count**0.5)  # a part in each record
+        further = xp.broadcast_to(xp.pad(further, ((0, 0), (k, 0))), (count, p, k + p))
+        both, r = xp.concatenate([both, further], axis=1), xp.pad(r, ((0, 0), (0, p)))
+    norms = xp.linalg.norm(both[:, :, k:], axis=(0, 1)), xp.linalg.norm(both[:, :, :k], axis=1)
+    column = xp.concatenate([norms[0], norms[1].ravel()])
+    D = xp.maximum(D, column)
+    shared, own = split(or_one(D), count, p)
+    columns = xp.concatenate([own, xp.broadcast_to(shared, (count, p))], axis=1)
+    R = xp.linalg.qr(xp.concatenate([both / columns[:, None, :], r[:, :, None]], axis=2), mode="r")
+    cost, length = xp.where(finite, seen.cost, xp.inf), xp.linalg.norm(r)
+    return ArrowTrial(x, seen.read, cost, length, D, column, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
 
 
 class Arrow(NamedTuple):
@@ -47,8 +75,7 @@ class Arrow(NamedTuple):
 
     def split(self, x):
         """Shared unknowns (p,) and own ones (records, k)."""
-        count = jax.tree.leaves(self.records)[0].shape[0]
-        return x[: self.p], x[self.p :].reshape(count, -1)
+        return split(x, jax.tree.leaves(self.records)[0].shape[0], self.p)
 
     def read(self, x):
         """Residuals of each record, and their Jacobians by the shared and by their own unknowns."""
@@ -67,29 +94,18 @@ class Arrow(NamedTuple):
         wJ, pull, _ = self.objective.estimating(r.ravel(), J.reshape(r.size, -1))
         return jnp.einsum("bm,bmp->bp", pull.reshape(r.shape), wJ.reshape(J.shape))
 
-    def look(self, x, D) -> ArrowTrial:
-        """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
+    def see(self, x) -> Seen:
+        """What `arrow_trial` has to know of x."""
         r, J, J_own = self.read(x)
-        count, m, k = J_own.shape
-        both = jnp.concatenate([J_own, J], axis=2).reshape(count * m, -1)
-        r_hat, both = self.objective.least_squares(r.ravel(), both)
-        finite = jnp.all(jnp.isfinite(r_hat)) & jnp.all(jnp.isfinite(both))
-        r_hat, both = (jnp.where(finite, y, 0) for y in (r_hat, both))
-        both, r_hat = both.reshape(count, m, -1), r_hat.reshape(count, m)
-        if self.bend is not None:
-            slopes, squares = jnp.einsum("bmp,bm->p", both[:, :, k:], r_hat), jnp.sum(both[:, :, k:] ** 2, axis=(0, 1))
-            further = jnp.diag(bent(self.bend(x[: self.p]), slopes, squares) / count**0.5)  # a part in each record
-            further = jnp.broadcast_to(jnp.pad(further, ((0, 0), (k, 0))), (count, self.p, k + self.p))
-            both, r_hat = jnp.concatenate([both, further], axis=1), jnp.pad(r_hat, ((0, 0), (0, self.p)))
-        norms = jnp.linalg.norm(both[:, :, k:], axis=(0, 1)), jnp.linalg.norm(both[:, :, :k], axis=1)
-        column = jnp.concatenate([norms[0], norms[1].ravel()])
-        D = jnp.maximum(D, column)
-        shared, own = self.split(or_one(D))
-        columns = jnp.concatenate([own, jnp.broadcast_to(shared, (count, self.p))], axis=1)
-        R = jnp.linalg.qr(jnp.concatenate([both / columns[:, None, :], r_hat[:, :, None]], axis=2), mode="r")
-        cost = jnp.where(finite, self.objective.cost(r.ravel()), jnp.inf)
-        length = jnp.linalg.norm(r_hat)
-        return ArrowTrial(x, r, J, J_own, cost, length, D, column, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
+        both = jnp.concatenate([J_own, J], axis=2)
+        r_hat, both_hat = self.objective.least_squares(r.ravel(), both.reshape(r.size, -1))
+        bend = None if self.bend is None else self.bend(x[: self.p])
+        read = r, J, J_own
+        return Seen(r_hat.reshape(r.shape), both_hat.reshape(both.shape), self.objective.cost(r.ravel()), bend, read)
+
+    def look(self, x, D) -> ArrowTrial:
+        """The trial at x, with D from the trials before."""
+        return arrow_trial(x, self.see(x), D, self.p)
 
     def nothing(self, x):
         """A trial before the first evaluation."""
@@ -97,52 +113,50 @@ class Arrow(NamedTuple):
 
     def step(self, trial, lam):
         """The damped step, and the decrease of the cost that the linear problem predicts."""
-        k, p = trial.R_own.shape[-1], self.p
-        root = jnp.sqrt(jnp.maximum(lam, float(jnp.finfo(lam.dtype).eps) ** 2))
-
-        def eliminate(R_own, R, z):
-            Q, T = jnp.linalg.qr(jnp.concatenate([R_own, root * jnp.eye(k, dtype=z.dtype)]))
-            b = jnp.pad(jnp.concatenate([R, z[:, None]], axis=1), ((0, k), (0, 0)))
-            part = Q.T @ b
-            return T, part, b - Q @ part
-
-        T, part, rest = jax.vmap(eliminate)(trial.R_own, trial.R, trial.z)
-        rest = rest.reshape(-1, p + 1)
-        damped = jnp.concatenate([rest, root * jnp.eye(p, p + 1, dtype=root.dtype)])
-        Q, S = jnp.linalg.qr(damped[:, :p])
-        shared = -jax.scipy.linalg.solve_triangular(S, Q.T @ damped[:, p])
-        unmet = part[:, :, p] + jnp.einsum("bkp,p->bk", part[:, :, :p], shared)
-        own = -jax.vmap(jax.scipy.linalg.solve_triangular)(T, unmet)
-        left = trial.z + jnp.einsum("bip,p->bi", trial.R, shared) + jnp.einsum("bik,bk->bi", trial.R_own, own)
-        predicted = (jnp.sum(trial.z**2) - jnp.sum(left**2)) / 2
-        return jnp.concatenate([shared, own.ravel()]) / or_one(trial.D), predicted
+        xp, z, (count, _, p), k = namespace_of(trial.x), trial.z, trial.R.shape, trial.R_own.shape[-1]
+        root = xp.sqrt(xp.maximum(lam, float(jnp.finfo(z.dtype).eps) ** 2))
+        damping = xp.broadcast_to(root * xp.eye(k, dtype=z.dtype), (count, k, k))
+        Q, T = xp.linalg.qr(xp.concatenate([trial.R_own, damping], axis=1))
+        b = xp.pad(xp.concatenate([trial.R, z[:, :, None]], axis=2), ((0, 0), (0, k), (0, 0)))
+        part = xp.swapaxes(Q, 1, 2) @ b
+        rest = (b - Q @ part).reshape(-1, p + 1)
+        damped = xp.concatenate([rest, root * xp.eye(p, p + 1, dtype=z.dtype)])
+        Q, S = xp.linalg.qr(damped[:, :p])
+        shared = -solve_upper(S, Q.T @ damped[:, p])
+        own = -solve_upper(T, part[:, :, p] + xp.einsum("bkp,p->bk", part[:, :, :p], shared))
+        left = z + xp.einsum("bip,p->bi", trial.R, shared) + xp.einsum("bik,bk->bi", trial.R_own, own)
+        predicted = (xp.sum(z**2) - xp.sum(left**2)) / 2
+        return xp.concatenate([shared, own.ravel()]) / or_one(trial.D), predicted
 
     def length(self, trial, dx):
         """Of J dx."""
-        shared, own = self.split(or_one(trial.D) * dx)
-        Jdx = jnp.einsum("bip,p->bi", trial.R, shared) + jnp.einsum("bik,bk->bi", trial.R_own, own)
-        return jnp.linalg.norm(Jdx)
+        xp = namespace_of(trial.x)
+        shared, own = split(or_one(trial.D) * dx, len(trial.R), trial.R.shape[-1])
+        Jdx = xp.einsum("bip,p->bi", trial.R, shared) + xp.einsum("bik,bk->bi", trial.R_own, own)
+        return xp.linalg.norm(Jdx)
 
     def cosine(self, trial):
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
-        shared = jnp.einsum("bip,bi->p", trial.R, trial.z)
-        own = jnp.einsum("bik,bi->bk", trial.R_own, trial.z)
-        return largest_cosine(jnp.concatenate([shared, own.ravel()]), trial)
+        xp = namespace_of(trial.x)
+        shared = xp.einsum("bip,bi->p", trial.R, trial.z)
+        own = xp.einsum("bik,bi->bk", trial.R_own, trial.z)
+        return largest_cosine(xp.concatenate([shared, own.ravel()]), trial)
 
-    def free_of_own(self, r, J, J_own):
-        """What `Objective.estimating` says of the residuals, with the part of J that no own unknown can make up for."""
-        count, m, k = J_own.shape
-        both = jnp.concatenate([J_own, J], axis=2).reshape(count * m, -1)
-        both, pull, bend = self.objective.estimating(r.ravel(), both)
+    def estimates(self, r, J, J_own):
+        """What `Objective.estimating` says of the residuals."""
+        return self.objective.estimating(r.ravel(), jnp.concatenate([J_own, J], axis=2).reshape(r.size, -1))
 
-        def project(both, bend):
-            Q, J = jnp.linalg.qr(both[:, :k])[0], both[:, k:]
-            if bend is None:
-                return J - Q @ (Q.T @ J)
-            h, U = jnp.linalg.eigh(Q.T @ (bend[:, None] * Q))
-            slopes = U.T @ Q.T @ (bend[:, None] * J)
-            return J - Q @ (U @ (slopes / jnp.maximum(h, LEAST_BEND)[:, None]))
 
-        bends = None if bend is None else bend.reshape(count, m)
-        rest = jax.vmap(project, in_axes=(0, None if bend is None else 0))(both.reshape(count, m, -1), bends)
-        return rest.reshape(count * m, -1), pull, bend
+def free_of_own(both, bend, count, p):
+    """The part of J, of derivatives by k own unknowns and then p shared ones, that no own unknown can make up for."""
+    xp = namespace_of(both)
+    both = both.reshape(count, -1, both.shape[-1])
+    k = both.shape[-1] - p
+    Q, J = xp.linalg.qr(both[:, :, :k])[0], both[:, :, k:]
+    Qt = xp.swapaxes(Q, 1, 2)
+    if bend is None:
+        return (J - Q @ (Qt @ J)).reshape(-1, p)
+    bend = bend.reshape(count, -1, 1)
+    h, U = xp.linalg.eigh(Qt @ (bend * Q))
+    slopes = xp.swapaxes(U, 1, 2) @ (Qt @ (bend * J))
+    return (J - Q @ (U @ (slopes / xp.maximum(h, LEAST_BEND)[:, :, None]))).reshape(-1, p)

@@ -155,6 +155,10 @@ class Dense(NamedTuple):
         bend = None if self.bend is None else self.bend(x)
         return Seen(*self.objective.least_squares(r, J), self.objective.cost(r), bend, (r, J))
 
+    def estimates(self, r, J):
+        """What `Objective.estimating` says of the residuals."""
+        return self.objective.estimating(r, J)
+
     def look(self, x, D) -> DenseTrial:
         """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
         return dense_trial(x, self.see(x), D)

@@ -29,7 +29,8 @@ from hhtjax.identification.arguments import (
 )
 from hhtjax.identification.identifiability import warn_undetermined
 from hhtjax.identification.outside import is_outside, solve_outside
-from hhtjax.identification.problem import Data, solve
+from hhtjax.identification.parts import Data
+from hhtjax.identification.problem import solve
 from hhtjax.identification.progress import BAD_START, NO_INFLUENCE, NO_SLOPE
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
@@ -134,7 +135,7 @@ def fit(
     data = _check_data("fit", params0, scale, weights, prior, tolerance)
     if of_records:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
-    alone = not of_records and is_outside(options, params0, data)
+    alone = is_outside(options, params0, data)
     result = or_plain(partial(solve_outside if alone else solve, residuals, options, params0, data))
     result = result._replace(params=thaw(result.params))
     return _finished("fit", result, weights) if is_concrete(result.code) else result

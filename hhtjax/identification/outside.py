@@ -2,23 +2,27 @@
 
 Levenberg-Marquardt and the covariances are a thousand small operations, which run once an iteration, and which XLA
 would compile anew with every function of residuals: of a pendulum's fit that was two thirds of the time. They are the
-lines of a fit inside a jit (`hhtjax.numerics.either`). Where runs choose their steps, for records, and for many
-residuals, the whole fit is one program, `solve`, as it is there.
+lines of a fit inside a jit (`hhtjax.numerics.either`). Where runs choose their steps, and for many residuals, the whole
+fit is one program, `solve`, as it is there.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.description import all_concrete, freeze, is_tracing
 from hhtjax.identification.arguments import LEVENBERG_MARQUARDT
+from hhtjax.identification.arrow import Arrow, ArrowTrial, arrow_trial
 from hhtjax.identification.gauss_newton import Dense, DenseTrial, dense_trial
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
-from hhtjax.identification.problem import Coordinates, dense_parts, dense_solution, longest_steps, result_of, solve
+from hhtjax.identification.parts import Coordinates, dense_parts, first, longest_steps, record_parts
+from hhtjax.identification.problem import dense_solution, records_solution, result_of, solve
 from hhtjax.identification.progress import BAD_START
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.runs.freezing import chooses_steps
@@ -35,6 +39,7 @@ class Kept(NamedTuple):
     residual: Any
     params: Any
     slope: Any
+    starts: Any
 
 
 @jax.tree_util.register_static
@@ -42,41 +47,55 @@ class Kept(NamedTuple):
 class Kind:
     """What is known of a fit when it has been traced."""
 
+    p: int  # unknowns, but those of records
+    shapes: tuple  # of the leaves of the residuals
     chooses_steps: bool
-    shapes: tuple
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _begin(residuals, options, params0, data):
     """The vector x to start from, the weights, and the kind of the fit."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
-    parts = dense_parts(residuals, coordinates, data)
-    return coordinates.x0, parts.w, Kind(chooses_steps(*hoisted(parts.f, coordinates.x0), coordinates.x0), parts.shapes)
+    x0 = coordinates.x0
+    if data.records is None:
+        parts = dense_parts(residuals, coordinates, data)
+        own, one = [], (x0,)
+    else:
+        parts = record_parts(residuals, coordinates, data)
+        own, one = [parts.own0.ravel()], (x0, parts.own0[0], first(data.records))
+    kind = Kind(x0.size, parts.shapes, chooses_steps(*hoisted(parts.f, *one), *one))
+    return jnp.concatenate([x0, *own]), parts.w, kind
 
 
 @partial(Programs, static_argnums=(0, 1))
 def _see(residuals, options, x, params0, data):
     """The `Seen` of x, with a `Kept`."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
-    parts = dense_parts(residuals, coordinates, data)
-    problem = Dense(parts.f, Objective(parts.w, options.loss, parts.m), coordinates.bend())
-    seen = problem.see(x)
-    r, _ = seen.read
-    estimates = None if options.loss is None else problem.objective.estimating(*seen.read)
-    kept = Kept(estimates, parts.unravel(r[: parts.m]), freeze(coordinates.params(x)), coordinates.slope(x))
+    p, starts = coordinates.x0.size, None
+    if data.records is None:
+        parts = dense_parts(residuals, coordinates, data)
+        problem = Dense(parts.f, Objective(parts.w, options.loss, parts.m), coordinates.bend())
+        seen = problem.see(x)
+        residual = parts.unravel(seen.read[0][: parts.m])
+    else:
+        parts = record_parts(residuals, coordinates, data)
+        objective = Objective(parts.w.ravel(), options.loss, parts.w.size)
+        problem = Arrow(parts.f, objective, data.records, p, coordinates.bend())
+        seen = problem.see(x)
+        residual, starts = parts.unravel(seen.read[0]), parts.unravel_start(problem.split(x)[1])
+    estimates = None if options.loss is None else problem.estimates(*seen.read)
+    kept = Kept(estimates, residual, freeze(coordinates.params(x[:p])), coordinates.slope(x[:p]), starts)
     return seen._replace(read=kept)
 
 
 class Outside(NamedTuple):
     """A `Dense` problem. see: x -> its `Seen`."""
 
-    see: Any
+    see: Callable
 
     def look(self, x, D):
         """The trial at x, with D from the trials before."""
-        seen = self.see(x)
-        numbers = jax.tree.map(np.asarray, seen._replace(read=None))
-        return dense_trial(x, numbers._replace(read=(numbers.r, numbers.J, seen.read)), D)
+        return dense_trial(x, _in_numpy(self.see(x)), D)
 
     def nothing(self, x):
         """A trial before the first evaluation."""
@@ -85,6 +104,32 @@ class Outside(NamedTuple):
         return DenseTrial(x, None, number + np.inf, number, zero, zero, zero, square, zero)
 
     step, length, cosine = Dense.step, Dense.length, Dense.cosine
+
+
+class OutsideRecords(NamedTuple):
+    """An `Arrow` problem. see: x -> its `Seen`."""
+
+    see: Callable
+    p: int
+    count: int
+
+    def look(self, x, D):
+        """The trial at x, with D from the trials before."""
+        return arrow_trial(x, _in_numpy(self.see(x)), D, self.p)
+
+    def nothing(self, x):
+        """A trial before the first evaluation."""
+        k, zero, number = (x.size - self.p) // self.count, np.zeros_like(x), np.zeros((), x.dtype)
+        R = np.zeros((self.count, 1, k + self.p), x.dtype)
+        return ArrowTrial(x, None, number + np.inf, number, zero, zero, R[:, :, k:], R[:, :, :k], R[:, :, 0])
+
+    step, length, cosine = Arrow.step, Arrow.length, Arrow.cosine
+
+
+def _in_numpy(seen):
+    """A `Seen` of NumPy arrays, but for what is kept beside r and J."""
+    seen, kept = jax.tree.map(np.asarray, seen._replace(read=None)), seen.read
+    return seen._replace(read=(seen.r, seen.J, kept))
 
 
 def is_outside(options, *given):
@@ -96,27 +141,38 @@ def is_outside(options, *given):
 def solve_outside(residuals, options, params0, data):
     """`solve`, where nothing is being traced."""
     x0, w, kind = _begin(residuals, options, params0, data)
-    if kind.chooses_steps or w.size * x0.size > MANY:
+    columns = x0.size if w.ndim == 1 else kind.p + (x0.size - kind.p) // len(w)
+    if kind.chooses_steps or w.size * columns > MANY:
         return solve(residuals, options, params0, data)
-    x0, w = np.asarray(x0), np.asarray(w)
-    tolerance = np.maximum(np.asarray(data.tolerance, x0.dtype), 10 * np.finfo(x0.dtype).eps)
-    warned = np.geterr()
+    x0, w, warned = np.asarray(x0), np.asarray(w), np.geterr()
 
     def see(x):
         with np.errstate(**warned):  # the user's functions may be traced here
             return _see(residuals, options, x, params0, data)
 
-    problem = Outside(see)
+    problem = Outside(see) if w.ndim == 1 else OutsideRecords(see, kind.p, len(w))
+    tolerance = np.maximum(np.asarray(data.tolerance, x0.dtype), 10 * np.finfo(x0.dtype).eps)
     longest = longest_steps(options.transforms, jax.tree.leaves(params0))
+    longest = np.concatenate([longest, np.full(x0.size - kind.p, np.inf)])
     with np.errstate(all="ignore"):
         limits = tolerance, options.max_iterations, options.progress
         best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
-        r, J, kept = best.read
-        estimates = (J, r, None) if kept.estimates is None else jax.tree.map(np.asarray, kept.estimates)
-        ended = history, iterations, code.astype(np.int32), None
-        found = dense_solution(best.x, best.cost, ended, kept.residual, estimates, kind.shapes, w)
+        found, kept = _solution(best, (history, iterations, code.astype(np.int32), None), kind, w, options.segments)
         if code == BAD_START:
             options = options._replace(covariance=False)  # of numbers that are not finite
         result = result_of(options, data, found, kept.params, np.asarray(kept.slope))
     numbers = {name: getattr(result, name) for name in NUMBERS}
     return result._replace(**jax.device_put(numbers))
+
+
+def _solution(best, ended, kind, w, segments):
+    """What the best trial says, and its `Kept`."""
+    r, J, kept = best.read
+    estimates = kept.estimates
+    if estimates is None:
+        estimates = J.reshape(r.size, -1), r.ravel(), None
+    estimates = jax.tree.map(np.asarray, estimates)
+    if w.ndim == 1:
+        return dense_solution(best.x, best.cost, ended, kept.residual, estimates, kind.shapes, w), kept
+    ended = ended, kept.residual, kept.starts, estimates, kind.shapes
+    return records_solution(best.x, best.cost, *ended, w, kind.p, segments), kept

@@ -2,7 +2,7 @@
 
 A new program costs XLA some 10 ms for every few operations: where an algorithm goes through many small ones, a few
 times, and nothing is being traced, NumPy is done before. Written against the module that `namespace_of` names, and with
-the three functions below, it takes either.
+the functions below, it takes either.
 """
 
 from functools import partial
@@ -45,6 +45,16 @@ def with_entry(x, i, value):
     x = x.copy()
     x[i] = value
     return x
+
+
+def solve_upper(T, y):
+    """x of T x = y, T (..., n, n) upper triangular, y (..., n).
+
+    >>> solve_upper(np.array([[1.0, 2.0], [0.0, 4.0]]), np.array([4.0, 4.0]))
+    array([2., 1.])
+    """
+    solve = np.linalg.solve if namespace_of(T) is np else jax.scipy.linalg.solve_triangular
+    return solve(T, y[..., None])[..., 0]
 
 
 def while_loop(unfinished, body, carry):
