@@ -171,6 +171,23 @@ def test_failures_are_told(bad):
         hhtjax.fit(residuals, 1.0)
 
 
+@pytest.mark.parametrize("size", [1e160, 5e307, jnp.inf, jnp.nan])
+def test_a_trial_that_blows_up_is_taken_back(size):
+    """Gauss-Newton on an arc tangent overshoots: there the residuals, or their squares, are beyond all numbers."""
+
+    def residuals(p):
+        x, y = jnp.where(jnp.abs(p[0]) < 4.0, jnp.array([jnp.arctan(p[0]), p[1]]), size * jnp.sin(p))
+        return x * jnp.array([0.5, 0.75, 1.0]) + 0.1 * y * jnp.array([1.0, 2.0, 3.0])
+
+    start = jnp.array([3.0, 0.0])
+    here = hhtjax.fit(residuals, start)
+    there = jax.jit(partial(hhtjax.fit, residuals))(start)
+    assert here.converged
+    assert (int(here.code), int(here.iterations)) == (int(there.code), int(there.iterations))
+    assert float(jnp.min(here.history.step[1:])) == 0  # one was taken back
+    np.testing.assert_allclose(here.params, 0.0, atol=1e-8)
+
+
 def test_progress_is_shown(capsys):
     hhtjax.fit(partial(lambda p: p * T - MEASURED), 1.0, progress=True)
     assert "converged" in capsys.readouterr().err

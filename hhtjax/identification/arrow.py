@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from hhtjax.identification.gauss_newton import Seen, bent, blank, largest_cosine, or_one, with_jacobian
 from hhtjax.identification.losses import LEAST_BEND, Objective
-from hhtjax.numerics.either import choose, namespace_of, solve_upper
+from hhtjax.numerics.either import choose, eigh, namespace_of, solve_upper
 
 
 class ArrowTrial(NamedTuple):
@@ -157,6 +157,6 @@ def free_of_own(both, bend, count, p):
     if bend is None:
         return (J - Q @ (Qt @ J)).reshape(-1, p)
     bend = bend.reshape(count, -1, 1)
-    h, U = xp.linalg.eigh(Qt @ (bend * Q))
+    h, U = eigh(Qt @ (bend * Q))
     slopes = xp.swapaxes(U, 1, 2) @ (Qt @ (bend * J))
     return (J - Q @ (U @ (slopes / xp.maximum(h, LEAST_BEND)[:, :, None]))).reshape(-1, p)

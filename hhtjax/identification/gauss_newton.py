@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.identification.losses import Objective
-from hhtjax.numerics.either import choose, namespace_of
+from hhtjax.numerics.either import choose, namespace_of, svd
 
 PART = 512  # rows
 
@@ -128,7 +128,7 @@ def dense_trial(x, seen, D) -> DenseTrial:
         R = triangle(xp.concatenate([R, xp.pad(xp.diag(further), ((0, 0), (0, 1)))]))
     column = xp.linalg.norm(R[:, :p], axis=0)
     D = xp.maximum(D, column)
-    U, s, Vt = xp.linalg.svd(R[:p, :p] / or_one(D)[None, :])
+    U, s, Vt = svd(R[:p, :p] / or_one(D)[None, :])
     cost = xp.where(finite, seen.cost, xp.inf)
     return DenseTrial(x, seen.read, cost, xp.linalg.norm(R[:, p]), D, column, s, Vt.T, U.T @ R[:p, p])
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import triangle
-from hhtjax.numerics.either import namespace_of
+from hhtjax.numerics.either import eigh, namespace_of, svd
 
 SEGMENTS = 32
 LEAST = 8  # segments that tell of a variance by how much they disagree
@@ -111,7 +111,7 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
     eps = float(jnp.finfo(J.dtype).eps)
     norms = xp.linalg.norm(J, axis=0)
     column = xp.where(norms == 0, 1, norms)
-    _, s, Vt = xp.linalg.svd(triangle(J / column[None, :]))
+    _, s, Vt = svd(triangle(J / column[None, :]))
     seen = s > 10 * J.shape[0] * eps * s[0]
     T = Vt.T * xp.where(seen, 1 / xp.where(seen, s, 1), 0)[None, :]  # coordinates in which J^T J = 1
     J = J @ (T / column[:, None])
@@ -146,7 +146,7 @@ def _inverse_curvature(J, bend, T, seen):
     xp, p = namespace_of(J), len(seen)
     if bend is None:
         return xp.eye(p, dtype=J.dtype), xp.zeros(p, bool)
-    h, U = xp.linalg.eigh(J.T @ (bend[:, None] * J) + xp.diag(xp.where(seen, 0, 1).astype(J.dtype)))
+    h, U = eigh(J.T @ (bend[:, None] * J) + xp.diag(xp.where(seen, 0, 1).astype(J.dtype)))
     flat = h <= FLAT
     share = xp.abs(T @ U) / xp.max(xp.abs(T), initial=1e-300)
     inverse = xp.where(flat, 0, 1 / xp.where(flat, 1, h))
@@ -171,7 +171,7 @@ def _clusters(J, r, cut, variance, x, prior):
     for rows, r_rows in zip(*(in_segments(y, *cut) for y in (J, r)), strict=True):
         A = A + xp.einsum("glp,glq->gpq", rows, rows)
         score = score + xp.einsum("glp,gl->gp", rows, r_rows)
-    share, U = xp.linalg.eigh(A)
+    share, U = eigh(A)
     alone = share > ALONE
     score = xp.where(alone, 0, xp.einsum("gpk,gp->gk", U, score) / xp.sqrt(xp.where(alone, 1, 1 - share)))
     stand_in = xp.where(alone, share, 0)

@@ -47,8 +47,35 @@ def with_entry(x, i, value):
     return x
 
 
+def svd(A):
+    """U, s and V^T of A = U diag(s) V^T, NaN where there are none, as of a matrix with NaN; NumPy would raise.
+
+    >>> [x.shape for x in svd(np.full((2, 3), np.nan))]
+    [(2, 2), (2,), (3, 3)]
+    """
+    m, n = A.shape[-2:]
+    return _or_nan(namespace_of(A).linalg.svd, A, [(m, m), (min(m, n),), (n, n)])
+
+
+def eigh(A):
+    """Eigenvalues and eigenvectors of symmetric matrices (..., n, n), NaN as in `svd`.
+
+    >>> [x.shape for x in eigh(np.full((4, 2, 2), np.nan))]
+    [(4, 2), (4, 2, 2)]
+    """
+    return _or_nan(namespace_of(A).linalg.eigh, A, [A.shape[-1:], A.shape[-2:]])
+
+
+def _or_nan(f, A, shapes):
+    """f(A), or arrays of NaN, behind the leading axes of A, where NumPy raises."""
+    try:
+        return f(A)
+    except np.linalg.LinAlgError:
+        return [np.full((*A.shape[:-2], *shape), np.nan, A.dtype) for shape in shapes]
+
+
 def solve_upper(T, y):
-    """x of T x = y, T (..., n, n) upper triangular, y (..., n).
+    """x of T x = y, T (..., n, n) upper triangular with a diagonal that is not 0, y (..., n).
 
     >>> solve_upper(np.array([[1.0, 2.0], [0.0, 4.0]]), np.array([4.0, 4.0]))
     array([2., 1.])
