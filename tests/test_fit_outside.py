@@ -39,7 +39,6 @@ KINDS = {
     "few segments": {"segments": 2, "transforms": TWO},
 }
 
-
 OFFSETS = {"b": jnp.array([0.1, 0.0, -0.3]), "c": jnp.zeros((3, 1))}
 RECORDS = jnp.stack([MEASURED + 0.1, MEASURED - 0.02 * T, MEASURED - 0.3]).at[1, 5].set(jnp.nan)
 PRESENT = {"y": jnp.isfinite(RECORDS), "few": jnp.array([1.0, 0.5, 2.0])}
@@ -189,5 +188,5 @@ def test_a_trial_that_blows_up_is_taken_back(size):
 
 
 def test_progress_is_shown(capsys):
-    hhtjax.fit(partial(lambda p: p * T - MEASURED), 1.0, progress=True)
+    hhtjax.fit(lambda p: p * T - MEASURED, 1.0, progress=True)
     assert "converged" in capsys.readouterr().err

@@ -22,7 +22,7 @@ from hhtjax.identification.gauss_newton import Dense, DenseTrial, dense_trial
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.parts import Coordinates, dense_parts, first, longest_steps, record_parts
-from hhtjax.identification.problem import dense_solution, records_solution, result_of, solve
+from hhtjax.identification.problem import dense_solution, limits_of, records_solution, result_of, solve
 from hhtjax.identification.progress import BAD_START
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.runs.freezing import chooses_steps
@@ -151,11 +151,9 @@ def solve_outside(residuals, options, params0, data):
             return _see(residuals, options, x, params0, data)
 
     problem = Outside(see) if w.ndim == 1 else OutsideRecords(see, kind.p, len(w))
-    tolerance = np.maximum(np.asarray(data.tolerance, x0.dtype), 10 * np.finfo(x0.dtype).eps)
-    longest = longest_steps(options.transforms, jax.tree.leaves(params0))
-    longest = np.concatenate([longest, np.full(x0.size - kind.p, np.inf)])
+    longest = longest_steps(options.transforms, jax.tree.leaves(params0), x0.size - kind.p)
     with np.errstate(all="ignore"):
-        limits = tolerance, options.max_iterations, options.progress
+        limits = limits_of(options, data, x0)
         best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
         found, kept = _solution(best, (history, iterations, code.astype(np.int32), None), kind, w, options.segments)
         if code == BAD_START:

@@ -68,10 +68,10 @@ class Coordinates:
         return [pair.mean for pair in pairs], [pair.deviation for pair in pairs]
 
 
-def longest_steps(transforms, leaves):
-    """Of the vector x, within which a transform is about straight, (p,)."""
+def longest_steps(transforms, leaves, own=0):
+    """Of the vector x, within which a transform is about straight, (p + own,); own: how many unknowns of records."""
     steps = [np.full(np.size(x), T.longest_step) for T, x in zip(transforms, leaves, strict=True) if T is not tf.fixed]
-    return np.concatenate(steps)
+    return np.concatenate([*steps, np.full(own, np.inf)])
 
 
 class DenseParts(NamedTuple):

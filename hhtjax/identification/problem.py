@@ -15,7 +15,7 @@ from hhtjax.identification.gauss_newton import Dense, with_jacobian
 from hhtjax.identification.implicit import at_minimum
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.losses import Objective
-from hhtjax.identification.parts import Coordinates, Data, dense_parts, first, record_parts
+from hhtjax.identification.parts import Coordinates, Data, dense_parts, first, longest_steps, record_parts
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.rounds import in_rounds
 from hhtjax.identification.sandwich import LEAST, count_segments, in_time, uncertainty, used_up, variance_inflation
@@ -51,13 +51,17 @@ class _Solved(NamedTuple):
 def solve(residuals, options: Options, params0, data: Data) -> FitResult:
     """The fit, with what it says about itself as data."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
-    tolerance = jnp.asarray(data.tolerance, coordinates.x0.dtype)
-    tolerance = jnp.maximum(tolerance, 10 * float(jnp.finfo(tolerance.dtype).eps))
-    limits = tolerance, options.max_iterations, options.progress
+    limits = limits_of(options, data, coordinates.x0)
     branch = _solve_dense if data.records is None else _solve_records
     found = branch(residuals, options, coordinates, data, limits)
     params, slope = freeze(coordinates.params(found.x)), coordinates.slope(found.x)
     return result_of(options, data, found, params, slope)
+
+
+def limits_of(options, data, x):
+    """The tolerance, at least 10 roundings of numbers like x; how many iterations at most; whether to show them."""
+    xp, least = namespace_of(x), 10 * float(jnp.finfo(x.dtype).eps)
+    return xp.maximum(xp.asarray(data.tolerance, x.dtype), least), options.max_iterations, options.progress
 
 
 def result_of(options, data, found, params, slope):
@@ -119,7 +123,7 @@ def _solve_records(residuals, options, coordinates, data, limits):
     problem = problem_of(given, w, data.records, parts.f)
     frozen = partial(_with_frozen_steps, problem) if chooses_steps(call, given, *one) else None
     x0 = jnp.concatenate([coordinates.x0, own0.ravel()])
-    longest = np.concatenate([coordinates.longest, np.full(own0.size, np.inf)])
+    longest = longest_steps(options.transforms, coordinates.leaves, own0.size)
     find = partial(_minimise, problem, frozen, x0, longest, options.optimizer, limits)
     x, read, ended = at_minimum(find, problem_of, p, given, w, data.records)
     cost, residual = problem.objective.cost(read[0].ravel()), parts.unravel(read[0])

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from hhtjax.description.presentation import overwrite, shown
-from hhtjax.numerics.either import with_entry
+from hhtjax.numerics.either import namespace_of, with_entry
 
 RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE, UNSETTLED = range(9)
 CONVERGED = COST, STEP, GRADIENT
@@ -55,7 +55,7 @@ def show(iteration, cost, step, code):
         what = what if code == RUNNING else REASONS[int(code)]
         overwrite(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", last=code != RUNNING)
 
-    if isinstance(cost, np.ndarray):
+    if namespace_of(cost) is np:
         tell(iteration, cost, step, code)
     else:
         jax.debug.callback(tell, iteration, cost, step, code)
