@@ -206,7 +206,7 @@ TABLE = {
         *("jnp.linalg.solve(jnp.diag(jnp.stack([2 + x[0], 4.0])), jnp.stack([x[0], 0.5]))",),
         *("jax.scipy.sparse.linalg.cg(lambda v: (S + S.T) @ v, x)[0]", "jnp.linalg.cholesky(S + S.T)", "lax.stop_gradient(x) * x"),
         *("staged(lambda x, y: (x, jnp.sin(x - y), y))(x, y)", "staged(lambda x: structural(np.eye(3)) @ x)(x)", "lax.optimization_barrier(x)"),
-        "jnp.where(largest_in_batch(t > s), x, y)",
+        *("jnp.where(largest_in_batch(t > s), x, y)", "stumpff(2, s)", "jnp.stack(stumpff(3, x * x))", "stumpff(2, z * z)[1] * z"),
         *("structural(np.array([0.0, 1.0, 0.0])) * x + y", "jax.pure_callback(np.sin, x, x, vmap_method='sequential')"),
         *("jax.nn.one_hot(i, 3) @ x", "lax.convert_element_type(structural(np.zeros(3)), float) - x", "jnp.vectorize(lambda a: a * s)(x)"),
     ],

@@ -6,16 +6,16 @@ With t = sqrt(x), c1 = sin t / t and c2 = (1 - cos t) / t^2. Analytic in x; valu
 right at x = 0 too. A derivative takes c(n + 1) and c(n + 2) and nothing else: one pair of series, as the value does.
 """
 
-from functools import partial, reduce
+from functools import reduce
 from math import factorial
 
-import jax
 import jax.numpy as jnp
+
+from hhtjax.xla import Family
 
 NEAR, TERMS = 4, 11  # x below which two neighbours are series, of so many terms; the recursion up cancels towards 0
 
 
-@jax.jit  # traced once
 def coefficients(x):
     """c1, ..., c5 at a scalar x >= 0.
 
@@ -25,11 +25,10 @@ def coefficients(x):
     return stumpff(5, x)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def stumpff(n, x):
+def members(n, x):
     """c1, ..., cn: power series and recursion down for x < NEAR, definitions and recursion up beyond.
 
-    >>> len(stumpff(7, jnp.array(1.0)))
+    >>> len(members(7, jnp.array(1.0)))
     7
     """
     small = x < NEAR
@@ -45,10 +44,10 @@ def stumpff(n, x):
     return tuple(jnp.where(small, a, b) for a, b in zip(reversed(near), far, strict=True))
 
 
-@stumpff.defjvp
-def _(n, primals, tangents):
-    c1, *c = stumpff(n + 2, *primals)
-    half = tangents[0] / 2
+def rule(stumpff, n, x, dx):
+    """Values and tangents."""
+    c1, *c = stumpff(n + 2, x)
+    half = dx / 2
     return (c1, *c[: n - 1]), tuple((k * c[k] - c[k - 1]) * half for k in range(1, n + 1))
 
 
@@ -60,3 +59,6 @@ def series(k, y):
     """
     first, *rest = [(-1) ** j / factorial(2 * j + k) for j in reversed(range(TERMS))]
     return reduce(lambda value, c: value * y + c, rest, jnp.full_like(y, first))
+
+
+stumpff = Family(members, rule)

@@ -39,7 +39,7 @@ True
 The door
 --------
 
-The rest of the library knows 24 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 25 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -57,6 +57,7 @@ The rest of the library knows 24 functions of this room, and works as well on pl
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
+    Family(members, rule)     functions of a number with derivatives in their family, one operation
     on_host(f, like, *args)   f(*args), an array like `like`, by a function of NumPy arrays
     together(f, x)            f(x), of which a batch has all values or none
     explain(f, *args)         what became of the loops of a program
@@ -91,6 +92,7 @@ all operations are compared by `python tests/programs.py`, and `tests/test_kerne
 """
 
 from hhtjax.xla.explanation import Explanation, calls, explain
+from hhtjax.xla.families import Family
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, part, staged, structural
@@ -110,6 +112,7 @@ __all__ = [
     "RANGE",
     "WIDE",
     "Explanation",
+    "Family",
     "Listing",
     "NotListed",
     "Programs",
