@@ -24,7 +24,7 @@ import numpy as np
 from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_real
 from hhtjax.numerics.stumpff import coefficients
-from hhtjax.xla import structural
+from hhtjax.xla import Bilinear, structural
 
 __all__ = [
     "cross",
@@ -229,13 +229,16 @@ def product(A, B) -> jax.Array:
     return _product(_real("product", "A", A, (3, 3)), _real("product", "B", B, (3, 3)))
 
 
-@jax.jit  # and so traced once, however often it is called: rotations are most of what a step of theirs takes to trace
-def _product(A, B):
-    return jnp.sum(A[:, :, None] * B[None], axis=1)
+# rotations are most of what a step of theirs takes to trace
+_product = Bilinear(
+    lambda A, B: jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2),
+    lambda C, B: _product(C, jnp.matrix_transpose(B)),
+    lambda A, C: _product(jnp.matrix_transpose(A), C),
+)
 
 
 def cross(x, y) -> jax.Array:
-    """x cross y, for (3,) each: one sum of products, without the gathers of jnp.cross.
+    """x cross y, for (3,) each; of scalars, which XLA fuses better than the gathers of jnp.cross.
 
     Args: x, y: (3,).
     Returns: (3,).
@@ -247,9 +250,12 @@ def cross(x, y) -> jax.Array:
     return _cross(_real("cross", "x", x, (3,)), _real("cross", "y", y, (3,)))
 
 
-@jax.jit
-def _cross(x, y):
-    return jnp.sum(x[:, None, None] * structural(GENERATORS.astype(x.dtype)) * y[None, None, :], axis=(0, 2))
+def _of_scalars(x, y):
+    (a, b, c), (d, e, f) = ([z[..., i] for i in range(3)] for z in (x, y))
+    return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=-1)
+
+
+_cross = Bilinear(_of_scalars, lambda z, y: _cross(y, z), lambda x, z: _cross(z, x))
 
 
 def inverse_coefficient(x):

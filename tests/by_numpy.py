@@ -153,7 +153,7 @@ CALLS = {
     **{"jit": _called("jaxpr"), "closed_call": _called("call_jaxpr"), "remat2": _called("jaxpr")},
     "hhtjax_in_turn": lambda self, params, asked, *values: self(params["closed"], *values),
     **{"custom_jvp_call": _called("call_jaxpr"), "custom_vjp_call": _called("call_jaxpr")},
-    "hhtjax_family": _called("jaxpr"),
+    **dict.fromkeys(("hhtjax_family", "hhtjax_bilinear"), _called("jaxpr")),
 }
 
 

@@ -16,7 +16,7 @@ from jax import lax
 from hhtjax.numerics import panels
 from hhtjax.numerics.sparse_matrix import Sparse
 from hhtjax.numerics.superlu import factorize_sparse
-from hhtjax.xla import choose, structural
+from hhtjax.xla import Bilinear, choose, structural
 
 UNROLLED = 8
 LOOPED = 16
@@ -32,9 +32,11 @@ def matvec(A, x) -> Any:
     return _by_columns(A, x)
 
 
-@jax.jit  # traced once for each size
-def _by_columns(A, x):
-    return jnp.sum(A * x[None, :], axis=1)
+_by_columns = Bilinear(
+    lambda A, x: sum(A[..., j] * x[..., None, j] for j in range(1, A.shape[-1])) + A[..., 0] * x[..., None, 0],
+    lambda b, x: b[..., :, None] * x[..., None, :],
+    lambda A, b: _by_columns(jnp.matrix_transpose(A), b),
+)
 
 
 def diagonal(A):

@@ -39,7 +39,7 @@ True
 The door
 --------
 
-The rest of the library knows 25 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 26 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -57,7 +57,8 @@ The rest of the library knows 25 functions of this room, and works as well on pl
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
-    Family(members, rule)     functions of a number with derivatives in their family, one operation
+    Bilinear(f, first, second)  a product as one operation, with its transposes
+    Family(members, rule)     functions of a number as one operation, with derivatives in their family
     on_host(f, like, *args)   f(*args), an array like `like`, by a function of NumPy arrays
     together(f, x)            f(x), of which a batch has all values or none
     explain(f, *args)         what became of the loops of a program
@@ -91,6 +92,7 @@ NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule w
 all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
 """
 
+from hhtjax.xla.bilinear import Bilinear
 from hhtjax.xla.explanation import Explanation, calls, explain
 from hhtjax.xla.families import Family
 from hhtjax.xla.gate import or_plain, plain
@@ -111,6 +113,7 @@ __all__ = [
     "QUICK",
     "RANGE",
     "WIDE",
+    "Bilinear",
     "Explanation",
     "Family",
     "Listing",

@@ -268,5 +268,5 @@ RULES = {
     "concatenate": _concatenate,
     "reduce_sum": _reduce_sum,
     "dot_general": _dot_general,
-    "jit": _call,
+    **dict.fromkeys(("jit", "hhtjax_bilinear"), _call),
 }

@@ -107,6 +107,7 @@ UNDERSTOOD = {
     "hhtjax_in_turn": _of_any("closed", "at_once", "number"),
     "hhtjax_structural": {},
     "hhtjax_family": _of_any("n", "family", "jaxpr"),
+    "hhtjax_bilinear": _of_any("product", "jaxpr"),
     "hhtjax_largest_in_batch": _of_any("kept"),
 }
 

@@ -25,6 +25,7 @@ INLINED = {  # a function called: the parameter that holds it
     **{"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr"},
     **{"remat2": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"},
     **{"custom_vjp_call_jaxpr": "fun_jaxpr", "hhtjax_family": "jaxpr"},
+    "hhtjax_bilinear": "jaxpr",
 }
 
 

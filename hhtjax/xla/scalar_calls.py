@@ -174,6 +174,7 @@ CALLS = {
     "cond": _cond,
     "hhtjax_in_turn": _in_turn,
     "jit": _call,
+    "hhtjax_bilinear": lambda run, eqn, x, y: run(eqn.params["jaxpr"], [x, y]),
     "while": _while_loop,
     "custom_linear_solve": _custom_linear_solve,
     "custom_jvp_call": _custom_jvp_call,
