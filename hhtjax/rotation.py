@@ -229,12 +229,9 @@ def product(A, B) -> jax.Array:
     return _product(_real("product", "A", A, (3, 3)), _real("product", "B", B, (3, 3)))
 
 
-# rotations are most of what a step of theirs takes to trace
-_product = Bilinear(
-    lambda A, B: jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2),
-    lambda C, B: _product(C, jnp.matrix_transpose(B)),
-    lambda A, C: _product(jnp.matrix_transpose(A), C),
-)
+@jax.jit  # and so traced once, however often it is called: rotations are most of what a step of theirs takes to trace
+def _product(A, B):
+    return jnp.sum(A[:, :, None] * B[None], axis=1)
 
 
 def cross(x, y) -> jax.Array:

@@ -14,7 +14,9 @@ from operations_table import ARGUMENTS, TABLE
 from program_writer import HEADER, usual_promotion
 from zoo import each
 
+from hhtjax.numerics.elimination import matvec
 from hhtjax.numerics.stumpff import stumpff
+from hhtjax.rotation import cross
 from hhtjax.xla import gate, linear_maps, parameters, scalar_calls, scalar_rules
 from hhtjax.xla.kernels import largest_in_batch, staged, structural
 from hhtjax.xla.turns import in_turn
@@ -30,7 +32,13 @@ SIGNS_OF_XLA = ("z + 0.0", "0.0 + z", "z - -0.0", "fill_value=-0.0")
 
 def scope():
     known = {"lax": lax, "jnp": jnp, "np": np, "jax": jax, "staged": staged, "structural": structural}
-    known |= {"largest_in_batch": largest_in_batch, "in_turn": in_turn, "stumpff": stumpff}
+    known |= {
+        "largest_in_batch": largest_in_batch,
+        "in_turn": in_turn,
+        "stumpff": stumpff,
+        "cross": cross,
+        "matvec": matvec,
+    }
     exec(HEADER, known)
     return known
 

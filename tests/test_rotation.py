@@ -223,3 +223,20 @@ def test_bad_rate_and_tolerance_are_named():
         tangent_rate(np.zeros(3), np.zeros(4))
     with pytest.raises(ValueError, match=r"^is_rotation: `tolerance` must not be negative; received -1"):
         is_rotation(EYE, -1.0)
+
+
+def test_products_inside_shard_map():
+    """Where JAX watches which arrays differ among devices."""
+    mesh = jax.make_mesh((1,), ("i",), axis_types=(jax.sharding.AxisType.Auto,))
+    spread, shared = jax.sharding.PartitionSpec("i"), jax.sharding.PartitionSpec()
+    x, y = jnp.arange(6.0).reshape(2, 3), jnp.array([1.0, -2.0, 0.5])
+
+    def turned(x, y):
+        return jax.vmap(lambda x: exp(x) @ rotation.cross(x, y))(x)
+
+    def total(f):
+        return jax.grad(lambda x, y: jnp.sum(f(x, y) ** 2), argnums=(0, 1))(x, y)
+
+    inside = total(jax.shard_map(turned, mesh=mesh, in_specs=(spread, shared), out_specs=spread))
+    for found, expected in zip(inside, total(turned), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)

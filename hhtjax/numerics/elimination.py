@@ -8,7 +8,6 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax

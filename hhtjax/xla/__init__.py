@@ -57,8 +57,8 @@ The rest of the library knows 26 functions of this room, and works as well on pl
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
-    Bilinear(f, first, second)  a product as one operation, with its transposes
-    Family(members, rule)     functions of a number as one operation, with derivatives in their family
+    Bilinear(f, ...)          a product as one operation, with its transposes
+    Family(members, rule)     functions of a number as one operation, with derivatives among them
     on_host(f, like, *args)   f(*args), an array like `like`, by a function of NumPy arrays
     together(f, x)            f(x), of which a batch has all values or none
     explain(f, *args)         what became of the loops of a program
@@ -92,14 +92,13 @@ NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule w
 all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
 """
 
-from hhtjax.xla.bilinear import Bilinear
 from hhtjax.xla.explanation import Explanation, calls, explain
-from hhtjax.xla.families import Family
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, part, staged, structural
 from hhtjax.xla.linear_maps import linear_map
 from hhtjax.xla.listing import Listing, Scalar
+from hhtjax.xla.operations import Bilinear, Family
 from hhtjax.xla.programs import QUICK, WIDE, Programs
 from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.rows import block_written, row_written

@@ -170,10 +170,20 @@ def _custom_jvp_call(run, eqn, *values):
     return back_results(call(*flat(values)))
 
 
+def _family(run, eqn, x):
+    """Of each element."""
+    n, family, dtype = eqn.params["n"], eqn.params["family"], eqn.outvars[0].aval.dtype
+    if not is_in_pieces(x) or not x.size:
+        return None
+    columns = zip(*(family(n, as_scalar(y, dtype)) for y in x.flat), strict=True)
+    return [arranged(list(column), x.shape) for column in columns]
+
+
 CALLS = {
     "cond": _cond,
     "hhtjax_in_turn": _in_turn,
     "jit": _call,
+    "hhtjax_family": _family,
     "hhtjax_bilinear": lambda run, eqn, x, y: run(eqn.params["jaxpr"], [x, y]),
     "while": _while_loop,
     "custom_linear_solve": _custom_linear_solve,

@@ -14,7 +14,7 @@ from jax import lax
 
 from hhtjax.xla.arithmetic import LAX, compute, recorder_of
 from hhtjax.xla.parameters import ELEMENTWISE
-from hhtjax.xla.pieces import ZEROS, arranged, as_scalar, each, is_known, is_structural, pieces, unmarked
+from hhtjax.xla.pieces import ZEROS, arranged, each, is_known, is_structural, pieces, unmarked
 
 # Rules: (operation, values) -> the values of the results, or None for whole arrays.
 
@@ -227,12 +227,6 @@ def _structural(eqn, x):
     return [each(lambda x: ZEROS.get(dtype, x) if is_known(x) and x == 0 else x, x)]
 
 
-def _family(eqn, x):
-    n, family, dtype = eqn.params["n"], eqn.params["family"], eqn.outvars[0].aval.dtype
-    columns = zip(*(family(n, as_scalar(y, dtype)) for y in x.flat), strict=True)
-    return [arranged(list(column), x.shape) for column in columns]
-
-
 def _moved(*moves):
     """Of what moves elements to places that are known: asked where it takes the numbers of the elements.
 
@@ -275,7 +269,6 @@ RULES = {
     "bitcast_convert_type": lambda eqn, x: _elementwise(eqn, x) if eqn.outvars[0].aval.shape == x.shape else None,
     **{"broadcast_in_dim": _broadcast_in_dim, "concatenate": _concatenate, "dot_general": _dot_general, "iota": _iota},
     **{"reshape": _reshape, "squeeze": _squeeze, "rev": _rev, "slice": _slice, "hhtjax_structural": _structural},
-    "hhtjax_family": _family,
     **{"split": _split, "stack": _stack, "transpose": _transpose, "unstack": _unstack},
     **{
         "gather": _moved(0),
