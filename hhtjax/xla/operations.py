@@ -1,8 +1,8 @@
 """Functions that stay one operation, whatever becomes of them.
 
 Autodiff writes a function out anew wherever it differentiates it, and once more in all that it keeps; vmap writes it
-again. Of an operation they ask for nothing but its rule, and what it computes is written when the program is: of a
-chain of bodies a quarter of all that JAX traced were the functions of finite rotations and cross products.
+again. Of an operation they ask for nothing but its rule, and what it computes is written when the program is. Of all
+that JAX traced for the gradient of a chain of bodies, a quarter had been finite rotations and cross products.
 """
 
 from collections.abc import Callable
