@@ -7,12 +7,13 @@ that JAX traced for the gradient of a chain of bodies, a quarter had been finite
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
+from jax.sharding import AxisType
 
 from hhtjax.xla.gate import is_on
 
@@ -39,7 +40,7 @@ class Family:
         x = jnp.asarray(x)
         if not _is_one(x):
             return self.plain(n, x)
-        return tuple(family_p.bind(x, n=n, family=self, jaxpr=_traced(self.members, x.dtype, x.shape, given=(n,))))
+        return tuple(family_p.bind(x, n=n, family=self, jaxpr=self.plain.trace(n, x).jaxpr))
 
     @cached_property
     def plain(self):
@@ -73,7 +74,7 @@ class Bilinear:
         x, y = (jnp.asarray(z, dtype) for z in (x, y))
         if not _is_one(x, y):
             return self.plain(x, y)
-        return bilinear_p.bind(x, y, product=self, jaxpr=_traced(self.f, dtype, x.shape, y.shape))
+        return bilinear_p.bind(x, y, product=self, jaxpr=self.plain.trace(x, y).jaxpr)
 
     @cached_property
     def plain(self):
@@ -82,14 +83,10 @@ class Bilinear:
 
 
 def _is_one(*arrays):
-    """Not inside a shard_map that watches what differs among devices: each operation of JAX has a rule for that."""
-    return is_on() and all(jax.typeof(x).manual_axis_type.empty for x in arrays)
-
-
-@cache
-def _traced(f, dtype, *shapes, given=()):
-    """What f computes, of arrays of these shapes."""
-    return jax.make_jaxpr(partial(f, *given))(*(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes))
+    """Not where types say how arrays are spread over devices: each operation of JAX has a rule for that."""
+    types = [jax.typeof(x) for x in arrays] if is_on() else []
+    spread = [not x.manual_axis_type.empty or AxisType.Explicit in x.sharding.mesh.axis_types for x in types]
+    return is_on() and not any(spread)
 
 
 def _jvp_of_family(x, dx, n, family, jaxpr):
