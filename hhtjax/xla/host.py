@@ -14,6 +14,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
 from hhtjax.xla.gate import is_on
+from hhtjax.xla.transforms import batch_size
 
 
 def on_host(f, like, *args):
@@ -56,7 +57,7 @@ def _lower(ctx, *args, **params):
 
 
 def _batch(args, axes, f, shape, dtype):
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+    size = batch_size(args, axes)
     args = [x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
     return host_p.bind(*args, f=f, shape=(size, *shape), dtype=dtype), 0
 

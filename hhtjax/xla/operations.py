@@ -16,6 +16,7 @@ from jax.interpreters import ad, batching, mlir
 from jax.sharding import AxisType
 
 from hhtjax.xla.gate import is_on
+from hhtjax.xla.transforms import batch_size, in_front
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +85,11 @@ class Bilinear:
 
 def _is_one(*arrays):
     """Not where types say how arrays are spread over devices: each operation of JAX has a rule for that."""
-    types = [jax.typeof(x) for x in arrays] if is_on() else []
-    spread = [not x.manual_axis_type.empty or AxisType.Explicit in x.sharding.mesh.axis_types for x in types]
-    return is_on() and not any(spread)
+    return is_on() and not any(map(_is_spread, map(jax.typeof, arrays)))
+
+
+def _is_spread(kind):
+    return not kind.manual_axis_type.empty or AxisType.Explicit in kind.sharding.mesh.axis_types
 
 
 def _jvp_of_family(x, dx, n, family, jaxpr):
@@ -98,12 +101,8 @@ def _batch_of_families(x, axes, n, family, jaxpr):
 
 
 def _batch_of_products(values, axes, product, jaxpr):
-    number = next(x.shape[axis] for x, axis in zip(values, axes, strict=True) if axis is not None)
-    x, y = (
-        jnp.broadcast_to(x, (number, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(values, axes, strict=True)
-    )
-    return product(x, y), 0
+    size = batch_size(values, axes)
+    return product(*(in_front(x, axis, size) for x, axis in zip(values, axes, strict=True))), 0
 
 
 family_p = Primitive("hhtjax_family")

@@ -24,8 +24,7 @@ WRITTEN_OUT = 1000  # operations more than those of a loop
 INLINED = {  # a function called: the parameter that holds it
     **{"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr"},
     **{"remat2": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"},
-    **{"custom_vjp_call_jaxpr": "fun_jaxpr", "hhtjax_family": "jaxpr"},
-    "hhtjax_bilinear": "jaxpr",
+    **{"custom_vjp_call_jaxpr": "fun_jaxpr", "hhtjax_family": "jaxpr", "hhtjax_bilinear": "jaxpr"},
 }
 
 

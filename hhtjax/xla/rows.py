@@ -10,6 +10,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from hhtjax.xla.transforms import batch_size, in_front
+
 
 def row_written(array, row, number):
     """The array (K, ...) with the row (...) in the place of that of a number, 0 to K - 1.
@@ -121,11 +123,8 @@ def _transpose(cotangent, array, block, number, *, members, axis):
 
 
 def _batch(args, axes, *, members, axis):
-    size = next(x.shape[a] for x, a in zip(args, axes, strict=True) if a is not None)
-    array, block, number = (
-        jnp.broadcast_to(x, (size, *jnp.shape(x))) if a is None else jnp.moveaxis(x, a, 0)
-        for x, a in zip(args, axes, strict=True)
-    )
+    size = batch_size(args, axes)
+    array, block, number = (in_front(x, a, size) for x, a in zip(args, axes, strict=True))
     if axes[2] is None and not jnp.ndim(args[2]):
         number = args[2]
     elif number.ndim <= members:  # shared by members of other batches

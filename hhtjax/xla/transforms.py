@@ -1,5 +1,6 @@
 """What of JAX's transformations is at work where a function runs."""
 
+import jax.numpy as jnp
 from jax.extend.core import Primitive
 
 KNOWN = "EvalTrace", "DynamicJaxprTrace"  # without any, and inside a jit
@@ -25,6 +26,16 @@ def is_untouched():
     [True, True, False, False, True]
     """
     return type(_here.bind()).__name__ in KNOWN
+
+
+def batch_size(args, axes):
+    """Number of the members of a batch. axes: of the arguments, None where all members share one."""
+    return next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+
+
+def in_front(x, axis, size):
+    """An argument with the axis of the members in front, repeated where they share it."""
+    return jnp.broadcast_to(x, (size, *jnp.shape(x))) if axis is None else jnp.moveaxis(x, axis, 0)
 
 
 def is_in_batch():

@@ -14,6 +14,7 @@ from jax.interpreters import partial_eval as pe
 from hhtjax.xla.gate import is_on
 from hhtjax.xla.interpreter import alone, evaluate
 from hhtjax.xla.rows import place, write_p
+from hhtjax.xla.transforms import batch_size
 from hhtjax.xla.two_ways import no_tangent
 
 
@@ -116,7 +117,7 @@ def _one_by_one(closed, mapped, number, *args):
 
 def _batch(args, axes, *, closed, at_once, number):
     """The carry differs between members, whatever else does."""
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+    size = batch_size(args, axes)
     mapped = [i < number or axis is not None for i, axis in enumerate(axes[1:])]
     asked, *args = (x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True))
     args = [

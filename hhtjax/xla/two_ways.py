@@ -17,6 +17,8 @@ from jax.extend.core import Primitive, Var
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
+from hhtjax.xla.transforms import batch_size, in_front
+
 
 class TwoWays(NamedTuple):
     """A function of a list of arrays, x, and its derivative for a list of floating tangents dx, one or more, of some of
@@ -159,9 +161,8 @@ def _transpose(cotangents, *args, ways, count, backwards):
 
 def _batch(primitive, args, axes, ways, count, **params):
     """Every tangent gets the batch, and all values, if part of x has it."""
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
-    pairs = zip(args[count:], axes[count:], strict=True)
-    given = [jnp.broadcast_to(x, (size, *jnp.shape(x))) if a is None else jnp.moveaxis(x, a, 0) for x, a in pairs]
+    size = batch_size(args, axes)
+    given = [in_front(x, axis, size) for x, axis in zip(args[count:], axes[count:], strict=True)]
     ways = ways.batched(list(axes[:count]))
     found = primitive.bind(*args[:count], *given, ways=ways, count=count, **params)
     alone = ways.number if primitive is both_p and all(axis is None for axis in axes[:count]) else 0
