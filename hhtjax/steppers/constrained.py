@@ -20,7 +20,13 @@ from jax import lax
 from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.stepper import State, join_info
-from hhtjax.systems.constraints import acceleration_and_multipliers, dependent_row, jacobian, reaction, violation
+from hhtjax.systems.constraints import (
+    acceleration_and_multipliers,
+    dependent_row,
+    jacobian,
+    violation,
+    violation_and_reaction,
+)
 from hhtjax.xla import part
 
 
@@ -59,8 +65,8 @@ def equations(method, system, params, dt, s):
 
     def r(s):
         force = system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
-        position, rate = violation(system, s.q, s.v, s.t, params)
-        rows = [force - reaction(system, s.q, s.t, params, s.L), position / (c.beta * dt**2)]
+        position, rate, pull = violation_and_reaction(system, s.q, s.v, s.t, params, s.L)
+        rows = [force - pull, position / (c.beta * dt**2)]
         return jnp.concatenate(rows + [rate / (c.gamma * dt)] * ggl)
 
     def shift(eta):

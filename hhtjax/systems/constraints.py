@@ -42,6 +42,13 @@ def reaction(system, q, t, params, L):
     return pull_back(system, q, pull(L)[0])
 
 
+def violation_and_reaction(system, q, v, t, params, L):
+    """Phi, dPhi/dt and B^T L, from one linearisation of the constraints."""
+    Phi, tangent = jax.linearize(lambda q, t: system.constraint(q, t, params), q, t)
+    gradient, _ = jax.linear_transpose(tangent, q, t)(L)
+    return Phi, tangent(system.rate(q, v), jnp.ones_like(t)), pull_back(system, q, gradient)
+
+
 def pull_back(system, q, gradient):
     """The force (n,) of a gradient with respect to q: the same, and the material moment for rotations."""
     zero = jnp.zeros(system.size, q.dtype)
