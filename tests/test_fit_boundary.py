@@ -80,6 +80,11 @@ def rooted(p):
             ValueError,
             r"received a finite residual with a derivative that is not finite: roots, .* max\(x, 1e-12\) has\.$",
         ),
+        (
+            lambda: hhtjax.fit(lambda p: 1e200 * p * jnp.ones(4), 2.0, covariance=False),
+            ValueError,
+            r"`residuals` must be finite at params0; received values up to 2e\+200, whose squares overflow; take other",
+        ),
     ],
 )
 def test_bad_input_is_named(call, error, message):

@@ -71,18 +71,38 @@ def bars(numbers):
     return table(["what", "bar", "here", "met"], lines)
 
 
-def first_call(numbers, before):
-    """A row for each scene and call, beside what it took at an earlier commit."""
+def first_calls(numbers, before):
+    """A row for each scene and call, beside what it took at an earlier commit, and what plain JAX takes."""
     then = {(r["scene"], r["call"]): r["cpu_time_s"]["total"] for r in before["rows"]}
     rows = []
     for r in numbers["rows"]:
-        total, again = r["cpu_time_s"]["total"], r["with_cache_cpu_time_s"]
-        earlier = then[r["scene"], r["call"].split(",")[0]]
-        times = {**r["cpu_time_s"], "before": earlier, "over before": total / earlier}
-        plain = r.get("obvious_cpu_time_s")  # of some
-        rows.append({**r, **times, "plain JAX": plain, "with a cache": again, "share": again / total})
-    columns = "scene", "call", "before", "total", "over before", "plain JAX", "tracing", "lowering", "compiling"
-    return rows_table(rows, {name: name for name in (*columns, "with a cache", "share")})
+        total, earlier = r["cpu_time_s"]["total"], then[r["scene"], r["call"].split(",")[0]]
+        row = {**r, **r["cpu_time_s"], "before": earlier, "over before": total / earlier}
+        row |= {"with a cache": r["with_cache_cpu_time_s"], "share": r["with_cache_cpu_time_s"] / total}
+        if (plain := r.get("obvious_cpu_time_s")) is not None:
+            share = r["obvious_with_cache_cpu_time_s"] / plain
+            row |= {"plain JAX": plain, "plain over before": plain / earlier, "plain's share": share}
+        rows.append(row)
+    return rows
+
+
+def halves(rows):
+    """How many first calls take half of before at most, and which do not though plain JAX does."""
+    rows = [r for r in rows if r["call"] != "gradient, QUICK"]
+    more = [r for r in rows if r["over before"] > 0.5]
+    bounded = [r for r in more if r.get("plain over before", 0) > 0.5]
+    left = ", ".join(f"{r['scene']} ({r['call']})" for r in more if r not in bounded) or "none"
+    return (
+        f"Half of before, or less: {len(rows) - len(more)} of {len(rows)}. Of the others plain JAX, too, takes more "
+        f"than half of before in {len(bounded)}; not in: {left}."
+    )
+
+
+def first_call(rows):
+    """The table of these."""
+    columns = "scene", "call", "before", "total", "over before", "plain JAX", "plain over before", "tracing"
+    columns = *columns, "lowering", "compiling", "with a cache", "share", "plain's share"
+    return rows_table(rows, {name: name for name in columns})
 
 
 def dense(rows):
@@ -124,6 +144,7 @@ def page(numbers):
     """The text of README.md."""
     c, batches, gradients = (numbers[part] for part in ("against_c", "batches", "gradients"))
     machine, before = numbers["machine"], json.loads((HERE / "first_call_before.json").read_text())
+    calls = first_calls(numbers["first_call"], before)
     differences = [
         r["q_minus_c_rad"] for r in c["single"] if r["method"] == PREDICTOR and r["q_minus_c_rad"] is not None
     ]
@@ -215,7 +236,8 @@ def page(numbers):
                 {"method": "method", "of": "compiled", "s": "compile_s", "over Kvaerno3's": "over_kvaerno3"},
             ),
             first_steps=numbers["first_call"]["num_steps"],
-            first_call=first_call(numbers["first_call"], before),
+            first_call=first_call(calls),
+            halves=halves(calls),
             before=before,
             cores=machine["cores"],
             busy=max(r["busy_processes"] for r in numbers["many_unknowns"]["dense"]),

@@ -273,7 +273,7 @@ def check_real(where, leaf):
 
 
 def first_bad(residual, weights):
-    """Words for the entries of a residual that are not finite, and not declared missing."""
+    """Words for what a sum of squares cannot have: entries not finite and not declared missing, or too large."""
     present = spread_weights("fit", weights, residual)
     values = [
         (path, np.where(np.asarray(w) == 0, 0, np.asarray(leaf)))
@@ -284,7 +284,14 @@ def first_bad(residual, weights):
     for path, x in values:
         if not np.all(np.isfinite(x)):
             index = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
-            return f"{x[index]} at residuals{jax.tree_util.keystr(path)}{list(index)} ({bad} of {total} entries)"
+            missing = "" if weights is not True else "; give missing samples the weight False"
+            where = f"residuals{jax.tree_util.keystr(path)}{list(index)}"
+            return f"{x[index]} at {where} ({bad} of {total} entries){missing}"
+    with np.errstate(over="ignore"):
+        squares = sum(np.sum(x**2) for _, x in values)
+    if not np.isfinite(squares):
+        largest = max(np.max(np.abs(x)) for _, x in values if x.size)
+        return f"values up to {largest:.3g}, whose squares overflow; take other units"
     return NO_SLOPE
 
 

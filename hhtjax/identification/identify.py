@@ -31,7 +31,7 @@ from hhtjax.identification.identifiability import warn_undetermined
 from hhtjax.identification.outside import is_outside, solve_outside
 from hhtjax.identification.parts import Data
 from hhtjax.identification.problem import solve
-from hhtjax.identification.progress import BAD_START, NO_INFLUENCE, NO_SLOPE
+from hhtjax.identification.progress import BAD_START, NO_INFLUENCE
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 from hhtjax.xla import or_plain
@@ -218,8 +218,7 @@ def _finished(caller, result, weights):
     code = int(result.code)
     if code == BAD_START:
         bad = first_bad(result.residual, weights)
-        missing = "" if weights is not True or bad == NO_SLOPE else "; give missing samples the weight False"
-        raise ValueError(f"{caller}: `residuals` must be finite at params0; received {bad}{missing}.")
+        raise ValueError(f"{caller}: `residuals` must be finite at params0; received {bad}.")
     if code == NO_INFLUENCE:
         raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")
     if result.uncertainty is not None:
