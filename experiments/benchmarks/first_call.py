@@ -92,7 +92,7 @@ def obvious_gradient(scene):
 def obvious_sweep(scene):
     """Of eight step sizes, each with as many steps as the smallest needs."""
     path, params, dt = path_of(scene, 2 * NUM_STEPS)
-    return jax.jit(jax.vmap(path, (None, 0)))(params, dt * jnp.linspace(0.5, 1.0, 8))
+    return jax.jit(jax.vmap(path, (None, 0)))(params, sizes(dt))
 
 
 def quick(scene):
@@ -112,11 +112,15 @@ def fit(scene):
     return hhtjax.fit(residuals, params[name], max_iterations=2).params
 
 
+def sizes(dt):
+    """Of the steps in a sweep."""
+    return dt * jnp.linspace(0.5, 1.0, 8)
+
+
 def sweep(scene):
     """Of eight step sizes."""
     (system, params, q0, v0), dt, stepper = SCENES[scene]()
-    dts = dt * jnp.linspace(0.5, 1.0, 8)
-    runs = hhtjax.sweep(system, stepper, q0, v0, params, dts=dts, duration=NUM_STEPS * dt, num_samples=10)
+    runs = hhtjax.sweep(system, stepper, q0, v0, params, dts=sizes(dt), duration=NUM_STEPS * dt, num_samples=10)
     runs.check()
     return runs.q
 

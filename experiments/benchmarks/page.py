@@ -71,7 +71,7 @@ def bars(numbers):
     return table(["what", "bar", "here", "met"], lines)
 
 
-def first_calls(numbers, before):
+def first_call_rows(numbers, before):
     """A row for each scene and call, beside what it took at an earlier commit, and what plain JAX takes."""
     then = {(r["scene"], r["call"]): r["cpu_time_s"]["total"] for r in before["rows"]}
     rows = []
@@ -144,7 +144,7 @@ def page(numbers):
     """The text of README.md."""
     c, batches, gradients = (numbers[part] for part in ("against_c", "batches", "gradients"))
     machine, before = numbers["machine"], json.loads((HERE / "first_call_before.json").read_text())
-    calls = first_calls(numbers["first_call"], before)
+    calls = first_call_rows(numbers["first_call"], before)
     differences = [
         r["q_minus_c_rad"] for r in c["single"] if r["method"] == PREDICTOR and r["q_minus_c_rad"] is not None
     ]

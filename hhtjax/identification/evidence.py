@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc
 
-from hhtjax.identification.arguments import spread_weights
+from hhtjax.identification.residuals import spread_weights
 from hhtjax.identification.sandwich import time_axis, used_up
 
 LAGS = 20  # of the test for white residuals

@@ -23,8 +23,6 @@ from hhtjax.identification.arguments import (
     check_records,
     check_scale,
     check_transforms,
-    check_weights,
-    first_bad,
     require_leading_axis,
 )
 from hhtjax.identification.identifiability import warn_undetermined
@@ -32,6 +30,7 @@ from hhtjax.identification.outside import is_outside, solve_outside
 from hhtjax.identification.parts import Data
 from hhtjax.identification.problem import solve
 from hhtjax.identification.progress import BAD_START, NO_INFLUENCE
+from hhtjax.identification.residuals import check_weights, first_bad
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 from hhtjax.xla import or_plain

@@ -9,9 +9,9 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import overwrite
-from hhtjax.identification.arguments import spread_weights
 from hhtjax.identification.evidence import count, residuals_of
 from hhtjax.identification.identify import fit
+from hhtjax.identification.residuals import spread_weights
 from hhtjax.identification.sandwich import in_time
 
 

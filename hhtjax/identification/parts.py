@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import thaw
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.arguments import check_residuals, spread_weights
+from hhtjax.identification.residuals import check_residuals, spread_weights
 
 
 class Data(NamedTuple):
