@@ -29,7 +29,7 @@ from hhtjax.steppers.friction_law import is_settled, switch
 from hhtjax.steppers.newton import newton, solve_and_keep
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Rubbing, join_info
-from hhtjax.systems.constraints import acceleration_and_multipliers
+from hhtjax.systems.constraints import answers, curvature
 from hhtjax.systems.friction import across, at_rest, directions, own_rate, reaction, responses, solve_some
 
 NOISE = 8  # roundings, of what it is the difference of, below which a number is 0
@@ -44,18 +44,19 @@ def begin_friction(method, system, q, v, t, params, dt):
         )
     at = q, v, t, params
     factorize = method.factorize_for(system) if system.num_constraints else method.factorize
-    H = directions(system, q, t, params)
-    G = responses(system, q, t, params, H, factorize)
-    K, own = across(H, G), own_rate(system, *at)
-    settle = partial(_settle, system, at, factorize, H, K, own)
+    answer, H = answers(system, q, t, params, factorize=factorize), directions(system, q, t, params)
+    turns = (-curvature(system, *at),) if system.num_constraints else ()
+    w, L0 = answer(system.force(*at), *turns)
+    G, pulls = responses(answer, H)
+    K = across(H, G)
+    own = own_rate(system, *at)
+    settle = partial(_settle, system, at, H, K, matvec(H, w) + own)
 
     def again(_, L):
         """L with the friction of limits that depend on L."""
-        return acceleration_and_multipliers(_smooth(system, *settle(L), L), *at, factorize)[1]
+        return L0 - matvec(pulls.T, settle(L)[1])
 
-    L = None
-    if system.num_constraints:
-        L = lax.fori_loop(0, LAGS, again, jnp.zeros(system.num_constraints, q.dtype))
+    L = lax.fori_loop(0, LAGS, again, jnp.zeros_like(L0)) if system.num_constraints else None
     sig, tau = settle(L)
     s = method.begin(_smooth(system, sig, tau, L), *at, dt)
     a = _taken_off(s.a, solve_some(K, sig == 0, matvec(H, s.a) + own), G)
@@ -72,18 +73,15 @@ def _smooth(system, sig, tau, L):
     return system._replace(force=force, friction=None)
 
 
-def _settle(system, at, factorize, H, K, own, L):
-    """sig and tau at the start. What rests is held, within the limits; what cannot be held slides."""
+def _settle(system, at, H, K, load, L):
+    """sig and tau at the start, where without friction ds/dt is the load. What rests is held, within the limits; what
+    cannot be held slides."""
     q, v, t, params = at
     sig, f = _direction(system, at, H), system.friction.limit(q, v, L, t, params)
     rests = sig == 0
-    free = _smooth(system, sig, jnp.zeros_like(f), L)
-    if system.num_constraints:
-        w, _ = acceleration_and_multipliers(free, *at, factorize=factorize)
-    else:
-        w = free.acceleration(*at, factorize=factorize)
-    slides, tau = at_rest(K, rests, matvec(H, w) + own, f)
-    return jnp.where(rests, slides, sig), jnp.where(rests, tau, sig * f)
+    slid = jnp.where(rests, 0, sig * f)
+    slides, tau = at_rest(K, rests, load - matvec(K, slid), f)
+    return jnp.where(rests, slides, sig), jnp.where(rests, tau, slid)
 
 
 def _direction(system, at, H):

@@ -119,7 +119,7 @@ def _consistent_initial(system, q0, v0, params, t0, z0, redundant):
 
 def correction(system, q, t, params, rows, factorize):
     """The x with B x = rows that is smallest in the norm of M."""
-    return saddle_point(system, q, t, params, jnp.zeros(system.size, q.dtype), rows, factorize)[0]
+    return saddle_point(system, q, t, params, factorize)(jnp.zeros(system.size, q.dtype), rows)[0]
 
 
 def nearest_position(system, q0, t, params, factorize):

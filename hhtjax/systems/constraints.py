@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.numerics.elimination import UNROLLED, matvec
-from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, factorize_saddle_point, solve
+from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, factorize_saddle_point, solver
 from hhtjax.systems import kinematics
 from hhtjax.xla import linear_map, staged
 
@@ -55,18 +55,35 @@ def pull_back(system, q, gradient):
     return jax.linear_transpose(lambda v: system.rate(q, v), zero)(gradient)[0]
 
 
-def saddle_point(system, q, t, params, force, rows, factorize=None):
-    """(x, L) with M x - B^T L = force and B x = rows: the index-1 system for accelerations, and all projections."""
+def saddle_point(system, q, t, params, factorize=None):
+    """The function (force, rows) -> (x, L) with M x - B^T L = force and B x = rows, factorised once: the index-1 system
+    for accelerations, and all projections."""
     M, B = system.full_mass(q, params), jacobian(system, q, t, params)
     A = jnp.block([[M, -B.T], [B, jnp.zeros((len(B), len(B)), B.dtype)]])
-    z = solve(A, jnp.concatenate([force, rows]), factorize or factorize_constrained(system.size, None))
-    return z[: system.size], z[system.size :]
+    inverse = solver(A, factorize or factorize_constrained(system.size, None))
+
+    def x_and_multipliers(force, rows):
+        z = inverse(jnp.concatenate([force, rows]))
+        return z[: system.size], z[system.size :]
+
+    return x_and_multipliers
+
+
+def answers(system, q, t, params, redundant=None, factorize=None):
+    """The function (force, rows=0) -> (dw, dL), factorised once: what more of a force makes of the accelerations and
+    the multipliers, which are None without constraints. rows: B dw. redundant, factorize: how it is solved."""
+    if not system.num_constraints:
+        inverse = system.mass_solver(system.mass(q, params), *(() if factorize is None else (factorize,)))
+        return lambda force, rows=None: (inverse(force), None)
+    factorize = factorize or factorize_constrained(system.size, redundant)
+    x_and_multipliers, zero = saddle_point(system, q, t, params, factorize), jnp.zeros(system.num_constraints, q.dtype)
+    return lambda force, rows=zero: x_and_multipliers(force, rows)
 
 
 def acceleration_and_multipliers(system, q, v, t, params, factorize=None):
     """w and L at a state that satisfies Phi = 0 and dPhi/dt = 0."""
     Q = system.force(q, v, t, params)
-    return saddle_point(system, q, t, params, Q, -curvature(system, q, v, t, params), factorize)
+    return saddle_point(system, q, t, params, factorize)(Q, -curvature(system, q, v, t, params))
 
 
 def jacobian(system, q, t, params):

@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_function, require_number
 from hhtjax.description import Description, freeze, is_array, thaw
 from hhtjax.numerics.seldom import seldom
-from hhtjax.systems.constraints import factorize_constrained, pull_back, saddle_point
+from hhtjax.systems.constraints import answers, pull_back
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,11 +216,7 @@ def _bounced(system, guard, law, redundant, q, v, t, params):
     e = jnp.asarray(law.coefficient(params)).astype(v.dtype)
     gradient, g_t = jax.grad(lambda q, t: jnp.asarray(guard(q, v, t, params)).reshape(()), argnums=(0, 1))(q, t)
     n = pull_back(system, q, gradient)
-    if system.num_constraints:
-        rows = jnp.zeros(system.num_constraints, v.dtype)
-        x, _ = saddle_point(system, q, t, params, n, rows, factorize_constrained(system.size, redundant))
-    else:
-        x = system.solve_mass(system.mass(q, params), n)
+    x, _ = answers(system, q, t, params, redundant)(n)
     mobility = jnp.sum(n * x)
     approach = jnp.sum(n * v) + g_t
     return v - (1 + e) * approach / jnp.where(mobility > 0, mobility, jnp.nan) * x

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 
 from hhtjax.numerics.elimination import factorize, matvec
-from hhtjax.numerics.linear_solve import solve
+from hhtjax.numerics.linear_solve import solver
 from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
@@ -65,11 +65,12 @@ class FlatSystem(NamedTuple):
     def acceleration(self, q, v, t, params, factorize=factorize):
         """w = M(q)^-1 Q(q, v, t), and zdot."""
         M, Q = self.mass(q, params), self.force(q, v, t, params)
-        return self.solve_mass(M, Q, factorize)
+        return self.mass_solver(M, factorize)(Q)
 
-    def solve_mass(self, M, Q, factorize=factorize):
-        """M^-1 Q, and what works on z as it is."""
-        return self._of_positions(lambda Q: Q / M if M.ndim == 1 else solve(M, Q, factorize), Q)
+    def mass_solver(self, M, factorize=factorize):
+        """The function Q -> M^-1 Q, and what works on z as it is; factorised once."""
+        inverse = (lambda Q: Q / M) if M.ndim == 1 else solver(M, factorize)
+        return partial(self._of_positions, inverse)
 
     def with_ones(self, d):
         """d (n,), of M, and ones for z: (N,)."""

@@ -19,7 +19,6 @@ from hhtjax.checks import describe, require_function
 from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems import returned
-from hhtjax.systems.constraints import saddle_point
 from hhtjax.xla import linear_map
 
 MOST = 8  # directions of friction
@@ -104,14 +103,10 @@ def own_rate(system, q, v, t, params):
     return jax.jvp(s, (q, t), (system.rate(q, v), jnp.ones_like(t)))[1]
 
 
-def responses(system, q, t, params, H, factorize=None):
-    """G (m, N): the accelerations that a unit of force in each direction of H makes, M^-1 H^T, with constraints."""
-    if system.num_constraints:
-        rows = jnp.zeros(system.num_constraints, q.dtype)
-        return jax.vmap(lambda h: saddle_point(system, q, t, params, h, rows, factorize)[0])(H)
-    M = system.mass(q, params)
-    ways = () if factorize is None else (factorize,)
-    return jax.vmap(lambda h: system.solve_mass(M, h, *ways))(H)
+def responses(answer, H):
+    """G (m, N), the accelerations that a unit of force in each direction of H makes, M^-1 H^T, with constraints; and
+    the multipliers that belong to them. answer: of `answers`."""
+    return jax.vmap(answer)(H)
 
 
 def across(H, G):
@@ -172,11 +167,11 @@ def _wrong(K, load, f, rests, sig):
     return jnp.where(sig == 0, jnp.sign(tau), 0), over > noise
 
 
-def held_back(system, s, L, old, new, dw, factorize):
+def held_back(system, s, L, old, new, dw, answer):
     """A jump dw of the accelerations at a state, as params jump and multipliers become L, with what friction does about
-    it: of joints at rest, and of those that slide, whose limits may jump too."""
+    it: of joints at rest, and of those that slide, whose limits may jump too. answer: of `answers` there."""
     H = directions(system, s.q, s.t, new)
-    G = responses(system, s.q, s.t, new, H, factorize)
+    G, _ = responses(answer, H)
     K, (sig, tau) = across(H, G), s.friction
     rests = sig == 0
     f0, f = (system.friction.limit(s.q, s.v, x, s.t, params) for x, params in ((s.L, old), (L, new)))

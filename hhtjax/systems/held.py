@@ -9,7 +9,7 @@ ends on a sample of uneven times, the old value there is the one held until then
 import jax
 import jax.numpy as jnp
 
-from hhtjax.systems.constraints import factorize_constrained, saddle_point
+from hhtjax.systems.constraints import answers
 from hhtjax.systems.friction import held_back
 from hhtjax.systems.sampled import SLOP, Sampled
 
@@ -65,15 +65,12 @@ def jump_after(params, t):
 def jump(stepper, system, s, old, new):
     """The state with the accelerations and multipliers that belong to the new params."""
     dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
-    ways = factorize_constrained(system.size, stepper.redundant if system.num_constraints else None)
+    answer = answers(system, s.q, s.t, new, stepper.redundant if system.num_constraints else None)
+    dw, dL = answer(dQ)
     if system.num_constraints:
-        rows = jnp.zeros(system.num_constraints, dQ.dtype)
-        dw, dL = saddle_point(system, s.q, s.t, new, dQ, rows, ways)
         L = s.L + dL
-    else:
-        dw = system.solve_mass(system.mass(s.q, new), dQ)
     if system.friction is not None:
-        dw, friction = held_back(system, s, L, old, new, dw, ways)
+        dw, friction = held_back(system, s, L, old, new, dw, answer)
         s = s._replace(friction=friction)
     return s._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
 
