@@ -11,7 +11,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
-from hhtjax.numerics.hoisted import hoisted
+from hhtjax.numerics.hoisted import hoisted, traced
 from hhtjax.xla import TwoWays, derivative, row_written, staged, together
 
 SLOTS, LEVELS = 64, 3
@@ -123,40 +123,37 @@ class Loop:
 
     def reverse(self, x, cotangents):
         count, carry, constants = split(x, len(self.floats))
-
-        def run(first, number, carry):
-            return lax.fori_loop(first, first + number, lambda i, carry: self.body(i, carry, constants), carry)
-
-        def back(level, first, number, carry, found):
-            """Cotangents of the carry, and sums of those of constants, before `number` iterations from `first`."""
-            if level == 0:
-                step, *at = self.step(first, carry, constants)
-                pull_back = staged(lambda *at: jax.vjp(step, *at, has_aux=True)[1])(*at)
-                cotangents, more = staged(pull_back)(found[0])
-                return cotangents, [x + y for x, y in zip(found[1], more, strict=True)]
-            size = SLOTS ** (level - 1)
-            blocks = (number + size - 1) // size
-
-            def keep(j, kept, carry):
-                return [row_written(k, x, j) for k, x in zip(kept, carry, strict=True)]
-
-            def block(j, now):
-                carry, kept = now
-                return run(first + j * size, size, carry), keep(j, kept, carry)
-
-            def turn(j, found):
-                j = blocks - 1 - j
-                start = [lax.dynamic_index_in_dim(x, j, 0, keepdims=False) for x in kept]
-                return back(level - 1, first + j * size, jnp.minimum(size, number - j * size), start, found)
-
-            kept = [jnp.zeros((SLOTS, *x.shape), x.dtype) for x in carry]
-            carry, kept = lax.fori_loop(0, blocks - 1, block, (carry, kept))
-            kept = keep(blocks - 1, kept, carry)
-            return lax.fori_loop(0, blocks, turn, found)
-
         sums = [jnp.zeros_like(x) for x in compress(constants, self.moves)]
-        cotangents, sums = back(LEVELS, jnp.zeros_like(count), count, carry, (cotangents, sums))
-        return [jnp.where(count <= LONGEST, x, jnp.nan) for x in (*cotangents, *sums)]
+        pull_back, needed = self.reverse_iteration(jnp.zeros_like(count), carry, constants, cotangents)
+        unread = [jnp.zeros_like(x) for x in carry]
+
+        def iterate(i, some):
+            return list(compress(self.body(i, merged(needed, some, unread), constants), needed))
+
+        def turn(i, some, found):
+            """Cotangents of the carry, and sums of those of constants, before iteration i."""
+            cotangents, more = pull_back(i, merged(needed, some, unread), constants, found[0])
+            return cotangents, [x + y for x, y in zip(found[1], more, strict=True)]
+
+        found = backwards(iterate, turn, count, list(compress(carry, needed)), (cotangents, sums))
+        return [jnp.where(count <= LONGEST, x, jnp.nan) for x in (*found[0], *found[1])]
+
+    def reverse_iteration(self, i, carry, constants, cotangents):
+        """The transpose of an iteration, of the same arguments, and which parts of the carry derivatives are made of:
+        those that it reads, in some iteration or the next."""
+
+        def pull_back(i, carry, constants, cotangents):
+            step, *at = self.step(i, carry, constants)
+            pull = staged(lambda *at: jax.vjp(step, *at, has_aux=True)[1])(*at)
+            return staged(pull)(cotangents)
+
+        pull_back = traced(pull_back, i, carry, constants, cotangents)
+        body = traced(self.body, i, carry, constants)
+        here = slice(1, 1 + len(carry))
+        needed = pull_back.reads()[here]
+        while (more := [x or y for x, y in zip(needed, body.reads(needed)[here], strict=True)]) != needed:
+            needed = more
+        return pull_back, needed
 
     def by_scans(self, x):
         """The loop as a nest of scans that skip what is beyond count, a function of what moves, and where it is."""
@@ -192,3 +189,47 @@ class Loop:
         run, *at = self.by_scans(x)
         found, moving = jax.vjp(run, *at, has_aux=True)[1](cotangents)
         return [*found, *moving]
+
+
+def backwards(iterate, turn, count, carry, found):
+    """turn(i, carry before iteration i, found) for i = count - 1, ..., 0.
+
+    carry: before the first. iterate: i, carry -> the next. A row is kept for the carry before each block of
+    SLOTS**level iterations within one of SLOTS**(level + 1).
+    """
+    sizes = jnp.asarray([SLOTS**level for level in range(LEVELS + 1)], count.dtype)
+
+    def row(level, i):
+        return level * SLOTS + i // sizes[level] % SLOTS
+
+    def read(kept, number):
+        return [lax.dynamic_index_in_dim(x, number, 0, keepdims=False) for x in kept]
+
+    def keep(kept, number, carry):
+        return [row_written(k, x, number) for k, x in zip(kept, carry, strict=True)]
+
+    def fill(level, last, kept):
+        """The rows of a level, up to that of iteration `last`, from the one above."""
+        size = sizes[level]
+        begin = last - last % sizes[level + 1]
+        blocks = (last - begin) // size
+
+        def block(j, now):
+            carry, kept = now
+            first = begin + j * size
+            kept = keep(kept, row(level, first), carry)
+            return lax.fori_loop(first, jnp.where(j < blocks, first + size, first), iterate, carry), kept
+
+        return lax.fori_loop(0, blocks + 1, block, (read(kept, row(level + 1, last)), kept))[1]
+
+    def back(j, now):
+        kept, found = now
+        i = count - 1 - j
+        ends = (j == 0) | ((i + 1) % sizes[1:] == 0)  # the last iteration ends blocks of all levels
+        levels = jnp.sum(ends, dtype=count.dtype)
+        kept = lax.fori_loop(0, levels, lambda k, kept: fill(levels - 1 - k, i, kept), kept)
+        return kept, turn(i, read(kept, row(0, i)), found)
+
+    kept = [jnp.zeros((LEVELS * SLOTS + 1, *x.shape), x.dtype) for x in carry]
+    kept = keep(kept, row(LEVELS, jnp.zeros_like(count)), carry)
+    return lax.fori_loop(0, count, back, (kept, found))[1]

@@ -1,7 +1,10 @@
 """What a function closes over, as an argument of it."""
 
+from typing import Any, NamedTuple
+
 import jax
 from jax.core import eval_jaxpr
+from jax.interpreters import partial_eval as pe
 
 
 def hoisted(f, *args):
@@ -29,14 +32,24 @@ def traced(f, *like):
     forgets.
 
     >>> import jax.numpy as jnp
-    >>> float(traced(lambda x: {"double": 2 * x}, jnp.array(1.0))(jnp.array(3.0))["double"])
-    6.0
+    >>> double = traced(lambda x, y: {"double": 2 * x, "y": y}, jnp.array(1.0), jnp.array(1.0))
+    >>> float(double(jnp.array(3.0), jnp.array(1.0))["double"]), double.reads(), double.reads([True, False])
+    (6.0, [True, True], [True, False])
     """
-    trace, result = jax.make_jaxpr(f, return_shape=True)(*like)
+    return Traced(*jax.make_jaxpr(f, return_shape=True)(*like))
 
-    def call(*args):
-        return jax.tree.unflatten(
-            jax.tree.structure(result), eval_jaxpr(trace.jaxpr, trace.consts, *jax.tree.leaves(args))
-        )
 
-    return call
+class Traced(NamedTuple):
+    """A function that has been traced."""
+
+    trace: Any
+    result: Any
+
+    def __call__(self, *args):
+        found = eval_jaxpr(self.trace.jaxpr, self.trace.consts, *jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(self.result), found)
+
+    def reads(self, needed=None):
+        """Which of the arrays in its arguments it makes those of its results from that are needed; None: all."""
+        needed = [True] * len(self.trace.out_avals) if needed is None else list(needed)
+        return pe.dce_jaxpr(self.trace.jaxpr, needed)[1]
