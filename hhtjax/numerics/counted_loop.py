@@ -11,8 +11,8 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
-from hhtjax.numerics.hoisted import hoisted, traced
-from hhtjax.xla import TwoWays, derivative, row_written, staged, together
+from hhtjax.numerics.hoisted import hoisted
+from hhtjax.xla import TwoWays, derivative, row_written, staged, together, traced
 
 SLOTS, LEVELS = 64, 3
 LONGEST = SLOTS**LEVELS  # iterations that reverse mode can go back
@@ -150,7 +150,7 @@ class Loop:
         pull_back = traced(pull_back, i, carry, constants, cotangents)
         body = traced(self.body, i, carry, constants)
         here = slice(1, 1 + len(carry))
-        needed = pull_back.reads()[here]
+        needed = pull_back.reads(None)[here]
         while (more := [x or y for x, y in zip(needed, body.reads(needed)[here], strict=True)]) != needed:
             needed = more
         return pull_back, needed

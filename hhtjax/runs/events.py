@@ -77,12 +77,9 @@ def passing(ways):
     """The function of a step and the log, with the counts of steps before and after it, that passes its events."""
 
     @checkpoint  # reverse mode would keep all that is in there for each step
-    def across(part, h, params):
-        return pass_events(ways, params, part, h)
-
     def noted(now, h, params):
         part, log = now
-        part, (rows, there) = across(part, h, params)
+        part, (rows, there) = pass_events(ways, params, part, h)
         return part, log.with_more(rows, there, ways.keep)
 
     def pass_them(now, counts, h, params):

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.elimination import diagonal
-from hhtjax.numerics.hoisted import hoisted, traced
+from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import choose, derivative_of, seldom
 from hhtjax.steppers.newton import Expand, left_by, linearized_solve, solve_expanded, told
-from hhtjax.xla import staged
+from hhtjax.xla import staged, traced
 
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
 

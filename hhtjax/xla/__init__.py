@@ -39,7 +39,7 @@ True
 The door
 --------
 
-The rest of the library knows 26 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 27 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -47,6 +47,7 @@ The rest of the library knows 26 functions of this room, and works as well on pl
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
+    traced(f, *args)          f, traced once, with word of which arguments its results are made of
     is_untouched()            whether neither a derivative nor a batch is being made here
     is_in_batch()             whether a batch is being made here
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
@@ -104,6 +105,7 @@ from hhtjax.xla.recording import NotListed, listed
 from hhtjax.xla.rows import block_written, row_written
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
+from hhtjax.xla.traced import traced
 from hhtjax.xla.transforms import is_in_batch, is_untouched
 from hhtjax.xla.turns import in_turn
 from hhtjax.xla.two_ways import TwoWays, derivative, together
@@ -143,6 +145,7 @@ __all__ = [
     "staged",
     "structural",
     "together",
+    "traced",
 ]
 
 
