@@ -138,13 +138,3 @@ class Forgetting:
 def pytest_configure(config):
     """As a plugin it sees the doctests too: a hook of this file would only see what lies beside it."""
     config.pluginmanager.register(Forgetting())
-
-
-@pytest.fixture
-def one_level(monkeypatch):
-    """Loops whose length is data go back no more than 64 iterations, beyond which derivatives are NaN: of their nest,
-    which tests/test_counted_loop.py is for, one level is left, and half of the program."""
-    from hhtjax.numerics import counted_loop
-
-    monkeypatch.setattr(counted_loop, "LEVELS", 1)
-    monkeypatch.setattr(counted_loop, "LONGEST", counted_loop.SLOTS)

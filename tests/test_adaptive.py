@@ -164,7 +164,6 @@ def test_first_order_systems_and_internal_states():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_level")
 def test_derivatives_are_those_of_the_accepted_steps():
     """Reverse by differences over the same steps, and forward along a direction; of what a force closes over, too."""
     stepper, times = hhtjax.hht(linearize="predictor"), np.array([0.7, 0.9, 2.0])

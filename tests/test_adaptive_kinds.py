@@ -106,7 +106,6 @@ SPRING = hhtjax.System(ONE, lambda q, v, t, u: u(t) - 4 * jnp.sin(q))
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_level")
 def test_derivatives_in_held_inputs():
     """Forward = reverse = differences over the same steps."""
     controlled = {"dt": hhtjax.adaptive(1e-3, 1e-6, max_steps=4000), "times": TIMES[-1:]}
@@ -237,7 +236,6 @@ def test_controlled_steps_of_stick_slip_are_fewer_than_equal_ones():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_level")
 def test_derivatives_through_switches():
     """Forward = reverse = differences over the same steps."""
     system, params, q0, v0, *_ = RUBBING["free"]

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hhtjax.numerics import counted_loop
 from hhtjax.numerics.counted_loop import LONGEST, SLOTS, repeat
-from hhtjax.xla import one_kernel
+from hhtjax.xla import one_kernel, row_written
 
 AT = 1e-2, 1.3
 COUNT = 5
@@ -86,3 +87,45 @@ def test_members_of_a_batch_with_counts_of_their_own():
     expected = every(unrolled)(*AT)
     np.testing.assert_allclose([x[1] for x in found], expected, rtol=1e-12)
     np.testing.assert_allclose([x[0] for x in found], [0, np.cos(AT[1]) + 0.3], atol=1e-14)
+
+
+def test_blocks_of_every_level_end_wherever_they_may(monkeypatch):
+    """Two iterations to a block, two blocks to the next: all counts of three levels."""
+    monkeypatch.setattr(counted_loop, "SLOTS", 2)
+    monkeypatch.setattr(counted_loop, "LONGEST", 8)
+
+    def step(i, x, a):
+        return x + a * jnp.sin(x + i)
+
+    found = jax.jit(jax.value_and_grad(lambda a, count: repeat(lambda i, x: step(i, x, a), 0.7 + 0 * a, count)))
+    for count in range(9):
+        expected = jax.value_and_grad(lambda a, count=count: _written_out(step, 0.7, a, count))(0.3)
+        np.testing.assert_allclose(found(0.3, count), expected, rtol=1e-13)
+
+
+def _written_out(step, x, a, count):
+    for i in range(count):
+        x = step(i, x, a)
+    return x
+
+
+def test_one_copy_of_the_iteration_for_all_levels_and_nothing_kept_that_is_only_written():
+    """In reverse mode, where nobody asks for values: one that goes forward, and the transposed one."""
+    rows = jnp.zeros((7, 11))
+
+    def loss(a, count):
+        def step(i, now):
+            x, log = now
+            return x + a * jnp.sin(x), row_written(log, x + jnp.zeros(11), i)
+
+        x, log = repeat(step, (0.7 + 0 * a, rows), count)
+        return x + jnp.sum(log)
+
+    found = jax.jit(jax.grad(loss))
+    program = found.lower(0.3, 5).as_text()
+    assert program.count("stablehlo.sine") == 2
+    assert f"tensor<{counted_loop.LEVELS * SLOTS + 1}xf64>" in program
+    assert f"tensor<{counted_loop.LEVELS * SLOTS + 1}x7x11xf64>" not in program
+    h = 1e-6
+    central = (loss(0.3 + h, 5) - loss(0.3 - h, 5)) / (2 * h)
+    np.testing.assert_allclose(found(0.3, 5), central, rtol=1e-8)

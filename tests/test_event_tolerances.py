@@ -100,7 +100,6 @@ def test_what_is_behind_an_event_has_an_error_of_its_own():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_level")
 def test_derivatives_are_those_of_the_accepted_steps():
     """In reverse, through two impacts, and by differences over the same steps; forward below. A guard closes over x."""
     problem = event_problems.dragged_ball()

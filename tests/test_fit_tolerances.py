@@ -90,7 +90,6 @@ def by_hand(rtol):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_level")
 @pytest.mark.parametrize("name", zoo.each(FORMS, quick=("jit",), rest=("alone", "scan")))
 def test_the_steps_are_those_of_the_other_point(name):
     """Values and derivatives against steps that are chosen by hand, whatever stands between."""

@@ -118,7 +118,6 @@ def test_order_two_where_steps_change_at_each_time():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_level")
 def test_derivatives_in_params_and_times_forward_and_reverse():
     def loss(k, times):
         runs = hhtjax.sweep(SPRING, STEPPER, ONE, ZERO, PARAMS | {"k": k}, t0=2.0, dts=[0.012, 0.07], times=times)

@@ -77,7 +77,6 @@ def test_the_work_is_about_the_sum_over_the_members():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_level")
 def test_derivatives_are_those_of_the_accepted_steps():
     """Reverse by differences over the same steps, and forward along a direction; of what a force closes over, too."""
     at, rtol = jax.tree.map(jnp.asarray, PARAMS), np.array([1e-3, 1e-2, 3e-3, 2e-3, 5e-3])

@@ -147,13 +147,13 @@ class Loop:
             pull = staged(lambda *at: jax.vjp(step, *at, has_aux=True)[1])(*at)
             return staged(pull)(cotangents)
 
-        pull_back = traced(pull_back, i, carry, constants, cotangents)
+        back = traced(pull_back, i, carry, constants, cotangents)
         body = traced(self.body, i, carry, constants)
         here = slice(1, 1 + len(carry))
-        needed = pull_back.reads(None)[here]
+        needed = back.reads(None)[here]
         while (more := [x or y for x, y in zip(needed, body.reads(needed)[here], strict=True)]) != needed:
             needed = more
-        return pull_back, needed
+        return back, needed
 
     def by_scans(self, x):
         """The loop as a nest of scans that skip what is beyond count, a function of what moves, and where it is."""

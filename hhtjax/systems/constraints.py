@@ -7,6 +7,7 @@ units of length. (The IVP test set writes -B^T lambda: its multipliers are the n
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +70,7 @@ def saddle_point(system, q, t, params, factorize=None):
     return x_and_multipliers
 
 
-def answers(system, q, t, params, redundant=None, factorize=None):
+def answers(system, q, t, params, redundant=None, factorize=None) -> Any:
     """The function (force, rows=0) -> (dw, dL), factorised once: what more of a force makes of the accelerations and
     the multipliers, which are None without constraints. rows: B dw. redundant, factorize: how it is solved."""
     if not system.num_constraints:
