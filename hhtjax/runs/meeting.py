@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description import freeze, thaw
+from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, if_any, seldom
 from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, STAYS, THROWN
 from hhtjax.runs.event_log import row_of
@@ -42,6 +43,7 @@ def pass_events(ways, params, part, h):
         new = ways.params(params, part.met.modes)
         part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new))
 
+    @checkpoint
     def slot(part, _):
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
         return if_any(partial(meet_or_flag, ways), going, (part, unnoted(part.start)), going, h, params)
