@@ -22,8 +22,9 @@ def repeat(body, carry, count):
     """carry -> body(i, carry) for i = 0, ..., count - 1, count a traced integer.
 
     A while loop, so that another count costs no compilation; its derivatives are such loops too, and cost as many
-    iterations. Reverse mode keeps the carry before each of up to SLOTS blocks of iterations on each of LEVELS levels,
-    and computes what a block holds again when it comes to it: up to SLOTS iterations twice, up to SLOTS^2 three times.
+    iterations. Reverse mode keeps what derivatives read of the carry before each of up to SLOTS blocks of iterations
+    on each of LEVELS levels, and computes what a block holds again when it comes to it: up to SLOTS iterations twice,
+    up to SLOTS^2 three times.
     Beyond LONGEST iterations its derivatives are NaN.
     """
     count = jnp.asarray(count)

@@ -43,7 +43,7 @@ def pass_events(ways, params, part, h):
         new = ways.params(params, part.met.modes)
         part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new))
 
-    @checkpoint
+    @checkpoint  # what all slots keep for reverse mode takes longer to compile than to compute one again
     def slot(part, _):
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
         return if_any(partial(meet_or_flag, ways), going, (part, unnoted(part.start)), going, h, params)

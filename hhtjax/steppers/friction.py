@@ -45,8 +45,7 @@ def begin_friction(method, system, q, v, t, params, dt):
     at = q, v, t, params
     factorize = method.factorize_for(system) if system.num_constraints else method.factorize
     answer, H = answers(system, q, t, params, factorize=factorize), directions(system, q, t, params)
-    turns = (-curvature(system, *at),) if system.num_constraints else ()
-    w, L0 = answer(system.force(*at), *turns)
+    w, L0 = answer(system.force(*at), -curvature(system, *at) if system.num_constraints else None)
     G, pulls = responses(answer, H)
     K = across(H, G)
     own = own_rate(system, *at)

@@ -65,7 +65,7 @@ def jump_after(params, t):
 def jump(stepper, system, s, old, new):
     """The state with the accelerations and multipliers that belong to the new params."""
     dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
-    answer = answers(system, s.q, s.t, new, stepper.redundant if system.num_constraints else None)
+    answer = answers(system, s.q, s.t, new, stepper.redundant)
     dw, dL = answer(dQ)
     if system.num_constraints:
         L = s.L + dL
