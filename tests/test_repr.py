@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax import Failure, FitResult, Info, Interpolant, Solution, State
+from hhtjax import Events, Failure, FitResult, Info, Interpolant, Solution, State
 from hhtjax.description.presentation import MOST, overwrite, shown
 from hhtjax.identification import History, ModeBias, Uncertainty
 from hhtjax.identification.progress import COST, LIMIT
@@ -38,6 +38,25 @@ def fitted(params=None, code=COST, transforms=(scaled, scaled), variance=(0.01, 
     residual, five = {"angle": jnp.full(100, VALUE)}, jnp.asarray(5, jnp.int32)
     result = FitResult(params, residual, jnp.asarray(0.25), history, five, jnp.asarray(code), transforms, believed, 32)
     return result._replace(**changed)
+
+
+def test_a_run_tells_how_many_events_there_were():
+    def events(count, kept=100):
+        rows = jnp.full((*np.shape(count), kept), VALUE)
+        return Events(jnp.asarray(count), rows, rows, *[None] * 4, rows)
+
+    def told(found, **changed):
+        return repr(run(events=found, **changed)).splitlines()[0].partition("; ")[2]
+
+    assert [told(events(n)) for n in (0, 1, 2)] == [
+        f"every step finite; {n}" for n in ("0 events", "1 event", "2 events")
+    ]
+    assert told(events(150)) == "every step finite; 150 events, 100 kept"
+    assert told(events([3, 5]), batch=(2,)) == "every step finite; 3 ... 5 events"
+    assert told(events([1, 1], 4), batch=(2,)) == "every step finite; 1 event"
+    assert repr(events(1)).startswith("Events(1 event, count=1, t=float64[100]")
+    assert "event" not in told(None)
+    assert told(events(2)._replace(count=None)) == told(events(2)._replace(t=None)) == "every step finite"
 
 
 def test_a_run_in_a_few_lines():

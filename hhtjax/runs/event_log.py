@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description.presentation import shown
+from hhtjax.description.presentation import between, known, shown
 from hhtjax.xla import block_written
 
 WHOLE = 65  # numbers, at least: an array of fewer would be taken to pieces
@@ -34,6 +34,14 @@ class Events(NamedTuple):
     after: Any
     z: Any
     rate: Any
+
+    def _verdict(self):
+        """How many, and whether some are lost; of a batch the fewest and the most."""
+        count, times = known(self.count), known(self.t)
+        if count is None or times is None or not count.size or not times.ndim:
+            return ""
+        lost = f", {times.shape[-1]} kept" if count.max() > times.shape[-1] else ""
+        return f"{between(count)} {'event' if count.max() == count.min() == 1 else 'events'}{lost}"
 
 
 class Log(NamedTuple):

@@ -209,6 +209,8 @@ class Solution(NamedTuple):
         verdict = "every step finite" if fault is None else fault.partition(". ")[0].removesuffix(".")
         if fault is None and self.info.converged is not None:
             verdict += ", and converged"
+        if self.events is not None and (met := self.events._verdict()):
+            verdict += f"; {met}"
         return f"{batch}{t.shape[-1]} saved times, t = {between(t, 's')}, dt = {between(dt, 's')}; {verdict}"
 
     def _why(self, member):
