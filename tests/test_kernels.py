@@ -249,22 +249,6 @@ def test_common_programs_are_compiled_without_a_trial(monkeypatch):
 
 
 @on_cpu
-def test_a_run_with_dry_friction_and_an_end_stop_is_one_kernel():
-    """Ten times as fast as without, and its branch for events is twice as long as the run without them."""
-    system = hhtjax.System(
-        lambda q, p: jnp.array([[3.0, jnp.cos(q[1])], [jnp.cos(q[1]), 2.0]]),
-        lambda q, v, t, p: jnp.array([p + v[1] ** 2 * jnp.sin(q[1]), -jnp.sin(q[1])]),
-        friction=lambda q, v, t, p: jnp.array([0.5, 0.0]),
-    )
-    stop = hhtjax.Event(lambda q, v, t, p: 1 - q[0], reset=hhtjax.impact(0.5))
-    q0 = jnp.array([0.0, 0.1])
-    found = paths(
-        lambda p: hhtjax.simulate(system, hhtjax.hht(), q0, 0 * q0, p, dt=0.01, num_steps=99, events=[stop]).q, 2.0
-    )
-    assert found == ("one kernel",)
-
-
-@on_cpu
 @pytest.mark.compiled
 def test_a_stage_of_a_large_batch_is_not_divided_among_threads():
     """XLA would call what kernels are not linked with."""
