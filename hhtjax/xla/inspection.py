@@ -17,7 +17,7 @@ PROVEN = {
     *("floor", "gather", "if", "iota", "is_finite", "log", "log_plus_one", "logistic", "maximum", "minimum"),
     *("multiply", "negate", "not", "optimization_barrier", "or", "pad", "power", "remainder", "reshape", "return"),
     *("reverse", "round_nearest_afz", "round_nearest_even", "rsqrt", "select"),
-    *("shift_left", "shift_right_logical", "sign", "sine", "slice", "sqrt"),  # sines.py shifts
+    *("shift_left", "shift_right_logical", "sign", "sine", "slice", "sqrt"),  # in sines, and random numbers
     *("subtract", "tan", "tanh", "transpose", "while", "xor"),
 }
 # those it should know: a kernel that holds one is compiled on trial
