@@ -100,6 +100,26 @@ def test_an_error_inside_mass_or_force_keeps_its_kind_and_says_where(name):
     notes = " ".join(caught.value.__notes__)
     assert f"simulate: raised while tracing `{name}` with {2 if name == 'mass' else 4} arguments: shape (1,)" in notes
     assert "['stiffness']: shape () float64" in notes
+    assert "simulate: the keys of `params` are 'stiffness'; a function of the system asked for 'k'." in notes
+
+
+@pytest.mark.parametrize(
+    ("arguments", "note"),
+    [
+        ({"q0": [1.0], "v0": [0.0]}, "`q0` is a list of numbers, which to JAX is no array but a container of 1: if an"),
+        ({"q0": [1.0, 2.0], "v0": [0.0, 0.0]}, "`v0` is a list of numbers, which to JAX is no array but a container"),
+        (
+            {"params": {"k": (1.0, 2.0)}},
+            "`params['k']` is a tuple of numbers, which to JAX is no array but a container",
+        ),
+        ({"params": None}, "`params` was left out, so that the functions of the system received None."),
+    ],
+)
+def test_lists_of_numbers_and_missing_params_are_named(arguments, note):
+    system = System(ONE, lambda q, v, t, params: -params["k"] * q)
+    with pytest.raises((TypeError, ValueError)) as caught:
+        run(system, **({"params": {"k": 1.0}} | arguments))
+    assert f"simulate: {note}" in " ".join(caught.value.__notes__)
 
 
 def test_a_constraint_is_refused_where_it_would_be_ignored():

@@ -178,3 +178,45 @@ def test_a_linear_system_is_factorised_outside_the_loop():
     loops = [part for part in text.split("\n\n") if "lapack_dgetrf" in part and "ENTRY" not in part]
     assert "lapack_dgetrf" in text
     assert not loops
+
+
+def test_diagonal_systems_are_stepped_without_a_matrix():
+    """Also beside a force at few coordinates: no array (n, n) anywhere in the program of a run."""
+    n = 37
+    k = jnp.linspace(1.0, 100.0, n)
+    systems = [
+        hhtjax.LinearSystem(jnp.ones(n), 0.01 * k, lambda params: params * k),
+        hhtjax.LinearSystem(jnp.ones(n), None, k, nonlinear=lambda q, v, t, params: -params * q**3, at=[3]),
+    ]
+    for system in systems:
+        for stepper in (hhtjax.hht(), hhtjax.hht(iterations=None), hhtjax.rosenbrock()):
+            run = partial(hhtjax.simulate, system, stepper, jnp.ones(n), jnp.zeros(n), dt=0.01, num_steps=3)
+            assert f"[{n},{n}]" not in str(jax.make_jaxpr(lambda p, run=run: run(params=p).q)(1.0))
+
+
+@pytest.mark.slow
+def test_diagonal_systems_move_as_full_ones():
+    n = 3
+    k = jnp.array([4.0, 9.0, 160.0])
+
+    def end(form, stepper, beside, params):
+        system = hhtjax.LinearSystem(form(jnp.ones(n)), form(0.01 * k), lambda p: form(p * k), **beside)
+        return hhtjax.simulate(system, stepper, jnp.ones(n), jnp.zeros(n), params, dt=0.05, num_steps=20).q[-1]
+
+    everywhere = {"nonlinear": lambda q, v, t, params: -params * q**3}
+    rubbing = {"friction": lambda q, v, t, params: 0.1 * jnp.ones(n)}
+    solved = hhtjax.hht(solve=lambda A, b: jnp.linalg.inv(A) @ b)
+    cases = [
+        ({}, hhtjax.hht()),
+        ({}, solved),
+        ({}, hhtjax.rowda()),
+        (everywhere, hhtjax.hht()),
+        (rubbing, hhtjax.hht()),
+    ]
+    for beside, stepper in cases:
+        ours, theirs = (
+            jax.jit(lambda p, f=partial(end, form, stepper, beside): (f(p), jax.jacfwd(f)(p), jax.jacrev(f)(p)))(1.3)
+            for form in (jnp.asarray, jnp.diag)
+        )
+        for x, y in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-12)

@@ -176,7 +176,9 @@ def test_dense_output_of_rows_that_were_picked_out(program):
 
 
 @pytest.mark.slow
-def test_progress_changes_neither_result_nor_gradient(capfd):
+def test_progress_changes_neither_result_nor_gradient(capfd, monkeypatch):
+    monkeypatch.setattr("hhtjax.runs.progress.LEAST", 30)  # steps of one unknown between two drawings
+
     @partial(jax.jit, static_argnums=1)
     def loss(k, progress):
         problem = DUFFING._replace(params={**DUFFING.params, "k": k})
@@ -193,14 +195,51 @@ def test_progress_changes_neither_result_nor_gradient(capfd):
     jax.effects_barrier()
     shown = capfd.readouterr().err
     assert "step 300 of 300" in shown
-    assert "step 3 of 300" in shown
-    assert len(shown.split("\r")) == 101  # a hundred times, no oftener
-    assert shown.count("\n") == 1  # and one line stays
+    assert "compiling ..." in shown
+    assert "step 30 of 300" in shown
+    assert len(shown.split("\r")) == 12  # once for compiling, and ten times
+    assert shown.count("\n") == 1  # one line stays
+    loss(2.0, True)
+    jax.effects_barrier()
+    assert "compiling" not in capfd.readouterr().err  # it is compiled already
     same(jax.grad(loss)(1.0, True), jax.grad(loss)(1.0, False))
     plain = batch(jnp.array([1.0, 2.0]), False)
     same(alone, plain[0][0])
     for x, y in zip(batch(jnp.array([1.0, 2.0]), True), plain, strict=True):
         same(x, y)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("num_steps", "save_every"), [(283, 1), (300, 150), (289, 17)])
+def test_progress_is_drawn_between_blocks_of_any_length(num_steps, save_every, capfd, monkeypatch):
+    """A prime number of steps, blocks within intervals, and blocks of several intervals."""
+    monkeypatch.setattr("hhtjax.runs.progress.LEAST", 40)
+    with_bar, plain = (
+        run(DUFFING, hhtjax.hht(), num_steps, save_every=save_every, progress=progress) for progress in (True, False)
+    )
+    jax.effects_barrier()
+    shown = capfd.readouterr().err
+    assert f"step {num_steps} of {num_steps}" in shown
+    assert 3 <= shown.count("step") <= 9
+    for x, y in zip(jax.tree.leaves(with_bar), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_progress_of_error_control(capfd, monkeypatch):
+    monkeypatch.setattr("hhtjax.runs.progress.LEAST", 20)
+    system, params, q0, v0, _ = DUFFING
+    control = {"dt": hhtjax.adaptive(1e-4, 1e-7), "times": jnp.array([0.5, 1.0])}
+    with_bar, plain = (
+        hhtjax.simulate(system, hhtjax.hht(), q0, v0, params, progress=progress, **control)
+        for progress in (True, False)
+    )
+    jax.effects_barrier()
+    shown = capfd.readouterr().err
+    assert "compiling ..." in shown
+    assert "100 % of the time" in shown
+    assert shown.count("%") > 2
+    np.testing.assert_allclose(with_bar.q, plain.q, rtol=1e-13)
 
 
 def pendulum_lagrangian(q, v, t, params):

@@ -203,7 +203,11 @@ WRONG = {
         {"in_axes": (None, None, None, {"m": 0})},
         r"`in_axes` for params must be a prefix of its structure, PyTreeDef\(.*\); received PyTreeDef\({'m': \*}\).",
     ),
-    "no axes": ({"params": PARAMS | {"k": np.ones(5)}}, r"`in_axes` is missing, and params\['k'\] may have one row"),
+    "no axes": ({"params": PARAMS | {"k": np.ones(5)}}, r"`in_axes` must say .* as params\['k'\] may"),
+    "a list": (
+        {"params": PARAMS | {"k": [1.0] * 5}, "in_axes": (None, None, None, {"c": None, "k": 0})},
+        r"`params\['k'\]\[0\]` must have",
+    ),
     "another axis": ({"in_axes": (None, 1, None, None)}, "must hold 0 and None"),
     "too few members": ({"in_axes": (None, 0, 0, None)}, "`q0` must have a leading axis of 5 members"),
     "mixed dtypes": ({"v0": np.zeros(1, np.float32)}, "must share one dtype"),

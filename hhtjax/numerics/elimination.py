@@ -46,10 +46,15 @@ def diagonal(A):
 
 
 def factorize(A):
-    """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff."""
+    """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff.
+
+    A: (n, n), or (n,) for a diagonal, or `Sparse`.
+    """
     if isinstance(A, Sparse):
         return factorize_sparse(A)
     A = lax.stop_gradient(A)
+    if A.ndim == 1:  # a diagonal
+        return lambda b, trans=0: b / A
     if A.shape[-1] == 2:
         return partial(_cramer, A)
     if A.shape[-1] <= SCALAR:

@@ -14,6 +14,7 @@ from hhtjax.runs.attempt import AT_EVENT, BROKEN, PI, TOO_MANY, TOO_SHORT, Bound
 from hhtjax.runs.attempt_events import trial_of
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import first_bad
+from hhtjax.runs.progress import announce, steps_between
 from hhtjax.runs.recorded import Recorder, solution
 from hhtjax.runs.solution import SimulationError
 from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, row_written
@@ -78,6 +79,8 @@ class Steps(NamedTuple):
 def choose(problem, end, control, progress=False, events=None, room=(), controller=PI, times=None):
     """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf behind them; no tracer of autodiff may
     come in. times: where samples are kept on the way, (K,); the third result is the `Solution` there, or None."""
+    if progress:
+        announce()
     flat, q, v, t0, _ = problem.flat()
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
     trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
@@ -97,22 +100,38 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
         new, begun = one_try(walk)
         here = or_alone(is_walking(walk, end))
         new = jax.tree.map(partial(jnp.where, here), new, walk)
-        if progress:
-            show(walk.state.t, new.state.t, t0, end)
         accepted = new.accepted > walk.accepted
         ends = row_written(ends, jnp.where(accepted, begun.end, jnp.inf), walk.accepted)
         return new, ends, recorder and recorder.add(since, begun, accepted)
 
+    def tries(carry):
+        return largest_in_batch(carry[0].accepted + carry[0].rejected)
+
+    def walked(carry, ahead):
+        """The walk on, while `ahead`; with a bar in blocks of tries, each a kernel."""
+        if not progress:
+            return lax.while_loop(ahead, body, carry)
+
+        def some(carry):
+            limit = tries(carry) + steps_between(control.max_steps, q.size)
+            block = partial(lax.while_loop, lambda x: ahead(x) & (tries(x) < limit), body)
+            carry = one_kernel(block, carry)
+            over, t = ~unfinished(carry), carry[0].state.t
+            lax.cond(over | (tries(carry) >= limit), lambda: show((t - t0) / (end - t0), over), lambda: None)
+            return carry
+
+        return lax.while_loop(ahead, some, carry)
+
     def to_sample(carry, time):
-        walk, ends, since = lax.while_loop(lambda x: unfinished(x) & (x[0].state.t < time), body, carry)
+        walk, ends, since = walked(carry, lambda x: unfinished(x) & (x[0].state.t < time))
         since, around = recorder.sample(since, walk.state)
         return (walk, ends, since), around
 
     def run(walk):
         carry = walk, jnp.full(control.max_steps, jnp.inf, t0.dtype), recorder and recorder.none
-        return (lax.while_loop(unfinished, body, carry), None) if times is None else lax.scan(to_sample, carry, times)
+        return (walked(carry, unfinished), None) if times is None else lax.scan(to_sample, carry, times)
 
-    (walk, ends, _), around = one_kernel(run, form.tree)
+    (walk, ends, _), around = (run if progress else partial(one_kernel, run))(form.tree)
     steps = as_steps(form.joined(walk), ends, t0, bounds.least)
     if times is None:
         return steps, ends, None
@@ -129,14 +148,14 @@ def as_steps(walk, times, t0, least):
     return steps._replace(event=jnp.where(walk.stop == AT_EVENT, walk.met.code, 0), guard=walk.met.event)
 
 
-def show(before, now, t0, end):
-    """A bar on stderr, a hundred times in a run."""
-    before, now = (jnp.floor(100 * (t - t0) / (end - t0)).astype(jnp.int32) for t in (before, now))
+def show(share, over):
+    """A bar on stderr; over: whether it is the last."""
 
-    def bar(done):
-        overwrite(f"[{'#' * (int(done) * 40 // 100):<40}] {int(done)} % of the time", last=int(done) == 100)
+    def bar(share, over):
+        done = int(100 * min(float(share), 1.0))
+        overwrite(f"[{'#' * (done * 40 // 100):<40}] {done} % of the time", last=bool(over))
 
-    lax.cond(now > before, lambda: jax.debug.callback(bar, now), lambda: None)
+    jax.debug.callback(bar, share, over)
 
 
 def trimmed(steps):

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.description.presentation import overwrite
 from hhtjax.numerics.seldom import choose, if_any
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_law import is_settled
@@ -202,15 +201,3 @@ def failure_of(known, count, info, failure):
 def neutral_info(shapes):
     """What `join_info` leaves unchanged."""
     return Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
-
-
-def show_progress(count, total, what):
-    """A bar on stderr, about a hundred times in a run."""
-    every = max(1, total // 100)
-
-    def show(count):
-        done = int(count) * 40 // total
-        overwrite(f"[{'#' * done:<40}] {what} {int(count)} of {total}", last=int(count) == total)
-
-    due = (count % every == 0) | (count == total)
-    lax.cond(due, lambda: jax.debug.callback(show, count), lambda: None)

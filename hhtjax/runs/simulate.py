@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
@@ -14,8 +15,9 @@ from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
 from hhtjax.runs.given_steps import refined, require_control_alone, require_steps
-from hhtjax.runs.loop import as_solution, flaw_at_start, given_sizes, loop_of, loop_over, show_progress
+from hhtjax.runs.loop import as_solution, flaw_at_start, given_sizes, loop_of, loop_over
 from hhtjax.runs.problem import Problem
+from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
@@ -139,21 +141,14 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_
     if events is not None:
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room)
 
-    def with_progress(advance, carry):
-        carry, info = advance(carry)
-        if progress:
-            show_progress(carry[1], num_steps, "step")
-        return carry, info
-
-    # without events, which are seldom; never with a callback, which keeps XLA from making one kernel
-    form = on_scalars(lambda carry: with_progress(plain.advance, carry[:3]), loop.carry)
-    step, keep = form.of(partial(with_progress, loop.advance)), form.of(loop.keep)
+    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)  # without events, which are seldom
+    step, keep = form.of(loop.advance), form.of(loop.keep)
 
     def interval(carry, _):
         if save_every == 1:
             carry, info = step(carry)
         else:
-            (carry, info), _ = checkpointed_scan(joined_step, (carry, loop.no_info), save_every, in_batch)
+            (carry, info), _ = joined_steps((carry, loop.no_info), save_every)
         return carry, (keep(carry[0]), info)
 
     def joined_step(carry, _):
@@ -161,11 +156,40 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_
         carry, new = step(carry)
         return (carry, join_info(info, new)), None
 
-    def run(carry):
-        return checkpointed_scan(interval, carry, num_steps // save_every, in_batch)
+    def joined_steps(carry, length):
+        return checkpointed_scan(joined_step, carry, length, in_batch)
 
-    (_, _, failure, *met), (path, info) = one_kernel(run, form.tree)
+    def intervals(carry, length):
+        return one_kernel(lambda carry: checkpointed_scan(interval, carry, length, in_batch), carry)
+
+    length = num_steps // save_every
+    if progress:
+        carry, (path, info) = _with_bar(intervals, joined_steps, keep, loop, form.tree, length, save_every, q.size)
+    else:
+        carry, (path, info) = intervals(form.tree, length)
+    _, _, failure, *met = carry
     start = loop.carry[0]
     flaw = flaw_at_start(problem.system, flat, start, params)
     solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution
+
+
+def _with_bar(intervals, joined_steps, keep, loop, carry, length, save_every, unknowns):
+    """The same intervals, with a bar drawn outside of kernels: between several of them, or within long ones."""
+    announce()
+    total = length * save_every
+    every = steps_between(total, unknowns)
+    if every >= save_every:
+        return in_blocks(intervals, carry, length, every // save_every, lambda n: draw(n * save_every, total, "step"))
+
+    def interval(carry, number):
+        def steps(carry, length):
+            return one_kernel(partial(joined_steps, length=length), carry)
+
+        def show(n):
+            draw(number * save_every + n, total, "step")
+
+        (carry, info), _ = in_blocks(steps, (carry, loop.no_info), save_every, every, show)
+        return carry, (keep(carry[0]), info)
+
+    return lax.scan(interval, carry, jnp.arange(length, dtype=jnp.int32))

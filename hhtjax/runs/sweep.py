@@ -10,7 +10,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.adaptive import Adaptive
-from hhtjax.runs.loop import show_progress
+from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
@@ -120,6 +120,8 @@ def sweep(
 @partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
 def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
     """The sweep of `Inputs`, compiled."""
+    if progress:
+        announce()
     dtype = jax.tree.leaves(data[1])[0].dtype
     dts, duration, t0, times = jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), (dts, duration, t0, times))
     if times is None:

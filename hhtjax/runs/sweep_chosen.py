@@ -11,7 +11,7 @@ from hhtjax.runs.choose import trimmed
 from hhtjax.runs.choose_many import Members, choose_many
 from hhtjax.runs.chosen import Grid, follow
 from hhtjax.runs.freezing import frozen, is_pair, run_and_choice
-from hhtjax.runs.loop import show_progress
+from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
 from hhtjax.runs.tightened import accepted_run, tighten
 from hhtjax.runs.verified import compared, verified
@@ -32,6 +32,8 @@ def sweep_chosen(inputs, progress):
 def run_chosen(system, start, choice, *, mapped, size, lanes, progress, pair, room):
     """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, of runs, of steps;
     pair: whether the two differ."""
+    if progress:
+        announce()
 
     def members_of(data, control, t0, times, events):
         dtype = jax.tree.leaves(data[1])[0].dtype

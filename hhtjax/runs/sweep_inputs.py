@@ -24,6 +24,7 @@ from hhtjax.runs.sweep_grid import (
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 from hhtjax.systems.consistent import distances, examine, require_consistent
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.returned import notes_on_lists
 from hhtjax.systems.rubbing import require_independent_friction
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
@@ -108,7 +109,8 @@ class Inputs(NamedTuple):
 
     @contextmanager
     def telling_of_axes(self):
-        """Adds to an error of shapes which arrays are as long as there are members, where in_axes says of none."""
+        """In place of an error of shapes, where `in_axes` is missing and some arrays are as long as there are members,
+        one that names these."""
         try:
             yield
         except (TypeError, ValueError) as error:
@@ -119,10 +121,11 @@ class Inputs(NamedTuple):
                 if jnp.shape(x)[:1] == (self.size,)
             ]
             if self.size > 1 and long and not any(self.mapped):
-                error.add_note(
-                    f"sweep: `in_axes` is missing, and {', '.join(long)} may have one row for each of the {self.size} "
-                    "members: then give 0 in it, in (stepper, q0, v0, params)."
-                )
+                raise (TypeError if isinstance(error, TypeError) else ValueError)(
+                    f"sweep: `in_axes` must say which arrays have one row for each of the {self.size} members, as "
+                    f"{', '.join(long)} may: in_axes=(stepper, q0, v0, params), each 0 where all its arrays have, "
+                    f"None where members share it, or a pytree of these; received None. Else: {error}"
+                ) from error
             raise
 
     def chunk(self, members):
@@ -226,14 +229,17 @@ def _flags(name, tree, axes, size=None):
             f"sweep: `in_axes` for {name} must be a prefix of its structure, {like}; received {received}."
         ) from None
     flags = jax.tree.leaves(flags, is_leaf=_is_none)
-    for x, flag in zip(jax.tree.leaves(tree), flags, strict=True):
+    for (path, x), flag in zip(jax.tree_util.tree_leaves_with_path(tree), flags, strict=True):
         if flag is not None and (flag != 0 or isinstance(flag, bool)):
             raise ValueError(f"sweep: `in_axes` must hold 0 and None; received {flag!r} for {name}.")
         if size is not None and flag == 0 and (jnp.ndim(x) == 0 or jnp.shape(x)[0] != size):
-            raise ValueError(
-                f"sweep: `{name}` must have a leading axis of {size} members, as many as dts, where in_axes is 0; "
-                f"received shape {jnp.shape(x)}."
+            error = ValueError(
+                f"sweep: `{name}{jax.tree_util.keystr(path)}` must have a leading axis of {size} members, as many as "
+                f"dts, where in_axes is 0; received shape {jnp.shape(x)}."
             )
+            for note in notes_on_lists("sweep", name, tree):
+                error.add_note(note)
+            raise error
     return [flag == 0 for flag in flags]
 
 

@@ -14,7 +14,7 @@ from hhtjax.steppers.stepper import State
 
 def factorized_once(method, system, params, dt):
     """The factorised matrix of a linear system, in the place of `factorize`."""
-    if system.matrices is not None and method.options.solve is None:
+    if system.knows_matrices and method.options.solve is None:
         return kept(step_matrix(method, system, params, dt))
     return reuse(method.factorize, method.factorize(step_matrix(method, system, params, dt)))
 
@@ -40,15 +40,17 @@ def with_local(A, local, params):
     def slope(s):
         return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
 
+    if A.ndim == 1 and local.size is None:  # the force beside it has a full Jacobian
+        A = jnp.diag(A)
     return changing(A, slope, local.spread, local.size)
 
 
 def step_matrix(method, system, params, dt):
-    """The matrix of the step of a linear system."""
-    zero = jnp.zeros(system.size if system.matrices is None else 1, dt.dtype)
+    """The matrix of the step of a linear system; a diagonal one (n,)."""
+    zero = jnp.zeros(1 if system.knows_matrices else system.size, dt.dtype)
     rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
     path = partial(method.arrive, system, rest, dt)
-    if system.matrices is not None:
+    if system.knows_matrices:
         _, change = jax.jvp(path, (zero,), (jnp.ones_like(zero),))  # the same for every unknown
         return system.step_matrix(params, change.w[0], change.v[0], change.q[0])
     return jax.jacfwd(lambda w: residual(system, params, path(w)))(zero)

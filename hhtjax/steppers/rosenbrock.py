@@ -79,7 +79,7 @@ class Rosenbrock(Embedded, Stepper):
         zero, instant = jnp.zeros(system.size, dt.dtype), jnp.zeros_like(dt)
 
         ways = factorize
-        if system.matrices is not None:
+        if system.knows_matrices:
             A, local = system.step_matrix(params, jnp.ones_like(dt), g * dt, (g * dt) ** 2), system.local
             ways = kept(A) if local is None else with_local(A, local, params)
 

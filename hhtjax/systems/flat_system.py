@@ -14,8 +14,8 @@ from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.matrices import as_matrix
-from hhtjax.systems.returned import check_like, check_matrix, count, evaluate
-from hhtjax.systems.sparse_system import with_sparse_matrices
+from hhtjax.systems.returned import check_like, check_matrix, count, evaluate, telling_of_arguments
+from hhtjax.systems.sparse_system import with_known_matrices
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem
 
 
@@ -43,16 +43,23 @@ class FlatSystem(NamedTuple):
     friction: FrictionLaw | None = None  # dry friction, which `force` does not hold
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
     settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
+    diagonals: Callable | None = None  # params -> M, C, K (None where absent), where all of them are diagonals (n,)
 
     def settled(self, params):
         """What `settle` gives, where there is something to settle."""
         return self if self.settle is None else self.settle(params)
 
     def step_matrix(self, params, w, v, q):
-        """w M + v C + q K, `Sparse`, of factors that are numbers."""
-        assert self.matrices is not None
-        M, C, K = self.matrices(params)
-        return combined(*((x, A) for x, A in ((w, M), (v, C), (q, K)) if A is not None))
+        """w M + v C + q K, `Sparse` or a diagonal (n,), of factors that are numbers."""
+        known = self.matrices or self.diagonals
+        assert known is not None
+        terms = [(x, A) for x, A in zip((w, v, q), known(params), strict=True) if A is not None]
+        return combined(*terms) if self.matrices is not None else sum(x * A for x, A in terms)
+
+    @property
+    def knows_matrices(self):
+        """Whether `step_matrix` gives the matrix of a step, so that none has to be found column by column."""
+        return self.matrices is not None or self.diagonals is not None
 
     def inertia(self, q, w, params):
         """M(q) w, and zdot."""
@@ -137,8 +144,13 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
 
     Runs while tracing, so it checks shapes and structures and costs nothing at run time.
     """
-    if isinstance(system, FirstOrderSystem):
-        return _flatten_first_order(caller, system, q0, t0, params)
+    with telling_of_arguments(caller, q0, v0, params):
+        if isinstance(system, FirstOrderSystem):
+            return _flatten_first_order(caller, system, q0, t0, params)
+        return _flatten_second_order(caller, system, q0, v0, t0, params, z0)
+
+
+def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
     q, unravel = ravel_pytree(q0)
     dtype = q.dtype
     v, unravel_rates = ravel_pytree(v0)
@@ -166,7 +178,7 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
         check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
         flat = flat._replace(product=partial(_flat_product, system.inertia, unravel, unravel_rates, dtype))
     if linear:
-        flat = with_sparse_matrices(caller, system, flat, on_vectors, dtype, params)
+        flat = with_known_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
         flat, q, v = _with_internal(system, flat, q, v0, z0)
     if system.friction is not None:

@@ -1,5 +1,7 @@
 """What the functions of a system return: the checks of shapes, structures and dtypes, made while tracing."""
 
+from contextlib import contextmanager
+
 import jax
 import jax.numpy as jnp
 
@@ -62,3 +64,35 @@ def evaluate(caller, name, function, *args):
         received = ", ".join(describe(x) for x in args)
         error.add_note(f"{caller}: raised while tracing `{name}` with {len(args)} arguments: {received}.")
         raise
+
+
+@contextmanager
+def telling_of_arguments(caller, q0, v0, params):
+    """Adds to an error of the user's functions, or of what they return, what may be wrong with the arguments."""
+    try:
+        yield
+    except Exception as error:
+        for name, tree in (("q0", q0), ("v0", v0), ("params", params)):
+            for note in notes_on_lists(caller, name, tree):
+                error.add_note(note)
+        if isinstance(error, KeyError) and isinstance(params, dict):
+            known = ", ".join(sorted(map(repr, params))) or "none"
+            error.add_note(f"{caller}: the keys of `params` are {known}; a function of the system asked for {error}.")
+        if params is None and isinstance(error, (TypeError, AttributeError)):
+            error.add_note(f"{caller}: `params` was left out, so that the functions of the system received None.")
+        raise
+
+
+def notes_on_lists(caller, name, tree):
+    """A note on each list or tuple of numbers, which is no array to JAX."""
+
+    def is_list(x):
+        return type(x) in (list, tuple)
+
+    for path, x in jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_list):
+        if is_list(x) and x and all(jnp.ndim(y) == 0 for y in jax.tree.leaves(x)):
+            where = f"{name}{jax.tree_util.keystr(path)}"
+            yield (
+                f"{caller}: `{where}` is a {type(x).__name__} of numbers, which to JAX is no array but a container of "
+                f"{len(x)}: if an array is meant, write jnp.array([...])."
+            )

@@ -1,4 +1,4 @@
-"""Linear systems whose matrices stay sparse: what that asks for, and where there is none."""
+"""Linear systems whose matrices stay sparse, or diagonal: what that asks for, and where there is none."""
 
 from hhtjax.numerics.sparse_matrix import Sparse
 from hhtjax.systems.linear_system import LinearSystem
@@ -23,11 +23,32 @@ def require_dense(caller, system, params):
                 )
 
 
-def with_sparse_matrices(caller, system, flat, on_vectors, dtype, params):
-    """The flat system as one whose matrices are kept sparse, if one is; on_vectors makes the flat one of a system."""
+def with_known_matrices(caller, system, flat, on_vectors, dtype, params):
+    """The flat system as one that keeps its matrices sparse, or diagonal, where they are.
+
+    on_vectors: makes the flat system of a `LinearSystem`.
+    """
     shapes = shapes_of_matrices(caller, system, params)
+
+    def matrices(params):
+        given = {name: getattr(system, name) for name in shapes}
+        found = {name: as_matrix(A(params) if callable(A) else A, dtype) for name, A in given.items()}
+        return [found.get(name) for name in "MCK"]
+
     if not any(isinstance(A, Sparse) for A in shapes.values()):
-        return flat
+        are_diagonal = all(len(A.shape) == 1 for A in shapes.values())
+        return _knowing(flat, diagonals=matrices) if are_diagonal else flat
+    _require_sparse(caller, system, shapes)
+
+    def settle(params):
+        known = matrices(params)
+        return _knowing(on_vectors(system.with_matrices(*known)), matrices=lambda params: known)
+
+    return _knowing(flat, matrices=matrices)._replace(settle=settle)
+
+
+def _require_sparse(caller, system, shapes):
+    """An error for what does not go with sparse matrices."""
     for name, A in shapes.items():
         if not isinstance(A, Sparse) and len(A.shape) > 1:
             raise ValueError(
@@ -39,19 +60,8 @@ def with_sparse_matrices(caller, system, flat, on_vectors, dtype, params):
     if system.nonlinear is not None and system.at is None:
         raise NotImplementedError(f"{caller}: name the coordinates of `nonlinear` by `at`: the matrices are sparse.")
 
-    def matrices(params):
-        given = {name: getattr(system, name) for name in shapes}
-        found = {name: as_matrix(A(params) if callable(A) else A, dtype) for name, A in given.items()}
-        return [found.get(name) for name in "MCK"]
 
-    def settle(params):
-        known = matrices(params)
-        return _knowing(on_vectors(system.with_matrices(*known)), lambda params: known)
-
-    return _knowing(flat, matrices)._replace(settle=settle)
-
-
-def _knowing(flat, matrices):
+def _knowing(flat, **matrices):
     """The system, and its linear part, with this function for its matrices."""
-    local = None if flat.local is None else flat.local._replace(linear=flat.local.linear._replace(matrices=matrices))
-    return flat._replace(matrices=matrices, local=local)
+    local = None if flat.local is None else flat.local._replace(linear=flat.local.linear._replace(**matrices))
+    return flat._replace(**matrices, local=local)

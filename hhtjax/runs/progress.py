@@ -1,0 +1,58 @@
+"""The bar on stderr: drawn between blocks of steps, so that the steps of a block stay one kernel."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.description.presentation import overwrite
+
+MOST = 100  # times that a bar is drawn in a run
+LEAST = 30_000  # steps between two, of one unknown: 1.5 ms, where to draw takes .15 ms
+
+
+def announce():
+    """Says on the line of the bar that a program is being compiled: called while it is traced, so only then."""
+    overwrite("compiling ...", last=False)
+
+
+def show_progress(count, total, what):
+    """A bar on stderr, about a hundred times in a run."""
+    every = max(1, total // MOST)
+    lax.cond((count % every == 0) | (count == total), lambda: draw(count, total, what), lambda: None)
+
+
+def draw(count, total, what):
+    """The bar itself."""
+
+    def show(count):
+        done = int(count) * 40 // total
+        overwrite(f"[{'#' * done:<40}] {what} {int(count)} of {total}", last=int(count) == total)
+
+    jax.debug.callback(show, count)
+
+
+def steps_between(total, unknowns):
+    """How many steps lie between two drawings, so that these take little: a step of n takes n^2 at least."""
+    return min(total, max(total // MOST, LEAST // unknowns**2, 1))
+
+
+def in_blocks(scan, carry, length, least, show):
+    """scan(carry, length), in blocks of `least` iterations or some more, with show(number of iterations) after each.
+
+    scan: carry, number of iterations -> carry, what they return, stacked.
+    """
+    size = next((n for n in range(least, min(4 * least, length) + 1) if length % n == 0), least)
+    blocks, rest = divmod(length, size)
+
+    def block(carry, number):
+        carry, ys = scan(carry, size)
+        show((number + 1) * size)
+        return carry, ys
+
+    carry, ys = lax.scan(block, carry, jnp.arange(blocks, dtype=jnp.int32))
+    ys = jax.tree.map(lambda y: y.reshape(blocks * size, *y.shape[2:]), ys)
+    if not rest:
+        return carry, ys
+    carry, tail = scan(carry, rest)
+    show(jnp.asarray(length, jnp.int32))
+    return carry, jax.tree.map(lambda y, z: jnp.concatenate([y, z]), ys, tail)
