@@ -229,7 +229,7 @@ def test_progress_is_drawn_between_blocks_of_any_length(num_steps, save_every, c
 def test_progress_of_error_control(capfd, monkeypatch):
     monkeypatch.setattr("hhtjax.runs.progress.LEAST", 20)
     system, params, q0, v0, _ = DUFFING
-    control = {"dt": hhtjax.adaptive(1e-4, 1e-7), "times": jnp.array([0.5, 1.0])}
+    control = {"dt": hhtjax.adaptive(1e-6, 1e-9), "times": jnp.array([0.5, 1.0])}
     with_bar, plain = (
         hhtjax.simulate(system, hhtjax.hht(), q0, v0, params, progress=progress, **control)
         for progress in (True, False)
