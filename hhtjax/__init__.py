@@ -80,6 +80,7 @@ from hhtjax.systems import interop
 from hhtjax.systems.band_limited import band_limited, band_limited_motion, spline_gain_error
 from hhtjax.systems.consistent import ConsistentInitial, consistent_initial
 from hhtjax.systems.events import Event, impact
+from hhtjax.systems.held import JumpWarning
 from hhtjax.systems.initial_values import PrecisionWarning
 from hhtjax.systems.matrices import sparse
 from hhtjax.systems.sampled import Sampled, sampled
@@ -89,7 +90,7 @@ from hhtjax.xla import Explanation, explain, plain
 __all__ = [  # noqa: RUF022
     "__version__", "analysis", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
-    "FirstOrderSystem", "LinearSystem", "System", "PrecisionWarning", "ConsistentInitial", "consistent_initial",
+    "FirstOrderSystem", "LinearSystem", "System", "PrecisionWarning", "JumpWarning", "ConsistentInitial", "consistent_initial",
     "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled", "sparse", "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",

@@ -161,3 +161,29 @@ def test_energy_balance_sees_one_value_in_each_interval():
     np.testing.assert_allclose(run.v[:, 0], v, rtol=1e-12)
     found = hhtjax.analysis.energy_balance(system, run, params)
     np.testing.assert_allclose(found.error, 0, atol=1e-14)
+
+
+def test_jumps_within_steps_are_told():
+    """By `simulate` and `sweep`, for steps of one size and of several; not where steps end on them, nor inside jit."""
+    system = hhtjax.System(jnp.ones(1), lambda q, v, t, params: params(t)[None])
+    u, uneven = (
+        hhtjax.sampled(jnp.arange(4.0), order=0, **at)
+        for at in ({"dt": 0.1}, {"times": jnp.array([0, 0.1, 0.25, 0.4])})
+    )
+    run = partial(hhtjax.simulate, system, hhtjax.rk4(), jnp.zeros(1), jnp.zeros(1))
+    runs = partial(hhtjax.sweep, system, hhtjax.rk4(), jnp.zeros(1), jnp.zeros(1))
+    off = [
+        (lambda: run(u, dt=0.04, num_steps=5), "simulate: a held input.* at t = 0.1,"),
+        (lambda: run(uneven, dt=0.1, num_steps=5), "simulate: .* at t = 0.25,"),
+        (lambda: run(u, dt=jnp.array([0.1, 0.05, 0.1])), "at t = 0.2,"),
+        (lambda: runs(u, dts=[0.05, 0.04], duration=0.4, num_samples=2), "sweep: .* at t = 0.1,"),
+        (lambda: runs(uneven, dts=[0.1], times=[0.1, 0.3]), "sweep: .* at t = 0.25,"),
+    ]
+    for call, message in off:
+        with pytest.warns(hhtjax.JumpWarning, match=message):
+            call()
+    run(u, dt=0.1 / 3, num_steps=12)  # warnings are errors here
+    run(u, dt=0.04, num_steps=2)  # ends before
+    run(uneven, dt=jnp.array([0.1, 0.15, 0.15, 0.3]))
+    runs(uneven, dts=[0.1, jnp.inf], times=[0.1, 0.25, 0.4])
+    jax.jit(lambda dt: run(u, dt=dt, num_steps=5).q)(0.04)

@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_integer, require_number
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import all_concrete, is_array, is_concrete, is_real
 from hhtjax.runs.adaptive import Adaptive
+from hhtjax.systems import held
 
 
 def require_steps(caller, stepper, dt, num_steps, parts=1):
@@ -53,3 +54,11 @@ def require_control_alone(caller, dt, times, num_steps, save_every, extrapolate)
 def refined(dt, k):
     """k steps in the place of each."""
     return jnp.repeat(dt / k, k) if jnp.ndim(dt) else dt / k
+
+
+def warn_of_jumps_in(problem, dt, num_steps):
+    """A warning where a held input jumps within one of these steps, as far as all is known."""
+    if held.holds(problem.params) and all_concrete((dt, problem.t0)):
+        dt, t0 = np.asarray(dt, float), np.asarray(problem.t0, float)
+        times = t0 + np.append(0.0, np.cumsum(dt) if dt.ndim else num_steps * dt)
+        held.warn_of_jumps("simulate", problem.params, times, lambda H: H * 0 + (1 if dt.ndim else num_steps), 4)

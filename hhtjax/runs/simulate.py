@@ -14,7 +14,7 @@ from hhtjax.runs.controlled import run_controlled
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
-from hhtjax.runs.given_steps import refined, require_control_alone, require_steps
+from hhtjax.runs.given_steps import refined, require_control_alone, require_steps, warn_of_jumps_in
 from hhtjax.runs.loop import as_solution, flaw_at_start, given_sizes, loop_of, loop_over
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
@@ -123,6 +123,7 @@ def simulate(
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
+    warn_of_jumps_in(problem, dt, num_steps)
     kind = {"rates": problem.rates(), "numbers": sum(map(jnp.size, jax.tree.leaves(problem.q0)))}
 
     def run(k):

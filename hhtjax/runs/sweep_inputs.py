@@ -22,6 +22,7 @@ from hhtjax.runs.sweep_grid import (
     require_times,
 )
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.systems import held
 from hhtjax.systems.consistent import distances, examine, require_consistent
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.returned import notes_on_lists
@@ -76,6 +77,8 @@ class Inputs(NamedTuple):
             num_samples = times.size
             require_steps_within(dts, t0, times[-1])
         data = stepper, q0, v0, params, z0
+        if held.holds(params) and not isinstance(dts, Adaptive):
+            _warn_of_jumps(params, t0, equal_times(t0, duration, num_samples) if times is None else times, dts)
         require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
         if system.constraint is not None:
             _require_consistent(system, data, mapped, t0)
@@ -271,3 +274,11 @@ def _require_consistent(system, data, mapped, t0):
     for i in sorted(worst):
         stepper, q0, v0, params, z0 = _member(data, mapped, i)
         require_consistent(f"sweep: member {i}", system, q0, v0, t0, params, stepper.redundant, z0)
+
+
+def _warn_of_jumps(params, t0, times, dts):
+    """A warning where a held input that the members share jumps within a step of one of them."""
+    if all_concrete((t0, times, dts)):
+        dts = np.unique(np.asarray(dts, float))
+        times = np.append(np.asarray(t0, float), np.asarray(times, float))
+        held.warn_of_jumps("sweep", params, times, lambda H: np.maximum(np.ceil(H[:, None] / dts * (1 - 1e-9)), 1), 5)

@@ -6,12 +6,51 @@ state carries on take the jump along: M dw - B^T dL = Q(new) - Q(old), B dw = 0.
 ends on a sample of uneven times, the old value there is the one held until then.
 """
 
+import warnings
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from hhtjax.description import all_concrete
 from hhtjax.systems.constraints import answers
 from hhtjax.systems.friction import held_back
 from hhtjax.systems.sampled import SLOP, Sampled
+
+
+OFF_GRID = 1e-6  # of a step, from which on a jump within it is told: what it costs is as much of a step's error
+
+
+class JumpWarning(UserWarning):
+    """A held input jumps within a step, where the method has order 1, whatever its order is elsewhere."""
+
+
+def warn_of_jumps(caller, params, times, steps, level):
+    """A `JumpWarning` where a held input jumps within a step, as far as all is known.
+
+    times: (K + 1,), at which steps of any size end. steps: H (J,), lengths between two of these -> how many equal steps
+    they are divided into, (J,), or (J, B) in B runs.
+    """
+    for x in filter(_is_held, jax.tree.leaves(params, is_leaf=_is_held)):
+        if not all_concrete((x, times)):
+            continue
+        jumps = np.asarray(x.jumps(), float)
+        jumps = jumps[(times[0] < jumps) & (jumps < times[-1])]
+        before = np.searchsorted(times, jumps, side="right") - 1
+        length = times[before + 1] - times[before]
+        share = (jumps - times[before]) / length
+        number = steps(length)
+        passed = share[:, None] * (number if number.ndim > 1 else number[:, None])  # steps before the jump
+        off = np.max(np.abs(passed - np.round(passed)), axis=1, initial=0) > OFF_GRID
+        if np.any(off):
+            warnings.warn(
+                f"{caller}: a held input, sampled(order=0), jumps at t = {jumps[np.argmax(off)]:.9g}, within a step: "
+                "its error falls as dt, not as dt^2. Let steps end at the jumps: by a dt that divides the sampling "
+                "period, by dt=(N,), by sweep(times=), or by dt=adaptive(...).",
+                JumpWarning,
+                stacklevel=level,
+            )
+            return
 
 
 def holds(params):

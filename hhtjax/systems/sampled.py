@@ -84,6 +84,12 @@ class Sampled:
         i = 1 + self._find(t, intervals, 1)[0]
         return jnp.where(i < intervals, self.times[jnp.minimum(i, intervals - 1)], jnp.inf)
 
+    def jumps(self):
+        """Of a held input the times at which it may jump, in NumPy: not for tracers."""
+        if self.times is not None:
+            return np.asarray(self.times)[1:]
+        return np.asarray(self.t0) + np.asarray(self.dt) * np.arange(1, len(self.polynomials))
+
     def constant(self, value):
         """The held input that always has this value."""
         one = jnp.ones((), self.polynomials.dtype)
@@ -107,7 +113,8 @@ def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
     A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order
-    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). `sweep(..., times=)` ends steps
+    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). A jump within a step makes it of
+    order 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends steps
     at jumps at any distances, and `adaptive` finds them by itself. What is saved at a jump is the acceleration before
     it; `interpolate` uses it for v after it too.
 
