@@ -90,7 +90,7 @@ from hhtjax.xla import Explanation, explain, plain
 __all__ = [  # noqa: RUF022
     "__version__", "analysis", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
-    "FirstOrderSystem", "LinearSystem", "System", "PrecisionWarning", "JumpWarning", "ConsistentInitial", "consistent_initial",
+    "FirstOrderSystem", "LinearSystem", "System", "ConsistentInitial", "consistent_initial", "JumpWarning", "PrecisionWarning",
     "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled", "sparse", "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",

@@ -17,7 +17,6 @@ from hhtjax.systems.constraints import answers
 from hhtjax.systems.friction import held_back
 from hhtjax.systems.sampled import SLOP, Sampled
 
-
 OFF_GRID = 1e-6  # of a step, from which on a jump within it is told: what it costs is as much of a step's error
 
 
