@@ -90,8 +90,9 @@ from hhtjax.xla import Explanation, explain, plain
 __all__ = [  # noqa: RUF022
     "__version__", "analysis", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
-    "FirstOrderSystem", "LinearSystem", "System", "ConsistentInitial", "consistent_initial", "JumpWarning", "PrecisionWarning",
-    "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled", "sparse", "spline_gain_error",
+    "FirstOrderSystem", "LinearSystem", "System", "ConsistentInitial", "consistent_initial", "JumpWarning",
+    "PrecisionWarning", "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled", "sparse",
+    "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
     "bossak", "collocation", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
