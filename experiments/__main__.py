@@ -32,6 +32,7 @@ EXPERIMENTS = {
     "squeezer": "identification.squeezer",
     "kim2019": "kim2019.kim2019",
     "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",
+    "reported": "reported.reported",
     "linearization": "linearization.linearization",
     "stability": "stability.stability",
     "sweeps": "sweeps.sweeps",

@@ -19,6 +19,7 @@ LARGEST = {".png": 200_000, ".gif": 400_000}  # bytes
         "export",
         "friction",
         "kim2019",
+        "reported",
         "stability",
         "sweeps",
         "work_precision",

@@ -136,7 +136,7 @@ def _flags(state, info):
         converged, row, solved, friction = info.converged, info.dependent_row, info.solved, info.friction
     rubs = None if friction is None else ~is_settled(friction)  # which `converged` tells too
     stalls = None if converged is None else ~converged if rubs is None else ~converged & ~rubs
-    found += [stalls, None if row is None else row > 0, None if solved is None else ~solved, rubs]
+    found += [stalls, None if row is None else row >= 0, None if solved is None else ~solved, rubs]
     bits = [jnp.where(x, jnp.int32(2**i), jnp.int32(0)) for i, x in enumerate(found) if x is not None]
     return sum(bits[1:], bits[0])
 

@@ -144,7 +144,7 @@ def judged(state, info, error):
     for x in (state.q, state.v, state.w, state.L):
         error = error if x is None else error + jnp.sum(0 * x)  # NaN where one is not finite
     fine = error < jnp.inf
-    independent = None if info.dependent_row is None else info.dependent_row == 0
+    independent = None if info.dependent_row is None else info.dependent_row < 0
     for told in (info.converged, info.solved, independent):
         fine = fine if told is None else fine & told
     return jnp.where(fine, error, jnp.inf)

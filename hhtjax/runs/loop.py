@@ -168,7 +168,7 @@ def first_failure(flat, failure, count, state, info):
 
 def told_failure(info):
     """Whether a step says by itself that it failed."""
-    failed = jnp.array(False) if info.dependent_row is None else info.dependent_row > 0
+    failed = jnp.array(False) if info.dependent_row is None else info.dependent_row >= 0
     for well in (info.converged, info.solved):
         failed = failed if well is None else failed | ~well
     return failed
@@ -182,7 +182,7 @@ def failure_of(known, count, info, failure):
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
     newton, row, left, friction = finite, failure.row, failure.solve, failure.friction
     if info.dependent_row is not None:
-        newton = newton & (info.dependent_row == 0)
+        newton = newton & (info.dependent_row < 0)
     if info.solved is not None:
         newton = newton & info.solved
     if info.friction is not None:
@@ -200,4 +200,5 @@ def failure_of(known, count, info, failure):
 
 def neutral_info(shapes):
     """What `join_info` leaves unchanged."""
-    return Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
+    neutral = Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
+    return neutral if neutral.dependent_row is None else neutral._replace(dependent_row=-1 - neutral.dependent_row)

@@ -26,7 +26,7 @@ class Failure(NamedTuple):
         step: its number, from 1, or 0 if none did.
         newton: whether Newton's iteration failed while the state was still finite.
         quantity: number of the first quantity that is not finite.
-        row: number, from 1, of the constraint that came to depend on those before it, 0 if none did; None without
+        row: index of the row of the constraint that came to depend on those before it, -1 if none did; None without
             constraints.
         solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is
             the library's own.
@@ -63,7 +63,10 @@ class Failure(NamedTuple):
             return "the linear solve left too much"
         if known(self.friction):
             return "the dry friction was not found"
-        return "a constraint depends on others" if known(self.row) else f"{QUANTITIES[quantity]} is not finite"
+        row = known(self.row)
+        if row is not None and row >= 0:
+            return "a constraint depends on others"
+        return f"{QUANTITIES[quantity]} is not finite"
 
 
 QUANTITIES = (
@@ -241,9 +244,9 @@ class Solution(NamedTuple):
                 "Newton's iteration did not converge; the state is still finite. Take a smaller dt, or more "
                 "max_iterations, or a larger tolerance"
             )
-        if row:
+        if self.failure.row is not None and row >= 0:
             return (
-                f"row {row - 1} of the constraint depends on the rows before it: the position is singular. Give the "
+                f"row {row} of the constraint depends on the rows before it: the position is singular. Give the "
                 'stepper redundant="least_squares", or formulate the constraint anew'
             )
         started = [x for x in jax.tree.leaves(self.acceleration) if is_concrete(x)]

@@ -70,8 +70,8 @@ class Info(NamedTuple):
         converged: whether they met the tolerance.
         constraint: max-norm of Phi at the end of the step.
         constraint_rate: that of dPhi/dt.
-        dependent_row: number, from 1, of the first constraint that depends on those before it at the start of the step;
-            0 while B has full rank.
+        dependent_row: index of the first row of the constraint that depends on those before it at the start of the
+            step; -1 while B has full rank.
         solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
             trust (`banded`, `conjugate_gradients`, a given function), or made with a sparse matrix.
         solved: whether that is within its tolerance.

@@ -144,7 +144,7 @@ def require_independent(caller, B, clear):
 
 
 def dependent_row(B):
-    """Number, from 1, of the first row of B (m, n) that depends on those above it, to a part in 1e6; 0 for none.
+    """Index of the first row of B (m, n) that depends on those above it, to a part in 1e6; -1 for none.
 
     The pivots of an elimination on the cosines between the rows: sin^2 of the angle to the span of the rows above.
     """
@@ -162,4 +162,5 @@ def dependent_row(B):
     else:
         G = lax.fori_loop(0, m - 1, eliminate, G)
     dependent = jnp.diagonal(G) < limit
-    return jnp.min(jnp.where(dependent, jnp.arange(1, m + 1), m + 1)) % (m + 1)
+    first = jnp.min(jnp.where(dependent, jnp.arange(m), m))
+    return jnp.where(first < m, first, -1)
