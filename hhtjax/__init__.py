@@ -63,7 +63,7 @@ from hhtjax.runs.chosen import choose_steps
 from hhtjax.runs.event_log import Events
 from hhtjax.runs.interpolate import InternalInterpolant, Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
-from hhtjax.runs.solution import Failure, SimulationError, Solution
+from hhtjax.runs.solution import FailedRunWarning, Failure, SimulationError, Solution
 from hhtjax.runs.sweep import sweep
 from hhtjax.runs.sweep_to_disk import load_sweep, sweep_to_disk
 from hhtjax.steppers.collocation import collocation, wilson
@@ -98,7 +98,8 @@ __all__ = [  # noqa: RUF022
     "bossak", "collocation", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
     "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
     # runs
-    "Failure", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant", "interpolate",
+    "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant",
+    "interpolate",
     "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep",
     "Explanation", "explain", "plain",
     # out of Python

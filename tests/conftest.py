@@ -136,5 +136,9 @@ class Forgetting:
 
 
 def pytest_configure(config):
-    """As a plugin it sees the doctests too: a hook of this file would only see what lies beside it."""
+    """As a plugin it sees the doctests too: a hook of this file would only see what lies beside it.
+
+    Many tests look at runs that fail, by `check` or `failed`; that such runs warn has a test of its own.
+    """
+    config.addinivalue_line("filterwarnings", "ignore::hhtjax.FailedRunWarning")
     config.pluginmanager.register(Forgetting())

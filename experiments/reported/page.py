@@ -24,7 +24,10 @@ def page(numbers):
     kinds = list(numbers["worst_error"])
     steppers = list(next(iter(numbers["worst_error"].values())))
     worst = [
-        [name, *(both(of_light(before["starts"], kind, name), numbers["worst_error"][kind].get(name)) for kind in kinds)]
+        [
+            name,
+            *(both(of_light(before["starts"], kind, name), numbers["worst_error"][kind].get(name)) for kind in kinds),
+        ]
         for name in steppers
     ]
     order = [[name, *(f"{x:.2f}" for x in by_mass.values())] for name, by_mass in numbers["order"].items()]

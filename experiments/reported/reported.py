@@ -59,7 +59,10 @@ def run(report, fast):
     earlier = {row["what"]: row["found"] for row in before["cases"]}
     report.table(
         ["what", "right", "before", "now"],
-        [[row["what"], *(shown(x) for x in (row["right"], earlier.get(row["what"], ""), row["found"]))] for row in rows],
+        [
+            [row["what"], *(shown(x) for x in (row["right"], earlier.get(row["what"], ""), row["found"]))]
+            for row in rows
+        ],
     )
     light = np.array(found["m_kg"]) <= starts.LIGHT
     worst = {

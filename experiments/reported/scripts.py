@@ -52,7 +52,7 @@ def array_changed_in_place():
 def forgotten_check():
     """A cubic repulsion, which reaches infinity, and a user who does not call check()."""
     system = hhtjax.System(ONE, lambda q, v, t, params: q**3)
-    run = hhtjax.simulate(system, hhtjax.hht(), 5 * ONE, NONE, dt=0.01, num_steps=200)
+    run = hhtjax.simulate(system, hhtjax.hht(iterations=None), 5 * ONE, NONE, dt=0.01, num_steps=200)
     return f"q = {run.q[-1, 0]:.6g}"
 
 
@@ -148,9 +148,7 @@ def rounding_at_its_stop():
 
 def constraint_switched_off():
     """A constraint that params switch off."""
-    system = hhtjax.System(
-        ONE, lambda q, v, t, params: -ONE, constraint=lambda q, t, params: params["on"] * (q - 1.0)
-    )
+    system = hhtjax.System(ONE, lambda q, v, t, params: -ONE, constraint=lambda q, t, params: params["on"] * (q - 1.0))
     hhtjax.simulate(system, hhtjax.hht(), ONE, NONE, {"on": 0.0}, dt=0.01, num_steps=10).check()
     return "silent"
 
@@ -195,6 +193,7 @@ def rosenbrock_valley():
 
 def drag_by_the_largest():
     """Drag by the largest velocity, on a circle."""
+
     def force(q, v, t, params):
         return -3.0 * v * jnp.max(jnp.abs(v)) + jnp.array([0.0, -5.0])
 
@@ -209,7 +208,9 @@ def conversion_out_of_range():
     def force(q, v, t, params):
         return 1e-9 * jnp.asarray([3e9, 1.0, 2.0]).astype(jnp.int32).astype(q.dtype) - q
 
-    run = hhtjax.simulate(hhtjax.System(jnp.ones(3), force), hhtjax.hht(), jnp.zeros(3), jnp.zeros(3), dt=1e-2, num_steps=1)
+    run = hhtjax.simulate(
+        hhtjax.System(jnp.ones(3), force), hhtjax.hht(), jnp.zeros(3), jnp.zeros(3), dt=1e-2, num_steps=1
+    )
     return run.acceleration[0, 0]
 
 
@@ -218,9 +219,7 @@ def hessian_with_newton():
     system = hhtjax.System(ONE, lambda q, v, t, params: -params * jnp.sin(q))
 
     def end(k):
-        run = hhtjax.simulate(
-            system, hhtjax.hht(iterations=None), ONE, NONE, k, dt=0.05, num_steps=40
-        )
+        run = hhtjax.simulate(system, hhtjax.hht(iterations=None), ONE, NONE, k, dt=0.05, num_steps=40)
         return run.q[-1, 0]
 
     h = 1e-4
@@ -304,5 +303,7 @@ def boolean_product():
     def force(q, v, t, params):
         return -1.0 * (jnp.ones((3, 3), bool) @ (q > 0)) * q
 
-    run = hhtjax.simulate(hhtjax.System(jnp.ones(3), force), hhtjax.hht(), jnp.ones(3), jnp.zeros(3), dt=1e-2, num_steps=1)
+    run = hhtjax.simulate(
+        hhtjax.System(jnp.ones(3), force), hhtjax.hht(), jnp.ones(3), jnp.zeros(3), dt=1e-2, num_steps=1
+    )
     return run.acceleration[0, 0]

@@ -10,6 +10,7 @@ import numpy as np
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.seldom import choose, if_any
+from hhtjax.runs.solution import told
 from hhtjax.systems import kinematics
 from hhtjax.xla import Programs
 
@@ -55,6 +56,8 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     Returns:
         An `Interpolant`; of a run with internal states an `InternalInterpolant`, which has z too.
 
+    A run that failed is told again, by a `FailedRunWarning`.
+
     Raises:
         TypeError, ValueError: times that are not real; a solution of several runs; a time outside the run, where the
             result is NaN for tracers.
@@ -71,6 +74,7 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     times = times if is_array(times) else np.asarray(times)
     if not is_real(times):
         raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
+    told("interpolate: of a run that failed", solution, throw=False)
     known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
     equal = not jnp.ndim(solution.dt) and solution.events is None  # an event may end a run early
     equal = None if equal and not is_concrete(t) else equal and not _are_uneven(t)

@@ -18,7 +18,7 @@ from hhtjax.runs.given_steps import refined, require_control_alone, require_step
 from hhtjax.runs.loop import as_solution, flaw_at_start, given_sizes, loop_of, loop_over
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
-from hhtjax.runs.solution import Solution
+from hhtjax.runs.solution import Solution, told
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Programs, is_in_batch, on_scalars, one_kernel, or_plain
@@ -42,6 +42,7 @@ def simulate(
     events: Any = None,
     max_events: int = 2,
     keep_events: int = 100,
+    throw: bool = False,
 ) -> Solution:
     """Steps `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), num_steps times by dt.
 
@@ -78,9 +79,11 @@ def simulate(
         max_events: how many of those that change something may fall into one step; more are a failure. With `adaptive`
             steps become shorter first, and what lies behind an event has an error of its own.
         keep_events: how many `run.events` has room for.
+        throw: whether a run that failed is an error; else it is a `FailedRunWarning`. Both say what `solution.check()`
+            says. Inside jit and vmap neither is known: there call `check()` on what comes out.
 
     Returns:
-        A `Solution`. Nothing raises while the steps run: call `solution.check()`.
+        A `Solution`.
 
     Differentiable, forward and reverse, in dt, t0, params, q0, v0, z0 and the numbers of the stepper; reverse
     mode computes the steps again, in blocks, and its memory grows with the square root of num_steps, but for a
@@ -94,6 +97,7 @@ def simulate(
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate
             a constraint. Values are checked unless they are tracers.
+        SimulationError: the run failed, if `throw`.
         NotImplementedError: a constraint, rotations, internal states, dry friction, events, steps of unequal size or
             error control, where the stepper does not know them.
 
@@ -118,7 +122,7 @@ def simulate(
         events = require_events("simulate", problem, events)
     if isinstance(dt, Adaptive) or times is not None:
         require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
-        return run_controlled(problem, times, dt, progress, events, room)
+        return told("simulate", run_controlled(problem, times, dt, progress, events, room), throw)
     dt, num_steps = require_steps("simulate", stepper, dt, num_steps, 2 ** (extrapolate - 1))
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
@@ -130,7 +134,8 @@ def simulate(
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
         return or_plain(partial(_simulate, problem, refined(dt, k), events, in_batch=is_in_batch(), **sizes, **kind))
 
-    return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
+    solution = run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
+    return told("simulate", solution, throw)
 
 
 @partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "in_batch"))

@@ -1,5 +1,6 @@
 """What a run returns, and how it tells of a step that failed."""
 
+import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +13,10 @@ from hhtjax.description.presentation import Table, all_known, between, brief, kn
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
 from hhtjax.steppers.stepper import Info
+
+
+class FailedRunWarning(RuntimeWarning):
+    """A run failed, as its `check` says in words; `throw=True` raises a `SimulationError` instead."""
 
 
 class SimulationError(RuntimeError):
@@ -130,6 +135,10 @@ class Solution(NamedTuple):
             failed |= ~jnp.all(self.error <= self.allowed[..., None], axis=-1)
         return failed
 
+    def _is_known(self):
+        """Whether what `check` looks at are numbers: outside of jit, vmap and grad."""
+        return all_concrete((self.failure, self.dt, self.t, self.steps, self.error))
+
     def check(self, reach=None):
         """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
 
@@ -138,7 +147,7 @@ class Solution(NamedTuple):
 
         For a batch made by vmap, names the first bad member. Not to be called inside jit.
         """
-        if not all_concrete((self.failure, self.dt, self.t, self.steps, self.error)):
+        if not self._is_known():
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
         if fault := self._fault(reach):
             raise SimulationError(f"simulate: {fault}")
@@ -299,3 +308,16 @@ class Solution(NamedTuple):
         dt = np.broadcast_to(np.asarray(self.dt)[member], t[1:].shape)
         i = np.clip(np.searchsorted(taken, step) - 1, 0, dt.size - 1)
         return t[i] + (step - taken[i]) * dt[i]
+
+
+def told(caller, solution, throw):
+    """The solution; with a `FailedRunWarning`, or for `throw` an error, where the run failed and that is known now."""
+    if solution.failure is None or not is_concrete(solution.failure.step):
+        return solution
+    failure, steps = solution.failure.step, solution.steps
+    failed = np.any(np.asarray(failure) > 0) or (steps is not None and np.any(np.asarray(steps.stop) > 0))
+    if (failed or solution.error is not None) and solution._is_known() and (fault := solution._fault()):
+        if throw:
+            raise SimulationError(f"{caller}: {fault}")
+        warnings.warn(f"{caller}: {fault}", FailedRunWarning, stacklevel=3)
+    return solution

@@ -11,7 +11,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.progress import announce, show_progress
-from hhtjax.runs.solution import Solution
+from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
 from hhtjax.runs.sweep_inputs import VECTORS, Inputs
@@ -38,6 +38,7 @@ def sweep(
     events=None,
     max_events=2,
     keep_events=100,
+    throw=False,
 ) -> Solution:
     """Runs `system` once for each of `dts`, all from t0 on, sampled at common times.
 
@@ -65,6 +66,7 @@ def sweep(
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
         events, max_events, keep_events: those of `simulate`. A block looks for events in the steps in which one of its
             members meets some, so that they cost a batch little.
+        throw: as for `simulate`; the first member that failed is named.
 
     Returns:
         A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for
@@ -79,6 +81,7 @@ def sweep(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape or value; those of `simulate`.
+        SimulationError: a member failed, if `throw`.
         NotImplementedError: `times` for a stepper that needs equal steps, `houbolt` or `park`; `adaptive` with a
             mesh, or for a stepper without an estimate; those of `simulate`.
 
@@ -108,13 +111,14 @@ def sweep(
         if isinstance(dts, Adaptive):
             if mesh is not None:
                 raise NotImplementedError("sweep: with dts=adaptive(...), leave `mesh` out.")
-            return sweep_chosen(inputs, progress)
+            return told("sweep", sweep_chosen(inputs, progress), throw)
         arguments, keywords = inputs.call(mesh=mesh, progress=progress)
         runs = partial(run_sweep, **keywords)
         if events is None or keywords["lanes"] <= VECTORS:
-            return or_plain(partial(runs, *arguments))
+            return told("sweep", or_plain(partial(runs, *arguments)), throw)
         # derivatives keep many states, of so many members more than a cache holds
-        return or_plain(partial(derivative_by, partial(runs, lanes=VECTORS), runs, *arguments))
+        found = or_plain(partial(derivative_by, partial(runs, lanes=VECTORS), runs, *arguments))
+        return told("sweep", found, throw)
 
 
 @partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
