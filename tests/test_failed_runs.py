@@ -58,7 +58,7 @@ def test_a_sweep_names_the_first_member_that_failed():
         solution = runs(jnp.array([-1.0, 1.0]))
     assert len(caught) == 1
     assert solution.failed.tolist() == [False, True]
-    with pytest.raises(hhtjax.SimulationError, match="^sweep: member 1"):
+    with pytest.raises(hhtjax.SimulationError, match=r"^sweep: member 1"):
         runs(jnp.array([-1.0, 1.0]), throw=True)
     runs(jnp.array([-1.0, -2.0]), throw=True)
 

@@ -31,7 +31,8 @@ def second_gravity():
     """A global that the force reads, changed between two runs."""
     global gravity
     system = hhtjax.System(ONE, lambda q, v, t, params: -gravity * ONE)
-    for gravity in (9.81, 1.62):
+    for g in (9.81, 1.62):
+        gravity = g
         run = hhtjax.simulate(system, hhtjax.hht(), NONE, NONE, dt=0.01, num_steps=100)
     gravity = 9.81
     return run.v[-1, 0]
