@@ -111,7 +111,7 @@ def follow(problem, times, grid, events=None, room=()):
 
     (_, (state, _, failure, *met)), (first, second, info) = one_kernel(samples, form.tree)
     (first, _), (second, extra) = form.joined(first), form.joined(second)
-    start = loop.carry[0]
+    start = loop.start
     flaw = flaw_at_start(problem.system, flat, start, params)
     ends = [as_solution(flat, start, path, None, info, failure, flaw) for path in (first, second)]
     if events is None:

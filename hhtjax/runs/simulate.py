@@ -165,7 +165,7 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_
         return checkpointed_scan(interval, carry, num_steps // save_every, in_batch)
 
     (_, _, failure, *met), (path, info) = one_kernel(run, form.tree)
-    start = loop.carry[0]
+    start = loop.start
     flaw = flaw_at_start(problem.system, flat, start, params)
     solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution

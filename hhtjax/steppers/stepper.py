@@ -147,6 +147,10 @@ class Stepper(Description):
         """State at the initial time, for a `FlatSystem`."""
         raise NotImplementedError
 
+    def smoothed(self, system, state, params, dt):
+        """The state from which the first step goes, where that is another than the one at the initial time."""
+        return state
+
     def bind(self, system, params, dt):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
         raise NotImplementedError
@@ -188,7 +192,13 @@ def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
     require_capable(caller, system, stepper, q0, v0)
     flat, q, v = flatten(caller, system, q0, v0, t0, params, z0)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
-    return _unravel(flat, stepper.astype(q.dtype).begin(flat, q, v, t0, held.before(params, t0, dt), dt))
+    return _unravel(flat, entered(stepper.astype(q.dtype), flat, q, v, t0, held.before(params, t0, dt), dt)[1])
+
+
+def entered(stepper, system, q, v, t, params, dt):
+    """The state at a start, and that from which the first step dt goes."""
+    start = stepper.begin(system, q, v, t, params, dt)
+    return start, stepper.smoothed(system, start, params, dt)
 
 
 def require_stepper(caller, stepper):
