@@ -19,7 +19,7 @@ from hhtjax.steppers.linearization import linearized_step, refresh
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
-from hhtjax.steppers.smooth_start import smoothed
+from hhtjax.steppers.smooth_start import jumped, smoothed
 from hhtjax.steppers.stepper import State, Stepper, join_info
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
@@ -74,11 +74,17 @@ class GeneralizedAlpha(Controlled, Stepper):
         w = system.acceleration(q, v, t, params, self.factorize)
         return State(t, q, v, w, w)
 
-    def smoothed(self, system, state, params, dt):
+    def smoothed(self, system, state, params, dt, moves=True):
         """The state from which the first step goes, by `start`."""
         if self.options.start == "simple" or not system.positions:
             return state
-        return smoothed(self, system.settled(params), state, params, dt)
+        return smoothed(self, system.settled(params), state, params, dt, moves)
+
+    def jumped(self, system, before, after, old, new, dt, answer):
+        """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
+        if self.options.start == "simple" or not system.positions:
+            return after
+        return jumped(self, system.settled(new), before, after, (old, new), dt, answer)
 
     def corrects(self, system):
         """Whether a0 has the term of second order."""

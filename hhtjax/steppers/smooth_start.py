@@ -32,10 +32,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.description import is_concrete
-from hhtjax.numerics.elimination import matvec
+from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.numerics.elimination import diagonal, inverse, matvec
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
+from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import curvature, jacobian, reaction, violation
@@ -43,6 +44,8 @@ from hhtjax.xla import linear_map, staged, traced
 
 POWERS, CORRECTIONS = 5, 5
 ITERATIONS = 40  # of Newton's method, at most
+LARGEST = 64  # unknowns whose matrix is inverted
+STIFF = 0.03  # part of a jump of the acceleration by which damping changes it within a step, and h resolves it
 SHORTEST = 1e-3  # part of a Newton step below which there is no way on
 
 
@@ -106,21 +109,42 @@ class Layer(NamedTuple):
         return jnp.zeros(self.system.size + self.system.num_constraints, self.base.v.dtype)
 
 
-def smoothed(method, system, s, params, h):
-    """The state from which the first step h goes, behind the layer at the start s."""
+def smoothed(method, system, s, params, h, moves=True):
+    """The state from which the first step h goes, behind the layer at the start s; moves: whether v becomes v+."""
     zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L))
     layer = Layer.of(method, system, params, h, zero)
     moved, damped = reads(layer)
     if layer.B is None and not (moved or damped):
         return s  # time alone changes the force, and M^-1 Q is as smooth
-    v, z, inverse = without_layer(method, layer, h, damped)
+    v, z, wdot = without_layer(method, layer, h, moves and damped, method.corrects(system))
     w, L = layer.parts(z)
-    a = w
-    shift = method.coefficients.alpha_m - method.coefficients.alpha_f
-    if method.corrects(system) and not (is_concrete(shift) and shift == 0):
-        wdot = layer.parts(rate_of(layer, s._replace(v=v, w=w, L=L), inverse))[0]
-        a = method.corrected(system, v, w, wdot, h)
+    a = w if wdot is None else method.corrected(system, v, w, wdot, h)
     return s._replace(v=v, w=w, a=a, L=L)
+
+
+def jumped(method, system, s, after, both, h, answer):
+    """The state behind a jump of held inputs: `after`, but where what damps is stiff.
+
+    That is so where the velocity of an explicit step, h gamma dw, changes the accelerations by more than a part of dw.
+    """
+    old, new = both
+    dw, V = after.w - s.w, method.coefficients.gamma * h
+    if system.friction is not None or not reads(Layer(system, new, s, 0.0, 0.0, 0.0, None, None))[1]:
+        return after
+    force = system.force(s.q, s.v + system.with_internal(V * dw, jnp.zeros_like(dw)), s.t, new)
+    change = answer(force - system.force(s.q, s.v, s.t, new))
+    D = system.with_ones(diagonal(system.mass(s.q, new)))
+    stiff = jnp.sum(D * change**2) > STIFF**2 * jnp.sum(D * dw**2)
+
+    def smooth(_, s, both, h):
+        old, new = map(thaw, both)
+        layer = Layer.of(method, system, new, h, s._replace(a=None, friction=None, memory=None))
+        layer = layer._replace(offset=layer._replace(params=old).rows(layer.base))
+        v, z, _ = without_layer(method, layer, h, damped=True)
+        dw, dL = layer.parts(z)
+        return s._replace(v=v, w=s.w + dw, a=s.a + dw, L=None if dL is None else s.L + dL)
+
+    return seldom(smooth, stiff, after, s, freeze(both), h)
 
 
 def reads(layer):
@@ -129,22 +153,111 @@ def reads(layer):
     return traced(lambda q, v: force(q, v, s.t, layer.params), s.q, s.v).reads(None)
 
 
-def without_layer(method, layer, h, damped):
-    """v+, the changes z = (dw, dL), and the solve with the matrix of the step."""
-    c = method.coefficients
-    newmark = replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
-    factorize = newmark.factorization(layer.system, layer.params, h)
-    v = layer.base.v
-    if damped:
-        z = layer.zeros() if layer.system.linear else root(layer, factorize)
-        inverse, z, at, tangent = newton_step(layer, factorize, z)
-        dv = layer.located(layer.V * z[: v.size])
-        v = v + damped_part(layer, factorize, inverse, at, tangent, dv, h)
+def without_layer(method, layer, h, damped, corrects=False):
+    """v+, the changes z = (dw, dL), and dw/dt where it is asked for.
+
+    The value comes from matrices, where these are small, and traces the force as seldom as can be, for programs that
+    compile in less time; derivatives from what is differentiable.
+    """
+    c, options = method.coefficients, method.options
+    shift = c.alpha_m - c.alpha_f
+    corrects = corrects and not (is_concrete(shift) and shift == 0)
+
+    def by_maps(method, data, h):
+        known, c = layer._replace(**data), method.coefficients
+        newmark = replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
+        factorize = newmark.factorization(known.system, known.params, h)
+        z = known.zeros() if known.system.linear or not damped else root(known, factorize)
+        inverse, z, at, tangent = newton_step(known, factorize, z)
+        drag = damping(known, factorize, at, tangent) if damped else None
+        return finished(known, inverse, drag, z, h, corrects)
+
+    def by_matrices(method, data, h):
+        known = layer._replace(**data)
+        z, inverse, C = expanded(known, damped)
+        return finished(known, partial(matvec, inverse), partial(matvec, C) if damped else None, z, h, corrects)
+
+    data = {name: x for name, x in layer._asdict().items() if name != "system"}
+    large = layer.zeros().size > LARGEST or layer.system.matrices is not None
+    if large or options.solve is not None or options.redundant is not None:
+        return by_maps(method, data, h)
+    return derivative_at_need(by_maps, by_matrices, method, data, h)
+
+
+def finished(layer, inverse, drag, z, h, corrects):
+    """The same, from the solve with the matrix of the step, the map C, and z behind the implicit step."""
+    v, bend = layer.base.v, layer.bend
+    if drag is not None:
+        v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
+        bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
+    z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend))
+    if not corrects:
+        return v, z, None
+    dw, dL = layer.parts(z)
+    base = layer.base
+    s = base._replace(v=v, w=base.w + dw, L=None if dL is None else base.L + dL)
+    return v, z, layer.parts(rate_of(layer, s, inverse))[0]
+
+
+def expanded(layer, damped):
+    """z behind the implicit step, and the inverse of the matrix of the step and C there, by one loop."""
+    system, base, n = layer.system, layer.base, layer.system.size
+
+    def force(x, dv, dw):
+        at = State(base.t, system.move(base.q, x), base.v + layer.located(dv), base.w + dw)
+        return residual(system, layer.params, at)
+
+    def around(z):
+        dw, dL = layer.parts(z)
+        value, tangent = jax.linearize(force, layer.X * dw, layer.V * dw, dw)
+
+        def columns(y):
+            return tangent(layer.X * y[:n], y[n:], y[:n])
+
+        J = staged(partial(linear_map, columns), 2)(jnp.zeros(2 * n, z.dtype))
+        C = J[:, n:]
+        A = J[:, :n] + layer.V * C
+        if layer.B is not None:
+            value = jnp.concatenate([
+                value - matvec(layer.B.T, base.L + dL), matvec(layer.B, base.w + dw) + layer.bend
+            ])  # fmt: skip
+            A = jnp.block([[A, -layer.B.T], [layer.B, jnp.zeros((len(layer.B), len(layer.B)), A.dtype)]])
+        solve = inverse(A)
+        value = value - layer.offset
+        dz = matvec(solve, value)
+        return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), solve, (C + C.T) / 2
+
+    z = layer.zeros()
+    if system.linear or not damped:
+        dz, _, solve, C = around(z)
     else:
-        inverse, *_ = newton_step(layer, factorize, layer.zeros())
-    bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
-    left = layer.rows(layer.base._replace(v=v), bend)
-    return v, corrected_by(layer, inverse, left), inverse
+        empty = jnp.zeros((z.size, z.size), z.dtype), jnp.zeros((n, n), z.dtype)
+        z, dz, solve, C = improved(around, z, *empty)
+    return z - dz, solve, C
+
+
+def improved(around, z, *more):
+    """The best z that Newton's method finds, with steps that are shortened until the next would be shorter, the next
+    step, and what else `around` tells there."""
+    eps = float(jnp.finfo(z.dtype).eps)
+
+    def unfinished(carry):
+        _, (_, energy, *_), first, part, count = carry
+        small = (count > 0) & (energy <= eps**1.1 * first)
+        return ~small & (part > SHORTEST) & (count < ITERATIONS)
+
+    def improve(carry):
+        z, best, first, part, count = carry
+        trial = z - part * best[0]
+        found = around(trial)
+        better = found[1] < best[1]
+        z, best = choose(better, (trial, found), (z, best))
+        return z, best, jnp.where(count == 0, best[1], first), jnp.where(better, 1, part / 4), count + 1
+
+    one = jnp.ones((), z.dtype)
+    begin = z, (jnp.zeros_like(z), jnp.inf * one, *more), one, one, jnp.zeros((), jnp.int32)
+    z, (dz, _, *more), *_ = lax.while_loop(unfinished, improve, begin)
+    return z, dz, *more
 
 
 def newton_step(layer, factorize, z):
@@ -155,25 +268,27 @@ def newton_step(layer, factorize, z):
     return inverse, z - inverse(value), at, tangent
 
 
-def damped_part(layer, factorize, inverse, at, tangent, dv, h):
-    """P^4 [1 + (5 - 2 gamma) (1 - P)] dv."""
-    zero, n = jax.tree.map(jnp.zeros_like, at), dv.size
+def damping(layer, factorize, at, tangent):
+    """The map (C + C^T)/2 at a state."""
+    zero, v = jax.tree.map(jnp.zeros_like, at), layer.base.v
 
     def drag(x):
-        return layer.located(tangent(zero._replace(v=layer.located(x)))[:n])
+        return tangent(zero._replace(v=layer.located(x)))[: v.size]
 
-    if isinstance(factorize, Trusted):  # large: no matrix is formed
-        pull = jax.linear_transpose(drag, dv)
+    if not isinstance(factorize, Trusted):
+        C = staged(partial(linear_map, drag), v.size)(v)
+        return partial(matvec, (C + C.T) / 2)
+    pull = jax.linear_transpose(drag, v)  # large: no matrix is formed
+    return lambda x: (drag(x) + pull(x)[0]) / 2
 
-        def both(x):
-            return (drag(x) + pull(x)[0]) / 2
-    else:
-        C = staged(partial(linear_map, drag), n)(dv)
-        both = partial(matvec, (C + C.T) / 2)
+
+def damped_part(layer, inverse, drag, dv, h):
+    """P^4 [1 + (5 - 2 gamma) (1 - P)] dv."""
+    n, m = dv.size, layer.zeros().size - dv.size
 
     def power(_, pair):
         x = pair[0]
-        y = jnp.pad(layer.V * both(x), (0, layer.zeros().size - n))
+        y = jnp.pad(layer.V * layer.located(drag(x)), (0, m))
         return layer.located(inverse(y)[:n]), x
 
     x, before = lax.fori_loop(0, POWERS, power, (dv, dv))
@@ -206,36 +321,16 @@ def rate_of(layer, s, inverse):
 
 
 def root(layer, factorize):
-    """z behind the implicit step, by Newton with steps that are shortened until the next would be shorter.
-
-    Where there is no way on it stays at the best that was found. Differentiated by the implicit-function theorem."""
-    n, eps = layer.system.size, float(jnp.finfo(layer.base.v.dtype).eps)
-
-    def once(f, z):
-        value, tangent = jax.linearize(f, z)
-        at = around(factorize, lambda: jax.linearize(layer.path, z))
-        dz = factorize_map(tangent, value, at)(value)
-        return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))  # the energy of the step to come
+    """z behind the implicit step; differentiated by the implicit-function theorem."""
+    n = layer.system.size
 
     def search(f, z):
-        def unfinished(carry):
-            _, _, energy, first, part, count = carry
-            small = (count > 0) & (energy <= eps**1.1 * first)
-            return ~small & (part > SHORTEST) & (count < ITERATIONS)
+        def around_it(z):
+            value, tangent = jax.linearize(f, z)
+            dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
+            return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
 
-        def improve(carry):
-            z, dz, energy, first, part, count = carry
-            trial = z - part * dz
-            next_dz, next_energy = once(f, trial)
-            better = next_energy < energy
-            z, dz, energy = (
-                jnp.where(better, x, y) for x, y in ((trial, z), (next_dz, dz), (next_energy, energy))
-            )
-            return z, dz, energy, jnp.where(count == 0, energy, first), jnp.where(better, 1, part / 4), count + 1
-
-        one = jnp.ones((), z.dtype)
-        begin = z, jnp.zeros_like(z), jnp.inf * one, one, one, jnp.zeros((), jnp.int32)
-        return lax.while_loop(unfinished, improve, begin)[0]
+        return improved(around_it, z)[0]
 
     def tangent_solve(g, y):
         return solve_map(g, y, factorize)
