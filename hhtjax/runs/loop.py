@@ -58,8 +58,10 @@ def given_sizes(t0, dt):
     return lambda number: [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
 
 
-def loop_over(flat, stepper, q, v, t0, params, sizes):
-    """The same with steps of any sizes: number of steps taken -> the next, the one before, and where it ends."""
+def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False):
+    """The same with steps of any sizes: number of steps taken -> the next, the one before, and where it ends.
+
+    resolves: whether the first is one of error control."""
     stepper = stepper.astype(q.dtype)
     none = jnp.zeros((), jnp.int32)
     first = sizes(none)[0]
@@ -85,7 +87,7 @@ def loop_over(flat, stepper, q, v, t0, params, sizes):
 
         return next_step
 
-    start, begun = entered(stepper, flat, q, v, t0, held.before(params, t0, first), first)
+    start, begun = entered(stepper, flat, q, v, t0, held.before(params, t0, first), first, resolves=resolves)
     no_info = neutral_info(jax.eval_shape(step, begun, none)[1])
     carry, keep = (begun, none, no_failure(no_info)), partial(saved, flat)
     return Loop(carry, advance(params), keep, no_info, advance, lambda count: tuple(sizes(count)[:2]), start)

@@ -74,11 +74,13 @@ class GeneralizedAlpha(Controlled, Stepper):
         w = system.acceleration(q, v, t, params, self.factorize)
         return State(t, q, v, w, w)
 
-    def smoothed(self, system, state, params, dt, moves=True):
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
         """The state from which the first step goes, by `start`."""
         if self.options.start == "simple" or not system.positions:
             return state
-        return smoothed(self, system.settled(params), state, params, dt, moves)
+        if resolves and not self.corrects(system):
+            return state
+        return smoothed(self, system.settled(params), state, params, dt, moves, resolves)
 
     def jumped(self, system, before, after, old, new, dt, answer):
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
@@ -88,7 +90,9 @@ class GeneralizedAlpha(Controlled, Stepper):
 
     def corrects(self, system):
         """Whether a0 has the term of second order."""
-        start = self.options.start
+        shift, start = self.coefficients.alpha_m - self.coefficients.alpha_f, self.options.start
+        if is_concrete(shift) and shift == 0:
+            return False
         return start == "corrected" or (start is None and system.num_constraints > 0)
 
     def corrected(self, system, v, w, wdot, dt):

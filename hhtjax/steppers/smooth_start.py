@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.description import freeze, thaw
 from hhtjax.numerics.elimination import diagonal, inverse, matvec
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
@@ -109,14 +109,16 @@ class Layer(NamedTuple):
         return jnp.zeros(self.system.size + self.system.num_constraints, self.base.v.dtype)
 
 
-def smoothed(method, system, s, params, h, moves=True):
-    """The state from which the first step h goes, behind the layer at the start s; moves: whether v becomes v+."""
+def smoothed(method, system, s, params, h, moves=True, resolves=False):
+    """The state from which the first step h goes, behind the layer at the start s.
+
+    moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M."""
     zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L))
-    layer = Layer.of(method, system, params, h, zero)
+    layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
     moved, damped = reads(layer)
-    if layer.B is None and not (moved or damped):
+    if layer.B is None and not (moved or damped or method.corrects(system)):
         return s  # time alone changes the force, and M^-1 Q is as smooth
-    v, z, wdot = without_layer(method, layer, h, moves and damped, method.corrects(system))
+    v, z, wdot = without_layer(method, layer, h, damped and moves and not resolves, method.corrects(system))
     w, L = layer.parts(z)
     a = w if wdot is None else method.corrected(system, v, w, wdot, h)
     return s._replace(v=v, w=w, a=a, L=L)
@@ -159,14 +161,12 @@ def without_layer(method, layer, h, damped, corrects=False):
     The value comes from matrices, where these are small, and traces the force as seldom as can be, for programs that
     compile in less time; derivatives from what is differentiable.
     """
-    c, options = method.coefficients, method.options
-    shift = c.alpha_m - c.alpha_f
-    corrects = corrects and not (is_concrete(shift) and shift == 0)
+    options = method.options
 
     def by_maps(method, data, h):
         known, c = layer._replace(**data), method.coefficients
         newmark = replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
-        factorize = newmark.factorization(known.system, known.params, h)
+        factorize = newmark.factorization(known.system, known.params, known.V / c.gamma)
         z = known.zeros() if known.system.linear or not damped else root(known, factorize)
         inverse, z, at, tangent = newton_step(known, factorize, z)
         drag = damping(known, factorize, at, tangent) if damped else None

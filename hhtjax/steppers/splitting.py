@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from hhtjax.description import is_concrete
 from hhtjax.numerics.elimination import matvec
 from hhtjax.numerics.linear_solve import solve
-from hhtjax.steppers.options import require_alpha
+from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
+from hhtjax.steppers.options import check_options, require_alpha
 from hhtjax.steppers.residual import hht_coefficients
 from hhtjax.steppers.stepper import Info, State, Stepper
 
@@ -40,6 +41,14 @@ class OperatorSplitting(Stepper):
         K, C = (-jax.jacfwd(system.force, argnums=i)(q, v, t, params) for i in (0, 1))
         memory = Memory(system.widened(K), C, self.weighted_force(system, q, v, t, params))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
+
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+        """The state from which the first step goes, as of the `hht` family."""
+        hht = GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
+        K, C, _ = state.memory
+        s = hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves)
+        memory = Memory(K, C, self.weighted_force(system, s.q, s.v, s.t, params))
+        return s._replace(a=None, memory=memory)
 
     def weighted_force(self, system, q, v, t, params):
         """P, what alpha weighs: Q, or in the modified form Q at rest."""

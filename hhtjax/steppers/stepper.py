@@ -148,9 +148,11 @@ class Stepper(Description):
         """State at the initial time, for a `FlatSystem`."""
         raise NotImplementedError
 
-    def smoothed(self, system, state, params, dt, moves=True):
-        """The state from which the first step goes, where that is another than the one at the initial time; moves:
-        whether its velocity may be another, too."""
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+        """The state from which the first step goes, where that is another than the one at the initial time.
+
+        moves: whether its velocity may be another, too. resolves: whether the first step, by error control, is so short
+        that it follows what is fastest."""
         return state
 
     def jumped(self, system, before, after, old, new, dt, answer):
@@ -202,10 +204,10 @@ def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
     return _unravel(flat, entered(stepper.astype(q.dtype), flat, q, v, t0, held.before(params, t0, dt), dt)[1])
 
 
-def entered(stepper, system, q, v, t, params, dt, moves=True):
+def entered(stepper, system, q, v, t, params, dt, moves=True, resolves=False):
     """The state at a start, and that from which the first step dt goes."""
     start = stepper.begin(system, q, v, t, params, dt)
-    return start, one_kernel(lambda s: stepper.smoothed(system, s, params, dt, moves), start, around=True)
+    return start, one_kernel(lambda s: stepper.smoothed(system, s, params, dt, moves, resolves), start, around=True)
 
 
 def require_stepper(caller, stepper):
