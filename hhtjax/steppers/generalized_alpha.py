@@ -19,6 +19,7 @@ from hhtjax.steppers.linearization import linearized_step, refresh
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
+from hhtjax.steppers.smooth_friction import smoothed_friction
 from hhtjax.steppers.smooth_start import jumped, smoothed
 from hhtjax.steppers.stepper import State, Stepper, join_info
 from hhtjax.systems import kinematics
@@ -76,11 +77,10 @@ class GeneralizedAlpha(Controlled, Stepper):
 
     def smoothed(self, system, state, params, dt, moves=True, resolves=False):
         """The state from which the first step goes, by `start`."""
-        if self.options.start == "simple" or not system.positions:
+        if self.options.start == "simple" or not system.positions or (resolves and not self.corrects(system)):
             return state
-        if resolves and not self.corrects(system):
-            return state
-        return smoothed(self, system.settled(params), state, params, dt, moves, resolves)
+        smooth = smoothed if system.friction is None else smoothed_friction
+        return smooth(self, system.settled(params), state, params, dt, moves, resolves)
 
     def jumped(self, system, before, after, old, new, dt, answer):
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
@@ -90,10 +90,8 @@ class GeneralizedAlpha(Controlled, Stepper):
 
     def corrects(self, system):
         """Whether a0 has the term of second order."""
-        shift, start = self.coefficients.alpha_m - self.coefficients.alpha_f, self.options.start
-        if is_concrete(shift) and shift == 0:
-            return False
-        return start == "corrected" or (start is None and system.num_constraints > 0)
+        start = self.options.start
+        return self.resizes and (start == "corrected" or (start is None and system.num_constraints > 0))
 
     def corrected(self, system, v, w, wdot, dt):
         """a0 of second order: w0 + (alpha_m - alpha_f) h times the rate of psiddot, or of v.

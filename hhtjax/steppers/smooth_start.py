@@ -109,19 +109,22 @@ class Layer(NamedTuple):
         return jnp.zeros(self.system.size + self.system.num_constraints, self.base.v.dtype)
 
 
-def smoothed(method, system, s, params, h, moves=True, resolves=False):
+def smoothed(method, system, s, params, h, moves=True, resolves=False, finish=None):
     """The state from which the first step h goes, behind the layer at the start s.
 
-    moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M."""
-    zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L))
+    moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M. finish: what
+    is made of the implicit step, by default `finished`.
+    """
+    zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
     layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
     moved, damped = reads(layer)
-    if layer.B is None and not (moved or damped or method.corrects(system)):
-        return s  # time alone changes the force, and M^-1 Q is as smooth
-    v, z, wdot = without_layer(method, layer, h, damped and moves and not resolves, method.corrects(system))
+    corrects = method.corrects(system)
+    if layer.B is None and not (damped or corrects or (moved and method.resizes)):
+        return s  # nothing that M^-1 Q could throw
+    v, z, wdot, *more = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
     w, L = layer.parts(z)
     a = w if wdot is None else method.corrected(system, v, w, wdot, h)
-    return s._replace(v=v, w=w, a=a, L=L)
+    return s._replace(v=v, w=w, a=a, L=L, **more[0] if more else {})
 
 
 def jumped(method, system, s, after, both, h, answer):
@@ -142,7 +145,7 @@ def jumped(method, system, s, after, both, h, answer):
         old, new = map(thaw, both)
         layer = Layer.of(method, system, new, h, s._replace(a=None, friction=None, memory=None))
         layer = layer._replace(offset=layer._replace(params=old).rows(layer.base))
-        v, z, _ = without_layer(method, layer, h, damped=True)
+        v, z, _ = without_layer(method, layer, h, True, False, finished)
         dw, dL = layer.parts(z)
         return s._replace(v=v, w=s.w + dw, a=s.a + dw, L=None if dL is None else s.L + dL)
 
@@ -155,8 +158,8 @@ def reads(layer):
     return traced(lambda q, v: force(q, v, s.t, layer.params), s.q, s.v).reads(None)
 
 
-def without_layer(method, layer, h, damped, corrects=False):
-    """v+, the changes z = (dw, dL), and dw/dt where it is asked for.
+def without_layer(method, layer, h, damped, corrects, finish):
+    """v+, the changes z = (dw, dL), and dw/dt where it is asked for; or what else `finish` makes of them.
 
     The value comes from matrices, where these are small, and traces the force as seldom as can be, for programs that
     compile in less time; derivatives from what is differentiable.
@@ -170,12 +173,13 @@ def without_layer(method, layer, h, damped, corrects=False):
         z = known.zeros() if known.system.linear or not damped else root(known, factorize)
         inverse, z, at, tangent = newton_step(known, factorize, z)
         drag = damping(known, factorize, at, tangent) if damped else None
-        return finished(known, inverse, drag, z, h, corrects)
+        return finish(method, known, inverse, drag, z, h, corrects)
 
     def by_matrices(method, data, h):
         known = layer._replace(**data)
         z, inverse, C = expanded(known, damped)
-        return finished(known, partial(matvec, inverse), partial(matvec, C) if damped else None, z, h, corrects)
+        drag = partial(matvec, C) if damped else None
+        return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)
 
     data = {name: x for name, x in layer._asdict().items() if name != "system"}
     large = layer.zeros().size > LARGEST or layer.system.matrices is not None
@@ -184,7 +188,7 @@ def without_layer(method, layer, h, damped, corrects=False):
     return derivative_at_need(by_maps, by_matrices, method, data, h)
 
 
-def finished(layer, inverse, drag, z, h, corrects):
+def finished(method, layer, inverse, drag, z, h, corrects):
     """The same, from the solve with the matrix of the step, the map C, and z behind the implicit step."""
     v, bend = layer.base.v, layer.bend
     if drag is not None:
@@ -214,7 +218,7 @@ def expanded(layer, damped):
         def columns(y):
             return tangent(layer.X * y[:n], y[n:], y[:n])
 
-        J = staged(partial(linear_map, columns), 2)(jnp.zeros(2 * n, z.dtype))
+        J = jax.vmap(columns, out_axes=1)(jnp.eye(2 * n, dtype=z.dtype))
         C = J[:, n:]
         A = J[:, :n] + layer.V * C
         if layer.B is not None:
@@ -282,17 +286,21 @@ def damping(layer, factorize, at, tangent):
     return lambda x: (drag(x) + pull(x)[0]) / 2
 
 
-def damped_part(layer, inverse, drag, dv, h):
-    """P^4 [1 + (5 - 2 gamma) (1 - P)] dv."""
-    n, m = dv.size, layer.zeros().size - dv.size
+def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
+    """P^4 [1 + (5 - 2 gamma) (1 - P)] dv. project: what keeps P x among the velocities that may change."""
 
     def power(_, pair):
         x = pair[0]
-        y = jnp.pad(layer.V * layer.located(drag(x)), (0, m))
-        return layer.located(inverse(y)[:n]), x
+        return project(response(layer, inverse, layer.V * layer.located(drag(x)))), x
 
     x, before = lax.fori_loop(0, POWERS, power, (dv, dv))
     return before + (POWERS - 2 * layer.V / h) * (before - x)
+
+
+def response(layer, inverse, force):
+    """S^-1 of a force, 0 for internal states."""
+    n = force.size
+    return layer.located(inverse(jnp.pad(force, (0, layer.zeros().size - n)))[:n])
 
 
 def corrected_by(layer, inverse, left):
