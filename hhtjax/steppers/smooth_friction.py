@@ -2,8 +2,8 @@
 
     S dv = h gamma (Q - H^T tau),    tau = f sign(s) where s != 0, |tau| <= f where s = 0,    s = sliding(v + dv)
 
-is the law of friction at the end of the step. Joints that are at rest, and stay so, get no part of P^4 dv. What the step
-resolves does not change; where damping is stiff a limit turns as the motion does, and who slides is told by v+.
+is the law of friction at the end of the step. Joints that are at rest, and stay so, get no part of P^4 dv. What the
+step resolves does not change; where damping is stiff a limit turns as the motion does, and v+ tells who slides.
 """
 
 from functools import partial

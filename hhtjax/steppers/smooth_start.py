@@ -74,6 +74,14 @@ class Layer(NamedTuple):
             bend = curvature(system, base.q, base.v, base.t, params)
         return cls(system, params, base, offset, c.beta * h**2, c.gamma * h, B, bend)
 
+    def data(self):
+        """What may be arguments of a function of JAX: all but the system, with params frozen."""
+        return freeze(self._replace(system=None))
+
+    def with_data(self, data):
+        """The layer with these."""
+        return thaw(data)._replace(system=self.system)
+
     def located(self, x):
         """x (N,) with 0 for internal states."""
         return self.system.with_internal(x, jnp.zeros_like(x))
@@ -112,8 +120,8 @@ class Layer(NamedTuple):
 def smoothed(method, system, s, params, h, moves=True, resolves=False, finish=None):
     """The state from which the first step h goes, behind the layer at the start s.
 
-    moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M. finish: what
-    is made of the implicit step, by default `finished`.
+    moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M.
+    finish: what is made of the implicit step, by default `finished`.
     """
     zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
     layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
@@ -132,8 +140,7 @@ def jumped(method, system, s, after, both, h, answer):
 
     That is so where the velocity of an explicit step, h gamma dw, changes the accelerations by more than a part of dw.
     """
-    old, new = both
-    dw, V = after.w - s.w, method.coefficients.gamma * h
+    new, dw, V = both[1], after.w - s.w, method.coefficients.gamma * h
     if system.friction is not None or not reads(Layer(system, new, s, 0.0, 0.0, 0.0, None, None))[1]:
         return after
     force = system.force(s.q, s.v + system.with_internal(V * dw, jnp.zeros_like(dw)), s.t, new)
@@ -167,7 +174,7 @@ def without_layer(method, layer, h, damped, corrects, finish):
     options = method.options
 
     def by_maps(method, data, h):
-        known, c = layer._replace(**data), method.coefficients
+        known, c = layer.with_data(data), method.coefficients
         newmark = replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
         factorize = newmark.factorization(known.system, known.params, known.V / c.gamma)
         z = known.zeros() if known.system.linear or not damped else root(known, factorize)
@@ -176,12 +183,12 @@ def without_layer(method, layer, h, damped, corrects, finish):
         return finish(method, known, inverse, drag, z, h, corrects)
 
     def by_matrices(method, data, h):
-        known = layer._replace(**data)
+        known = layer.with_data(data)
         z, inverse, C = expanded(known, damped)
         drag = partial(matvec, C) if damped else None
         return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)
 
-    data = {name: x for name, x in layer._asdict().items() if name != "system"}
+    data = layer.data()
     large = layer.zeros().size > LARGEST or layer.system.matrices is not None
     if large or options.solve is not None or options.redundant is not None:
         return by_maps(method, data, h)
