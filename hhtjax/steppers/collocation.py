@@ -71,8 +71,8 @@ def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Co
 
         theta/(2 (theta + 1)) >= beta >= (2 theta^2 - 1)/(4 (2 theta^3 - 1))
 
-    It starts as `hht` does, so what damps stiffly does not overshoot. Without damping, and away from rest, the first q1
-    may overshoot where a step is far beyond a period.
+    From w = M^-1 Q with a step far beyond a period, the first q1 overshoots by the square of h: so runs begin as those of
+    `hht` do.
 
     Args:
         beta: in (0, 1/4]; theta: 1 or more; numbers, or tracers to differentiate.
