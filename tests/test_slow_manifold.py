@@ -43,7 +43,9 @@ def exact(m, t, v0=0.0):
     fast = -(C + d) / (2 * m)
     slow = K / (m * fast)
     b = -(v0 + slow / K) / (slow - fast)
-    return np.where(t < 0, 0, (1 / K - (1 / K + b) * np.exp(slow * np.maximum(t, 0)) + b * np.exp(fast * t.clip(0))).real)
+    return np.where(
+        t < 0, 0, (1 / K - (1 / K + b) * np.exp(slow * np.maximum(t, 0)) + b * np.exp(fast * t.clip(0))).real
+    )
 
 
 def errors(run, h, reference=exact, duration=0.2):
@@ -121,7 +123,8 @@ def test_nothing_damped_nothing_changed():
     for start, alpha in (("smooth", 0.0), ("simple", -0.3)):
         free = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -9.0 * q)
         state = hhtjax.hht(alpha, start=start).init(free, jnp.ones(1), jnp.ones(1), None, dt=0.1)
-        assert state.v[0] == 1 and state.w[0] == state.a[0] == -9
+        assert state.v[0] == 1
+        assert state.w[0] == state.a[0] == -9
 
     def away(h):
         state = hhtjax.hht(start="smooth").init(spring, jnp.ones(1), jnp.ones(1), 2.0, dt=h)

@@ -40,8 +40,16 @@ class Collocation(Stepper):
 
     def smoothed(self, system, state, params, dt, moves=True, resolves=False):
         """The state from which the first step goes, as of the `hht` family; for 2 h, as the equation holds beyond h."""
-        newmark = GeneralizedAlpha(Coefficients(0.0, 0.0, self.beta, 0.5), 2, self.options)
-        return newmark.smoothed(system, state, params, 2 * dt, moves, resolves)._replace(a=None)
+        return self.newmark.smoothed(system, state, params, 2 * dt, moves, resolves)._replace(a=None)
+
+    def jumped(self, system, before, after, old, new, dt, answer):
+        """The same where held inputs jump."""
+        return self.newmark.jumped(system, before, after, old, new, 2 * dt, answer)
+
+    @property
+    def newmark(self):
+        """The method of which it is, for theta = 1."""
+        return GeneralizedAlpha(Coefficients(0.0, 0.0, self.beta, 0.5), 2, self.options)
 
     def bind(self, system, params, dt):
         """Newton for w_c; the state carries w1, which obeys the equation of motion only within O(h^2)."""
@@ -71,8 +79,8 @@ def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Co
 
         theta/(2 (theta + 1)) >= beta >= (2 theta^2 - 1)/(4 (2 theta^3 - 1))
 
-    From w = M^-1 Q with a step far beyond a period, the first q1 overshoots by the square of h: so runs begin as those of
-    `hht` do.
+    From w = M^-1 Q with a step far beyond a period, the first q1 overshoots by the square of h: so runs begin as those
+    of `hht` do.
 
     Args:
         beta: in (0, 1/4]; theta: 1 or more; numbers, or tracers to differentiate.

@@ -154,7 +154,8 @@ def jumped(method, system, s, after, both, h, answer):
         layer = layer._replace(offset=layer._replace(params=old).rows(layer.base))
         v, z, _ = without_layer(method, layer, h, True, False, finished)
         dw, dL = layer.parts(z)
-        return s._replace(v=v, w=s.w + dw, a=s.a + dw, L=None if dL is None else s.L + dL)
+        a, L = (None if x is None else x + change for x, change in ((s.a, dw), (s.L, dL)))
+        return s._replace(v=v, w=s.w + dw, a=a, L=L)
 
     return seldom(smooth, stiff, after, s, freeze(both), h)
 
