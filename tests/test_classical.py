@@ -34,7 +34,7 @@ COLLOCATION = {"wilson": hhtjax.wilson(), "collocation": hhtjax.collocation(0.18
 
 def collocation_step(method, system, h):
     def step(x):
-        state = method.init(system, x[:1], x[1:2], None, h)._replace(w=x[2:])
+        state = method.init(system, x[:1], x[1:2], None, h)._replace(v=x[1:2], w=x[2:])
         state, _ = method.step(system, state, None, h)
         return jnp.concatenate([state.q, state.v, state.w])
 
@@ -59,15 +59,20 @@ def test_wilson_is_unconditionally_stable_from_theta_1_366(theta, stable):
 
 
 def test_wilson_overshoots_and_newmark_does_not():
-    """From q = 1 at rest with a step of ten periods."""
+    """From q = 1 at rest with a step of ten periods, and w = M^-1 Q; a run begins otherwise, and does not either."""
     frequency_h = 20 * np.pi
-    system = oscillator(k=M * frequency_h**2 / H**2, c=0.0)
+    k = M * frequency_h**2 / H**2
+    system = oscillator(k=k, c=0.0)
 
     def first(method):
-        return float(hhtjax.simulate(system, method, jnp.ones(1), jnp.zeros(1), dt=H, num_steps=1).q[-1, 0])
+        state = method.init(system, jnp.ones(1), jnp.zeros(1), None, H)
+        state, _ = method.step(system, state._replace(w=jnp.array([-k / M])), None, H)
+        return float(state.q[0])
 
     assert first(hhtjax.wilson(1.4)) == pytest.approx(1 - frequency_h**2 * (1 - 1 / 1.4) / 2, rel=1e-2)
     assert abs(first(hhtjax.newmark())) <= 1
+    run = hhtjax.simulate(system, hhtjax.wilson(1.4), jnp.ones(1), jnp.zeros(1), dt=H, num_steps=1)
+    assert abs(run.q[-1, 0]) <= 1
 
 
 HOUBOLT = np.array([2, -5, 4, -1]), np.array([11, -18, 9, -2]) / 6  # of h^2 w and of h v, on q1, q, ...

@@ -113,7 +113,7 @@ def test_a_jump_leads_to_the_start_under_the_new_force():
     def states():
         old, new = (stepper.init(system, scene.q0, scene.v0, p, dt=0.1) for p in params)
         flat, _, _ = flatten("test", system, scene.q0, scene.v0, 0.0, params[0])
-        return old, new, held.jump(stepper, flat, old, *params)
+        return old, new, held.jump(stepper, flat, old, *params, 0.1)
 
     old, new, found = states()
     for name in ("w", "L"):

@@ -249,7 +249,7 @@ def test_a_sampled_input_starts_as_smoothly_as_the_function_it_samples():
     ramp = {"u": sampled(np.arange(6.0)[:, None], 1.0), "k": 9.0}
     stepper = hhtjax.hht(alpha=-0.3, start="corrected")
     state = jax.jit(lambda u: stepper.init(OSCILLATOR, jnp.zeros(1), jnp.zeros(1), u, dt=0.1))(ramp)
-    assert np.allclose(state.a - state.w, -0.3 * 0.1 * 1.0, rtol=1e-12)
+    assert np.allclose(state.a - state.w, -0.3 * 0.1 * 1.0, rtol=1e-6)  # but for the fifth power of what h resolves
 
 
 def test_gradients_through_a_simulation_with_respect_to_the_samples():

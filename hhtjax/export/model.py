@@ -10,7 +10,7 @@ from hhtjax.checks import require_params
 from hhtjax.description import all_concrete, thaw
 from hhtjax.export.fields import Field, distinct, fields
 from hhtjax.steppers.friction_law import is_settled
-from hhtjax.steppers.stepper import INTERNAL, require_capable, require_stepper, require_system
+from hhtjax.steppers.stepper import INTERNAL, entered, require_capable, require_stepper, require_system
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
@@ -108,7 +108,7 @@ def begin(made: Given, numbers: Numbers):
         params = numbers.params(values, u)
         q0, v0, z0 = (starts.get(name) for name in ("q0", "v0", "z0"))
         flat, q, v = flatten(made.caller, made.system, q0, v0, t0, params, z0)
-        state = made.stepper.astype(q.dtype).begin(flat, q, v, t0, params, dt)
+        _, state = entered(made.stepper.astype(q.dtype), flat, q, v, t0, params, dt)
         return state, _flags(state, None)
 
     return f
@@ -121,7 +121,7 @@ def step(made: Given, numbers: Numbers):
         old, now = numbers.params(values, before), numbers.params(values, u)
         flat, stepper = made.flat(state.t, now), made.stepper.astype(made.dtype)
         if numbers.inputs:
-            state = held.jump(stepper, flat, state, old, now)
+            state = held.jump(stepper, flat, state, old, now, dt)
         state, info = stepper.bind(flat, now, dt)(state)
         return state, _flags(state, info)
 

@@ -68,6 +68,31 @@ def factorize(A):
     return partial(_by_lapack, panels.lu(A))
 
 
+def inverse(A):
+    """A^-1 (n, n), constant to autodiff, by Gauss and Jordan in a loop: little to compile, for what is done once.
+
+    Rows are measured by the square roots of the diagonal, and those without one by what is left, so that no units
+    choose the pivots.
+    """
+    A, n = lax.stop_gradient(A), len(A)
+    if n == 2:
+        return jnp.stack([_cramer(A, e) for e in jnp.eye(2, dtype=A.dtype)], axis=1)
+    d = jnp.abs(diagonal(A))
+    size = jnp.sqrt(jnp.where(d == 0, 1, d))
+    rest = matvec(jnp.abs(A), 1 / size)
+    rows = 1 / jnp.where(d == 0, jnp.where(rest == 0, 1, rest), size)
+    i = jnp.arange(n)
+
+    def eliminate(k, both):
+        pivot = _pivot(both, k)
+        both = both[jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))]
+        row = both[k] / both[k, k]
+        return jnp.where((i == k)[:, None], row[None, :], both - both[:, k][:, None] * row[None, :])
+
+    both = jnp.concatenate([rows[:, None] * A, jnp.diag(rows)], axis=1)
+    return lax.fori_loop(0, n, eliminate, both)[:, n:]
+
+
 def _lu(A):
     """L below the diagonal and U on and above it, and the order of the rows: A[order] = L U."""
     n = A.shape[0]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
+from hhtjax.description import all_concrete
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.xla import in_turn, largest_in_batch
 
@@ -101,3 +102,16 @@ def derivative_by(f, value, *args):
         return jax.jvp(of_moving, ([x[i] for i in moving],), ([dots[i] for i in moving],))
 
     return call(leaves)
+
+
+def derivative_at_need(f, value, *args):
+    """The same, f traced for a derivative only, unless value closes over numbers that are not known.
+
+    >>> import jax
+    >>> print(jax.grad(lambda x: derivative_at_need(lambda x, y: x**y, lambda x, y: x * x, x, 2))(3.0))
+    6.0
+    """
+    call, constants = hoisted(value, *args)
+    if all_concrete(constants):
+        return derivative_by(f, partial(call, constants), *args)
+    return derivative_of(lambda: f(*args), lambda: call(constants, *args))

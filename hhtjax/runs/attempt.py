@@ -9,6 +9,7 @@ import numpy as np
 
 from hhtjax.numerics.rough import rough_exp, rough_log, without_rounding
 from hhtjax.runs.events import before_any
+from hhtjax.steppers.stepper import entered
 from hhtjax.systems import held, kinematics
 from hhtjax.xla import staged
 
@@ -209,15 +210,16 @@ def why_short(error):
 
 
 def begin(trial, q, v, t0):
-    """The walk before its first step. The method starts with the longest of these, of which others are parts."""
+    """The walk before its first step, and the state at t0 as it is saved. The method starts with the longest of these,
+    of which others are parts."""
     flat, stepper, bounds = trial.flat, trial.stepper, trial.bounds
     longest = jnp.minimum((trial.end - t0) / 100, bounds.most)
-    state = stepper.begin(flat, q, v, t0, held.before(trial.params, t0, longest), longest)
+    start, state = entered(stepper, flat, q, v, t0, held.before(trial.params, t0, longest), longest, resolves=True)
     q_size, v_size = sizes(flat, state)
     h = bounds.first(state, v_size, trial.end - t0)
     one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)
     past = stepper.begin_estimates(flat, state)
     walk = Walk(state, h, longest, past, 0 * one, one, q_size, v_size, none, none, none)
-    if trial.ways is None:
-        return walk
-    return walk._replace(met=before_any(trial.ways, trial.params))
+    if trial.ways is not None:
+        walk = walk._replace(met=before_any(trial.ways, trial.params))
+    return walk, start

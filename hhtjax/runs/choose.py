@@ -84,13 +84,13 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     flat, q, v, t0, _ = problem.flat()
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
     trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
-    start = begin(trial, q, v, t0)
+    walk, start = begin(trial, q, v, t0)
     plain = partial(attempt, trial._replace(ways=None))
-    form = on_scalars(plain, start, derivatives=False)  # as in a run: events are seldom
+    form = on_scalars(plain, walk, derivatives=False)  # as in a run: events are seldom
     one_try = form.of(plain if trial.ways is None else partial(attempt, trial))
     recorder: Any = None
     if times is not None:
-        recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, start)[1].info)
+        recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, walk)[1].info)
 
     def unfinished(carry):  # one answer for a batch: else vmap has each try copy the ends of all members
         return largest_in_batch(is_walking(carry[0], end))
@@ -135,7 +135,7 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     steps = as_steps(form.joined(walk), ends, t0, bounds.least)
     if times is None:
         return steps, ends, None
-    return steps, ends, solution(problem, start.state, form.joined(around), times, steps.reached)
+    return steps, ends, solution(problem, start, form.joined(around), times, steps.reached)
 
 
 def as_steps(walk, times, t0, least):

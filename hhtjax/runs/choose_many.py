@@ -115,7 +115,7 @@ class Search(NamedTuple):
         problem = self.members.problem(arrays)
         flat, q, v, t0, _ = problem.flat()
         bounds = Bounds.of(flat, problem.stepper, self.members.control(arrays), t0, self.end)
-        return bounds, begin(self.trial(arrays, bounds), q, v, t0)
+        return bounds, begin(self.trial(arrays, bounds), q, v, t0)[0]
 
     def trial(self, arrays, bounds):
         """How a member's steps are tried."""

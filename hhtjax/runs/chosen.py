@@ -99,7 +99,7 @@ def follow(problem, times, grid, events=None, room=()):
     """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
     flat, q, v, t0, params = problem.flat()
     longest = largest_in_batch(grid.counts)
-    plain = loop = loop_over(flat, problem.stepper, q, v, t0, params, grid.sizes)
+    plain = loop = loop_over(flat, problem.stepper, q, v, t0, params, grid.sizes, resolves=True)
     if events is not None:
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, in_pieces=True)
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
@@ -111,7 +111,7 @@ def follow(problem, times, grid, events=None, room=()):
 
     (_, (state, _, failure, *met)), (first, second, info) = one_kernel(samples, form.tree)
     (first, _), (second, extra) = form.joined(first), form.joined(second)
-    start = loop.carry[0]
+    start = loop.start
     flaw = flaw_at_start(problem.system, flat, start, params)
     ends = [as_solution(flat, start, path, None, info, failure, flaw) for path in (first, second)]
     if events is None:

@@ -10,7 +10,7 @@ from jax import lax
 from hhtjax.numerics.seldom import choose, if_any
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_law import is_settled
-from hhtjax.steppers.stepper import Info, join_info, public
+from hhtjax.steppers.stepper import Info, entered, join_info, public
 from hhtjax.systems import held
 from hhtjax.systems.matrices import mass_flaw
 
@@ -18,7 +18,8 @@ from hhtjax.systems.matrices import mass_flaw
 class Loop(NamedTuple):
     """What a run is made of. carry: (state, number of steps, first failure), before the first; advance: carry -> carry,
     Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged; bound: params -> advance; sizes:
-    number of steps taken -> the size of the next, and of the last; past: bound, sizes -> advance past events."""
+    number of steps taken -> the size of the next, and of the last; start: the state at t0, as it is saved; past: bound,
+    sizes -> advance past events."""
 
     carry: Any
     advance: Any
@@ -26,6 +27,7 @@ class Loop(NamedTuple):
     no_info: Info
     bound: Any
     sizes: Any
+    start: Any
     past: Any = None
 
 
@@ -41,10 +43,11 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     def advance(now):
         return counted(step if now is params else take_step(now), flat, t0, dt)
 
-    start = stepper.begin(flat, q, v, t0, held.before(params, t0, dt), dt)
-    no_info = neutral_info(jax.eval_shape(step, start)[1])
-    carry = start, jnp.zeros((), jnp.int32), no_failure(no_info)
-    return Loop(carry, counted(step, flat, t0, dt), partial(saved, flat), no_info, advance, lambda count: (dt, dt))
+    start, first = entered(stepper, flat, q, v, t0, held.before(params, t0, dt), dt)
+    no_info = neutral_info(jax.eval_shape(step, first)[1])
+    carry = first, jnp.zeros((), jnp.int32), no_failure(no_info)
+    keep = partial(saved, flat)
+    return Loop(carry, counted(step, flat, t0, dt), keep, no_info, advance, lambda count: (dt, dt), start)
 
 
 def given_sizes(t0, dt):
@@ -54,8 +57,10 @@ def given_sizes(t0, dt):
     return lambda number: [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
 
 
-def loop_over(flat, stepper, q, v, t0, params, sizes):
-    """The same with steps of any sizes: number of steps taken -> the next, the one before, and where it ends."""
+def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False):
+    """The same with steps of any sizes: number of steps taken -> the next, the one before, and where it ends.
+
+    resolves: whether the first is one of error control."""
     stepper = stepper.astype(q.dtype)
     none = jnp.zeros((), jnp.int32)
     first = sizes(none)[0]
@@ -81,10 +86,10 @@ def loop_over(flat, stepper, q, v, t0, params, sizes):
 
         return next_step
 
-    start = stepper.begin(flat, q, v, t0, held.before(params, t0, first), first)
-    no_info = neutral_info(jax.eval_shape(step, start, none)[1])
-    carry = start, none, no_failure(no_info)
-    return Loop(carry, advance(params), partial(saved, flat), no_info, advance, lambda count: tuple(sizes(count)[:2]))
+    start, begun = entered(stepper, flat, q, v, t0, held.before(params, t0, first), first, resolves=resolves)
+    no_info = neutral_info(jax.eval_shape(step, begun, none)[1])
+    carry, keep = (begun, none, no_failure(no_info)), partial(saved, flat)
+    return Loop(carry, advance(params), keep, no_info, advance, lambda count: tuple(sizes(count)[:2]), start)
 
 
 def resized_step(flat, stepper, params, dt, last):

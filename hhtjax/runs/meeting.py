@@ -17,9 +17,9 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, if_any, seldom
 from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, STAYS, THROWN
 from hhtjax.runs.event_log import row_of
-from hhtjax.runs.event_parts import SHORT, Met, Part, go
+from hhtjax.runs.event_parts import Met, Part, go
 from hhtjax.runs.event_times import beside_zero, first_of, first_time, located, look, nearness, pick
-from hhtjax.steppers.stepper import join_info
+from hhtjax.steppers.stepper import entered, join_info
 from hhtjax.systems import held
 from hhtjax.xla import staged
 
@@ -41,7 +41,7 @@ def pass_events(ways, params, part, h):
     if ways.middle is not None:
         old = held.before(ways.events.with_modes(params, part.met.modes), part.start.t, part.last)
         new = ways.params(params, part.met.modes)
-        part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new))
+        part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new, h))
 
     @checkpoint  # what all slots keep for reverse mode takes longer to compile than to compute one again
     def slot(part, _):
@@ -53,7 +53,7 @@ def pass_events(ways, params, part, h):
     met = part.met
 
     def anew(s, params):
-        return begin(ways, s.q, s.v, s.t, thaw(params), h)
+        return begin(ways, s.q, s.v, s.t, thaw(params), h, moves=False)
 
     now = freeze(ways.params(params, met.modes))
     end = seldom(anew, (part.divided > 0) & ~met.ended, part.end, now)
@@ -94,9 +94,9 @@ def flag(part, bad, code, which):
     return part._replace(met=met)
 
 
-def begin(ways, q, v, t, params, h):
-    """The state at a new start."""
-    return staged(lambda q, v, t, h: ways.stepper.begin(ways.flat, q, v, t, params, h))(q, v, t, h)
+def begin(ways, q, v, t, params, h, moves=True):
+    """The state from which a step of size h goes at a new start; moves: whether its velocity may be another."""
+    return staged(lambda q, v, t, h: entered(ways.stepper, ways.flat, q, v, t, params, h, moves)[1])(q, v, t, h)
 
 
 def meet(ways, now, found, h, params):
@@ -132,9 +132,8 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
     then = ways.params(params, modes)
     ends = pick(this, jnp.asarray(events.ends, h.dtype)) > 0
     rest = jnp.where(ends, 0, part.rest - tau)
-    size = jnp.maximum(rest, SHORT * h)
-    start = begin(ways, e.q, v, e.t, then, size)
-    end, more = go(ways, then, start, rest, size, h)
+    start = begin(ways, e.q, v, e.t, then, h)  # whole: what is left may be far too short to tell what is stiff
+    end, more = go(ways, then, start, rest, h, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
 
     g1, d1 = events.rates(ways.flat, start, then)
@@ -152,7 +151,7 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
     infos = join_info(join_info(choose(part.divided > 0, part.info, ways.no_info), info), more)
     asked = asks(ways, start, end, then, rest) | jnp.any(due)
     passed = part.passed & near & (d1 < 0)
-    new = Part(start, end, infos, rest, size, met, part.divided + 1, asked, passed, beside, due)
+    new = Part(start, end, infos, rest, h, met, part.divided + 1, asked, passed, beside, due)
     slack = nearness(h) * h * (jnp.abs(d) + jnp.abs(d1))
     jumps = (g > slack) & (g1 < -slack) & ~near & ~(this > 0) & ~jnp.asarray(events.noted)
     return flag(new, ~ends, THROWN, jumps)

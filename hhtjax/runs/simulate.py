@@ -175,7 +175,7 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_
     else:
         carry, (path, info) = intervals(form.tree, length)
     _, _, failure, *met = carry
-    start = loop.carry[0]
+    start = loop.start
     flaw = flaw_at_start(problem.system, flat, start, params)
     solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution

@@ -51,7 +51,7 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
         return lax.scan(interval, carry, intervals, num_samples)
 
     (_, _, failure, *met), (path, info) = one_kernel(samples, form.tree)
-    start = loop.carry[0]
+    start = loop.start
     flaw = flaw_at_start(system, flat, start, params)
     solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution

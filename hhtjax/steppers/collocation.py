@@ -12,9 +12,10 @@ from typing import Any
 
 from hhtjax.checks import require_number
 from hhtjax.numerics.elimination import factorize
+from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
 from hhtjax.steppers.newton import newton
 from hhtjax.steppers.options import Options, check_options
-from hhtjax.steppers.residual import residual
+from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State, Stepper
 
 
@@ -36,6 +37,19 @@ class Collocation(Stepper):
     def begin(self, system, q, v, t, params, dt):
         """w0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
+
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+        """The state from which the first step goes, as of the `hht` family; for 2 h, as the equation holds beyond h."""
+        return self.newmark.smoothed(system, state, params, 2 * dt, moves, resolves)._replace(a=None)
+
+    def jumped(self, system, before, after, old, new, dt, answer):
+        """The same where held inputs jump."""
+        return self.newmark.jumped(system, before, after, old, new, 2 * dt, answer)
+
+    @property
+    def newmark(self):
+        """The method of which it is, for theta = 1."""
+        return GeneralizedAlpha(Coefficients(0.0, 0.0, self.beta, 0.5), 2, self.options)
 
     def bind(self, system, params, dt):
         """Newton for w_c; the state carries w1, which obeys the equation of motion only within O(h^2)."""
@@ -65,7 +79,8 @@ def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Co
 
         theta/(2 (theta + 1)) >= beta >= (2 theta^2 - 1)/(4 (2 theta^3 - 1))
 
-    Started away from rest with a step far beyond a period, the first q1 overshoots by the square of h.
+    From w = M^-1 Q with a step far beyond a period, the first q1 overshoots by the square of h: so runs begin as those
+    of `hht` do.
 
     Args:
         beta: in (0, 1/4]; theta: 1 or more; numbers, or tracers to differentiate.

@@ -13,7 +13,6 @@ C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13, 1985; A. Cardona
 1989; M. Arnold, O. Bruls, Multibody Syst. Dyn. 18, 2007.
 """
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -30,21 +29,13 @@ from hhtjax.systems.constraints import (
 from hhtjax.xla import part
 
 
-def begin_constrained(method, system, q, v, t, params, dt):
-    """w0 and L0 of the index-1 system, and a0 of second order, without which L is of first."""
+def begin_constrained(method, system, q, v, t, params):
+    """w0 and L0 of the index-1 system."""
     where = method.options.linearize
     if where in ("held", "state"):
         raise ValueError(f"hht: with constraints, leave `linearize` out: it is at the predictor; received {where!r}.")
-
-    def start(q, v, t):
-        return acceleration_and_multipliers(system, q, v, t, params, method.factorize_for(system))
-
-    if method.options.start == "simple":
-        w, L = start(q, v, t)
-        return State(t, q, v, w, w, L)
-    (w, L), tangent = jax.linearize(start, q, v, t)
-    wdot, _ = tangent(system.rate(q, v), w, jnp.ones_like(t))
-    return State(t, q, v, w, method.corrected(system, v, w, wdot, dt), L)
+    w, L = acceleration_and_multipliers(system, q, v, t, params, method.factorize_for(system))
+    return State(t, q, v, w, w, L)
 
 
 def directions(system, M, B):

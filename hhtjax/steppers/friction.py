@@ -57,12 +57,12 @@ def begin_friction(method, system, q, v, t, params, dt):
 
     L = lax.fori_loop(0, LAGS, again, jnp.zeros_like(L0)) if system.num_constraints else None
     sig, tau = settle(L)
-    s = method.begin(_smooth(system, sig, tau, L), *at, dt)
+    s = method.begin(smooth_system(system, sig, tau, L), *at, dt)
     a = _taken_off(s.a, solve_some(K, sig == 0, matvec(H, s.a) + own), G)
     return s._replace(a=a, friction=Rubbing(sig, tau))
 
 
-def _smooth(system, sig, tau, L):
+def smooth_system(system, sig, tau, L):
     """Without the law, but with the friction of joints that slide, and the forces tau at those that do not."""
 
     def force(q, v, t, params):
@@ -76,14 +76,14 @@ def _settle(system, at, H, K, load, L):
     """sig and tau at the start, where without friction ds/dt is the load. What rests is held, within the limits; what
     cannot be held slides."""
     q, v, t, params = at
-    sig, f = _direction(system, at, H), system.friction.limit(q, v, L, t, params)
+    sig, f = direction(system, at, H), system.friction.limit(q, v, L, t, params)
     rests = sig == 0
     slid = jnp.where(rests, 0, sig * f)
     slides, tau = at_rest(K, rests, load - matvec(K, slid), f)
     return jnp.where(rests, slides, sig), jnp.where(rests, tau, slid)
 
 
-def _direction(system, at, H):
+def direction(system, at, H):
     """In which direction each joint slides: 0 where its velocity is a rounding of the velocities it is made of, which
     would begin with the whole limit, and the accelerations of that."""
     q, v, t, params = at

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Unpack
 
-import jax
-import jax.numpy as jnp
-
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
 from hhtjax.numerics.elimination import factorize
@@ -22,6 +19,8 @@ from hhtjax.steppers.linearization import linearized_step, refresh
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
+from hhtjax.steppers.smooth_friction import smoothed_friction
+from hhtjax.steppers.smooth_start import jumped, smoothed
 from hhtjax.steppers.stepper import State, Stepper, join_info
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
@@ -65,24 +64,34 @@ class GeneralizedAlpha(Controlled, Stepper):
     keeps_sparse = True
 
     def begin(self, system, q, v, t, params, dt):
-        """w0 = M^-1 Q, and a0 = w0 ("simple") or w0 + (alpha_m - alpha_f) h dw/dt ("corrected")."""
-        c, given = self.coefficients, self.options.solve
+        """The state at the start, w0 = a0 = M^-1 Q."""
+        given = self.options.solve
         if system.matrices is not None and not (given is None or isinstance(given, Structured)):
             raise NotImplementedError(f"hht: leave out `solve` with sparse matrices; received {given!r}.")
         if system.friction is not None:
             return begin_friction(self, system, q, v, t, params, dt)
         if system.num_constraints:
-            return begin_constrained(self, system, q, v, t, params, dt)
+            return begin_constrained(self, system, q, v, t, params)
+        w = system.acceleration(q, v, t, params, self.factorize)
+        return State(t, q, v, w, w)
 
-        def acceleration(q, v, t):
-            return system.acceleration(q, v, t, params, self.factorize)
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+        """The state from which the first step goes, by `start`."""
+        if self.options.start == "simple" or not system.positions or (resolves and not self.corrects(system)):
+            return state
+        smooth = smoothed if system.friction is None else smoothed_friction
+        return smooth(self, system.settled(params), state, params, dt, moves, resolves)
 
-        shift = c.alpha_m - c.alpha_f
-        if self.options.start != "corrected" or (is_concrete(shift) and shift == 0):
-            w = acceleration(q, v, t)
-            return State(t, q, v, w, w)
-        w, tangent = jax.linearize(acceleration, q, v, t)
-        return State(t, q, v, w, self.corrected(system, v, w, tangent(system.rate(q, v), w, jnp.ones_like(t)), dt))
+    def jumped(self, system, before, after, old, new, dt, answer):
+        """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
+        if self.options.start == "simple" or not system.positions:
+            return after
+        return jumped(self, system.settled(new), before, after, (old, new), dt, answer)
+
+    def corrects(self, system):
+        """Whether a0 has the term of second order."""
+        start = self.options.start
+        return self.resizes and (start == "corrected" or (start is None and system.num_constraints > 0))
 
     def corrected(self, system, v, w, wdot, dt):
         """a0 of second order: w0 + (alpha_m - alpha_f) h times the rate of psiddot, or of v.
@@ -123,17 +132,23 @@ class GeneralizedAlpha(Controlled, Stepper):
             rates = system.end_of_chart(x, *rates)
         return State(s.t + dt, system.move(s.q, x), *rates)
 
+    def factorization(self, system, params, dt):
+        """What the matrix of a step is factorised by; that of a linear system is so here, once."""
+        if system.num_constraints:
+            return self.factorize_for(system)
+        if system.linear and system.friction is None:
+            return factorized_once(self, system, params, dt)
+        return linear_part(self, system, params, dt) or self.factorize
+
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""
         system = system.settled(params)
-        known = linear_part(self, system, params, dt)
         if system.friction is not None:
-            return bind_friction(self, system, params, dt, known)
+            return bind_friction(self, system, params, dt, linear_part(self, system, params, dt))
         if system.num_constraints:
             return bind_constrained(self, system, params, dt)
-        if system.linear:  # all points of linearisation are one
-            return partial(step, self, system, params, factorized_once(self, system, params, dt), "predictor", dt)
-        return partial(step, self, system, params, known or self.factorize, self.options.linearize, dt)
+        where = "predictor" if system.linear else self.options.linearize  # all points of linearisation are one
+        return partial(step, self, system, params, self.factorization(system, params, dt), where, dt)
 
 
 @takes_options
@@ -166,10 +181,15 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
             row's own terms, or tolerance times these if that is less; a residual that is rounding ends the iteration
             too (iterations=None only).
         max_iterations: Newton iterations before a step counts as failed (iterations=None only).
-        start: "simple", a0 = w0; "corrected", a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order
-            value. q, v and w are of order 2 with both; only a needs the correction, which blows up when
-            h exceeds the fastest time scale of the system. Default: simple; corrected with constraints. Internal
-            states start simple always.
+        start: how the recursion begins, at t0, behind events, and where held inputs jump.
+            "smooth": with an implicit step of the velocity, of what damps more stiffly than h resolves alone, and an
+                acceleration by corrections with the matrix of the step. What h resolves is changed by O(h^5). Without
+                it a light, strongly damped coordinate that does not start with the velocity of its forces is thrown by
+                h^2 M^-1 Q (1/2 - beta/gamma), any multiple of where it goes. `run.v[0]` is the v0 that was given.
+            "corrected": the same, and a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order value. q, v and w are of
+                order 2 without; a and multipliers need it.
+            "simple": a0 = w0 = M^-1 Q, the recursion to the letter.
+            Default: smooth; corrected with constraints. Internal states keep their rates.
         formulation: of constraints. "ggl": Phi = 0 and dPhi/dt = 0, by one more multiplier for each (Gear,
             Gupta, Leimkuhler 1985); "index3": Phi = 0 alone, of index 3 as an equation: its
             multipliers, and their derivatives, hold roundings over h^2. With constraints, as with dry friction, the

@@ -23,7 +23,7 @@ class Options:
     linearize: Literal["predictor", "held", "state", "auto"] | None = None
     tolerance: float = 1e-10
     max_iterations: int = 20
-    start: Literal["corrected", "simple"] | None = None
+    start: Literal["smooth", "corrected", "simple"] | None = None
     formulation: Literal["ggl", "index3"] = "ggl"
     redundant: Literal["least_squares"] | None = None
     kinematics: Literal["chart", "lie"] = "chart"
@@ -41,7 +41,7 @@ class Keywords(TypedDict, total=False):
     linearize: Literal["predictor", "held", "state", "auto"] | None
     tolerance: float
     max_iterations: int
-    start: Literal["corrected", "simple"] | None
+    start: Literal["smooth", "corrected", "simple"] | None
     formulation: Literal["ggl", "index3"]
     redundant: Literal["least_squares"] | None
     kinematics: Literal["chart", "lie"]

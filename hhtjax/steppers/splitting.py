@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from hhtjax.description import is_concrete
 from hhtjax.numerics.elimination import matvec
 from hhtjax.numerics.linear_solve import solve
-from hhtjax.steppers.options import require_alpha
+from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
+from hhtjax.steppers.options import check_options, require_alpha
 from hhtjax.steppers.residual import hht_coefficients
 from hhtjax.steppers.stepper import Info, State, Stepper
 
@@ -40,6 +41,15 @@ class OperatorSplitting(Stepper):
         K, C = (-jax.jacfwd(system.force, argnums=i)(q, v, t, params) for i in (0, 1))
         memory = Memory(system.widened(K), C, self.weighted_force(system, q, v, t, params))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
+
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+        """The state from which the first step goes, as of the `hht` family."""
+        hht = GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
+        K, C, _ = state.memory
+        s = hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves)
+        left = system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)  # not 0 of what is stiff
+        P = self.weighted_force(system, s.q, s.v, s.t, params) + left
+        return s._replace(a=None, memory=Memory(K, C, P))
 
     def weighted_force(self, system, q, v, t, params):
         """P, what alpha weighs: Q, or in the modified form Q at rest."""
@@ -92,6 +102,8 @@ def operator_splitting(alpha: Any = -0.05, modified=False) -> OperatorSplitting:
     for every h while it softens. Once stiffened beyond the first bound (1.4 times for alpha = -0.3, 5.5 for -0.05) it
     is excited at every h, however small, by a rate of O(h^3). With alpha = 0 the second is h^2 (k - k0) <= 4 m: q~ then
     takes the steps of velocity Verlet with the mass M + h^2 K0/4.
+
+    Runs begin as those of `hht` do, not with a = M^-1 Q as in the sources.
 
     `solution.acceleration` holds a, which belongs to the time t + alpha h.
 

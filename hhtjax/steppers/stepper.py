@@ -13,6 +13,7 @@ from hhtjax.systems import held, kinematics
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.system import require_system as require_system
+from hhtjax.xla import one_kernel
 
 
 @shown
@@ -147,6 +148,18 @@ class Stepper(Description):
         """State at the initial time, for a `FlatSystem`."""
         raise NotImplementedError
 
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+        """The state from which the first step goes, where that is another than the one at the initial time.
+
+        moves: whether its velocity may be another, too. resolves: whether the first step, by error control, is so short
+        that it follows what is fastest."""
+        return state
+
+    def jumped(self, system, before, after, old, new, dt, answer):
+        """`after`, the state where held inputs jump, with M dw = Q(new) - Q(old), or what else a step dt asks for;
+        `before`: the same without. answer: dQ -> dw."""
+        return after
+
     def bind(self, system, params, dt):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
         raise NotImplementedError
@@ -188,7 +201,13 @@ def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
     require_capable(caller, system, stepper, q0, v0)
     flat, q, v = flatten(caller, system, q0, v0, t0, params, z0)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
-    return _unravel(flat, stepper.astype(q.dtype).begin(flat, q, v, t0, held.before(params, t0, dt), dt))
+    return _unravel(flat, entered(stepper.astype(q.dtype), flat, q, v, t0, held.before(params, t0, dt), dt)[1])
+
+
+def entered(stepper, system, q, v, t, params, dt, moves=True, resolves=False):
+    """The state at a start, and that from which the first step dt goes."""
+    start = stepper.begin(system, q, v, t, params, dt)
+    return start, one_kernel(lambda s: stepper.smoothed(system, s, params, dt, moves, resolves), start, around=True)
 
 
 def require_stepper(caller, stepper):

@@ -89,7 +89,7 @@ def entered(stepper, system, params, dt, last, s):
     if not holds(params):
         return params, s
     now = held_at(params, s.t + dt / 2)
-    return now, jump(stepper, system, s, before(params, s.t, last), now)
+    return now, jump(stepper, system, s, before(params, s.t, last), now, dt)
 
 
 def jump_after(params, t):
@@ -100,17 +100,21 @@ def jump_after(params, t):
     return jnp.min(jnp.stack([*times, jnp.full_like(t, jnp.inf)]))
 
 
-def jump(stepper, system, s, old, new):
-    """The state with the accelerations and multipliers that belong to the new params."""
+def jump(stepper, system, s, old, new, h):
+    """The state with the accelerations and multipliers that belong to the new params, for a step h.
+
+    What damps far too stiffly for the step changes its velocity, too: see `Stepper.jumped`."""
     dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
     answer = answers(system, s.q, s.t, new, stepper.redundant)
     dw, dL = answer(dQ)
     if system.num_constraints:
         L = s.L + dL
+    s1 = s
     if system.friction is not None:
         dw, friction = held_back(system, s, L, old, new, dw, answer)
-        s = s._replace(friction=friction)
-    return s._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
+        s1 = s._replace(friction=friction)
+    s1 = s1._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
+    return stepper.jumped(system, s, s1, old, new, h, lambda dQ: answer(dQ)[0])
 
 
 def _is_held(x):
