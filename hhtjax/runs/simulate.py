@@ -112,12 +112,12 @@ def simulate(
         require_integer("simulate", "max_events", max_events),
         require_integer("simulate", "keep_events", keep_events),
     )
-    if events is not None:
-        events = require_events("simulate", problem, events)
     if isinstance(dt, Adaptive) or times is not None:
         require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
         return run_controlled(problem, times, dt, progress, events, room)
     dt, num_steps = require_steps("simulate", stepper, dt, num_steps, 2 ** (extrapolate - 1))
+    if events is not None:
+        events = require_events("simulate", problem, events, dt[0] if jnp.ndim(dt) else dt)
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
