@@ -119,6 +119,11 @@ def _with_multipliers(caller, problem, event):
         raise ValueError(f"{caller}: the `guard` asks for `multipliers`, and the system has no constraint.")
     if isinstance(event.reset, Impact):
         raise ValueError(f"{caller}: the `guard` of an impact must depend on q and t only, not on multipliers.")
+    if problem.stepper.options.formulation == "index3":
+        raise NotImplementedError(
+            f'{caller}: the `guard` asks for `multipliers`, and with formulation="index3" those of a step that is '
+            "divided are of order 0: leave `formulation` out."
+        )
     at = problem.q0, problem.t0, thaw(problem.params)
     m, dtype = (
         returned.evaluate(caller, "constraint", system.constraint, *at).shape,

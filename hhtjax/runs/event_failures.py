@@ -5,12 +5,13 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
     MANY: (
         "more than max_events in a step, the first of them event",
         "A motion that comes to rest on a guard gives infinitely many: let it rest by a stiff force, or a constraint "
-        "in a run of its own. Else take a smaller dt, or a larger max_events",
+        "that the event switches on. Else take a smaller dt, or a larger max_events",
     ),
     STAYS: (
         "the motion stays beyond the guard of event",
-        "A body that rests there needs a stiff force, or a constraint in a run of its own. An event that turns nothing "
-        "back needs a guard that depends on the mode its switch changes. A force that jumps there needs a mode, too",
+        "A body that rests there needs a stiff force, or a constraint that the event switches on. An event that turns "
+        "nothing back needs a guard that depends on the mode its switch changes. A force that jumps there needs a mode, "
+        "too",
     ),
     ALONG: (
         "no velocity changes the guard of event",

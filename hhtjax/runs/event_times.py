@@ -13,6 +13,7 @@ TOGETHER = 1e-9  # part of a step: two events that are one
 ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations, at most
 NEARLY = 1e-8  # part of a step: the next iteration would change a rounding
 ROUNDINGS = 16  # of the terms of a guard, and of what it changes by in a step, that count as zero
+JUDGED = 1e-3  # part of a step: of a shorter rest the next step tells whether the motion leaves the guard
 ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
 
 
@@ -80,7 +81,7 @@ def look(ways, part, params, h):
 
     first = jnp.zeros_like(g0), lowest, lowest / 2, jnp.full_like(part.rest, jnp.inf), 0
     place = lax.while_loop(unfinished, improve, first)[2]
-    stays = (g1 < -rounding) & (part.rest > SHORT * h) & ~hit & ~left & ~noted
+    stays = (g1 < -rounding) & (part.rest > JUDGED * h) & ~hit & ~left & ~noted
     unknown = jnp.isnan(g1) & jnp.all(jnp.isfinite(part.end.q)) & jnp.all(jnp.isfinite(part.end.v))
     place = jnp.where(hit, place, jnp.inf)
     found = Found(

@@ -20,7 +20,9 @@ from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_N
 from hhtjax.runs.event_log import row_of
 from hhtjax.runs.event_parts import SHORT, Met, Part, go
 from hhtjax.runs.event_times import (
+    ROUNDINGS,
     beside_zero,
+    eps,
     first_of,
     first_time,
     lateness,
@@ -29,6 +31,7 @@ from hhtjax.runs.event_times import (
     nearness,
     pick,
     reached,
+    shaken,
 )
 from hhtjax.steppers.stepper import join_info
 from hhtjax.systems import held
@@ -170,7 +173,8 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
     asked = asks(ways, start, end, then, over, rest) | jnp.any(due)
     passed = part.passed & near & (d1 < 0)
     new = Part(start, end, infos, rest, size, met, part.divided + 1, asked, passed, beside, due)
-    slack = nearness(h) * h * (jnp.abs(d) + jnp.abs(d1))
+    slack = nearness(h) * h * (jnp.abs(d) + jnp.abs(d1)) + shaken(events.still, start, then, over)
+    slack = slack + ROUNDINGS * eps(h) * jnp.abs(g)
     jumps = (g > slack) & (g1 < -slack) & ~near & ~(this > 0)
     jumps = jumps & ~jnp.asarray(np.asarray(events.noted) | np.asarray(events.forced))
     return flag(new, ~ends, THROWN, jumps)
