@@ -10,8 +10,8 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
     STAYS: (
         "the motion stays beyond the guard of event",
         "A body that rests there needs a stiff force, or a constraint that the event switches on. An event that turns "
-        "nothing back needs a guard that depends on the mode its switch changes. A force that jumps there needs a mode, "
-        "too",
+        "nothing back needs a guard that depends on the mode its switch changes. A force that jumps there needs a "
+        "mode, too",
     ),
     ALONG: (
         "no velocity changes the guard of event",

@@ -163,6 +163,7 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
     beside = jnp.where(going_on, part.beside, near_and_due)
     due = jnp.where(going_on, part.due, near_and_due) & ~(this > 0)
     same = (jnp.abs(d1 - d) <= nearness(h) * jnp.abs(d)) & (jnp.abs(g1 - g) <= nearness(h) * h * jnp.abs(d))
+    same = same | jnp.asarray(events.timed)  # nothing changes those
     corner = jnp.any(beside & ~(this > 0) & ~same)  # in another order they might have other outcomes
     code = jnp.where(corner, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
     code = jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE).astype(part.met.code.dtype)
