@@ -1,6 +1,8 @@
 """What may go wrong at an event, as data and in words."""
 
-FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE, THROWN = range(9)
+from hhtjax.systems.constraints import SWITCHED_OFF
+
+FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE, THROWN, SINGULAR = range(10)
 EVENTS = {  # what it is, before the number of the event, and what to do about it
     MANY: (
         "more than max_events in a step, the first of them event",
@@ -38,5 +40,9 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
         "what another event changes takes the motion at once beyond the guard of event",
         "A guard of the velocity jumps with that, and one of params with a switch: say what happens by one event with "
         "a reset and a switch of its own, or let the guard depend on a mode",
+    ),
+    SINGULAR: (
+        "the constraint determines no acceleration behind event",
+        f"What its reset and its switch make of v and the params must be numbers, and rows independent. {SWITCHED_OFF}",
     ),
 }

@@ -16,7 +16,7 @@ from jax import lax
 from hhtjax.description import freeze, thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, if_any, seldom
-from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, STAYS, THROWN
+from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, SINGULAR, STAYS, THROWN
 from hhtjax.runs.event_log import row_of
 from hhtjax.runs.event_parts import SHORT, Met, Part, go
 from hhtjax.runs.event_times import (
@@ -166,6 +166,8 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
     same = same | jnp.asarray(events.timed)  # nothing changes those
     corner = jnp.any(beside & ~(this > 0) & ~same)  # in another order they might have other outcomes
     code = jnp.where(corner, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
+    if ways.flat.num_constraints:
+        code = jnp.where((code == FINE) & ~jnp.all(jnp.isfinite(start.w)), SINGULAR, code)
     code = jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE).astype(part.met.code.dtype)
 
     pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end)

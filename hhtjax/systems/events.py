@@ -367,14 +367,14 @@ def _changed(system, event, params, at):
     leaves, structure = jax.tree.flatten(params)
     places = [i for i, x in enumerate(leaves) if is_array(x) or not callable(x)]
 
-    def after(data, at):
+    def after(data, q, v, t):
         filled = list(leaves)
         for i, x in zip(places, data, strict=True):
             filled[i] = x
-        after = jax.tree.leaves(switched(system, event, *at, structure.unflatten(filled)))
+        after = jax.tree.leaves(switched(system, event, q, v, t, structure.unflatten(filled)))
         return [after[i] for i in places]
 
-    jaxpr = jax.make_jaxpr(after)([leaves[i] for i in places], at).jaxpr
+    jaxpr = jax.make_jaxpr(after)([leaves[i] for i in places], *at).jaxpr
     pairs = zip(places, jaxpr.invars, jaxpr.outvars, strict=False)  # behind the params is the state
     return [i for i, before, after in pairs if after is not before]
 
