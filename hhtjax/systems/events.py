@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.checks import require_function, require_number
+from hhtjax.checks import in_words, require_function, require_number
 from hhtjax.description import Description, as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.numerics.seldom import seldom
 from hhtjax.systems.constraints import answers, pull_back
@@ -109,8 +109,8 @@ class Event(Description):
             require_function("Event", "switch", self.switch, "switch(...)")
             if not any(_takes(self.switch, count) for count in SWITCHES):
                 raise TypeError(
-                    "Event: `switch` must be a function switch(params) or switch(q, v, t, params); received one with "
-                    f"the arguments ({', '.join(inspect.signature(self.switch).parameters)})."
+                    "Event: `switch` is called as switch(params) or switch(q, v, t, params); received a function of "
+                    f"{in_words(inspect.signature(self.switch))}."
                 )
         if not isinstance(self.terminal, bool):
             raise TypeError(f"Event: `terminal` must be True or False; received {self.terminal!r}.")
