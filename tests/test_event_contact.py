@@ -49,6 +49,26 @@ def test_a_rate_that_is_no_rounding_is_refused():
     check_message(ValueError, "it is 0, with the rate -1e-09 and the second derivative 2", lambda: pulled(2.0, -1e-9))
 
 
+def test_traced_starts_are_judged_by_their_steps():
+    """Of rounding it is rest; at once an impact where the rate is more, though the body would come back by itself."""
+
+    @jax.jit
+    def end(force, rate):
+        return pulled(force, rate)
+
+    for rate in (0.0, -1e-17, 1e-17):
+        run = end(2.0, rate)
+        run.check()
+        assert run.events.count == 0
+    run = end(2.0, -0.1)
+    run.check()
+    np.testing.assert_allclose(run.q[:, 0], 0.05 * run.t + run.t**2, atol=1e-14)
+    assert (int(run.events.count), float(run.events.t[0])) == (1, 0.0)
+    check_message(
+        SimulationError, "step 1 (to t = 0.1) failed: the motion stays beyond the guard", end(-2.0, 0.0).check
+    )
+
+
 @pytest.mark.slow
 def test_such_starts_under_error_control_and_in_a_sweep():
     control = {"dt": adaptive(1e-4, 1e-7), "times": [1.0]}

@@ -214,8 +214,8 @@ ERRORS = {
                   lambda: Event(at=lambda p, q: 1.0)),
     "returned": (TypeError, "simulate: events[0]: `at` must return a time, or (K,) times; received shape (1, 7)",
                  lambda: loaded(np.ones((1, 7)))),
-    "switch": (TypeError, "Event: `switch` is called as switch(params) or switch(q, v, t, params); received a function of "
-               "2 positional arguments (q, p).", lambda: Event(at=1.0, switch=lambda q, p: p)),
+    "switch": (TypeError, "Event: `switch` is called as switch(params) or switch(q, v, t, params); received a "
+               "function of 2 positional arguments (q, p).", lambda: Event(at=1.0, switch=lambda q, p: p)),
 }  # fmt: skip
 
 

@@ -33,11 +33,6 @@ class Found(NamedTuple):
     size: Any
 
 
-def falls_and_rises(g0, d0, g1, d1):
-    """Whether a guard that is positive at both ends may be zero between them."""
-    return (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
-
-
 def look(ways, part, params, h):
     """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
     part, params = lax.stop_gradient((part, params))
@@ -58,13 +53,16 @@ def look(ways, part, params, h):
     def cubic(x):
         return g0 + x * (d0 + x * (a + x * b))
 
-    turns = falls_and_rises(g0, d0, g1, d1)
+    turns = (d0 < 0) & (d1 > 0)
     root = jnp.sqrt(jnp.maximum(a * a - 3 * b * d0, 0))
-    lowest = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
-    touches = turns & (cubic(lowest) < -rounding)
-    rests = (g0 <= rounding) & (g1 >= -rounding) & ~timed  # at its guard to rounding: the next step tells
-    falls = (g0 >= -rounding) & (d0 <= 0) & (g1 < -rounding) & (part.divided == 0)  # behind one of which it did
-    at_once = (g0 <= 0) & (g1 <= 0) & (timed | ((forced | falls) & ~noted))
+    bottom = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
+    below = turns & (cubic(bottom) < -rounding)
+    turns = turns & (g0 > 0) & (g1 > 0)
+    touches, lowest = turns & below, jnp.where(turns, bottom, 1)
+    rests = (g0 <= rounding) & (g1 >= -rounding) & ~below & ~timed  # at its guard to rounding: the next step tells
+    fresh = (part.divided == 0) & (g0 <= 0) & (g0 >= -rounding)  # at its guard, and not by an event of this step
+    falls = fresh & (((d0 <= 0) & (g1 < -rounding)) | below) & ~noted
+    at_once = falls | ((g0 <= 0) & (g1 <= 0) & (timed | (forced & ~noted)))
     hit = ~part.passed & (touches | ((g1 <= 0) & ((g0 > 0) | returns) & ~rests) | at_once)
     hit, lowest = jnp.where(jnp.any(part.due), part.due, hit), jnp.where(part.due | at_once, 0, lowest)
 
