@@ -19,6 +19,7 @@ MANY = {  # of seven times each
     "a rounding beside the grid": [np.nextafter(0.1 * k, np.inf if k % 2 else 0.0) for k in range(1, 8)],
     "before the start and behind the end": [-1.0, -0.5, 0.5, 1.01, 2.0, 2.0, np.inf],
     "all at once": [0.37] * 7,
+    "a rounding behind the end": [-1.0, -1.0, -1.0, -1.0, -1.0, -1.0, 1 + 2e-16],
 }
 
 
@@ -39,7 +40,7 @@ def test_loads_at_known_times(case):
     T = np.array(MANY[case])
     run = loaded(T)
     run.check()
-    met = T[(T >= 0) & (T <= 1)]
+    met = T[(T >= 0) & (T <= 1 + 1e-15)]
     assert int(run.events.count) == met.size
     np.testing.assert_allclose(run.events.t[: met.size], met, rtol=0, atol=1e-15)
     np.testing.assert_allclose(run.q[:, 0], pushed(T, run.t), rtol=0, atol=1e-14)
