@@ -48,7 +48,7 @@ def require_function(caller, name, value, signature):
         )
     called = _signature(value, follow_wrapped=False)  # a decorator may have filled in some of them
     if expected != ["..."] and called is not None and not _takes(called, len(expected)):
-        raise TypeError(f"{caller}: `{name}` is called as {signature}; received a function of {_arguments(called)}.")
+        raise TypeError(f"{caller}: `{name}` is called as {signature}; received a function of {in_words(called)}.")
 
 
 def _signature(function, **options):
@@ -68,7 +68,7 @@ def _takes(called, count):
     return True
 
 
-def _arguments(called):
+def in_words(called):
     """The arguments of a signature in words; those that have to be given by name are not positional."""
     named = [name for name, x in called.parameters.items() if x.kind is x.KEYWORD_ONLY]
     first = [name for name in called.parameters if name not in named]

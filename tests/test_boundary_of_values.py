@@ -119,7 +119,8 @@ WRONG = {  # what is called, how, and one that takes a function, with one that t
     "LinearSystem: `K`": ("K(params)", lambda f: hhtjax.LinearSystem(Q, K=f), lambda q, p: 1, "2", "(q, p)"),
     "LinearSystem: `force`": ("force(t, params)", lambda f: hhtjax.LinearSystem(Q, force=f), lambda t: 1, "1", "(t)"),
     "FirstOrderSystem: `rate`": ("rate(y, t, params)", hhtjax.FirstOrderSystem, lambda y, p: y, "2", "(y, p)"),
-    "Event: `switch`": ("switch(params)", lambda f: meet(guard=height, switch=f), lambda: 0, "0", "()"),
+    "Event: `switch`": (
+        "switch(params) or switch(q, v, t, params)", lambda f: meet(guard=height, switch=f), lambda: 0, "0", "()"),
     "simulate: events[0]: `guard`": (
         "guard(q, v, t, params)", lambda f: meet(guard=f), lambda q, v: q[0], "2", "(q, v)"),
     "simulate: events[0]: `reset`": (

@@ -149,7 +149,8 @@ def factorize_least_squares(n):
         tolerance = max(RANK_TOLERANCE, 100 * float(jnp.finfo(A.dtype).eps))
         d = jnp.abs(jnp.diagonal(A)[:n])
         first = 1 / jnp.sqrt(jnp.where(d == 0, 1, d))
-        rest = 1 / jnp.max(jnp.abs(first[:, None] * A[:n, n:]))
+        size = jnp.max(jnp.abs(first[:, None] * A[:n, n:]))
+        rest = 1 / jnp.where(size == 0, 1, size)  # 0 where all constraints are switched off
         scale = jnp.concatenate([first, jnp.full(A.shape[0] - n, rest)])
         U, s, Vt = jnp.linalg.svd(scale[:, None] * A * scale[None, :])
         inverse = jnp.where(s > tolerance * s[0], 1 / s, 0)

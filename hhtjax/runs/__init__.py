@@ -188,6 +188,24 @@ Here a spring that is only there beyond q = 1:
 >>> int(run.events.count), round(float(run.events.after[1, 0]), 2)
 (2, -0.73)
 
+`switch(q, v, t, params)` sees the state, too. What happens at known times has no guard: `Event(at=times)`, with numbers
+or a function of params, divides steps there, and error control ends them there. Runs are differentiable in the times.
+
+>>> brake = hhtjax.Event(at=lambda p: p["time"], switch=lambda p: p | {"force": -0.8})
+>>> cart = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: p["force"] + 0 * q)
+>>> def where(time):
+...     params = {"time": time, "force": 0.0}
+...     run = hhtjax.simulate(
+...         cart, hhtjax.hht(), jnp.zeros(1), jnp.ones(1), params, dt=0.1, num_steps=10, events=[brake])
+...     return run.q[-1, 0]
+>>> [round(float(f(0.27)), 6) for f in (where, jax.grad(where))]              # 1 - .4 (1 - .27)^2, .8 (1 - .27)
+[0.78684, 0.584]
+
+Contact that lasts is a constraint that events switch on and off: on where the body meets its stop, with `impact(0.0)`,
+off where the multiplier falls to zero, which a guard sees that has an argument `multipliers`. The number of constraints
+of a run is fixed, so one that is off holds a coordinate of its own instead: `hhtjax.scenes.shaken_table` shows it. A
+body may start at rest at its guard where its acceleration takes it off.
+
 What fails is named, and never ends behind the wall: more changes in a step than `max_events`, as of a ball that comes
 to rest; a motion that stays beyond its guard; two impacts at one time; a start beyond a guard. Derivatives belong to
 the order in which events happen; where a motion only grazes a guard they grow without bound (`run.events.rate` tells),

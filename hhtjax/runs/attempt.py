@@ -166,6 +166,8 @@ def next_end(trial, params, walk):
     t, end = walk.state.t, trial.end
     h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
     due = jnp.minimum(end, held.jump_after(params, t)) if held.holds(params) else end
+    if walk.met is not None and walk.met.over:
+        due = jnp.minimum(due, trial.ways.events.due_after(t, walk.met.over))
     left = due - t
     lands = left <= reach  # what has doubled does, where jumps are equally far apart
     h = jnp.where(lands, left, jnp.minimum(h, without_rounding(left / 2, more=1)))  # the second half is no longer
@@ -221,5 +223,5 @@ def begin(trial, q, v, t0):
     past = stepper.begin_estimates(flat, state)
     walk = Walk(state, h, longest, past, 0 * one, one, q_size, v_size, none, none, none)
     if trial.ways is not None:
-        walk = walk._replace(met=before_any(trial.ways, trial.params))
+        walk = walk._replace(met=before_any(trial.ways, trial.params, t0))
     return walk, start

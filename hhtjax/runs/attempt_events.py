@@ -34,7 +34,7 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
         return resized_step(flat, stepper, params, h, h)(stepper.begin(flat, q, v, t0, params, h))
 
     no_info = neutral_info(jax.eval_shape(one, end)[1])
-    flat_events = flatten_events(flat, events, params, stepper.redundant)
+    flat_events = flatten_events(flat, events, params, (q, v, t0), stepper.redundant)
     ways = Ways(flat, stepper, flat_events, room[0], no_info, reaching(flat, stepper, no_info))
     return trial._replace(ways=ways, past_events=past_events)
 
@@ -42,7 +42,7 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
 def past_events(trial, tried, walk, h):
     """The try, past the events in its step."""
     now = trial.ways.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
-    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, now, h)
+    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, now, walk.met.over, h)
     return seldom_alone(partial(passed, trial), asked, tried, walk, h)
 
 

@@ -202,8 +202,13 @@ def choose_steps(
     times = checked_times("choose_steps", problem, times, control)
     room = (require_integer("choose_steps", "max_events", max_events),)
     if events is not None:
-        events = require_events("choose_steps", problem, events)
+        events = require_events("choose_steps", problem, events, usual_step(problem.t0, times))
     return trimmed(steps_for(lax.stop_gradient((problem, times, control, events)), progress, room)[0])
+
+
+def usual_step(t0, times):
+    """How long a step may be before any is chosen: a thousandth of the run."""
+    return (times[-1] - t0) / 1000
 
 
 def checked_times(caller, problem, times, control):

@@ -11,7 +11,8 @@ from hhtjax.description import all_concrete, is_tracing
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.choose import choose, trimmed
-from hhtjax.runs.chosen import checked_times, run_over, steps_for
+from hhtjax.runs.chosen import checked_times, run_over, steps_for, usual_step
+from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.freezing import frozen, is_pair, run_and_choice
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.tightened import accepted_run, tighten
@@ -22,6 +23,8 @@ from hhtjax.xla import Programs, is_untouched, one_kernel, or_plain
 def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
+    if events is not None:
+        events = require_events("simulate", problem, events, usual_step(problem.t0, times))
     start, alone = (problem, times, control, events), is_untouched() and not is_pair()
     if control.verify == "tighten":
         return run_tightened(start, alone, progress, room)

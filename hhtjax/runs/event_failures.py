@@ -1,16 +1,19 @@
 """What may go wrong at an event, as data and in words."""
 
-FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE, THROWN = range(9)
+from hhtjax.systems.constraints import SWITCHED_OFF
+
+FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE, THROWN, SINGULAR = range(10)
 EVENTS = {  # what it is, before the number of the event, and what to do about it
     MANY: (
         "more than max_events in a step, the first of them event",
         "A motion that comes to rest on a guard gives infinitely many: let it rest by a stiff force, or a constraint "
-        "in a run of its own. Else take a smaller dt, or a larger max_events",
+        "that the event switches on. Else take a smaller dt, or a larger max_events",
     ),
     STAYS: (
         "the motion stays beyond the guard of event",
-        "A body that rests there needs a stiff force, or a constraint in a run of its own. An event that turns nothing "
-        "back needs a guard that depends on the mode its switch changes. A force that jumps there needs a mode, too",
+        "A body that rests there needs a stiff force, or a constraint that the event switches on. An event that turns "
+        "nothing back needs a guard that depends on the mode its switch changes. A force that jumps there needs a "
+        "mode, too",
     ),
     ALONG: (
         "no velocity changes the guard of event",
@@ -37,5 +40,9 @@ EVENTS = {  # what it is, before the number of the event, and what to do about i
         "what another event changes takes the motion at once beyond the guard of event",
         "A guard of the velocity jumps with that, and one of params with a switch: say what happens by one event with "
         "a reset and a switch of its own, or let the guard depend on a mode",
+    ),
+    SINGULAR: (
+        "the constraint determines no acceleration behind event",
+        f"What its reset and its switch make of v and the params must be numbers, and rows independent. {SWITCHED_OFF}",
     ),
 }

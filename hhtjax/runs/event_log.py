@@ -22,8 +22,8 @@ class Events(NamedTuple):
         q: where, like q0 with a leading axis; None of a first-order system.
         before, after: v before and after each, like v0 with a leading axis; y of a first-order system.
         z: internal states there, None without.
-        rate: (keep_events,), dg/dt before. Where it is small beside the velocities the motion grazes the guard, and
-            derivatives are huge, at last infinite.
+        rate: (keep_events,), dg/dt before, the part of multipliers as they change over the step. Where it is small
+            beside the velocities the motion grazes the guard, and derivatives are huge, at last infinite.
     """
 
     count: Any

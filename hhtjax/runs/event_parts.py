@@ -43,7 +43,8 @@ class Ways(NamedTuple):
 
 class Met(NamedTuple):
     """What a run with events carries along: numbers that switches changed, whether it has ended, what went wrong (code
-    and event), the `Log`, and, where it is read off between its steps, the pieces of the last."""
+    and event), the `Log`, where it is read off between its steps the pieces of the last, and of each event with known
+    times how many of them are over."""
 
     modes: list
     ended: Any
@@ -51,6 +52,7 @@ class Met(NamedTuple):
     event: Any
     log: Any = None
     pieces: Any = None
+    over: Any = ()
 
 
 class Part(NamedTuple):

@@ -6,20 +6,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.runs.event_parts import go
+from hhtjax.runs.event_parts import SHORT, go
+from hhtjax.systems.sampled import SLOP
 
 TOGETHER = 1e-9  # part of a step: two events that are one
 ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations, at most
 NEARLY = 1e-8  # part of a step: the next iteration would change a rounding
+ROUNDINGS = 16  # of the terms of a guard, and of what it changes by in a step, that count as zero
+JUDGED = 1e-3  # part of a step: of a shorter rest the next step tells whether the motion leaves the guard
 ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
 
 
 class Found(NamedTuple):
-    """Of each event: whether it falls into the part of a step, where about (0 to 1), before where, whether it only
-    touches there, whether the motion stays beyond it, and was made to by the event before, whether it is no number, and
-    how large the guard is."""
+    """Of each event: whether it falls into the part of a step, whether by a jump before that, where about (0 to 1),
+    before where, whether it only touches there, whether the motion stays beyond it, and was made to by the event
+    before, whether it is no number, and how large the guard is."""
 
     hit: Any
+    jumped: Any
     place: Any
     limit: Any
     touches: Any
@@ -29,17 +33,16 @@ class Found(NamedTuple):
     size: Any
 
 
-def falls_and_rises(g0, d0, g1, d1):
-    """Whether a guard that is positive at both ends may be zero between them."""
-    return (g0 > 0) & (g1 > 0) & (d0 < 0) & (d1 > 0)
-
-
 def look(ways, part, params, h):
     """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
     part, params = lax.stop_gradient((part, params))
     now = ways.params(params, part.met.modes)
-    (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, s, now) for s in (part.start, part.end))
-    noted = jnp.asarray(ways.events.noted)
+    events, over = ways.events.still, part.met.over
+    (g0, d0), (g1, d1) = events.both(ways.flat, part.start, part.end, now, over, part.rest)
+    rounding = shaken(events, part.end, now, over) + ROUNDINGS * eps(h) * h * jnp.maximum(jnp.abs(d0), jnp.abs(d1))
+    rounding = jnp.where(jnp.isfinite(rounding), rounding, 0)
+    g1 = g1 - lateness(events, part.end.t)
+    noted, timed, forced = (jnp.asarray(x) for x in (events.noted, events.timed, events.forced))
     rising = (d0 > 0) & (d1 > 0)
     left = rising & (g1 > -nearness(g1) * h * d1)  # behind an event g is a rounding of either sign
     negative = (part.divided > 0) & (g0 < -beside_zero(d0, h, jnp.abs(g0) + jnp.abs(g1)))
@@ -50,12 +53,18 @@ def look(ways, part, params, h):
     def cubic(x):
         return g0 + x * (d0 + x * (a + x * b))
 
-    turns = falls_and_rises(g0, d0, g1, d1)
+    turns = (d0 < 0) & (d1 > 0)
     root = jnp.sqrt(jnp.maximum(a * a - 3 * b * d0, 0))
-    lowest = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
-    touches = turns & (cubic(lowest) < 0)
-    hit = ~part.passed & (touches | ((g1 <= 0) & ((g0 > 0) | returns)))
-    hit, lowest = jnp.where(jnp.any(part.due), part.due, hit), jnp.where(part.due, 0, lowest)
+    bottom = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
+    below = turns & (cubic(bottom) < -rounding)
+    turns = turns & (g0 > 0) & (g1 > 0)
+    touches, lowest = turns & below, jnp.where(turns, bottom, 1)
+    rests = (g0 <= rounding) & (g1 >= -rounding) & ~below & ~timed  # at its guard to rounding: the next step tells
+    fresh = (part.divided == 0) & (g0 <= 0) & (g0 >= -rounding)  # at its guard, and not by an event of this step
+    falls = fresh & (((d0 <= 0) & (g1 < -rounding)) | below) & ~noted
+    at_once = falls | ((g0 <= 0) & (g1 <= 0) & (timed | (forced & ~noted)))
+    hit = ~part.passed & (touches | ((g1 <= 0) & ((g0 > 0) | returns) & ~rests) | at_once)
+    hit, lowest = jnp.where(jnp.any(part.due), part.due, hit), jnp.where(part.due | at_once, 0, lowest)
 
     def improve(now):
         low, high, x, _, k = now
@@ -70,11 +79,29 @@ def look(ways, part, params, h):
 
     first = jnp.zeros_like(g0), lowest, lowest / 2, jnp.full_like(part.rest, jnp.inf), 0
     place = lax.while_loop(unfinished, improve, first)[2]
-    stays = (g1 < 0) & ~hit & ~left & ~noted
+    stays = (g1 < -rounding) & (part.rest > JUDGED * h) & ~hit & ~left & ~noted
     unknown = jnp.isnan(g1) & jnp.all(jnp.isfinite(part.end.q)) & jnp.all(jnp.isfinite(part.end.v))
     place = jnp.where(hit, place, jnp.inf)
-    found = Found(hit, place, lowest, touches, stays, stays & negative, unknown, jnp.abs(g0) + jnp.abs(g1))
+    found = Found(
+        hit, at_once & hit & forced, place, lowest, touches, stays, stays & negative, unknown, jnp.abs(g0) + jnp.abs(g1)
+    )
     return lax.stop_gradient(found)
+
+
+def shaken(events, s, params, over):
+    """How much each guard changes where q and v do by roundings: of the size of those of its terms."""
+
+    def moved(x):
+        k = np.arange(x.size)
+        uneven = np.where(k % 2, -1, 1) * (0.75 + 0.618034 * k % 0.5)
+        return x * (1 + ROUNDINGS * eps(x) * jnp.asarray(uneven, x.dtype))
+
+    return jnp.abs(events.guards(s._replace(q=moved(s.q), v=moved(s.v)), params, over) - events.guards(s, params, over))
+
+
+def lateness(events, t):
+    """By how much an event may come after the end of a step, by rounding, and still be one of it."""
+    return jnp.where(jnp.asarray(events.timed), SLOP * eps(t) * jnp.abs(t), 0)
 
 
 def first_time(ways, params, part, found, h):
@@ -87,8 +114,8 @@ def first_time(ways, params, part, found, h):
 
     def improve(now):
         low, high, tau, *_, k = now
-        s, _ = go(ways, params, part.start, tau, part.last, h)
-        g, d = ways.events.rates(ways.flat, s, params)
+        s, _ = reached(ways, params, part, tau, h)
+        g, d = events.rates(ways.flat, s, params, part.met.over, Ldot)
         above = jnp.all((g > 0) | ~found.hit)
         low, high = jnp.where(above, tau, low), jnp.where(above, high, tau)
         times = jnp.where(d < 0, tau - g / jnp.where(d < 0, d, 1), jnp.inf)
@@ -99,6 +126,8 @@ def first_time(ways, params, part, found, h):
         near = jnp.abs(times - new) <= nearness(h) * h
         return low, high, new, near, jnp.abs(new - tau), k + 1
 
+    events = ways.events.still
+    Ldot = events.slope(part.start, part.end, part.rest)
     tau = jnp.clip(jnp.min(found.place), 0, 1) * part.rest
     high = jnp.min(jnp.where(found.hit, found.limit, 1)) * part.rest
     begin = jnp.zeros_like(tau), high, tau, jnp.zeros_like(found.hit), jnp.full_like(tau, jnp.inf), 0
@@ -119,12 +148,23 @@ def first_of(events, part, found, near):
     return jnp.min(jnp.where(this, numbers, numbers.size)), this.astype(found.place.dtype)
 
 
-def located(ways, params, part, this, tau, h):
-    """The time of an event, with its derivative."""
+def reached(ways, params, part, tau, h):
+    """`go` from the start of a part; in a very short time multipliers change, too, where a guard sees them."""
+    s, info = go(ways, params, part.start, tau, part.last, h)
+    if any(ways.events.forced):
+        Ldot = ways.events.slope(part.start, part.end, part.rest)
+        s = s._replace(L=jnp.where(tau <= SHORT * h, part.start.L + tau * Ldot, s.L))
+    return s, info
+
+
+def located(ways, params, part, this, found, tau, h):
+    """The time of an event, with its derivative; of multipliers that have jumped below zero that of the start."""
+    jumped = pick(this, found.jumped.astype(h.dtype)) > 0
 
     def guard(tau):
-        s, _ = go(ways, params, part.start, tau, part.last, h)
-        return pick(this, ways.events.guards(s.q, s.v, s.t, params))
+        s, _ = reached(ways, params, part, tau, h)
+        g = pick(this, ways.events.guards(s, params, part.met.over))
+        return jnp.where(jumped, -tau, g) if any(ways.events.forced) else g
 
     return lax.custom_root(guard, tau, lambda _, tau: tau, lambda g, y: y / g(jnp.ones_like(y)))
 
@@ -137,12 +177,17 @@ def improved(x, y, slope, low, high):
 
 def beside_zero(rate, h, size):
     """How far from zero a guard may be where its event was found, of numbers of this size."""
-    return 1e-3 * jnp.abs(rate) * h + 1e3 * float(jnp.finfo(h.dtype).eps) * size
+    return 1e-3 * jnp.abs(rate) * h + 1e3 * eps(h) * size
 
 
 def nearness(x):
     """The part of a step within which two times are one."""
-    return max(TOGETHER, 1e3 * float(jnp.finfo(x.dtype).eps))
+    return max(TOGETHER, 1e3 * eps(x))
+
+
+def eps(x):
+    """A rounding of 1."""
+    return float(jnp.finfo(x.dtype).eps)
 
 
 def pick(this, x):

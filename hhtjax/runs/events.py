@@ -25,9 +25,9 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     """
     start = loop.carry[0]
     stepper = stepper.astype(start.v.dtype)
-    flat_events, no_info = flatten_events(flat, events, params, stepper.redundant), loop.no_info
-    ways = Ways(flat, stepper, flat_events, max_events, no_info, reaching(flat, stepper, no_info), keep)
-    met = before_any(ways, params)
+    flat_events = flatten_events(flat, events, params, (start.q, start.v, start.t), stepper.redundant)
+    ways = Ways(flat, stepper, flat_events, max_events, loop.no_info, reaching(flat, stepper, loop.no_info), keep)
+    met = before_any(ways, params, start.t)
     met = met._replace(log=Log.empty(unnoted(start)[0], keep, ways.slots))
     if in_pieces:
         met = met._replace(pieces=Pieces.none(start, max_events + 1))
@@ -41,7 +41,7 @@ def past_events(ways, params, bound, sizes):
     bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
     """
     events, pass_them = ways.events, passing(ways)
-    fixed = None if events.modes(params) else bound(params)
+    fixed = None if events.switches else bound(params)
 
     def step(carry, here=None):
         *run, met = carry
@@ -69,7 +69,7 @@ def past_events(ways, params, bound, sizes):
 def may_meet(ways, part, h, params):
     """Whether there may be an event in a step."""
     now = ways.during(params, part.start.t, h).params(params, part.met.modes)
-    asked = asks(ways, part.start, part.end, now, h)
+    asked = asks(ways, part.start, part.end, now, part.met.over, h)
     return asked & ~part.met.ended if any(ways.events.ends) else asked
 
 
@@ -98,10 +98,10 @@ def at_rest(here, new, old):
     return new if here is None else choose(here, new, old)
 
 
-def before_any(ways, params):
+def before_any(ways, params, t):
     """`Met` before the first event."""
     none = jnp.zeros((), jnp.int32)
-    return Met(ways.events.modes(params), jnp.array(False), none + FINE, none)
+    return Met(ways.events.modes(params), jnp.array(False), none + FINE, none, over=ways.events.before_any(t))
 
 
 def with_told_events(flat, solution, met, keep):

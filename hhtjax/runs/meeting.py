@@ -10,24 +10,40 @@ A rest of a millionth of the step is a Taylor polynomial: skipping it would lose
 from functools import partial
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from hhtjax.description import freeze, thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.seldom import choose, if_any, seldom
-from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, STAYS, THROWN
+from hhtjax.runs.event_failures import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, SINGULAR, STAYS, THROWN
 from hhtjax.runs.event_log import row_of
 from hhtjax.runs.event_parts import Met, Part, go
-from hhtjax.runs.event_times import beside_zero, first_of, first_time, located, look, nearness, pick
+from hhtjax.runs.event_times import (
+    ROUNDINGS,
+    beside_zero,
+    eps,
+    first_of,
+    first_time,
+    lateness,
+    located,
+    look,
+    nearness,
+    pick,
+    reached,
+    shaken,
+)
 from hhtjax.steppers.stepper import entered, join_info
 from hhtjax.systems import held
 from hhtjax.xla import staged
 
 
-def asks(ways, s, s1, params, h):
+def asks(ways, s, s1, params, over, h):
     """Whether an event may fall into the step from s to s1: no more than a look at both ends, in few operations."""
-    (g0, d0), (g1, d1) = (ways.events.rates(ways.flat, x, params) for x in lax.stop_gradient((s, s1)))
-    noted = jnp.asarray(ways.events.noted)
+    (g0, d0), (g1, d1) = ways.events.still.both(ways.flat, *lax.stop_gradient((s, s1)), params, over, h)
+    noted = np.asarray(ways.events.noted) & ~np.asarray(ways.events.timed)
+    if any(ways.events.timed):
+        g1 = g1 - lateness(ways.events, s1.t)
     below = ~(g1 > 0) & (~noted | (g0 > 0) | (d0 > 0))
     cross_below = g0 * (d1 - d0) <= d0 * (g1 - g0 - d1 * h)  # tangents at both ends; a division is dear
     return jnp.any(below | ((d0 < 0) & (d1 > 0) & cross_below))
@@ -107,16 +123,20 @@ def meet(ways, now, found, h, params):
     tau, near = lax.stop_gradient(first_time(ways, ways.params(*known[:2]), known[2], found, h))
     i, this = first_of(events, part, found, near)
     now = ways.params(params, met.modes)
-    tau = located(ways, now, part, this, tau, h)
-    e, info = go(ways, now, part.start, tau, part.last, h)
-    g, d = events.rates(ways.flat, e, now)
+    tau = located(ways, now, part, this, found, tau, h)
+    e, info = reached(ways, now, part, tau, h)
+    Ldot = events.slope(part.start, part.end, part.rest)
+    g, d = events.rates(ways.flat, e, now, met.over, Ldot)
     rate = pick(this, d)
     missed = ~(jnp.abs(pick(this, g)) <= beside_zero(rate, h, pick(this, found.size)))
-    v, modes = events.outcome(i, e.q, e.v, e.t, now, events.with_modes(params, met.modes))
+    missed = missed & ~(pick(this, found.jumped.astype(h.dtype)) > 0)
+    v, modes = events.outcome(i, e, now, events.with_modes(params, met.modes))
     row = row_of(e.t, i, rate, e.q, e.v, v)
 
-    passed = part._replace(passed=part.passed | (this > 0))
-    new = behind(ways, part, (e, info, tau, g, d), (v, modes), i, this, near, h, params)
+    over = events.passed(i, met.over)
+    again = jnp.asarray(events.timed)  # a time that is over is no longer its guard
+    passed = part._replace(passed=part.passed | ((this > 0) & ~again), met=met._replace(over=over))
+    new = behind(ways, part, (e, info, tau, g, d), (v, modes, over), i, this, near, h, params)
     noted, touches = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, found.touches))
     new = choose(noted, passed, new)  # what changes nothing divides no step
     stays, many = missed & jnp.all(jnp.isfinite(e.v)), ~noted & (part.divided == ways.max_events)
@@ -128,7 +148,7 @@ def meet(ways, now, found, h, params):
 
 def behind(ways, part, at, outcome, i, this, near, h, params):
     """The part of the step behind event i. at: the state and the `Info` before it, when, and g and dg/dt of all."""
-    events, (e, info, tau, g, d), (v, modes) = ways.events, at, outcome
+    events, (e, info, tau, g, d), (v, modes, over) = ways.events, at, outcome
     then = ways.params(params, modes)
     ends = pick(this, jnp.asarray(events.ends, h.dtype)) > 0
     rest = jnp.where(ends, 0, part.rest - tau)
@@ -136,22 +156,27 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
     end, more = go(ways, then, start, rest, h, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
 
-    g1, d1 = events.rates(ways.flat, start, then)
+    g1, d1 = events.rates(ways.flat, start, then, over, events.slope(start, end, rest))
     near_and_due = near & ~part.passed & ~jnp.asarray(events.noted)
     going_on = jnp.any(part.due)
     beside = jnp.where(going_on, part.beside, near_and_due)
     due = jnp.where(going_on, part.due, near_and_due) & ~(this > 0)
     same = (jnp.abs(d1 - d) <= nearness(h) * jnp.abs(d)) & (jnp.abs(g1 - g) <= nearness(h) * h * jnp.abs(d))
+    same = same | jnp.asarray(events.timed)  # nothing changes those
     corner = jnp.any(beside & ~(this > 0) & ~same)  # in another order they might have other outcomes
     code = jnp.where(corner, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
+    if ways.flat.num_constraints:
+        code = jnp.where((code == FINE) & ~jnp.all(jnp.isfinite(start.w)), SINGULAR, code)
     code = jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE).astype(part.met.code.dtype)
 
     pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end)
-    met = Met(modes, ends, code, i, pieces=pieces)
+    met = Met(modes, ends, code, i, pieces=pieces, over=over)
     infos = join_info(join_info(choose(part.divided > 0, part.info, ways.no_info), info), more)
-    asked = asks(ways, start, end, then, rest) | jnp.any(due)
+    asked = asks(ways, start, end, then, over, rest) | jnp.any(due)
     passed = part.passed & near & (d1 < 0)
     new = Part(start, end, infos, rest, h, met, part.divided + 1, asked, passed, beside, due)
-    slack = nearness(h) * h * (jnp.abs(d) + jnp.abs(d1))
-    jumps = (g > slack) & (g1 < -slack) & ~near & ~(this > 0) & ~jnp.asarray(events.noted)
+    slack = nearness(h) * h * (jnp.abs(d) + jnp.abs(d1)) + shaken(events.still, start, then, over)
+    slack = slack + ROUNDINGS * eps(h) * jnp.abs(g)
+    jumps = (g > slack) & (g1 < -slack) & ~near & ~(this > 0)
+    jumps = jumps & ~jnp.asarray(np.asarray(events.noted) | np.asarray(events.forced))
     return flag(new, ~ends, THROWN, jumps)

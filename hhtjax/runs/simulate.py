@@ -75,8 +75,8 @@ def simulate(
             steps, as is all at a saved time that an event comes before in some runs only.
         t0: time of the start.
         events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
-            happen; the grid stays what it is. Steps without one take as long as before, and a look at the guards. For
-            the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`.
+            happen, or at known times; the grid stays what it is. Steps without one take as long as before, and a look
+            at the guards. For the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`.
         max_events: how many of those that change something may fall into one step; more are a failure. With `adaptive`
             steps become shorter first, and what lies behind an event has an error of its own.
         keep_events: how many `run.events` has room for.
@@ -119,12 +119,12 @@ def simulate(
         require_integer("simulate", "max_events", max_events),
         require_integer("simulate", "keep_events", keep_events),
     )
-    if events is not None:
-        events = require_events("simulate", problem, events)
     if isinstance(dt, Adaptive) or times is not None:
         require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
         return told("simulate", run_controlled(problem, times, dt, progress, events, room), throw)
     dt, num_steps = require_steps("simulate", stepper, dt, num_steps, 2 ** (extrapolate - 1))
+    if events is not None:
+        events = require_events("simulate", problem, events, dt[0] if jnp.ndim(dt) else dt)
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 

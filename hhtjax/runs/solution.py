@@ -13,6 +13,7 @@ from hhtjax.description.presentation import Table, all_known, between, brief, kn
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
 from hhtjax.steppers.stepper import Info
+from hhtjax.systems.constraints import SWITCHED_OFF
 
 
 class FailedRunWarning(RuntimeWarning):
@@ -255,8 +256,9 @@ class Solution(NamedTuple):
             )
         if self.failure.row is not None and row >= 0:
             return (
-                f"row {row} of the constraint depends on the rows before it: the position is singular. Give the "
-                'stepper redundant="least_squares", or formulate the constraint anew'
+                f"row {row} of the constraint depends on the rows before it, or has no gradient: the position is "
+                'singular. Give the stepper redundant="least_squares", or formulate the constraint anew. '
+                f"{SWITCHED_OFF}"
             )
         started = [x for x in jax.tree.leaves(self.acceleration) if is_concrete(x)]
         if not all(np.isfinite(np.asarray(x)[(*member, 0)]).all() for x in started):

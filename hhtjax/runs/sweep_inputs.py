@@ -98,15 +98,21 @@ class Inputs(NamedTuple):
             stepper, q0, v0, params, z0 = data
             return Problem(self.system, stepper, q0, v0, params, self.t0, z0)
 
+        if isinstance(self.dts, Adaptive):
+            assert self.times is not None
+            steps = jnp.full(self.size, (self.times[-1] - self.t0) / 1000)
+        else:
+            steps = self.dts
+
         def require(i):
             where = f"sweep: member {i}" if any(self.mapped) else "sweep"
-            return require_events(where, problem_of(_member(self.data, self.mapped, i)), events)
+            return require_events(where, problem_of(_member(self.data, self.mapped, i)), events, steps[i])
 
         events = require(0)
         leaves, structure = jax.tree.flatten(self.data)
         if any(self.mapped) and all_concrete((self.system, leaves, self.t0, events)):
             axes = [0 if flag else None for flag in self.mapped]
-            for i in refused_members(lambda x: problem_of(structure.unflatten(x)), leaves, axes, events)[:1]:
+            for i in refused_members(lambda x: problem_of(structure.unflatten(x)), leaves, axes, events, steps)[:1]:
                 require(i)
         return self._replace(events=events, room=room)
 

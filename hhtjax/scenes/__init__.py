@@ -29,6 +29,7 @@ from hhtjax.scenes import lugre as lugre
 from hhtjax.scenes import maxwell as maxwell
 from hhtjax.scenes import motor_joint as motor_joint
 from hhtjax.scenes import pendulum as pendulum
+from hhtjax.scenes import shaken_table as shaken_table
 from hhtjax.scenes import slider_crank as slider_crank
 from hhtjax.scenes import squeezer as squeezer
 from hhtjax.scenes import top as top

@@ -187,7 +187,8 @@ def _solved(A, b, n, redundant):
             return np.linalg.solve(A, b[..., None])[..., 0]
         d = np.abs(np.diagonal(A, axis1=-2, axis2=-1))[..., :n]
         first = 1 / np.sqrt(np.where(d == 0, 1, d))
-        rest = 1 / np.max(np.abs(first[..., None] * A[..., :n, n:]), axis=(-2, -1))[..., None]
+        size = np.max(np.abs(first[..., None] * A[..., :n, n:]), axis=(-2, -1))[..., None]
+        rest = 1 / np.where(size == 0, 1, size)
         scale = np.concatenate([first, np.broadcast_to(rest, (*rest.shape[:-1], A.shape[-1] - n))], axis=-1)
         tolerance = max(RANK_TOLERANCE, 100 * float(np.finfo(A.dtype).eps))
         inverse = np.linalg.pinv(scale[..., :, None] * A * scale[..., None, :], rcond=tolerance)

@@ -20,6 +20,10 @@ from hhtjax.systems import kinematics
 from hhtjax.xla import linear_map, staged
 
 GRADIENT = 64  # times what roundings of q change a constraint and its gradient, below which it has none
+SWITCHED_OFF = (
+    "A row that params switch off, on * Phi, leaves its multiplier without an equation: let it hold a coordinate s of "
+    'its own instead, on * Phi + (1 - on) * s, as in hhtjax.scenes.shaken_table, or take redundant="least_squares"'
+)
 SHAKES = 3  # by a rounding
 
 
@@ -130,7 +134,7 @@ def require_independent(caller, B, clear):
     if empty:
         raise ValueError(
             f"{caller}: `constraint` rows {empty} have no gradient in q at the start but for rounding, or not a finite "
-            "one."
+            f"one. {SWITCHED_OFF}."
         )
     left, values, _ = np.linalg.svd(B / size[:, None])
     dependent = left[:, values < RANK_TOLERANCE]

@@ -1,10 +1,11 @@
-"""Events: a guard that falls to zero, and what becomes of the motion there.
+"""Events: a guard that falls to zero, or a time that is known, and what becomes of the motion there.
 
     g(q, v, t) > 0 where the motion is allowed;   at g = 0:  v := reset(q, v, t),  params := switch(params),  or the end
 
 How a step finds the time is in hhtjax/runs/meeting.py.
 """
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -12,42 +13,55 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.checks import require_function, require_number
-from hhtjax.description import Description, freeze, is_array, thaw
+from hhtjax.checks import in_words, require_function, require_number
+from hhtjax.description import Description, as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.numerics.seldom import seldom
 from hhtjax.systems.constraints import answers, pull_back
+from hhtjax.systems.sampled import SLOP
 
 
 @dataclass(frozen=True, eq=False)
 class Event(Description):
-    """Something that happens where a guard falls to zero: `simulate(..., events=[Event(...)])`.
+    """Something that happens where a guard falls to zero, or at known times: `simulate(..., events=[Event(...)])`.
 
     Args:
         guard: g, `guard(q, v, t, params)` -> a number, smooth, positive where the motion is allowed, negative beyond.
             It counts where it falls from positive to zero, not where it rises: for the other direction give -g, for
             both a mode that turns the sign, see `switch`. With internal states z stands behind v; of a
-            `FirstOrderSystem` guard(y, t, params).
+            `FirstOrderSystem` guard(y, t, params). With one more argument that is named `multipliers`, as in
+            `guard(q, v, t, params, multipliers)`, it sees the multipliers L (m,) of the constraint: a contact that is
+            held by a constraint ends where its multiplier falls to zero.
         reset: what the velocity becomes, `reset(q, v, t, params)` -> a pytree like v; or `impact(restitution)`. Of a
             `FirstOrderSystem` what y becomes. By default nothing changes. q cannot: it has to be continuous.
-        switch: what the params become, `switch(params)`, of the same structure, shapes and dtypes. So a force that
+        switch: what the params become, `switch(params)`, of the same structure, shapes and dtypes; or
+            `switch(q, v, t, params)`, with the state before the event (arguments as those of a guard). So a force that
             jumps is written with a mode, a number in params, and no `where` of the position in it: a step across the
             jump loses its order, and one that ends on it may find itself thrown back for ever. After an event that
             turns nothing back the guard would be negative: let it depend on the mode.
         terminal: whether the run ends there. The state stays what it was, time included.
+        at: in the place of a guard the times at which it happens: a number, (K,) in increasing order, or
+            `at(params)` -> one of these, with the params of the start. Steps are divided there, and a run is
+            differentiable in the times. Those before t0 are over, and one at t0 happens at the start of the first step.
 
-    An event with none of the three is noted, and changes nothing: sections of a Poincare map, times of passage. Of
-    events at one time those come first. Others happen one after the other, where none changes the rate of another's
-    guard, as impacts of bodies that do not touch; else their order would matter, and the run fails by name.
+    An event with none of reset, switch and terminal is noted, and changes nothing: sections of a Poincare map, times of
+    passage. Of events at one time those come first. Others happen one after the other, where none changes the rate of
+    another's guard, as impacts of bodies that do not touch; else their order would matter, and the run fails by name.
 
     A guard that jumps below zero with what another event changes, as -v does in a rebound, has not fallen there: a
     noted event is not met, as in a run of SciPy's that begins anew behind the other, and any other fails by name. Note
-    the rebounds by the guard of the impact.
+    the rebounds by the guard of the impact. Only a guard of multipliers may jump: forces do, where a load is switched
+    on, and its event happens at once.
+
+    The times of multipliers are those at which the L that the run saves is zero: as exact as L, which is of order 2.
 
     Resting contact is no event: a ball that comes to rest on the floor bounces infinitely often in a finite time, and
     the run fails by name when more than `max_events` fall into a step. Give contacts that last a stiff force, or a
-    constraint in a run of its own that begins there.
+    constraint that an event switches on, and another one off where its multiplier falls to zero: see
+    `hhtjax.scenes.shaken_table`. A body at rest at its guard may start where its acceleration takes it off.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind.
@@ -60,19 +74,44 @@ class Event(Description):
     >>> run.check()
     >>> int(run.events.count), round(float(run.events.t[0]), 6)                # sqrt(2/9.81)
     (1, 0.451524)
+
+    A load that is switched on at a time, and the derivative of where a body is in that time, -F (1 - time)/m:
+
+    >>> import jax
+    >>> body = hhtjax.System(mass=jnp.full(1, 2.0), force=lambda q, v, t, params: params["F"] + 0 * q)
+    >>> def where(time):
+    ...     load = hhtjax.Event(at=lambda params: params["time"], switch=lambda params: params | {"F": 3.0})
+    ...     params = {"F": 0.0, "time": time}
+    ...     return hhtjax.simulate(
+    ...         body, hhtjax.hht(), jnp.zeros(1), jnp.zeros(1), params, dt=0.1, num_steps=10, events=[load]).q[-1, 0]
+    >>> [round(float(f(0.62)), 6) for f in (where, jax.grad(where))]           # 3 (1 - .62)^2/4, -3 (1 - .62)/2
+    [0.1083, -0.57]
     """
 
-    guard: Callable
+    guard: Callable | None = None
     reset: Any = None
     switch: Callable | None = None
     terminal: bool = False
+    at: Any = None
 
     def __post_init__(self):
-        require_function("Event", "guard", self.guard, "guard(...)")
+        if (self.guard is None) == (self.at is None):
+            raise TypeError(f"Event: give either `guard` or `at`; received guard={self.guard!r} and at={self.at!r}.")
+        if self.guard is not None:
+            require_function("Event", "guard", self.guard, "guard(...)")
+        else:
+            object.__setattr__(self, "at", _required_times(self.at))
         if self.reset is not None and not isinstance(self.reset, Impact):
             require_function("Event", "reset", self.reset, "reset(...)")
+        if self.at is not None and isinstance(self.reset, Impact):
+            raise TypeError("Event: an impact needs the direction of a `guard`; received one with `at`.")
         if self.switch is not None:
-            require_function("Event", "switch", self.switch, "switch(params)")
+            require_function("Event", "switch", self.switch, "switch(...)")
+            if not any(_takes(self.switch, count) for count in SWITCHES):
+                raise TypeError(
+                    "Event: `switch` is called as switch(params) or switch(q, v, t, params); received a function of "
+                    f"{in_words(inspect.signature(self.switch))}."
+                )
         if not isinstance(self.terminal, bool):
             raise TypeError(f"Event: `terminal` must be True or False; received {self.terminal!r}.")
 
@@ -80,6 +119,64 @@ class Event(Description):
     def is_noted(self):
         """Whether it changes nothing."""
         return self.reset is None and self.switch is None and not self.terminal
+
+    @property
+    def sees_multipliers(self):
+        """Whether its guard has an argument for them."""
+        return self.guard is not None and "multipliers" in _parameters(self.guard)
+
+    @property
+    def switch_sees_state(self):
+        """Whether its switch is one of the state too."""
+        return self.switch is not None and not _takes(self.switch, 1)
+
+    def times(self, params):
+        """Those of `at`, (K,); NaN where they do not increase."""
+        times = jnp.atleast_1d(as_float(self.at(params) if callable(self.at) else self.at))
+        return jnp.where(jnp.all(times[1:] >= times[:-1]), times, jnp.nan)
+
+
+SWITCHES = 1, 3, 4, 5  # how many arguments: params, and before it y, t of a first-order system, q, v, t, or q, v, z, t
+
+
+def _required_times(at):
+    """What `Event` takes as `at`, times by values as an array."""
+    if callable(at) and not is_array(at):
+        require_function("Event", "at", at, "at(params)")
+        return at
+    at = np.asarray(at) if isinstance(at, (int, float, list, tuple)) and not isinstance(at, bool) else at
+    if not (is_array(at) and is_real(at)):
+        raise TypeError(f"Event: `at` must be a time, (K,) times, or a function at(params); received {at!r}.")
+    require_times("Event", at)
+    return at.astype(float) if isinstance(at, (np.ndarray, np.generic)) and at.dtype.kind in "iu" else at
+
+
+def require_times(caller, times):
+    """An error for times that are no numbers (K,), or do not increase; tracers pass."""
+    if np.ndim(times) > 1 or not np.size(times):
+        raise ValueError(f"{caller}: `at` must be a number, or of shape (K,); received the shape {np.shape(times)}.")
+    if is_concrete(times):
+        known = np.atleast_1d(np.asarray(times))
+        wrong = np.flatnonzero(~(known[1:] >= known[:-1]))
+        if np.isnan(known).any() or wrong.size:
+            raise ValueError(f"{caller}: `at` must hold numbers in increasing order; received {np.asarray(times)}.")
+
+
+def _parameters(function):
+    """The names of its arguments; none where it does not tell."""
+    try:
+        return list(inspect.signature(function).parameters)
+    except (TypeError, ValueError):
+        return []
+
+
+def _takes(function, count):
+    """Whether it can be called with so many arguments; of one that does not tell, whether it is one."""
+    try:
+        inspect.signature(function).bind(*range(count))
+    except (TypeError, ValueError) as error:
+        return isinstance(error, ValueError) and count == 1
+    return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,27 +224,94 @@ def impact(restitution: Any = 1.0) -> Impact:
 class FlatEvents(NamedTuple):
     """Events of a system on vectors; made by `flatten_events`. E is their number."""
 
-    guards: Callable  # q, v, t, params -> (E,)
-    outcome: Callable  # i, q, v, t, params in this step, params -> v, and the modes after event i
+    values: Callable  # state, params, the next of the known times -> (E,)
+    outcome: Callable  # i, state, params in this step, params -> v, and the modes after event i
     noted: tuple  # (E,), whether it changes nothing
     ends: tuple  # (E,), whether the run ends there
+    forced: tuple  # (E,), whether its guard is one of multipliers, which may jump
+    times: tuple  # (E,), the times at which it happens, (K,), or None
+    switches: bool  # whether one of them changes params
     modes: Callable  # params -> a list of those of its numbers that a switch changes
     with_modes: Callable  # params, frozen or not, modes -> params
 
-    def rates(self, system, s, params):
-        """g, and dg/dt along the motion: (E,) each."""
+    @property
+    def timed(self):
+        """(E,), whether it happens at known times."""
+        return tuple(times is not None for times in self.times)
+
+    @property
+    def still(self):
+        """The same with times that are constant to derivatives."""
+        return self._replace(times=lax.stop_gradient(self.times))
+
+    def guards(self, s, params, over):
+        """g, (E,). over: of each event with known times, how many of them are over."""
+        return self.values(s, params, next_times(self.times, over))
+
+    def rates(self, system, s, params, over, Ldot=None):
+        """g, and dg/dt along the motion: (E,) each. Ldot: the rate of the multipliers."""
         at = s.q, s.v, s.t
         along = system.rate(s.q, s.v), s.w, jnp.ones_like(s.t)
-        return jax.jvp(lambda q, v, t: self.guards(q, v, t, params), at, along)
+        if any(self.forced):
+            at, along = (*at, s.L), (*along, Ldot)
+
+        def guards(q, v, t, L=None):
+            return self.guards(s._replace(q=q, v=v, t=t, L=s.L if L is None else L), params, over)
+
+        return jax.jvp(guards, at, along)
+
+    def slope(self, s, s1, h):
+        """The rate of the multipliers between two states, where a guard sees them."""
+        return (s1.L - s.L) / jnp.where(h > 0, h, 1) if any(self.forced) else None
+
+    def both(self, system, s, s1, params, over, h):
+        """The same at both ends of a step."""
+        Ldot = self.slope(s, s1, h)
+        return [self.rates(system, x, params, over, Ldot) for x in (s, s1)]
+
+    def before_any(self, t):
+        """Of each event with times, how many of these are over at the start of a run."""
+
+        def passed(times):
+            slack = SLOP * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + jnp.abs(times))
+            return jnp.sum(times < t - slack, dtype=jnp.int32)
+
+        return [passed(times) for times in self.times if times is not None]
+
+    def passed(self, i, over):
+        """The same behind event i."""
+        numbers = [number for number, here in enumerate(self.timed) if here]
+        return [x + (i == number).astype(x.dtype) for number, x in zip(numbers, over, strict=True)]
+
+    def due_after(self, t, over):
+        """The next of all known times that is more than a rounding after t; inf where there is none."""
+        later = t + SLOP * float(jnp.finfo(t.dtype).eps) * jnp.abs(t)
+        due = [jnp.where(time > later, time, jnp.inf) for time in next_times(self.times, over)]
+        return jnp.min(jnp.stack([jnp.full_like(t, jnp.inf), *due]))
 
 
-def flatten_events(system, events, params, redundant=None):
-    """The events of a `FlatSystem`. redundant: how its constraints are solved."""
-    calls = [partial(_on_vectors, system, event.guard) for event in events]
-    changed = sorted({i for event in events if event.switch for i in _changed(event.switch, params)})
+def next_times(times, over):
+    """When each of the events with times happens next; inf where it does not."""
+    known = [x for x in times if x is not None]
+    return [_first_left(x, passed) for x, passed in zip(known, over, strict=True)]
 
-    def guards(q, v, t, params):
-        return jnp.stack([jnp.asarray(g(q, v, t, params)).astype(q.dtype).reshape(()) for g in calls])
+
+def _first_left(times, over):
+    """The first of the times (K,) that is not over; inf where all are."""
+    last = len(times) - 1
+    time = times[0] if last == 0 else lax.dynamic_index_in_dim(times, jnp.minimum(over, last), keepdims=False)
+    return jnp.where(over > last, jnp.inf, time)
+
+
+def flatten_events(system, events, params, at, redundant=None):
+    """The events of a `FlatSystem`. at: q, v, t of the start; redundant: how its constraints are solved."""
+    changed = sorted({i for event in events if event.switch for i in _changed(system, event, params, at)})
+    times = tuple(None if event.at is None else event.times(params).astype(at[1].dtype) for event in events)
+
+    def values(s, params, due):
+        due = iter(due)
+        values = [next(due) - s.t if event.guard is None else _guard(system, event, s, params) for event in events]
+        return jnp.stack([jnp.asarray(g).astype(s.v.dtype).reshape(()) for g in values])
 
     def modes(params):
         leaves = jax.tree.leaves(params)
@@ -161,19 +325,33 @@ def flatten_events(system, events, params, redundant=None):
 
     def outcome_of(event, before, q, t, frozen):
         (v, old), (now, params) = before, thaw(frozen)
-        after = params if event.switch is None else event.switch(params)
+        after = switched(system, event, q, v, t, params)
         new = [x.astype(y.dtype) for x, y in zip(modes(after), old, strict=True)]
         return _reset(system, event, redundant, q, v, t, now), new
 
-    def outcome(i, q, v, t, now, params):
-        after, frozen = (v, modes(params)), freeze((now, params))
+    def outcome(i, s, now, params):
+        after, frozen = (s.v, modes(params)), freeze((now, params))
         for number, event in enumerate(events):
             if not event.is_noted:
-                after = seldom(partial(outcome_of, event), i == number, after, q, t, frozen)
+                after = seldom(partial(outcome_of, event), i == number, after, s.q, s.t, frozen)
         return after
 
-    noted, ends = tuple(event.is_noted for event in events), tuple(event.terminal for event in events)
-    return FlatEvents(guards, outcome, noted, ends, modes, with_modes)
+    names = "is_noted", "terminal", "sees_multipliers"
+    noted, ends, forced = (tuple(getattr(event, name) for event in events) for name in names)
+    return FlatEvents(values, outcome, noted, ends, forced, times, bool(changed), modes, with_modes)
+
+
+def switched(system, event, q, v, t, params):
+    """The params behind an event, from the flat state before it."""
+    if event.switch is None:
+        return params
+    return _on_vectors(system, event.switch, q, v, t, params) if event.switch_sees_state else event.switch(params)
+
+
+def _guard(system, event, s, params):
+    """The guard of an event at a state."""
+    guard = partial(event.guard, multipliers=s.L) if event.sees_multipliers else event.guard
+    return _on_vectors(system, guard, s.q, s.v, s.t, params)
 
 
 def _on_vectors(system, function, q, v, t, params):
@@ -184,20 +362,20 @@ def _on_vectors(system, function, q, v, t, params):
     return function(system.unravel(q), system.unravel_rates(system.located(v)), *internal, t, params)
 
 
-def _changed(switch, params):
+def _changed(system, event, params, at):
     """Numbers of the leaves of params that a switch changes."""
     leaves, structure = jax.tree.flatten(params)
     places = [i for i, x in enumerate(leaves) if is_array(x) or not callable(x)]
 
-    def switched(data):
+    def after(data, q, v, t):
         filled = list(leaves)
         for i, x in zip(places, data, strict=True):
             filled[i] = x
-        after = jax.tree.leaves(switch(structure.unflatten(filled)))
+        after = jax.tree.leaves(switched(system, event, q, v, t, structure.unflatten(filled)))
         return [after[i] for i in places]
 
-    jaxpr = jax.make_jaxpr(switched)([leaves[i] for i in places]).jaxpr
-    pairs = zip(places, jaxpr.invars, jaxpr.outvars, strict=True)
+    jaxpr = jax.make_jaxpr(after)([leaves[i] for i in places], *at).jaxpr
+    pairs = zip(places, jaxpr.invars, jaxpr.outvars, strict=False)  # behind the params is the state
     return [i for i, before, after in pairs if after is not before]
 
 

@@ -1,0 +1,80 @@
+"""A body on a table that shakes: it rides on the table, is thrown off, flies, and lands for the next ride.
+
+    m y'' = -m g + L,   riding: y = A sin(W t), L >= 0,   in flight: L = 0,   landing: y' becomes that of the table
+
+One run, in which events switch a constraint on and off. The number of constraints of a run is fixed, so where this one
+is off it holds something else: a coordinate s of its own, which nothing moves, and which is 0 throughout.
+
+    Phi = on (y - A sin(W t)) + (1 - on) s
+
+(`on` times the constraint alone would leave a multiplier without an equation; redundant="least_squares" takes that,
+with a singular value decomposition in each step.) The body leaves the table where its multiplier falls to zero,
+sin(W t) = g/(A W^2), and the rest of the motion is a parabola up to the next contact.
+J. Guckenheimer, P. Holmes, Nonlinear Oscillations, Dynamical Systems, and Bifurcations of Vector Fields, 1983, Ch. 2.4.
+"""
+
+import jax.numpy as jnp
+
+from hhtjax.scenes.scene import EventScene, array
+from hhtjax.systems.events import Event, impact
+from hhtjax.systems.system import System
+
+GRAVITY = 9.81
+
+
+def mass(q, params):
+    """M, a diagonal: of the body and of s, for which any will do."""
+    return params["m"] * jnp.ones(2, q.dtype)
+
+
+def weight(q, v, t, params):
+    """Q; nothing moves s."""
+    return jnp.array([-params["m"] * params["g"], 0.0], q.dtype)
+
+
+def over_table(q, t, params):
+    """Of the body, m."""
+    return q[0] - params["A"] * jnp.sin(params["W"] * t)
+
+
+def contact(q, t, params):
+    """Phi: the body on the table, or s at 0."""
+    on = params["on"]
+    return (on * over_table(q, t, params) + (1 - on) * q[1])[None]
+
+
+def before_landing(q, v, t, params):
+    """Falls to zero where the body in flight meets the table."""
+    return jnp.where(params["on"] == 1, 1.0, over_table(q, t, params))
+
+
+def before_leaving(q, v, t, params, multipliers):
+    """Falls to zero where nothing presses the riding body onto the table any more."""
+    return jnp.where(params["on"] == 1, multipliers[0], 1.0)
+
+
+def land(params):
+    """The constraint on."""
+    return params | {"on": 0 * params["on"] + 1}
+
+
+def leave(params):
+    """The constraint off."""
+    return params | {"on": 0 * params["on"]}
+
+
+LANDING, LEAVING = Event(before_landing, reset=impact(0.0), switch=land), Event(before_leaving, switch=leave)
+
+
+def shaken_table(strength=2.0) -> EventScene:
+    """Two flights in 1.3 s, from a ride at the table's mean height (SI units).
+
+    Args:
+        strength: A W^2/g, the table's largest acceleration; beyond 1 it throws the body off.
+
+    >>> float(shaken_table().params["A"])
+    0.1962
+    """
+    params = {"m": 0.5, "g": GRAVITY, "A": strength * GRAVITY / 100.0, "W": 10.0, "on": 1.0}
+    v0 = array([10.0 * params["A"], 0.0])
+    return EventScene(System(mass, weight, contact), params, array([0.0, 0.0]), v0, 1.3, (LANDING, LEAVING))
