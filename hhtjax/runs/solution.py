@@ -12,6 +12,7 @@ from hhtjax.description.presentation import Table, all_known, between, brief, kn
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
 from hhtjax.steppers.stepper import Info
+from hhtjax.systems.matrices import MASSLESS, UNSYMMETRIC
 
 
 class SimulationError(RuntimeError):
@@ -218,7 +219,8 @@ class Solution(NamedTuple):
         found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
         _, newton, quantity, row, left, friction, mass, event, guard = found
         if mass:
-            return f"`mass` must be {MASS[mass]}; at the start, mass(q0, params) is not"
+            way = "" if mass == UNSYMMETRIC else f". {MASSLESS}"
+            return f"`mass` must be {MASS[mass]}; at the start it is not{way}"
         if event:
             what, advice = EVENTS[int(event)]
             return f"{what} {guard}. {advice}"

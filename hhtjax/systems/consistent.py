@@ -130,7 +130,7 @@ def nearest_position(system, q0, t, params, factorize):
     def f(z):
         x, mu = z[:n], z[n:]
         Phi, pull = jax.vjp(lambda x: system.constraint(system.move(q0, x), t, params), x)
-        return jnp.concatenate([system.inertia(q0, x, params) - pull(mu)[0], Phi])
+        return jnp.concatenate([system.inertia(q0, x, t, params) - pull(mu)[0], Phi])
 
     size = jnp.max(jnp.abs(q0))
 
@@ -160,7 +160,7 @@ def examine(system, q0, v0, t0, params, z0):
     params = thaw(params)
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
-    M, (B, clear) = flat.mass(q, params), gradient(flat, q, t, params)
+    M, (B, clear) = flat.mass(q, t, params), gradient(flat, q, t, params)
     sizes = kinematics.sizes(flat.blocks, q), flat.located(jnp.abs(v))
     M = jnp.diag(M) if M.ndim == 1 else M
     return M, B[:, : flat.positions], violation(flat, q, v, t, params), sizes, clear
@@ -237,7 +237,7 @@ def _turns(system, q0, v0, t0, params, z0):
     params = thaw(params)
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
-    d = diagonal(flat.mass(q, params))
+    d = diagonal(flat.mass(q, t, params))
     d = jnp.where(d == 0, 1, d)
     d = d / jnp.min(d)  # which may be too small to be squared
     unit = flat.with_ones(1 / jnp.sqrt(d))
