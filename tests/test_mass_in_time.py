@@ -81,9 +81,8 @@ def rate_by_hand(t, y, params):
 
 def by_scipy(params=PARAMS, duration=DURATION):
     y0 = np.concatenate([Q0, V0])
-    return solve_ivp(partial(rate_by_hand), (0, duration), y0, "DOP853", args=(params,), rtol=1e-12, atol=1e-13).y[
-        :, -1
-    ]
+    path = solve_ivp(rate_by_hand, (0, duration), y0, "DOP853", args=(params,), rtol=1e-12, atol=1e-13)
+    return path.y[:, -1]
 
 
 def run(stepper, params=PARAMS, system=CRANE, num_steps=400, **options):

@@ -13,8 +13,8 @@ LARGEST_DENSE = 5000  # rows of a sparse matrix that is made dense: 200 MB
 SMALL = 300  # rows of a sparse matrix up to which a dense one is solved as quickly
 SYMMETRIC = 1e-6  # relative size of M - M^T that passes
 MASSLESS = (
-    "A coordinate without mass is no part of the motion: say its equilibrium as a `constraint`, or, if it is damped, make "
-    "it an internal state whose rate the balance of its forces gives"
+    "A coordinate without mass has no acceleration of its own: say its equilibrium as a `constraint`, or, if it is "
+    "damped, make it an internal state whose rate the balance of its forces gives"
 )
 
 
