@@ -67,7 +67,7 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
         z0: internal states, where the system has some; they enter the forces, and stay as they are.
 
     q is found by steps that fall towards the constraints and towards q0, not by Newton's alone, which from afar ends
-    anywhere. Where the constraints bend on the way it is the nearest of up to 12 searches; nothing proves that there is
+    anywhere. Where the constraints bend on the way it is the nearest of up to 24 searches; nothing proves that there is
     no nearer one. `moved` tells the distance.
     Differentiable, forward and reverse. Under jit nothing raises, and `converged` tells.
 

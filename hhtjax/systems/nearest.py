@@ -25,12 +25,13 @@ from hhtjax.numerics.linear_solve import solve_map
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import jacobian
 
-STARTS = 12
+STARTS = 24
+PARTS = 1.0, 0.5, 0.25  # of the distance found, in turn, at which other starts are
 MAX_ITERATIONS = 60
 HALVINGS = 12
 DECREASE = 1e-4  # of what the slope promises, which a step has to bring (Armijo)
 WEIGHT = 1e3  # of the constraints, beside the Hessian of which convexity on them is asked (Debreu 1952)
-BENT = 0.2  # of Phi(q0), what either end's slope may miss of it where the first point found is taken for the nearest
+BENT = 0.1  # of Phi(q0), what either end's slope may miss of it where the first point found is taken for the nearest
 
 
 class Problem(NamedTuple):
@@ -90,7 +91,8 @@ def _search(p, z0):
     """The nearest of the points that were found, and 1 if there is one, else 0, as a float, for autodiff."""
     n, eps = len(p.d), float(jnp.finfo(z0.dtype).eps)
     ways = np.random.default_rng(0).standard_normal((STARTS, n))
-    ways = jnp.asarray(ways / np.linalg.norm(ways, axis=1, keepdims=True), z0.dtype).at[0].set(0)
+    ways *= np.resize(PARTS, (STARTS, 1)) / np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = jnp.asarray(ways, z0.dtype).at[0].set(0)  # the first is the guess itself
     apart = jnp.sum(p.unit * jnp.abs(p.Phi))
 
     def unfinished(carry):
