@@ -51,6 +51,19 @@ def require_function(caller, name, value, signature):
         raise TypeError(f"{caller}: `{name}` is called as {signature}; received a function of {in_words(called)}.")
 
 
+def positional_names(function):
+    """The names of the arguments that a function can be given by position; none where it does not tell."""
+    known = _signature(function)
+    kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+    return [] if known is None else [name for name, x in known.parameters.items() if x.kind in kinds]
+
+
+def takes(function, count):
+    """Whether a function can be called with so many arguments, as far as it tells."""
+    called = _signature(function, follow_wrapped=False)
+    return called is None or _takes(called, count)
+
+
 def _signature(function, **options):
     """None where it does not tell."""
     try:

@@ -67,7 +67,7 @@ def test_it_stands_in_the_place_of_the_matrix():
     twice = System(mass, force, inertia=lambda q, w, params: {"q": 2 * inertia(q, w, params)["q"]})
     flat, q, _ = flatten("test", twice, Q0, V0, 0.0, {"m": 2.0})
     w = jnp.array([1.0, -2.0, 0.5])
-    np.testing.assert_allclose(flat.inertia(q, w, {"m": 2.0}), 2 * mass(Q0, {"m": 2.0}) @ w, rtol=1e-13)
+    np.testing.assert_allclose(flat.inertia(q, w, 0.0, {"m": 2.0}), 2 * mass(Q0, {"m": 2.0}) @ w, rtol=1e-13)
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_lagrangians_have_one():
 
     system = System.from_lagrangian(lagrangian)
     q, w = jnp.array([0.3, -0.7]), jnp.array([1.1, 0.4])
-    np.testing.assert_allclose(system.inertia(q, w, 3.0), system.mass(q, 3.0) @ w, rtol=1e-14)
+    np.testing.assert_allclose(system.inertia(q, w, 0.5, 3.0), system.mass(q, 0.5, 3.0) @ w, rtol=1e-14)
 
 
 def test_errors():

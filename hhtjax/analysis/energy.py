@@ -103,7 +103,7 @@ def _balance(system, solution, run, across, params, potential):
 
     def energies(q, v, t):
         V = jnp.zeros_like(t) if potential is None else potential(flat.unravel(q), t, params)
-        return along(v, flat.inertia(q, v, params)) / 2, jnp.asarray(V).astype(t.dtype)
+        return along(v, flat.inertia(q, v, t, params)) / 2, jnp.asarray(V).astype(t.dtype)
 
     def power(q, v, t, L, params):
         """P, without dry friction; derivatives along the motion by the chain rule, q at the rate qdot and v held."""

@@ -30,6 +30,7 @@ from hhtjax.identification.arguments import check_real, require_prefix
 from hhtjax.identification.prewarp import motion, prewarped
 from hhtjax.steppers.stepper import Stepper, require_stepper
 from hhtjax.systems.consistent import require_consistent
+from hhtjax.systems.mass import mass_at
 from hhtjax.systems.sparse_system import require_dense
 from hhtjax.systems.system import LinearSystem, System, require_smooth
 
@@ -179,20 +180,20 @@ def _require_point(q, v):
 
 
 def _is_driven(system, params, q, v, t, dt):
-    """Whether the force at a state depends on the time."""
+    """Whether the force at a state, or the mass, depends on the time."""
     v = jax.tree.map(jnp.zeros_like, q) if v is None else v
 
-    def force(t):
-        return ravel_pytree(system.force(q, v, t, params))[0]
+    def at(t):
+        return ravel_pytree((system.force(q, v, t, params), mass_at(system, q, t, params)))[0]
 
-    forces = jax.vmap(force)(t + dt * jnp.arange(float(DRIVEN)))
-    return bool(jnp.any(forces != forces[:1]))
+    found = jax.vmap(at)(t + dt * jnp.arange(float(DRIVEN)))
+    return bool(jnp.any(found != found[:1]))
 
 
 def _linear_part(system, params, q, v, t):
     """M, C, K about a state, (n, n) each; with a constraint, of the n - m motions that it leaves."""
     given, (q, unravel) = q, ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
-    M = jnp.asarray(system.mass(unravel(q), params) if callable(system.mass) else system.mass)
+    M = jnp.asarray(mass_at(system, unravel(q), t, params))
     M = jnp.diag(M) if M.ndim == 1 else M
     _require_coordinates(len(M), given, v)
     v = jnp.zeros_like(q) if v is None else ravel_pytree(v)[0]

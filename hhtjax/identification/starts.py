@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.band_limited import band_limited_motion
 from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.mass import mass_at
 from hhtjax.systems.returned import evaluate
 from hhtjax.systems.sampled import Sampled, sampled
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_smooth, require_system
@@ -84,21 +86,22 @@ def equation_error(
 
     def residuals(params):
         def one(q, v, a, t):
-            _require_no_rotations(system, q, params)
+            _require_no_rotations(system, q, t, params)
             flat, x, rate = flatten("equation_error", system, q, v, t, params)
-            known = flat.force(x, rate, t.astype(rate.dtype), params)
-            return flat.inertia(x, ravel_pytree(a if flat.positions else v)[0], params) - known
+            t = t.astype(rate.dtype)
+            known = flat.force(x, rate, t, params)
+            return flat.inertia(x, ravel_pytree(a if flat.positions else v)[0], t, params) - known
 
         return jax.vmap(one)(*inside)
 
     return residuals
 
 
-def _require_no_rotations(system, q, params):
+def _require_no_rotations(system, q, t, params):
     """An error for positions (3, 3) whose mass is that of angular velocities (3,)."""
     turning = sum(x.size for x in jax.tree.leaves(q) if x.shape[-2:] == (3, 3))
     if turning and isinstance(system, System):
-        M = evaluate("equation_error", "mass", system.mass, q, params) if callable(system.mass) else system.mass
+        M = evaluate("equation_error", "mass", partial(mass_at, system), q, t, params)
         rows = sum(x.size for x in jax.tree.leaves(q)) - turning + turning // 3
         if getattr(M, "shape", None) in ((rows,), (rows, rows)):
             raise NotImplementedError(

@@ -14,6 +14,7 @@ from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
+from hhtjax.systems.matrices import MASSLESS, UNSYMMETRIC
 
 
 class FailedRunWarning(RuntimeWarning):
@@ -231,7 +232,8 @@ class Solution(NamedTuple):
         found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
         _, newton, quantity, row, left, friction, mass, event, guard = found
         if mass:
-            return f"`mass` must be {MASS[mass]}; at the start, mass(q0, params) is not"
+            way = "" if mass == UNSYMMETRIC else f". {MASSLESS}"
+            return f"`mass` must be {MASS[mass]}; at the start it is not{way}"
         if event:
             what, advice = EVENTS[int(event)]
             return f"{what} {guard}. {advice}"

@@ -52,10 +52,10 @@ def equations(method, system, params, dt, s):
     c, n, m = method.coefficients, system.size, system.num_constraints
     ggl = method.options.formulation == "ggl"
     B = jacobian(system, s.q, s.t, params)
-    D = part(lambda q, B: directions(system, system.mass(q, params), B))(s.q, B) if ggl else None
+    D = part(lambda q, B: directions(system, system.mass(q, s.t, params), B))(s.q, B) if ggl else None
 
     def r(s):
-        force = system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
+        force = system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)
         position, rate, pull = violation_and_reaction(system, s.q, s.v, s.t, params, s.L)
         rows = [force - pull, position / (c.beta * dt**2)]
         return jnp.concatenate(rows + [rate / (c.gamma * dt)] * ggl)

@@ -32,8 +32,8 @@ def linearize_at_state(system, params, s):
     Q, tangent = jax.linearize(forces, s.q, s.v)
     Q_q = linear_map(lambda x: tangent(system.located(x), zero), zero)
     Q_v = linear_map(lambda x: tangent(system.located(zero), x), zero)
-    Ma_q = system.widened(jax.jacfwd(lambda q: system.inertia(q, s.w, params))(s.q))
-    return system.full_mass(s.q, params), Q, Q_q, Q_v, Ma_q
+    Ma_q = system.widened(jax.jacfwd(lambda q: system.inertia(q, s.w, s.t, params))(s.q))
+    return system.full_mass(s.q, s.t, params), Q, Q_q, Q_v, Ma_q
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ class ConventionalHHT(Stepper):
                 return State(s.t + dt, system.move(s.q, x), v, a, L=z[n:] if m else None, memory=x)
 
             def r(s1):
-                now = system.inertia(s1.q, s1.w, params) - (1 + alpha) * force(s1, s.t + late)
+                now = system.inertia(s1.q, s1.w, s1.t, params) - (1 + alpha) * force(s1, s.t + late)
                 # both terms in components that work on the rate of x; for Q0 that is so already
                 now = kinematics.pull_back(system.blocks, s1.memory, now) + alpha * Q0
                 if not m:

@@ -37,7 +37,7 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
         expansion = expand(at, first)
         return *solution(expansion), expansion
 
-    D = system.with_ones(diagonal(system.mass(s.q, params)))
+    D = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
     limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
     ways = path(s.w), held, lambda r: jnp.sum(r * (r / D)), limit
     # derivatives by one expansion about the state that was chosen: through both they would take longer to compile
@@ -78,5 +78,5 @@ def refresh(system, params, c, s, factorize):
     """The state with the acceleration that its q and v ask for, w = M^-1 Q, and what the solve left."""
     Q = system.force(s.q, s.v, s.t, params)
     w = system.acceleration(s.q, s.v, s.t, params, factorize)
-    left = left_by(factorize, lambda w: system.inertia(s.q, w, params), Q, w)
+    left = left_by(factorize, lambda w: system.inertia(s.q, w, s.t, params), Q, w)
     return s._replace(w=w, a=s.a + (1 - c.alpha_f) / (1 - c.alpha_m) * (w - s.w)), told(factorize, left)

@@ -51,4 +51,4 @@ def advance(c, s, dt, w):
 
 def residual(system, params, s):
     """M(q) w - Q(q, v, t): zero on the trajectory."""
-    return system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)
+    return system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)

@@ -109,7 +109,7 @@ class Layer(NamedTuple):
     def product(self, z):
         """The part of the rows that z enters at the start itself: M dw - B^T dL, B dw."""
         dw, dL = self.parts(z)
-        force = self.system.inertia(self.base.q, dw, self.params)
+        force = self.system.inertia(self.base.q, dw, self.base.t, self.params)
         return force if dL is None else jnp.concatenate([force - matvec(self.B.T, dL), matvec(self.B, dw)])
 
     def zeros(self):
@@ -145,7 +145,7 @@ def jumped(method, system, s, after, both, h, answer):
         return after
     force = system.force(s.q, s.v + system.with_internal(V * dw, jnp.zeros_like(dw)), s.t, new)
     change = answer(force - system.force(s.q, s.v, s.t, new))
-    D = system.with_ones(diagonal(system.mass(s.q, new)))
+    D = system.with_ones(diagonal(system.mass(s.q, s.t, new)))
     stiff = jnp.sum(D * change**2) > STIFF**2 * jnp.sum(D * dw**2)
 
     def smooth(_, s, both, h):

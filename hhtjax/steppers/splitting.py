@@ -72,7 +72,7 @@ class OperatorSplitting(Stepper):
             v = s.v + dt * ((1 - gamma) * s.w + gamma * guess)
             Q = system.force(q, v, t, params)
             P = self.weighted_force(system, q, v, t, params)
-            a = solve(system.full_mass(q, params) + implicit + alpha * weighted, Q - guess + alpha * (P - P0))
+            a = solve(system.full_mass(q, t, params) + implicit + alpha * weighted, Q - guess + alpha * (P - P0))
             memory = Memory(K, C, P - matvec(weighted, a))
             return State(t, q + system.located(dt**2 * beta * a), v + dt * gamma * a, guess + a, memory=memory), Info()
 

@@ -34,6 +34,9 @@ Energies are enough: `System.from_lagrangian` makes M and Q of L = T - V by auto
 ...     lagrangian=lambda q, v, t, p: 0.5 * jnp.sum(v**2) - 0.5 * p["k"] * jnp.sum(q**2),
 ...     force=lambda q, v, t, p: p["u"](t) - 0.1 * v)
 
+M may change in time, as that of a load which is hoisted, or of a pendulum whose length is driven: L may depend on t as
+it likes, and `System` takes a function `mass(q, t, params)`. All steppers keep their order on it.
+
 Linear systems, and others with few nonlinear forces
 ----------------------------------------------------
 
@@ -117,6 +120,27 @@ it is fast) `rk4` and `dopri5`, with constraints, rotations, sweeps and gradient
 
 `hhtjax.scenes` has motors, Bouc-Wen hysteresis, LuGre friction and a rubber mount. Relays, whose g jumps, are none of
 these, nor is dry friction without bristles.
+
+Coordinates without mass
+------------------------
+
+A node between two springs, or between a spring and a damper, has no mass, and so no acceleration that forces give: a
+singular mass is an error. Where forces on it depend on positions alone, their balance is a `constraint`, and M may be
+singular. It has no reaction: the multiplier is 0. Where a damper sits at it, the balance is its velocity, and the node
+an internal state. Here a mass on two springs of 300 and 600 N/m in a row, which are one of 200 N/m; and on a spring of
+300 N/m in a row with a damper of 50 N s/m.
+
+>>> def springs(q, v, t, params):
+...     node, end = q
+...     return jnp.stack([600 * (end - node) - 300 * node, -600 * (end - node)])
+>>> row = hhtjax.System(jnp.array([0.0, 2.0]), springs, lambda q, t, params: springs(q, q, t, params)[:1])
+>>> run = hhtjax.simulate(row, hhtjax.hht(), jnp.array([0.2, 0.3]), jnp.zeros(2), dt=1e-3, num_steps=314)
+>>> run.check()
+>>> round(float(run.q[-1, 1]), 3)                                                  # half a period of sqrt(200/2) rad/s
+-0.3
+>>> damped = hhtjax.System(
+...     jnp.ones(1), lambda end, v, node, t, params: -300 * (end - node),
+...     internal=lambda end, v, node, t, params: 300 * (end - node) / 50)
 
 Dry friction
 ------------

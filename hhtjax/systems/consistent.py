@@ -1,19 +1,17 @@
 """Initial values that satisfy the constraints, and the check that they do."""
 
-import math
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import all_concrete, known_now, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.elimination import diagonal
-from hhtjax.numerics.linear_solve import RANK_TOLERANCE, solve_map
+from hhtjax.numerics.linear_solve import RANK_TOLERANCE
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import (
     acceleration_and_multipliers,
@@ -27,9 +25,9 @@ from hhtjax.systems.constraints import (
 )
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.nearest import nearest_position
 from hhtjax.xla import Programs
 
-MAX_ITERATIONS = 50
 CONSISTENT = 1e-6  # distance of initial values from consistent ones that passes, beside 1 + |q|, each coordinate
 SMALL = 1e-3  # of a mechanism's size, if that is so small that the former does not tell
 ROUNDINGS = 1000  # of q, which nobody asks about
@@ -43,7 +41,9 @@ class ConsistentInitial(NamedTuple):
     Attributes:
         q, v, acceleration: pytrees like q0 and v0.
         multipliers: L, (m,).
-        converged: whether Newton's iteration reached Phi(q) = 0.
+        converged: whether a point with Phi(q) = 0 was found.
+        moved: how far q is from q0 in the coordinate that is farthest, in its unit, radians for rotations. Compare it
+            with how well q0 was meant: a start far away may be of another assembly than that which was thought of.
     """
 
     q: Any
@@ -51,6 +51,7 @@ class ConsistentInitial(NamedTuple):
     acceleration: Any
     multipliers: Any
     converged: Any
+    moved: Any = None
 
 
 def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=None) -> ConsistentInitial:
@@ -65,8 +66,10 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
         redundant: "least_squares" for constraints that may depend on each other, as in `hht`.
         z0: internal states, where the system has some; they enter the forces, and stay as they are.
 
-    Differentiable, forward and reverse. Newton for q from q0: start near. Under jit nothing raises, and
-    `converged` tells.
+    q is found by steps that fall towards the constraints and towards q0, not by Newton's alone, which from afar ends
+    anywhere. Where the constraints bend on the way it is the nearest of up to 24 searches; nothing proves that there is
+    no nearer one. `moved` tells the distance.
+    Differentiable, forward and reverse. Under jit nothing raises, and `converged` tells.
 
     Returns:
         A `ConsistentInitial`.
@@ -109,49 +112,18 @@ def _consistent_initial(system, q0, v0, params, t0, z0, redundant):
     factorize = factorize_constrained(flat.size, redundant)
     t = jnp.asarray(t0).astype(q.dtype)
     rows = gradient(flat, q, t, params)
-    q, converged = nearest_position(flat, q, t, params, factorize)
+    q, x, converged = nearest_position(flat, q, t, params, factorize)
     left = jnp.max(jnp.abs(flat.constraint(q, t, params)))
     v = v + correction(flat, q, t, params, -violation(flat, q, v, t, params)[1], factorize)
     w, L = acceleration_and_multipliers(flat, q, v, t, params, factorize)
     v, w = (flat.unravel_rates(flat.located(x)) for x in (v, w))
-    return ConsistentInitial(flat.unravel(q), v, w, L, converged), rows, left
+    moved = jnp.max(jnp.abs(flat.located(x)))
+    return ConsistentInitial(flat.unravel(q), v, w, L, converged, moved), rows, left
 
 
 def correction(system, q, t, params, rows, factorize):
     """The x with B x = rows that is smallest in the norm of M."""
     return saddle_point(system, q, t, params, factorize)(jnp.zeros(system.size, q.dtype), rows)[0]
-
-
-def nearest_position(system, q0, t, params, factorize):
-    """q on Phi = 0, its displacement from q0 smallest in the norm of M(q0), by Newton, and whether that converged."""
-    n, eps = system.size, float(jnp.finfo(q0.dtype).eps)
-    z0 = jnp.zeros(n + system.num_constraints, q0.dtype)
-
-    def f(z):
-        x, mu = z[:n], z[n:]
-        Phi, pull = jax.vjp(lambda x: system.constraint(system.move(q0, x), t, params), x)
-        return jnp.concatenate([system.inertia(q0, x, params) - pull(mu)[0], Phi])
-
-    size = jnp.max(jnp.abs(q0))
-
-    def search(f, z):
-        def unfinished(carry):
-            z, change, last, iterations = carry
-            largest = size + jnp.max(jnp.abs(z[:n]))
-            ends = change <= jnp.where(change > last / 2, 16 * eps * (1 + largest), 16 * eps * largest)
-            return ~ends & (iterations < MAX_ITERATIONS)
-
-        def improve(carry):
-            z, last, _, iterations = carry
-            dz = factorize(jax.jacfwd(f)(z))(f(z), trans=0)
-            return z - dz, jnp.max(jnp.abs(dz[:n])), last, iterations + 1
-
-        far = jnp.asarray(jnp.inf, z.dtype)
-        z, change, *_ = lax.while_loop(unfinished, improve, (z, far, far, 0))
-        return z, change
-
-    z, change = lax.custom_root(f, z0, search, lambda g, y: solve_map(g, y, factorize), has_aux=True)
-    return system.move(q0, z[:n]), change <= math.sqrt(eps) * (1 + size + jnp.max(jnp.abs(z[:n])))
 
 
 @Programs
@@ -160,7 +132,7 @@ def examine(system, q0, v0, t0, params, z0):
     params = thaw(params)
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
-    M, (B, clear) = flat.mass(q, params), gradient(flat, q, t, params)
+    M, (B, clear) = flat.mass(q, t, params), gradient(flat, q, t, params)
     sizes = kinematics.sizes(flat.blocks, q), flat.located(jnp.abs(v))
     M = jnp.diag(M) if M.ndim == 1 else M
     return M, B[:, : flat.positions], violation(flat, q, v, t, params), sizes, clear
@@ -238,7 +210,7 @@ def _turns(system, q0, v0, t0, params, z0):
     params = thaw(params)
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
-    d = diagonal(flat.mass(q, params))
+    d = diagonal(flat.mass(q, t, params))
     d = jnp.where(d == 0, 1, d)
     d = d / jnp.min(d)  # which may be too small to be squared
     unit = flat.with_ones(1 / jnp.sqrt(d))

@@ -63,7 +63,7 @@ def pull_back(system, q, gradient):
 def saddle_point(system, q, t, params, factorize=None):
     """The function (force, rows) -> (x, L) with M x - B^T L = force and B x = rows, factorised once: the index-1 system
     for accelerations, and all projections."""
-    M, B = system.full_mass(q, params), jacobian(system, q, t, params)
+    M, B = system.full_mass(q, t, params), jacobian(system, q, t, params)
     A = jnp.block([[M, -B.T], [B, jnp.zeros((len(B), len(B)), B.dtype)]])
     inverse = solver(A, factorize or factorize_constrained(system.size, None))
 
@@ -78,7 +78,7 @@ def answers(system, q, t, params, redundant=None, factorize=None) -> Any:
     """The function (force, rows=0) -> (dw, dL), factorised once: what more of a force makes of the accelerations and
     the multipliers, which are None without constraints. rows: B dw. redundant, factorize: how it is solved."""
     if not system.num_constraints:
-        inverse = system.mass_solver(system.mass(q, params), *(() if factorize is None else (factorize,)))
+        inverse = system.mass_solver(system.mass(q, t, params), *(() if factorize is None else (factorize,)))
         return lambda force, rows=None: (inverse(force), None)
     factorize = factorize or factorize_constrained(system.size, redundant)
     x_and_multipliers, zero = saddle_point(system, q, t, params, factorize), jnp.zeros(system.num_constraints, q.dtype)

@@ -13,6 +13,7 @@ from hhtjax.numerics.linear_solve import solver
 from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
+from hhtjax.systems.mass import mass_at, product_at, timed
 from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.returned import check_like, check_matrix, count, evaluate, telling_of_arguments
 from hhtjax.systems.sparse_system import with_known_matrices
@@ -27,7 +28,7 @@ class FlatSystem(NamedTuple):
     n = 0. q is (n,) too, but for rotations, of which it holds the matrices.
     """
 
-    mass: Callable  # q, params -> (n, n), or (n,) for a diagonal: of the rates that have positions
+    mass: Callable  # q, t, params -> (n, n), or (n,) for a diagonal: of the rates that have positions
     force: Callable  # q, v, t, params -> (N,)
     size: int  # N, the number of rates
     positions: int  # n, how many of them have positions
@@ -38,7 +39,7 @@ class FlatSystem(NamedTuple):
     constraint: Any = None  # q, t, params -> (m,); None without
     num_constraints: int = 0  # m
     blocks: tuple = ()  # where the rotations are; empty without
-    product: Callable | None = None  # q, w, params -> M(q) w, where the system has its own
+    product: Callable | None = None  # q, w, t, params -> M w, where the system has its own
     local: Any = None  # the `Local` force beside a linear system
     friction: FrictionLaw | None = None  # dry friction, which `force` does not hold
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
@@ -61,17 +62,17 @@ class FlatSystem(NamedTuple):
         """Whether `step_matrix` gives the matrix of a step, so that none has to be found column by column."""
         return self.matrices is not None or self.diagonals is not None
 
-    def inertia(self, q, w, params):
-        """M(q) w, and zdot."""
+    def inertia(self, q, w, t, params):
+        """M(q, t) w, and zdot."""
 
         def product(w):
-            return matvec(self.mass(q, params), w) if self.product is None else self.product(q, w, params)
+            return matvec(self.mass(q, t, params), w) if self.product is None else self.product(q, w, t, params)
 
         return self._of_positions(product, w)
 
     def acceleration(self, q, v, t, params, factorize=factorize):
-        """w = M(q)^-1 Q(q, v, t), and zdot."""
-        M, Q = self.mass(q, params), self.force(q, v, t, params)
+        """w = M(q, t)^-1 Q(q, v, t), and zdot."""
+        M, Q = self.mass(q, t, params), self.force(q, v, t, params)
         return self.mass_solver(M, factorize)(Q)
 
     def mass_solver(self, M, factorize=factorize):
@@ -83,9 +84,9 @@ class FlatSystem(NamedTuple):
         """d (n,), of M, and ones for z: (N,)."""
         return d if self.positions == self.size else jnp.concatenate([d, jnp.ones(self.size - self.positions, d.dtype)])
 
-    def full_mass(self, q, params):
-        """M(q), and ones for z, as a matrix (N, N)."""
-        M = self.mass(q, params)
+    def full_mass(self, q, t, params):
+        """M(q, t), and ones for z, as a matrix (N, N)."""
+        M = self.mass(q, t, params)
         if M.ndim == 1:
             return jnp.diag(self.with_ones(M))
         return M if self.positions == self.size else block_diag(M, jnp.eye(self.size - self.positions, dtype=M.dtype))
@@ -175,8 +176,9 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
 
     flat = on_vectors(system)
     if not linear and system.inertia is not None:
-        check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
-        flat = flat._replace(product=partial(_flat_product, system.inertia, unravel, unravel_rates, dtype))
+        at = q0, v0, *timed(system.inertia, 2, t0), params
+        check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, *at), "v0", v0, dtype)
+        flat = flat._replace(product=partial(_flat_product, system, unravel, unravel_rates, dtype))
     if linear:
         flat = with_known_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
@@ -186,9 +188,8 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
     return flat, q, v
 
 
-def _flat_mass(system, unravel, dtype, q, params):
-    M = system.mass(unravel(q), params) if callable(system.mass) else system.mass
-    return as_matrix(M, dtype)
+def _flat_mass(system, unravel, dtype, q, t, params):
+    return as_matrix(mass_at(system, unravel(q), t, params), dtype)
 
 
 def _flat_force(unravel_rates, system, unravel, dtype, q, v, t, params):
@@ -231,7 +232,7 @@ def _flatten_first_order(caller, system, y0, t0, params):
     def rate(q, v, t, params):
         return ravel_pytree(system.rate(unravel(v), t, params))[0].astype(dtype)
 
-    def mass(q, params):
+    def mass(q, t, params):
         return jnp.ones(0, dtype)
 
     return FlatSystem(mass, rate, n, 0, False, unravel, unravel), jnp.zeros(0, dtype), y
@@ -245,7 +246,8 @@ def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):
             if matrix is not None:
                 check_matrix(caller, name, matrix, n, dtype, params)
     else:
-        check_matrix(caller, "mass", system.mass, n, dtype, q0, params)
+        at = (q0, *timed(system.mass, 1, t0), params) if callable(system.mass) else ()
+        check_matrix(caller, "mass", system.mass, n, dtype, *at)
     if linear and system.load is not None:
         Q = evaluate(caller, "force", system.load, t0, params)
     elif system.internal is None:
@@ -276,5 +278,5 @@ def _flat_constraint(constraint, unravel, dtype, q, t, params):
     return jnp.asarray(constraint(unravel(q), t, params)).astype(dtype)
 
 
-def _flat_product(inertia, unravel, unravel_rates, dtype, q, w, params):
-    return ravel_pytree(inertia(unravel(q), unravel_rates(w), params))[0].astype(dtype)
+def _flat_product(system, unravel, unravel_rates, dtype, q, w, t, params):
+    return ravel_pytree(product_at(system, unravel(q), unravel_rates(w), t, params))[0].astype(dtype)

@@ -10,26 +10,26 @@ from jax.flatten_util import ravel_pytree
 
 @dataclass(frozen=True)
 class LagrangianMass:
-    """M(q) = d2L/dv2."""
+    """M(q, t) = d2L/dv2, which no v enters: at v = 0."""
 
     lagrangian: Callable
     is_lagrangian = True  # knows no rotations
 
-    def __call__(self, q, params):
+    def __call__(self, q, t, params):
         zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))
-        return jax.hessian(lambda v: self.lagrangian(q, unravel(v), 0.0, params))(zero)
+        return jax.hessian(lambda v: self.lagrangian(q, unravel(v), t, params))(zero)
 
 
 @dataclass(frozen=True)
 class LagrangianInertia:
-    """M(q) w, the derivative of the momentum dL/dv in the direction w: one column of the Hessian, not all."""
+    """M(q, t) w, the derivative of the momentum dL/dv in the direction w: one column of the Hessian, not all."""
 
     lagrangian: Callable
 
-    def __call__(self, q, w, params):
+    def __call__(self, q, w, t, params):
         q, w = (jax.tree.map(jnp.asarray, x) for x in (q, w))
         zero = jax.tree.map(jnp.zeros_like, w)
-        momentum = jax.grad(lambda v: self.lagrangian(q, v, 0.0, params))
+        momentum = jax.grad(lambda v: self.lagrangian(q, v, t, params))
         return jax.jvp(momentum, (zero,), (w,))[1]
 
 

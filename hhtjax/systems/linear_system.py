@@ -30,6 +30,8 @@ class LinearSystem(Description):
             K may be None. Rows follow `jax.flatten_util.ravel_pytree(v)`. Sparse matrices of more than 300 rows stay
             sparse, are factorised by SciPy's SuperLU, and solved with in each step by the `hht` family, `rosenbrock`
             and `rowda`, with the same derivatives; smaller ones become dense, or diagonals.
+            M must be regular, as the acceleration at the start is M^-1 times the forces: for coordinates without mass
+            take a `System` with a `constraint`, or internal states (`hhtjax.systems`, coordinates without mass).
         force: f, `force(t, params)`, a pytree structured like v; None for free vibration.
         nonlinear: g, `nonlinear(q, v, t, params)`, a pytree structured like v. With `at`: of the coordinates q[at] and
             v[at], (k,) each, the forces (k,) on these.

@@ -12,6 +12,10 @@ LARGEST_CHECKED = 256  # rows of a mass matrix that is looked at
 LARGEST_DENSE = 5000  # rows of a sparse matrix that is made dense: 200 MB
 SMALL = 300  # rows of a sparse matrix up to which a dense one is solved as quickly
 SYMMETRIC = 1e-6  # relative size of M - M^T that passes
+MASSLESS = (
+    "A coordinate without mass has no acceleration of its own: say its equilibrium as a `constraint`, or, if it is "
+    "damped, make it an internal state whose rate the balance of its forces gives"
+)
 
 
 def as_matrix(value, dtype):
@@ -146,8 +150,9 @@ def require_mass(caller, name, M, massless=False):
         smallest = np.linalg.eigvalsh(scaled)[0]
         rounding = 4 * len(M) * float(np.finfo(np.result_type(M, np.float32)).eps)
     if smallest < -rounding or (not massless and smallest <= rounding):
-        what = "singular" if smallest >= -rounding else "not"
-        raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is {what}.")
+        if smallest < -rounding:
+            raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is not.")
+        raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is singular. {MASSLESS}.")
 
 
 def _require_sparse_mass(caller, name, M):

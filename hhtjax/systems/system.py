@@ -9,6 +9,7 @@ from hhtjax.description import Description
 from hhtjax.systems.friction import require_friction
 from hhtjax.systems.lagrangian import InternalLagrangianForce, LagrangianForce, LagrangianInertia, LagrangianMass
 from hhtjax.systems.linear_system import LinearSystem
+from hhtjax.systems.mass import require_inertial
 from hhtjax.systems.matrices import constant_matrix, require_mass
 
 __all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_smooth", "require_system"]
@@ -19,7 +20,9 @@ class System(Description):
     """A second-order mechanical system  M(q) w = Q(q, v, t)  with acceleration w.
 
     Args:
-        mass: M, the generalised mass matrix: `mass(q, params)`, or an array where M is constant.
+        mass: M, the generalised mass matrix: `mass(q, params)`, or an array where M is constant; `mass(q, t, params)`,
+            its second argument named t, where it changes in time. (Q then holds -(dM/dt) v, if it is the rate of the
+            momentum M v that is known: `from_lagrangian` puts it there.)
             Shape (n, n), symmetric positive definite, or (n,) for a diagonal. Its rows follow
             `jax.flatten_util.ravel_pytree(v)`; for a dict that is the order of the *sorted* keys. What is no such
             matrix is an error here if it is an array, and named by `Solution.check` if it is so where a run starts.
@@ -28,7 +31,8 @@ class System(Description):
             gives NaN there, and max(x, 1e-12)**1.5 does not.
         constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), m <= n, rows independent. Then
             M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.
-        inertia: M(q) w without M, `inertia(q, w, params)`, a pytree structured like v: for chains and trees, whose
+        inertia: M(q) w without M, `inertia(q, w, params)`, or `inertia(q, w, t, params)`, a pytree structured like v:
+            for chains and trees, whose
             inverse dynamics take fewer operations than their matrix. It replaces the product of `mass` and w, in the
             steps and in their Jacobians, and is trusted to be equal to it; `mass` is still asked for M itself.
         internal: g, the rate of internal states z of first order, such as the current of a motor, the integral of a
@@ -116,46 +120,69 @@ class System(Description):
             for name in ("force", "internal"):
                 require_function("System", name, getattr(self, name), f"{name}(q, v, z, t, params)")
         if self.inertia is not None:
-            require_function("System", "inertia", self.inertia, "inertia(q, w, params)")
+            require_inertial("System", "inertia", self.inertia, ("q", "w"))
         if self.constraint is not None:
             _require_constraint(self.constraint)
         more = (self.internal is not None) * ("z",) + (self.constraint is not None) * ("L",)
         require_friction("System", self.friction, self.sliding, *more)
         if callable(self.mass):
-            require_function("System", "mass", self.mass, "mass(q, params)")
+            require_inertial("System", "mass", self.mass, ("q",))
         else:
             mass = constant_matrix("System", "mass", self.mass)
             require_mass("System", "mass", mass, self.constraint is not None)
             object.__setattr__(self, "mass", mass)
 
     @classmethod
-    def from_lagrangian(cls, lagrangian, force=None, internal=None, friction=None, sliding=None):
-        """The system of Lagrange's equations  d/dt (dL/dv) - dL/dq = F, with M and Q by autodiff.
+    def from_lagrangian(
+        cls, lagrangian, force=None, internal=None, friction=None, sliding=None, constraint=None
+    ) -> "System":
+        """The system of Lagrange's equations  d/dt (dL/dv) - dL/dq = F + B^T L, with M and Q by autodiff.
 
-            M = d2L/dv2,    Q = F + dL/dq - (d2L/dv dq) v - d2L/dv dt
+            M(q, t) = d2L/dv2,    Q = F + dL/dq - (d2L/dv dq) v - d2L/dv dt
+
+        M may depend on the time: a hoisted load, a pendulum whose length is driven, a tank that runs empty. Its rate is
+        the last term of Q. Of a body that loses mass this is the equation where what leaves is at rest; where it keeps
+        the velocity of the body, add (dM/dt) v to `force`.
 
         Args:
-            lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v, with
-                a mass matrix that depends on q and params only: M is evaluated at v = 0, t = 0.
+            lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v: M is evaluated at
+                v = 0. Every coordinate needs a mass; `hhtjax.systems` has the ways for one that has none.
             force: F, the forces that no potential holds (damping, inputs): `force(q, v, t, params)`.
             internal: as for `System`; then `force(q, v, z, t, params)`.
-            friction, sliding: as for `System`.
+            friction, sliding, constraint: as for `System`. (Events are arguments of `simulate`.)
+
+        Returns:
+            A `System`, whose `mass(q, t, params)` and `inertia(q, w, t, params)` are those of L.
+
+        Raises:
+            TypeError, ValueError: an argument of a wrong kind.
 
         Example: a mass on a spring, L = m v^2/2 - k q^2/2.
 
-        >>> import hhtjax
+        >>> import jax.numpy as jnp, hhtjax
         >>> spring = hhtjax.System.from_lagrangian(lambda q, v, t, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2)
         >>> float(spring.force(0.1, 0.0, 0.0, {"m": 2.0, "k": 30.0}))
         -3.0
+
+        Example: a load of 1 kg on a rope that is hoisted at 0.1 m/s; it swings the wider, the shorter the rope is.
+
+        >>> def lagrangian(angle, rate, t, p):
+        ...     l = p["l"] - p["u"] * t
+        ...     return 0.5 * (l * rate) ** 2 + 0.5 * p["u"] ** 2 + 9.81 * l * jnp.cos(angle)
+        >>> run = hhtjax.simulate(
+        ...     hhtjax.System.from_lagrangian(lagrangian), hhtjax.hht(), 0.1, 0.0, {"l": 4.0, "u": 0.1},
+        ...     dt=0.01, num_steps=3000)
+        >>> [round(float(jnp.max(jnp.abs(x))), 2) for x in (run.q[:500], run.q[-500:])]
+        [0.11, 0.27]
         """
-        require_function("System.from_lagrangian", "lagrangian", lagrangian, "lagrangian(q, v, t, params)")
+        caller = "System.from_lagrangian"
+        require_function(caller, "lagrangian", lagrangian, "lagrangian(q, v, t, params)")
         if force is not None:
             arguments = "q, v, t, params" if internal is None else "q, v, z, t, params"
-            require_function("System.from_lagrangian", "force", force, f"force({arguments})")
+            require_function(caller, "force", force, f"force({arguments})")
         own_force = (LagrangianForce if internal is None else InternalLagrangianForce)(lagrangian, force)
         inertia = LagrangianInertia(lagrangian)
-        more = {"inertia": inertia, "internal": internal, "friction": friction, "sliding": sliding}
-        return cls(LagrangianMass(lagrangian), own_force, **more)
+        return cls(LagrangianMass(lagrangian), own_force, constraint, inertia, internal, friction, sliding)
 
 
 @dataclass(frozen=True, eq=False)

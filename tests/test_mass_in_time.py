@@ -1,0 +1,240 @@
+"""Masses that depend on the time: a load on a rope that is hoisted, and what leaks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiled_c import Library, needs_compiler
+from helpers import check_gradient
+from scipy.integrate import solve_ivp
+from zoo import each
+
+import hhtjax
+from hhtjax import System
+
+PARAMS = {"cart": 2.0, "load": 1.0, "c": 0.3, "amplitude": 0.5}
+Q0, V0, DURATION = jnp.array([0.1, 0.6]), jnp.array([0.2, -0.3]), 2.0
+STEPPERS = {
+    "hht": (hhtjax.hht(), 2),
+    "newton": (hhtjax.hht(-0.3, iterations=None), 2),
+    "held": (hhtjax.hht(linearize="held"), 2),
+    "state": (hhtjax.hht(linearize="state"), 2),
+    "corrected": (hhtjax.hht(-0.3, start="corrected"), 2),
+    "generalized_alpha": (hhtjax.generalized_alpha(0.5), 2),
+    "bossak": (hhtjax.bossak(), 2),
+    "wilson": (hhtjax.wilson(), 2),
+    "houbolt": (hhtjax.houbolt(), 2),
+    "park": (hhtjax.park(), 2),
+    "rosenbrock": (hhtjax.rosenbrock(), 2),
+    "rowda": (hhtjax.rowda(), 3),
+    "rk4": (hhtjax.rk4(), 4),
+    "dopri5": (hhtjax.dopri5(), 5),
+    "implicit_euler": (hhtjax.implicit_euler(), 1),
+    "conventional": (hhtjax.conventional_hht(), 2),
+    "kim": (hhtjax.kim_hht(), 1),
+    "kim_implicit_euler": (hhtjax.kim_implicit_euler(), 1),
+    "operator_splitting": (hhtjax.operator_splitting(), 1),
+}
+
+
+def length(t, params):
+    """Of the rope."""
+    return 2.0 + params["amplitude"] * jnp.sin(3.0 * t)
+
+
+def lagrangian(q, v, t, params):
+    """A cart, and a load on a rope; q = (x, angle)."""
+
+    def place(q, t):
+        return jnp.stack([q[0] + length(t, params) * jnp.sin(q[1]), -length(t, params) * jnp.cos(q[1])])
+
+    at, velocity = jax.jvp(place, (q, jnp.asarray(t, q.dtype)), (v, jnp.ones((), q.dtype)))
+    return 0.5 * params["cart"] * v[0] ** 2 + params["load"] * (0.5 * velocity @ velocity - 9.81 * at[1])
+
+
+def damper(q, v, t, params):
+    return jnp.stack([-params["c"] * v[0], 0.0 * v[1]])
+
+
+CRANE = System.from_lagrangian(lagrangian, damper)
+
+
+def mass(q, t, params):
+    """By hand, from the accelerations along and across the rope."""
+    m, r = params["load"], length(t, params)
+    return jnp.array([[params["cart"] + m, m * r * jnp.cos(q[1])], [m * r * jnp.cos(q[1]), m * r**2]])
+
+
+def force(q, v, t, params):
+    m, (s, c) = params["load"], (jnp.sin(q[1]), jnp.cos(q[1]))
+    r, rate = jax.jvp(lambda t: length(t, params), (t,), (jnp.ones_like(t),))
+    second = -9.0 * (r - 2.0)
+    on_cart = m * (r * s * v[1] ** 2 - 2 * rate * c * v[1] - second * s) - params["c"] * v[0]
+    return jnp.stack([on_cart, -m * r * (2 * rate * v[1] + 9.81 * s)])
+
+
+@jax.jit
+def rate_by_hand(t, y, params):
+    q, v, t = y[:2], y[2:], jnp.asarray(t, y.dtype)
+    return jnp.concatenate([v, jnp.linalg.solve(mass(q, t, params), force(q, v, t, params))])
+
+
+def by_scipy(params=PARAMS, duration=DURATION):
+    y0 = np.concatenate([Q0, V0])
+    path = solve_ivp(rate_by_hand, (0, duration), y0, "DOP853", args=(params,), rtol=1e-12, atol=1e-13)
+    return path.y[:, -1]
+
+
+def run(stepper, params=PARAMS, system=CRANE, num_steps=400, **options):
+    return hhtjax.simulate(system, stepper, Q0, V0, params, dt=DURATION / num_steps, num_steps=num_steps, **options)
+
+
+@pytest.mark.parametrize("name", each(STEPPERS, quick=["hht", "rk4"]))
+def test_order(name):
+    """That of the stepper for masses which do not depend on the time."""
+    stepper, order = STEPPERS[name]
+    exact, steps = by_scipy(), (100, 200) if order > 3 else (400, 800)
+    runs = [run(stepper, num_steps=n) for n in steps]
+    errors = [np.abs(np.concatenate([x.q[-1], x.v[-1]]) - exact).max() for x in runs]
+    runs[-1].check()
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
+    assert errors[1] < {1: 5e-2, 2: 1e-3, 3: 1e-5, 4: 1e-6, 5: 1e-8}[order]
+
+
+def test_a_spring_that_carries_more_and_more():
+    """What M at t = 0 made -0.110: L = (1 + t) v^2/2 - 5 q^2; in closed form by Bessel functions."""
+    from scipy.special import j0, j1, y0, y1
+
+    def lagrangian(q, v, t, params):
+        return 0.5 * (1 + t) * v**2 - 5 * q**2
+
+    # (1 + t) q'' + q' + 10 q = 0: q = a J0(s) + b Y0(s), s = 2 sqrt(10 (1 + t))
+    s0, s = 2 * np.sqrt(10.0), 2 * np.sqrt(40.0)
+    a, b = np.linalg.solve([[j0(s0), y0(s0)], [j1(s0), y1(s0)]], [0.5, 0.0])
+    system = System.from_lagrangian(lagrangian)
+    end = hhtjax.simulate(system, hhtjax.hht(), 0.5, 0.0, dt=1e-3, num_steps=3000).q[-1]
+    assert end == pytest.approx(0.3549, abs=5e-5)
+    assert end == pytest.approx(a * j0(s) + b * y0(s), abs=1e-5)
+
+
+@pytest.mark.slow
+def test_by_hand_and_by_its_products():
+    """A function mass(q, t, params), and one inertia(q, w, t, params) in its place."""
+    made = run(hhtjax.hht(), num_steps=50)
+    by_hand = System(mass, force)
+    by_products = System(mass, force, inertia=lambda q, w, t, params: mass(q, t, params) @ w)
+    for system in (by_hand, by_products):
+        np.testing.assert_allclose(run(hhtjax.hht(), system=system, num_steps=50).q, made.q, rtol=0, atol=1e-12)
+    shifted = System(lambda q, time, params: mass(q, time - 0.0, params), force)
+    np.testing.assert_allclose(run(hhtjax.hht(), system=shifted, num_steps=50).q, made.q, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("stepper", "num_steps"), [
+    pytest.param(hhtjax.hht(-0.1, linearize="predictor"), 40, id="hht"),
+    pytest.param(hhtjax.hht(-0.1, iterations=None, tolerance=1e-13), 40, id="newton", marks=pytest.mark.slow),
+    pytest.param(hhtjax.rk4(), 40, id="rk4", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_gradients(stepper, num_steps):
+    """In what the rope, and so the mass, depends on, and in t0."""
+
+    def loss(arguments):
+        params, t0 = arguments
+        path = hhtjax.simulate(CRANE, stepper, Q0, V0, params, dt=0.02, t0=t0, num_steps=num_steps)
+        return jnp.sum(path.q**2) + 0.3 * jnp.sum(path.v**2) + 0.1 * jnp.sum(path.acceleration**2)
+
+    check_gradient(loss, (PARAMS, 0.2), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_with_error_control_and_in_a_batch():
+    control = hhtjax.adaptive(1e-5, 1e-7)
+    for stepper in (hhtjax.hht(), hhtjax.rowda()):
+        chosen = hhtjax.simulate(CRANE, stepper, Q0, V0, PARAMS, dt=control, times=jnp.array([1.0, DURATION]))
+        np.testing.assert_allclose(chosen.q[-1], by_scipy()[:2], rtol=0, atol=3e-5)
+    both = {name: jnp.array([x, 1.1 * x]) for name, x in PARAMS.items()}
+    batch = jax.vmap(lambda params: run(hhtjax.hht(), params, num_steps=100).q[-1])(both)
+    alone = run(hhtjax.hht(), {name: x[1] for name, x in both.items()}, num_steps=100).q[-1]
+    np.testing.assert_allclose(batch[1], alone, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_energy_balance_knows_of_it():
+    """The work of what drives the rope; what the steps make of it is of order 2."""
+
+    def made(num_steps):
+        path = run(hhtjax.hht(), num_steps=num_steps)
+        return float(jnp.max(jnp.abs(hhtjax.analysis.energy_balance(CRANE, path, PARAMS).error)))
+
+    coarse, fine = made(200), made(400)
+    assert fine < 5e-4
+    assert np.log2(coarse / fine) == pytest.approx(2, abs=0.2)
+
+
+@pytest.mark.slow
+def test_impacts_take_the_mass_of_their_time():
+    """A wall for the cart. It jerks the load by dangle = -cos(angle)/r dx', with the length r at that time."""
+    wall = hhtjax.Event(guard=lambda q, v, t, params: 0.25 - q[0], reset=hhtjax.impact(restitution=0.5))
+    path = run(hhtjax.hht(), num_steps=100, events=[wall])
+    path.check()
+    t, angle, before, after = (np.asarray(x)[0] for x in (path.events.t, path.events.q[:, 1], *path.events[4:6]))
+    jump, rope = after - before, float(length(t, PARAMS))
+    np.testing.assert_allclose(jump, -1.5 * before[0] * np.array([1.0, -np.cos(angle) / rope]), rtol=1e-9)
+    assert abs(rope - 2.0) > 0.1
+
+
+@pytest.mark.slow
+def test_constraint_friction_and_internal_states_pass_through():
+    """What leaks from a pendulum in x, y keeps its velocity, so that nothing changes but the multiplier, with m."""
+
+    def leaking(params, t):
+        return jnp.exp(-params * t)
+
+    def lagrangian(q, v, t, params):
+        return leaking(params, t) * (0.5 * v @ v - 9.81 * q[1])
+
+    def thrust(q, v, t, params):
+        return -params * leaking(params, t) * v
+
+    def rod(q, t, params):
+        return jnp.array([jnp.sqrt(q @ q) - 2.0])
+
+    made = System.from_lagrangian(lagrangian, thrust, constraint=rod)
+    plain = System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -9.81]), rod)
+    start, stepper = (jnp.array([1.2, -1.6]), jnp.zeros(2)), hhtjax.hht(-0.1, iterations=None, tolerance=1e-12)
+    leaks, exact = (hhtjax.simulate(system, stepper, *start, 0.5, dt=0.01, num_steps=100) for system in (made, plain))
+    np.testing.assert_allclose(leaks.q, exact.q, rtol=0, atol=1e-10)
+    scale = leaking(0.5, exact.t)[:, None]
+    np.testing.assert_allclose(leaks.multipliers, scale * exact.multipliers, rtol=1e-9)
+
+
+def test_momentum_in_closed_form():
+    """M = 1 + t; what pushes fades, zdot = -z, and friction takes its limit: p = 1 - exp(-t) + 0.5 - 0.2 t."""
+    system = System.from_lagrangian(
+        lambda q, v, t, params: 0.5 * (1 + t) * v**2,
+        force=lambda q, v, z, t, params: z,
+        internal=lambda q, v, z, t, params: -z,
+        friction=lambda q, v, z, t, params: 0.2 + 0 * q,
+    )
+    path = hhtjax.simulate(system, hhtjax.hht(), 0.0, 0.5, z0=1.0, dt=5e-3, num_steps=200)
+    path.check()
+    momentum = 1.5 - jnp.exp(-path.t) - 0.2 * path.t
+    np.testing.assert_allclose((1 + path.t) * path.v, momentum, rtol=0, atol=2e-5)
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_in_c(tmp_path):
+    model = hhtjax.export_c(CRANE, hhtjax.hht(), Q0, V0, PARAMS, name="crane")
+    library = Library(model, tmp_path)
+    state, _ = library.begin(Q0, V0, t0=0.3, dt=0.01)
+    library.run(state, 100, 0.01)
+    path = hhtjax.simulate(CRANE, hhtjax.hht(), Q0, V0, PARAMS, t0=0.3, dt=0.01, num_steps=100)
+    np.testing.assert_allclose(np.ravel(np.array(state.q)), path.q[-1], rtol=0, atol=1e-12)
+
+
+def test_other_arguments_are_refused():
+    for function in (lambda q, v, params: q, lambda t, q, params: q, lambda q, t, params, more: q):
+        with pytest.raises(TypeError, match=r"System: `mass` (must be|is called as|.*)mass\(q, "):
+            System(function, force)
+    with pytest.raises(TypeError, match=r"System: `inertia` is called as inertia\(q, w, params\)"):
+        System(mass, force, inertia=lambda q, w, v, params: w)
