@@ -80,7 +80,7 @@ def check_options(caller, params, optimizer, transforms, loss, max_iterations, c
     elif loss is not None and loss not in LOSSES:
         raise ValueError(f"{caller}: `loss` must be one of {', '.join(LOSSES)}, a function or None; received {loss!r}.")
     if max_iterations is None:
-        max_iterations = 50 if optimizer == LEVENBERG_MARQUARDT else 1000
+        max_iterations = 200 if optimizer == LEVENBERG_MARQUARDT else 1000
     max_iterations = require_integer(caller, "max_iterations", max_iterations)
     segments = require_integer(caller, "segments", segments, 2)
     rho = LOSSES.get(loss) if isinstance(loss, str) else loss

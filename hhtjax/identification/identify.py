@@ -81,7 +81,7 @@ def fit(
             an M-estimate. None: rho(z) = z.
         prior: for each leaf of params0, or for whole branches: `Gaussian(mean, deviation)`, or None. It adds
             1/2 ((p - mean)/deviation)^2, so that w r should have unit variance.
-        max_iterations: default 50, or 1000 with an optax optimiser.
+        max_iterations: default 200, or 1000 with an optax optimiser.
         tolerance: relative, on the cosine between residual and Jacobian columns; or, where that is less than
             10 sqrt(tolerance), on the change of the cost and on the scaled step. With optax: the relative change of
             the cost, five times running.
@@ -116,8 +116,8 @@ def fit(
             combination of them that does not matter.
 
     References:
-        Levenberg (1944); Marquardt (1963), with his scaling of the damping; Nocedal, Wright (2006), Ch. 10. Robust
-        losses: Triggs, McLauchlan, Hartley, Fitzgibbon (2000), as in SciPy's `least_squares`.
+        Levenberg (1944); Marquardt (1963), with his scaling of the damping; Nocedal, Wright (2006), Ch. 10; geodesic
+        acceleration: Transtrum, Sethna (2012). Robust losses: Triggs, McLauchlan, Hartley, Fitzgibbon (2000), as in SciPy's `least_squares`.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.linspace(0.0, 1.0, 20)
