@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from mgh import PROBLEMS, jacobian
 from scipy.optimize import least_squares
 
 import hhtjax
@@ -10,7 +11,6 @@ from hhtjax.identification.gauss_newton import Seen
 from hhtjax.identification.least_squares import levenberg_marquardt
 from hhtjax.identification.outside import Outside
 from hhtjax.identification.progress import CONVERGED
-from mgh import PROBLEMS, jacobian
 
 LIMIT = check_options("fit", 0.0, None, None, None, None, True, 2, False).max_iterations
 

@@ -24,7 +24,6 @@ from hhtjax.identification.progress import (
 )
 from hhtjax.numerics.either import choose, namespace_of, while_loop
 
-
 ALIKE = 0.7  # cosine of two steps, from which on one tells how the residual bends along the other
 MOST_BENT = 1.5  # 2 |D a| over |D v|: beyond it v is no straight line any more, and a no correction of it
 LESS, AGAIN, FASTER = 4.0, 4.0, 6  # lam is divided by 4 after a good step, by 4 times more after each further one
