@@ -151,6 +151,8 @@ class Arrow(NamedTuple):
 
     def bending(self, now, new, at, step):
         """J^T r'' at one of two trials, with r'' = (J_new - J_now) step, of the weighted residuals."""
+        if now.read is None:  # before the first evaluation, in NumPy
+            return 0 * step
         (J0, _), (J1, _), (J, row) = map(self.weighted, (now, new, at))
         xp, (count, _, p) = namespace_of(step), now.R.shape
         shared, own = split(step, count, p)

@@ -59,15 +59,17 @@ class Objective(NamedTuple):
         """
         if self.loss is None:
             return self.scaled(r), self.scaled(J)
-        row, slope = jnp.sqrt(self.stretch(r)), self.losses(r)[1]
+        row, slope = jnp.sqrt(self._stretch(r)), self.losses(r)[1]
         r, J = self.scaled(r), self.scaled(J)
         return slope * r / jnp.where(row == 0, 1, row), J * row[:, None]
 
     def stretch(self, r):
         """rho' + 2 rho'' z of each residual, and not far less than rho': the squares of the factors of the rows of w J.
         None without a loss: 1."""
-        if self.loss is None:
-            return None
+        return None if self.loss is None else self._stretch(r)
+
+    def _stretch(self, r):
+        """Of a cost with a loss."""
         _, slope, curvature = self.losses(r)
         return jnp.maximum(slope + 2 * curvature * self.scaled(r) ** 2, LEAST_BEND * slope)
 

@@ -111,10 +111,7 @@ class Outside(NamedTuple):
         return _weighted(J, kept)
 
     step, damped, length, cosine, offset = Dense.step, Dense.damped, Dense.length, Dense.cosine, Dense.offset
-
-    def bending(self, now, new, at, step):
-        """As of `Dense`; 0 before the first evaluation."""
-        return 0 * step if now.read is None else Dense.bending(self, now, new, at, step)
+    bending = Dense.bending
 
 
 class OutsideRecords(NamedTuple):
@@ -140,10 +137,7 @@ class OutsideRecords(NamedTuple):
         return _weighted(J, kept)
 
     step, damped, length, cosine, offset = Arrow.step, Arrow.damped, Arrow.length, Arrow.cosine, Arrow.offset
-
-    def bending(self, now, new, at, step):
-        """As of `Arrow`; 0 before the first evaluation."""
-        return 0 * step if now.read is None else Arrow.bending(self, now, new, at, step)
+    bending = Arrow.bending
 
 
 def _weighted(J, kept):
