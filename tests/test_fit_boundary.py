@@ -90,3 +90,49 @@ def rooted(p):
 def test_bad_input_is_named(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+CLOCK = jnp.linspace(0.0, 1.0, 21)
+
+
+def column_less_row(p):
+    return {"q": 3 * ((p * CLOCK)[:, None] - jnp.sin(CLOCK)) / 2}
+
+
+def of_a_record(p, start, record):
+    return (start + p * CLOCK)[:, None] - record
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
+def test_every_sample_less_every_other_is_refused(wrap):
+    """(n, 1) less (n,), of which JAX and NumPy make (n, n)."""
+    message = r"fit: `residuals` must be one for each sample; received \(21, 21\).* \(21, 1\) and \(21,\)"
+    with jax.numpy_rank_promotion("allow"):
+        with pytest.raises(ValueError, match=message):
+            hhtjax.fit(wrap(column_less_row), 1.0, covariance=False)
+        records = jnp.stack([jnp.sin(CLOCK)] * 2)
+        with pytest.raises(ValueError, match=message):
+            hhtjax.fit(wrap(of_a_record), 1.0, records=records, starts=jnp.zeros(2), covariance=False)
+
+
+@pytest.mark.parametrize(
+    "residuals",
+    [
+        lambda p: p * CLOCK[:, None] * CLOCK - 0.5 * jnp.outer(CLOCK, CLOCK) * jnp.ones((21, 21)),
+        lambda p: p * CLOCK[:, None] - 0.5 * CLOCK[:, None] + 0 * CLOCK[None, :],
+        lambda p: p * jnp.ones((21, 21)) * CLOCK - 0.5 * CLOCK,
+    ],
+)
+def test_square_residuals_on_purpose_are_none_of_it(residuals):
+    """Of a matrix of measurements, or with both ranks written out."""
+    matrix = jnp.arange(441.0).reshape(21, 21) / 441
+    with jax.numpy_rank_promotion("allow"):
+        found = hhtjax.fit(lambda p: residuals(p) + 0 * matrix, 1.0, covariance=False)
+    assert float(found.params) == pytest.approx(0.5)
+
+
+def test_a_missing_sample_of_a_record_is_named():
+    records = jnp.stack([CLOCK, CLOCK.at[7].set(jnp.nan)])
+    message = r"received nan at residuals\[1, 7\], record 1, sample 7 \(1 of 42 entries\); give missing samples"
+    with pytest.raises(ValueError, match=message):
+        hhtjax.fit(lambda p, start, record: start + p * CLOCK - record, 1.0, records=records, starts=jnp.zeros(2))

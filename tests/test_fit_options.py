@@ -212,7 +212,17 @@ def test_many_parameters_take_an_optax_optimiser():
         (
             {"transforms": {"a": hhtjax.positive, "b": None}},
             ValueError,
-            "`transforms` must be a prefix of params0: pytree structure error: .*\n *transforms\n",
+            "`transforms` must have keys of params0, 'a', 'offset', 'rate'; received 'b'.",
+        ),
+        (
+            {"transforms": [hhtjax.positive]},
+            ValueError,
+            "`transforms` must be a prefix of params0: pytree structure error",
+        ),
+        (
+            {"transforms": {"a": hhtjax.bounded(np.zeros(2), 3)}},
+            ValueError,
+            r"`params0\['a'\]` must have the shape of the bounds in `transforms`; received \(\)",
         ),
         ({"transforms": "log"}, TypeError, "`transforms` must hold hhtjax.positive, .* received 'log'"),
         (
@@ -256,6 +266,12 @@ def test_bad_options_are_named(options, error, message):
 def test_bad_starts_and_bounds_are_named():
     with pytest.raises(ValueError, match="bounded: `lower` must be less than upper; received 2 and 1"):
         hhtjax.bounded(2, 1)
+    with pytest.raises(ValueError, match="bounded: a bound must be finite; received None and None"):
+        hhtjax.bounded()
+    with pytest.raises(ValueError, match="bounded: `upper` must be finite, or inf for none; received nan"):
+        hhtjax.bounded(0, np.nan)
+    with pytest.raises(TypeError, match=r"bounded: `lower` must be a real number, an array of them, or None; .* '0'"):
+        hhtjax.bounded("0", 1)
     with pytest.raises(ValueError, match="multistart: `starts` must have one leading axis in all leaves"):
         hhtjax.multistart(residuals, TRUE)
     with pytest.raises(ValueError, match="multistart: `starts` must hold at least one number"):
@@ -264,3 +280,50 @@ def test_bad_starts_and_bounds_are_named():
         ValueError, match=r"multistart: `starts` must be positive, for its transform; received \[ 1. -1.\]"
     ):
         hhtjax.multistart(lambda p: p - t, jnp.array([1.0, -1.0]), transforms=hhtjax.positive)
+
+
+def test_transforms_of_some_keys_leave_the_others_alone():
+    """As if None had been written for these, in a branch too."""
+
+    def nested(params):
+        return model(params["inner"]) - MEASURED
+
+    given = hhtjax.fit(nested, {"inner": TRUE}, transforms={"inner": {"a": hhtjax.positive}}, covariance=False)
+    assert given.converged
+    names = ["a", "offset", "rate"]  # in the order of JAX
+    assert [type(T).__name__ for T in given.transforms] == ["Positive" if n == "a" else "Scaled" for n in names]
+
+
+def test_bounds_are_arrays_and_one_sided():
+    """Each entry has its own: between, below, above, none; found as by SciPy, and kept by JSON."""
+    data = np.array([[1.0, 2.0, 3.0, 4.0], [1.2, 2.4, 3.1, 4.0]])
+    lower, upper = np.array([0.0, -np.inf, 3.2, -np.inf]), np.array([0.8, 1.5, np.inf, np.inf])
+    transform = hhtjax.bounded(lower, upper)
+    result = hhtjax.fit(lambda p: p[None, :] - data, jnp.array([0.5, 0.5, 3.5, 0.1]), transforms=transform)
+    start = np.array([0.5, 0.5, 3.5, 0.1])
+    known = least_squares(lambda x: (x - data).ravel(), start, bounds=(lower, upper), xtol=1e-14, ftol=1e-14)
+    np.testing.assert_allclose(result.params, known.x, rtol=1e-5)
+    assert transform.contains(result.params).all()
+    ends = np.array(result.interval())
+    assert (ends[0] >= lower).all()
+    assert (ends[1] <= upper).all()
+    assert hhtjax.FitResult.from_json(result.to_json()).transforms == result.transforms
+    for one, start, end in ((hhtjax.bounded(lower=4), 5.0, 4.0), (hhtjax.bounded(upper=2), -3.0, 2.0)):
+        assert float(hhtjax.fit(lambda p: p - data[0, 1:3], start, transforms=one).params) == pytest.approx(
+            np.clip(2.5, *((end, 9) if end == 4 else (-9, end))), abs=1e-4
+        )
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_coordinates_of_bounds_and_back(dtype):
+    """The inverse; bend is p''/p' by differentiation; nothing leaves the bounds."""
+    T = hhtjax.bounded(np.array([0.0, -np.inf, 3.2, -np.inf]), np.array([0.8, 1.5, np.inf, np.inf]))
+    x = jnp.array([-0.7, 0.4, 0.9, 2.0], dtype)
+    p = T.parameter(x, 1.0)
+    assert p.dtype == T.coordinate(p, 1.0).dtype == T.bend(x).dtype == dtype
+    np.testing.assert_allclose(T.coordinate(p, 1.0), x, rtol=1e-5)
+    slope = lambda x: jax.jvp(lambda x: T.parameter(x, 1.0), (x,), (jnp.ones_like(x),))[1]  # noqa: E731
+    first, second = jax.jvp(slope, (x,), (jnp.ones_like(x),))
+    np.testing.assert_allclose(T.bend(x), second / first, rtol=1e-4, atol=1e-6)
+    for far in (-1e4, 1e4):
+        assert T.contains(T.parameter(jnp.full(4, far, dtype), 1.0)).all()

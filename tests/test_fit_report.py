@@ -104,3 +104,11 @@ def test_the_score_test_predicts_the_refit():
     assert (exact.statistic[0], exact.cost_drop[0]) == (0, 0)
     twice = hhtjax.identification.score_test(lambda *x: [with_kink(*x)] * 2, without.params, absent)
     assert twice.statistic[0] == pytest.approx(found.statistic[0])  # the same errors again say nothing more
+
+
+@pytest.mark.parametrize(("shape", "advised"), [(jnp.exp(-6 * x) * jnp.sin(80 * x), True), (jnp.sin(80 * x), False)])
+def test_a_residual_that_fades_asks_for_other_starts(shape, advised):
+    """As that of a friction fit in a false minimum; one that stays as large does not, nor one that is white."""
+    noise = 0.001 * np.random.default_rng(1).normal(size=200)
+    said = [hhtjax.fit(lambda level, y=y: level - y, 0.3).summary() for y in (shape + noise, jnp.asarray(noise))]
+    assert ["multistart" in text and "windows" in text for text in said] == [advised, False]

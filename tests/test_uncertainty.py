@@ -84,7 +84,12 @@ def test_outputs_may_come_before_the_samples():
 @pytest.mark.parametrize(
     ("directions", "values", "phrases"),
     [
-        ([[1.0, 1.0, 0.0]], [2.0, 2.0, 1.0], ["k1, k2 only through their ratio"]),
+        ([[1.0, 1.0, 0.0]], [2.0, 2.0, 1.0], ["k1, k2 only through their difference or ratio"]),
+        ([[2.0, 3.0, 0.0]], [2.0, 3.0, 1.0], ["k1, k2 only through their ratio"]),
+        ([[1.0, 1.0, 0.0]], [2.0, 3.0, 1.0], ["k1, k2 only through their difference"]),
+        ([[1.0, -1.0, 0.0]], [2.0, 3.0, 1.0], ["k1, k2 only through their sum"]),
+        ([[1.0, -1.0, 0.0]], [0.0, 3.0, 1.0], ["k1, k2 only through their sum"]),
+        ([[1.0, -1.0, 0.0]], [2.0, 2.0, 1.0], ["k1, k2 only through their sum or product"]),
         ([[2.0, -3.0, 0.0]], [2.0, 3.0, 1.0], ["k1, k2 only through their product"]),
         ([[2.0, 3.0, -1.0]], [2.0, 3.0, -1.0], ["k1, k2, c only through their ratios"]),
         ([[0.0, 0.0, 1.0]], [2.0, 3.0, 0.0], ["c not at all"]),
@@ -92,7 +97,7 @@ def test_outputs_may_come_before_the_samples():
         (
             [[1.0, 1.0, 1.0], [1.0, 1.0, -1.0]],
             [1.0, 1.0, 1.0],
-            ["k1, k2 only through their ratio", "c not at all"],
+            ["k1, k2 only through their difference or ratio", "c not at all"],
         ),
     ],
 )

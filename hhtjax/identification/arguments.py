@@ -80,7 +80,7 @@ def check_options(caller, params, optimizer, transforms, loss, max_iterations, c
     elif loss is not None and loss not in LOSSES:
         raise ValueError(f"{caller}: `loss` must be one of {', '.join(LOSSES)}, a function or None; received {loss!r}.")
     if max_iterations is None:
-        max_iterations = 50 if optimizer == LEVENBERG_MARQUARDT else 1000
+        max_iterations = 200 if optimizer == LEVENBERG_MARQUARDT else 1000
     max_iterations = require_integer(caller, "max_iterations", max_iterations)
     segments = require_integer(caller, "segments", segments, 2)
     rho = LOSSES.get(loss) if isinstance(loss, str) else loss
@@ -210,11 +210,28 @@ def check_real(where, leaf):
 
 def check_transforms(caller, transforms, params, name="params0"):
     """The transform of each leaf of params, which have to be reachable by it."""
+    transforms = _completed(caller, transforms, params, "", name)
     kinds = "hhtjax.positive, bounded(), fixed"
     require_entries(caller, "transforms", transforms, params, name, tf.is_transform, kinds)
     transforms = tf.per_leaf(transforms, params)
     for (path, leaf), T in zip(jax.tree_util.tree_leaves_with_path(params), transforms, strict=True):
         where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
+        of_one = jnp.shape(leaf)[1:] if name == "starts" else jnp.shape(leaf)
+        if not T.fits(of_one):
+            raise ValueError(f"{where} must have the shape of the bounds in `transforms`; received {of_one}.")
         if is_concrete(leaf) and not np.all(T.contains(leaf)):
             raise ValueError(f"{where} must {T.expectation}; received {leaf}.")
     return transforms
+
+
+def _completed(caller, transforms, params, where, name):
+    """Transforms of all keys of a dict, None for those that are not given."""
+    if not (isinstance(transforms, dict) and isinstance(params, dict)):
+        return transforms
+    if unknown := [key for key in transforms if key not in params]:
+        raise ValueError(
+            f"{caller}: `transforms{where}` must have keys of {name}{where}, {', '.join(map(repr, params))}; "
+            f"received {unknown[0]!r}."
+        )
+    pairs = ((key, _completed(caller, transforms.get(key), y, f"{where}[{key!r}]", name)) for key, y in params.items())
+    return type(params)(pairs)

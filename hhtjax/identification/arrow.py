@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.identification.gauss_newton import Seen, bent, blank, largest_cosine, or_one, with_jacobian
+from hhtjax.identification.gauss_newton import Seen, bending, bent, blank, largest_cosine, or_one, with_jacobian
 from hhtjax.identification.losses import LEAST_BEND, Objective
-from hhtjax.numerics.either import choose, eigh, namespace_of, solve_upper
+from hhtjax.numerics.either import choose, eigh, namespace_of, solve_upper, solve_upper_transposed
 
 
 class ArrowTrial(NamedTuple):
@@ -57,6 +57,23 @@ def arrow_trial(x, seen, D, p) -> ArrowTrial:
     R = xp.linalg.qr(xp.concatenate([both / columns[:, None, :], r[:, :, None]], axis=2), mode="r")
     cost, length = xp.where(finite, seen.cost, xp.inf), xp.linalg.norm(r)
     return ArrowTrial(x, seen.read, cost, length, D, column, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
+
+
+def _eliminated(trial, lam):
+    """The damped problem without own unknowns: with T (records, k, k) and S (p, p) upper triangular,
+
+    T own + part (shared, 1) = 0,    S shared + seen = 0.
+    """
+    xp, z, (count, _, p), k = namespace_of(trial.x), trial.z, trial.R.shape, trial.R_own.shape[-1]
+    root = xp.sqrt(xp.maximum(lam, float(jnp.finfo(z.dtype).eps) ** 2))
+    damping = xp.broadcast_to(root * xp.eye(k, dtype=z.dtype), (count, k, k))
+    Q, T = xp.linalg.qr(xp.concatenate([trial.R_own, damping], axis=1))
+    b = xp.pad(xp.concatenate([trial.R, z[:, :, None]], axis=2), ((0, 0), (0, k), (0, 0)))
+    part = xp.swapaxes(Q, 1, 2) @ b
+    rest = (b - Q @ part).reshape(-1, p + 1)
+    damped = xp.concatenate([rest, root * xp.eye(p, p + 1, dtype=z.dtype)])
+    Q, S = xp.linalg.qr(damped[:, :p])
+    return T, part, S, Q.T @ damped[:, p]
 
 
 class Arrow(NamedTuple):
@@ -113,20 +130,50 @@ class Arrow(NamedTuple):
 
     def step(self, trial, lam):
         """The damped step, and the decrease of the cost that the linear problem predicts."""
-        xp, z, (count, _, p), k = namespace_of(trial.x), trial.z, trial.R.shape, trial.R_own.shape[-1]
-        root = xp.sqrt(xp.maximum(lam, float(jnp.finfo(z.dtype).eps) ** 2))
-        damping = xp.broadcast_to(root * xp.eye(k, dtype=z.dtype), (count, k, k))
-        Q, T = xp.linalg.qr(xp.concatenate([trial.R_own, damping], axis=1))
-        b = xp.pad(xp.concatenate([trial.R, z[:, :, None]], axis=2), ((0, 0), (0, k), (0, 0)))
-        part = xp.swapaxes(Q, 1, 2) @ b
-        rest = (b - Q @ part).reshape(-1, p + 1)
-        damped = xp.concatenate([rest, root * xp.eye(p, p + 1, dtype=z.dtype)])
-        Q, S = xp.linalg.qr(damped[:, :p])
-        shared = -solve_upper(S, Q.T @ damped[:, p])
+        xp, z, p = namespace_of(trial.x), trial.z, trial.R.shape[-1]
+        T, part, S, seen = _eliminated(trial, lam)
+        shared = -solve_upper(S, seen)
         own = -solve_upper(T, part[:, :, p] + xp.einsum("bkp,p->bk", part[:, :, :p], shared))
         left = z + xp.einsum("bip,p->bi", trial.R, shared) + xp.einsum("bik,bk->bi", trial.R_own, own)
         predicted = (xp.sum(z**2) - xp.sum(left**2)) / 2
         return xp.concatenate([shared, own.ravel()]) / or_one(trial.D), predicted
+
+    def damped(self, trial, lam, slope):
+        """(J^T J + lam D^2)^-1 slope."""
+        xp, (count, _, p) = namespace_of(trial.x), trial.R.shape
+        T, part, S = _eliminated(trial, lam)[:3]
+        shared, own = split(slope / or_one(trial.D), count, p)
+        ahead = solve_upper_transposed(T, own)
+        shared = shared - xp.einsum("bkp,bk->p", part[:, :, :p], ahead)
+        shared = solve_upper(S, solve_upper_transposed(S, shared))
+        own = solve_upper(T, ahead - xp.einsum("bkp,p->bk", part[:, :, :p], shared))
+        return xp.concatenate([shared, own.ravel()]) / or_one(trial.D)
+
+    def bending(self, now, new, at, step):
+        """J^T r'' at one of two trials, with r'' = (J_new - J_now) step, of the weighted residuals."""
+        if now.read is None:  # before the first evaluation, in NumPy
+            return 0 * step
+        (J0, _), (J1, _), (J, row) = map(self.weighted, (now, new, at))
+        xp, (count, _, p) = namespace_of(step), now.R.shape
+        shared, own = split(step, count, p)
+        step = xp.concatenate([own, xp.broadcast_to(shared, (count, p))], axis=1)[:, :, None]
+        slopes = bending((J0 @ step)[:, :, 0], (J1 @ step)[:, :, 0], J, row)
+        k = own.shape[1]
+        return xp.concatenate([xp.sum(slopes[:, k:], axis=0), slopes[:, :k].ravel()])
+
+    def weighted(self, trial):
+        """w J by a record's own unknowns and then the shared ones, and as in `Dense`."""
+        r, J, J_own = trial.read
+        both = jnp.concatenate([J_own, J], axis=2)
+        row = self.objective.stretch(r.ravel())
+        both = self.objective.scaled(both.reshape(r.size, -1)).reshape(both.shape)
+        return both, None if row is None else row.reshape(r.shape)
+
+    def offset(self, trial):
+        """Length of the part of the residual that a step without damping takes away, over that of the residual."""
+        xp = namespace_of(trial.x)
+        _, predicted = self.step(trial, xp.zeros_like(trial.length))
+        return xp.sqrt(xp.maximum(2 * predicted, 0)) / or_one(trial.length)
 
     def length(self, trial, dx):
         """Of J dx."""

@@ -107,6 +107,17 @@ def whiteness(residuals: Residuals):
     return float(products / energy) if energy else 0.0, chi_squared_tail(Q, degrees), lags
 
 
+def fades(residuals: Residuals) -> bool:
+    """Whether the last third of the residuals, in all, is less than a third as large as the first: of records that die
+    away."""
+    first, last = 0.0, 0.0
+    for r in residuals.weighted:
+        third = len(r) // 3
+        if len(r) >= LEAST * LEAST:
+            first, last = first + np.sum(r[:third] ** 2), last + np.sum(r[-third:] ** 2)
+    return bool(last < first / 9)
+
+
 def chi_squared_tail(x, degrees) -> float:
     """Probability of more than x, of an integer number of degrees of freedom: a finite sum."""
     y, odd = float(x) / 2, degrees % 2

@@ -88,6 +88,12 @@ def largest_cosine(slopes, trial):
     return largest / or_one(trial.length)
 
 
+def bending(before, after, J, row):
+    """J^T r'' with r'' the difference of J dx at the ends of a step, and the rows of J (.., m, p) times `row`."""
+    bend = after - before if row is None else row * (after - before)
+    return namespace_of(J).einsum("...mp,...m->...p", J, bend)
+
+
 class Seen(NamedTuple):
     """What an evaluation at a point tells."""
 
@@ -173,6 +179,30 @@ class Dense(NamedTuple):
         weight = trial.s / xp.maximum(trial.s**2 + lam, float(jnp.finfo(trial.s.dtype).tiny))
         dx = -(trial.V @ (weight * trial.z)) / or_one(trial.D)
         return dx, xp.sum(trial.z**2 * (1 - (1 - trial.s * weight) ** 2)) / 2
+
+    def damped(self, trial, lam, slope):
+        """(J^T J + lam D^2)^-1 slope."""
+        xp, D = namespace_of(trial.x), or_one(trial.D)
+        weight = xp.maximum(trial.s**2 + lam, float(jnp.finfo(trial.s.dtype).tiny))
+        return trial.V @ (trial.V.T @ (slope / D) / weight) / D
+
+    def bending(self, now, new, at, step):
+        """J^T r'' at one of two trials, with r'' = (J_new - J_now) step, of the weighted residuals."""
+        if now.read is None:  # before the first evaluation, in NumPy
+            return 0 * step
+        (J0, _), (J1, _), (J, row) = map(self.weighted, (now, new, at))
+        return bending(J0 @ step, J1 @ step, J, row)
+
+    def weighted(self, trial):
+        """w J, and the squares of the factors of its rows in the least-squares problem; None for 1."""
+        r, J = trial.read
+        return self.objective.scaled(J), self.objective.stretch(r)
+
+    def offset(self, trial):
+        """Length of the part of the residual that a step without damping takes away, over that of the residual."""
+        xp = namespace_of(trial.x)
+        reached = trial.s > 100 * float(jnp.finfo(trial.s.dtype).eps) * trial.s[0]
+        return xp.linalg.norm(xp.where(reached, trial.z, 0)) / or_one(trial.length)
 
     def length(self, trial, dx):
         """Of J dx."""

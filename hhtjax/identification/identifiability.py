@@ -68,11 +68,18 @@ def _phrase(names, direction, values):
     if len(names) == 1:
         return f"{names[0]} not at all"
     joined = ", ".join(names)
-    if np.all(values[at] != 0) and np.allclose(direction, 1, atol=1e-3):
-        return f"{joined} only through their ratio{'s' * (len(names) > 2)}"
-    if np.all(values[at] != 0) and len(names) == 2 and np.allclose(direction, [1, -1], atol=1e-3):
-        return f"{joined} only through their product"
-    unit = ["d{0}/{0}" if value != 0 else "d{0}" for value in values[at]]
+    values = values[at]
+    absolute = direction * np.where(values == 0, 1, values)
+    through = []
+    if len(names) == 2:
+        for name, sign in (("sum", -1), ("difference", 1)):
+            through += [name] if np.allclose(absolute / absolute[0], [1, sign], atol=1e-3) else []
+    if np.all(values != 0):
+        through += ["product"] if len(names) == 2 and np.allclose(direction, [1, -1], atol=1e-3) else []
+        through += [f"ratio{'s' * (len(names) > 2)}"] if np.allclose(direction, 1, atol=1e-3) else []
+    if through:
+        return f"{joined} only through their {' or '.join(through)}"
+    unit = ["d{0}/{0}" if value != 0 else "d{0}" for value in values]
     terms = " ".join(f"{x:+.3g} {u.format(n)}" for x, u, n in zip(direction, unit, names, strict=True))
     return f"{joined} not along {terms}"
 

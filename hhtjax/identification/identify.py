@@ -70,7 +70,7 @@ def fit(
             Schur complement): so the Jacobian has columns for one start only, however many records there are.
             Levenberg-Marquardt, without a prior.
         transforms: for each leaf of params0, or for whole branches: `positive`, `bounded(lower, upper)`, `fixed`,
-            or None for neither.
+            or None for neither. Keys of dicts may be left out, for None.
         scale: typical size of each parameter: a pytree like params0, whose leaves are numbers or arrays of
             the shape of theirs. The optimiser works on params/scale, if no transform is given. Default: |params0|,
             or 1 where that is 0. Levenberg-Marquardt scales itself, and uses it for its step tolerance only.
@@ -81,7 +81,7 @@ def fit(
             an M-estimate. None: rho(z) = z.
         prior: for each leaf of params0, or for whole branches: `Gaussian(mean, deviation)`, or None. It adds
             1/2 ((p - mean)/deviation)^2, so that w r should have unit variance.
-        max_iterations: default 50, or 1000 with an optax optimiser.
+        max_iterations: default 200, or 1000 with an optax optimiser.
         tolerance: relative, on the cosine between residual and Jacobian columns; or, where that is less than
             10 sqrt(tolerance), on the change of the cost and on the scaled step. With optax: the relative change of
             the cost, five times running.
@@ -108,16 +108,18 @@ def fit(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; a start that a transform excludes; no free parameter;
-            residuals that are not finite at params0, and not declared missing; that do not depend on any parameter
-            there; or that JAX cannot trace; more parameters than residuals.
+            residuals that are not finite at params0, and not declared missing; that are (n, n), because (n, 1) and (n,)
+            were subtracted; that do not depend on any parameter there; or that JAX cannot trace; more parameters than
+            residuals.
 
     Warns:
         IdentifiabilityWarning: the Jacobian at the solution lacks rank: names the parameters concerned, and the
             combination of them that does not matter.
 
     References:
-        Levenberg (1944); Marquardt (1963), with his scaling of the damping; Nocedal, Wright (2006), Ch. 10. Robust
-        losses: Triggs, McLauchlan, Hartley, Fitzgibbon (2000), as in SciPy's `least_squares`.
+        Levenberg (1944); Marquardt (1963), with his scaling of the damping; Nocedal, Wright (2006), Ch. 10; geodesic
+        acceleration: Transtrum, Sethna (2012). Robust losses: Triggs, McLauchlan, Hartley, Fitzgibbon (2000), as in
+        SciPy's `least_squares`.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.linspace(0.0, 1.0, 20)
@@ -216,7 +218,7 @@ def _finished(caller, result, weights):
     """The result of a fit outside of jit: trouble told, and the history cut to what happened."""
     code = int(result.code)
     if code == BAD_START:
-        bad = first_bad(result.residual, weights)
+        bad = first_bad(result.residual, weights, result.starts is not None)
         raise ValueError(f"{caller}: `residuals` must be finite at params0; received {bad}.")
     if code == NO_INFLUENCE:
         raise ValueError(f"{caller}: `residuals` must depend on params; their derivatives at params0 are all zero.")

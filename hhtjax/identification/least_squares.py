@@ -3,9 +3,12 @@
 What ended it is a code.
 """
 
+from typing import Any, NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.identification.gauss_newton import or_one
 from hhtjax.identification.progress import (
     BAD_START,
     COST,
@@ -21,13 +24,36 @@ from hhtjax.identification.progress import (
 )
 from hhtjax.numerics.either import choose, namespace_of, while_loop
 
+ALIKE = 0.7  # cosine of two steps, from which on one tells how the residual bends along the other
+MOST_BENT = 1.5  # 2 |D a| over |D v|: beyond it v is no straight line any more, and a no correction of it
+LESS, AGAIN, FASTER = 4.0, 4.0, 6  # lam is divided by 4 after a good step, by 4 times more after each further one
+
+
+class Course(NamedTuple):
+    """What is known from the steps so far."""
+
+    lam: Any
+    radius: Any  # |D dx| of the next step at most; inf after a success
+    good: Any  # how many good steps, one after the other; 0, 1, ..
+    failures: Any  # how many trials have not lowered the cost, one after the other
+    along: Any  # the last step, taken or not
+    slope: Any  # J^T r'' with r'' the second derivative of the residual along it
+
 
 def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress, room=None, enough=None):
     """Damped Gauss-Newton on a `Dense` or an `Arrow` problem; returns the best trial, the history, and why it ended.
 
-    dx = -(J^T J + lam D^2)^-1 J^T r. With rho the decrease of the cost over that predicted, lam changes by the factor
-    max(1/8, 1 - (2 rho - 1)^3) when a step lowers the cost (Nielsen 1999), and grows by 6 when it does not. Before that
-    it grows until no entry of dx is longer than that of `longest`. room: for how many iterations the history has
+    dx = v + a/2,    v = -(J^T J + lam D^2)^-1 J^T r,    a = -(J^T J + lam D^2)^-1 J^T r''
+
+    with the velocity v and the acceleration a of a path that follows a curved valley (Transtrum, Sethna 2012). r'' is
+    the second derivative of the residual along v. It is not evaluated: the difference of the Jacobians at the ends of
+    the last step gives it along that step, and the part of v along it is taken. So it costs no run, and needs no second
+    derivative of what runs.
+
+    With rho the decrease of the cost over that predicted, lam changes by the factor max(least, 1 - (2 rho - 1)^3) when
+    a step lowers the cost (Nielsen 1999); least is 1/4, and less by 4 with each step of rho > 0.9 that follows another.
+    When it does not, lam grows until |D v| is half as long, or a quarter after two failures, an eighth after three, ...
+    It also grows until no entry of v is longer than that of `longest`. room: for how many iterations the history has
     room, where max_iterations is a tracer. enough: trial, step -> whether to end with a step like that, for STEP.
     """
     xp, eps = namespace_of(x), float(jnp.finfo(x.dtype).eps)
@@ -37,16 +63,17 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
         return carry[-1] == RUNNING
 
     def improve(carry):
-        now, lam, iteration, history, _ = carry
+        now, course, iteration, history, _ = carry
         first = iteration < 0
-        lam, step, predicted = _within(problem, now, lam, longest)
-        new = problem.look(now.x + xp.where(first, 0, step), now.D)
+        lam, v, predicted = _within(problem, now, course, longest)
+        step = xp.where(first, 0, v + _half_acceleration(problem, now, course, (lam, v), longest))
+        new = problem.look(now.x + step, now.D)
         lower = new.cost < now.cost
-        gain = (now.cost - new.cost) / predicted
         small = _small(problem, now, new, lower, (step, predicted, lam), history.cost[0], tolerance)
-        lam = xp.where(first, lam, lam * xp.where(lower, xp.maximum(1 / 8, 1 - (2 * gain - 1) ** 3), 6))
-        iteration = iteration + 1
         best = choose(lower | first, new, now)
+        course = _learn(problem, (now, new, best), course, (lam, v, step), (now.cost - new.cost) / predicted, lower)
+        course = choose(first, carry[1], course)
+        iteration = iteration + 1
         code = xp.where(iteration == max_iterations, LIMIT, running)
         code = xp.where(~lower & (lam > 1 / eps), STUCK, code)
         code = xp.where(small == RUNNING, code, small)
@@ -57,48 +84,90 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
         code = xp.where(first & xp.all(best.column == 0), NO_INFLUENCE, code)
         code = xp.where(first & ~xp.isfinite(new.cost), BAD_START, code)
         taken = xp.where(lower & ~first, xp.max(xp.abs(step)), 0)
-        history = record(history, iteration, best.cost, taken, lam)
+        history = record(history, iteration, best.cost, taken, course.lam)
         if progress:
             show(iteration, best.cost, taken, code)
-        return best, lam, iteration, history, code
+        return best, course, iteration, history, code
 
     # nothing is known before the first evaluation, which is that of the loop: f is compiled once
     empty = xp.full((max_iterations if room is None else room) + 1, xp.nan, x.dtype)
-    start = xp.asarray(1e-3, x.dtype), xp.asarray(-1, np.int32), History(empty, empty, empty), running
+    zero = xp.zeros((), np.int32)
+    course = Course(xp.asarray(1e-3, x.dtype), xp.asarray(xp.inf, x.dtype), zero, zero, 0 * x, 0 * x)
+    start = course, xp.asarray(-1, np.int32), History(empty, empty, empty), running
     best, _, iterations, history, code = while_loop(unfinished, improve, (problem.nothing(x), *start))
     return best, history, iterations, code
 
 
+def _half_acceleration(problem, now, course, attempt, longest):
+    """a/2 of the step v; 0 where v is not along the step that tells of r'', or a not small against v."""
+    xp, (lam, v) = namespace_of(now.x), attempt
+    own, last = now.D * v, now.D * course.along
+    size, both = xp.linalg.norm(last), xp.sum(own * last)
+    part = both / or_one(size) ** 2
+    half = -problem.damped(now, lam, part**2 * course.slope) / 2
+    alike = (xp.abs(both) > ALIKE * size * xp.linalg.norm(own)) & (size > 0)
+    straight = 4 * xp.linalg.norm(now.D * half) <= MOST_BENT * xp.linalg.norm(own)
+    return xp.where(alike & straight & xp.all(xp.abs(v + half) <= _bounded(longest, v.dtype)), half, 0)
+
+
+def _learn(problem, trials, course, attempt, rho, lower):
+    """The `Course` behind an attempt."""
+    (now, new, best), (lam, v, step) = trials, attempt
+    xp, eps = namespace_of(now.x), float(jnp.finfo(now.x.dtype).eps)
+    good = xp.where(lower & (rho > 0.9), xp.minimum(course.good + 1, FASTER), 0)
+    failures = xp.where(lower, 0, course.failures + 1)
+    further = xp.maximum(good - 1, 0).astype(lam.dtype)
+    least = AGAIN**-further / LESS
+    eased = xp.maximum(lam * xp.maximum(least, 1 - (2 * rho - 1) ** 3), eps**2)
+    shorter = xp.where(xp.isfinite(new.cost), 0.5 ** xp.minimum(failures, 9).astype(lam.dtype), 0.1)
+    radius = xp.where(lower, xp.inf, shorter * xp.linalg.norm(now.D * v))
+    known = xp.isfinite(new.cost)
+    slope = xp.where(known, problem.bending(now, new, best, step), course.slope)
+    along = xp.where(known, step, course.along)
+    kept = Course(xp.where(lower, eased, 2 * lam), radius, good, failures, along, slope)
+    return Course(*(xp.asarray(x, y.dtype) for x, y in zip(kept, course, strict=True)))
+
+
 def _small(problem, now, new, lower, attempt, start, tolerance):
-    """COST or STEP where an attempt has changed the cost or the unknowns too little to go on; else RUNNING.
+    """COST or STEP where an attempt has changed the cost or the unknowns too little to go on; else RUNNING. GRADIENT
+    where the residual is rounding.
 
     A step is also small, and changes little, because it is damped, or because a derivative is 1e10, as of a chaotic
-    run: the gradient has to be small too, or the residual next to nothing.
+    run: the gradient has to be small too, or the residual next to nothing; and the damping has to be small, or the
+    part of the residual that a step without damping would take away (the relative offset of Bates, Watts 1981).
     """
     xp, (step, predicted, lam) = namespace_of(now.x), attempt
     flat = (predicted <= tolerance * now.cost) & (xp.abs(now.cost - new.cost) <= tolerance * now.cost)
     short = xp.all(xp.abs(step) <= tolerance * (xp.abs(now.x) + tolerance))
-    damped = lam * xp.max(xp.where(now.column > 0, now.D / now.column, 1)) ** 2
+    damped = lam * xp.max(xp.where(now.column > 0, now.D / or_one(now.column), 1)) ** 2
     best = choose(lower, new, now)
     reach = xp.linalg.norm(best.column * xp.maximum(xp.abs(best.x), 1))  # of parameters changed by themselves
     rounding = 10 * float(jnp.finfo(reach.dtype).eps) * reach
-    nothing = (best.cost <= tolerance * start) | (best.length <= rounding)
-    minimum = (damped <= 1) & (nothing | (problem.cosine(best) <= 10 * xp.sqrt(tolerance)))
-    return xp.where(minimum & flat, COST, xp.where(minimum & short, STEP, RUNNING))
+    little = (best.cost <= tolerance * start) | (best.length <= rounding)
+    nothing = (best.cost <= tolerance**2 * start) & (best.length <= rounding)
+    sound = (damped <= 1) | (problem.offset(best) <= 10 * xp.sqrt(tolerance))
+    minimum = sound & (little | (problem.cosine(best) <= 10 * xp.sqrt(tolerance)))
+    code = xp.where(minimum & flat, COST, xp.where(minimum & short, STEP, RUNNING))
+    return xp.where(nothing, GRADIENT, code)
 
 
-def _within(problem, now, lam, longest):
-    """The least damping, lam times a power of 4, whose step is within `longest`; that step, and what it predicts."""
-    if np.all(np.isinf(longest)):
-        return lam, *problem.step(now, lam)  # the loop would only cost time to compile
+def _within(problem, now, course, longest):
+    """The least damping, lam times a power of 2, whose step is within `longest` and the radius; that step, and what it
+    predicts."""
     xp = namespace_of(now.x)
-    longest = np.minimum(longest, np.finfo(lam.dtype).max).astype(lam.dtype)  # so that inf is too long
+    longest = _bounded(longest, now.x.dtype)
 
     def too_long(carry):
-        return xp.any(xp.abs(carry[1]) > longest)
+        _, v, _ = carry
+        return xp.any(xp.abs(v) > longest) | (xp.linalg.norm(now.D * v) > course.radius)
 
     def damp(carry):
-        lam = 4 * carry[0]
+        lam = 2 * carry[0]
         return lam, *problem.step(now, lam)
 
-    return while_loop(too_long, damp, (lam / 4, xp.full_like(now.x, xp.inf), lam))
+    return while_loop(too_long, damp, (course.lam / 2, xp.full_like(now.x, xp.inf), course.lam))
+
+
+def _bounded(longest, dtype):
+    """The longest steps, so that inf is too long."""
+    return np.minimum(longest, np.finfo(dtype).max).astype(dtype)

@@ -59,9 +59,19 @@ class Objective(NamedTuple):
         """
         if self.loss is None:
             return self.scaled(r), self.scaled(J)
-        r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
-        row = jnp.sqrt(jnp.maximum(slope + 2 * curvature * r**2, LEAST_BEND * slope))
+        row, slope = jnp.sqrt(self._stretch(r)), self.losses(r)[1]
+        r, J = self.scaled(r), self.scaled(J)
         return slope * r / jnp.where(row == 0, 1, row), J * row[:, None]
+
+    def stretch(self, r):
+        """rho' + 2 rho'' z of each residual, and not far less than rho': the squares of the factors of the rows of w J.
+        None without a loss: 1."""
+        return None if self.loss is None else self._stretch(r)
+
+    def _stretch(self, r):
+        """Of a cost with a loss."""
+        _, slope, curvature = self.losses(r)
+        return jnp.maximum(slope + 2 * curvature * self.scaled(r) ** 2, LEAST_BEND * slope)
 
     def estimating(self, r, J):
         """w J, and the first and second derivative of the loss of each weighted residual (None without a loss: 1).

@@ -40,6 +40,7 @@ class Kept(NamedTuple):
     params: Any
     slope: Any
     starts: Any
+    stretch: Any  # of `Objective.stretch`
 
 
 @jax.tree_util.register_static
@@ -83,8 +84,9 @@ def _see(residuals, options, x, params0, data):
         problem = Arrow(parts.f, objective, data.records, p, coordinates.bend())
         seen = problem.see(x)
         residual, starts = parts.unravel(seen.read[0]), parts.unravel_start(problem.split(x)[1])
+    stretch = problem.objective.stretch(seen.read[0].ravel())
     estimates = None if options.loss is None else problem.estimates(*seen.read)
-    kept = Kept(estimates, residual, freeze(coordinates.params(x[:p])), coordinates.slope(x[:p]), starts)
+    kept = Kept(estimates, residual, freeze(coordinates.params(x[:p])), coordinates.slope(x[:p]), starts, stretch)
     return seen._replace(read=kept)
 
 
@@ -103,7 +105,13 @@ class Outside(NamedTuple):
         square, number = np.zeros((x.size, x.size), x.dtype), np.zeros((), x.dtype)
         return DenseTrial(x, None, number + np.inf, number, zero, zero, zero, square, zero)
 
-    step, length, cosine = Dense.step, Dense.length, Dense.cosine
+    def weighted(self, trial):
+        """As of `Dense`."""
+        _, J, kept = trial.read
+        return _weighted(J, kept)
+
+    step, damped, length, cosine, offset = Dense.step, Dense.damped, Dense.length, Dense.cosine, Dense.offset
+    bending = Dense.bending
 
 
 class OutsideRecords(NamedTuple):
@@ -123,7 +131,21 @@ class OutsideRecords(NamedTuple):
         R = np.zeros((self.count, 1, k + self.p), x.dtype)
         return ArrowTrial(x, None, number + np.inf, number, zero, zero, R[:, :, k:], R[:, :, :k], R[:, :, 0])
 
-    step, length, cosine = Arrow.step, Arrow.length, Arrow.cosine
+    def weighted(self, trial):
+        """As of `Arrow`."""
+        _, J, kept = trial.read
+        return _weighted(J, kept)
+
+    step, damped, length, cosine, offset = Arrow.step, Arrow.damped, Arrow.length, Arrow.cosine, Arrow.offset
+    bending = Arrow.bending
+
+
+def _weighted(J, kept):
+    """w J, whose rows in a least-squares problem are others where there is a loss."""
+    if kept is None or kept.estimates is None:
+        return J, None
+    wJ, _, _ = kept.estimates
+    return np.reshape(wJ, J.shape), np.reshape(kept.stretch, J.shape[:-1])
 
 
 def _in_numpy(seen):

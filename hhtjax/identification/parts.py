@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.description import thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.residuals import check_residuals, spread_weights
+from hhtjax.identification.samples import require_own_samples
 
 
 class Data(NamedTuple):
@@ -70,7 +71,8 @@ class Coordinates:
 
 def longest_steps(transforms, leaves, own=0):
     """Of the vector x, within which a transform is about straight, (p + own,); own: how many unknowns of records."""
-    steps = [np.full(np.size(x), T.longest_step) for T, x in zip(transforms, leaves, strict=True) if T is not tf.fixed]
+    pairs = [(T, x) for T, x in zip(transforms, leaves, strict=True) if T is not tf.fixed]
+    steps = [np.broadcast_to(T.longest_step, np.shape(x)).ravel() for T, x in pairs]
     return np.concatenate([*steps, np.full(own, np.inf)])
 
 
@@ -90,7 +92,9 @@ class DenseParts(NamedTuple):
 
 def dense_parts(residuals, coordinates, data) -> DenseParts:
     """One residual function of all parameters, with priors as further rows."""
-    shapes = check_residuals("fit", residuals, coordinates.x0.size, coordinates.params(coordinates.x0))
+    params0 = coordinates.params(coordinates.x0)
+    shapes = check_residuals("fit", residuals, coordinates.x0.size, params0)
+    require_own_samples("fit", residuals, shapes, params0)
     leaves = spread_weights("fit", data.weights, shapes)
     w, unravel = ravel_pytree(jax.tree.unflatten(jax.tree.structure(shapes), leaves))
     if data.prior is not None:
@@ -129,6 +133,8 @@ def record_parts(residuals, coordinates, data) -> RecordParts:
 
     unknowns, params0 = coordinates.x0.size + own0.size, coordinates.params(coordinates.x0)
     shapes = check_residuals("fit", every, unknowns, params0, data.starts, data.records)
+    one = params0, first(data.starts), first(data.records)
+    require_own_samples("fit", residuals, jax.tree.map(lambda y: y.update(shape=y.shape[1:]), shapes), *one)
     leaves = spread_weights("fit", data.weights, shapes)
     weights = jax.tree.unflatten(jax.tree.structure(shapes), leaves)
     w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)

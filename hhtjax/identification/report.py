@@ -12,13 +12,25 @@ import numpy as np
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.evidence import count, effective_observations, residuals_of, rms, used_by_starts, whiteness
+from hhtjax.identification.evidence import (
+    count,
+    effective_observations,
+    fades,
+    residuals_of,
+    rms,
+    used_by_starts,
+    whiteness,
+)
 from hhtjax.identification.identifiability import parameter_names, parameter_values, why_undetermined
 from hhtjax.identification.progress import CONVERGED, REASONS
 
 CLOSE = 0.95  # correlation of two estimates that is worth a word
 MOST_PAIRS = 3
 AT_BOUND = 0.01  # standard errors
+ADVICE = (
+    "the residual is not white, and fades: of a motion that dies away, as by friction, this may be a false minimum; "
+    "try other starts (multistart), or windows of the record with starts of their own (windows)"
+)
 
 
 def summary(result) -> str:
@@ -103,6 +115,8 @@ def _about_residuals(result):
         words.append(f"correlation at lag 1 {rho:+.2f}")
         words.append(f"{'' if p > 0.05 else 'not '}white (Ljung-Box, {lags} lags: p = {p:.2g})")
     lines.append("; ".join(words))
+    if found and found[1] <= 0.05 and fades(residuals):
+        lines.append(ADVICE)
     if starts:
         each = sum(map(np.size, starts)) // len(starts[0])
         lines.append(f"starts: of {len(starts[0])} records, {each} unknowns each")

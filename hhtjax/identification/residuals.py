@@ -73,7 +73,7 @@ def check_weights(caller, weights):
                 raise ValueError(f"{where} must not be negative; received {np.min(leaf)}.")
 
 
-def first_bad(residual, weights):
+def first_bad(residual, weights, of_records=False):
     """Words for what a sum of squares cannot have: entries not finite and not declared missing, or too large."""
     present = spread_weights("fit", weights, residual)
     values = [
@@ -87,6 +87,8 @@ def first_bad(residual, weights):
             index = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             missing = "" if weights is not True else "; give missing samples the weight False"
             where = f"residuals{jax.tree_util.keystr(path)}{list(index)}"
+            if of_records:
+                where += f", record {index[0]}" + (f", sample {index[1]}" if len(index) > 1 else "")
             return f"{x[index]} at {where} ({bad} of {total} entries){missing}"
     with np.errstate(over="ignore"):
         squares = sum(np.sum(x**2) for _, x in values)

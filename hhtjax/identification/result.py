@@ -179,7 +179,8 @@ def _ends(T, p, reach):
     x = T.coordinate(p, one)
     _, slope = jax.jvp(lambda x: T.parameter(x, one), (x,), (one,))
     by_x = T.parameter(x - reach / slope, one), T.parameter(x + reach / slope, one)
-    cut = jnp.maximum(p - reach, T.lower), jnp.minimum(p + reach, T.upper)
+    lower, upper = T.ends(p.dtype)
+    cut = jnp.maximum(p - reach, lower), jnp.minimum(p + reach, upper)
     near = T.distance(p) < reach
     return tuple(jnp.where(near, *ends) for ends in zip(cut, by_x, strict=True))
 

@@ -4,7 +4,7 @@
 
     none          p = scale x
     positive      p = exp(x)
-    bounded       p = lower + (upper - lower)/(1 + exp(-x))
+    bounded       p = lower + (upper - lower)/(1 + exp(-x));  of one bound lower + exp(x), or upper - exp(-x)
     fixed         p stays as it is in params0
 
 A step of Levenberg-Marquardt changes the x of a positive or bounded parameter by at most 1: for more, the exponential
@@ -12,13 +12,12 @@ is no straight line.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-
-from hhtjax.checks import require_number
 
 
 class Transform:
@@ -26,7 +25,6 @@ class Transform:
 
     expectation = "be real"
     longest_step = 1.0  # in x
-    lower, upper = -np.inf, np.inf  # of p
 
     def __init_subclass__(cls):
         jax.tree_util.register_static(cls)
@@ -47,9 +45,18 @@ class Transform:
         """p''/p' at x."""
         raise NotImplementedError
 
+    def ends(self, dtype: Any = float):
+        """The bounds of p."""
+        return np.asarray(-np.inf, dtype), np.asarray(np.inf, dtype)
+
+    def fits(self, shape):
+        """Whether the transform is one of parameters of this shape."""
+        return True
+
     def distance(self, p):
         """Of p from the nearer bound."""
-        return jnp.minimum(p - self.lower, self.upper - p)
+        lower, upper = self.ends(p.dtype)
+        return jnp.minimum(p - lower, upper - p)
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,10 @@ class Positive(Transform):
     """p = exp(x)."""
 
     expectation = "be positive, for its transform"
-    lower = 0.0
+
+    def ends(self, dtype: Any = float):
+        """0 and none."""
+        return np.asarray(0.0, dtype), np.asarray(np.inf, dtype)
 
     def contains(self, p):
         """p > 0."""
@@ -98,38 +108,70 @@ class Positive(Transform):
 
 @dataclass(frozen=True)
 class Bounded(Transform):
-    """p between lower and upper."""
+    """p between lower and upper: numbers, or nested tuples like an array, so that they can be hashed; inf for none."""
 
-    lower: float
-    upper: float
+    lower: Any
+    upper: Any
 
     @property
     def expectation(self):
         """Words for an error."""
         return f"lie between {self.lower} and {self.upper}, for its transform"
 
+    def ends(self, dtype: Any = float):
+        """The bounds as arrays."""
+        return np.asarray(self.lower, dtype), np.asarray(self.upper, dtype)
+
+    @property
+    def longest_step(self):
+        """1 where there is a bound."""
+        lower, upper = self.ends()
+        return np.where(np.isfinite(lower) | np.isfinite(upper), 1.0, np.inf)
+
+    def fits(self, shape):
+        """Whether the bounds have the shape of a parameter, or are numbers."""
+        return all(np.shape(bound) in ((), tuple(shape)) for bound in (self.lower, self.upper))
+
     def contains(self, p):
         """lower < p < upper."""
-        return (np.asarray(p) > self.lower) & (np.asarray(p) < self.upper)
+        p = np.asarray(p)
+        lower, upper = self.ends(np.result_type(p.dtype, np.float16))
+        return (p > lower) & (p < upper)
 
     def parameter(self, x, scale):
-        """lower + (upper - lower)/(1 + exp(-x))."""
-        share = jax.nn.sigmoid(jnp.where(x > 0, -x, x))  # from the nearer bound on: so its derivative is never 0
-        away = (self.upper - self.lower) * share
-        p = jnp.where(x > 0, self.upper - away, self.lower + away)
-        lower, upper = (np.asarray(bound, p.dtype) for bound in (self.lower, self.upper))
+        """lower + (upper - lower)/(1 + exp(-x)); of one bound lower + exp(x), or upper - exp(-x); of none scale x."""
+        lower, upper = self.ends(x.dtype)
+        has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
+        p = self._between(x, np.where(has_lower, lower, 0), np.where(has_upper, upper, 1))
+        if not np.all(has_lower & has_upper):  # exp is not even traced where it is not needed
+            p = jnp.where(has_lower & has_upper, p, scale * x)
+            p = jnp.where(has_lower & ~has_upper, np.where(has_lower, lower, 0) + jnp.exp(x), p)
+            p = jnp.where(~has_lower & has_upper, np.where(has_upper, upper, 0) - jnp.exp(-x), p)
         tiny = jnp.finfo(p.dtype).tiny
         least, most = np.nextafter(lower, upper), np.nextafter(upper, lower)  # what rounds to a bound stays inside
         inside = jnp.clip(p, np.maximum(least, lower + tiny), np.minimum(most, upper - tiny))
-        return p + lax.stop_gradient(inside - p)  # with the derivative of p
+        return jnp.where(jnp.isfinite(p), p + lax.stop_gradient(inside - p), inside)  # with the derivative of p
+
+    @staticmethod
+    def _between(x, lower, upper):
+        """Between two finite bounds."""
+        share = jax.nn.sigmoid(jnp.where(x > 0, -x, x))  # from the nearer bound on: so its derivative is never 0
+        away = (upper - lower) * share
+        return jnp.where(x > 0, upper - away, lower + away)
 
     def coordinate(self, p, scale):
-        """log((p - lower)/(upper - p))."""
-        return jnp.log((p - self.lower) / (self.upper - p))
+        """The inverse of `parameter`."""
+        lower, upper = self.ends(p.dtype)
+        has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
+        above = jnp.where(has_lower, p - np.where(has_lower, lower, 0), 1)
+        below = jnp.where(has_upper, np.where(has_upper, upper, 0) - p, 1)
+        return jnp.where(has_lower | has_upper, jnp.log(above / below), p / scale)
 
     def bend(self, x):
-        """-tanh(x/2)."""
-        return -jnp.tanh(x / 2)
+        """-tanh(x/2); of one bound 1 or -1; of none 0."""
+        lower, upper = (np.isfinite(bound) for bound in self.ends())
+        one_sided = lower.astype(float) - upper.astype(float)
+        return jnp.where(lower & upper, -jnp.tanh(x / 2), one_sided.astype(x.dtype))
 
 
 @dataclass(frozen=True)
@@ -142,28 +184,51 @@ positive = Positive()
 fixed = Fixed()
 
 
-def bounded(lower: float, upper: float) -> Bounded:
-    """A transform that keeps a parameter strictly between two numbers.
+def bounded(lower: Any = None, upper: Any = None) -> Bounded:
+    """A transform that keeps a parameter strictly between two bounds, or on one side of one.
 
     Args:
-        lower, upper: numbers.
+        lower, upper: numbers, or arrays of the shape of the parameter; None, -inf or inf where there is no bound.
 
     Returns:
         What `fit(transforms=...)` takes.
 
     Raises:
-        TypeError, ValueError: a bound is no finite number, or lower >= upper.
+        TypeError, ValueError: a bound that is not real, or NaN; lower >= upper; no bound at all.
 
     >>> import hhtjax
     >>> result = hhtjax.fit(lambda p: p - jax.numpy.array([2.0, 3.0]), 0.5, transforms=hhtjax.bounded(0, 1))
     >>> round(float(result.params), 3)                                          # 2.5 without the bound
     1.0
+    >>> result = hhtjax.fit(lambda p: p - jax.numpy.array([2.0, 3.0]), 5.0, transforms=hhtjax.bounded(lower=4))
+    >>> round(float(result.params), 3)
+    4.0
     """
-    for name, value in (("lower", lower), ("upper", upper)):
-        require_number("bounded", name, value, np.isfinite, "be finite")
-    if lower >= upper:
+    ends = [_bound(name, y, none) for name, y, none in (("lower", lower, -np.inf), ("upper", upper, np.inf))]
+    if not np.all(ends[0] < ends[1]):
         raise ValueError(f"bounded: `lower` must be less than upper; received {lower} and {upper}.")
-    return Bounded(float(lower), float(upper))
+    if np.all(np.isinf(ends[0])) and np.all(np.isinf(ends[1])):
+        raise ValueError(f"bounded: a bound must be finite; received {lower} and {upper}.")
+    return Bounded(*(_hashable(y.tolist()) for y in ends))
+
+
+def _bound(name, given, none):
+    """A bound as an array of floats."""
+    if given is None:
+        return np.asarray(none)
+    try:
+        bound = np.asarray(given, float) if np.asarray(given).dtype.kind in "iuf" else None
+    except (TypeError, ValueError, jax.errors.TracerArrayConversionError):
+        bound = None
+    if bound is None:
+        raise TypeError(f"bounded: `{name}` must be a real number, an array of them, or None; received {given!r}.")
+    if np.any(np.isnan(bound)) or np.any(bound == -none):
+        raise ValueError(f"bounded: `{name}` must be finite, or {none} for none; received {given}.")
+    return bound
+
+
+def _hashable(x):
+    return tuple(map(_hashable, x)) if isinstance(x, list) else x
 
 
 def is_transform(x):

@@ -84,6 +84,17 @@ def solve_upper(T, y):
     return solve(T, y[..., None])[..., 0]
 
 
+def solve_upper_transposed(T, y):
+    """x of T^T x = y, T as in `solve_upper`.
+
+    >>> solve_upper_transposed(np.array([[1.0, 2.0], [0.0, 4.0]]), np.array([1.0, 6.0]))
+    array([1., 1.])
+    """
+    if namespace_of(T) is np:
+        return np.linalg.solve(np.swapaxes(T, -1, -2), y[..., None])[..., 0]
+    return jax.scipy.linalg.solve_triangular(T, y[..., None], trans="T")[..., 0]
+
+
 def while_loop(unfinished, body, carry):
     """`lax.while_loop`; where `unfinished(carry)` is of NumPy, a loop of Python.
 
