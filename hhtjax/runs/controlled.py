@@ -13,6 +13,7 @@ from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.choose import choose, trimmed
 from hhtjax.runs.chosen import checked_times, run_over, steps_for
 from hhtjax.runs.freezing import frozen, is_pair, run_and_choice
+from hhtjax.runs.output import beside_path, without_path
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.tightened import accepted_run, tighten
 from hhtjax.runs.verified import compared, scaled, verified
@@ -22,9 +23,11 @@ from hhtjax.xla import Programs, is_untouched, one_kernel, or_plain
 def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
+    problem = problem._replace(output=beside_path(problem.output, control))
     start, alone = (problem, times, control, events), is_untouched() and not is_pair()
     if control.verify == "tighten":
-        return run_tightened(start, alone, progress, room)
+        run = run_tightened(start, alone, progress, room)
+        return run if problem.output is None else without_path(run)
     in_one = alone and passes_alone(problem, events)
     if in_one:  # else the program that chooses steps for a derivative or a batch is that of `choose_steps`
         run, steps, ends = or_plain(partial(run_in_one, problem, times, unverified(control), progress=progress))
@@ -36,7 +39,8 @@ def run_controlled(problem, times, control, progress, events=None, room=()) -> S
         better = finer(start, choice, steps, ends, room, in_one)
         run = run._replace(**verified(run, better, start[2], problem.stepper.order))
     steps = trimmed(steps)
-    return run._replace(dt=steps.dt, steps=steps)
+    run = run._replace(dt=steps.dt, steps=steps)
+    return run if problem.output is None else without_path(run)
 
 
 def passes_alone(problem, events):

@@ -14,7 +14,8 @@ from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
 from hhtjax.runs.given_steps import refined, require_control_alone, require_steps
-from hhtjax.runs.loop import as_solution, flaw_at_start, given_sizes, loop_of, loop_over, show_progress
+from hhtjax.runs.loop import flaw_at_start, given_sizes, loop_of, loop_over, show_progress
+from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, join_info
@@ -40,6 +41,7 @@ def simulate(
     events: Any = None,
     max_events: int = 2,
     keep_events: int = 100,
+    output: Any = None,
 ) -> Solution:
     """Steps `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), num_steps times by dt.
 
@@ -105,6 +107,7 @@ def simulate(
     [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
     """
     problem = Problem.checked("simulate", system, stepper, q0, v0, params, t0, z0)
+    problem = problem._replace(output=require_output("simulate", output))
     save_every = require_integer("simulate", "save_every", save_every)
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
@@ -147,14 +150,15 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_
 
     # without events, which are seldom; never with a callback, which keeps XLA from making one kernel
     form = on_scalars(lambda carry: with_progress(plain.advance, carry[:3]), loop.carry)
-    step, keep = form.of(partial(with_progress, loop.advance)), form.of(loop.keep)
+    step = form.of(partial(with_progress, loop.advance))
+    save, as_saved = savings(form, loop, flat, problem.output, params)
 
     def interval(carry, _):
         if save_every == 1:
             carry, info = step(carry)
         else:
             (carry, info), _ = checkpointed_scan(joined_step, (carry, loop.no_info), save_every, in_batch)
-        return carry, (keep(carry[0]), info)
+        return carry, (save(carry), info)
 
     def joined_step(carry, _):
         carry, info = carry
@@ -165,7 +169,6 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_
         return checkpointed_scan(interval, carry, num_steps // save_every, in_batch)
 
     (_, _, failure, *met), (path, info) = one_kernel(run, form.tree)
-    start = loop.carry[0]
-    flaw = flaw_at_start(problem.system, flat, start, params)
-    solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
+    flaw = flaw_at_start(problem.system, flat, loop.carry[0], params)
+    solution = as_saved(form.joined(path), dt, info, failure, flaw)
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution

@@ -11,6 +11,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.loop import show_progress
+from hhtjax.runs.output import require_output
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.sweep_chosen import sweep_chosen
 from hhtjax.runs.sweep_grid import fit_to_samples, fit_to_times
@@ -38,6 +39,7 @@ def sweep(
     events=None,
     max_events=2,
     keep_events=100,
+    output=None,
 ) -> Solution:
     """Runs `system` once for each of `dts`, all from t0 on, sampled at common times.
 
@@ -103,7 +105,7 @@ def sweep(
     """
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
-    inputs = inputs.with_events(events, max_events, keep_events)
+    inputs = inputs.with_events(events, max_events, keep_events)._replace(output=require_output("sweep", output))
     with inputs.telling_of_axes():
         if isinstance(dts, Adaptive):
             if mesh is not None:
@@ -118,7 +120,9 @@ def sweep(
 
 
 @partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
-def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
+def run_sweep(
+    system, data, dts, duration, t0, times, events, output=None, *, mapped, num_samples, lanes, mesh, progress, room
+):
     """The sweep of `Inputs`, compiled."""
     dtype = jax.tree.leaves(data[1])[0].dtype
     dts, duration, t0, times = jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), (dts, duration, t0, times))
@@ -139,7 +143,7 @@ def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_sam
 
     def member(leaves, dt, substeps, longest):
         grid = dt, substeps, longest, t0, num_samples, times
-        return run_member(system, jax.tree.unflatten(structure, leaves), *grid, events, room)
+        return run_member(system, jax.tree.unflatten(structure, leaves), *grid, events, room, output)
 
     def block(leaves, dts, substeps, numbered):
         number, members = numbered
