@@ -12,6 +12,7 @@ from hhtjax.checks import require_function
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.runs.interpolate import interpolate
+from hhtjax.runs.output import require_path
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
@@ -78,6 +79,7 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
         raise TypeError(f"{caller}: `system` must be a System or LinearSystem; received {system!r}.")
     if not isinstance(solution, Solution) or solution.t.ndim != 1:
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
+    require_path(caller, solution)
     if potential is not None:
         require_function(caller, "potential", potential, "potential(q, t, params)")
     return _energy_balance(system, solution, freeze(params), potential)

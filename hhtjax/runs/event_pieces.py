@@ -10,7 +10,7 @@ from jax import lax
 
 class Pieces(NamedTuple):
     """The parts of a step between its events, in their order: states (max_events + 1, ...) at which they start and end;
-    those there are not start at infinity. modes: in each the numbers in params that switches change, where asked for."""
+    those there are not start at infinity. modes: in each the numbers that switches have changed, where asked for."""
 
     start: Any
     end: Any

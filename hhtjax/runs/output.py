@@ -102,11 +102,11 @@ def output_at_start(flat, output, params, start, h):
     return output_of(output, flat, held.before(params, start.t, h), start)
 
 
-def output_at(output, found, params):
+def output_at(output, found, t, params):
     """The same of anything with the attributes of a `Solution`, at one time."""
     names = {"w": "acceleration", "L": "multipliers"}
-    values = {name: getattr(found, names.get(name, name)) for name in NAMES if name != "params"}
-    return output(values | {"params": params}, found.t.dtype)
+    values = {name: getattr(found, names.get(name, name)) for name in NAMES if name not in ("t", "params")}
+    return output(values | {"t": t, "params": params}, t.dtype)
 
 
 PATH = ("q", "v", "acceleration", "multipliers", "z", "zdot", "friction", "sticking")
@@ -123,8 +123,10 @@ def without_path(run):
 
 
 def savings(form, loop, flat, output, params):
-    """How a run saves: the function carry -> what is kept, in a form, and that of all kept, dt, info, failure, flaw -> the
-    `Solution`. The first takes the size of the step that has led there, too, where the loop does not know it."""
+    """How a run saves: the function carry -> what is kept, and that of all kept, dt, info, failure, flaw -> `Solution`.
+
+    The first takes the size of the step that has led there, too, where the loop does not know it.
+    """
     if output is None:
         keep = form.of(loop.keep)
         return lambda carry, last=None: keep(carry[0]), partial(as_solution, flat, loop.carry[0])

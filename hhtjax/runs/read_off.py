@@ -71,10 +71,10 @@ def output_between(flat, output, params, pair, time, long):
     """What `output` gives at a time between a pair of what `kept` has made of states; long: of `read_between`."""
     (a, _), (b, extra) = jax.tree.map(lambda x: x[None], pair)
     a, b, times = as_path(flat, a), as_path(flat, b), time[None]
-    found = read_between(flat, a, b, extra, times, times, long)._replace(t=times)
+    found = read_between(flat, a, b, extra, times, times, long)
     if held.holds(params):  # as the step has had them
         params = held.held_at(params, (a.t[0] + b.t[0]) / 2)
-    return output_at(output, jax.tree.map(lambda x: x[0], found), params)
+    return output_at(output, jax.tree.map(lambda x: x[0], found), time, params)
 
 
 def with_output(run, start, found, times, reached):

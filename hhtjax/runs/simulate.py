@@ -9,15 +9,25 @@ import jax.numpy as jnp
 from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.adaptive import Adaptive
+from hhtjax.runs.chosen import follow
 from hhtjax.runs.controlled import run_controlled
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
-from hhtjax.runs.given_steps import refined, require_control_alone, require_steps
+from hhtjax.runs.given_steps import (
+    EqualSteps,
+    refined,
+    require_control_alone,
+    require_one_length,
+    require_steps,
+    require_steps_to,
+    steps_within,
+)
 from hhtjax.runs.loop import flaw_at_start, given_sizes, loop_of, loop_over, show_progress
 from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.solution import Solution
+from hhtjax.runs.sweep_grid import equal_times, require_times
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Programs, is_in_batch, on_scalars, one_kernel, or_plain
@@ -33,6 +43,8 @@ def simulate(
     z0: Any = None,
     dt: Any,
     num_steps: int | None = None,
+    duration: Any = None,
+    num_samples: int | None = None,
     times: Any = None,
     t0: Any = 0.0,
     save_every: int = 1,
@@ -59,8 +71,14 @@ def simulate(
             anew in each step. A step more than twice as long as the one before can make rho_inf near 0 unstable.
             Or `adaptive(rtol, atol)`, steps that are chosen by their errors, and constant to derivatives.
         num_steps: number of steps.
-        times: (K,), with `adaptive`: increasing, after t0. The run ends at the last, and is read off at the others, by
-            cubics between its steps (multipliers by lines).
+        duration: in the place of num_steps, as for `sweep`: dt is made smaller, if need be, so that a whole number of
+            steps is as long, which is reported as `run.dt`. Both are part of the program then; or, with `adaptive`,
+            data.
+        num_samples: K, with `duration`: the number of samples after the start, at equal distances, each at the end of
+            a step (with `adaptive` between two). Default: every step is saved.
+        times: (K,), in the place of num_steps: increasing, after t0, data. The run goes on to the last, and is read off
+            at all of them, by cubics between its steps (multipliers and dry friction by lines): the steps stay what
+            they are, a number dt or `adaptive`, and end at none of the times. (In `sweep` with step sizes they do.)
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
@@ -78,6 +96,13 @@ def simulate(
         max_events: how many of those that change something may fall into one step; more are a failure. With `adaptive`
             steps become shorter first, and what lies behind an event has an error of its own.
         keep_events: how many `run.events` has room for.
+        output: a function of some of q, v, w (the acceleration), L (multipliers), z, zdot, friction, sticking, t and
+            params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`. It returns a pytree of
+            arrays. These are saved, as `run.output`, in the place of q, v and all else, so that a long run of a large
+            system keeps little. `check` works as before. What a system does not have is None; of a first-order system
+            q is y, and v its rate. params are those of the moment, as events have switched them and inputs are held.
+            Extrapolation takes the errors out of the outputs, number by number: of rotations return their entries
+            only where that is meant. `verify` compares q at the samples, which it keeps while it runs.
 
     Returns:
         A `Solution`. Nothing raises while the steps run: call `solution.check()`.
@@ -105,6 +130,14 @@ def simulate(
     >>> solution.check()
     >>> [round(float(q), 4) for q in solution.q[:, 0]]                       # cos(2 t)
     [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
+
+    What a sensor shows, at its own times, and nothing else:
+
+    >>> solution = hhtjax.simulate(
+    ...     spring, hhtjax.hht(), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0}, dt=1e-3, times=[0.25, 0.6, 1.0],
+    ...     output=lambda q, params: {"pull": params["k"] * q[0]})
+    >>> [round(float(x), 4) for x in solution.output["pull"]], solution.q                     # 4 cos(2 t)
+    ([4.0, 3.5103, 1.4494, -1.6646], None)
     """
     problem = Problem.checked("simulate", system, stepper, q0, v0, params, t0, z0)
     problem = problem._replace(output=require_output("simulate", output))
@@ -117,20 +150,48 @@ def simulate(
     )
     if events is not None:
         events = require_events("simulate", problem, events)
-    if isinstance(dt, Adaptive) or times is not None:
-        require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
+    dtype = jax.tree.leaves(problem.q0)[0].dtype
+    if duration is not None or num_samples is not None:
+        rest = {"num_steps": num_steps, "times": times, "save_every": save_every}
+        require_one_length("simulate", duration, num_samples, **rest)
+        if not isinstance(dt, Adaptive):
+            dt, num_steps, save_every = steps_within("simulate", dtype, dt, duration, num_samples)
+        elif num_samples is not None:
+            times = equal_times(problem.t0, duration, num_samples)
+    if isinstance(dt, Adaptive):
+        require_control_alone("simulate", times, num_steps, save_every, extrapolate)
         return run_controlled(problem, times, dt, progress, events, room)
+    kind = {"rates": problem.rates(), "numbers": sum(map(jnp.size, jax.tree.leaves(problem.q0)))}
+    if times is not None:
+        times = require_times(times, problem.t0, dtype, "simulate")
+        dt = require_steps_to("simulate", times, dt, num_steps, save_every, problem.t0)
+        if progress:
+            raise NotImplementedError("simulate: with `times` and a number for `dt`, leave `progress` out.")
+
+        def run_to(k):
+            return or_plain(partial(_read_off, problem, times, dt / k, events, room=room, rates=kind["rates"]))
+
+        return run_to(1) if extrapolate == 1 else extrapolated(run_to, extrapolate, stepper.order, join_info)
     dt, num_steps = require_steps("simulate", stepper, dt, num_steps, 2 ** (extrapolate - 1))
     if num_steps % save_every:
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
-
-    kind = {"rates": problem.rates(), "numbers": sum(map(jnp.size, jax.tree.leaves(problem.q0)))}
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
         return or_plain(partial(_simulate, problem, refined(dt, k), events, in_batch=is_in_batch(), **sizes, **kind))
 
     return run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
+
+
+@partial(Programs, static_argnames=("room",))
+def _read_off(problem, times, dt, events, *, room):
+    """The run with equal steps, at times between them."""
+
+    def run(problem, times, dt, events):
+        t0, times, dt = map(problem.times, (problem.t0, times, dt))
+        return follow(problem, times, EqualSteps.to(t0, times, dt), events, room)._replace(dt=dt)
+
+    return one_kernel(run, problem, times, dt, events, around=True)  # what comes before and behind the loop too
 
 
 @partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "in_batch"))

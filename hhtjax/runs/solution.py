@@ -300,6 +300,8 @@ class Solution(NamedTuple):
         taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
         if self._is_every_step():
             return t[0] + np.sum(np.asarray(self.dt)[member][:step])
+        if np.ndim(self.dt) < self.t.ndim:  # steps of one size, which may end at none of the saved times
+            return t[0] + step * np.asarray(self.dt)[member]
         dt = np.broadcast_to(np.asarray(self.dt)[member], t[1:].shape)
         i = np.clip(np.searchsorted(taken, step) - 1, 0, dt.size - 1)
         return t[i] + (step - taken[i]) * dt[i]

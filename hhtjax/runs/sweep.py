@@ -65,6 +65,8 @@ def sweep(
             processes; each then holds all results, those of one device to rounding. They lie on all devices: take
             `jax.device_get` of them before mixing them with others.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
+        output: that of `simulate`: a function whose values are saved in the place of q, v and all else, so that a large
+            sweep keeps little, in memory and, by `sweep_to_disk`, on disk.
         events, max_events, keep_events: those of `simulate`. A block looks for events in the steps in which one of its
             members meets some, so that they cost a batch little.
 
@@ -102,6 +104,14 @@ def sweep(
     ...     dts=jnp.full(2, 0.01), duration=1.0, num_samples=5, in_axes=(None, None, None, 0))
     >>> [round(float(q), 2) for q in runs.q[:, -1, 0]], runs.failed.tolist()          # cos(2), cos(3)
     ([-0.42, -0.99], [False, False])
+
+    The energies alone:
+
+    >>> runs = hhtjax.sweep(
+    ...     spring, hhtjax.hht(), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0}, dts=jnp.full(2, 0.01), duration=1.0,
+    ...     num_samples=5, output=lambda q, v, params: 0.5 * jnp.sum(v**2) + 0.5 * params["k"] * jnp.sum(q**2))
+    >>> runs.output.shape, runs.q
+    ((2, 6), None)
     """
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
