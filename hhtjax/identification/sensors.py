@@ -142,7 +142,9 @@ def _each(name, x, like):
 
 
 def _with_flaws(y, since, gain, offset, drift):
-    """gain y + offset + drift t, each a number or of the shape of a reading."""
+    """gain y + offset + drift t, each a number or of the shape of a reading; flags and counts as they are."""
+    if not jnp.issubdtype(y.dtype, jnp.floating):
+        return y
 
     def like_y(x):
         return x if jnp.ndim(x) == 0 else jnp.broadcast_to(x, y.shape)

@@ -169,11 +169,12 @@ def between_events(events, a, b, H, x, times):
         return jnp.where(on_axes(behind & ahead, before), jnp.nan, value)
 
     for name in ("multipliers", "friction", "sticking"):
-        x, y = getattr(a, name), getattr(b, name)
-        if x is not None:
-            value = on_the_same_side(x, y)
+        before, after = getattr(a, name), getattr(b, name)
+        if before is not None:
+            value = on_the_same_side(before, after)
             a, b = (
-                side._replace(**{name: jnp.where(on_axes(inside, value), value, old)}) for side, old in ((a, x), (b, y))
+                side._replace(**{name: jnp.where(on_axes(inside, value), value, old)})
+                for side, old in ((a, before), (b, after))
             )
     pairs = {"v": "q"} if first_order else {"acceleration": "v", "zdot": "z"}  # the slope of each, where none is known
     a, b = (
