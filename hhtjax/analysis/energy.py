@@ -156,7 +156,7 @@ def _points(flat, solution, run, params):
 def _between(solution, run, H, middle, jumps):
     """Positions and rates in the middle of each interval, of length H; jumps: whether, or where, accelerations do."""
     found = interpolate(solution, middle)
-    rates = _vectors(found[1:])
+    rates = _vectors((found.v, found.z))
     if jumps is not False:  # of the cubic through q and v the slope
         q, v = _vectors(run.q), _vectors(run.v)
         slope = 1.5 * jnp.diff(q, axis=0) / jnp.where(H > 0, H, 1)[:, None] - (v[1:] + v[:-1]) / 4

@@ -87,7 +87,7 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     one_try = form.of(plain if trial.ways is None else partial(attempt, trial))
     recorder: Any = None
     if times is not None:
-        sensed = problem.output, trial.params, times[-1] - t0
+        sensed = () if problem.output is None else (problem.output, trial.params, times[-1] - t0)
         recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, start)[1].info, *sensed)
 
     def unfinished(carry):  # one answer for a batch: else vmap has each try copy the ends of all members

@@ -71,9 +71,9 @@ class Grid(NamedTuple):
             needed = 2 * needed - ((needed > 0) & (ends[2 * needed - 2] >= times)).astype(needed.dtype)
         return cls(t0, ends, jnp.diff(needed, prepend=0).astype(jnp.int32), reached)
 
-    def loop(self, *start):
-        """The `Loop` over its steps, from what `loop_over` begins with."""
-        return loop_over(*start, self.sizes)
+    def loop(self, flat, stepper, q, v, t0, params):
+        """The `Loop` over its steps."""
+        return loop_over(flat, stepper, q, v, t0, params, self.sizes)
 
     def sizes(self, number):
         """Of a step its size, that of the one before, and where it ends; behind the last 1, and inf."""

@@ -124,9 +124,9 @@ class EqualSteps(NamedTuple):
         counts = jnp.maximum(jnp.diff(number, prepend=0), 0)
         return cls(dt, counts, jnp.where(fine, jnp.inf, t0))
 
-    def loop(self, *start):
-        """The `Loop` over them, from what `loop_of` begins with."""
-        return loop_of(*start, self.dt)
+    def loop(self, flat, stepper, q, v, t0, params):
+        """The `Loop` over them."""
+        return loop_of(flat, stepper, q, v, t0, params, self.dt)
 
 
 def refined(dt, k):
