@@ -71,7 +71,7 @@ def simulate(
             anew in each step. A step more than twice as long as the one before can make rho_inf near 0 unstable.
             Or `adaptive(rtol, atol)`, steps that are chosen by their errors, and constant to derivatives.
         num_steps: number of steps.
-        duration: in the place of num_steps, as for `sweep`: dt is made smaller, if need be, so that a whole number of
+        duration: in the place of num_steps, as in a sweep: dt is made smaller, if need be, so that a whole number of
             steps is as long, which is reported as `run.dt`. Both are part of the program then; or, with `adaptive`,
             data.
         num_samples: K, with `duration`: the number of samples after the start, at equal distances, each at the end of
