@@ -51,9 +51,10 @@ from hhtjax.identification.arguments import Gaussian
 from hhtjax.identification.bias import step_size_bias
 from hhtjax.identification.comparison import compare
 from hhtjax.identification.identify import fit, multistart
-from hhtjax.identification.measured import measure, windows
+from hhtjax.identification.measured import windows
 from hhtjax.identification.refinement import refine
 from hhtjax.identification.result import FitResult
+from hhtjax.identification.sensors import accelerometer, measure
 from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
 from hhtjax.numerics.structured_solve import banded, conjugate_gradients
@@ -61,7 +62,7 @@ from hhtjax.runs.adaptive import adaptive
 from hhtjax.runs.choose import Steps
 from hhtjax.runs.chosen import choose_steps
 from hhtjax.runs.event_log import Events
-from hhtjax.runs.interpolate import InternalInterpolant, Interpolant, interpolate
+from hhtjax.runs.interpolate import Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import FailedRunWarning, Failure, SimulationError, Solution
 from hhtjax.runs.sweep import sweep
@@ -98,15 +99,14 @@ __all__ = [  # noqa: RUF022
     "bossak", "collocation", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
     "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
     # runs
-    "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "InternalInterpolant",
-    "interpolate",
+    "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
     "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep",
     "Explanation", "explain", "plain",
     # out of Python
     "ExportedC", "ExportedFMU", "export_c", "export_fmu",
     # identification
-    "FitResult", "Gaussian", "bounded", "compare", "equation_error", "fit", "fit_progressively", "fixed", "measure",
-    "multistart", "positive", "refine", "step_size_bias", "windows",
+    "FitResult", "Gaussian", "accelerometer", "bounded", "compare", "equation_error", "fit", "fit_progressively",
+    "fixed", "measure", "multistart", "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip
 
 

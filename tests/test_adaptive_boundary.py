@@ -64,7 +64,7 @@ WRONG = {
     "times back": ({}, {"times": [1.0, 0.5]}, "simulate: `times` must be strictly increasing"),
     "steps too": ({}, {"num_steps": 4}, "simulate: with dt=adaptive(...), leave `num_steps` out; received 4."),
     "extrapolate": ({}, {"extrapolate": 2}, "simulate: with dt=adaptive(...), leave `extrapolate` out; received 2."),
-    "times alone": ({}, {"dt": 0.1}, "simulate: `times` is for dt=adaptive(...)"),
+    "uneven": ({}, {"dt": np.full(9, 0.1)}, "with `times`, `dt` must be a number or adaptive(...); received (9,)."),
     "no estimate": ({}, {"stepper": hhtjax.kim_hht()}, "as a number, or take hht, newmark (gamma = 1/2), bossak, "),
     "gamma": ({}, {"stepper": hhtjax.newmark(0.3025, 0.6)}, "simulate: GeneralizedAlpha has no estimate of its error"),
     "rtol": ({"rtol": 0.0}, {}, "adaptive: `rtol` must be positive and finite; received 0.0."),

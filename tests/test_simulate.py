@@ -100,7 +100,7 @@ def test_dense_output_is_of_order_four():
             num_steps=1000,
             save_every=1000 // intervals,
         )
-        q, v = (np.asarray(x)[:, 0] for x in hhtjax.interpolate(path, times))
+        q, v = (np.asarray(x)[:, 0] for x in hhtjax.interpolate(path, times)[:2])
         return np.array([np.max(np.abs(q - np.cos(2 * times))), np.max(np.abs(v + 2 * np.sin(2 * times)))])
 
     np.testing.assert_allclose(np.log2(error(10) / error(20)), 4, atol=0.15)

@@ -12,6 +12,7 @@ from hhtjax.checks import require_function
 from hhtjax.description import freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.runs.interpolate import interpolate
+from hhtjax.runs.output import require_path
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
@@ -78,6 +79,7 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
         raise TypeError(f"{caller}: `system` must be a System or LinearSystem; received {system!r}.")
     if not isinstance(solution, Solution) or solution.t.ndim != 1:
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
+    require_path(caller, solution)
     if potential is not None:
         require_function(caller, "potential", potential, "potential(q, t, params)")
     return _energy_balance(system, solution, freeze(params), potential)
@@ -154,7 +156,7 @@ def _points(flat, solution, run, params):
 def _between(solution, run, H, middle, jumps):
     """Positions and rates in the middle of each interval, of length H; jumps: whether, or where, accelerations do."""
     found = interpolate(solution, middle)
-    rates = _vectors(found[1:])
+    rates = _vectors((found.v, found.z))
     if jumps is not False:  # of the cubic through q and v the slope
         q, v = _vectors(run.q), _vectors(run.v)
         slope = 1.5 * jnp.diff(q, axis=0) / jnp.where(H > 0, H, 1)[:, None] - (v[1:] + v[:-1]) / 4

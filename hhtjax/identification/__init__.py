@@ -60,7 +60,7 @@ A start that is poor
 
 `equation_error` finds one without a guess, by putting the measured motion into the equations of motion.
 `fit_progressively` goes from a poor one over longer and longer parts of a record. `multistart` tries many at once.
-`measure` adds a sensor's gain, offset and delay to what is simulated.
+`measure` shows a run as sensors do, at their times, with gain, offset, drift and delay; `accelerometer` is one of them.
 
 Which model
 -----------
@@ -87,11 +87,12 @@ from hhtjax.identification.comparison import Comparison, NestedTest, compare
 from hhtjax.identification.identifiability import IdentifiabilityWarning
 from hhtjax.identification.identify import Multistart, fit, multistart
 from hhtjax.identification.inference import Profile, Score, prediction_errors, profile, score_test
-from hhtjax.identification.measured import Windows, measure, windows, wrap_angle
+from hhtjax.identification.measured import Windows, windows, wrap_angle
 from hhtjax.identification.progress import History
 from hhtjax.identification.refinement import Refined, StepSizeWarning, refine
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import Uncertainty
+from hhtjax.identification.sensors import accelerometer, measure
 from hhtjax.identification.starts import equation_error, fit_progressively
 from hhtjax.identification.transforms import bounded, fixed, positive
 
@@ -110,6 +111,7 @@ __all__ = [
     "StepSizeWarning",
     "Uncertainty",
     "Windows",
+    "accelerometer",
     "bounded",
     "compare",
     "equation_error",

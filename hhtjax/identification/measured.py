@@ -1,15 +1,12 @@
-"""Measurements: records cut into windows of one shape for `fit(..., records=...)`, and what sensors make of motion."""
+"""Measurements: records cut into windows of one shape for `fit(..., records=...)`."""
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description.presentation import shown
-from hhtjax.runs.interpolate import interpolate
-from hhtjax.runs.solution import Solution
 
 
 @shown
@@ -96,36 +93,3 @@ def wrap_angle(angle: Any) -> Any:
     """
     angle = jnp.asarray(angle)
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
-
-
-def measure(solution: Solution, times: Any, gain: Any = 1.0, offset: Any = 0.0, delay: Any = 0.0) -> Any:
-    """What sensors of position show at `times`: gain q(t - delay) + offset, at the start of the run for earlier times.
-
-    gain, offset and delay (s, a number) are ordinary parameters of a fit: of a signal's gain and a model's stiffness
-    and mass only ratios can be found.
-
-    Args:
-        solution: of one run. times: (samples,), s, not after its end.
-        gain, offset: numbers, or pytrees like q.
-        delay: s, a number.
-
-    Returns:
-        A pytree like q, with a leading axis of samples.
-
-    Raises:
-        TypeError, ValueError: as `interpolate`; gain or offset unlike q.
-
-    >>> import jax.numpy as jnp, hhtjax
-    >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q)
-    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.zeros(1), jnp.ones(1), dt=0.1, num_steps=10)    # q = t
-    >>> float(measure(run, jnp.array([0.8]), gain=2.0, offset=0.5, delay=0.3)[0, 0].round(6))
-    1.5
-    """
-    if not isinstance(solution, Solution):
-        raise TypeError(f"measure: `solution` must be what simulate returns; received {type(solution).__name__}.")
-    q = interpolate(solution, jnp.maximum(jnp.asarray(times) - delay, solution.t[0])).q
-
-    def like_q(x):
-        return jax.tree.map(lambda _: x, q) if jax.tree.structure(x) != jax.tree.structure(q) else x
-
-    return jax.tree.map(lambda y, g, b: g * y + b, q, like_q(gain), like_q(offset))

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 
 from hhtjax.description import all_concrete
+from hhtjax.runs.output import require_path
 from hhtjax.runs.solution import Solution
 
 SYMBOLS = {"q": "q", "v": "v", "acceleration": "w", "multipliers": "L", "z": "z"}
@@ -13,6 +14,7 @@ def require_run(caller, solution):
     """An error unless it is the solution of one run, with numbers."""
     if not isinstance(solution, Solution):
         raise TypeError(f"{caller}: `solution` must be a Solution, as of simulate; received {type(solution).__name__}.")
+    require_path(caller, solution)
     if not all_concrete(solution):
         raise TypeError(f"{caller}: `solution` is a tracer: draw outside jit, vmap and grad.")
     if np.ndim(solution.t) != 1:

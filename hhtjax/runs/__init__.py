@@ -120,6 +120,26 @@ compare at the times of the measurements.
 >>> hhtjax.interpolate(run, jnp.array([0.123, 4.56])).q.shape
 (2, 1)
 
+It gives accelerations, multipliers and dry friction, too. `simulate(..., times=)` reads a run off at such times while
+it goes, and keeps nothing else.
+
+Outputs
+-------
+
+`output=` saves a function of the motion in the place of q and v, in `simulate`, `sweep` and `sweep_to_disk`: what
+sensors show, energies, a distance. It names what it reads, of q, v, w (the acceleration), L (multipliers), z, zdot,
+friction, sticking, t and params. A run of a million steps of a large system then keeps what is asked for.
+
+>>> def felt(q, w, params):
+...     return {"height": -params["l"] * jnp.cos(q[0]), "turning": w[0]}
+>>> run = hhtjax.simulate(pendulum, hhtjax.hht(), q0, v0, params, dt=1e-2, times=[0.123, 4.56], output=felt)
+>>> run.check()
+>>> run.q, run.output["height"].shape
+(None, (3,))
+
+`hhtjax.measure` shows such an output of a run that has kept q and v, as a sensor with a delay, an offset and a clock of
+its own, and `hhtjax.accelerometer` is an output.
+
 Tolerances
 ----------
 

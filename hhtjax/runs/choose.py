@@ -90,7 +90,8 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
     one_try = form.of(plain if trial.ways is None else partial(attempt, trial))
     recorder: Any = None
     if times is not None:
-        recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, walk)[1].info)
+        sensed = () if problem.output is None else (problem.output, trial.params, times[-1] - t0)
+        recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, walk)[1].info, *sensed)
 
     def unfinished(carry):  # one answer for a batch: else vmap has each try copy the ends of all members
         return largest_in_batch(is_walking(carry[0], end))
@@ -124,7 +125,7 @@ def choose(problem, end, control, progress=False, events=None, room=(), controll
 
     def to_sample(carry, time):
         walk, ends, since = walked(carry, lambda x: unfinished(x) & (x[0].state.t < time))
-        since, around = recorder.sample(since, walk.state)
+        since, around = recorder.sample(since, walk.state, time)
         return (walk, ends, since), around
 
     def run(walk):

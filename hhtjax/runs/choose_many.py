@@ -35,11 +35,12 @@ class Members(NamedTuple):
     lanes: int  # members in a block
     events: Any = None
     room: tuple = ()
+    output: Any = None
 
     def problem(self, arrays):
         """One member's."""
         (stepper, q0, v0, params, z0), _ = jax.tree.unflatten(self.structure, arrays)
-        return Problem(self.system, stepper, q0, v0, params, self.t0, z0)
+        return Problem(self.system, stepper, q0, v0, params, self.t0, z0, self.output)
 
     def control(self, arrays):
         """Its tolerances."""

@@ -17,9 +17,10 @@ from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.event_pieces import Pieces
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.freezing import frozen
-from hhtjax.runs.loop import as_solution, flaw_at_start, loop_over, resting
+from hhtjax.runs.loop import flaw_at_start, loop_over, resting, with_flaw
+from hhtjax.runs.output import output_at_start
 from hhtjax.runs.problem import Problem
-from hhtjax.runs.read_off import kept, read_off
+from hhtjax.runs.read_off import kept, output_between, solution_at, with_output
 from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems import held
@@ -43,7 +44,7 @@ def chosen_steps(problem, end, control, events=None, progress=False, room=()):
 def steps_for(choice, progress, room):
     """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
     problem, times, control, events = choice
-    control = replace(control, verify=False)
+    control, problem = replace(control, verify=False), problem._replace(output=None)
     keywords = {"progress": progress, "room": room[:1], "rates": problem.rates()}
     return or_plain(partial(chosen_steps, problem, times[-1], control, events, **keywords))
 
@@ -69,6 +70,10 @@ class Grid(NamedTuple):
             ends = jnp.stack([(starts + ends) / 2, ends], 1).ravel()
             needed = 2 * needed - ((needed > 0) & (ends[2 * needed - 2] >= times)).astype(needed.dtype)
         return cls(t0, ends, jnp.diff(needed, prepend=0).astype(jnp.int32), reached)
+
+    def loop(self, flat, stepper, q, v, t0, params):
+        """The `Loop` over its steps."""
+        return loop_over(flat, stepper, q, v, t0, params, self.sizes, resolves=True)
 
     def sizes(self, number):
         """Of a step its size, that of the one before, and where it ends; behind the last 1, and inf."""
@@ -99,34 +104,43 @@ def follow(problem, times, grid, events=None, room=()):
     """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
     flat, q, v, t0, params = problem.flat()
     longest = largest_in_batch(grid.counts)
-    plain = loop = loop_over(flat, problem.stepper, q, v, t0, params, grid.sizes, resolves=True)
+    plain = loop = grid.loop(flat, problem.stepper, q, v, t0, params)
     if events is not None:
-        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, in_pieces=True)
+        more = {"in_pieces": True, "with_modes": problem.output is not None}
+        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, **more)
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
     begun = partial(begun_with, flat, problem.stepper, params, loop)
-    interval = to_next_sample(loop, form, begun, partial(kept, flat, problem.stepper), in_pieces=events is not None)
+    keep, read = partial(kept, flat, problem.stepper), None
+    if problem.output is not None:
+        read = partial(output_in, loop, flat, problem.output, params, keep, times[-1] - loop.carry[0].t)
+        if not problem.output.beside_path:
+            keep = None
+    interval = to_next_sample(loop, form, begun, keep, in_pieces=events is not None, read=read)
 
     def samples(carry):
         return lax.scan(interval, (carry[0] if events is None else (), carry), (grid.counts, longest, times))
 
-    (_, (state, _, failure, *met)), (first, second, info) = one_kernel(samples, form.tree)
-    (first, _), (second, extra) = form.joined(first), form.joined(second)
+    (_, (state, _, failure, *met)), (around, found, info) = one_kernel(samples, form.tree)
     start = loop.start
     flaw = flaw_at_start(problem.system, flat, start, params)
-    ends = [as_solution(flat, start, path, None, info, failure, flaw) for path in (first, second)]
-    if events is None:
-        return read_off(flat, ends, extra, times, grid.reached)
-    met = form.joined(met[0])
-    times = jnp.where(met.ended, jnp.minimum(times, state.t), times)
-    return with_told_events(flat, read_off(flat, ends, extra, times, grid.reached), met, room[1])
+    if met:
+        met = form.joined(met[0])
+        times = jnp.where(met.ended, jnp.minimum(times, state.t), times)
+    run = solution_at(flat, start, form.joined(around), times, grid.reached, info, with_flaw(failure, flaw))
+    if problem.output is not None:
+        first = loop.sizes(jnp.zeros((), jnp.int32))[0]
+        at_start = output_at_start(flat, problem.output, params, start, first)
+        run = with_output(run, at_start, form.joined(found), times, grid.reached)
+    return with_told_events(flat, run, met, room[1]) if met else run
 
 
-def to_next_sample(loop, form, begun, keep, in_pieces):
+def to_next_sample(loop, form, begun, keep, in_pieces, read=None):
     """The body of the scan over the times: steps until one of them ends at the time or beyond, and both ends of that.
 
     in_pieces: of the part of it between events, of which its `Pieces` tell; else the state before is carried along.
+    keep: what is kept of both, None for nothing; read: what else, of both, the run and the time.
     """
-    advance, begun, keep = form.of(loop.advance), form.of(begun), form.of(keep)
+    advance, begun = form.of(loop.advance), form.of(begun)
 
     @checkpoint
     def interval(carry, now):
@@ -140,9 +154,21 @@ def to_next_sample(loop, form, begun, keep, in_pieces):
 
         last, run, info = repeat(step, (*carry, loop.no_info), most)
         pair = form.of(Pieces.around)(run[3].pieces, time) if in_pieces else (last, run[0])
-        return (last, run), (*map(keep, pair), info)
+        around = None if keep is None else tuple(map(form.of(keep), pair[:2]))
+        found = None if read is None else form.of(read)(pair, run, time)
+        return (last, run), (around, found, info)
 
     return interval
+
+
+def output_in(loop, flat, output, params, keep, long, pair, run, time):
+    """The output of a run at a time between a pair of states, with their modes where there are events."""
+    first, second, *modes = pair
+    if modes:
+        state, _, _, met = run
+        time = jnp.where(met.ended, jnp.minimum(time, state.t), time)
+        params = loop.now(met._replace(modes=modes[0] or met.modes))
+    return output_between(flat, output, params, (keep(first), keep(second)), time, long)
 
 
 def begun_with(flat, stepper, params, loop, run):

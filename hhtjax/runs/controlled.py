@@ -14,6 +14,7 @@ from hhtjax.runs.choose import choose, trimmed
 from hhtjax.runs.chosen import checked_times, run_over, steps_for, usual_step
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.freezing import frozen, is_pair, run_and_choice
+from hhtjax.runs.output import beside_path, without_path
 from hhtjax.runs.solution import Solution
 from hhtjax.runs.tightened import accepted_run, tighten
 from hhtjax.runs.verified import compared, scaled, verified
@@ -25,9 +26,11 @@ def run_controlled(problem, times, control, progress, events=None, room=()) -> S
     times = checked_times("simulate", problem, times, control)
     if events is not None:
         events = require_events("simulate", problem, events, usual_step(problem.t0, times))
+    problem = problem._replace(output=beside_path(problem.output, control))
     start, alone = (problem, times, control, events), is_untouched() and not is_pair()
     if control.verify == "tighten":
-        return run_tightened(start, alone, progress, room)
+        run = run_tightened(start, alone, progress, room)
+        return run if problem.output is None else without_path(run)
     in_one = alone and passes_alone(problem, events)
     if in_one:  # else the program that chooses steps for a derivative or a batch is that of `choose_steps`
         run, steps, ends = or_plain(partial(run_in_one, problem, times, unverified(control), progress=progress))
@@ -39,7 +42,8 @@ def run_controlled(problem, times, control, progress, events=None, room=()) -> S
         better = finer(start, choice, steps, ends, room, in_one)
         run = run._replace(**verified(run, better, start[2], problem.stepper.order))
     steps = trimmed(steps)
-    return run._replace(dt=steps.dt, steps=steps)
+    run = run._replace(dt=steps.dt, steps=steps)
+    return run if problem.output is None else without_path(run)
 
 
 def passes_alone(problem, events):

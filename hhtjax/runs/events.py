@@ -18,10 +18,10 @@ from hhtjax.systems.events import flatten_events
 from hhtjax.xla import in_turn
 
 
-def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False):
+def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False, with_modes=False):
     """The `Loop` with events: its carry has `Met` behind (state, number of steps, first failure).
 
-    in_pieces: whether that has the `Pieces` of the last step.
+    in_pieces: whether that has the `Pieces` of the last step; with_modes: whether these have the modes.
     """
     start = loop.carry[0]
     stepper = stepper.astype(start.v.dtype)
@@ -30,9 +30,10 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     met = before_any(ways, params, start.t)
     met = met._replace(log=Log.empty(unnoted(start)[0], keep, ways.slots))
     if in_pieces:
-        met = met._replace(pieces=Pieces.none(start, max_events + 1))
+        met = met._replace(pieces=Pieces.none(start, max_events + 1, met.modes if with_modes else ()))
     step = past_events(ways, params, loop.bound, loop.sizes)
-    return loop._replace(carry=(*loop.carry, met), advance=step, past=partial(past_events, ways, params))
+    more = {"past": partial(past_events, ways, params), "now": lambda met: flat_events.with_modes(params, met.modes)}
+    return loop._replace(carry=(*loop.carry, met), advance=step, **more)
 
 
 def past_events(ways, params, bound, sizes):
@@ -55,7 +56,7 @@ def past_events(ways, params, bound, sizes):
         new, count = at_rest(here, (new, count), (state, before))
         if met.pieces is not None:
             begun = held.entered(ways.stepper, ways.flat, now, h, last, state)[1]
-            met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new), met.pieces))
+            met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new, met.modes), met.pieces))
         part = Part.whole(ways, state, new, info, h, last, met._replace(log=None))
         counts = None if here is None else (before, count)
         asked = may_meet(ways, part, h, params)

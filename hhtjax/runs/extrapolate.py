@@ -38,12 +38,13 @@ def _combine(solutions, order, join):
     turns = first.acceleration is not None  # a first-order system has no rotations
     q = value("q", partial(_positions, first.v) if turns else None)
     rest = {name: value(name) for name in ("v", "acceleration", "multipliers", "z", "zdot")}
+    rest["output"] = value("output", _outputs)
     if first.friction is not None:  # which jump, at times that each run has for itself
         rest |= {name: getattr(finest, name) for name in ("friction", "sticking")}
     failure = _first([solution.failure for solution in solutions])
     if first.events is not None:
         rest["t"] = value("t")  # behind a terminal event its time
-        combine = partial(_positions, first.events.before) if turns else None
+        combine = None if first.events.q is None else partial(_positions, first.events.before)
         rest["events"], same = _events([solution.events for solution in solutions], order, combine)
         failure = _told_apart(first, failure, same)
     return first._replace(q=q, **rest, info=reduce(join, [solution.info for solution in solutions]), failure=failure)
@@ -89,6 +90,15 @@ def _positions(v, gain, coarse, fine):
         return turn(coarse, fine) if kinematics.is_rotation(fine.shape, v.shape) else take_out(gain, coarse, fine)
 
     return jax.tree.map(leaf, v, coarse, fine)
+
+
+def _outputs(gain, coarse, fine):
+    """`take_out` of what a user's function returned; flags and numbers that count are those of the finest run."""
+
+    def leaf(coarse, fine):
+        return take_out(gain, coarse, fine) if jnp.issubdtype(fine.dtype, jnp.floating) else fine
+
+    return jax.tree.map(leaf, coarse, fine)
 
 
 def _first(failures):

@@ -31,6 +31,8 @@ def bad_steps(t, dt, has_events):
     if unknown.any():
         which = first_bad(unknown.reshape(*t.shape[:-1], -1).any(axis=-1))[1]
         return f"{which}`dt` must be positive and finite, and in a sweep at most the distance of the samples."
+    if np.any(gaps < 0):
+        return ORDER.format(t)
     alike = gaps == 0
     if has_events:  # one may have ended the run, at the last time
         alike &= (t[..., 1:] < t[..., -1:]) | (t[..., :1] == t[..., -1:])

@@ -17,56 +17,64 @@ from hhtjax.xla import Programs
 
 @shown
 class Interpolant(NamedTuple):
-    """Position and velocity between the saved times; made by `interpolate`.
+    """A run between its saved times; made by `interpolate`. All have the times asked for as leading axes.
 
     Attributes:
-        q, v: with the times asked for as leading axes; of a first-order system y and None.
+        q, v: position and velocity; of a first-order system y and None.
+        acceleration: that of v; None of a first-order system.
+        multipliers: L, None without constraints.
+        z, zdot: internal states and their rates, None without.
+        friction, sticking: dry friction, and whether a joint sticks, None without.
+        output: what the run has in the place of all these, None without.
     """
 
     q: Any
     v: Any
+    acceleration: Any = None
+    multipliers: Any = None
+    z: Any = None
+    zdot: Any = None
+    friction: Any = None
+    sticking: Any = None
+    output: Any = None
 
 
-@shown
-class InternalInterpolant(NamedTuple):
-    """The same of a run with internal states.
-
-    Attributes:
-        q, v, z: with the times asked for as leading axes.
-    """
-
-    q: Any
-    v: Any
-    z: Any
-
-
-def interpolate(solution, times) -> Interpolant | InternalInterpolant:
-    """Dense output: q, v and z at arbitrary times inside the run, differentiable in all.
+def interpolate(solution, times) -> Interpolant:
+    """Dense output: what a run has saved, at arbitrary times inside the run, differentiable in all.
 
     Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
     through (z, zdot); for a rotation, of the rotation vector from the saved one before. Their error is O(H^4), H the
-    spacing of the saved times. Where events lie between two saved times, the polynomials end there: q with O(H^4), v
-    and z (and y of a first-order system) straight lines with O(H^2); at the event itself v is that behind it. NaN
-    behind the last of `keep_events`, if there were more.
+    spacing of the saved times. The acceleration, and zdot, are the rates of these cubics, with O(H^3); multipliers and
+    dry friction are straight lines, with O(H^2), the friction of a joint that begins to slide, or to stick, the nearer
+    of the two that are saved. Of a run with `output=` straight lines join its outputs, numbers as they are: give such a
+    run the times, `simulate(..., times=, output=)`, where O(H^2) is too much.
+
+    Where events lie between two saved times, the polynomials end there: q with O(H^4), v and z (and y of a first-order
+    system) straight lines with O(H^2), their rates constant; at the event itself v is that behind it. Multipliers and
+    friction are those saved on the same side, and NaN between two events. All is NaN
+    behind the last of `keep_events`, if there were more. Where a held input jumps at a saved time, what is known there
+    is what was before the jump.
 
     Args:
         solution: of one run (vmap this function for a batch).
         times: scalar or array, inside [solution.t[0], solution.t[-1]] up to rounding.
 
     Returns:
-        An `Interpolant`; of a run with internal states an `InternalInterpolant`, which has z too.
+        An `Interpolant`.
 
     A run that failed is told again, by a `FailedRunWarning`.
 
     Raises:
         TypeError, ValueError: times that are not real; a solution of several runs; a time outside the run, where the
             result is NaN for tracers.
+        NotImplementedError: a run with events and `output=`, of which nothing is known at its events.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: 0 * q - 9.81)
     >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.array([0.0]), jnp.array([10.0]), dt=0.1, num_steps=10)
-    >>> round(float(hhtjax.interpolate(run, 0.25).q[0]), 5)                 # 10 t - 9.81 t^2/2
-    2.19344
+    >>> found = hhtjax.interpolate(run, 0.25)
+    >>> round(float(found.q[0]), 5), round(float(found.acceleration[0]), 5)                 # 10 t - 9.81 t^2/2
+    (2.19344, -9.81)
     """
     t = solution.t
     if t.ndim != 1:
@@ -75,6 +83,10 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
     if not is_real(times):
         raise TypeError(f"interpolate: `times` must be real numbers; received {times!r}.")
     told("interpolate: of a run that failed", solution, throw=False)
+    if solution.output is not None and solution.events is not None:
+        raise NotImplementedError(
+            "interpolate: nothing is known of the output of a run at its events: give `times` to simulate."
+        )
     known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
     equal = not jnp.ndim(solution.dt) and solution.events is None  # an event may end a run early
     equal = None if equal and not is_concrete(t) else equal and not _are_uneven(t)
@@ -83,7 +95,7 @@ def interpolate(solution, times) -> Interpolant | InternalInterpolant:
         bad = np.asarray(times).astype(t.dtype)[np.asarray(outside)].flat[0]
         raise ValueError(f"interpolate: `times` must lie in [{t[0]:.6g}, {t[-1]:.6g}]; received {bad:.6g}.")
     v = None if solution.acceleration is None else found.v
-    return Interpolant(found.q, v) if solution.z is None else InternalInterpolant(found.q, v, found.z)
+    return Interpolant(found.q, v, *(getattr(found, name) for name in Interpolant._fields[2:]))
 
 
 def _are_uneven(t):
@@ -153,6 +165,21 @@ def between_events(events, a, b, H, x, times):
     def secant(rate, y0, y1):
         return jnp.where(on_axes(inside, rate), (y1 - y0) / on_axes(jnp.where(H > 0, H, 1), rate), rate)
 
+    def on_the_same_side(before, after):
+        """Of what jumps at events: what is saved on this side of them."""
+        value = jnp.where(on_axes(inside & ahead, before), before, after)
+        if before.dtype == bool:
+            return value
+        return jnp.where(on_axes(behind & ahead, before), jnp.nan, value)
+
+    for name in ("multipliers", "friction", "sticking"):
+        before, after = getattr(a, name), getattr(b, name)
+        if before is not None:
+            value = on_the_same_side(before, after)
+            a, b = (
+                side._replace(**{name: jnp.where(on_axes(inside, value), value, old)})
+                for side, old in ((a, before), (b, after))
+            )
     pairs = {"v": "q"} if first_order else {"acceleration": "v", "zdot": "z"}  # the slope of each, where none is known
     a, b = (
         side._replace(**{
@@ -166,7 +193,7 @@ def between_events(events, a, b, H, x, times):
 def between(a, b, H, x):
     """The saved values between those of a and b, which are H apart, at the part x of it, 0 to 1; any leading axes.
 
-    Rates are those of the polynomials where nothing else is known; multipliers are linear.
+    Rates are those of the polynomials where nothing else is known; multipliers, friction and outputs are linear.
     """
 
     def hermite(y0, y1, slope0, slope1):
@@ -186,6 +213,20 @@ def between(a, b, H, x):
     def linear(y0, y1):
         return y0 + on_axes(x, y0) * (y1 - y0)
 
+    def nearer(y0, y1):
+        return jnp.where(on_axes(x, y0) < 0.5, y0, y1)
+
+    def rubbing(tau0, tau1, sticks0, sticks1):
+        alike = (sticks0 == sticks1) & (sticks0 | (tau0 * tau1 >= 0))
+        return jnp.where(alike, linear(tau0, tau1), nearer(tau0, tau1) + 0 * on_axes(x, tau0))
+
+    def told(y0, y1):
+        return (linear if jnp.issubdtype(y0.dtype, jnp.floating) else nearer)(y0, y1)
+
+    a = a._replace(output=jax.tree.map(told, a.output, b.output))
+    if a.friction is not None:
+        friction = rubbing(a.friction, b.friction, a.sticking, b.sticking)
+        a = a._replace(friction=friction, sticking=nearer(a.sticking, b.sticking))
     q = jax.tree.map(position, a.q, b.q, a.v, b.v)
     if a.acceleration is None:
         return a._replace(q=q, v=jax.tree.map(rate, a.q, b.q, a.v, b.v))

@@ -19,7 +19,7 @@ class Loop(NamedTuple):
     """What a run is made of. carry: (state, number of steps, first failure), before the first; advance: carry -> carry,
     Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged; bound: params -> advance; sizes:
     number of steps taken -> the size of the next, and of the last; start: the state at t0, as it is saved; past: bound,
-    sizes -> advance past events."""
+    sizes -> advance past events; now: what events carry along -> the params after them."""
 
     carry: Any
     advance: Any
@@ -29,6 +29,7 @@ class Loop(NamedTuple):
     sizes: Any
     start: Any
     past: Any = None
+    now: Any = None
 
 
 def loop_of(flat, stepper, q, v, t0, params, dt):
@@ -138,14 +139,25 @@ def saved(flat, state):
 
 def as_solution(flat, start, path, dt, info, failure, flaw=None):
     """The start and the path after it as a `Solution`; flaw: of the mass at the start, as `mass_flaw` says it."""
-    if flaw is not None:
-        failure = failure._replace(step=jnp.where(flaw > 0, 1, failure.step), mass=flaw)
-    t, q, v, w, L, *z, friction = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
+    failure = with_flaw(failure, flaw)
+    path = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
+    return as_path(flat, path)._replace(dt=dt, info=info, failure=failure)
+
+
+def as_path(flat, path):
+    """What was saved, with a leading axis, as a `Solution` that knows nothing else."""
+    t, q, v, w, L, *z, friction = path
     q = jax.vmap(flat.unravel)(q)
     v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in (v, w))
     z, zdot = (None if x is None else jax.vmap(flat.unravel_internal)(x) for x in z)
-    solution = Solution(t, q, v, w, L, dt, info, failure, z, zdot)
+    nothing: Any = None
+    solution = Solution(t, q, v, w, L, nothing, nothing, nothing, z, zdot)
     return solution if friction is None else solution._replace(friction=friction.tau, sticking=friction.sig == 0)
+
+
+def with_flaw(failure, flaw):
+    """The failure, or that of a mass that is none at the start."""
+    return failure if flaw is None else failure._replace(step=jnp.where(flaw > 0, 1, failure.step), mass=flaw)
 
 
 def flaw_at_start(system, flat, start, params):

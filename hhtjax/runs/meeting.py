@@ -169,7 +169,7 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
         code = jnp.where((code == FINE) & ~jnp.all(jnp.isfinite(start.w)), SINGULAR, code)
     code = jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE).astype(part.met.code.dtype)
 
-    pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end)
+    pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end, modes)
     met = Met(modes, ends, code, i, pieces=pieces, over=over)
     infos = join_info(join_info(choose(part.divided > 0, part.info, ways.no_info), info), more)
     asked = asks(ways, start, end, then, over, rest) | jnp.any(due)

@@ -16,7 +16,8 @@ from hhtjax.systems.rubbing import require_independent_friction
 
 
 class Problem(NamedTuple):
-    """A system, how to step it, and from where; params hold no functions, as `freeze` leaves them."""
+    """A system, how to step it, and from where; params hold no functions, as `freeze` leaves them. output: an `Output`,
+    where a run saves that in place of its path."""
 
     system: Any
     stepper: Any
@@ -25,6 +26,7 @@ class Problem(NamedTuple):
     params: Any
     t0: Any
     z0: Any
+    output: Any = None
 
     @classmethod
     def checked(cls, caller, system, stepper, q0, v0, params, t0, z0):

@@ -10,15 +10,27 @@ from jax import lax
 from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.adaptive import Adaptive
+from hhtjax.runs.chosen import follow
 from hhtjax.runs.controlled import run_controlled
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
-from hhtjax.runs.given_steps import refined, require_control_alone, require_steps, warn_of_jumps_in
-from hhtjax.runs.loop import as_solution, flaw_at_start, given_sizes, loop_of, loop_over
+from hhtjax.runs.given_steps import (
+    EqualSteps,
+    refined,
+    require_control_alone,
+    require_one_length,
+    require_steps,
+    require_steps_to,
+    steps_within,
+    warn_of_jumps_in,
+)
+from hhtjax.runs.loop import flaw_at_start, given_sizes, loop_of, loop_over
+from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
 from hhtjax.runs.solution import Solution, told
+from hhtjax.runs.sweep_grid import equal_times, require_times
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Programs, is_in_batch, on_scalars, one_kernel, or_plain
@@ -34,6 +46,8 @@ def simulate(
     z0: Any = None,
     dt: Any,
     num_steps: int | None = None,
+    duration: Any = None,
+    num_samples: int | None = None,
     times: Any = None,
     t0: Any = 0.0,
     save_every: int = 1,
@@ -43,6 +57,7 @@ def simulate(
     max_events: int = 2,
     keep_events: int = 100,
     throw: bool = False,
+    output: Any = None,
 ) -> Solution:
     """Steps `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), num_steps times by dt.
 
@@ -60,8 +75,14 @@ def simulate(
             anew in each step. A step more than twice as long as the one before can make rho_inf near 0 unstable.
             Or `adaptive(rtol, atol)`, steps that are chosen by their errors, and constant to derivatives.
         num_steps: number of steps.
-        times: (K,), with `adaptive`: increasing, after t0. The run ends at the last, and is read off at the others, by
-            cubics between its steps (multipliers by lines).
+        duration: in the place of num_steps, as in a sweep: dt is made smaller, if need be, so that a whole number of
+            steps is as long, which is reported as `run.dt`. Both are part of the program then; or, with `adaptive`,
+            data.
+        num_samples: K, with `duration`: the number of samples after the start, at equal distances, each at the end of
+            a step (with `adaptive` between two). Default: every step is saved.
+        times: (K,), in the place of num_steps: increasing, after t0, data. The run goes on to the last, and is read off
+            at all of them, by cubics between its steps (multipliers and dry friction by lines): the steps stay what
+            they are, a number dt or `adaptive`, and end at none of the times. (In `sweep` with step sizes they do.)
         save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
             start and the end only, and stores no path.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
@@ -80,6 +101,13 @@ def simulate(
         max_events: how many of those that change something may fall into one step; more are a failure. With `adaptive`
             steps become shorter first, and what lies behind an event has an error of its own.
         keep_events: how many `run.events` has room for.
+        output: a function of some of q, v, w (the acceleration), L (multipliers), z, zdot, friction, sticking, t and
+            params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`. It returns a pytree of
+            arrays. These are saved, as `run.output`, in the place of q, v and all else, so that a long run of a large
+            system keeps little. `check` works as before. What a system does not have is None; of a first-order system
+            q is y, and v its rate. params are those of the moment, as events have switched them and inputs are held.
+            Extrapolation takes the errors out of the outputs, number by number: of rotations return their entries
+            only where that is meant. `verify` compares q at the samples, which it keeps while it runs.
         throw: whether a run that failed is an error; else it is a `FailedRunWarning`. Both say what `solution.check()`
             says. Inside jit and vmap neither is known: there call `check()` on what comes out.
 
@@ -110,8 +138,17 @@ def simulate(
     >>> solution.check()
     >>> [round(float(q), 4) for q in solution.q[:, 0]]                       # cos(2 t)
     [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
+
+    What a sensor shows, at its own times, and nothing else:
+
+    >>> solution = hhtjax.simulate(
+    ...     spring, hhtjax.hht(), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0}, dt=1e-3, times=[0.25, 0.6, 1.0],
+    ...     output=lambda q, params: {"pull": params["k"] * q[0]})
+    >>> [round(float(x), 4) for x in solution.output["pull"]], solution.q                     # 4 cos(2 t)
+    ([4.0, 3.5103, 1.4494, -1.6646], None)
     """
     problem = Problem.checked("simulate", system, stepper, q0, v0, params, t0, z0)
+    problem = problem._replace(output=require_output("simulate", output))
     save_every = require_integer("simulate", "save_every", save_every)
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
@@ -119,9 +156,31 @@ def simulate(
         require_integer("simulate", "max_events", max_events),
         require_integer("simulate", "keep_events", keep_events),
     )
-    if isinstance(dt, Adaptive) or times is not None:
-        require_control_alone("simulate", dt, times, num_steps, save_every, extrapolate)
+    dtype = jax.tree.leaves(problem.q0)[0].dtype
+    if duration is not None or num_samples is not None:
+        rest = {"num_steps": num_steps, "times": times, "save_every": save_every}
+        require_one_length("simulate", duration, num_samples, **rest)
+        if not isinstance(dt, Adaptive):
+            dt, num_steps, save_every = steps_within("simulate", dtype, dt, duration, num_samples)
+        elif num_samples is not None:
+            times = equal_times(problem.t0, duration, num_samples)
+    if isinstance(dt, Adaptive):
+        require_control_alone("simulate", times, num_steps, save_every, extrapolate)
         return told("simulate", run_controlled(problem, times, dt, progress, events, room), throw)
+    kind = {"rates": problem.rates(), "numbers": sum(map(jnp.size, jax.tree.leaves(problem.q0)))}
+    if times is not None:
+        times = require_times(times, problem.t0, dtype, "simulate")
+        dt = require_steps_to("simulate", times, dt, num_steps, save_every, problem.t0)
+        if progress:
+            raise NotImplementedError("simulate: with `times` and a number for `dt`, leave `progress` out.")
+        if events is not None:
+            events = require_events("simulate", problem, events, dt)
+
+        def run_to(k):
+            return or_plain(partial(_read_off, problem, times, dt / k, events, room=room, rates=kind["rates"]))
+
+        solution = run_to(1) if extrapolate == 1 else extrapolated(run_to, extrapolate, stepper.order, join_info)
+        return told("simulate", solution, throw)
     dt, num_steps = require_steps("simulate", stepper, dt, num_steps, 2 ** (extrapolate - 1))
     if events is not None:
         events = require_events("simulate", problem, events, dt[0] if jnp.ndim(dt) else dt)
@@ -129,7 +188,6 @@ def simulate(
         raise ValueError(f"simulate: `save_every` must divide num_steps={num_steps}; received {save_every}.")
 
     warn_of_jumps_in(problem, dt, num_steps)
-    kind = {"rates": problem.rates(), "numbers": sum(map(jnp.size, jax.tree.leaves(problem.q0)))}
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
@@ -137,6 +195,17 @@ def simulate(
 
     solution = run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
     return told("simulate", solution, throw)
+
+
+@partial(Programs, static_argnames=("room",))
+def _read_off(problem, times, dt, events, *, room):
+    """The run with equal steps, at times between them."""
+
+    def run(problem, times, dt, events):
+        t0, times, dt = map(problem.times, (problem.t0, times, dt))
+        return follow(problem, times, EqualSteps.to(t0, times, dt), events, room)._replace(dt=dt)
+
+    return one_kernel(run, problem, times, dt, events, around=True)  # what comes before and behind the loop too
 
 
 @partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "in_batch"))
@@ -149,14 +218,15 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room)
 
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)  # without events, which are seldom
-    step, keep = form.of(loop.advance), form.of(loop.keep)
+    step = form.of(loop.advance)
+    save, as_saved = savings(form, loop, flat, problem.output, params)
 
     def interval(carry, _):
         if save_every == 1:
             carry, info = step(carry)
         else:
             (carry, info), _ = joined_steps((carry, loop.no_info), save_every)
-        return carry, (keep(carry[0]), info)
+        return carry, (save(carry), info)
 
     def joined_step(carry, _):
         carry, info = carry
@@ -171,17 +241,16 @@ def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_
 
     length = num_steps // save_every
     if progress:
-        carry, (path, info) = _with_bar(intervals, joined_steps, keep, loop, form.tree, length, save_every, q.size)
+        carry, (path, info) = _with_bar(intervals, joined_steps, save, loop, form.tree, length, save_every, q.size)
     else:
         carry, (path, info) = intervals(form.tree, length)
     _, _, failure, *met = carry
-    start = loop.start
-    flaw = flaw_at_start(problem.system, flat, start, params)
-    solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
+    flaw = flaw_at_start(problem.system, flat, loop.start, params)
+    solution = as_saved(form.joined(path), dt, info, failure, flaw)
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution
 
 
-def _with_bar(intervals, joined_steps, keep, loop, carry, length, save_every, unknowns):
+def _with_bar(intervals, joined_steps, save, loop, carry, length, save_every, unknowns):
     """The same intervals, with a bar drawn outside of kernels: between several of them, or within long ones."""
     announce()
     total = length * save_every
@@ -197,6 +266,6 @@ def _with_bar(intervals, joined_steps, keep, loop, carry, length, save_every, un
             draw(number * save_every + n, total, "step")
 
         (carry, info), _ = in_blocks(steps, (carry, loop.no_info), save_every, every, show)
-        return carry, (keep(carry[0]), info)
+        return carry, (save(carry), info)
 
     return lax.scan(interval, carry, jnp.arange(length, dtype=jnp.int32))

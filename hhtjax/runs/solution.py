@@ -105,6 +105,8 @@ class Solution(NamedTuple):
         failed: whether the run failed, a property; (B,) of a batch: which members did.
         allowed: what `check` lets pass of it, 10 (rtol max|q| + atol); a tenth of that with verify="tighten".
         events: what happened on the way, `Events`; None without.
+        output: what `output=` returned, a pytree with a leading axis K + 1, in the place of q, v, acceleration,
+            multipliers, z, zdot, friction and sticking, which are None then; None without.
     """
 
     t: Any
@@ -123,6 +125,7 @@ class Solution(NamedTuple):
     error: Any = None
     allowed: Any = None
     events: Any = None
+    output: Any = None
 
     @property
     def failed(self):
@@ -169,6 +172,8 @@ class Solution(NamedTuple):
         strays = np.zeros_like(steps)
         if reach is not None:
             require_number("check", "reach", reach, lambda x: x > 0, "be positive")
+            if self.q is None and self.output is not None:
+                raise ValueError(f"check: leave `reach` out: the run has kept its output, and no q; received {reach}.")
             strays = self._first_beyond(reach)
             strays = np.where((steps > 0) & (steps <= strays), 0, strays)
         bad = np.where(strays > 0, strays, steps)
@@ -204,6 +209,7 @@ class Solution(NamedTuple):
         """The run in a line, and its arrays."""
         rows = leaf_rows(q=self.q, v=self.v, acceleration=self.acceleration, multipliers=self.multipliers)
         rows += leaf_rows(z=self.z, zdot=self.zdot, friction=self.friction, sticking=self.sticking)
+        rows += leaf_rows(output=self.output)
         return Table(f"Solution: {self._title()}", [["", "shape", "dtype"], *rows, *leaf_rows(info=self.info)])
 
     def _title(self):
@@ -268,7 +274,8 @@ class Solution(NamedTuple):
                 "the acceleration is not finite at the start already: there the mass is singular, or a function of the "
                 "system not finite"
             )
-        names = ("y", "y'") if self.acceleration is None else QUANTITIES
+        is_first_order = self.acceleration is None and self.output is None
+        names = ("y", "y'") if is_first_order else QUANTITIES
         return f"{names[quantity]} is not finite. Take a smaller dt, or another linearize=, or a method that damps"
 
     def _first_beyond(self, reach):
@@ -309,6 +316,8 @@ class Solution(NamedTuple):
         taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
         if self._is_every_step():
             return t[0] + np.sum(np.asarray(self.dt)[member][:step])
+        if np.ndim(self.dt) < self.t.ndim:  # steps of one size, which may end at none of the saved times
+            return t[0] + step * np.asarray(self.dt)[member]
         dt = np.broadcast_to(np.asarray(self.dt)[member], t[1:].shape)
         i = np.clip(np.searchsorted(taken, step) - 1, 0, dt.size - 1)
         return t[i] + (step - taken[i]) * dt[i]

@@ -10,6 +10,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from hhtjax.numerics.seldom import derivative_by
 from hhtjax.runs.adaptive import Adaptive
+from hhtjax.runs.output import require_output
 from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_chosen import sweep_chosen
@@ -39,6 +40,7 @@ def sweep(
     max_events=2,
     keep_events=100,
     throw=False,
+    output=None,
 ) -> Solution:
     """Runs `system` once for each of `dts`, all from t0 on, sampled at common times.
 
@@ -64,6 +66,8 @@ def sweep(
             processes; each then holds all results, those of one device to rounding. They lie on all devices: take
             `jax.device_get` of them before mixing them with others.
         progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
+        output: that of `simulate`: a function whose values are saved in the place of q, v and all else, so that a large
+            sweep keeps little, in memory and, by `sweep_to_disk`, on disk.
         events, max_events, keep_events: those of `simulate`. A block looks for events in the steps in which one of its
             members meets some, so that they cost a batch little.
         throw: as for `simulate`; the first member that failed is named.
@@ -103,10 +107,18 @@ def sweep(
     ...     dts=jnp.full(2, 0.01), duration=1.0, num_samples=5, in_axes=(None, None, None, 0))
     >>> [round(float(q), 2) for q in runs.q[:, -1, 0]], runs.failed.tolist()          # cos(2), cos(3)
     ([-0.42, -0.99], [False, False])
+
+    The energies alone:
+
+    >>> runs = hhtjax.sweep(
+    ...     spring, hhtjax.hht(), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0}, dts=jnp.full(2, 0.01), duration=1.0,
+    ...     num_samples=5, output=lambda q, v, params: 0.5 * jnp.sum(v**2) + 0.5 * params["k"] * jnp.sum(q**2))
+    >>> runs.output.shape, runs.q
+    ((2, 6), None)
     """
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
-    inputs = inputs.with_events(events, max_events, keep_events)
+    inputs = inputs.with_events(events, max_events, keep_events)._replace(output=require_output("sweep", output))
     with inputs.telling_of_axes():
         if isinstance(dts, Adaptive):
             if mesh is not None:
@@ -122,7 +134,9 @@ def sweep(
 
 
 @partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
-def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_samples, lanes, mesh, progress, room):
+def run_sweep(
+    system, data, dts, duration, t0, times, events, output=None, *, mapped, num_samples, lanes, mesh, progress, room
+):
     """The sweep of `Inputs`, compiled."""
     if progress:
         announce()
@@ -145,7 +159,7 @@ def run_sweep(system, data, dts, duration, t0, times, events, *, mapped, num_sam
 
     def member(leaves, dt, substeps, longest):
         grid = dt, substeps, longest, t0, num_samples, times
-        return run_member(system, jax.tree.unflatten(structure, leaves), *grid, events, room)
+        return run_member(system, jax.tree.unflatten(structure, leaves), *grid, events, room, output)
 
     def block(leaves, dts, substeps, numbered):
         number, members = numbered

@@ -11,6 +11,7 @@ from hhtjax.runs.choose import trimmed
 from hhtjax.runs.choose_many import Members, choose_many
 from hhtjax.runs.chosen import Grid, follow
 from hhtjax.runs.freezing import frozen, is_pair, run_and_choice
+from hhtjax.runs.output import beside_path, without_path
 from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
 from hhtjax.runs.tightened import accepted_run, tighten
@@ -22,24 +23,26 @@ def sweep_chosen(inputs, progress):
     """The `Solution` of a sweep whose `dts` are an `Adaptive`."""
     static = {"mapped": inputs.mapped, "size": inputs.size, "lanes": lanes_for(inputs.size), "progress": progress}
     static |= {"pair": is_pair(), "room": inputs.room}
-    starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times, inputs.events))
+    output = beside_path(inputs.output, inputs.dts)
+    starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times, inputs.events, output))
     runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, rates=inputs.sizes()[1]))
     steps = trimmed(runs.steps)
-    return runs._replace(dt=steps.dt, steps=steps)
+    runs = runs._replace(dt=steps.dt, steps=steps)
+    return runs if output is None else without_path(runs)
 
 
 @partial(Programs, static_argnames=("mapped", "size", "lanes", "progress", "pair", "room"))
 def run_chosen(system, start, choice, *, mapped, size, lanes, progress, pair, room):
-    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, of runs, of steps;
-    pair: whether the two differ."""
+    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, output, of runs, of
+    steps; pair: whether the two differ."""
     if progress:
         announce()
 
-    def members_of(data, control, t0, times, events):
+    def members_of(data, control, t0, times, events, output):
         dtype = jax.tree.leaves(data[1])[0].dtype
         times, t0 = (jnp.asarray(x).astype(dtype) for x in (times, t0))
         arrays, structure = jax.tree.flatten((data, control))
-        return Members(system, arrays, structure, axes, t0, times, size, lanes, events, room)
+        return Members(system, arrays, structure, axes, t0, times, size, lanes, events, room, output)
 
     control = start[1]
     axes = [0 if flag else None for flag in mapped] + [0 if jnp.ndim(x) else None for x in jax.tree.leaves(control)]

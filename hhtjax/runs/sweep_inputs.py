@@ -50,6 +50,7 @@ class Inputs(NamedTuple):
     size: int
     events: Any = None
     room: tuple = ()
+    output: Any = None
 
     @classmethod
     def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes, times=None, z0=None):
@@ -163,7 +164,7 @@ class Inputs(NamedTuple):
         lanes = lanes_for(self.size, least_lanes(self.size, unknowns, hands) if are_alike(dts) else 1)
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
         fitting = {"rates": rates, "numbers": unknowns if lanes > 1 else None}
-        arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events
+        arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events, self.output
         return arguments, {**static, **fitting, "mesh": mesh, "progress": progress, "room": self.room}
 
 

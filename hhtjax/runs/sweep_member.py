@@ -9,12 +9,13 @@ from hhtjax.description import thaw
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.counted_loop import repeat
 from hhtjax.runs.events import loop_with_events, with_told_events
-from hhtjax.runs.loop import advance_from, as_solution, flaw_at_start, loop_of, resting
+from hhtjax.runs.loop import advance_from, flaw_at_start, loop_of, resting
+from hhtjax.runs.output import savings
 from hhtjax.systems.flat_system import flatten
 from hhtjax.xla import on_scalars, one_kernel, or_alone
 
 
-def run_member(system, data, dt, substeps, longest, t0, num_samples, times, events, room):
+def run_member(system, data, dt, substeps, longest, t0, num_samples, times, events, room, output=None):
     """One member; it rests from `substeps` to `longest`, where its block still works.
 
     With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval, and
@@ -29,7 +30,7 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
     if events is not None:
         loop = loop_with_events(plain, flat, stepper, events, params, *room)
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
-    keep = form.of(loop.keep)
+    save, as_saved = savings(form, loop, flat, output, params)
     pace = _paces(flat, stepper, params, loop, form, substeps, longest)
 
     def part(carry, here):
@@ -45,15 +46,15 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
     def interval(run, here):
         carry = run, loop.no_info
         (run, info), _ = lax.scan(part, carry, here) if resizes else part(carry, here)
-        return run, (keep(run[0]), info)
+        last = None if here is None or output is None else here[1].ravel()[0]
+        return run, (save(run, last), info)
 
     def samples(carry):
         return lax.scan(interval, carry, intervals, num_samples)
 
     (_, _, failure, *met), (path, info) = one_kernel(samples, form.tree)
-    start = loop.start
-    flaw = flaw_at_start(system, flat, start, params)
-    solution = as_solution(flat, start, form.joined(path), dt, info, failure, flaw)
+    flaw = flaw_at_start(system, flat, loop.start, params)
+    solution = as_saved(form.joined(path), dt, info, failure, flaw)
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from hhtjax.checks import require_integer
 from hhtjax.description import VERSION, all_concrete
 from hhtjax.runs.adaptive import Adaptive
+from hhtjax.runs.output import require_output
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.xla import or_plain
@@ -40,6 +41,7 @@ def sweep_to_disk(
     events=None,
     max_events=2,
     keep_events=100,
+    output=None,
 ) -> Path:
     """The same as `sweep`, `chunk` members at a time, each chunk written to a file of its own in `folder`.
 
@@ -54,7 +56,7 @@ def sweep_to_disk(
         chunk: members in a file, which bounds the memory.
         progress: one line on stderr for each file.
         system, stepper, q0, v0, params, z0, dts, duration, num_samples, times, t0, in_axes, events, max_events,
-            keep_events: those of `sweep`.
+            keep_events, output: those of `sweep`.
 
     Returns:
         The folder, to be read by `load_sweep`, or by `numpy.load` file by file.
@@ -79,7 +81,9 @@ def sweep_to_disk(
         raise NotImplementedError("sweep_to_disk: `dts` must be step sizes; adaptive(...) is for `sweep`.")
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
-    inputs = inputs.with_events(events, max_events, keep_events)
+    inputs = inputs.with_events(events, max_events, keep_events)._replace(
+        output=require_output("sweep_to_disk", output)
+    )
     if not all_concrete(inputs):
         raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
     folder, size = Path(folder), inputs.dts.size

@@ -1,0 +1,243 @@
+"""Sensors: what they show of a motion, at times of their own, with gain, offset, drift and delay."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.checks import describe, require_function, require_number, require_params
+from hhtjax.description import Description, is_array, is_real, thaw
+from hhtjax.numerics.elimination import matvec
+from hhtjax.runs.interpolate import interpolate, on_axes
+from hhtjax.runs.output import output_at, require_output
+from hhtjax.runs.solution import Solution
+from hhtjax.systems import kinematics
+from hhtjax.xla import Programs
+
+
+def measure(
+    solution: Solution,
+    times: Any,
+    gain: Any = 1.0,
+    offset: Any = 0.0,
+    delay: Any = 0.0,
+    *,
+    drift: Any = 0.0,
+    output: Any = None,
+    params: Any = None,
+) -> Any:
+    """What sensors show at `times`, on their clocks:
+
+        y(t) = gain s(t - delay) + offset + drift (t - t0)
+
+    s is the position q; or `output`, a function of the motion; or, of a run with `output=`, what that has saved, by
+    straight lines. Before the start of the run, at t0, s is what it is there.
+
+    gain, offset, drift and delay are ordinary parameters of a fit: of a signal's gain and a model's stiffness and mass
+    only ratios can be found. Sensors that differ in them, or have clocks of their own, are entries of a dict: each of
+    `times`, gain, offset, drift and delay may be one for all, or a dict of one for each, as for the axes of `jax.vmap`.
+
+    Args:
+        solution: of one run.
+        times: (samples,), s, not after its end; or one for each sensor.
+        gain, offset, drift: numbers, or arrays of the shape of a sensor's reading; drift per second.
+        delay: s, numbers.
+        output: a function of some of q, v, w (the acceleration), L (multipliers), z, zdot, friction, sticking, t and
+            params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`. It returns any pytree.
+            What a system does not have is None. See `accelerometer`. What lies between the saved times is that of
+            `interpolate`; numbers in params that events switch are those that are given here.
+        params: what `output` gets, such as the params of the run.
+
+    Returns:
+        A pytree like q, or like what `output` returns, with a leading axis of samples.
+
+    Raises:
+        TypeError, ValueError: as `interpolate`; an `output` of other arguments; a tree that does not fit what is
+            measured.
+
+    Example: a falling ball, by a tape and by an accelerometer with a clock of its own, which is late by .3 s. In free
+    fall it shows nothing but its offset:
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q - params["g"])
+    >>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.zeros(1), jnp.ones(1), {"g": 9.81}, dt=0.1, num_steps=10)
+    >>> def sensors(q, w, params):
+    ...     return {"tape": q[0], "felt": w[0] + params["g"]}
+    >>> shown = hhtjax.measure(
+    ...     run, {"tape": jnp.array([0.5, 1.0]), "felt": jnp.array([0.33, 0.66, 0.99])},
+    ...     offset={"tape": 0.0, "felt": 0.02}, delay={"tape": 0.0, "felt": 0.3}, output=sensors, params={"g": 9.81})
+    >>> [round(float(x), 5) for x in shown["tape"]], [round(float(x), 5) for x in shown["felt"]]     # t - 9.81 t^2/2
+    ([-0.72625, -3.905], [0.02, 0.02, 0.02])
+    """
+    if not isinstance(solution, Solution):
+        raise TypeError(f"measure: `solution` must be what simulate returns; received {type(solution).__name__}.")
+    output = require_output("measure", output)
+    if output is not None and solution.output is not None:
+        raise ValueError("measure: leave `output` out: the run was made with one, and has kept nothing else.")
+    sense = partial(_sensed, solution, output, require_params("measure", params))
+    times, delay = _one_or_tree(times), _one_or_tree(delay)
+    t0 = solution.t[0]
+    if _is_tree(times) or _is_tree(delay):
+        like = jax.eval_shape(lambda: sense(t0))
+        clocks = list(zip(_each("times", times, like), _each("delay", delay, like), strict=True))
+        found = {(id(t), id(late)): jax.tree.leaves(sense(_clock(t, late, t0))) for t, late in clocks}
+        leaves = [found[id(t), id(late)][i] for i, (t, late) in enumerate(clocks)]
+        shown, times = jax.tree.structure(like).unflatten(leaves), [t for t, _ in clocks]
+    else:
+        shown = sense(_clock(times, delay, t0))
+        times = [times] * len(jax.tree.leaves(shown))
+    leaves, structure = jax.tree.flatten(shown)
+    parts = [_each(name, _one_or_tree(x), shown) for name, x in (("gain", gain), ("offset", offset), ("drift", drift))]
+    return structure.unflatten([
+        _with_flaws(y, jnp.asarray(t) - t0, *more) for y, t, *more in zip(leaves, times, *parts, strict=True)
+    ])  # fmt: skip
+
+
+def _clock(times, delay, t0):
+    """The times at which is measured what is shown at these."""
+    require_number("measure", "delay", delay, np.isfinite, "be finite")
+    return jnp.maximum(jnp.asarray(times) - delay, t0)
+
+
+def _sensed(solution, output, params, times):
+    """What ideal sensors show, with the times as leading axes."""
+    found = interpolate(solution, times)
+    if output is None:
+        return found.q if solution.output is None else found.output
+    return _outputs(output, found, jnp.asarray(times).astype(solution.t.dtype), params)
+
+
+@Programs
+def _outputs(output, found, times, params):
+    """The output at each of the times, what is known there being `found`."""
+    params = thaw(params)
+    one = partial(output_at, output)
+    for _ in range(times.ndim):
+        one = jax.vmap(one, (0, 0, None))
+    return one(found, times, params)
+
+
+def _one_or_tree(x):
+    """Numbers in a list as an array."""
+    return np.asarray(x) if isinstance(x, (list, tuple)) and all(is_real(y) and np.ndim(y) == 0 for y in x) else x
+
+
+def _is_tree(x):
+    return not (is_array(x) or is_real(x))
+
+
+def _each(name, x, like):
+    """One for each leaf of what is measured, from one for all or for whole parts of it."""
+    try:
+        return jax.tree.leaves(jax.tree.map(lambda x, part: [x] * len(jax.tree.leaves(part)), x, like))
+    except (ValueError, TypeError):
+        raise ValueError(
+            f"measure: `{name}` must be one for all, or one for each part of what is measured, {describe(like)}; "
+            f"received {describe(x)}."
+        ) from None
+
+
+def _with_flaws(y, since, gain, offset, drift):
+    """gain y + offset + drift t, each a number or of the shape of a reading; flags and counts as they are."""
+    if not jnp.issubdtype(y.dtype, jnp.floating):
+        return y
+
+    def like_y(x):
+        return x if jnp.ndim(x) == 0 else jnp.broadcast_to(x, y.shape)
+
+    shown = like_y(gain) * y + like_y(offset)
+    is_zero = isinstance(drift, (int, float)) and drift == 0
+    return shown if is_zero else shown + like_y(drift) * on_axes(since.astype(y.dtype), y)
+
+
+@dataclass(frozen=True, eq=False)
+class Accelerometer(Description):
+    """The output of an accelerometer; made by `accelerometer`."""
+
+    position: Any
+    gravity: Any
+    frame: Any
+
+    def __call__(self, q, v, w, t, params):
+        """f = R^T (a - g)."""
+        x, unravel = ravel_pytree(q)
+        rates = ravel_pytree(v)[0]
+        blocks, one = kinematics.layout(q, v), jnp.ones_like(t)
+
+        def velocity(x, rates, t):
+            motion = kinematics.rate(blocks, x, rates), one
+            return jax.jvp(lambda x, t: jnp.asarray(self.position(unravel(x), t, params)), (x, t), motion)[1]
+
+        along = kinematics.rate(blocks, x, rates), ravel_pytree(w)[0], one
+        a = jax.jvp(velocity, (x, rates, t), along)[1]
+        g = jnp.asarray(self.gravity(params) if callable(self.gravity) else self.gravity)
+        if a.ndim != 1 or g.shape != a.shape:
+            raise ValueError(
+                f"accelerometer: `gravity` must have the shape of what `position` returns, {a.shape}, (d,); received "
+                f"{g.shape}."
+            )
+        f = a - g.astype(a.dtype)
+        if self.frame is None:
+            return f
+        R = jnp.asarray(self.frame(q, t, params))
+        if R.shape != (a.size, a.size):
+            raise ValueError(f"accelerometer: `frame` must return {(a.size, a.size)}; received {R.shape}.")
+        return matvec(R.T, f)
+
+
+def accelerometer(position: Any, gravity: Any, frame: Any = None) -> Accelerometer:
+    """What an accelerometer shows, for the `output` of `measure`, `simulate` and `sweep`:
+
+        f = R^T (a - g),    a = d^2/dt^2 position(q(t), t)
+
+    the acceleration less that of gravity (the proper acceleration, or specific force), in the axes of the sensor. In
+    free fall it is zero, and at rest it points up. a is found from q, v and w by derivatives of `position` along the
+    motion, so that the place on a body, its centripetal acceleration and a moving support are in it.
+
+    Args:
+        position: where the sensor sits, `position(q, t, params)` -> (d,), m, in axes at rest; d is 1, 2 or 3.
+        gravity: (d,), the acceleration of free fall, m/s^2, such as (0, 0, -9.81); or a function `gravity(params)`.
+        frame: the axes of the sensor, `frame(q, t, params)` -> (d, d), a rotation whose columns they are; of a body
+            with the rotation R that is R itself. Default: axes at rest.
+
+    Returns:
+        A function (q, v, w, t, params) -> (d,). Make it once: functions are known by identity, and another one is
+        compiled anew.
+
+    Raises:
+        TypeError: what is no function of these arguments.
+        ValueError: shapes that do not fit, when it is first called.
+
+    References:
+        Titterton, Weston, Strapdown Inertial Navigation Technology (2004), Ch. 3; MuJoCo's sensor of that name.
+
+    Example: on the bob of a pendulum, with axes across the rod and along it. At the lowest point it shows g + l v^2.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> def position(q, t, params):
+    ...     return params["l"] * jnp.array([jnp.sin(q[0]), -jnp.cos(q[0])])
+    >>> def frame(q, t, params):
+    ...     s, c = jnp.sin(q[0]), jnp.cos(q[0])
+    ...     return jnp.array([[c, -s], [s, c]])                                      # across, and up along the rod
+    >>> bob = hhtjax.accelerometer(position, (0.0, -9.81), frame)
+    >>> shown = bob(jnp.zeros(1), jnp.full(1, 2.0), jnp.zeros(1), 0.0, {"l": 0.5})
+    >>> [round(float(f), 2) for f in shown]                                          # 9.81 + 0.5 * 2^2
+    [0.0, 11.81]
+    """
+    require_function("accelerometer", "position", position, "position(q, t, params)")
+    if frame is not None:
+        require_function("accelerometer", "frame", frame, "frame(q, t, params)")
+    if callable(gravity):
+        require_function("accelerometer", "gravity", gravity, "gravity(params)")
+    else:
+        gravity = np.asarray(gravity) if isinstance(gravity, (list, tuple)) else gravity
+        if not is_real(gravity) or np.ndim(gravity) != 1:
+            raise TypeError(
+                "accelerometer: `gravity` must be (d,) real numbers, or a function gravity(params); "
+                f"received {gravity!r}."
+            )
+    return Accelerometer(position, gravity, frame)
