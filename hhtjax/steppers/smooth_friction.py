@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from hhtjax.numerics.elimination import matvec
 from hhtjax.steppers.friction import begin_friction, direction, smooth_system
-from hhtjax.steppers.smooth_start import corrected_by, damped_part, rate_of, response, smoothed
+from hhtjax.steppers.smooth_start import Found, corrected_by, damped_part, rate_of, response, smoothed
 from hhtjax.systems.constraints import curvature
 from hhtjax.systems.friction import across, at_rest, directions, own_rate, solve_some
 
@@ -55,4 +55,4 @@ def finished(law, method, layer, inverse, drag, z, h, corrects):
     if corrects:
         s = base._replace(v=v, w=z[:n], L=L)
         wdot = taken_off(layer.parts(rate_of(rubbing, s, inverse))[0], sticks)
-    return v, z, wdot, {"friction": found.friction}
+    return Found(v, z, wdot, friction=found.friction)
