@@ -17,10 +17,10 @@ from hhtjax.systems.constraints import curvature
 from hhtjax.systems.friction import across, at_rest, directions, own_rate, solve_some
 
 
-def smoothed_friction(method, system, s, params, h, moves=True, resolves=False):
+def smoothed_friction(method, system, s, params, h, moves=True, resolves=False, alone=False):
     """As `smoothed`."""
     free = system._replace(friction=None)
-    return smoothed(method, free, s, params, h, moves, resolves, partial(finished, system.friction))
+    return smoothed(method, free, s, params, h, moves, resolves, alone, partial(finished, system.friction))
 
 
 def finished(law, method, layer, inverse, drag, z, h, corrects):

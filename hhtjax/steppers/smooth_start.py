@@ -30,17 +30,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from hhtjax.description import freeze, thaw
-from hhtjax.numerics.elimination import diagonal, inverse, matvec
+from hhtjax.numerics.elimination import UNROLLED, diagonal, inverse, matvec
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import curvature, jacobian, reaction, violation
-from hhtjax.xla import linear_map, staged, traced
+from hhtjax.xla import linear_map, one_kernel, staged, traced
 
 POWERS, CORRECTIONS = 5, 5
 ITERATIONS = 40  # of Newton's method, at most
@@ -117,24 +118,28 @@ class Layer(NamedTuple):
         return jnp.zeros(self.system.size + self.system.num_constraints, self.base.v.dtype)
 
 
-def smoothed(method, system, s, params, h, moves=True, resolves=False, finish=None):
+def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=False, finish=None):
     """The state from which the first step h goes, behind the layer at the start s.
 
     moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M.
-    finish: what is made of the implicit step, by default `finished`.
+    alone: whether no kernel is around. finish: what is made of the implicit step, by default `finished`.
     """
-    zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
-    layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
-    damped, corrects = reads_velocity(layer), method.corrects(system)
-    if layer.B is None and not (damped or corrects):
+    damped, corrects = reads_velocity(system, s, params), method.corrects(system)
+    if not (system.num_constraints or damped or corrects):
         return s  # M^-1 Q throws a velocity, but nothing that a spring holds
-    found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
-    w, L = layer.parts(found.z)
-    if finish is None and not resolves:  # M^-1 Q as it is, where nothing damps
-        w, L = choose(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
-    a = w if found.wdot is None else method.corrected(system, found.v, w, found.wdot, h)
-    s1 = s._replace(v=found.v, w=w, a=a, L=L)
-    return s1 if found.friction is None else s1._replace(friction=found.friction)
+
+    def behind(s):
+        zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
+        layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
+        found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
+        w, L = layer.parts(found.z)
+        if finish is None and not resolves:  # M^-1 Q as it is, where nothing damps
+            w, L = choose(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
+        a = w if found.wdot is None else method.corrected(system, found.v, w, found.wdot, h)
+        s1 = s._replace(v=found.v, w=w, a=a, L=L)
+        return s1 if found.friction is None else s1._replace(friction=found.friction)
+
+    return one_kernel(behind, s, around=True) if alone else behind(s)
 
 
 def jumped(method, system, s, after, both, h, answer):
@@ -143,7 +148,7 @@ def jumped(method, system, s, after, both, h, answer):
     That is so where the velocity of an explicit step, h gamma dw, changes the accelerations by more than a part of dw.
     """
     new, dw, V = both[1], after.w - s.w, method.coefficients.gamma * h
-    if system.friction is not None or not reads_velocity(Layer(system, new, s, 0.0, 0.0, 0.0, None, None)):
+    if system.friction is not None or not reads_velocity(system, s, new):
         return after
     force = system.force(s.q, s.v + system.with_internal(V * dw, jnp.zeros_like(dw)), s.t, new)
     change = answer(force - system.force(s.q, s.v, s.t, new))
@@ -162,10 +167,9 @@ def jumped(method, system, s, after, both, h, answer):
     return seldom(smooth, stiff, after, s, freeze(both), h)
 
 
-def reads_velocity(layer):
+def reads_velocity(system, s, params):
     """Whether the force depends on v."""
-    s, force = layer.base, layer.system.force
-    return traced(lambda v: force(s.q, v, s.t, layer.params), s.v).reads(None)[0]
+    return traced(lambda v: system.force(s.q, v, s.t, params), s.v).reads(None)[0]
 
 
 def without_layer(method, layer, h, damped, corrects, finish):
@@ -192,7 +196,7 @@ def without_layer(method, layer, h, damped, corrects, finish):
         return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)._replace(damps=jnp.any(C != 0))
 
     data = layer.data()
-    large = layer.zeros().size > LARGEST or layer.system.matrices is not None
+    large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
     if large or options.solve is not None or options.redundant is not None:
         return by_maps(method, data, h)
     return derivative_at_need(by_maps, by_matrices, method, data, h)
@@ -300,12 +304,16 @@ def damping(layer, factorize, at, tangent):
     def drag(x):
         return tangent(zero._replace(v=layer.located(x)))[: v.size]
 
-    if not isinstance(factorize, Trusted):
+    if not (isinstance(factorize, Trusted) or layer.system.linear):
         C = staged(partial(linear_map, drag), v.size)(v)
         C = (C + C.T) / 2
         return partial(matvec, C), jnp.any(C != 0)
     pull = jax.linear_transpose(drag, v)  # large: no matrix is formed
-    return lambda x: (drag(x) + pull(x)[0]) / 2, jnp.array(True)
+
+    def both(x):
+        return (drag(x) + pull(x)[0]) / 2
+
+    return both, jnp.any(both(jnp.asarray(1 + 0.618 * np.arange(v.size) % 0.5, v.dtype)) != 0)
 
 
 def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
