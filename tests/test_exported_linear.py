@@ -61,7 +61,7 @@ def test_matrices_are_loops(library):
     """So that a hundred unknowns are no million lines; what is small has neither loops nor factors."""
     _, library = library
     model = library.model
-    assert len(model.source.splitlines()) < 3000
+    assert len(model.source.splitlines()) < 5000  # of which the start, with three solves more than M^-1 Q, is half
     assert "double factors_0" not in model.header
     assert f"chain_real factors_0[{SIZE * SIZE}];" in model.header
     assert model.operations > 2 * SIZE**2

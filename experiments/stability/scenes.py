@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from experiments.linearization.scenes import Case, cases, elastic_pendulum, spring_and_weight, unit_mass
+from hhtjax import System
 from hhtjax.scenes import Scene
 
 
@@ -59,6 +60,16 @@ def hardening_chain() -> Scene:
     return unit_mass(force, {"k": 100.0, "k3": 1e4}, [0.0, 0.0, 0.0, 0.5], [0.0] * 4, 1.0)
 
 
+def far_from_slow_manifold() -> Scene:
+    """A node of a milligram that 1 N pushes from rest, against 50 q + 5 v: after a microsecond it is as fast as that."""
+
+    def force(q, v, t, params):
+        return 1.0 - params["k"] * q - params["c"] * v
+
+    system = System(lambda q, params: jnp.reshape(params["m"], (1,)), force)
+    return Scene(system, {"m": 1e-6, "k": 50.0, "c": 5.0}, jnp.zeros(1), jnp.zeros(1), 0.5)
+
+
 def held_out() -> list[Case]:
     """Scenes on which nothing was tuned."""
     return [
@@ -69,6 +80,7 @@ def held_out() -> list[Case]:
         Case("stick-slip", stick_slip(), 16, "Radau"),
         Case("dissipative contact", dissipative_contact(), 16, "DOP853"),
         Case("hardening chain", hardening_chain(), 16, "DOP853"),
+        Case("started far from its slow manifold", far_from_slow_manifold(), 16, "Radau"),
     ]
 
 

@@ -44,7 +44,7 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     def advance(now):
         return counted(step if now is params else take_step(now), flat, t0, dt)
 
-    start, first = entered(stepper, flat, q, v, t0, held.before(params, t0, dt), dt)
+    start, first = entered(stepper, flat, q, v, t0, held.before(params, t0, dt), dt, alone=True)
     no_info = neutral_info(jax.eval_shape(step, first)[1])
     carry = first, jnp.zeros((), jnp.int32), no_failure(no_info)
     keep = partial(saved, flat)
@@ -87,7 +87,8 @@ def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False):
 
         return next_step
 
-    start, begun = entered(stepper, flat, q, v, t0, held.before(params, t0, first), first, resolves=resolves)
+    how = {"resolves": resolves, "alone": not resolves}
+    start, begun = entered(stepper, flat, q, v, t0, held.before(params, t0, first), first, **how)
     no_info = neutral_info(jax.eval_shape(step, begun, none)[1])
     carry, keep = (begun, none, no_failure(no_info)), partial(saved, flat)
     return Loop(carry, advance(params), keep, no_info, advance, lambda count: tuple(sizes(count)[:2]), start)

@@ -112,7 +112,7 @@ def flag(part, bad, code, which):
 
 def begin(ways, q, v, t, params, h, moves=True):
     """The state from which a step of size h goes at a new start; moves: whether its velocity may be another."""
-    return staged(lambda q, v, t, h: entered(ways.stepper, ways.flat, q, v, t, params, h, moves)[1])(q, v, t, h)
+    return staged(lambda q, v, t, h: entered(ways.stepper, ways.flat, q, v, t, params, h, moves=moves)[1])(q, v, t, h)
 
 
 def meet(ways, now, found, h, params):

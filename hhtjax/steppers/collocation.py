@@ -38,9 +38,9 @@ class Collocation(Stepper):
         """w0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
 
-    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
         """The state from which the first step goes, as of the `hht` family; for 2 h, as the equation holds beyond h."""
-        return self.newmark.smoothed(system, state, params, 2 * dt, moves, resolves)._replace(a=None)
+        return self.newmark.smoothed(system, state, params, 2 * dt, moves, resolves, alone)._replace(a=None)
 
     def jumped(self, system, before, after, old, new, dt, answer):
         """The same where held inputs jump."""

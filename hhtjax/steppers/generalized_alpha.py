@@ -75,12 +75,12 @@ class GeneralizedAlpha(Controlled, Stepper):
         w = system.acceleration(q, v, t, params, self.factorize)
         return State(t, q, v, w, w)
 
-    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
         """The state from which the first step goes, by `start`."""
         if self.options.start == "simple" or not system.positions or (resolves and not self.corrects(system)):
             return state
         smooth = smoothed if system.friction is None else smoothed_friction
-        return smooth(self, system.settled(params), state, params, dt, moves, resolves)
+        return smooth(self, system.settled(params), state, params, dt, moves, resolves, alone)
 
     def jumped(self, system, before, after, old, new, dt, answer):
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""

@@ -12,7 +12,7 @@ h^2 w (1/2 - beta/gamma) of it in q: any multiple of F/k. So a step begins behin
 
 Where the step resolves the motion v+ - v is O(h^5), and w is M^-1 Q but for O(h^5): order and error constants stay.
 Elsewhere w is bounded. Forces without dissipation, such as gyroscopic ones, have an antisymmetric C, and move no
-velocity.
+velocity. Where C + C^T is 0 nothing changes at all: the recursion throws no spring by its M^-1 Q.
 
 While its velocity changes a coordinate falls back by m/c dv. Here v+ is that of the end, and what the recursion makes
 of the rest, v + dv - v+, is half a step of it. With the factor [1 + ...], whose slope at P = 1 is that of P^(2 gamma),
@@ -30,17 +30,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from hhtjax.description import freeze, thaw
-from hhtjax.numerics.elimination import diagonal, inverse, matvec
+from hhtjax.numerics.elimination import UNROLLED, diagonal, inverse, matvec
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import curvature, jacobian, reaction, violation
-from hhtjax.xla import linear_map, staged, traced
+from hhtjax.xla import linear_map, one_kernel, staged, traced
 
 POWERS, CORRECTIONS = 5, 5
 ITERATIONS = 40  # of Newton's method, at most
@@ -117,22 +118,28 @@ class Layer(NamedTuple):
         return jnp.zeros(self.system.size + self.system.num_constraints, self.base.v.dtype)
 
 
-def smoothed(method, system, s, params, h, moves=True, resolves=False, finish=None):
+def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=False, finish=None):
     """The state from which the first step h goes, behind the layer at the start s.
 
     moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M.
-    finish: what is made of the implicit step, by default `finished`.
+    alone: whether no kernel is around. finish: what is made of the implicit step, by default `finished`.
     """
-    zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
-    layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
-    moved, damped = reads(layer)
-    corrects = method.corrects(system)
-    if layer.B is None and not (damped or corrects or (moved and method.resizes)):
-        return s  # nothing that M^-1 Q could throw
-    v, z, wdot, *more = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
-    w, L = layer.parts(z)
-    a = w if wdot is None else method.corrected(system, v, w, wdot, h)
-    return s._replace(v=v, w=w, a=a, L=L, **more[0] if more else {})
+    damped, corrects = reads_velocity(system, s, params), method.corrects(system)
+    if not (system.num_constraints or damped or corrects):
+        return s  # M^-1 Q throws a velocity, but nothing that a spring holds
+
+    def behind(s):
+        zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
+        layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
+        found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
+        w, L = layer.parts(found.z)
+        if finish is None and not resolves:  # M^-1 Q as it is, where nothing damps
+            w, L = choose(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
+        a = w if found.wdot is None else method.corrected(system, found.v, w, found.wdot, h)
+        s1 = s._replace(v=found.v, w=w, a=a, L=L)
+        return s1 if found.friction is None else s1._replace(friction=found.friction)
+
+    return one_kernel(behind, s, around=True) if alone else behind(s)
 
 
 def jumped(method, system, s, after, both, h, answer):
@@ -141,7 +148,7 @@ def jumped(method, system, s, after, both, h, answer):
     That is so where the velocity of an explicit step, h gamma dw, changes the accelerations by more than a part of dw.
     """
     new, dw, V = both[1], after.w - s.w, method.coefficients.gamma * h
-    if system.friction is not None or not reads(Layer(system, new, s, 0.0, 0.0, 0.0, None, None))[1]:
+    if system.friction is not None or not reads_velocity(system, s, new):
         return after
     force = system.force(s.q, s.v + system.with_internal(V * dw, jnp.zeros_like(dw)), s.t, new)
     change = answer(force - system.force(s.q, s.v, s.t, new))
@@ -152,7 +159,7 @@ def jumped(method, system, s, after, both, h, answer):
         old, new = map(thaw, both)
         layer = Layer.of(method, system, new, h, s._replace(a=None, friction=None, memory=None))
         layer = layer._replace(offset=layer._replace(params=old).rows(layer.base))
-        v, z, _ = without_layer(method, layer, h, True, False, finished)
+        v, z, *_ = without_layer(method, layer, h, True, False, finished)
         dw, dL = layer.parts(z)
         a, L = (None if x is None else x + change for x, change in ((s.a, dw), (s.L, dL)))
         return s._replace(v=v, w=s.w + dw, a=a, L=L)
@@ -160,14 +167,13 @@ def jumped(method, system, s, after, both, h, answer):
     return seldom(smooth, stiff, after, s, freeze(both), h)
 
 
-def reads(layer):
-    """Whether the force depends on q, and on v."""
-    s, force = layer.base, layer.system.force
-    return traced(lambda q, v: force(q, v, s.t, layer.params), s.q, s.v).reads(None)
+def reads_velocity(system, s, params):
+    """Whether the force depends on v."""
+    return traced(lambda v: system.force(s.q, v, s.t, params), s.v).reads(None)[0]
 
 
 def without_layer(method, layer, h, damped, corrects, finish):
-    """v+, the changes z = (dw, dL), and dw/dt where it is asked for; or what else `finish` makes of them.
+    """What `finish` makes of the implicit step: a `Found`.
 
     The value comes from matrices, where these are small, and traces the force as seldom as can be, for programs that
     compile in less time; derivatives from what is differentiable.
@@ -180,35 +186,46 @@ def without_layer(method, layer, h, damped, corrects, finish):
         factorize = newmark.factorization(known.system, known.params, known.V / c.gamma)
         z = known.zeros() if known.system.linear or not damped else root(known, factorize)
         inverse, z, at, tangent = newton_step(known, factorize, z)
-        drag = damping(known, factorize, at, tangent) if damped else None
-        return finish(method, known, inverse, drag, z, h, corrects)
+        drag, damps = damping(known, factorize, at, tangent)
+        return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
 
     def by_matrices(method, data, h):
         known = layer.with_data(data)
         z, inverse, C = expanded(known, damped)
         drag = partial(matvec, C) if damped else None
-        return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)
+        return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)._replace(damps=jnp.any(C != 0))
 
     data = layer.data()
-    large = layer.zeros().size > LARGEST or layer.system.matrices is not None
+    large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
     if large or options.solve is not None or options.redundant is not None:
         return by_maps(method, data, h)
     return derivative_at_need(by_maps, by_matrices, method, data, h)
 
 
+class Found(NamedTuple):
+    """Behind a layer: v+, the changes z = (dw, dL), dw/dt where it is asked for, whether anything damps at all, and
+    dry friction where there is some."""
+
+    v: Any
+    z: Any
+    wdot: Any = None
+    damps: Any = None
+    friction: Any = None
+
+
 def finished(method, layer, inverse, drag, z, h, corrects):
-    """The same, from the solve with the matrix of the step, the map C, and z behind the implicit step."""
+    """The `Found`, from the solve with the matrix of the step, the map C, and z behind the implicit step."""
     v, bend = layer.base.v, layer.bend
     if drag is not None:
         v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
         bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
     z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend))
     if not corrects:
-        return v, z, None
+        return Found(v, z)
     dw, dL = layer.parts(z)
     base = layer.base
     s = base._replace(v=v, w=base.w + dw, L=None if dL is None else base.L + dL)
-    return v, z, layer.parts(rate_of(layer, s, inverse))[0]
+    return Found(v, z, layer.parts(rate_of(layer, s, inverse))[0])
 
 
 def expanded(layer, damped):
@@ -281,17 +298,22 @@ def newton_step(layer, factorize, z):
 
 
 def damping(layer, factorize, at, tangent):
-    """The map (C + C^T)/2 at a state."""
+    """The map (C + C^T)/2 at a state, and whether it is anything but 0."""
     zero, v = jax.tree.map(jnp.zeros_like, at), layer.base.v
 
     def drag(x):
         return tangent(zero._replace(v=layer.located(x)))[: v.size]
 
-    if not isinstance(factorize, Trusted):
+    if not (isinstance(factorize, Trusted) or layer.system.linear):
         C = staged(partial(linear_map, drag), v.size)(v)
-        return partial(matvec, (C + C.T) / 2)
+        C = (C + C.T) / 2
+        return partial(matvec, C), jnp.any(C != 0)
     pull = jax.linear_transpose(drag, v)  # large: no matrix is formed
-    return lambda x: (drag(x) + pull(x)[0]) / 2
+
+    def both(x):
+        return (drag(x) + pull(x)[0]) / 2
+
+    return both, jnp.any(both(jnp.asarray(1 + 0.618 * np.arange(v.size) % 0.5, v.dtype)) != 0)
 
 
 def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):

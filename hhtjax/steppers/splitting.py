@@ -42,11 +42,11 @@ class OperatorSplitting(Stepper):
         memory = Memory(system.widened(K), C, self.weighted_force(system, q, v, t, params))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
-    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
         """The state from which the first step goes, as of the `hht` family."""
         hht = GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
         K, C, _ = state.memory
-        s = hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves)
+        s = hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves, alone)
         left = system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)  # not 0 of what is stiff
         P = self.weighted_force(system, s.q, s.v, s.t, params) + left
         return s._replace(a=None, memory=Memory(K, C, P))

@@ -13,7 +13,6 @@ from hhtjax.systems import held, kinematics
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.system import require_system as require_system
-from hhtjax.xla import one_kernel
 
 
 @shown
@@ -148,11 +147,11 @@ class Stepper(Description):
         """State at the initial time, for a `FlatSystem`."""
         raise NotImplementedError
 
-    def smoothed(self, system, state, params, dt, moves=True, resolves=False):
+    def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
         """The state from which the first step goes, where that is another than the one at the initial time.
 
         moves: whether its velocity may be another, too. resolves: whether the first step, by error control, is so short
-        that it follows what is fastest."""
+        that it follows what is fastest. alone: whether no kernel is around."""
         return state
 
     def jumped(self, system, before, after, old, new, dt, answer):
@@ -201,13 +200,15 @@ def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
     require_capable(caller, system, stepper, q0, v0)
     flat, q, v = flatten(caller, system, q0, v0, t0, params, z0)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
-    return _unravel(flat, entered(stepper.astype(q.dtype), flat, q, v, t0, held.before(params, t0, dt), dt)[1])
+    return _unravel(
+        flat, entered(stepper.astype(q.dtype), flat, q, v, t0, held.before(params, t0, dt), dt, alone=True)[1]
+    )
 
 
-def entered(stepper, system, q, v, t, params, dt, moves=True, resolves=False):
-    """The state at a start, and that from which the first step dt goes."""
+def entered(stepper, system, q, v, t, params, dt, **how):
+    """The state at a start, and that from which the first step dt goes. how: of `Stepper.smoothed`."""
     start = stepper.begin(system, q, v, t, params, dt)
-    return start, one_kernel(lambda s: stepper.smoothed(system, s, params, dt, moves, resolves), start, around=True)
+    return start, stepper.smoothed(system, start, params, dt, **how)
 
 
 def require_stepper(caller, stepper):
