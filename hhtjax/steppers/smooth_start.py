@@ -347,7 +347,7 @@ def rate_of(layer, s, inverse):
     system, params = layer.system, layer.params
 
     def rows(q, v, t):
-        force = system.inertia(q, s.w, params) - system.force(q, v, t, params)
+        force = system.inertia(q, s.w, t, params) - system.force(q, v, t, params)
         if layer.B is None:
             return force
         along = system.rate(q, v), s.w, jnp.ones_like(t)

@@ -47,7 +47,7 @@ class OperatorSplitting(Stepper):
         hht = GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
         K, C, _ = state.memory
         s = hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves, alone)
-        left = system.inertia(s.q, s.w, params) - system.force(s.q, s.v, s.t, params)  # not 0 of what is stiff
+        left = system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)  # not 0 of what is stiff
         P = self.weighted_force(system, s.q, s.v, s.t, params) + left
         return s._replace(a=None, memory=Memory(K, C, P))
 
