@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.systems.constraints import answers
-from hhtjax.systems.friction import held_back
+from hhtjax.systems.friction_rows import depends, held_back
 from hhtjax.systems.sampled import SLOP, Sampled
 
 
@@ -70,7 +70,7 @@ def jump(stepper, system, s, old, new):
     if system.num_constraints:
         L = s.L + dL
     if system.friction is not None:
-        dw, friction = held_back(system, s, L, old, new, dw, answer)
+        dw, friction, L = held_back(system, s, L, old, new, dw, answer, depends(system, stepper.redundant))
         s = s._replace(friction=friction)
     return s._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
 

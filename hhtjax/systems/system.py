@@ -108,6 +108,7 @@ class System(Description):
     internal: Callable | None = None
     friction: Callable | None = None
     sliding: Callable | None = None
+    depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
     def __post_init__(self):
         if self.internal is None:
