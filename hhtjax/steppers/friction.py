@@ -120,7 +120,7 @@ def bind_friction(method, system, params, dt, kept=None):
         H = directions(system, at.q, at.t, params)
         G = _each(inverse, jnp.pad(H, ((0, 0), (0, z.size - size))))
         pulls = G[:, size : size + system.num_constraints]
-        rows = rows_of(system, at.q, at.t, params, H, G[:, :size], pulls, smooth == 0, dependent)
+        rows = rows_of(system, at.q, at.t, params, H, G[:, :size], pulls, sig == 0, dependent)
         W = across(H, _each(along, G).v)
 
         def sliding(z):
@@ -130,12 +130,16 @@ def bind_friction(method, system, params, dt, kept=None):
         f = law.limit(held.q, held.v, held.L, held.t, params)
         z = z - matvec(G.T, jnp.where(stops, sig * f, 0))
         driven = dependent and is_prescribed(system, rows, pulls, (s, at), params)
-        end, left = _switches(sliding(z), law.sliding(s.q, s.v, s.t, params), sig, tau, f, W, rows, dt, driven)
+        end, left, held = _switches(sliding(z), law.sliding(s.q, s.v, s.t, params), sig, tau, f, W, rows, dt, driven)
+
+        def displacement(z):
+            x = method.advance(s, dt, z[:size])[0]
+            taken = None if shift is None else shift(z[size + system.num_constraints :])
+            return x if taken is None else x - taken
+
+        still = displacement(z - matvec(G.T, held)) if dependent else None
         z = z - matvec(G.T, end.tau)
-        x = method.advance(s, dt, z[:size])[0]
-        taken = None if shift is None else shift(z[size + system.num_constraints :])
-        x = x if taken is None else x - taken
-        s1 = system.tidy(_behind(system, params, s, path(z), x, end, f, G, rows, dependent))
+        s1 = system.tidy(_behind(system, params, s, path(z), displacement(z), end, f, G, rows, still))
         if method.estimating:
             defect = _defect(method, system, params, rubbing, path(z), end.tau + jnp.where(stops, sig * f, 0), inverse)
             info = info._replace(defect=defect, switched=_switched(system, s, s1, end, G, dependent))
@@ -188,17 +192,22 @@ def _free_step(options, system, r, path, z, s, factorize, at):
 
 
 def _switches(sf, s, sig, tau, f, W, rows, h, driven):
-    """How joints come out of the step, and what part of it is left where there were too many events."""
+    """How joints come out of the step, and what part of it is left where there were too many events; of rows that may
+    depend on each other also what would hold joints that stick."""
     if driven is not False:
         return run_pieces(sf, s, sig, tau, f, W, rows, h, driven)
     Wh = h * rows.K
     if len(f) == 1:
-        return switch(sf, s, sig, tau, f, diagonal(W), diagonal(Wh)), jnp.zeros((), sf.dtype)
-    return run_events(sf, s, sig, tau, f, W, Wh)
+        return switch(sf, s, sig, tau, f, diagonal(W), diagonal(Wh)), jnp.zeros((), sf.dtype), None
+    return *run_events(sf, s, sig, tau, f, W, Wh), None
 
 
-def _behind(system, params, s, s1, x, end, f, G, rows, dependent):
-    """The state s1 at the end of the step, displaced by x, moved onto the branches on which its joints end."""
+def _behind(system, params, s, s1, x, end, f, G, rows, still):
+    """The state s1 at the end of the step, displaced by x, moved onto the branches on which its joints end.
+
+    still: of rows that may depend on each other, the displacement if nobody switched.
+    """
+    dependent = still is not None
     h, sig, K = s1.t - s.t, s.friction.sig, rows.K
     size, sliding = system.size, system.friction.sliding
     moves, sticks = ~end.kept & (end.sig != 0), ~end.kept & (end.sig == 0)
@@ -206,8 +215,11 @@ def _behind(system, params, s, s1, x, end, f, G, rows, dependent):
     middle = directions(system, system.move(s.q, x / 2), s.t + h / 2, params)
     zero = jnp.zeros(size, x.dtype)
     own = [sliding(y.q, zero, y.t, params) for y in (s, s1)]
-    slid = matvec(middle, x) + h / 2 * (own[0] + own[1])
-    x = _taken_off(x, rows.solve(K, ~end.kept, slid - end.slid * h, sticks), Gv)
+    slid, there = matvec(middle, x) + h / 2 * (own[0] + own[1]), rows.carriers(~end.kept)
+    if dependent:
+        before = jnp.where(sig == 0, 0, matvec(middle, still) + h / 2 * (own[0] + own[1]))
+        slid = slid - before
+    x = _taken_off(x, rows.solve(K, there, slid - end.slid * h), Gv)
     s1 = s1._replace(q=system.move(s.q, x))
     s1 = s1._replace(v=_taken_off(s1.v, rows.solve(K, sticks, sliding(s1.q, s1.v, s1.t, params)), Gv))
 
@@ -218,7 +230,7 @@ def _behind(system, params, s, s1, x, end, f, G, rows, dependent):
     w = s1.w - matvec(Gv.T, onto)
     y = rows.solve(K, sticks, matvec(H, w) + own)
     w = _taken_off(w, y, Gv)
-    a = _taken_off(s1.a, rows.solve(K, ~end.kept, matvec(H, s1.a - w), sticks), Gv)
+    a = _taken_off(s1.a, rows.solve(K, there, matvec(H, s1.a - w)), Gv)
     borne, tau = onto + y, jnp.where(sticks, sig * f + (end.tau + onto) + y, end.sig * f)
     if dependent:
         shared = rows.shared(sticks, tau, f)

@@ -39,8 +39,9 @@ class Course(NamedTuple):
 
 
 def run_pieces(sf, s, sig, tau, f, W, rows, h, driven):
-    """How joints come out of a step that start with s and, unless they stick, would come out with sf; and what part of
-    the step is left where the events were too many. W: fall of sf by units of friction; driven: where a part of s
+    """How joints come out of a step that start with s and, unless they stick, would come out with sf; what part of the
+    step is left where the events were too many; and what would hold joints that stick if nobody switched. Distances are
+    those beyond the ones of that step. W: fall of sf by units of friction; driven: where a part of s
     is prescribed."""
     smooth = f == 0  # where nothing rubs, nothing switches
     stuck, basis = (sig == 0) & ~smooth, rows.basis
@@ -61,9 +62,9 @@ def run_pieces(sf, s, sig, tau, f, W, rows, h, driven):
     begin = Moment(jnp.zeros((), s.dtype), s0, jnp.where(turned, -sig, sig), jnp.zeros_like(s), ~stuck & ~turned)
     end = _to_the_end(begin, course)
     to = _directions(end, course, 1.0)
-    dtau = rows.solve(W, ~end.kept, sf - end.s)
+    dtau = rows.solve(W, rows.carriers(~end.kept), sf - end.s)
     to = jnp.where(smooth, jnp.sign(sf - matvec(W, dtau)), to)
-    return Switch(end.s, to, dtau, end.slid, end.kept), 1 - end.theta
+    return Switch(end.s, to, dtau, end.slid - s0 - c / 2, end.kept), 1 - end.theta, held
 
 
 @jax.custom_jvp

@@ -37,13 +37,17 @@ class Independent(NamedTuple):
 
     K: Any
 
-    def solve(self, A, some, b, first=None):
+    def solve(self, A, some, b):
         """y with A y = b on those rows and columns, 0 elsewhere."""
         return solver_of_some(A, some)(b)
 
     def at_rest(self, rests, load, f, size=None):
         """sig and tau of joints at rest."""
         return at_rest(self.K, rests, load, f)
+
+    def carriers(self, some):
+        """The same rows."""
+        return some
 
 
 class Dependent(NamedTuple):
@@ -62,13 +66,17 @@ class Dependent(NamedTuple):
         """As many of those rows as do not depend on each other; from `first`, while there are such."""
         return independent(self.K, self.least, some, first)
 
-    def solve(self, A, some, b, first=False):
+    def solve(self, A, some, b):
         """y with A y = b on as many of those rows and columns as are independent, 0 elsewhere."""
-        return solver_of_some(A, self.spanning(some, first))(b)
+        return solver_of_some(A, self.spanning(some))(b)
 
     def at_rest(self, rests, load, f, size=0.0):
         """sig and tau of joints at rest, from their loads, which are made of terms of this size."""
         return at_rest_in_box(self, rests, load, f, size)
+
+    def carriers(self, some):
+        """The rows of the basis that some rows are made of."""
+        return self.basis & jnp.any(some[None, :] & (self.C != 0), axis=1)
 
     def shared(self, sticks, tau, f):
         """tau, where joints stick in other forces that do the same, within the limits."""
@@ -225,8 +233,8 @@ def smallest_in_box(K, load, f, moved):
         block = jnp.where(pinned[:, None] | pinned[None, :], eye, A)
         step = -solver(block)(jnp.where(pinned, 0, g))
         tried = jnp.concatenate([shorter[:, None] * step[None, :], -shorter[:, None] * g[None, :]])
-        path = jnp.clip(u[None, :] + tried, -top, top)
-        costs = jnp.sum(path * (path @ A / 2 - pull), axis=1)
+        path = jnp.clip(u[None, :] + tried, -top[None, :], top[None, :])
+        costs = jnp.sum(path * (path @ A / 2 - pull[None, :]), axis=1)
         cost, size = jnp.sum(u * (matvec(A, u) / 2 - pull)), jnp.sum(jnp.abs(u * pull))
         lower = jnp.any(costs < cost - 16 * eps * size)
         better = jnp.where(lower, path[jnp.argmin(costs)], path[0])
