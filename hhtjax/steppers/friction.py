@@ -25,7 +25,7 @@ from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.low_rank import Updated
 from hhtjax.steppers.constrained import equations, report_constraints
 from hhtjax.steppers.friction_events import run_events
-from hhtjax.steppers.friction_law import is_settled, switch
+from hhtjax.steppers.friction_law import DEPENDENT, is_settled, switch
 from hhtjax.steppers.friction_loops import run_pieces
 from hhtjax.steppers.newton import newton, solve_and_keep
 from hhtjax.steppers.residual import residual
@@ -143,6 +143,7 @@ def bind_friction(method, system, params, dt, kept=None):
         if method.estimating:
             defect = _defect(method, system, params, rubbing, path(z), end.tau + jnp.where(stops, sig * f, 0), inverse)
             info = info._replace(defect=defect, switched=_switched(system, s, s1, end, G, dependent))
+        left = jnp.where(rows.are_dependent(), DEPENDENT, left)
         info = _told(info, left, _is_limit(law, at, params) & ~jnp.any((f < 0) | (f == jnp.inf)))
         return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
 

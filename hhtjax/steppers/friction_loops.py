@@ -24,6 +24,9 @@ from hhtjax.steppers.friction_law import Switch
 from hhtjax.systems.friction_rows import slides_in_box, slight
 
 
+BEYOND = 2.0  # theta of a step that is done
+
+
 class Course(NamedTuple):
     """A step in which nobody switches: its ds/dtheta, and its friction, base = start + theta rise; limits; the rows,
     what a unit of force does to velocities in the step, what is rounding of that, and how large the terms of c are."""
@@ -61,10 +64,9 @@ def run_pieces(sf, s, sig, tau, f, W, rows, h, driven):
     course = Course(c, start, rise, f, rows, h * rows.K, h * rows.least, lax.stop_gradient(size))
     begin = Moment(jnp.zeros((), s.dtype), s0, jnp.where(turned, -sig, sig), jnp.zeros_like(s), ~stuck & ~turned)
     end = _to_the_end(begin, course)
-    to = _directions(end, course, 1.0)
     dtau = rows.solve(W, rows.carriers(~end.kept), sf - end.s)
-    to = jnp.where(smooth, jnp.sign(sf - matvec(W, dtau)), to)
-    return Switch(end.s, to, dtau, end.slid - s0 - c / 2, end.kept), 1 - end.theta, held
+    to = jnp.where(smooth, jnp.sign(sf - matvec(W, dtau)), end.sig)
+    return Switch(end.s, to, dtau, end.slid - s0 - c / 2, end.kept), jnp.maximum(1 - end.theta, 0), held
 
 
 @jax.custom_jvp
@@ -73,7 +75,7 @@ def _to_the_end(at, course):
 
     def unfinished(carry):
         at, i = carry
-        return (at.theta < 1) & (i < EVENTS * len(at.s))
+        return (at.theta < BEYOND) & (i < EVENTS * len(at.s))
 
     return lax.while_loop(unfinished, lambda x: (_piece(x[0], course), x[1] + 1), (at, 0))[0]
 
@@ -87,13 +89,13 @@ def _by_pieces(at, course):
     """The same in a fixed number of pieces, for reverse mode."""
 
     def visit(at, _):  # a `lax.cond` cannot be transposed in a batch, as this is the rule of a derivative
-        return seldom(_piece, at.theta < 1, at, course), None
+        return seldom(_piece, at.theta < BEYOND, at, course), None
 
     return lax.scan(visit, at, length=PIECES[0] + PIECES[1] * len(at.s))[0]
 
 
 def _piece(at, course):
-    """On to the next joint that comes to rest, or to the end of the step."""
+    """On to the next joint that comes to rest, or to the end of the step; and there, who starts to slide."""
     f, smooth, rest = course.f, course.f == 0, 1 - at.theta
     middle = (1 + at.theta) / 2
     sig = _directions(at, course, middle)
@@ -107,7 +109,7 @@ def _piece(at, course):
     who = due & (wait <= go + slight(f.dtype))
     s = at.s + go * speed
     slid = at.slid + go * (at.s + s) / 2
-    theta = jnp.where(due, at.theta + go, 1)
+    theta = jnp.where(due, at.theta + go, jnp.where(at.theta < 1, 1.0, BEYOND))
     return Moment(theta, jnp.where(who | rests, 0, s), jnp.where(who, 0, sig), slid, at.kept & ~who)
 
 

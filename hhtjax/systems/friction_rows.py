@@ -45,6 +45,15 @@ class Independent(NamedTuple):
         """sig and tau of joints at rest."""
         return at_rest(self.K, rests, load, f)
 
+    def are_dependent(self):
+        """Whether they depend on each other after all."""
+        left, least, m = lax.stop_gradient(self.K), _rounding(self.K), len(self.K)
+        found = jnp.zeros((), bool)
+        for i in range(m - 1):  # what is left of a diagonal, without those before it
+            left = left - left[:, i, None] * left[None, i, :] / left[i, i]
+            found = found | (jnp.abs(left[i + 1, i + 1]) < least[i + 1])
+        return found
+
     def carriers(self, some):
         """The same rows."""
         return some
@@ -68,11 +77,15 @@ class Dependent(NamedTuple):
 
     def solve(self, A, some, b):
         """y with A y = b on as many of those rows and columns as are independent, 0 elsewhere."""
-        return solver_of_some(A, self.spanning(some))(b)
+        return solver_of_positive(A, self.spanning(some))(b)
 
     def at_rest(self, rests, load, f, size=0.0):
         """sig and tau of joints at rest, from their loads, which are made of terms of this size."""
         return at_rest_in_box(self, rests, load, f, size)
+
+    def are_dependent(self):
+        """That is known of them."""
+        return False
 
     def carriers(self, some):
         """The rows of the basis that some rows are made of."""
@@ -98,20 +111,20 @@ def rows_of(system, q, t, params, H, G, pulls, first, dependent):
     K = jnp.stack([matvec(H, g) for g in G], axis=1)
     if not dependent:
         return Independent(K)
-    least = _limit(K.dtype) * diagonal(K)
+    least = _rounding(K)
     if system.num_constraints:
         least = least / _left_by_constraints(H, pulls, jacobian(system, q, t, params)) ** 2
-    least = lax.stop_gradient(jnp.abs(least))
+    least = lax.stop_gradient(least)
     basis = independent(K, least, jnp.ones(len(K), bool), first)
-    inverse, moved = solver_of_some(K, basis), diagonal(K) > least
+    inverse, moved = solver_of_positive(K, basis), diagonal(K) > least
     C = jnp.stack([inverse(jnp.where(moved[j], K[:, j], 0)) for j in range(len(K))], axis=1)
     C = jnp.where(basis[:, None] & basis[None, :], jnp.eye(len(K), dtype=K.dtype), C)
     return Dependent(_through(C, basis, K), C, basis, least)
 
 
-def _limit(dtype):
-    """In single precision more."""
-    return max(LIMIT, 1e3 * float(jnp.finfo(dtype).eps))
+def _rounding(K):
+    """What is rounding in the diagonal of K: in single precision more."""
+    return max(LIMIT, 1e3 * float(jnp.finfo(K.dtype).eps)) * jnp.abs(diagonal(K))
 
 
 def slight(dtype):
@@ -129,8 +142,37 @@ def _left_by_constraints(H, pulls, B):
     """Which part of each row constraints leave to move something: at most 1, and more than 0."""
     left, taken = jnp.abs(H + pulls @ B), jnp.abs(H) + jnp.abs(pulls) @ jnp.abs(B)
     unit = jnp.maximum(jnp.max(jnp.abs(H), axis=0), jnp.max(jnp.abs(B), axis=0))  # of each coordinate
-    left, taken = (jnp.max(x / jnp.where(unit == 0, 1, unit), axis=1) for x in (left, taken))
+    left, taken = (jnp.max(x / jnp.where(unit == 0, 1, unit)[None, :], axis=1) for x in (left, taken))
     return jnp.clip(left / jnp.where(taken == 0, 1, taken), float(jnp.finfo(H.dtype).eps), 1)
+
+
+def solver_of_positive(A, some):
+    """b -> y with A y = b on those rows and columns, 0 elsewhere, of an A that is positive there."""
+
+    def factorize(A):
+        inverse = _inverse(lax.stop_gradient(A))
+        return lambda b, trans=0: (inverse.T if trans else inverse) @ b
+
+    solve = solver(_alone(A, some), factorize)
+    return lambda b: solve(jnp.where(some, b, 0))
+
+
+def _alone(A, some):
+    """A on those rows and columns, beside ones."""
+    return jnp.where(some[:, None] & some[None, :], A, jnp.eye(len(A), dtype=A.dtype))
+
+
+def _inverse(A):
+    """Of a positive A, which needs no other pivots, by as short a program as can be."""
+    i = jnp.arange(len(A))
+
+    def exchange(k, X):
+        row, column, pivot = X[k], X[:, k] / X[k, k], X[k, k]
+        there, down = (i == k)[:, None], (i == k)[None, :]
+        rest = jnp.where(down, -column[:, None], X - column[:, None] * row[None, :])
+        return jnp.where(there, jnp.where(down, 1 / pivot, (row / pivot)[None, :]), rest)
+
+    return lax.fori_loop(0, len(A), exchange, A)
 
 
 def independent(K, least, some, first=False):
@@ -184,7 +226,7 @@ def at_rest_in_box(rows, rests, load, f, size=0.0):
     sticks = rests & (sig == 0)
     tau = jnp.where(sig == 0, tau, sig * f)
     inside = sticks & (jnp.abs(tau) < f)
-    held = solver_of_some(K, rows.spanning(sticks, inside))
+    held = solver_of_positive(K, rows.spanning(sticks, inside))
     return sig, tau + held(load - matvec(K, tau))
 
 
@@ -219,7 +261,7 @@ def smallest_in_box(K, load, f, moved):
         return jnp.max(jnp.abs(jnp.clip(u - g, -top, top) - u))
 
     def enough(u):
-        return 64 * eps * (jnp.max(jnp.abs(b)) + jnp.max(matvec(jnp.abs(R), jnp.abs(u))))
+        return 64 * eps * (jnp.max(jnp.abs(b)) + jnp.max(jnp.abs(R) @ jnp.abs(u)))
 
     def unfinished(carry):
         _, _, done, i = carry
@@ -228,21 +270,20 @@ def smallest_in_box(K, load, f, moved):
     def improve(carry):
         u, old, _, i = carry
         pull = b + PROXIMAL * old
-        g = matvec(A, u) - pull
+        g = A @ u - pull
         pinned = ((u >= top) & (g < 0)) | ((u <= -top) & (g > 0)) | ~moved
-        block = jnp.where(pinned[:, None] | pinned[None, :], eye, A)
-        step = -solver(block)(jnp.where(pinned, 0, g))
+        step = -(_inverse(_alone(A, ~pinned)) @ jnp.where(pinned, 0, g))
         tried = jnp.concatenate([shorter[:, None] * step[None, :], -shorter[:, None] * g[None, :]])
         path = jnp.clip(u[None, :] + tried, -top[None, :], top[None, :])
         costs = jnp.sum(path * (path @ A / 2 - pull[None, :]), axis=1)
-        cost, size = jnp.sum(u * (matvec(A, u) / 2 - pull)), jnp.sum(jnp.abs(u * pull))
+        cost, size = jnp.sum(u * (A @ u / 2 - pull)), jnp.sum(jnp.abs(u * pull))
         lower = jnp.any(costs < cost - 16 * eps * size)
         better = jnp.where(lower, path[jnp.argmin(costs)], path[0])
-        calmer = away(better, matvec(A, better) - pull) < away(u, g)  # where costs are rounding
+        calmer = away(better, A @ better - pull) < away(u, g)  # where costs are rounding
         at_minimum = (away(u, g) <= enough(u)) | ~(lower | calmer)
         new = jnp.where(at_minimum, u, better)
         settled = jnp.max(jnp.abs(u - old)) <= eps * jnp.max(jnp.abs(u))
-        done = at_minimum & (settled | (away(u, matvec(R, u) - b) <= 8 * enough(u)))
+        done = at_minimum & (settled | (away(u, R @ u - b) <= 8 * enough(u)))
         return new, jnp.where(at_minimum, u, old), done, i + 1
 
     begin = jnp.zeros_like(b)
