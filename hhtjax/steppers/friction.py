@@ -101,10 +101,11 @@ def bind_friction(method, system, params, dt, kept=None):
     kept: a `Changing` that knows the matrix without the slopes of limits, which H^T, then constant, spreads.
     """
     law, size, dependent = system.friction, system.size, depends(system, method.redundant)
+    driven = method.redundant is None and system.num_constraints >= system.positions
 
     def step(s):
         r, path, z, shift, B = _equations(method, system, params, dt, s)
-        stops, at = _foreseen(system, params, dt, s, path(z))
+        stops, at = _foreseen(system, params, dt, s, path(z), driven)
         sig, tau = s.friction
         smooth = jnp.where(stops, 0, sig)
 
@@ -129,8 +130,8 @@ def bind_friction(method, system, params, dt, kept=None):
         held = path(z - matvec(G.T, rows.solve(W, smooth == 0, sliding(z))))
         f = law.limit(held.q, held.v, held.L, held.t, params)
         z = z - matvec(G.T, jnp.where(stops, sig * f, 0))
-        driven = dependent and is_prescribed(system, rows, pulls, (s, at), params)
-        end, left, held = _switches(sliding(z), law.sliding(s.q, s.v, s.t, params), sig, tau, f, W, rows, dt, driven)
+        given = dependent and is_prescribed(system, rows, pulls, (s, at), params)
+        end, left, held = _switches(sliding(z), law.sliding(s.q, s.v, s.t, params), sig, tau, f, W, rows, dt, given)
 
         def displacement(z):
             x = method.advance(s, dt, z[:size])[0]
@@ -157,12 +158,17 @@ def _equations(method, system, params, dt, s):
     return lambda s: residual(system, params, s), lambda w: method.arrive(system, s, dt, w), s.w, None, None
 
 
-def _foreseen(system, params, h, s, predicted):
+def _foreseen(system, params, h, s, predicted, driven):
     """Which joints come to rest within the step, if nothing changes, and the state to linearise about: the predicted
-    one, but when the first of them rests all accelerations end: with them its whole friction would go on to act."""
+    one, but when the first of them rests all accelerations end: with them its whole friction would go on to act.
+
+    driven: whether all motion is prescribed, which then goes on.
+    """
     sliding, (sig, tau) = system.friction.sliding, s.friction
     s0, s1 = (sliding(x.q, x.v, x.t, params) for x in (s, predicted))
     stops = (sig * s1 < 0) & (tau != 0)
+    if driven:
+        return stops, predicted
     theta = jnp.min(jnp.clip(jnp.where(stops, s0 / jnp.where(stops, s0 - s1, 1), 1), 0, 1))
     q = system.move(s.q, h * s.v + h**2 * theta * (1 - theta / 2) * s.a)
     ended = predicted._replace(q=q, v=s.v + h * theta * s.a, w=theta * s.w)
@@ -192,11 +198,11 @@ def _free_step(options, system, r, path, z, s, factorize, at):
     return z, info, inverse, along
 
 
-def _switches(sf, s, sig, tau, f, W, rows, h, driven):
+def _switches(sf, s, sig, tau, f, W, rows, h, given):
     """How joints come out of the step, and what part of it is left where there were too many events; of rows that may
     depend on each other also what would hold joints that stick."""
-    if driven is not False:
-        return run_pieces(sf, s, sig, tau, f, W, rows, h, driven)
+    if given is not False:
+        return run_pieces(sf, s, sig, tau, f, W, rows, h, given)
     Wh = h * rows.K
     if len(f) == 1:
         return switch(sf, s, sig, tau, f, diagonal(W), diagonal(Wh)), jnp.zeros((), sf.dtype), None

@@ -58,7 +58,9 @@ def run_pieces(sf, s, sig, tau, f, W, rows, h, driven):
     ends = [jnp.where(driven, x - of_basis(x), 0) for x in (moving, still)]
     s0 = jnp.where(stuck, 0, of_basis(moving) + ends[0])
     c = of_basis(jnp.where(stuck, 0, still - s)) + ends[1] - ends[0]
-    size = jnp.abs(ends[0]) + jnp.abs(ends[1]) + matvec(jnp.abs(rows.C.T), jnp.where(basis, jnp.abs(sf) + jnp.abs(s), 0))
+    size = (
+        jnp.abs(ends[0]) + jnp.abs(ends[1]) + matvec(jnp.abs(rows.C.T), jnp.where(basis, jnp.abs(sf) + jnp.abs(s), 0))
+    )
     turned = ~stuck & ~smooth & (sig * s0 < -slight(s.dtype) * size)  # as its direction did, within the step
     start, rise = jnp.where(stuck, tau, sig * f), jnp.where(stuck, held - tau, 0)
     course = Course(c, start, rise, f, rows, h * rows.K, h * rows.least, lax.stop_gradient(size))

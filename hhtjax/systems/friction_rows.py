@@ -219,15 +219,21 @@ def is_prescribed(system, rows, pulls, states, params):
 def at_rest_in_box(rows, rests, load, f, size=0.0):
     """sig and tau of joints at rest: what holds them, within their limits; those slide that this leaves accelerated.
 
-    tau has the derivatives that ds/dt needs; which of dependent joints has them is as free as the forces are.
+    Derivatives are those of the smallest forces tau that hold what sticks, beside those at their limits.
     """
     K = rows.K
-    sig, tau = slides_in_box(K, rows.least, rests, load, f, size)
+    sig, found = slides_in_box(K, rows.least, rests, load, f, size)
     sticks = rests & (sig == 0)
-    tau = jnp.where(sig == 0, tau, sig * f)
-    inside = sticks & (jnp.abs(tau) < f)
-    held = solver_of_positive(K, rows.spanning(sticks, inside))
-    return sig, tau + held(load - matvec(K, tau))
+    inside = sticks & (jnp.abs(found) < f * (1 - 64 * float(jnp.finfo(f.dtype).eps))) & (diagonal(K) > rows.least)
+    limited = jnp.where(inside | ~rests, 0, jnp.where(sticks, jnp.sign(found), sig) * f)
+    here = rows.spanning(inside)
+    B = jnp.where(here[:, None] & inside[None, :], K, 0)
+    unit = 1 / jnp.where(inside, diagonal(K), 1)
+    solve = solver_of_positive(B @ (unit[:, None] * B.T), here)
+    held = unit * (B.T @ solve(load - matvec(K, limited)))
+    found = jnp.where(inside, found, lax.stop_gradient(limited))
+    exact = found + unit * (B.T @ solve(load - matvec(K, found)))
+    return sig, limited + jnp.where(inside, held + lax.stop_gradient(exact - held), 0)
 
 
 def slides_in_box(K, least, rests, load, f, size=0.0):
