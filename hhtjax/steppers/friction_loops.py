@@ -23,7 +23,6 @@ from hhtjax.steppers.friction_events import EVENTS, PIECES, Moment
 from hhtjax.steppers.friction_law import Switch
 from hhtjax.systems.friction_rows import slides_in_box, slight
 
-
 BEYOND = 2.0  # theta of a step that is done
 
 

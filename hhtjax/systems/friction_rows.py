@@ -15,7 +15,6 @@ dynamics, 1988.
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -23,7 +22,6 @@ from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems.constraints import jacobian, violation
 from hhtjax.systems.friction import at_rest, directions, responses, solver_of_some
-
 
 LIMIT = 1e-10  # relative size, squared, of what is left of a direction, below which it is rounding
 SLIGHT = 1e-9  # relative size of an acceleration, or of a time in a step, below which it is 0
