@@ -1,4 +1,4 @@
-"""Dry friction of joints whose directions depend on each other, or on constraints: closed loops, driven cranks, gears."""
+"""Dry friction of joints whose directions depend on each other, or on constraints: loops, driven cranks, gears."""
 
 import warnings
 from itertools import product
@@ -21,7 +21,7 @@ ONE, TWO, ZERO = jnp.ones(1), jnp.ones(2), jnp.zeros(2)
 
 def all_choices(K, load, f):
     """The least of tau' K tau/2 - load' tau in the box, and the smallest tau there, by trial of all sets of bounds."""
-    best, found = np.inf, None
+    best, found = np.inf, 0 * f
     for trial in product((0.0, 1.0, -1.0), repeat=len(f)):
         tau, free = np.array(trial) * f, np.array(trial) == 0
         inner = K[np.ix_(free, free)]
@@ -84,6 +84,7 @@ def gears():
     return jax.jit(jax.vmap(turned))(jnp.array([[1.5, 5.0], [4.0, 0.0], [0.0, 8.0], [0.0, 0.0]]))
 
 
+@pytest.mark.slow
 def test_both_sides_of_a_gear_rub(gears):
     """The same motion, whichever side has how much of it; and none of it stays where it is 0."""
     gears.check()
@@ -96,6 +97,7 @@ def test_both_sides_of_a_gear_rub(gears):
     np.testing.assert_allclose(np.abs(gears.friction[0])[slides], np.tile([1.5, 5.0], (slides.sum(), 1)), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_sticks_stays_and_shares_its_load_within_the_limits(gears):
     stuck = np.asarray(gears.sticking[0]).all(axis=1)
     q, tau = np.asarray(gears.q[0])[stuck], np.asarray(gears.friction[0])[stuck]
@@ -118,7 +120,7 @@ def test_gears_in_single_precision_and_in_batches(gears):
 
 @pytest.mark.slow
 def test_derivatives_in_the_limits_of_a_gear():
-    """Through reversals; also from the side of 0, where a limit is 0: there it brakes as much as the other side would."""
+    """Through reversals; also where a limit is 0: there it would brake as much as the other side does."""
 
     def end(F):
         run = turned(F, 32)
@@ -184,9 +186,9 @@ def test_two_belts_pull_one_block():
         exact = solve_ivp(rate, (0, 4), [0, 1], "Radau", np.asarray(run.t), rtol=1e-9, atol=1e-10)
         return np.max(np.abs(exact.y[0] - run.q[:, 0]))
 
-    wide, narrow = error(1e-2), error(1e-3)
-    assert narrow < 3e-4
-    assert narrow < wide / 4
+    wide, narrow = error(1e-3), error(1e-4)
+    assert narrow < 1e-4
+    assert narrow < wide / 6
 
 
 @pytest.mark.slow
@@ -209,9 +211,9 @@ def test_a_driven_crank_bears_all_four_joints():
     exact = np.sign(rate) * (np.asarray(LIMITS) @ np.abs(rates))
     away = np.abs(torque - exact)
     turning = np.any(np.diff(np.sign(rates * rate), axis=1) != 0, axis=0)
-    clear = np.convolve(np.concatenate([[False], turning]), np.ones(3), "same") == 0
+    clear = ~np.concatenate([[False], turning])
     assert np.max(away[clear]) < 1e-6
-    assert np.count_nonzero(~clear) < 15
+    assert np.count_nonzero(~clear) == 3
     np.testing.assert_allclose(found.q[0], found.q[1], atol=1e-12)
     np.testing.assert_allclose(np.abs(found.friction[0]), np.tile(LIMITS, (801, 1)))
 

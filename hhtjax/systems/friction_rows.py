@@ -1,13 +1,13 @@
 """Directions of friction that may depend on each other, or on constraints, and what joints at rest there do.
 
-In a closed loop more joints may rub than there are freedoms: K = H A^-1 H^T is singular. The forces are then not unique,
-and the motion is: of joints at rest, with the accelerations `load` without friction,
+In a closed loop more joints may rub than there are freedoms: K = H A^-1 H^T is singular. The forces are then not
+unique, and the motion is: of joints at rest, with the accelerations `load` without friction,
 
     min tau' K tau/2 - load' tau,    |tau_i| <= F_i,    ds/dt = load - K tau
 
-Every minimiser gives the same ds/dt. Of all of them the one with the least sum of K_ii tau_i^2 is taken. Where a joint's
-motion is prescribed, as in a mechanism with a driven crank, K_ii = 0: its friction moves nothing, and acts on the
-multipliers alone.
+Every minimiser gives the same ds/dt. Of all of them the one with the least sum of K_ii tau_i^2 is taken. Where the
+motion of a joint is prescribed, as in a mechanism with a driven crank, K_ii = 0: its friction moves nothing, and acts
+on the multipliers alone.
 
 D. Bertsekas, SIAM J. Control Optim. 20, 1982; J. Moreau, Unilateral contact and dry friction in finite freedom
 dynamics, 1988.

@@ -52,10 +52,10 @@ class System(Description):
             F(q, v, t) may be any continuous function, a Stribeck curve among them; its value at s = 0 is the stiction.
             Friction that differs from one direction to the other, from -F1 to F2, is F = (F1 + F2)/2 with the constant
             force (F1 - F2)/2 in `force`. For the `hht` family; see `hhtjax.systems`.
-        sliding: s, the sliding velocities, `sliding(q, v, t, params)` -> (m,), m <= 16, affine in v, H = ds/dv: relative
+        sliding: s, the sliding velocities, `sliding(q, v, t, params)` -> (m,), affine in v, H = ds/dv: relative
             velocities of bodies, v - u(t) on a moving belt. Default: v itself. Where F is larger than all that comes,
-            s = 0 holds throughout: a constraint of velocities, as of a wheel that rolls. (m is the size of a dense
-            problem that each step solves; joints that rub without touching each other's motion go in runs of their own.)
+            s = 0 holds throughout: a constraint of velocities, as of a wheel that rolls. m <= 16, as each step solves
+            dense problems of m joints, several times, and its loops are as long.
 
             Rows may depend on each other, and on constraints: every joint of a closed loop may rub, both sides of a
             gear, each joint of a mechanism with a driven crank, whose friction the multipliers then bear. The motion
