@@ -122,13 +122,14 @@ def test_gears_in_single_precision_and_in_batches(gears):
 def test_derivatives_in_the_limits_of_a_gear():
     """Through reversals; also where a limit is 0: there it would brake as much as the other side does."""
 
-    def end(F):
-        run = turned(F, 32)
-        return jnp.sum(run.q[-3] * jnp.array([1.0, 0.3]))
+    def end(F, num_steps=32):
+        run = turned(F, num_steps)
+        return jnp.sum(run.q[-3 * num_steps // 32] * jnp.array([1.0, 0.3]))
 
     check_gradient(end, np.asarray(GEARED["F"]), step=1e-6)
-    slope = jax.jit(jax.grad(end))(jnp.array([4.0, 0.0]))
-    assert slope[1] == pytest.approx(slope[0] / 2, rel=1e-9)
+    # a joint without a limit switches with the step, so that its derivative is of first order
+    slope = np.asarray(jax.jit(jax.jacfwd(lambda F: end(F, 128)))(jnp.array([4.0, 0.0])))
+    np.testing.assert_allclose(slope[1], slope[0] / 2, rtol=0.03)
 
 
 @pytest.mark.slow
