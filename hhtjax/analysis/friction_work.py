@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.numerics.elimination import matvec
-from hhtjax.numerics.linear_solve import solve
 from hhtjax.systems import held
 from hhtjax.systems.constraints import answers
-from hhtjax.systems.friction import across, directions, responses
+from hhtjax.systems.friction import directions, responses
+from hhtjax.systems.friction_rows import rows_of
 
 
 def directions_of(solution):
@@ -56,9 +56,9 @@ def _power(flat, params, first, middle, last, unseen):
     apart = s[0] - s[2]
     theta = jnp.clip((2 * _simpson(s) - s[2]) / jnp.where(apart == 0, 1, apart), 0, 1)
     H = directions(flat, q, t, params)
-    G, _ = responses(answers(flat, q, t, params, "least_squares"), H)
-    K = across(H, G)
-    mean = jnp.clip(mean + solve(K, matvec(H, unseen)), -f, f)
+    G, pulls = responses(answers(flat, q, t, params, "least_squares"), H)
+    rows = rows_of(flat, q, t, params, H, G, pulls, False, dependent=True)
+    mean = jnp.clip(mean + rows.solve(rows.K, jnp.ones(len(f), bool), matvec(H, unseen)), -f, f)
     switched = (theta * tau0 * s[0] + (1 - theta) * tau1 * s[2]) / 2 + mean * _simpson(c)
     return jnp.sum(jnp.where(sig0 == sig1, steady, switched))
 

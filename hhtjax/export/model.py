@@ -14,7 +14,7 @@ from hhtjax.steppers.stepper import INTERNAL, entered, require_capable, require_
 from hhtjax.systems import held
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
-from hhtjax.systems.rubbing import require_independent_friction
+from hhtjax.systems.rubbing import with_known_rows
 from hhtjax.systems.sampled import Sampled
 from hhtjax.systems.sparse_system import require_dense
 from hhtjax.systems.system import FirstOrderSystem
@@ -54,7 +54,7 @@ def given(caller, system, stepper, q0, v0, params, z0):
     params = require_params(caller, params)
     require_dense(caller, system, params)
     if system.friction is not None:
-        require_independent_friction(caller, system, q0, v0, 0.0, params, z0)
+        system = with_known_rows(caller, system, q0, v0, 0.0, params, z0)
     if not all_concrete((system, stepper, q0, v0, params, z0)):
         raise TypeError(f"{caller}: all arguments must be numbers, because they are written out; received tracers.")
     starts = {name: x for name, x in (("q0", q0), ("v0", v0), ("z0", z0)) if x is not None}

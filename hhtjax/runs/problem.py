@@ -12,7 +12,7 @@ from hhtjax.steppers.stepper import require_capable, require_stepper, require_sy
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
-from hhtjax.systems.rubbing import require_independent_friction
+from hhtjax.systems.rubbing import with_known_rows
 
 
 class Problem(NamedTuple):
@@ -38,7 +38,7 @@ class Problem(NamedTuple):
         q0, v0, z0 = initial_values(caller, system, q0, v0, z0, level=4)
         require_capable(caller, system, stepper, q0, v0)
         if system.friction is not None:
-            require_independent_friction(caller, system, q0, v0, t0, params, z0)
+            system = with_known_rows(caller, system, q0, v0, t0, params, z0)
         if system.constraint is not None:
             require_consistent(caller, system, q0, v0, t0, params, stepper.redundant, z0)
         t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew

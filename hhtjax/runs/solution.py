@@ -12,6 +12,7 @@ from hhtjax.description import all_concrete, is_concrete
 from hhtjax.description.presentation import Table, all_known, between, brief, known, leaf_rows, shown
 from hhtjax.runs.event_failures import EVENTS
 from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
+from hhtjax.steppers.friction_law import DEPENDENT
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
 from hhtjax.systems.matrices import MASSLESS, UNSYMMETRIC
@@ -252,10 +253,15 @@ class Solution(NamedTuple):
             )
         if np.isinf(friction):
             return "a limit of the dry friction is negative or not finite: see `friction` of the System"
+        if friction == DEPENDENT:
+            return (
+                "directions of dry friction came to depend on each other, which was not known when the run began. Give "
+                'the stepper redundant="least_squares", for all that may depend on each other'
+            )
         if friction:
             return (
                 f"joints with dry friction switch too often: {friction:.2g} of the step is left. Take a smaller dt, as "
-                "for forces that drive what slides, or look for joints whose sliding velocities depend on each other"
+                "for forces that drive what slides"
             )
         if newton:
             return (

@@ -26,7 +26,7 @@ from hhtjax.systems import held
 from hhtjax.systems.consistent import distances, examine, require_consistent
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.returned import notes_on_lists
-from hhtjax.systems.rubbing import require_independent_friction
+from hhtjax.systems.rubbing import with_known_rows
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 VECTORS = 32  # members, of fewer of which LLVM often writes loops out, one member after the other
@@ -85,7 +85,7 @@ class Inputs(NamedTuple):
             _require_consistent(system, data, mapped, t0)
         if system.friction is not None:
             _, q, v, p, z = _member(data, mapped, 0)
-            require_independent_friction("sweep", system, q, v, t0, p, z)
+            system = with_known_rows("sweep", system, q, v, t0, p, z)
         duration, t0 = (x if x is None or not is_concrete(x) else float(x) for x in (duration, t0))
         return cls(system, data, dts, duration, t0, mapped, int(num_samples), times, size)
 

@@ -25,12 +25,14 @@ from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.low_rank import Updated
 from hhtjax.steppers.constrained import equations, report_constraints
 from hhtjax.steppers.friction_events import run_events
-from hhtjax.steppers.friction_law import is_settled, switch
+from hhtjax.steppers.friction_law import DEPENDENT, is_settled, switch
+from hhtjax.steppers.friction_loops import run_pieces
 from hhtjax.steppers.newton import newton, solve_and_keep
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Rubbing, join_info
 from hhtjax.systems.constraints import answers, curvature
-from hhtjax.systems.friction import across, at_rest, directions, own_rate, reaction, responses, solve_some
+from hhtjax.systems.friction import across, directions, own_rate, reaction, responses
+from hhtjax.systems.friction_rows import depends, is_prescribed, rows_of
 
 NOISE = 8  # roundings, of what it is the difference of, below which a number is 0
 LAGS = 20  # how often multipliers, and limits that depend on them, are made anew at the start
@@ -47,9 +49,10 @@ def begin_friction(method, system, q, v, t, params, dt):
     answer, H = answers(system, q, t, params, factorize=factorize), directions(system, q, t, params)
     w, L0 = answer(system.force(*at), -curvature(system, *at) if system.num_constraints else None)
     G, pulls = responses(answer, H)
-    K = across(H, G)
-    own = own_rate(system, *at)
-    settle = partial(_settle, system, at, H, K, matvec(H, w) + own)
+    rows = rows_of(system, q, t, params, H, G, pulls, False, depends(system, method.redundant))
+    K, own = rows.K, own_rate(system, *at)
+    size = matvec(jnp.abs(H), jnp.abs(w)) + jnp.abs(own)
+    settle = partial(_settle, system, at, H, rows, matvec(H, w) + own, size)
 
     def again(_, L):
         """L with the friction of limits that depend on L."""
@@ -58,7 +61,7 @@ def begin_friction(method, system, q, v, t, params, dt):
     L = lax.fori_loop(0, LAGS, again, jnp.zeros_like(L0)) if system.num_constraints else None
     sig, tau = settle(L)
     s = method.begin(smooth_system(system, sig, tau, L), *at, dt)
-    a = _taken_off(s.a, solve_some(K, sig == 0, matvec(H, s.a) + own), G)
+    a = _taken_off(s.a, rows.solve(K, sig == 0, matvec(H, s.a) + own), G)
     return s._replace(a=a, friction=Rubbing(sig, tau))
 
 
@@ -72,14 +75,14 @@ def smooth_system(system, sig, tau, L):
     return system._replace(force=force, friction=None)
 
 
-def _settle(system, at, H, K, load, L):
-    """sig and tau at the start, where without friction ds/dt is the load. What rests is held, within the limits; what
-    cannot be held slides."""
+def _settle(system, at, H, rows, load, size, L):
+    """sig and tau at the start, where without friction ds/dt is the load, of terms of that size. What rests is held,
+    within the limits; what cannot be held slides."""
     q, v, t, params = at
     sig, f = direction(system, at, H), system.friction.limit(q, v, L, t, params)
     rests = sig == 0
     slid = jnp.where(rests, 0, sig * f)
-    slides, tau = at_rest(K, rests, load - matvec(K, slid), f)
+    slides, tau = rows.at_rest(rests, load - matvec(rows.K, slid), f, size)
     return jnp.where(rests, slides, sig), jnp.where(rests, tau, slid)
 
 
@@ -97,11 +100,12 @@ def bind_friction(method, system, params, dt, kept=None):
 
     kept: a `Changing` that knows the matrix without the slopes of limits, which H^T, then constant, spreads.
     """
-    law, size = system.friction, system.size
+    law, size, dependent = system.friction, system.size, depends(system, method.redundant)
+    driven = method.redundant is None and system.num_constraints >= system.positions
 
     def step(s):
         r, path, z, shift, B = _equations(method, system, params, dt, s)
-        stops, at = _foreseen(system, params, dt, s, path(z))
+        stops, at = _foreseen(system, params, dt, s, path(z), driven)
         sig, tau = s.friction
         smooth = jnp.where(stops, 0, sig)
 
@@ -116,23 +120,31 @@ def bind_friction(method, system, params, dt, kept=None):
         z, info, inverse, along = _free_step(method.options, system, rubbing, path, z, s, factorize, at)
         H = directions(system, at.q, at.t, params)
         G = _each(inverse, jnp.pad(H, ((0, 0), (0, z.size - size))))
-        K, W = across(H, G[:, :size]), across(H, _each(along, G).v)
+        pulls = G[:, size : size + system.num_constraints]
+        rows = rows_of(system, at.q, at.t, params, H, G[:, :size], pulls, sig == 0, dependent)
+        W = across(H, _each(along, G).v)
 
         def sliding(z):
             return law.sliding(at.q, path(z).v, at.t, params)  # with H as in W
 
-        held = path(z - matvec(G.T, solve_some(W, smooth == 0, sliding(z))))
+        held = path(z - matvec(G.T, rows.solve(W, smooth == 0, sliding(z))))
         f = law.limit(held.q, held.v, held.L, held.t, params)
         z = z - matvec(G.T, jnp.where(stops, sig * f, 0))
-        end, left = _switches(sliding(z), law.sliding(s.q, s.v, s.t, params), sig, tau, f, W, dt * K)
+        given = dependent and is_prescribed(system, rows, pulls, (s, at), params)
+        end, left, held = _switches(sliding(z), law.sliding(s.q, s.v, s.t, params), sig, tau, f, W, rows, dt, given)
+
+        def displacement(z):
+            x = method.advance(s, dt, z[:size])[0]
+            taken = None if shift is None else shift(z[size + system.num_constraints :])
+            return x if taken is None else x - taken
+
+        still = displacement(z - matvec(G.T, held)) if dependent else None
         z = z - matvec(G.T, end.tau)
-        x = method.advance(s, dt, z[:size])[0]
-        taken = None if shift is None else shift(z[size + system.num_constraints :])
-        x = x if taken is None else x - taken
-        s1 = system.tidy(_behind(system, params, s, path(z), x, end, f, G, K))
+        s1 = system.tidy(_behind(system, params, s, path(z), displacement(z), end, f, G, rows, still))
         if method.estimating:
             defect = _defect(method, system, params, rubbing, path(z), end.tau + jnp.where(stops, sig * f, 0), inverse)
-            info = info._replace(defect=defect, switched=_switched(system, s, s1, end, G))
+            info = info._replace(defect=defect, switched=_switched(system, s, s1, end, G, dependent))
+        left = jnp.where(rows.are_dependent(), DEPENDENT, left)
         info = _told(info, left, _is_limit(law, at, params) & ~jnp.any((f < 0) | (f == jnp.inf)))
         return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
 
@@ -146,12 +158,17 @@ def _equations(method, system, params, dt, s):
     return lambda s: residual(system, params, s), lambda w: method.arrive(system, s, dt, w), s.w, None, None
 
 
-def _foreseen(system, params, h, s, predicted):
+def _foreseen(system, params, h, s, predicted, driven):
     """Which joints come to rest within the step, if nothing changes, and the state to linearise about: the predicted
-    one, but when the first of them rests all accelerations end: with them its whole friction would go on to act."""
+    one, but when the first of them rests all accelerations end: with them its whole friction would go on to act.
+
+    driven: whether all motion is prescribed, which then goes on.
+    """
     sliding, (sig, tau) = system.friction.sliding, s.friction
     s0, s1 = (sliding(x.q, x.v, x.t, params) for x in (s, predicted))
     stops = (sig * s1 < 0) & (tau != 0)
+    if driven:
+        return stops, predicted
     theta = jnp.min(jnp.clip(jnp.where(stops, s0 / jnp.where(stops, s0 - s1, 1), 1), 0, 1))
     q = system.move(s.q, h * s.v + h**2 * theta * (1 - theta / 2) * s.a)
     ended = predicted._replace(q=q, v=s.v + h * theta * s.a, w=theta * s.w)
@@ -181,37 +198,52 @@ def _free_step(options, system, r, path, z, s, factorize, at):
     return z, info, inverse, along
 
 
-def _switches(sf, s, sig, tau, f, W, Wh):
-    """How joints come out of the step, and what part of it is left where there were too many events."""
+def _switches(sf, s, sig, tau, f, W, rows, h, given):
+    """How joints come out of the step, and what part of it is left where there were too many events; of rows that may
+    depend on each other also what would hold joints that stick."""
+    if given is not False:
+        return run_pieces(sf, s, sig, tau, f, W, rows, h, given)
+    Wh = h * rows.K
     if len(f) == 1:
-        return switch(sf, s, sig, tau, f, diagonal(W), diagonal(Wh)), jnp.zeros((), sf.dtype)
-    return run_events(sf, s, sig, tau, f, W, Wh)
+        return switch(sf, s, sig, tau, f, diagonal(W), diagonal(Wh)), jnp.zeros((), sf.dtype), None
+    return *run_events(sf, s, sig, tau, f, W, Wh), None
 
 
-def _behind(system, params, s, s1, x, end, f, G, K):
-    """The state s1 at the end of the step, displaced by x, moved onto the branches on which its joints end."""
-    h, sig = s1.t - s.t, s.friction.sig
+def _behind(system, params, s, s1, x, end, f, G, rows, still):
+    """The state s1 at the end of the step, displaced by x, moved onto the branches on which its joints end.
+
+    still: of rows that may depend on each other, the displacement if nobody switched.
+    """
+    dependent = still is not None
+    h, sig, K = s1.t - s.t, s.friction.sig, rows.K
     size, sliding = system.size, system.friction.sliding
     moves, sticks = ~end.kept & (end.sig != 0), ~end.kept & (end.sig == 0)
     Gv = system.widened(G[:, : system.positions])  # internal states do not jump
     middle = directions(system, system.move(s.q, x / 2), s.t + h / 2, params)
     zero = jnp.zeros(size, x.dtype)
     own = [sliding(y.q, zero, y.t, params) for y in (s, s1)]
-    slid = matvec(middle, x) + h / 2 * (own[0] + own[1])
-    x = _taken_off(x, solve_some(K, ~end.kept, slid - end.slid * h), Gv)
+    slid, there = matvec(middle, x) + h / 2 * (own[0] + own[1]), rows.carriers(~end.kept)
+    if dependent:
+        before = jnp.where(sig == 0, 0, matvec(middle, still) + h / 2 * (own[0] + own[1]))
+        slid = slid - before
+    x = _taken_off(x, rows.solve(K, there, slid - end.slid * h), Gv)
     s1 = s1._replace(q=system.move(s.q, x))
-    s1 = s1._replace(v=_taken_off(s1.v, solve_some(K, sticks, sliding(s1.q, s1.v, s1.t, params)), Gv))
+    s1 = s1._replace(v=_taken_off(s1.v, rows.solve(K, sticks, sliding(s1.q, s1.v, s1.t, params)), Gv))
 
     H = directions(system, s1.q, s1.t, params)
     own = own_rate(system, s1.q, s1.v, s1.t, params)
-    onto = jnp.where(moves, (end.sig - sig) * f - end.tau, 0)
+    change = jnp.where(moves, (end.sig - sig) * f, 0)
+    onto = change - end.tau if dependent else jnp.where(moves, (end.sig - sig) * f - end.tau, 0)
     w = s1.w - matvec(Gv.T, onto)
-    y = solve_some(K, sticks, matvec(H, w) + own)
+    y = rows.solve(K, sticks, matvec(H, w) + own)
     w = _taken_off(w, y, Gv)
-    a = _taken_off(s1.a, solve_some(K, ~end.kept, matvec(H, s1.a - w)), Gv)
+    a = _taken_off(s1.a, rows.solve(K, there, matvec(H, s1.a - w)), Gv)
+    borne, tau = onto + y, jnp.where(sticks, sig * f + (end.tau + onto) + y, end.sig * f)
+    if dependent:
+        shared = rows.shared(sticks, tau, f)
+        borne, tau = borne + shared - tau, shared
     if s1.L is not None:
-        s1 = s1._replace(L=s1.L - matvec(G[:, size : size + system.num_constraints].T, onto + y))
-    tau = jnp.where(sticks, sig * f + end.tau + y, end.sig * f)
+        s1 = s1._replace(L=s1.L - matvec(G[:, size : size + system.num_constraints].T, borne))
     return s1._replace(w=w, a=a, friction=Rubbing(end.sig, tau))
 
 
@@ -224,9 +256,11 @@ def _defect(method, system, params, rubbing, s1, dtau, inverse):
     return inverse(left + jnp.pad(force, (0, left.size - force.size)))
 
 
-def _switched(system, s, s1, end, G):
+def _switched(system, s, s1, end, G, dependent):
     """`Info.switched`: by how much friction that switched from s to s1 has changed the accelerations."""
     same = end.kept | ((s.friction.sig == 0) & (end.sig == 0))
+    if dependent:  # where one switches, others may hold what it held
+        same = end.kept | jnp.all(same)
     change = jnp.where(same, 0, s.friction.tau - s1.friction.tau)
     return matvec(system.widened(G[:, : system.positions]).T, change)
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+DEPENDENT = 2.0  # `Info.friction` where rows that are taken to be independent are not
 SETTLED = 1e-9  # change of friction over its limit that passes; 1000 roundings in float32
 
 

@@ -196,7 +196,9 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
             one linearisation is at the predictor.
         redundant: "least_squares" for constraints that depend on each other, always or in singular positions: of
             their multipliers the smallest. One singular value decomposition per solve. By default they are
-            an error at the start, and a failure named by `solution.check()` at the step where they become so.
+            an error at the start, and a failure named by `solution.check()` at the step where they become so. Also for
+            directions of dry friction that may depend on each other where that shows neither in their number nor at
+            the start.
         kinematics: of rotations. "chart": the recursion runs on the rotation vector of each step (Cardona, Geradin
             1989, made second order); "lie": on the angular velocity itself (Bruls, Cardona 2010). Simpler, of
             order 2 too, but 4 to 5 times the error on a fast top.

@@ -76,7 +76,7 @@ class Info(NamedTuple):
             trust (`banded`, `conjugate_gradients`, a given function), or made with a sparse matrix.
         solved: whether that is within its tolerance.
         friction: the part of a step that is left where several joints switch more often than it resolves; infinite
-            where a limit is negative or not finite.
+            where a limit is negative or not finite, and 2 where directions of friction came to depend on each other.
         defect: S^-1 r, what a linearised step has left of its residual at its end, as a correction of the unknowns
             (under error control only).
         switched: by how much dry friction that switched has changed the accelerations (alike).

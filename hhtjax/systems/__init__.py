@@ -174,7 +174,9 @@ that never slides, with those velocities as `sliding`, and a limit beyond all fo
 it. It has to start without sliding.
 
 On a belt with the speed u, `sliding=lambda q, v, t, params: v - params["u"]`; between two bodies it is the difference
-of their velocities. s must be affine in v, and its rows independent of each other and of constraints. A limit in a
+of their velocities. s must be affine in v. Its rows, up to 16, may depend on each other and on constraints: all joints
+of a closed loop rub, and those of a mechanism whose crank is driven. The motion is unique, the forces at joints that
+stick are not; `System` says which are given. A limit in a
 system with internal states is called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F is
 to be continuous: a jump from stiction to sliding is written as a steep Stribeck curve. Between saved times
 `interpolate` is of order 2 only where a joint switches. `energy_balance` knows what friction takes, and what a belt

@@ -21,7 +21,8 @@ from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems import returned
 from hhtjax.xla import linear_map
 
-MOST = 8  # directions of friction
+MOST = 16  # directions of friction
+FEW = 8  # up to so many are taken to be independent of each other, unless something speaks against it
 ROUNDING = 64  # of a load that a joint at rest bears beyond its limit
 
 
@@ -31,6 +32,7 @@ class FrictionLaw(NamedTuple):
     limit: Callable  # q, v, L, t, params -> F (m,)
     sliding: Callable  # q, v, t, params -> s (m,), affine in v
     size: int  # m
+    dependent: bool  # whether rows of `sliding` may depend on each other, or on constraints
 
 
 def require_friction(caller, friction, sliding, *more):
@@ -59,7 +61,7 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
                 "give `sliding`, the sliding velocities of those that rub."
             )
     else:
-        m = returned.count(caller, "sliding", system.sliding, min(n, MOST), dtype, q0, v0, t0, params)
+        m = returned.count(caller, "sliding", system.sliding, MOST, dtype, q0, v0, t0, params)
         if not hasattr(F, "shape") or F.shape != (m,):
             raise ValueError(
                 f"{caller}: `friction` must return ({m},), one limit for each of `sliding`; received {describe(F)}."
@@ -78,7 +80,8 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
             return v
         return jnp.asarray(system.sliding(flat.unravel(q), flat.unravel_rates(v), t, params)).astype(dtype)
 
-    return FrictionLaw(limit, sliding, m)
+    dependent = m > min(n - flat.num_constraints, FEW) or system.depending
+    return FrictionLaw(limit, sliding, m, dependent)
 
 
 def directions(system, q, t, params):
@@ -165,18 +168,3 @@ def _wrong(K, load, f, rests, sig):
     over = jnp.where(sig == 0, jnp.abs(tau) - f, sig * (matvec(K, tau) - load) / alone)
     noise = ROUNDING * float(jnp.finfo(f.dtype).eps) * (jnp.abs(load) + matvec(jnp.abs(K), f)) / alone
     return jnp.where(sig == 0, jnp.sign(tau), 0), over > noise
-
-
-def held_back(system, s, L, old, new, dw, answer):
-    """A jump dw of the accelerations at a state, as params jump and multipliers become L, with what friction does about
-    it: of joints at rest, and of those that slide, whose limits may jump too. answer: of `answers` there."""
-    H = directions(system, s.q, s.t, new)
-    G, _ = responses(answer, H)
-    K, (sig, tau) = across(H, G), s.friction
-    rests = sig == 0
-    f0, f = (system.friction.limit(s.q, s.v, x, s.t, params) for x, params in ((s.L, old), (L, new)))
-    sliding = sig * (f - f0)
-    load = matvec(H, dw) + matvec(K, jnp.where(rests, tau, -sliding))
-    slides, held = at_rest(K, rests, load, f)
-    change = jnp.where(rests, held - tau, sliding)
-    return dw - matvec(G.T, change), s.friction._replace(sig=jnp.where(rests, slides, sig), tau=tau + change)

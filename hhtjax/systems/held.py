@@ -14,7 +14,7 @@ import numpy as np
 
 from hhtjax.description import all_concrete
 from hhtjax.systems.constraints import answers
-from hhtjax.systems.friction import held_back
+from hhtjax.systems.friction_rows import depends, held_back
 from hhtjax.systems.sampled import SLOP, Sampled
 
 OFF_GRID = 1e-6  # of a step, from which on a jump within it is told: what it costs is as much of a step's error
@@ -111,7 +111,7 @@ def jump(stepper, system, s, old, new, h):
         L = s.L + dL
     s1 = s
     if system.friction is not None:
-        dw, friction = held_back(system, s, L, old, new, dw, answer)
+        dw, friction, L = held_back(system, s, L, old, new, dw, answer, depends(system, stepper.redundant))
         s1 = s._replace(friction=friction)
     s1 = s1._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
     return stepper.jumped(system, s, s1, old, new, h, lambda dQ: answer(dQ)[0])

@@ -110,6 +110,7 @@ class LinearSystem(Description):
 
     constraint = None
     internal = None
+    depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
     def mass(self, q, params):
         """M, whatever q."""

@@ -1,4 +1,6 @@
-"""The check that directions of friction do not depend on each other, or on constraints, at the start."""
+"""Whether directions of friction depend on each other, or on constraints, at the start."""
+
+from copy import copy
 
 import jax
 import jax.numpy as jnp
@@ -26,11 +28,12 @@ def _rows(system, q0, v0, t0, params, z0):
     return B, H, directions(flat, elsewhere, t, params) - H
 
 
-def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
-    """An error that names directions of friction that others, or constraints, make redundant; tracers pass."""
+def with_known_rows(caller, system, q0, v0, t0, params, z0=None):
+    """The system, marked where directions of friction depend on each other, or on constraints; an error for what are
+    none. Of tracers nothing is known."""
     rows = known_now(_rows, system, q0, v0, t0, params, z0)
     if rows is None:
-        return
+        return system
     B, H, change = rows
     if not np.all(np.isfinite(H)):
         raise ValueError(f"{caller}: `sliding` has no finite derivative in v at the start.")
@@ -38,17 +41,26 @@ def require_independent_friction(caller, system, q0, v0, t0, params, z0=None):
         raise ValueError(
             f"{caller}: `sliding` of a LinearSystem must have the same derivative in v for all q: else take a System."
         )
+    for i in np.flatnonzero(~np.any(H, axis=1))[:1]:
+        raise ValueError(f"{caller}: row {i} of `sliding` does not depend on v: friction there does nothing.")
+    if not _depend(B, H):
+        return system
+    marked = copy(system)
+    object.__setattr__(marked, "depending", True)
+    return marked
+
+
+def _depend(B, H):
+    """Whether a row of H depends on those before it, or on the rows of B."""
     basis = np.zeros((0, H.shape[1]))
     if B.size:
         _, sizes, basis = np.linalg.svd(B, full_matrices=False)
         basis = basis[sizes > DEPENDENT * sizes[0]]  # constraints may be redundant
-    for i, row in enumerate(H):
+    for row in H:
         left = row
         for _ in range(2):  # once more, for what rounding leaves
             left = left - basis.T @ (basis @ left)
         if np.linalg.norm(left) <= DEPENDENT * np.linalg.norm(row):
-            why = "does not depend on v" if not np.any(row) else "depends on those before it, or on constraints"
-            raise ValueError(
-                f"{caller}: row {i} of `sliding` {why}: friction there cannot be told from other forces. Leave it out."
-            )
+            return True
         basis = np.vstack([basis, left / np.linalg.norm(left)])
+    return False

@@ -56,9 +56,21 @@ class System(Description):
             F(q, v, t) may be any continuous function, a Stribeck curve among them; its value at s = 0 is the stiction.
             Friction that differs from one direction to the other, from -F1 to F2, is F = (F1 + F2)/2 with the constant
             force (F1 - F2)/2 in `force`. For the `hht` family; see `hhtjax.systems`.
-        sliding: s, the sliding velocities, `sliding(q, v, t, params)` -> (m,), m <= 8, affine in v, H = ds/dv. Relative
-            velocities of bodies, v - u(t) on a moving belt. Rows must be independent. Default: v itself. Where F is
-            larger than all that comes, s = 0 holds throughout: a constraint of velocities, as of a wheel that rolls.
+        sliding: s, the sliding velocities, `sliding(q, v, t, params)` -> (m,), affine in v, H = ds/dv: relative
+            velocities of bodies, v - u(t) on a moving belt. Default: v itself. Where F is larger than all that comes,
+            s = 0 holds throughout: a constraint of velocities, as of a wheel that rolls. m <= 16, as each step solves
+            dense problems of m joints, several times, and its loops are as long.
+
+            Rows may depend on each other, and on constraints: every joint of a closed loop may rub, both sides of a
+            gear, each joint of a mechanism with a driven crank, whose friction the multipliers then bear. The motion
+            is unique then, and the forces are not: where dependent joints stick, of all forces that give this motion,
+            |tau_i| <= F_i, the ones with the least sum of K_ii tau_i^2 are given, K = H M^-1 H^T with the constraints;
+            and 0 where a joint rests that can move nothing. Which of them a real joint bears no rigid model tells. The
+            derivatives of the motion are exact for those who stick and slide; single forces of dependent joints that
+            stick have derivatives that add up to the right ones, and no more. More rows than freedoms (n minus the rows
+            of `constraint`), or than 8, are taken to be dependent, and so are rows that the start shows to be. Rows
+            of which only a tracer tells, or that become dependent later, are named by `check()`:
+            `hht(redundant="least_squares")` is for these.
 
     q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
     leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
@@ -112,6 +124,7 @@ class System(Description):
     internal: Callable | None = None
     friction: Callable | None = None
     sliding: Callable | None = None
+    depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
     def __post_init__(self):
         if self.internal is None:

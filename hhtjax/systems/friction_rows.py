@@ -1,0 +1,315 @@
+"""Directions of friction that may depend on each other, or on constraints, and what joints at rest there do.
+
+In a closed loop more joints may rub than there are freedoms: K = H A^-1 H^T is singular. The forces are then not
+unique, and the motion is: of joints at rest, with the accelerations `load` without friction,
+
+    min tau' K tau/2 - load' tau,    |tau_i| <= F_i,    ds/dt = load - K tau
+
+Every minimiser gives the same ds/dt. Of all of them the one with the least sum of K_ii tau_i^2 is taken. Where the
+motion of a joint is prescribed, as in a mechanism with a driven crank, K_ii = 0: its friction moves nothing, and acts
+on the multipliers alone.
+
+D. Bertsekas, SIAM J. Control Optim. 20, 1982; J. Moreau, Unilateral contact and dry friction in finite freedom
+dynamics, 1988.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.numerics.elimination import diagonal, matvec
+from hhtjax.numerics.linear_solve import solver
+from hhtjax.systems.constraints import jacobian, violation
+from hhtjax.systems.friction import at_rest, directions, responses, solver_of_some
+
+LIMIT = 1e-10  # relative size, squared, of what is left of a direction, below which it is rounding
+SLIGHT = 1e-9  # relative size of an acceleration, or of a time in a step, below which it is 0
+PROXIMAL = 1e-6  # relative weight of the proximal term
+ROUNDS = 200  # Newton steps in a box problem: a handful is enough, but a NaN ends nowhere
+HALVINGS = 16  # of a Newton step
+
+
+class Independent(NamedTuple):
+    """Rows that do not depend on each other: every choice of them is solved as it is."""
+
+    K: Any
+
+    def solve(self, A, some, b):
+        """y with A y = b on those rows and columns, 0 elsewhere."""
+        return solver_of_some(A, some)(b)
+
+    def at_rest(self, rests, load, f, size=None):
+        """sig and tau of joints at rest."""
+        return at_rest(self.K, rests, load, f)
+
+    def are_dependent(self):
+        """Whether they depend on each other after all."""
+        left, least, m = lax.stop_gradient(self.K), _rounding(self.K), len(self.K)
+        found = jnp.zeros((), bool)
+        for i in range(m - 1):  # what is left of a diagonal, without those before it
+            left = left - left[:, i, None] * left[None, i, :] / left[i, i]
+            found = found | (jnp.abs(left[i + 1, i + 1]) < least[i + 1])
+        return found
+
+    def carriers(self, some):
+        """The same rows."""
+        return some
+
+
+class Dependent(NamedTuple):
+    """Rows that may depend on each other, on those of a basis: s_j = sum C_ij s_i.
+
+    K: what a unit of force in direction j does in direction i; of dependent rows that of the basis, so that it is of
+    the rank that it should have. least: what is rounding in its diagonal.
+    """
+
+    K: Any
+    C: Any
+    basis: Any
+    least: Any
+
+    def spanning(self, some, first=False):
+        """As many of those rows as do not depend on each other; from `first`, while there are such."""
+        return independent(self.K, self.least, some, first)
+
+    def solve(self, A, some, b):
+        """y with A y = b on as many of those rows and columns as are independent, 0 elsewhere."""
+        return solver_of_positive(A, self.spanning(some))(b)
+
+    def at_rest(self, rests, load, f, size=0.0):
+        """sig and tau of joints at rest, from their loads, which are made of terms of this size."""
+        return at_rest_in_box(self, rests, load, f, size)
+
+    def are_dependent(self):
+        """That is known of them."""
+        return False
+
+    def carriers(self, some):
+        """The rows of the basis that some rows are made of."""
+        return self.basis & jnp.any(some[None, :] & (self.C != 0), axis=1)
+
+    def shared(self, sticks, tau, f):
+        """tau, where joints stick in other forces that do the same, within the limits."""
+        held = jnp.where(sticks, tau, 0)
+        _, shared = self.at_rest(sticks, matvec(self.K, held), f, matvec(jnp.abs(self.K), jnp.abs(held)))
+        return jnp.where(sticks, shared, tau)
+
+
+def depends(system, redundant):
+    """Whether directions may depend on each other: as is known of the system, or as `redundant` of the stepper says."""
+    return system.friction.dependent or redundant is not None
+
+
+def rows_of(system, q, t, params, H, G, pulls, first, dependent):
+    """The rows of H, with G = A^-1 H^T and the multipliers that belong to it. first: those that a basis begins with.
+
+    dependent: whether they may depend on each other; where not, they cost nothing.
+    """
+    K = jnp.stack([matvec(H, g) for g in G], axis=1)
+    if not dependent:
+        return Independent(K)
+    least = _rounding(K)
+    if system.num_constraints:
+        least = least / _left_by_constraints(H, pulls, jacobian(system, q, t, params)) ** 2
+    least = lax.stop_gradient(least)
+    basis = independent(K, least, jnp.ones(len(K), bool), first)
+    inverse, moved = solver_of_positive(K, basis), diagonal(K) > least
+    C = jnp.stack([inverse(jnp.where(moved[j], K[:, j], 0)) for j in range(len(K))], axis=1)
+    C = jnp.where(basis[:, None] & basis[None, :], jnp.eye(len(K), dtype=K.dtype), C)
+    return Dependent(_through(C, basis, K), C, basis, least)
+
+
+def _rounding(K):
+    """What is rounding in the diagonal of K: in single precision more."""
+    return max(LIMIT, 1e3 * float(jnp.finfo(K.dtype).eps)) * jnp.abs(diagonal(K))
+
+
+def slight(dtype):
+    """The same of SLIGHT."""
+    return max(SLIGHT, 1e3 * float(jnp.finfo(dtype).eps))
+
+
+def _through(C, basis, K):
+    """C^T K C, of the basis alone."""
+    inner = jnp.where(basis[:, None] & basis[None, :], K, 0)
+    return C.T @ (inner @ C)
+
+
+def _left_by_constraints(H, pulls, B):
+    """Which part of each row constraints leave to move something: at most 1, and more than 0."""
+    left, taken = jnp.abs(H + pulls @ B), jnp.abs(H) + jnp.abs(pulls) @ jnp.abs(B)
+    unit = jnp.maximum(jnp.max(jnp.abs(H), axis=0), jnp.max(jnp.abs(B), axis=0))  # of each coordinate
+    left, taken = (jnp.max(x / jnp.where(unit == 0, 1, unit)[None, :], axis=1) for x in (left, taken))
+    return jnp.clip(left / jnp.where(taken == 0, 1, taken), float(jnp.finfo(H.dtype).eps), 1)
+
+
+def solver_of_positive(A, some):
+    """b -> y with A y = b on those rows and columns, 0 elsewhere, of an A that is positive there."""
+
+    def factorize(A):
+        inverse = _inverse(lax.stop_gradient(A))
+        return lambda b, trans=0: (inverse.T if trans else inverse) @ b
+
+    solve = solver(_alone(A, some), factorize)
+    return lambda b: solve(jnp.where(some, b, 0))
+
+
+def _alone(A, some):
+    """A on those rows and columns, beside ones."""
+    return jnp.where(some[:, None] & some[None, :], A, jnp.eye(len(A), dtype=A.dtype))
+
+
+def _inverse(A):
+    """Of a positive A, which needs no other pivots, by as short a program as can be."""
+    i = jnp.arange(len(A))
+
+    def exchange(k, X):
+        row, column, pivot = X[k], X[:, k] / X[k, k], X[k, k]
+        there, down = (i == k)[:, None], (i == k)[None, :]
+        rest = jnp.where(down, -column[:, None], X - column[:, None] * row[None, :])
+        return jnp.where(there, jnp.where(down, 1 / pivot, (row / pivot)[None, :]), rest)
+
+    return lax.fori_loop(0, len(A), exchange, A)
+
+
+def independent(K, least, some, first=False):
+    """A largest choice of `some` of the rows of a semi-definite K that do not depend on each other.
+
+    By elimination with diagonal pivots, the largest next; those of `first` before others.
+    """
+    K, m = lax.stop_gradient(K), len(K)
+    before = jnp.where(jnp.broadcast_to(first, (m,)), 1 / float(jnp.finfo(K.dtype).eps), 1).astype(K.dtype)
+
+    def take(_, carry):
+        chosen, left = carry
+        d = diagonal(left)
+        fits = some & ~chosen & (d > least)
+        ratio = jnp.where(fits, d / jnp.where(least > 0, least, 1) * before, -1)
+        i = jnp.argmax(ratio)
+        here = (jnp.arange(m) == i) & fits
+        row = jnp.sum(jnp.where(here[:, None], left, 0), axis=0)
+        column = jnp.sum(jnp.where(here[None, :], left, 0), axis=1)
+        pivot = jnp.sum(jnp.where(here, d, 0))
+        return chosen | here, left - (column / jnp.where(pivot == 0, 1, pivot))[:, None] * row[None, :]
+
+    return lax.fori_loop(0, m, take, (jnp.zeros(m, bool), K))[0]
+
+
+def is_prescribed(system, rows, pulls, states, params):
+    """Whether a sliding velocity has a part that the basis has no say in, at one of two states: (m,).
+
+    That is r = own - C^T own + (L - C^T L) dPhi/dt in s_j = sum C_ij s_i + r_j, where H^T - H^T C = -B^T L.
+    """
+    zero, C = jnp.zeros(system.size, pulls.dtype), rows.C.T
+    found = jnp.zeros(len(C), bool)
+    for x in states:
+        own = system.friction.sliding(x.q, zero, x.t, params)
+        r, size = own - matvec(C, own), jnp.abs(own) + matvec(jnp.abs(C), jnp.abs(own))
+        if system.num_constraints:
+            rate = violation(system, x.q, zero, x.t, params)[1]
+            r = r + (pulls - C @ pulls) @ rate
+            size = size + (jnp.abs(pulls) + jnp.abs(C) @ jnp.abs(pulls)) @ jnp.abs(rate)
+        found = found | (jnp.abs(r) > 1e4 * float(jnp.finfo(r.dtype).eps) * size)
+    return found & ~rows.basis
+
+
+def at_rest_in_box(rows, rests, load, f, size=0.0):
+    """sig and tau of joints at rest: what holds them, within their limits; those slide that this leaves accelerated.
+
+    Derivatives are those of the smallest forces tau that hold what sticks, beside those at their limits.
+    """
+    K = rows.K
+    sig, found = slides_in_box(K, rows.least, rests, load, f, size)
+    sticks = rests & (sig == 0)
+    inside = sticks & (jnp.abs(found) < f * (1 - 64 * float(jnp.finfo(f.dtype).eps))) & (diagonal(K) > rows.least)
+    limited = jnp.where(inside | ~rests, 0, jnp.where(sticks, jnp.sign(found), sig) * f)
+    here = rows.spanning(inside)
+    B = jnp.where(here[:, None] & inside[None, :], K, 0)
+    unit = 1 / jnp.where(inside, diagonal(K), 1)
+    solve = solver_of_positive(B @ (unit[:, None] * B.T), here)
+    held = unit * (B.T @ solve(load - matvec(K, limited)))
+    found = jnp.where(inside, found, lax.stop_gradient(limited))
+    exact = found + unit * (B.T @ solve(load - matvec(K, found)))
+    return sig, limited + jnp.where(inside, held + lax.stop_gradient(exact - held), 0)
+
+
+def slides_in_box(K, least, rests, load, f, size=0.0):
+    """The directions of those joints at rest that cannot be held, and the forces; both without derivatives."""
+    K, load, f, size = lax.stop_gradient((K, load, f, jnp.asarray(size, K.dtype)))
+    rests = jnp.broadcast_to(rests, f.shape)
+    moved = rests & (diagonal(K) > least)
+    tau = smallest_in_box(K, jnp.where(moved, load, 0), jnp.where(moved, f, 0), moved)
+    rate = load - matvec(K, tau)
+    nothing = slight(K.dtype) * (jnp.abs(load) + matvec(jnp.abs(K), jnp.abs(tau)) + size)
+    d = jnp.sign(rate)
+    at_limit = ~moved | (d * tau >= f * (1 - 64 * float(jnp.finfo(f.dtype).eps)))
+    return jnp.where(rests & at_limit & (jnp.abs(rate) > nothing), d, 0), tau
+
+
+def smallest_in_box(K, load, f, moved):
+    """tau with min tau' K tau/2 - load' tau, |tau| <= f, for a semi-definite K: by Newton's iteration on what no bound
+    holds, projected (Bertsekas 1982), with a proximal term: from 0, so that of all minima the smallest is found.
+
+    In units in which the diagonal of K is 1.
+    """
+    m, alone = len(f), diagonal(K)
+    unit = jnp.sqrt(jnp.where(moved, alone, 1))
+    R = jnp.where(moved[:, None] & moved[None, :], (K + K.T) / 2 / unit[:, None] / unit[None, :], 0)
+    b, top = load / unit, f * unit
+    eye = jnp.eye(m, dtype=K.dtype)
+    A, eps = R + PROXIMAL * eye, float(jnp.finfo(K.dtype).eps)
+    shorter = 0.5 ** jnp.arange(HALVINGS, dtype=K.dtype)
+
+    def away(u, g):
+        return jnp.max(jnp.abs(jnp.clip(u - g, -top, top) - u))
+
+    def enough(u):
+        return 64 * eps * (jnp.max(jnp.abs(b)) + jnp.max(jnp.abs(R) @ jnp.abs(u)))
+
+    def unfinished(carry):
+        _, _, done, i = carry
+        return ~done & (i < ROUNDS)
+
+    def improve(carry):
+        u, old, _, i = carry
+        pull = b + PROXIMAL * old
+        g = A @ u - pull
+        pinned = ((u >= top) & (g < 0)) | ((u <= -top) & (g > 0)) | ~moved
+        step = -(_inverse(_alone(A, ~pinned)) @ jnp.where(pinned, 0, g))
+        tried = jnp.concatenate([shorter[:, None] * step[None, :], -shorter[:, None] * g[None, :]])
+        path = jnp.clip(u[None, :] + tried, -top[None, :], top[None, :])
+        costs = jnp.sum(path * (path @ A / 2 - pull[None, :]), axis=1)
+        cost, size = jnp.sum(u * (A @ u / 2 - pull)), jnp.sum(jnp.abs(u * pull))
+        lower = jnp.any(costs < cost - 16 * eps * size)
+        better = jnp.where(lower, path[jnp.argmin(costs)], path[0])
+        calmer = away(better, A @ better - pull) < away(u, g)  # where costs are rounding
+        at_minimum = (away(u, g) <= enough(u)) | ~(lower | calmer)
+        new = jnp.where(at_minimum, u, better)
+        settled = jnp.max(jnp.abs(u - old)) <= eps * jnp.max(jnp.abs(u))
+        done = at_minimum & (settled | (away(u, R @ u - b) <= 8 * enough(u)))
+        return new, jnp.where(at_minimum, u, old), done, i + 1
+
+    begin = jnp.zeros_like(b)
+    u, *_ = lax.while_loop(unfinished, improve, (begin, begin, jnp.all(b == 0), 0))
+    return u / unit
+
+
+def held_back(system, s, L, old, new, dw, answer, dependent):
+    """A jump dw of the accelerations at a state, as params jump and multipliers become L, with what friction does about
+    it: of joints at rest, and of those that slide, whose limits may jump too; and the multipliers. answer: of `answers`
+    there; dependent: whether directions may depend on each other."""
+    H, (sig, tau) = directions(system, s.q, s.t, new), s.friction
+    rests = sig == 0
+    G, pulls = responses(answer, H)
+    rows = rows_of(system, s.q, s.t, new, H, G, pulls, rests, dependent)
+    K = rows.K
+    f0, f = (system.friction.limit(s.q, s.v, x, s.t, params) for x, params in ((s.L, old), (L, new)))
+    sliding = sig * (f - f0)
+    load = matvec(H, dw) + matvec(K, jnp.where(rests, tau, -sliding))
+    slides, held = rows.at_rest(rests, load, f, matvec(jnp.abs(H), jnp.abs(s.w)))
+    change = jnp.where(rests, held - tau, sliding)
+    friction = s.friction._replace(sig=jnp.where(rests, slides, sig), tau=tau + change)
+    if dependent and system.num_constraints:
+        L = L - matvec(pulls.T, change)
+    return dw - matvec(G.T, change), friction, L

@@ -1,0 +1,317 @@
+"""Dry friction of joints whose directions depend on each other, or on constraints: loops, driven cranks, gears."""
+
+import warnings
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiled_c import Library, needs_compiler, numbers
+from four_bar import CRANK, FREE, LIMITS, PARAMS, angles, motion, ratios, reduced
+from friction_problems import free_vibration_exact
+from helpers import check_gradient
+from scipy.integrate import solve_ivp
+
+import hhtjax
+from hhtjax.systems.friction_rows import slides_in_box
+
+ONE, TWO, ZERO = jnp.ones(1), jnp.ones(2), jnp.zeros(2)
+
+
+def all_choices(K, load, f):
+    """The least of tau' K tau/2 - load' tau in the box, and the smallest tau there, by trial of all sets of bounds."""
+    best, found = np.inf, 0 * f
+    for trial in product((0.0, 1.0, -1.0), repeat=len(f)):
+        tau, free = np.array(trial) * f, np.array(trial) == 0
+        inner = K[np.ix_(free, free)]
+        unit = np.sqrt(np.diag(inner))
+        pull = (load - K @ tau)[free]
+        if free.any():  # of all minima that of least sum of K_ii tau_i^2
+            tau[free] = np.linalg.lstsq(inner / unit / unit[:, None], pull / unit, rcond=1e-9)[0] / unit
+        if np.any(np.abs(tau) > f * (1 + 1e-12) + 1e-14):
+            continue
+        cost, size = tau @ K @ tau / 2 - load @ tau, np.diag(K) @ tau**2
+        scale = np.abs(load) @ f + 1e-300
+        if cost < best - 1e-11 * scale or (cost < best + 1e-11 * scale and size < np.diag(K) @ found**2):
+            best, found = min(cost, best), tau
+    return best, found
+
+
+@pytest.mark.parametrize(("m", "rank"), [(2, 1), (4, 1), (4, 2), (6, 3)])
+def test_the_box_problem_is_that_of_all_choices(m, rank):
+    """Forces of semi-definite matrices, limits of 0 among them: the motion, who slides, and the smallest forces."""
+    rng, N = np.random.default_rng(m + rank), 25
+    B = rng.normal(size=(N, m, rank))
+    K, f = B @ B.transpose(0, 2, 1), 10 ** rng.uniform(-1, 1, (N, m)) * (rng.random((N, m)) < 0.8)
+    load = np.einsum("nij,nj->ni", B, rng.normal(size=(N, rank)) * 10 ** rng.uniform(-1, 1.5, (N, 1)))
+    least = 1e-10 * np.einsum("nii->ni", K)
+    given = (*map(jnp.asarray, (K, least)), jnp.ones((N, m), bool), *map(jnp.asarray, (load, f)))
+    sig, tau = map(np.asarray, jax.jit(jax.vmap(slides_in_box))(*given))
+    for i in range(N):
+        _, exact = all_choices(K[i], load[i], f[i])
+        rate = load[i] - K[i] @ exact
+        size = np.abs(load[i]) + np.abs(K[i]) @ np.abs(exact)
+        assert np.all(np.abs(K[i] @ (tau[i] - exact)) < 1e-9 * size)
+        moves = np.abs(rate) > 1e-6 * size
+        np.testing.assert_array_equal(np.where(moves, np.sign(rate), 0), sig[i] * moves)
+        assert np.all(np.abs(rate[~moves]) < 1e-9 * size[~moves])
+        d = np.diag(K[i])
+        assert d @ tau[i] ** 2 <= d @ exact**2 * (1 + 1e-5) + 1e-14
+    assert {-1, 0, 1} == set(np.unique(sig))
+
+
+def gear(q, t, params):
+    """The first turns twice as fast as the second."""
+    return q[:1] - 2 * q[1:]
+
+
+GEAR = hhtjax.System(
+    jnp.array([0.5, 2.0]), lambda q, v, t, p: jnp.array([-p["k"], 0.0]) * q, gear, friction=lambda q, v, L, t, p: p["F"]
+)
+GEARED = {"k": 100.0, "F": jnp.array([1.5, 5.0])}  # 1.5 + 5/2 at the first, which feels a mass of 1
+
+
+def turned(F=GEARED["F"], num_steps=400, dtype=float):
+    q0 = jnp.array([0.5, 0.25], dtype)
+    params = {"k": jnp.asarray(100.0, dtype), "F": jnp.asarray(F, dtype)}
+    return hhtjax.simulate(GEAR, hhtjax.hht(), q0, 0 * q0, params, dt=2.2 / num_steps, num_steps=num_steps)
+
+
+@pytest.fixture(scope="module")
+def gears():
+    """Limits of which a batch has those of both sides, of one side, and none."""
+    return jax.jit(jax.vmap(turned))(jnp.array([[1.5, 5.0], [4.0, 0.0], [0.0, 8.0], [0.0, 0.0]]))
+
+
+@pytest.mark.slow
+def test_both_sides_of_a_gear_rub(gears):
+    """The same motion, whichever side has how much of it; and none of it stays where it is 0."""
+    gears.check()
+    exact, _ = free_vibration_exact(np.asarray(gears.t[0]))
+    np.testing.assert_allclose(gears.q[:3, :, 0], np.tile(exact, (3, 1)), atol=1e-3)
+    np.testing.assert_allclose(gears.q[..., 0], 2 * gears.q[..., 1], atol=1e-13)
+    np.testing.assert_allclose(gears.q[3, :, 0], 0.5 * np.cos(10 * gears.t[3]), atol=2e-2)
+    assert gears.sticking[:3, -1].tolist() == [[True, True], [True, False], [False, True]]
+    slides = ~np.asarray(gears.sticking[0]).any(axis=1)
+    np.testing.assert_allclose(np.abs(gears.friction[0])[slides], np.tile([1.5, 5.0], (slides.sum(), 1)), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_what_sticks_stays_and_shares_its_load_within_the_limits(gears):
+    stuck = np.asarray(gears.sticking[0]).all(axis=1)
+    q, tau = np.asarray(gears.q[0])[stuck], np.asarray(gears.friction[0])[stuck]
+    assert np.ptp(q[:, 0]) < 1e-15
+    assert np.all(np.abs(gears.v[0])[stuck] < 1e-15)
+    assert np.all(np.abs(tau) <= [1.5, 5.0])
+    np.testing.assert_allclose(tau[1:] @ [1, 0.5], -100 * q[1:, 0], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_gears_in_single_precision_and_in_batches(gears):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hhtjax.PrecisionWarning)
+        rough = turned(dtype=jnp.float32)
+    rough.check()
+    assert {x.dtype for x in (rough.q, rough.friction)} == {np.dtype("float32")}
+    np.testing.assert_allclose(rough.q, gears.q[0], atol=1e-4)
+    np.testing.assert_allclose(turned().q, gears.q[0], atol=1e-13)
+
+
+@pytest.mark.slow
+def test_derivatives_in_the_limits_of_a_gear():
+    """Through reversals; also where a limit is 0: there it would brake as much as the other side does."""
+
+    def end(F, num_steps=32):
+        run = turned(F, num_steps)
+        return jnp.sum(run.q[-3 * num_steps // 32] * jnp.array([1.0, 0.3]))
+
+    check_gradient(end, np.asarray(GEARED["F"]), step=1e-6)
+    # a joint without a limit switches with the step, so that its derivative is of first order
+    slope = np.asarray(jax.jit(jax.jacfwd(lambda F: end(F, 128)))(jnp.array([4.0, 0.0])))
+    np.testing.assert_allclose(slope[1], slope[0] / 2, rtol=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("m", [3, 16])
+def test_many_pads_on_one_disc(m):
+    """As many as rub, with their limits' sum; one of them on a belt that moves gives its part of the motion."""
+    share = jnp.arange(1.0, m + 1) / sum(range(1, m + 1))
+    disc = hhtjax.System(
+        ONE,
+        lambda q, v, t, p: -100 * q,
+        friction=lambda q, v, t, p: 4 * share,
+        sliding=lambda q, v, t, p: v * jnp.ones(m),
+    )
+    run = hhtjax.simulate(disc, hhtjax.hht(), 0.5 * ONE, 0 * ONE, dt=2.2 / 400, num_steps=400)
+    run.check()
+    np.testing.assert_allclose(run.q[:, 0], free_vibration_exact(np.asarray(run.t))[0], atol=1e-3)
+    assert run.sticking[-1].all()
+    np.testing.assert_allclose(np.sum(run.friction[-1]), -100 * run.q[-1, 0], rtol=1e-9)
+    if m == 3:
+        found = hhtjax.analysis.energy_balance(disc, run, potential=lambda q, t, params: 50 * jnp.sum(q**2))
+        assert np.max(np.abs(found.error)) < 5e-3 * 12.5
+        assert found.work[-1] < -0.9 * 12.5
+
+
+def test_more_than_sixteen_are_refused():
+    system = hhtjax.System(
+        jnp.ones(1),
+        lambda q, v, t, p: -q,
+        friction=lambda *_: jnp.ones(17),
+        sliding=lambda q, v, t, p: v * jnp.ones(17),
+    )
+    with pytest.raises(ValueError, match=r"`sliding` must return an array \(m,\) with 1 <= m <= 16"):
+        hhtjax.simulate(system, hhtjax.hht(), ONE, ONE, dt=0.1, num_steps=1)
+
+
+@pytest.mark.slow
+def test_two_belts_pull_one_block():
+    """Of other speeds: s2 = s1 - 1 depends on s1 but for what is prescribed. Against tanh with less and less width."""
+    block = hhtjax.System(
+        ONE,
+        lambda q, v, t, p: -4.0 * q,
+        friction=lambda q, v, t, p: jnp.array([1.0, 1.5]),
+        sliding=lambda q, v, t, p: v * TWO - jnp.array([0.3, -0.5 * jnp.cos(2 * t)]),
+    )
+    run = hhtjax.simulate(block, hhtjax.hht(), 0 * ONE, ONE, dt=2e-3, num_steps=2000, save_every=100)
+    run.check()
+
+    def error(width):
+        def rate(t, y):
+            return [
+                y[1],
+                -4 * y[0] - np.tanh((y[1] - 0.3) / width) - 1.5 * np.tanh((y[1] + 0.5 * np.cos(2 * t)) / width),
+            ]
+
+        exact = solve_ivp(rate, (0, 4), [0, 1], "Radau", np.asarray(run.t), rtol=1e-9, atol=1e-10)
+        return np.max(np.abs(exact.y[0] - run.q[:, 0]))
+
+    wide, narrow = error(1e-3), error(1e-4)
+    assert narrow < 1e-4
+    assert narrow < wide / 6
+
+
+@pytest.mark.slow
+def test_a_driven_crank_bears_all_four_joints():
+    """Sum of F_i |ds_i/dq| beside the torque without friction; nothing moves otherwise."""
+    t = np.linspace(0, 2, 801)
+    x, rate = motion(t)
+    q0, v0 = angles(x[:1])[:, 0], ratios(angles(x[:1])[:, 0]) * rate[0]
+
+    @jax.jit
+    @jax.vmap
+    def run(F):
+        return hhtjax.simulate(CRANK, hhtjax.hht(), q0, v0, {**PARAMS, "F": F}, dt=2 / 800, num_steps=800)
+
+    found = run(jnp.stack([LIMITS, 0 * LIMITS]))
+    found.check()
+    torque = np.asarray(found.multipliers[0] - found.multipliers[1])[:, 2]
+    slopes = np.array([ratios(q) for q in angles(x).T])
+    rates = np.stack([slopes[:, 0], slopes[:, 1] - slopes[:, 0], slopes[:, 2] - slopes[:, 1], slopes[:, 2]])
+    exact = np.sign(rate) * (np.asarray(LIMITS) @ np.abs(rates))
+    away = np.abs(torque - exact)
+    turning = np.any(np.diff(np.sign(rates * rate), axis=1) != 0, axis=0)
+    clear = ~np.concatenate([[False], turning])
+    assert np.max(away[clear]) < 1e-6
+    assert np.count_nonzero(~clear) == 3
+    np.testing.assert_allclose(found.q[0], found.q[1], atol=1e-12)
+    np.testing.assert_allclose(np.abs(found.friction[0]), np.tile(LIMITS, (801, 1)))
+
+
+LOADED = {**PARAMS, "A": 40.0, "W": 5.0, "F": 15 * LIMITS}
+
+
+@pytest.mark.slow
+def test_four_joints_of_a_four_bar_rub():
+    """Order 2 against one freedom, solved from switch to switch, through rest, reversals and turns of single joints."""
+    T, samples, sizes = 3.0, 30, np.array([480, 1920])
+    exact, switches = reduced(LOADED, np.linspace(0, T, samples + 1))
+    assert len(switches) == 6
+    q0 = angles(np.array([0.7]))[:, 0]
+    found = hhtjax.sweep(FREE, hhtjax.hht(), q0, 0 * q0, LOADED, dts=T / sizes, duration=T, num_samples=samples)
+    found.check()
+    error = np.stack(
+        [np.max(np.abs(x[:, :, 0] - y[None]), axis=1) for x, y in zip((found.q, found.v), exact, strict=True)]
+    )
+    order = np.log(error[:, 0] / error[:, 1]) / np.log(4)
+    assert np.all(order > 1.85), order
+    assert np.all(error[:, 1] < [1e-3, 4e-3]), error
+    assert 0.02 < np.mean(found.sticking[1]) < 0.2
+    one = hhtjax.simulate(FREE, hhtjax.hht(), q0, 0 * q0, LOADED, dt=T / 1920, num_steps=1920)
+    balance = hhtjax.analysis.energy_balance(FREE, one, LOADED)
+    assert np.max(np.abs(balance.error)) < 1e-3 * np.max(np.abs(balance.kinetic))
+
+
+@pytest.mark.slow
+def test_derivatives_in_all_four_limits():
+    q0 = angles(np.array([0.7]))[:, 0]
+
+    def end(F):
+        run = hhtjax.simulate(FREE, hhtjax.hht(), q0, 0 * q0, {**LOADED, "F": F}, dt=1 / 32, num_steps=32)
+        return run.q[-1, 0] + 0.1 * run.v[-1, 0] + 0.01 * run.multipliers[-1, 0]
+
+    check_gradient(end, np.asarray(LOADED["F"]), step=1e-6)
+
+
+def twins(limit=lambda q, v, t, p: p * TWO):
+    """Two pads on the first of three masses: fewer rows than freedoms, so that only the start shows what they are."""
+    return hhtjax.System(
+        jnp.ones(3), lambda q, v, t, p: -100 * q, friction=limit, sliding=lambda q, v, t, p: v[0] * TWO
+    )
+
+
+@pytest.mark.slow
+def test_what_a_start_shows_and_what_a_tracer_hides():
+    """Inside a batch of limits rows are not known: there the stepper is told, else the run fails by name."""
+    q0 = jnp.array([0.5, 0.1, 0.1])
+
+    def run(F, stepper=hhtjax.hht()):  # noqa: B008 (frozen)
+        return hhtjax.simulate(twins(lambda q, v, t, p: p * TWO), stepper, q0, 0 * q0, F, dt=2.2 / 400, num_steps=400)
+
+    known = run(2.0)
+    known.check()
+    np.testing.assert_allclose(known.q[:, 0], free_vibration_exact(np.asarray(known.t))[0], atol=1e-3)
+
+    def hidden(c, stepper):
+        system = hhtjax.System(
+            jnp.ones(3), lambda q, v, t, p: -100 * q, friction=lambda q, v, t, p: 2.0 * TWO,
+            sliding=lambda q, v, t, c: v[0] * jnp.stack([c, 1.0]),
+        )  # fmt: skip
+        return hhtjax.simulate(system, stepper, q0, 0 * q0, c, dt=2.2 / 400, num_steps=400)
+
+    told = jax.vmap(lambda c: hidden(c, hhtjax.hht(redundant="least_squares")))(TWO)
+    np.testing.assert_allclose(told.q[0], known.q, atol=1e-12)
+    with pytest.raises(
+        hhtjax.SimulationError, match=r"directions of dry friction came to depend on each other.*least_squares"
+    ):
+        jax.vmap(lambda c: hidden(c, hhtjax.hht()))(TWO).check()
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_a_gear_in_c(tmp_path):
+    arguments = hhtjax.hht(), jnp.array([0.5, 0.25]), ZERO, GEARED
+    library = Library(hhtjax.export_c(GEAR, *arguments), tmp_path)
+    dt = 2.2 / 400
+    state, flags = library.begin(*arguments[1:3], dt=dt)
+    assert flags == 0
+    assert library.run(state, 400, dt) == 0
+    run = turned()
+    assert numbers(state, "q") == pytest.approx(np.asarray(run.q[-1]), rel=1e-10)
+    assert numbers(state, "friction_tau") == pytest.approx(np.asarray(run.friction[-1]), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_held_torque_breaks_a_gear_away_at_its_jump():
+    """(u - 4) t^2/2 from the jump on: exact, since all is constant between."""
+    u = hhtjax.sampled(jnp.array([1.0, 3.9, 6.0, 6.0]), dt=1.0, order=0)
+    system = hhtjax.System(
+        GEAR.mass, lambda q, v, t, u: jnp.stack([u(t), 0.0 * t]), gear, friction=lambda q, v, L, t, u: GEARED["F"]
+    )
+    run = hhtjax.simulate(system, hhtjax.hht(0.0), ZERO, ZERO, u, dt=0.25, num_steps=11)
+    run.check()
+    t = np.maximum(np.asarray(run.t) - 2, 0)
+    np.testing.assert_allclose(run.v[:, 0], 2 * t, atol=1e-12)
+    np.testing.assert_allclose(run.q[:, 0], t**2, atol=1e-12)
+    assert run.sticking[:9].all()
