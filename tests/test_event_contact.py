@@ -260,6 +260,36 @@ def test_the_derivatives_of_lifting():
     np.testing.assert_allclose(along(np.array([1.25, 1.05, 0.0, 9.0, 1.013])), exact, rtol=0, atol=1e-12)
 
 
+BEAD = System(
+    jnp.ones(3),
+    lambda q, v, t, p: jnp.array([0.0, -10.0, 0.0]),
+    lambda q, t, p: (p["on"] * outside(q) + (1 - p["on"]) * q[2])[None],
+)
+
+
+def outside(q):
+    """Of a circle of radius 1."""
+    return (q[0] ** 2 + q[1] ** 2 - 1) / 2
+
+
+@pytest.mark.slow
+def test_a_bead_that_slides_off_a_ball_leaves_it_wherever_in_a_step():
+    """At cos(angle) = 2/3 of that where it rested; a hair behind the start of a step, too, as with the third dt."""
+    meets = Event(lambda q, v, t, p: jnp.where(p["on"] == 1, 1.0, outside(q)), impact(0.0), LAND.switch)
+    q0 = np.array([np.sin(0.3), np.cos(0.3), 0.0])
+
+    @jax.jit
+    def run(dt):
+        return simulate(BEAD, LIGHT, q0, np.zeros(3), {"on": 1.0}, dt=dt, num_steps=200, events=[meets, LIFT])
+
+    height = 2 / 3 * np.cos(0.3)
+    for dt in (0.0035, 0.005, 0.006805084745762712, *np.linspace(0.004, 0.01, 20)):
+        found = run(dt)
+        found.check()
+        assert found.events.which[:2].tolist() == [1, -1]
+        assert abs(found.events.q[0, 1] - height) < 2 * dt**2
+
+
 # constraints that params switch off
 
 BARE = System(
