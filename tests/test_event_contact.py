@@ -172,10 +172,11 @@ def test_contact_ends_and_begins_in_one_run():
 @pytest.mark.slow
 def test_the_derivatives_of_contact():
     """Of the times, and of a height in flight, in the amplitude: forward, reverse, differences, and the formula of the
-    first time, sin(W t) = g/(A W^2)."""
+    first time, sin(W t) = g/(A W^2), which is met to the first order of dt: the error of the time, of dt^2, changes
+    with its place in a step."""
 
     def told(A):
-        run = shaken({"dt": 0.01, "num_steps": 90}, A=A)
+        run = shaken({"dt": 0.0025, "num_steps": 360}, A=A)
         return jnp.concatenate([run.events.t[:3], run.q[-1, :1]])
 
     A = float(SCENE.params["A"])
@@ -184,7 +185,7 @@ def test_the_derivatives_of_contact():
     central = (along(A + 1e-6)[0] - along(A - 1e-6)[0]) / 2e-6
     assert abs(by_column - by_row).max() < 1e-12
     assert abs(by_column - central).max() < 1e-6
-    np.testing.assert_allclose(by_column[0], -np.tan(10 * flights(2.0)[0]) / (10 * A), rtol=1e-2)
+    np.testing.assert_allclose(by_column[0], -np.tan(10 * flights(2.0)[0]) / (10 * A), rtol=4 * 0.0025)
 
 
 @pytest.mark.slow
