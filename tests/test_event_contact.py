@@ -172,10 +172,11 @@ def test_contact_ends_and_begins_in_one_run():
 @pytest.mark.slow
 def test_the_derivatives_of_contact():
     """Of the times, and of a height in flight, in the amplitude: forward, reverse, differences, and the formula of the
-    first time, sin(W t) = g/(A W^2)."""
+    first time, sin(W t) = g/(A W^2), which is met to the first order of dt: the error of the time, of dt^2, changes
+    with its place in a step."""
 
     def told(A):
-        run = shaken({"dt": 0.01, "num_steps": 90}, A=A)
+        run = shaken({"dt": 0.0025, "num_steps": 360}, A=A)
         return jnp.concatenate([run.events.t[:3], run.q[-1, :1]])
 
     A = float(SCENE.params["A"])
@@ -184,7 +185,7 @@ def test_the_derivatives_of_contact():
     central = (along(A + 1e-6)[0] - along(A - 1e-6)[0]) / 2e-6
     assert abs(by_column - by_row).max() < 1e-12
     assert abs(by_column - central).max() < 1e-6
-    np.testing.assert_allclose(by_column[0], -np.tan(10 * flights(2.0)[0]) / (10 * A), rtol=1e-2)
+    np.testing.assert_allclose(by_column[0], -np.tan(10 * flights(2.0)[0]) / (10 * A), rtol=4 * 0.0025)
 
 
 @pytest.mark.slow
@@ -258,6 +259,36 @@ def test_the_derivatives_of_lifting():
         assert abs(along(x) - np.array(central)).max() < 1e-7
     exact = [0.0, 1.0, 0.0, 0.0, -15 * (2 - 1.013)]
     np.testing.assert_allclose(along(np.array([1.25, 1.05, 0.0, 9.0, 1.013])), exact, rtol=0, atol=1e-12)
+
+
+BEAD = System(
+    jnp.ones(3),
+    lambda q, v, t, p: jnp.array([0.0, -10.0, 0.0]),
+    lambda q, t, p: (p["on"] * outside(q) + (1 - p["on"]) * q[2])[None],
+)
+
+
+def outside(q):
+    """Of a circle of radius 1."""
+    return (q[0] ** 2 + q[1] ** 2 - 1) / 2
+
+
+@pytest.mark.slow
+def test_a_bead_that_slides_off_a_ball_leaves_it_wherever_in_a_step():
+    """At cos(angle) = 2/3 of that where it rested; a hair behind the start of a step, too, as with the third dt."""
+    meets = Event(lambda q, v, t, p: jnp.where(p["on"] == 1, 1.0, outside(q)), impact(0.0), LAND.switch)
+    q0 = np.array([np.sin(0.3), np.cos(0.3), 0.0])
+
+    @jax.jit
+    def run(dt):
+        return simulate(BEAD, LIGHT, q0, np.zeros(3), {"on": 1.0}, dt=dt, num_steps=200, events=[meets, LIFT])
+
+    height = 2 / 3 * np.cos(0.3)
+    for dt in (0.0035, 0.005, 0.006805084745762712, *np.linspace(0.004, 0.01, 20)):
+        found = run(dt)
+        found.check()
+        assert found.events.which[:2].tolist() == [1, -1]
+        assert abs(found.events.q[0, 1] - height) < 2 * dt**2
 
 
 # constraints that params switch off

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.runs.event_parts import SHORT, go
+from hhtjax.runs.event_parts import go
 from hhtjax.systems.sampled import SLOP
 
 TOGETHER = 1e-9  # part of a step: two events that are one
@@ -149,11 +149,12 @@ def first_of(events, part, found, near):
 
 
 def reached(ways, params, part, tau, h):
-    """`go` from the start of a part; in a very short time multipliers change, too, where a guard sees them."""
+    """`go` from the start of a part. Where a guard sees multipliers they go over from a line to those of the step:
+    these are of order 2, but in a very short one they are not those of the start, and a guard must not jump."""
     s, info = go(ways, params, part.start, tau, part.last, h)
     if any(ways.events.forced):
-        Ldot = ways.events.slope(part.start, part.end, part.rest)
-        s = s._replace(L=jnp.where(tau <= SHORT * h, part.start.L + tau * Ldot, s.L))
+        line = part.start.L + tau * ways.events.slope(part.start, part.end, part.rest)
+        s = s._replace(L=line + tau / jnp.where(part.rest > 0, part.rest, 1) * (s.L - line))
     return s, info
 
 

@@ -56,7 +56,8 @@ class Event(Description):
     the rebounds by the guard of the impact. Only a guard of multipliers may jump: forces do, where a load is switched
     on, and its event happens at once.
 
-    The times of multipliers are those at which the L that the run saves is zero: as exact as L, which is of order 2.
+    The times of multipliers are those at which L is zero, between lines and what a part of the step gives: as exact as
+    the L that the run saves, of order 2; derivatives are those of the run, and of order 1.
 
     Resting contact is no event: a ball that comes to rest on the floor bounces infinitely often in a finite time, and
     the run fails by name when more than `max_events` fall into a step. Give contacts that last a stiff force, or a
