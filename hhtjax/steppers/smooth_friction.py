@@ -12,9 +12,10 @@ import jax.numpy as jnp
 
 from hhtjax.numerics.elimination import matvec
 from hhtjax.steppers.friction import begin_friction, direction, smooth_system
-from hhtjax.steppers.smooth_start import Found, corrected_by, damped_part, rate_of, response, smoothed
+from hhtjax.steppers.smooth_start import Found, corrected_by, damped_part, rate_of, smoothed
 from hhtjax.systems.constraints import curvature
-from hhtjax.systems.friction import across, at_rest, directions, own_rate, solve_some
+from hhtjax.systems.friction import directions, own_rate
+from hhtjax.systems.friction_rows import depends, rows_of
 
 
 def smoothed_friction(method, system, s, params, h, moves=True, resolves=False, alone=False):
@@ -28,18 +29,20 @@ def finished(law, method, layer, inverse, drag, z, h, corrects):
     system, base, params = layer.system._replace(friction=law), layer.base, layer.params
     q, v, t, n = base.q, base.v, base.t, layer.system.size
     H = directions(system, q, t, params)
-    G = jnp.stack([response(layer, inverse, row) for row in H])
-    K = across(H, G)
+    answers = jnp.stack([inverse(jnp.pad(row, (0, z.size - n))) for row in H])
+    G, pulls = jnp.stack([layer.located(x) for x in answers[:, :n]]), answers[:, n:]
+    rows = rows_of(system, q, t, params, H, G, pulls, False, depends(system, method.redundant))
 
     def taken_off(x, some, own=0.0):
         """x without what moves these joints."""
-        return x - matvec(G.T, solve_some(K, some, matvec(H, x) + own))
+        return x - matvec(G.T, rows.solve(rows.K, some, matvec(H, x) + own))
 
     if drag is not None:
         start = begin_friction(method, system, q, v, t, params, h)
         dv = layer.located(layer.V * z[:n])
         f = law.limit(q, v, start.L, t, params)
-        ends, tau = at_rest(layer.V * K, jnp.ones_like(f) > 0, law.sliding(q, v + dv, t, params), f)
+        load, size = law.sliding(q, v + dv, t, params) / layer.V, matvec(jnp.abs(H), jnp.abs(v + dv)) / layer.V
+        ends, tau = rows.at_rest(jnp.ones_like(f) > 0, load, f, size)
         stays = (direction(system, (q, v, t, params), H) == 0) & (ends == 0)
         dv = taken_off(dv - layer.V * matvec(G.T, tau), stays)
         v = v + damped_part(layer, inverse, drag, dv, h, lambda x: taken_off(x, stays))
