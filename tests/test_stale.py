@@ -18,7 +18,7 @@ DATA = {"k": [1.0]}
 ARRAY = np.ones(1)
 module = types.ModuleType("of_the_user")
 sys.modules["of_the_user"] = module
-module.k = 1.0
+setattr(module, "k", 1.0)  # noqa: B010
 
 
 def body(i, c):

@@ -163,7 +163,8 @@ class Look:
     def __init__(self, f, unread=()):
         """unread: containers that the function itself changes, such as a list that it appends to."""
         self.unread = unread
-        self.values, self.steps, self.key, self.arrays, self.contents = [f], [], [], [], []
+        self.values, self.steps, self.arrays, self.contents = [f], [], [], []
+        self.key: Any = []
         self._seen, self._kept, self.is_broken = {}, [], False
         i = 0
         while i < min(len(self.values), MOST_VALUES):
