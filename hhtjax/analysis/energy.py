@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from hhtjax.analysis.event_rows import with_event_rows
 from hhtjax.analysis.friction_work import friction_work, switches
 from hhtjax.checks import require_function
-from hhtjax.description import freeze, thaw
+from hhtjax.description import current, freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.runs.interpolate import interpolate
 from hhtjax.runs.output import require_path
@@ -82,6 +82,7 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
     require_path(caller, solution)
     if potential is not None:
         require_function(caller, "potential", potential, "potential(q, t, params)")
+        potential = current(potential)
     return _energy_balance(system, solution, freeze(params), potential)
 
 

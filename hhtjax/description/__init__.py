@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from hhtjax.description.current import current
+
 VERSION = "0.1.0"  # of the library
 
 
@@ -65,7 +67,7 @@ class Fixed:
 
     def tree_flatten(self):
         """No leaves."""
-        return (), self.function
+        return (), current(self.function)
 
     @classmethod
     def tree_unflatten(cls, function, _):
@@ -108,8 +110,8 @@ class Description:
     """Base of systems and steppers, which say what to compute and hold no state.
 
     A subclass is a frozen dataclass with `eq=False`. Arrays among its fields (a constant mass
-    matrix, an `alpha` that is being differentiated) are leaves of the pytree; functions, Python
-    numbers and strings are static. Two descriptions are equal, and hash alike, when all fields are.
+    matrix, an `alpha` that is being differentiated) are leaves of the pytree; functions, as they are
+    `current`, Python numbers and strings are static. Two descriptions are equal, and hash alike, when all fields are.
     """
 
     def __init_subclass__(cls):
@@ -139,7 +141,11 @@ class Description:
         return self
 
     def _flatten(self):
-        fields = {name: value for name, value in vars(self).items() if name != "_places"}
+        fields = {
+            name: current(value) if callable(value) and not isinstance(value, Description) else value
+            for name, value in vars(self).items()
+            if name != "_places"
+        }
         return jax.tree.flatten(fields, is_leaf=lambda x: x is None)  # others put None in the place of an array
 
     def __eq__(self, other):

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_function, require_number
-from hhtjax.description import is_concrete, thaw
+from hhtjax.description import current, is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
     check_options,
@@ -91,9 +91,8 @@ def fit(
             `Uncertainty`). Of `records` whole ones, where that makes 8 and more than there are parameters.
         progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
 
-    A function is traced and compiled once, and then known by its identity: data that it reads from outside are part of
-    the program, and that an array has changed in place or a name been bound anew goes unnoticed. For other data make
-    another function, `lambda params: residuals(params, data)`, or pass them as `records`.
+    A function is traced and compiled once, and anew where something that it reads from outside differs, as `simulate`
+    says; arrays are compared by their bytes. Data that change from call to call cost no compilation as `records`.
 
     Estimates have derivatives, forward and reverse, in all that a fit is given and its residuals read, but where it
     starts: those of the minimum, H dx + (dg/dd) dd = 0 with g = dc/dx the slope of the cost and H = dg/dx, by the
@@ -137,6 +136,7 @@ def fit(
     if of_records:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
     alone = is_outside(options, params0, data)
+    residuals, options = current(residuals), options._replace(loss=options.loss and current(options.loss))
     result = or_plain(partial(solve_outside if alone else solve, residuals, options, params0, data))
     result = result._replace(params=thaw(result.params))
     return _finished("fit", result, weights) if is_concrete(result.code) else result
@@ -199,6 +199,7 @@ def multistart(
     )
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
+    residuals, options = current(residuals), options._replace(loss=options.loss and current(options.loss))
     every = or_plain(lambda: jax.vmap(lambda start: solve(residuals, options, start, data))(starts))
     failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
     cost = jnp.where(failed, jnp.inf, every.cost)

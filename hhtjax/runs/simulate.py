@@ -119,9 +119,10 @@ def simulate(
     megabyte that it may take to do so only once.
     Compiled once for each system, stepper, structure, num_steps and save_every; a new dt, q0 or params
     costs no compilation, but for numbers of another type: 4 after 4.0, or np.float64(4.0), is another program, and
-    so is an array after a number. Functions are told apart by identity, here as in `fit`: one that reads a global
-    variable, or data around it, keeps the values of its first call. Pass through params what may change, or define the
-    function anew, or call `jax.clear_caches()`.
+    so is an array after a number. Functions are known by identity and by what they read from outside: globals, cells of
+    closures, attributes of modules and of objects, entries of lists and dicts, arrays by their bytes. Where one of
+    these differs, here as in `fit`, the program is made anew; through params it costs no compilation. Inside a `jit` of
+    your own JAX's rule holds: what a function has read when that was traced stays.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate

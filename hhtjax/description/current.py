@@ -1,0 +1,172 @@
+"""What stands for a function in the programs of JAX: itself, or, where it reads other data, another of its kind."""
+
+import functools
+import types
+import weakref
+from contextlib import suppress
+from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
+from typing import Any
+
+from hhtjax.description.copies import again
+from hhtjax.description.reads import JITTED, Look, Same, is_users
+
+MOST_STATES = 16  # of what a function reads, for which its programs are found again
+
+
+def current(f) -> Any:
+    """f, as long as all that it reads from outside is what it was; else what does the same, but is not equal to f.
+
+    To be called where a function becomes part of what JAX keeps a program by.
+
+    >>> gain = [1.0]
+    >>> force = lambda q: gain[0] * q
+    >>> before, again = current(force), current(force)
+    >>> gain[0] = 2.0
+    >>> before is again, current(force) is before, current(force)(3.0)
+    (True, False, 6.0)
+    """
+    entry = _entries.get(id(f))
+    if entry is None or entry[0]() is not f:
+        return _first(f)
+    _, known, origin = entry
+    return known.current(f if origin is None else origin)
+
+
+_entries: dict[int, tuple] = {}  # by the id of a function: weak reference to it, `Known`, and what it stands for
+_methods: dict[tuple, tuple] = {}  # by those of an object and its function
+
+
+def _first(f):
+    """The same of a function that has not been met."""
+    if isinstance(f, types.FunctionType | partial):
+        return _enter(f, Known()).current(f)
+    if isinstance(f, types.MethodType):
+        return _known_method(f).current(f)
+    if isinstance(f, JITTED | type | types.BuiltinFunctionType):
+        return f
+    if is_dataclass(f) and type(f).__hash__ is not object.__hash__:  # equal ones share programs
+        return _with_current_call(_with_current_fields(f))
+    if is_users(type(f)) and type(f).__hash__ is object.__hash__:
+        return _enter(f, Known()).current(f)
+    return f
+
+
+def _enter(f, known, origin=None):
+    key = id(f)
+
+    def gone(ref):
+        if (entry := _entries.get(key)) is not None and entry[0] is ref:
+            del _entries[key]
+
+    with suppress(TypeError):  # an object that does not allow it is known for one call
+        _entries[key] = weakref.ref(f, gone), known, origin
+    return known
+
+
+def _known_method(f):
+    """By its object and its function: a method is another object each time."""
+    key = _method_key(f)
+    if (entry := _methods.get(key)) is not None and entry[0]() is f.__self__:
+        return entry[1]
+    known = Known()
+    with suppress(TypeError):
+        _methods[key] = weakref.ref(f.__self__, lambda _: _methods.pop(key, None)), known
+    return known
+
+
+def _method_key(f):
+    return id(f.__self__), id(f.__func__)
+
+
+def _with_current_fields(f):
+    """A dataclass of functions, such as a force by a Lagrangian, with what stands for each."""
+    changed = {}
+    for field in fields(f):
+        x = getattr(f, field.name)
+        if callable(x) and (now := current(x)) is not x:
+            changed[field.name] = now
+    if not changed:
+        return f
+    new = object.__new__(type(f))
+    for name, value in {**vars(f), **changed}.items():
+        object.__setattr__(new, name, value)
+    return new
+
+
+def _with_current_call(f):
+    """The same, of which equal ones are known by the function of their class."""
+    call = type(f).__call__
+    if not is_users(type(f)) or not isinstance(call, types.FunctionType) or (now := current(call)) is call:
+        return f
+    return _Called(now, f)
+
+
+@dataclass(frozen=True)
+class _Called:
+    call: Any
+    f: Any
+
+    def __call__(self, *args, **keywords):
+        return self.call(self.f, *args, **keywords)
+
+
+class Known:
+    """What stands for a function in each state of what it reads."""
+
+    def __init__(self):
+        self.unread = set()
+        self.states = []  # (key, weak reference to what stands for the function, None for itself), the latest last
+        self.look: Any = None
+
+    def current(self, f):
+        """What stands for f now."""
+        if self.look is not None and self.look.still_holds(f):
+            if (stands := self.states[-1][1]) is None:
+                return f
+            if (form := stands()) is not None:
+                return form
+        return self._found(f)
+
+    def _form(self, state, f):
+        return f if state[1] is None else state[1]()
+
+    def _found(self, f):
+        self.look = Look(f, self.unread)
+        key, form = self.look.key, None
+        alive = [state for state in self.states if self._form(state, f) is not None]
+        same = [state for state in alive if state[0] == key]
+        if same:
+            state, form = same[0], self._form(same[0], f)
+        else:
+            form = again(f) if self.states else f
+            if self.look.may_change():
+                form = Reading(form, f, self, self.look)
+            if form is not f:
+                _enter(form, self, f)
+            state = key, None if form is f else weakref.ref(form)
+        self.states = [*(x for x in alive if x is not state), state][-MOST_STATES:]
+        return form
+
+    def ignore(self, changed, form, f):
+        """What the function changes itself is not compared any more. form: what stands for f, and has been called."""
+        self.unread |= set(map(Same, changed))
+        self.look = Look(f, self.unread)
+        self.states = [(self.look.key, weakref.ref(form))]
+
+
+class Reading:
+    """A function that reads lists, dicts or arrays: it notes which of them it changes itself, when it is traced."""
+
+    def __init__(self, form, f, known, look):
+        functools.update_wrapper(self, f, updated=())
+        self._form, self._f, self._known, self._look = form, f, known, look
+
+    def __call__(self, *args, **keywords):
+        before = [(x, tell, tell(x)) for x, tell in self._look.changeable(self._f)]
+        try:
+            return self._form(*args, **keywords)
+        finally:
+            if changed := [x for x, tell, held in before if tell(x) != held]:
+                self._known.ignore(changed, self, self._f)
+                self._look = self._known.look
