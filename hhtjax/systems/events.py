@@ -18,6 +18,7 @@ from hhtjax.checks import require_function, require_number
 from hhtjax.description import Description, freeze, is_array, thaw
 from hhtjax.numerics.seldom import seldom
 from hhtjax.systems.constraints import answers, pull_back
+from hhtjax.xla import consistent
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +144,7 @@ class FlatEvents(NamedTuple):
 
 def flatten_events(system, events, params, redundant=None):
     """The events of a `FlatSystem`. redundant: how its constraints are solved."""
-    calls = [partial(_on_vectors, system, event.guard) for event in events]
+    calls = [consistent(partial(_on_vectors, system, event.guard)) for event in events]
     changed = sorted({i for event in events if event.switch for i in _changed(event.switch, params)})
 
     def guards(q, v, t, params):
@@ -206,8 +207,9 @@ def _reset(system, event, redundant, q, v, t, params):
     if event.reset is None:
         return v
     if isinstance(event.reset, Impact):
-        return _bounced(system, partial(_on_vectors, system, event.guard), event.reset, redundant, q, v, t, params)
-    new = ravel_pytree(_on_vectors(system, event.reset, q, v, t, params))[0].astype(v.dtype)
+        guard = consistent(partial(_on_vectors, system, event.guard))
+        return _bounced(system, guard, event.reset, redundant, q, v, t, params)
+    new = ravel_pytree(consistent(partial(_on_vectors, system, event.reset))(q, v, t, params))[0].astype(v.dtype)
     return system.with_internal(jnp.pad(new, (0, system.size - new.size)), v)
 
 

@@ -17,6 +17,7 @@ from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.returned import check_like, check_matrix, count, evaluate
 from hhtjax.systems.sparse_system import with_sparse_matrices
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem
+from hhtjax.xla import consistent
 
 
 class FlatSystem(NamedTuple):
@@ -151,20 +152,22 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
     constraint, m = None, 0
     if system.constraint is not None:
         m = count(caller, "constraint", system.constraint, n, dtype, q0, t0, params)
-        constraint = partial(_flat_constraint, system.constraint, unravel, dtype)
+        constraint = consistent(partial(_flat_constraint, system.constraint, unravel, dtype))
 
     linear = isinstance(system, LinearSystem)
     _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0)
 
     def on_vectors(system):
         mass, force = (partial(f, system, unravel, dtype) for f in (_flat_mass, partial(_flat_force, unravel_rates)))
+        mass, force = consistent(mass) if callable(system.mass) else mass, consistent(force)
         flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks)
         return _with_local(system, flat, dtype) if linear and system.nonlinear is not None else flat
 
     flat = on_vectors(system)
     if not linear and system.inertia is not None:
         check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, q0, v0, params), "v0", v0, dtype)
-        flat = flat._replace(product=partial(_flat_product, system.inertia, unravel, unravel_rates, dtype))
+        product = partial(_flat_product, system.inertia, unravel, unravel_rates, dtype)
+        flat = flat._replace(product=consistent(product))
     if linear:
         flat = with_sparse_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
@@ -194,7 +197,7 @@ def _with_local(system, flat, dtype):
         return system.local_force(flat.unravel(q), flat.unravel_rates(v), t, params).astype(dtype)
 
     spread, size = partial(system.spread, n=flat.size), None if system.at is None else len(system.at)
-    local = Local(flat._replace(force=linear_force), local_force, spread, size)
+    local = Local(flat._replace(force=consistent(linear_force)), consistent(local_force), spread, size)
     return flat._replace(linear=False, local=local)
 
 
@@ -207,7 +210,7 @@ def _with_internal(system, flat, q, v0, z0):
         at = flat.unravel(q), *unravel(V), t, params
         return ravel_pytree((system.force(*at), system.internal(*at)))[0].astype(V.dtype)
 
-    return flat._replace(force=force, size=V.size, unravel_internal=unravel_internal), q, V
+    return flat._replace(force=consistent(force), size=V.size, unravel_internal=unravel_internal), q, V
 
 
 def _flatten_first_order(caller, system, y0, t0, params):
@@ -222,7 +225,7 @@ def _flatten_first_order(caller, system, y0, t0, params):
     def mass(q, params):
         return jnp.ones(0, dtype)
 
-    return FlatSystem(mass, rate, n, 0, False, unravel, unravel), jnp.zeros(0, dtype), y
+    return FlatSystem(mass, consistent(rate), n, 0, False, unravel, unravel), jnp.zeros(0, dtype), y
 
 
 def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):

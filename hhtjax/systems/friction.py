@@ -19,7 +19,7 @@ from hhtjax.checks import describe, require_function
 from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems import returned
-from hhtjax.xla import linear_map
+from hhtjax.xla import consistent, linear_map
 
 MOST = 8  # directions of friction
 ROUNDING = 64  # of a load that a joint at rest bears beyond its limit
@@ -78,7 +78,7 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
             return v
         return jnp.asarray(system.sliding(flat.unravel(q), flat.unravel_rates(v), t, params)).astype(dtype)
 
-    return FrictionLaw(limit, sliding, m)
+    return FrictionLaw(consistent(limit), consistent(sliding), m)
 
 
 def directions(system, q, t, params):
