@@ -57,6 +57,19 @@ def test_derivatives_behind_products_and_sums():
         np.testing.assert_allclose(found["equality"][0][i][largest], x[largest], rtol=1e-12)
 
 
+@pytest.mark.compiled
+def test_an_element_is_the_largest_at_every_point():
+    """In a program of its own, where XLA evaluates a b + c a twice: for a fifth of the points they would differ."""
+    f = consistent(lambda a, b, c: jnp.max(jnp.abs(a * b + c * a)))
+    along = jax.jit(lambda a, b, c: jax.jvp(lambda a: f(a, b, c), (a,), (b,))[1])
+    back = jax.jit(jax.grad(f))
+    for a, b, c in np.random.default_rng(0).standard_normal((40, 3, 3)):
+        x = a * b + c * a
+        i = np.argmax(np.abs(x))
+        np.testing.assert_allclose(along(a, b, c), np.sign(x[i]) * (b + c)[i] * b[i], rtol=1e-12)
+        np.testing.assert_allclose(back(a, b, c), np.where(np.arange(3) == i, np.sign(x[i]) * (b + c), 0), rtol=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.compiled
 def test_a_drag_of_the_largest_velocity_on_a_circle():
