@@ -113,3 +113,18 @@ def test_a_product_of_booleans():
 
     x = jnp.array([0.3, -0.2, 0.1])
     np.testing.assert_allclose(join(by_scalars(count)(split(x))), x + 1.0)
+
+
+def test_numbers_of_a_method_as_arrays_inside_jit():
+    """alpha and dt are checked there too, by their values."""
+    spring, alpha, dt = hhtjax.System(np.ones(1), lambda q, v, t, p: -q), jnp.array(-0.1), jnp.array(0.1)
+
+    @jax.jit
+    def run():
+        return hhtjax.simulate(spring, hhtjax.hht(alpha), jnp.ones(1), jnp.zeros(1), dt=dt, num_steps=5).q
+
+    expected = hhtjax.simulate(spring, hhtjax.hht(-0.1), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=5).q
+    np.testing.assert_allclose(run(), expected, rtol=1e-14)
+    wrong = jnp.array(0.5)
+    with pytest.raises(ValueError, match="alpha"):
+        jax.jit(lambda: hhtjax.hht(wrong) and 0)()
