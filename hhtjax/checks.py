@@ -15,7 +15,8 @@ def require_number(caller, name, value, valid, expectation):
         large = is_array(value) and jnp.ndim(value) and (jnp.size(value) > 4 or not is_concrete(value))
         shown = f"an array of shape {jnp.shape(value)}" if large else repr(value)
         raise TypeError(f"{caller}: `{name}` must be a real number; received {shown}.")
-    if is_concrete(value) and not valid(value):
+    # a concrete array of JAX inside a jit would make a tracer of every comparison
+    if is_concrete(value) and not valid(np.asarray(value)[()]):
         raise ValueError(f"{caller}: `{name}` must {expectation}; received {value}.")
     return value
 

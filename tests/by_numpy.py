@@ -207,7 +207,9 @@ MOVES = {
     "stack": lambda eqn, *x: [np.stack(x, eqn.params["axis"])],
     "rev": lambda eqn, x: [np.flip(x, eqn.params["dimensions"])],
     "unstack": lambda eqn, x: list(np.moveaxis(x, eqn.params["axis"], 0)),
-    **dict.fromkeys(("hhtjax_watch", "hhtjax_structural", "hhtjax_largest_in_batch"), lambda eqn, x: [x]),
+    **dict.fromkeys(
+        ("hhtjax_held", "hhtjax_watch", "hhtjax_structural", "hhtjax_largest_in_batch"), lambda eqn, x: [x]
+    ),
 }
 
 

@@ -18,6 +18,7 @@ from hhtjax.numerics.elimination import matvec
 from hhtjax.numerics.stumpff import stumpff
 from hhtjax.rotation import cross
 from hhtjax.xla import gate, linear_maps, parameters, scalar_calls, scalar_rules
+from hhtjax.xla.consistent import held
 from hhtjax.xla.kernels import largest_in_batch, staged, structural
 from hhtjax.xla.turns import in_turn
 
@@ -34,6 +35,7 @@ def scope():
     known = {"lax": lax, "jnp": jnp, "np": np, "jax": jax, "staged": staged, "structural": structural}
     known |= {
         "largest_in_batch": largest_in_batch,
+        "held": held,
         "in_turn": in_turn,
         "stumpff": stumpff,
         "cross": cross,

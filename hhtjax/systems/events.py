@@ -22,6 +22,7 @@ from hhtjax.description import Description, as_float, freeze, is_array, is_concr
 from hhtjax.numerics.seldom import seldom
 from hhtjax.systems.constraints import answers, pull_back
 from hhtjax.systems.sampled import SLOP
+from hhtjax.xla import consistent
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,10 +309,11 @@ def flatten_events(system, events, params, at, redundant=None):
     """The events of a `FlatSystem`. at: q, v, t of the start; redundant: how its constraints are solved."""
     changed = sorted({i for event in events if event.switch for i in _changed(system, event, params, at)})
     times = tuple(None if event.at is None else event.times(params).astype(at[1].dtype) for event in events)
+    guards = [None if event.guard is None else consistent(partial(_guard, system, event)) for event in events]
 
     def values(s, params, due):
         due = iter(due)
-        values = [next(due) - s.t if event.guard is None else _guard(system, event, s, params) for event in events]
+        values = [next(due) - s.t if guard is None else guard(s.q, s.v, s.t, s.L, params) for guard in guards]
         return jnp.stack([jnp.asarray(g).astype(s.v.dtype).reshape(()) for g in values])
 
     def modes(params):
@@ -349,10 +351,10 @@ def switched(system, event, q, v, t, params):
     return _on_vectors(system, event.switch, q, v, t, params) if event.switch_sees_state else event.switch(params)
 
 
-def _guard(system, event, s, params):
+def _guard(system, event, q, v, t, L, params):
     """The guard of an event at a state."""
-    guard = partial(event.guard, multipliers=s.L) if event.sees_multipliers else event.guard
-    return _on_vectors(system, guard, s.q, s.v, s.t, params)
+    guard = partial(event.guard, multipliers=L) if event.sees_multipliers else event.guard
+    return _on_vectors(system, guard, q, v, t, params)
 
 
 def _on_vectors(system, function, q, v, t, params):
@@ -385,8 +387,9 @@ def _reset(system, event, redundant, q, v, t, params):
     if event.reset is None:
         return v
     if isinstance(event.reset, Impact):
-        return _bounced(system, partial(_on_vectors, system, event.guard), event.reset, redundant, q, v, t, params)
-    new = ravel_pytree(_on_vectors(system, event.reset, q, v, t, params))[0].astype(v.dtype)
+        guard = consistent(partial(_on_vectors, system, event.guard))
+        return _bounced(system, guard, event.reset, redundant, q, v, t, params)
+    new = ravel_pytree(consistent(partial(_on_vectors, system, event.reset))(q, v, t, params))[0].astype(v.dtype)
     return system.with_internal(jnp.pad(new, (0, system.size - new.size)), v)
 
 

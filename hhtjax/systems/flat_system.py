@@ -18,6 +18,7 @@ from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.returned import check_like, check_matrix, count, evaluate, telling_of_arguments
 from hhtjax.systems.sparse_system import with_known_matrices
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem
+from hhtjax.xla import consistent
 
 
 class FlatSystem(NamedTuple):
@@ -164,13 +165,14 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
     constraint, m = None, 0
     if system.constraint is not None:
         m = count(caller, "constraint", system.constraint, n, dtype, q0, t0, params)
-        constraint = partial(_flat_constraint, system.constraint, unravel, dtype)
+        constraint = consistent(partial(_flat_constraint, system.constraint, unravel, dtype))
 
     linear = isinstance(system, LinearSystem)
     _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0)
 
     def on_vectors(system):
         mass, force = (partial(f, system, unravel, dtype) for f in (_flat_mass, partial(_flat_force, unravel_rates)))
+        mass, force = consistent(mass) if callable(system.mass) else mass, consistent(force)
         flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks)
         return _with_local(system, flat, dtype) if linear and system.nonlinear is not None else flat
 
@@ -178,7 +180,8 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
     if not linear and system.inertia is not None:
         at = q0, v0, *timed(system.inertia, 2, t0), params
         check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, *at), "v0", v0, dtype)
-        flat = flat._replace(product=partial(_flat_product, system, unravel, unravel_rates, dtype))
+        product = partial(_flat_product, system, unravel, unravel_rates, dtype)
+        flat = flat._replace(product=consistent(product))
     if linear:
         flat = with_known_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
@@ -207,7 +210,7 @@ def _with_local(system, flat, dtype):
         return system.local_force(flat.unravel(q), flat.unravel_rates(v), t, params).astype(dtype)
 
     spread, size = partial(system.spread, n=flat.size), None if system.at is None else len(system.at)
-    local = Local(flat._replace(force=linear_force), local_force, spread, size)
+    local = Local(flat._replace(force=consistent(linear_force)), consistent(local_force), spread, size)
     return flat._replace(linear=False, local=local)
 
 
@@ -220,7 +223,7 @@ def _with_internal(system, flat, q, v0, z0):
         at = flat.unravel(q), *unravel(V), t, params
         return ravel_pytree((system.force(*at), system.internal(*at)))[0].astype(V.dtype)
 
-    return flat._replace(force=force, size=V.size, unravel_internal=unravel_internal), q, V
+    return flat._replace(force=consistent(force), size=V.size, unravel_internal=unravel_internal), q, V
 
 
 def _flatten_first_order(caller, system, y0, t0, params):
@@ -235,7 +238,7 @@ def _flatten_first_order(caller, system, y0, t0, params):
     def mass(q, t, params):
         return jnp.ones(0, dtype)
 
-    return FlatSystem(mass, rate, n, 0, False, unravel, unravel), jnp.zeros(0, dtype), y
+    return FlatSystem(mass, consistent(rate), n, 0, False, unravel, unravel), jnp.zeros(0, dtype), y
 
 
 def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):

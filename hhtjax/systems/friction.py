@@ -19,7 +19,7 @@ from hhtjax.checks import describe, require_function
 from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems import returned
-from hhtjax.xla import linear_map
+from hhtjax.xla import consistent, linear_map
 
 MOST = 16  # directions of friction
 FEW = 8  # up to so many are taken to be independent of each other, unless something speaks against it
@@ -81,7 +81,7 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
         return jnp.asarray(system.sliding(flat.unravel(q), flat.unravel_rates(v), t, params)).astype(dtype)
 
     dependent = m > min(n - flat.num_constraints, FEW) or system.depending
-    return FrictionLaw(limit, sliding, m, dependent)
+    return FrictionLaw(consistent(limit), consistent(sliding), m, dependent)
 
 
 def directions(system, q, t, params):

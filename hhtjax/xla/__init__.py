@@ -39,12 +39,13 @@ True
 The door
 --------
 
-The rest of the library knows 27 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 28 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
     part(f)                   f, a kernel of its own where it is in none
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
+    consistent(f)             f, of which what is compared is computed once
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     structural(x)             x, whose zeros are such by structure
     traced(f, *args)          f, traced once, with word of which arguments its results are made of
@@ -93,6 +94,7 @@ NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule w
 all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
 """
 
+from hhtjax.xla.consistent import consistent
 from hhtjax.xla.explanation import Explanation, calls, explain
 from hhtjax.xla.gate import or_plain, plain
 from hhtjax.xla.host import on_host
@@ -125,6 +127,7 @@ __all__ = [
     "block_written",
     "calls",
     "choose",
+    "consistent",
     "derivative",
     "explain",
     "in_turn",

@@ -105,6 +105,7 @@ UNDERSTOOD = {
         **{"ctx_mesh": lambda mesh: mesh.empty, "compiler_options_kvs": _empty},
     },
     "hhtjax_in_turn": _of_any("closed", "at_once", "number"),
+    "hhtjax_held": {},
     "hhtjax_structural": {},
     "hhtjax_family": _of_any("n", "family", "jaxpr"),
     "hhtjax_bilinear": _of_any("product", "jaxpr"),

@@ -114,7 +114,7 @@ class _Listing:
             return self.run(eqn.params[INLINED[name]], values)
         if name in LOOPS:
             return LOOPS[name](self, eqn, *values)
-        if name in ("hhtjax_watch", "optimization_barrier", "device_put"):
+        if name in ("hhtjax_held", "hhtjax_watch", "optimization_barrier", "device_put"):
             return values
         if name == "hhtjax_inside":  # functions come in two forms: outside of a kernel LAPACK's
             return [known_pieces(np.bool_(False))]

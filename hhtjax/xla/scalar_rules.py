@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.xla.arithmetic import LAX, compute, recorder_of
+from hhtjax.xla.consistent import held
 from hhtjax.xla.parameters import ELEMENTWISE
 from hhtjax.xla.pieces import ZEROS, arranged, each, is_known, is_structural, pieces, unmarked
 
@@ -94,14 +95,37 @@ def _exactly(f):
 
 
 def _converted_number(dtype, x):
-    """A known number in another type; XLA's own way where it does not fit, or where there is a choice."""
-    if jnp.issubdtype(dtype, jnp.integer) and jnp.issubdtype(x.dtype, jnp.floating):
-        limits = jnp.iinfo(dtype)
-        if not limits.min < x < limits.max:
-            return None
+    """A known number in another type, as XLA does it when a program runs: it saturates, and NaN becomes 0. Where XLA or
+    MLIR folds constants it would be a cast of C, which is something else on every machine."""
     if any(jnp.issubdtype(d, jnp.complexfloating) for d in (dtype, x.dtype)):
         return None
-    return dtype.type(x)
+    if jnp.issubdtype(dtype, jnp.integer) and jnp.issubdtype(x.dtype, jnp.floating):
+        limits = jnp.iinfo(dtype)
+        if np.isnan(x):
+            return dtype.type(0)
+        return dtype.type(limits.min if x <= limits.min else limits.max if x >= limits.max else int(x))
+    return x.astype(dtype)
+
+
+def _integers(f):
+    """A function of integers of any size, and of the limits of their type; of other numbers nothing is known."""
+
+    def rule(dtype, *x):
+        if not jnp.issubdtype(dtype, jnp.integer):
+            return None
+        limits = jnp.iinfo(dtype)
+        return np.array(f(limits, *map(int, x)) % 2**limits.bits, np.uint64).astype(dtype)[()]
+
+    return rule
+
+
+def _divided(limits, x, y):
+    """Towards zero; -1, in all its bits, where y is 0. Folding by XLA ends the process there."""
+    return -1 if y == 0 else (abs(x) // abs(y)) * (1 if (x < 0) == (y < 0) else -1)
+
+
+def _remainder(limits, x, y):
+    return x if y == 0 else x - y * _divided(limits, x, y)
 
 
 def _fold(name, dtype, x):
@@ -132,6 +156,7 @@ def _choice(name):
 
     @chosen.defjvp
     def _(x, dx):
+        x = tuple(map(held, x))
         found = chosen(*x)
         here = [lax.convert_element_type(lax.eq(y, found), found.dtype) for y in x]
         return found, lax.div(reduce(lax.add, map(lax.mul, dx, here)), reduce(lax.add, here))
@@ -157,7 +182,7 @@ def _rows(x, first, last):
 
 def _dot_general(eqn, x, y):
     out = eqn.outvars[0].aval
-    if any(v.aval.dtype != out.dtype for v in eqn.invars):
+    if any(v.aval.dtype != out.dtype for v in eqn.invars) or out.dtype == bool:
         return None
     over, batch = eqn.params["dimension_numbers"]
     rows = []
@@ -269,6 +294,7 @@ RULES = {
     "bitcast_convert_type": lambda eqn, x: _elementwise(eqn, x) if eqn.outvars[0].aval.shape == x.shape else None,
     **{"broadcast_in_dim": _broadcast_in_dim, "concatenate": _concatenate, "dot_general": _dot_general, "iota": _iota},
     **{"reshape": _reshape, "squeeze": _squeeze, "rev": _rev, "slice": _slice, "hhtjax_structural": _structural},
+    "hhtjax_held": lambda eqn, x: [each(lambda y: y if is_known(y) else held(y), x)],
     **{"split": _split, "stack": _stack, "transpose": _transpose, "unstack": _unstack},
     **{
         "gather": _moved(0),
@@ -290,6 +316,7 @@ NUMPY = {
     **{"eq": _exactly(np.equal), "ne": _exactly(np.not_equal), "lt": _exactly(np.less)},
     **{"le": _exactly(np.less_equal), "gt": _exactly(np.greater), "ge": _exactly(np.greater_equal)},
     **{"and": _exactly(np.bitwise_and), "or": _exactly(np.bitwise_or), "copy": _exactly(lambda x: x)},
+    **{"div": _integers(_divided), "rem": _integers(_remainder)},
     "convert_element_type": _converted_number,
 }
 FOLDS = {f"reduce_{kind}": _reduction(kind) for kind in ("max", "min")}  # where no derivative is taken

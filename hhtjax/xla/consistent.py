@@ -1,0 +1,206 @@
+"""Functions in which a number that is compared is the number that is used.
+
+XLA evaluates what is cheap anew for each of its users, and LLVM rounds a product and a sum together where it likes. So
+of one number the program may hold two, which differ in the last place, and x == max(x) may hold for no element of x.
+JAX's derivative of a maximum counts these elements: it becomes 0/0, or, of a maximum of two, 0. So the numbers that are
+asked for equality are `held`: computed once, for all who use them. `lax.optimization_barrier` does not do this: on the
+CPU XLA drops it before it fuses.
+
+Comparisons by order, x < y, are left alone: where two roundings of x differ in that, either answer is right to
+rounding.
+"""
+
+from functools import wraps
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal, Primitive
+from jax.interpreters import ad, batching, mlir
+
+from hhtjax.xla.gate import is_on
+from hhtjax.xla.interpreter import alone, evaluate
+from hhtjax.xla.kernel_calls import compute_once
+
+SHORT = 512  # numbers; XLA divides no work on so few among threads, which in a kernel takes a second result
+EQUALITIES = {"eq", "ne"}
+CHOICES = {"max", "min", "reduce_max", "reduce_min", "cummax", "cummin"}  # JAX's derivatives ask who equals the result
+# what a number passes unchanged, or with another sign, and what makes the same number of the same numbers
+EXACT = CHOICES | {
+    *(
+        "abs",
+        "broadcast_in_dim",
+        "clamp",
+        "concatenate",
+        "copy",
+        "dynamic_slice",
+        "expand_dims",
+        "gather",
+        "neg",
+        "pad",
+    ),
+    *("reshape", "rev", "select_n", "slice", "sort", "split", "squeeze", "stack", "stop_gradient", "transpose"),
+    *("unstack",),
+}
+INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}  # the parameter that holds what is called
+REBUILT = {"cond", "scan", "while"}
+
+
+def held(x):
+    """The array x, computed once for all that use it; its tangent is left alone.
+
+    >>> print(held(jnp.arange(2.0)))
+    [0. 1.]
+    """
+    return held_p.bind(jnp.asarray(x))
+
+
+def consistent(f):
+    """f, of which values and derivatives do not depend on how often XLA evaluates what is compared in it.
+
+    Args:
+        f: a function of pytrees of arrays, to one.
+
+    Returns:
+        A function with the same values; f itself on plain JAX, and what is traced the same where f compares nothing.
+
+    Raises:
+        whatever f raises, when it is called.
+
+    >>> largest = consistent(lambda x: jnp.max(x * x + x))
+    >>> print(jax.grad(largest)(jnp.array([1.0, 3.0])))
+    [0. 7.]
+    """
+    if f is None or not is_on():
+        return f
+    compares = True
+
+    @wraps(f)
+    def g(*args, **keywords):
+        nonlocal compares
+        if not compares:
+            return f(*args, **keywords)
+        leaves, structure = jax.tree.flatten((args, keywords))
+        places = [i for i, x in enumerate(leaves) if hasattr(x, "dtype")]  # numbers of Python, and functions, stay
+
+        def on_arrays(*arrays):
+            new = dict(zip(places, arrays, strict=True))
+            args, keywords = structure.unflatten([new.get(i, x) for i, x in enumerate(leaves)])
+            return f(*args, **keywords)
+
+        arrays = [leaves[i] for i in places]
+        trace, like = jax.make_jaxpr(on_arrays, return_shape=True)(*arrays)
+        compares = _compares(trace.jaxpr)
+        return jax.tree.structure(like).unflatten(_run(trace.jaxpr, trace.consts, arrays))
+
+    return g
+
+
+def _run(jaxpr, constants, values, inside=False):
+    """The values of a jaxpr's results. inside: of one within, of which arguments are held where it stands."""
+    hold = _to_hold(jaxpr)
+    given = [*constants, *values]
+    if not inside:
+        given = _held_where(hold, [*jaxpr.constvars, *jaxpr.invars], given)
+    return evaluate(jaxpr, given, lambda eqn, values: _held_where(hold, eqn.outvars, _apply(eqn, values)))
+
+
+def _held_where(hold, variables, values):
+    return [held(x) if v in hold else x for v, x in zip(variables, values, strict=True)]
+
+
+def _to_hold(jaxpr):
+    """Variables from which come, by exact operations, the numbers that are asked for equality."""
+    hold = set()
+    for eqn in reversed(jaxpr.eqns):
+        name = eqn.primitive.name
+        asked = name in EQUALITIES or any(map(_asks, _inner(eqn)))
+        if asked or not hold.isdisjoint(eqn.outvars):
+            if name in EXACT:
+                hold.difference_update(eqn.outvars)
+            if asked or name in EXACT or _inner(eqn):
+                hold.update(x for x in eqn.invars if _is_floating(x))
+    return hold
+
+
+def _is_floating(x):
+    return not isinstance(x, Literal) and jnp.issubdtype(x.aval.dtype, np.floating)
+
+
+def _inner(eqn):
+    """The jaxprs within an operation that are evaluated anew here."""
+    if eqn.primitive.name not in REBUILT and eqn.primitive.name not in INLINED:
+        return []
+    return [getattr(x, "jaxpr", x) for x in jax.tree.leaves(list(eqn.params.values())) if hasattr(x, "eqns")]
+
+
+def _asks(jaxpr):
+    """Whether it asks floating numbers for equality."""
+    return _has(EQUALITIES, jaxpr)
+
+
+def _compares(jaxpr):
+    """The same, its derivatives included."""
+    return _has(EQUALITIES | CHOICES, jaxpr)
+
+
+def _has(names, jaxpr):
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name in names and any(map(_is_floating, eqn.invars)):
+            return True
+        if any(_has(names, x) for x in _inner(eqn)):
+            return True
+    return False
+
+
+def _apply(eqn, values):
+    """The results of one operation."""
+    name = eqn.primitive.name
+    if name in CHOICES and any(map(_is_floating, eqn.invars)):
+        return [_choice(eqn)(*values)]
+    if not any(map(_compares, _inner(eqn))):
+        return alone(eqn)(*values)
+    if name in INLINED:
+        closed = eqn.params[INLINED[name]]
+        return _run(closed.jaxpr, closed.consts, values, inside=True)
+    params = jax.tree.map(lambda x: _rebuilt(x) if isinstance(x, ClosedJaxpr) else x, eqn.params)
+    return alone(eqn.replace(params=params))(*values)
+
+
+def _rebuilt(closed):
+    """The body of a loop, or a branch."""
+    like = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in closed.in_avals]
+    return jax.make_jaxpr(lambda *x: _run(closed.jaxpr, closed.consts, x, inside=True))(*like)
+
+
+def _choice(eqn):
+    """A maximum or minimum as a function whose derivative compares it with the numbers that it was taken of."""
+
+    def plain(*x):
+        return alone(eqn)(*x)[0]
+
+    choose = jax.custom_jvp(plain)
+    choose.defjvp(lambda x, dx: jax.jvp(plain, tuple(map(held, x)), tuple(dx)))
+    return choose
+
+
+def _jvp(primals, tangents):
+    return held_p.bind(*primals), tangents[0]
+
+
+def _lower(ctx, x):
+    """A call that XLA does not inline."""
+    n = ctx.avals_in[0].size
+    call = jax.jit(lambda x: [x] if n <= SHORT else [x, x.ravel()[:1]])
+    results = mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_out=None), x)
+    compute_once(results[0].owner)
+    return results[:1]
+
+
+held_p = Primitive("hhtjax_held")
+held_p.def_impl(lambda x: x)
+held_p.def_abstract_eval(lambda x: x)
+ad.primitive_jvps[held_p] = _jvp
+batching.defvectorized(held_p)
+mlir.register_lowering(held_p, lambda ctx, x: [x])
+mlir.register_lowering(held_p, _lower, platform="cpu")
