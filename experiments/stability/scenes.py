@@ -61,7 +61,7 @@ def hardening_chain() -> Scene:
 
 
 def far_from_slow_manifold() -> Scene:
-    """A node of a milligram that 1 N pushes from rest, against 50 q + 5 v: after a microsecond it is as fast as that."""
+    """A node of a milligram that 1 N pushes from rest, against 50 q + 5 v: in a microsecond it is as fast as that."""
 
     def force(q, v, t, params):
         return 1.0 - params["k"] * q - params["c"] * v
