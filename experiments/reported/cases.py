@@ -18,15 +18,25 @@ CASES = {
     "assembly": [
         Case("three links, 300 guesses: not the nearest, silently", scripts.nearest_assembly, 0.0, 0.0),
     ],
+    "dry friction": [
+        Case(
+            "a gear of which both sides rub: angle after 1 s", scripts.gear_that_rubs_on_both_sides, 0.725 / 1.5, 1e-4
+        ),
+        Case("a driven crank that rubs: torque", scripts.driven_crank_that_rubs, 0.4, 1e-9),
+        Case("two joints, one of which has a limit of 0: q after 1 s", scripts.joint_without_friction, 0.35, 1e-6),
+    ],
     "guards": [
         Case("at rest at its stop, pulled off: q after 1 s", scripts.pulled_off_its_stop, 1.0, 1e-9),
         Case("the same, with a velocity of -1e-17", scripts.rounding_at_its_stop, 1.0, 1e-9),
+        Case("a load of 3 N that begins at 0.62 s: q after 1 s", scripts.load_at_a_known_time, 0.2166, 1e-9),
         Case("a constraint that params switch off", scripts.constraint_switched_off, "switch"),
     ],
     "fits": [
         Case("run.q - y of shapes (101, 1) and (101,)", scripts.rank_promotion, "(101, 101)"),
         Case("transforms for one of two parameters: c", scripts.transforms_of_some, 3.0, 1e-6),
         Case("a record with a sample missing", scripts.nan_residuals, "['mast'][17]"),
+        Case("10,000 steps of which one number is kept: MB", scripts.outputs_alone, 0.0, 1.0),
+        Case("two parameters whose sum alone is seen", scripts.sum_of_two_parameters, "sum"),
         Case("Rosenbrock's valley from (-12, 10): iterations, of 50", scripts.rosenbrock_valley, 0.0, 50.0),
     ],
     "compiler": [

@@ -1,5 +1,7 @@
 """Problems that people reported, a function each, as their users would write it. What is right stands in cases.py."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,8 @@ import hhtjax
 
 ONE, NONE = jnp.ones(1), jnp.zeros(1)
 TIMES = jnp.linspace(0.0, 2.0, 101)
-measured, gravity = None, 9.81
+measured: Any = None
+gravity = 9.81
 
 
 # 0. data that a function reads, and runs that fail
@@ -128,6 +131,43 @@ def nearest_distance(guess):
     return best
 
 
+# 4. dry friction
+
+
+def gear_that_rubs_on_both_sides():
+    """A gear of ratio 2, both shafts rub: 0.3 N m on the first, 0.5 on the second, driven by 2 N m at the first."""
+    system = hhtjax.System(
+        jnp.array([1.0, 2.0]),
+        lambda q, v, t, params: jnp.array([2.0, 0.0]),
+        constraint=lambda q, t, params: q[:1] - 2 * q[1:],
+        friction=lambda q, v, t, params: jnp.array([0.3, 0.5]),
+    )
+    run = hhtjax.simulate(system, hhtjax.hht(), jnp.zeros(2), jnp.zeros(2), dt=0.01, num_steps=100)
+    return run.q[-1, 0]
+
+
+def driven_crank_that_rubs():
+    """The torque of a drive that turns a crank at 1 rad/s against dry friction of 0.4 N m."""
+    system = hhtjax.System(
+        ONE,
+        lambda q, v, t, params: NONE,
+        constraint=lambda q, t, params: q - t,
+        friction=lambda q, v, t, params: 0.4 * ONE,
+    )
+    run = hhtjax.simulate(system, hhtjax.hht(), NONE, ONE, dt=0.01, num_steps=10)
+    return run.multipliers[-1, 0]
+
+
+def joint_without_friction():
+    """One of two joints has a limit of 0."""
+    system = hhtjax.System(
+        jnp.ones(2),
+        lambda q, v, t, params: jnp.ones(2),
+        friction=lambda q, v, t, params: jnp.array([0.3, 0.0]),
+    )
+    return hhtjax.simulate(system, hhtjax.hht(), jnp.zeros(2), jnp.zeros(2), dt=0.01, num_steps=100).q[-1, 0]
+
+
 # 5. guards
 
 
@@ -154,7 +194,30 @@ def constraint_switched_off():
     return "silent"
 
 
-# 6. fits
+def load_at_a_known_time():
+    """A load of 3 N that begins at t = 0.62."""
+    system = hhtjax.System(ONE, lambda q, v, t, params: params["load"] * ONE)
+    on = hhtjax.Event(at=0.62, switch=lambda params: params | {"load": 3.0})
+    run = hhtjax.simulate(system, hhtjax.hht(), NONE, NONE, {"load": 0.0}, dt=0.1, num_steps=10, events=[on])
+    return run.q[-1, 0]
+
+
+# 6. fits and sensors
+
+
+def outputs_alone():
+    """A long run of which the force in a spring is kept, and nothing else: MB."""
+    system = hhtjax.System(jnp.ones(20), lambda q, v, t, params: -q)
+    run = hhtjax.simulate(
+        system, hhtjax.hht(), jnp.ones(20), jnp.zeros(20), dt=0.01, num_steps=10_000, output=lambda q: q[0]
+    )
+    return sum(x.nbytes for x in jax.tree.leaves(run)) / 1e6
+
+
+def sum_of_two_parameters():
+    """Two parameters of which the record shows the sum alone."""
+    y = 3 * TIMES + 0.01 * jnp.sin(99 * TIMES)
+    return hhtjax.fit(lambda p: (p["a"] + p["b"]) * TIMES - y, {"a": 1.0, "b": 2.5}).summary().replace("\n", " ")
 
 
 def rank_promotion():
@@ -207,12 +270,11 @@ def conversion_out_of_range():
     """A constant converted to an integer that cannot hold it."""
 
     def force(q, v, t, params):
-        return 1e-9 * jnp.asarray([3e9, 1.0, 2.0]).astype(jnp.int32).astype(q.dtype) - q
+        return 1e-9 * jnp.asarray([3e9, 1.0, 2.0]).astype(jnp.int32).astype(q.dtype) + 0 * q
 
-    run = hhtjax.simulate(
-        hhtjax.System(jnp.ones(3), force), hhtjax.hht(), jnp.zeros(3), jnp.zeros(3), dt=1e-2, num_steps=1
-    )
-    return run.acceleration[0, 0]
+    system, stepper = hhtjax.System(np.ones(3), force), hhtjax.hht(linearize="predictor")
+    run = hhtjax.simulate(system, stepper, jnp.zeros(3), jnp.zeros(3), dt=1e-2, num_steps=1)
+    return run.acceleration[-1, 0]
 
 
 def hessian_with_newton():

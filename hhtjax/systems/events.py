@@ -389,7 +389,8 @@ def _reset(system, event, redundant, q, v, t, params):
     if isinstance(event.reset, Impact):
         guard = consistent(partial(_on_vectors, system, event.guard))
         return _bounced(system, guard, event.reset, redundant, q, v, t, params)
-    new = ravel_pytree(consistent(partial(_on_vectors, system, event.reset))(q, v, t, params))[0].astype(v.dtype)
+    reset: Any = consistent(partial(_on_vectors, system, event.reset))
+    new = ravel_pytree(reset(q, v, t, params))[0].astype(v.dtype)
     return system.with_internal(jnp.pad(new, (0, system.size - new.size)), v)
 
 
