@@ -36,7 +36,7 @@ CASES = {
         Case("transforms for one of two parameters: c", scripts.transforms_of_some, 3.0, 1e-6),
         Case("a record with a sample missing", scripts.nan_residuals, "['mast'][17]"),
         Case("10,000 steps of which one number is kept: MB", scripts.outputs_alone, 0.0, 1.0),
-        Case("two parameters whose sum alone is seen", scripts.sum_of_two_parameters, "sum"),
+        Case("two parameters whose sum alone is seen", scripts.sum_of_two_parameters, "only through their sum"),
         Case("Rosenbrock's valley from (-12, 10): iterations, of 50", scripts.rosenbrock_valley, 0.0, 50.0),
     ],
     "compiler": [

@@ -140,7 +140,7 @@ def gear_that_rubs_on_both_sides():
         jnp.array([1.0, 2.0]),
         lambda q, v, t, params: jnp.array([2.0, 0.0]),
         constraint=lambda q, t, params: q[:1] - 2 * q[1:],
-        friction=lambda q, v, t, params: jnp.array([0.3, 0.5]),
+        friction=lambda q, v, L, t, params: jnp.array([0.3, 0.5]),
     )
     run = hhtjax.simulate(system, hhtjax.hht(), jnp.zeros(2), jnp.zeros(2), dt=0.01, num_steps=100)
     return run.q[-1, 0]
@@ -152,7 +152,7 @@ def driven_crank_that_rubs():
         ONE,
         lambda q, v, t, params: NONE,
         constraint=lambda q, t, params: q - t,
-        friction=lambda q, v, t, params: 0.4 * ONE,
+        friction=lambda q, v, L, t, params: 0.4 * ONE,
     )
     run = hhtjax.simulate(system, hhtjax.hht(), NONE, ONE, dt=0.01, num_steps=10)
     return run.multipliers[-1, 0]
