@@ -38,8 +38,11 @@ NOISE = 8  # roundings, of what it is the difference of, below which a number is
 LAGS = 20  # how often multipliers, and limits that depend on them, are made anew at the start
 
 
-def begin_friction(method, system, q, v, t, params, dt):
-    """The state at the start: who slides, who sticks, and the accelerations of that."""
+def begin_friction(method, system, q, v, t, params, dt, still=False):
+    """The state at the start: who slides, who sticks, and the accelerations of that.
+
+    still: (m,), joints that are at rest, whatever rounding their velocities show.
+    """
     if method.options.linearize in ("held", "state"):
         raise ValueError(
             f"hht: with friction, leave `linearize` out: it is at the predictor; received {method.options.linearize!r}."
@@ -52,7 +55,7 @@ def begin_friction(method, system, q, v, t, params, dt):
     rows = rows_of(system, q, t, params, H, G, pulls, False, depends(system, method.redundant))
     K, own = rows.K, own_rate(system, *at)
     size = matvec(jnp.abs(H), jnp.abs(w)) + jnp.abs(own)
-    settle = partial(_settle, system, at, H, rows, matvec(H, w) + own, size)
+    settle = partial(_settle, system, at, H, rows, matvec(H, w) + own, size, still)
 
     def again(_, L):
         """L with the friction of limits that depend on L."""
@@ -75,11 +78,11 @@ def smooth_system(system, sig, tau, L):
     return system._replace(force=force, friction=None)
 
 
-def _settle(system, at, H, rows, load, size, L):
+def _settle(system, at, H, rows, load, size, still, L):
     """sig and tau at the start, where without friction ds/dt is the load, of terms of that size. What rests is held,
-    within the limits; what cannot be held slides."""
+    within the limits; what cannot be held slides. still: who rests in any case."""
     q, v, t, params = at
-    sig, f = direction(system, at, H), system.friction.limit(q, v, L, t, params)
+    sig, f = jnp.where(still, 0, direction(system, at, H)), system.friction.limit(q, v, L, t, params)
     rests = sig == 0
     slid = jnp.where(rests, 0, sig * f)
     slides, tau = rows.at_rest(rests, load - matvec(rows.K, slid), f, size)

@@ -47,6 +47,7 @@ POWERS, CORRECTIONS = 5, 5
 ITERATIONS = 40  # of Newton's method, at most
 LARGEST = 64  # unknowns whose matrix is inverted
 STIFF = 0.03  # part of a jump of the acceleration by which damping changes it within a step, and h resolves it
+GAINED = 0.03  # part of the energy of a motion that a C may give it within a step, and still counts as a damper
 SHORTEST = 1e-3  # part of a Newton step below which there is no way on
 
 
@@ -192,7 +193,7 @@ def without_layer(method, layer, h, damped, corrects, finish):
     def by_matrices(method, data, h):
         known = layer.with_data(data)
         z, inverse, C = expanded(known, damped)
-        drag = partial(matvec, C) if damped else None
+        drag = Drag(partial(matvec, C), dissipates(known, C)) if damped else None
         return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)._replace(damps=jnp.any(C != 0))
 
     data = layer.data()
@@ -200,6 +201,13 @@ def without_layer(method, layer, h, damped, corrects, finish):
     if large or options.solve is not None or options.redundant is not None:
         return by_maps(method, data, h)
     return derivative_at_need(by_maps, by_matrices, method, data, h)
+
+
+class Drag(NamedTuple):
+    """The map (C + C^T)/2, and whether it takes energy from every motion, which is taken on trust of large systems."""
+
+    of: Any
+    dissipates: Any = True
 
 
 class Found(NamedTuple):
@@ -217,7 +225,8 @@ def finished(method, layer, inverse, drag, z, h, corrects):
     """The `Found`, from the solve with the matrix of the step, the map C, and z behind the implicit step."""
     v, bend = layer.base.v, layer.bend
     if drag is not None:
-        v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
+        part = damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
+        v = v + jnp.where(drag.dissipates, part, 0)
         bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
     z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend))
     if not corrects:
@@ -304,16 +313,35 @@ def damping(layer, factorize, at, tangent):
     def drag(x):
         return tangent(zero._replace(v=layer.located(x)))[: v.size]
 
-    if not (isinstance(factorize, Trusted) or layer.system.linear):
+    if not isinstance(factorize, Trusted) and v.size <= LARGEST:
         C = staged(partial(linear_map, drag), v.size)(v)
         C = (C + C.T) / 2
-        return partial(matvec, C), jnp.any(C != 0)
+        return Drag(partial(matvec, C), dissipates(layer, C)), jnp.any(C != 0)
     pull = jax.linear_transpose(drag, v)  # large: no matrix is formed
 
     def both(x):
         return (drag(x) + pull(x)[0]) / 2
 
-    return both, jnp.any(both(jnp.asarray(1 + 0.618 * np.arange(v.size) % 0.5, v.dtype)) != 0)
+    return Drag(both), jnp.any(both(jnp.asarray(1 + 0.618 * np.arange(v.size) % 0.5, v.dtype)) != 0)
+
+
+def dissipates(layer, C):
+    """Whether h gamma x^T C x > -GAINED x^T M x for all x: else P grows what it should take away.
+
+    So it is of every damper. It is not of a feedback without reaction, whose C is not symmetric.
+    """
+    base, n = layer.base, layer.system.size
+    A = lax.stop_gradient(layer.system.full_mass(base.q, base.t, layer.params) + layer.V / GAINED * C)
+    unit = jnp.sqrt(jnp.maximum(jnp.abs(diagonal(A)), float(jnp.finfo(A.dtype).tiny)))
+    A, least = A / unit[:, None] / unit[None, :], n * float(jnp.finfo(A.dtype).eps)
+
+    def eliminate(k, carry):
+        A, fine = carry
+        pivot = A[k, k]
+        A = A - A[:, k][:, None] * A[k][None, :] / jnp.where(jnp.abs(pivot) < least, least, pivot)
+        return A, fine & (pivot > -least)
+
+    return lax.fori_loop(0, n, eliminate, (A, jnp.array(True)))[1]
 
 
 def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
@@ -321,7 +349,7 @@ def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
 
     def power(_, pair):
         x = pair[0]
-        return project(response(layer, inverse, layer.V * layer.located(drag(x)))), x
+        return project(response(layer, inverse, layer.V * layer.located(drag.of(x)))), x
 
     x, before = lax.fori_loop(0, POWERS, power, (dv, dv))
     return before + (POWERS - 2 * layer.V / h) * (before - x)
