@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.numerics.implicit_root import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, invert_and_bound, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.steppers.stepper import Info
@@ -107,7 +108,10 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
 
     relative = jnp.minimum(RELATIVE, jnp.maximum(tolerance, SHAKE * NOISE * float(jnp.finfo(w.dtype).eps)))
 
-    def search(f, w):
+    def f(w):
+        return r(path(w))
+
+    def search(w):
         def unfinished(carry):
             _, value, iterations, converged, _ = carry
             return ~converged & (iterations < max_iterations) & jnp.all(jnp.isfinite(value))
@@ -131,15 +135,13 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
         left = jnp.zeros((), w.dtype) if isinstance(factorize, Trusted) else None
         begin = w, jnp.zeros_like(w), jnp.zeros((), jnp.int32), jnp.array(False), left
         w, value, iterations, converged, left = lax.while_loop(unfinished, improve, begin)
-        # as floats: custom_root cannot differentiate past integers
-        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype), left)
+        return w, (jnp.max(jnp.abs(value)), iterations, converged, left)
 
     def tangent_solve(g, y):
         return solve_map(g, y, factorize)
 
-    w, told_by_search = lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
-    size, iterations, converged, left = told_by_search
-    return w, told(factorize, left, Info(size, iterations.astype(jnp.int32), converged > 0))
+    w, (size, iterations, converged, left) = implicit_root(f, w, search, tangent_solve)
+    return w, told(factorize, left, Info(size, iterations, converged))
 
 
 def is_rounding(system, r, s0, s1, value, limit, ask):
