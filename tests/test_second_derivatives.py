@@ -1,4 +1,4 @@
-"""Second derivatives of runs that search for roots, forward and reverse over reverse: those of the implicit function."""
+"""Second derivatives of runs that search for roots, forward and reverse over reverse."""
 
 import jax
 import jax.numpy as jnp

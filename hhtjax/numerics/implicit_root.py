@@ -1,7 +1,5 @@
 """Roots with the derivatives of the implicit function, of every order and in every mode."""
 
-from functools import partial
-
 import jax
 from jax.custom_derivatives import zero_from_primal
 

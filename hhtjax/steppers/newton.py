@@ -31,8 +31,33 @@ def linearized_solve(r, path, w, factorize, at=None, again=False):
 
 def solve_and_keep(r, path, w, factorize, at=None, again=False):
     """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
-    expansion = Expand(partial(jax.linearize, r), partial(jax.linearize, path), w)(at)
+    expansion = Expand(partial(linearize_rows, r), partial(jax.linearize, path), w)(at)
     return *solve_expanded(r, path, w, factorize, again, expansion), expansion.along
+
+
+def linearized(f, x, linearize=jax.linearize):
+    """f(x) and its tangent there; a word where a callback has no derivative."""
+    try:
+        return linearize(f, x)
+    except ValueError as error:
+        if "callbacks do not support JVP" not in str(error):
+            raise
+        raise ValueError(
+            "this stepper needs the derivatives of the force (and mass and constraint) in q and v, `rosenbrock` in t; "
+            "`jax.pure_callback` and `io_callback`, which are called there, have none. Give them some by "
+            "`jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
+        ) from error
+
+
+def linearize_rows(r, s, linearize=jax.linearize):
+    """r and its tangent about a state s, for changes that leave the time as it is.
+
+    Where r cannot be differentiated, as with a `jax.pure_callback` of the time, the time is held.
+    """
+    try:
+        return linearize(r, s)
+    except ValueError:
+        return linearized(lambda x: r(x._replace(t=s.t)), s, linearize)
 
 
 class Expansion(NamedTuple):
@@ -118,7 +143,7 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
 
         def improve(carry):
             w0, _, iterations, _, left = carry
-            before, tangent = staged(partial(jax.linearize, f), w.size)(w0)
+            before, tangent = staged(partial(linearized, f), w.size)(w0)
             here = around(factorize, lambda: jax.linearize(path, w0))
             inverse, terms = invert_and_bound(tangent, w, here)
             dw = inverse(before, trans=0)
