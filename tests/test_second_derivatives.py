@@ -66,3 +66,15 @@ def test_second_derivatives_are_differences_of_the_first(f, mode):
     expected = (4 * difference(1) - difference(2)) / 3
     H = jax.jit(SECOND[mode](f), compiler_options=QUICK)(X)
     np.testing.assert_allclose(H, expected, rtol=0, atol=2e-10 * np.max(np.abs(expected)))
+
+
+def test_the_gradient_of_two_unknowns_evaluated_on_scalars():
+    """Reverse mode against forward mode; what the search tells besides the root is no integer there."""
+    system = hhtjax.System(np.ones(2), lambda q, v, t, p: -p * jnp.sin(q + q[::-1]) - 0.1 * v)
+
+    def end(p):
+        start = jnp.array([1.0, 0.5]), jnp.zeros(2), p
+        return hhtjax.simulate(system, hhtjax.hht(iterations=None), *start, dt=DT, num_steps=10).q[-1]
+
+    forward, reverse = jax.jit(lambda p: (jax.jacfwd(end)(p), jax.jacrev(end)(p)), compiler_options=QUICK)(9.0)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)

@@ -19,7 +19,7 @@ def implicit_root(f, guess, search, tangent_solve):
     Args:
         f: (n,) -> (n,); differentiated in what it closes over.
         guess: (n,), where the search begins.
-        search: guess -> (w, more).
+        search: guess -> (w, more); more are floats.
         tangent_solve: g, y -> x with g(x) = y, for the linear map g of dw; differentiable.
 
     Returns:
@@ -27,7 +27,7 @@ def implicit_root(f, guess, search, tangent_solve):
 
     >>> import jax, jax.numpy as jnp
     >>> def root(a):
-    ...     search = lambda w: (jax.lax.fori_loop(0, 40, lambda _, w: (w + a / w) / 2, w), 40)
+    ...     search = lambda w: (jax.lax.fori_loop(0, 40, lambda _, w: (w + a / w) / 2, w), None)
     ...     return implicit_root(lambda w: w * w - a, a, search, lambda g, y: y / g(1.0))[0]
     >>> [float(f(4.0)) for f in (root, jax.grad(root), jax.grad(jax.grad(root)))]
     [2.0, 0.25, -0.03125]

@@ -160,13 +160,14 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
         left = jnp.zeros((), w.dtype) if isinstance(factorize, Trusted) else None
         begin = w, jnp.zeros_like(w), jnp.zeros((), jnp.int32), jnp.array(False), left
         w, value, iterations, converged, left = lax.while_loop(unfinished, improve, begin)
-        return w, (jnp.max(jnp.abs(value)), iterations, converged, left)
+        # as floats: integers have no tangents, which an evaluation on scalars cannot hand on
+        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype), left)
 
     def tangent_solve(g, y):
         return solve_map(g, y, factorize)
 
     w, (size, iterations, converged, left) = implicit_root(f, w, search, tangent_solve)
-    return w, told(factorize, left, Info(size, iterations, converged))
+    return w, told(factorize, left, Info(size, iterations.astype(jnp.int32), converged > 0))
 
 
 def is_rounding(system, r, s0, s1, value, limit, ask):
