@@ -1,5 +1,7 @@
 """A sweep over several devices and several processes has the bits of a sweep on one."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,3 +55,18 @@ def test_inside_shard_map_operations_are_understood():
     inside = eqn.params["jaxpr"].eqns
     assert "broadcast_in_dim" in {x.primitive.name for x in inside}
     assert all(map(is_understood, inside))
+
+
+def test_shard_map_that_checks_axes_is_refused_in_words():
+    mesh = jax.make_mesh((1,), ("b",))
+    system = hhtjax.System(np.ones(1), lambda q, v, t, p: -p * q)
+
+    def end(k):
+        return hhtjax.simulate(system, hhtjax.rk4(), jnp.ones(1), jnp.zeros(1), k, dt=0.1, num_steps=3).q[-1]
+
+    given = jax.device_put(jnp.array([1.0, 2.0]), jax.NamedSharding(mesh, PartitionSpec("b")))
+    spread = PartitionSpec("b")
+    by_hand = partial(jax.shard_map, jax.vmap(end), mesh=mesh, in_specs=spread, out_specs=spread)
+    with pytest.raises(TypeError, match=r"simulate: inside `jax.shard_map`.*axes \['b'\].*check_vma=False"):
+        by_hand()(given)
+    np.testing.assert_array_equal(jax.jit(by_hand(check_vma=False))(given), jax.vmap(end)(jnp.array([1.0, 2.0])))

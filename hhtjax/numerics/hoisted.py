@@ -15,9 +15,21 @@ def hoisted(f, *args):
     >>> len(constants), float(f(constants, jnp.array(2.0))["product"])
     (1, 6.0)
     """
+    call, constants = opened(f, *args)
+    return jax.jit(call), constants
+
+
+def opened(f, *args):
+    """The same without a `jit` around it.
+
+    >>> import jax, jax.numpy as jnp
+    >>> n = jnp.array(3)
+    >>> f, constants = opened(lambda x: x * n, jnp.array(1.0))
+    >>> len(constants), float(f(constants, jnp.array(2.0)))
+    (1, 6.0)
+    """
     trace, like = jax.make_jaxpr(f, return_shape=True)(*args)
 
-    @jax.jit
     def call(constants, *args):
         return jax.tree.unflatten(jax.tree.structure(like), eval_jaxpr(trace.jaxpr, constants, *jax.tree.leaves(args)))
 

@@ -49,9 +49,12 @@ def invert_and_bound(f, like, factorize):
 
 def _solve(f, b, inverse):
     f = part(f, b.size)  # for its derivatives
-    return lax.custom_linear_solve(
-        f, b, solve=lambda _, y: inverse(y, trans=0), transpose_solve=lambda _, y: inverse(y, trans=1)
-    )
+    call = partial(lax.custom_linear_solve, f, b, solve=lambda _, y: inverse(y, trans=0))
+    try:
+        return call(transpose_solve=lambda _, y: inverse(y, trans=1))
+    except (ValueError, NotImplementedError):
+        # JAX transposes f at once, and a `while_loop` in a user's force has no transpose: only reverse mode needs one
+        return call()
 
 
 class Trusted:

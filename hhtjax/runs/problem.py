@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import is_concrete, thaw
@@ -34,6 +35,7 @@ class Problem(NamedTuple):
         require_system(caller, system)
         require_stepper(caller, stepper)
         params = require_params(caller, params)
+        _refuse_checked_axes(caller, q0, v0, params, t0, z0)
         require_number(caller, "t0", t0, np.isfinite, "be finite")
         q0, v0, z0 = initial_values(caller, system, q0, v0, z0, level=4)
         require_capable(caller, system, stepper, q0, v0)
@@ -57,3 +59,16 @@ class Problem(NamedTuple):
         params = thaw(self.params)
         flat, q, v = flatten("simulate", self.system, self.q0, self.v0, self.t0, params, self.z0)
         return flat, q, v, self.times(self.t0), params
+
+
+def _refuse_checked_axes(caller, *args):
+    """Under `check_vma` of `jax.shard_map` each array says over which axes it varies. Constants must say so too, and
+    those of loops, branches and Jacobians do not here."""
+    for x in jax.tree.leaves(args):
+        kind = getattr(jax.typeof(x), "mat", None) if isinstance(x, Tracer) else None
+        if kind is not None and kind.varying:
+            raise TypeError(
+                f"{caller}: inside `jax.shard_map` with check_vma=True, its default; received arguments that vary over "
+                f"the axes {sorted(kind.varying)}. Write jax.shard_map(..., check_vma=False): the values are the same. "
+                "`sweep` spreads its members over devices by itself."
+            )

@@ -9,7 +9,7 @@ from jax import lax
 from hhtjax.numerics.elimination import diagonal
 from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.seldom import choose, derivative_of, seldom
-from hhtjax.steppers.newton import Expand, left_by, linearized_solve, solve_expanded, told
+from hhtjax.steppers.newton import Expand, left_by, linearize_rows, linearized_solve, solve_expanded, told
 from hhtjax.xla import staged, traced
 
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
@@ -27,7 +27,8 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
         return linearized_solve(r, path, s.w, factorize, held, again)
 
     # each traced once, for both states that r is expanded about
-    expand = Expand(traced(partial(linearize, r), now), traced(partial(linearize, path), s.w), s.w)
+    rows = partial(linearize_rows, r, linearize=linearize)
+    expand = Expand(traced(rows, now), traced(partial(linearize, path), s.w), s.w)
 
     @jax.jit
     def solution(expansion):

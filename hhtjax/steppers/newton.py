@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.numerics.implicit_root import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, invert_and_bound, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.steppers.stepper import Info
@@ -30,8 +31,33 @@ def linearized_solve(r, path, w, factorize, at=None, again=False):
 
 def solve_and_keep(r, path, w, factorize, at=None, again=False):
     """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
-    expansion = Expand(partial(jax.linearize, r), partial(jax.linearize, path), w)(at)
+    expansion = Expand(partial(linearize_rows, r), partial(jax.linearize, path), w)(at)
     return *solve_expanded(r, path, w, factorize, again, expansion), expansion.along
+
+
+def linearized(f, x, linearize=jax.linearize):
+    """f(x) and its tangent there; a word where a callback has no derivative."""
+    try:
+        return linearize(f, x)
+    except ValueError as error:
+        if "callbacks do not support JVP" not in str(error):
+            raise
+        raise ValueError(
+            "this stepper needs the derivatives of the force (and mass and constraint) in q and v, `rosenbrock` in t; "
+            "`jax.pure_callback` and `io_callback`, which are called there, have none. Give them some by "
+            "`jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
+        ) from error
+
+
+def linearize_rows(r, s, linearize=jax.linearize):
+    """r and its tangent about a state s, for changes that leave the time as it is.
+
+    Where r cannot be differentiated, as with a `jax.pure_callback` of the time, the time is held.
+    """
+    try:
+        return linearize(r, s)
+    except ValueError:
+        return linearized(lambda x: r(x._replace(t=s.t)), s, linearize)
 
 
 class Expansion(NamedTuple):
@@ -107,14 +133,17 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
 
     relative = jnp.minimum(RELATIVE, jnp.maximum(tolerance, SHAKE * NOISE * float(jnp.finfo(w.dtype).eps)))
 
-    def search(f, w):
+    def f(w):
+        return r(path(w))
+
+    def search(w):
         def unfinished(carry):
             _, value, iterations, converged, _ = carry
             return ~converged & (iterations < max_iterations) & jnp.all(jnp.isfinite(value))
 
         def improve(carry):
             w0, _, iterations, _, left = carry
-            before, tangent = staged(partial(jax.linearize, f), w.size)(w0)
+            before, tangent = staged(partial(linearized, f), w.size)(w0)
             here = around(factorize, lambda: jax.linearize(path, w0))
             inverse, terms = invert_and_bound(tangent, w, here)
             dw = inverse(before, trans=0)
@@ -131,14 +160,13 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
         left = jnp.zeros((), w.dtype) if isinstance(factorize, Trusted) else None
         begin = w, jnp.zeros_like(w), jnp.zeros((), jnp.int32), jnp.array(False), left
         w, value, iterations, converged, left = lax.while_loop(unfinished, improve, begin)
-        # as floats: custom_root cannot differentiate past integers
+        # as floats: integers have no tangents, which an evaluation on scalars cannot hand on
         return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype), left)
 
     def tangent_solve(g, y):
         return solve_map(g, y, factorize)
 
-    w, told_by_search = lax.custom_root(lambda w: r(path(w)), w, search, tangent_solve, has_aux=True)
-    size, iterations, converged, left = told_by_search
+    w, (size, iterations, converged, left) = implicit_root(f, w, search, tangent_solve)
     return w, told(factorize, left, Info(size, iterations.astype(jnp.int32), converged > 0))
 
 

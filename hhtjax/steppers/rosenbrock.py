@@ -26,6 +26,7 @@ from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.sparse_solve import kept
 from hhtjax.steppers.estimate import Embedded, Errors
 from hhtjax.steppers.linear_part import with_local
+from hhtjax.steppers.newton import linearized
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.xla import staged
@@ -93,7 +94,7 @@ class Rosenbrock(Embedded, Stepper):
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 
         def step(s):
-            value, tangent = staged(partial(jax.linearize, r), system.size)(s)
+            value, tangent = staged(partial(linearized, r), system.size)(s)
             solve = once if system.linear else factorized(tangent, s)
             end, errors = stages(system, self.tableau, s, dt, r, value, tangent, solve)
             if estimating and not system.linear:  # what the derivatives at the start do not know of the end

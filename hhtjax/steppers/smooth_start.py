@@ -35,6 +35,7 @@ from jax import lax
 
 from hhtjax.description import freeze, thaw
 from hhtjax.numerics.elimination import UNROLLED, diagonal, inverse, matvec
+from hhtjax.numerics.implicit_root import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
@@ -390,15 +391,18 @@ def root(layer, factorize):
     """z behind the implicit step; differentiated by the implicit-function theorem."""
     n = layer.system.size
 
-    def search(f, z):
+    def f(z):
+        return layer.rows(layer.path(z))
+
+    def search(z):
         def around_it(z):
             value, tangent = jax.linearize(f, z)
             dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
             return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
 
-        return improved(around_it, z)[0]
+        return improved(around_it, z)[0], None
 
     def tangent_solve(g, y):
         return solve_map(g, y, factorize)
 
-    return lax.custom_root(lambda z: layer.rows(layer.path(z)), layer.zeros(), search, tangent_solve)
+    return implicit_root(f, layer.zeros(), search, tangent_solve)[0]

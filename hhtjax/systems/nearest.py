@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.numerics.implicit_root import implicit_root
 from hhtjax.numerics.linear_solve import solve_map
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import jacobian
@@ -64,12 +65,12 @@ def nearest_position(system, q0, t, params, factorize):
         Phi, pull = jax.vjp(constraint, x)
         return jnp.concatenate([system.inertia(q0, x, t, params) - pull(mu)[0], Phi])
 
-    def search(f, z):
+    def search(z):
         problem = lax.stop_gradient(_problem(system, q0, t, params))
-        return _search(problem._replace(conditions=f, constraint=constraint, factorize=factorize), z)
+        return _search(problem._replace(conditions=conditions, constraint=constraint, factorize=factorize), z)
 
     z0 = jnp.zeros(n + system.num_constraints, q0.dtype)
-    z, found = lax.custom_root(conditions, z0, search, lambda g, y: solve_map(g, y, factorize), has_aux=True)
+    z, found = implicit_root(conditions, z0, search, lambda g, y: solve_map(g, y, factorize))
     return system.move(q0, z[:n]), z[:n], found > math.sqrt(eps)
 
 
