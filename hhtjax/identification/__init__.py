@@ -55,6 +55,19 @@ option          what it says
                 eliminated: each step of the fit is solved as if only the parameters were unknown
 ==============  ==================================================================================================
 
+How the minimum is found
+------------------------
+
+Levenberg-Marquardt solves a linear least-squares problem for each step, and damps it. Where a step lowers the cost as
+predicted, the damping falls, faster with each such step in a row; where it does not, the next step is at most half as
+long. Each run brings its exact Jacobian, and two Jacobians tell how the residuals bend along the last step. A further
+step is corrected for that (geodesic acceleration), so that it follows a curved valley; this costs no run.
+
+A fit ends where the gradient vanishes. It also ends where the last step changed the cost, or the unknowns, by less than
+`tolerance`; then the gradient or the residual must be small too, and so the damping or what an undamped step
+still takes off the residual. With dry friction or stops the cost may have kinks. A kink can be a local minimum;
+which of them a fit finds depends on its path. Fit again from points near the estimate, and keep the least cost.
+
 A start that is poor
 --------------------
 
