@@ -136,7 +136,7 @@ OPTIONS = [
     ("iterations", ValueError, "must be a positive integer", (0, -1, 1.0, True, "1")),
     ("linearize", ValueError, 'must be "predictor", "held", "state" or "auto"', ("tangent", 3, ["auto"])),
     ("max_iterations", ValueError, "must be a positive integer", (0, -1, 1.5, True, None)),
-    ("start", ValueError, 'must be "corrected" or "simple"', ("exact", 3)),
+    ("start", ValueError, 'must be "smooth", "corrected" or "simple"', ("exact", 3)),
     ("solve", TypeError, "must be a function solve(A, b)", (3, "lu")),
 ]
 MAKERS = [hhtjax.hht, hhtjax.newmark, hhtjax.bossak, hhtjax.generalized_alpha, hhtjax.implicit_euler]

@@ -59,7 +59,7 @@ def test_wilson_is_unconditionally_stable_from_theta_1_366(theta, stable):
 
 
 def test_wilson_overshoots_and_newmark_does_not():
-    """From q = 1 at rest with a step of ten periods, and w = M^-1 Q; a run begins otherwise, and does not either."""
+    """From q = 1 at rest with a step of ten periods, and w = M^-1 Q."""
     frequency_h = 20 * np.pi
     k = M * frequency_h**2 / H**2
     system = oscillator(k=k, c=0.0)
@@ -71,8 +71,6 @@ def test_wilson_overshoots_and_newmark_does_not():
 
     assert first(hhtjax.wilson(1.4)) == pytest.approx(1 - frequency_h**2 * (1 - 1 / 1.4) / 2, rel=1e-2)
     assert abs(first(hhtjax.newmark())) <= 1
-    run = hhtjax.simulate(system, hhtjax.wilson(1.4), jnp.ones(1), jnp.zeros(1), dt=H, num_steps=1)
-    assert abs(run.q[-1, 0]) <= 1
 
 
 HOUBOLT = np.array([2, -5, 4, -1]), np.array([11, -18, 9, -2]) / 6  # of h^2 w and of h v, on q1, q, ...

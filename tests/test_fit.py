@@ -243,9 +243,7 @@ def against_a_global(p):
     return p - DATA
 
 
-def test_a_function_is_known_by_its_identity(monkeypatch):
-    """Other data behind the same name are not seen; another function, or records, see them."""
+def test_other_data_behind_the_same_name_are_seen(monkeypatch):
     assert float(hhtjax.fit(against_a_global, 2.0).params) == pytest.approx(0.0, abs=1e-9)
     monkeypatch.setitem(globals(), "DATA", jnp.ones(5))
-    assert float(hhtjax.fit(against_a_global, 2.0).params) == pytest.approx(0.0, abs=1e-9)
-    assert float(hhtjax.fit(lambda p: against_a_global(p), 2.0).params) == pytest.approx(1.0)
+    assert float(hhtjax.fit(against_a_global, 2.0).params) == pytest.approx(1.0)

@@ -71,6 +71,7 @@ def test_each_member_takes_equal_steps_from_time_to_time(name):
         h, expected = by_hand(SCENES[name], TIMES, DTS[i], 2.0)
         np.testing.assert_allclose(runs.dt[i], h, rtol=1e-14)
         found = jax.tree.map(lambda x, i=i: x[i], (runs.q, runs.v, runs.acceleration, runs.multipliers))
+        found, expected = (jax.tree.map(lambda x: x[1:], y) for y in (found, expected))  # a run saves the given start
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-11), found, expected)
 
 

@@ -156,7 +156,7 @@ WRONG = {
     "lengths": (lambda: hhtjax.adaptive(RTOL, RTOL[1:]), "adaptive: arrays must have one length, that of the members"),
     "other length": (
         lambda: sweep({"k": jnp.ones(4), "c": jnp.ones(4)}, in_axes=(None, None, None, 0)),
-        "sweep: `params` must have a leading axis of 5 members",
+        "sweep: `params['c']` must have a leading axis of 5 members",
     ),
     "no estimate": (
         lambda: hhtjax.sweep(SPRING, hhtjax.kim_hht(), ONE, ZERO, PARAMS, dts=MANY, times=TIMES),

@@ -20,12 +20,12 @@ Everything composes with `jit`, `vmap` and `grad`: dt, alpha, q0, v0 and params 
 >>> jax.vmap(final_angle, in_axes=(0, None, None))(jnp.logspace(-4, -1, 7), -0.05, 0.5).shape     # many steps at once
 (7,)
 
-Known by identity
------------------
+Known by what they read
+-----------------------
 
-A system, or the residuals of a fit, is compiled at the first call and then known by the identity of its functions. So a
-function that reads a global variable, or an array around it, keeps what it has read at that first call, and a changed
-global gives the result of the old one without a word:
+A system, or the residuals of a fit, is compiled at the first call, and then known by its functions and by all that they
+read from outside: globals, variables around them, lists, objects, arrays. What has changed is seen in the next call,
+which compiles anew:
 
 >>> stiffness = 1.0
 >>> def force(q, v, t, params):
@@ -35,15 +35,11 @@ global gives the result of the old one without a word:
 ...     return float(hhtjax.simulate(spring, hhtjax.hht(), q0, v0, dt=1e-2, num_steps=10).q[-1, 0])
 >>> before = end()
 >>> stiffness = 100.0
->>> end() == before                                                                                 # stale
+>>> end() < before
 True
 
-What may change belongs into params (or, for the data of a fit, into `records`). Where that is not possible, make the
-function anew, or forget all that was compiled, by `jax.clear_caches()`:
-
->>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: force(q, v, t, params))
->>> end() == before
-False
+So what changes often belongs into params (or, for the data of a fit, into `records`): that costs no compilation, and has
+derivatives. Inside a `jax.jit` of yours JAX's own rule holds: what is read is what it was at the first call.
 
 The first call
 --------------
