@@ -38,8 +38,8 @@ which compiles anew:
 >>> end() < before
 True
 
-So what changes often belongs into params (or, for the data of a fit, into `records`): that costs no compilation, and has
-derivatives. Inside a `jax.jit` of yours JAX's own rule holds: what is read is what it was at the first call.
+So what changes often belongs into params (or, for the data of a fit, into `records`): that costs no compilation, and
+has derivatives. `simulate` says what holds inside a jit of yours.
 
 The first call
 --------------
