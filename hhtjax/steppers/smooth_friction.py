@@ -46,8 +46,7 @@ def finished(law, method, layer, inverse, drag, z, h, corrects):
         ends, tau = rows.at_rest(jnp.ones_like(f) > 0, load, f, size)
         stays = (direction(system, (q, v, t, params), H) == 0) & (ends == 0)
         dv = taken_off(dv - layer.V * matvec(G.T, tau), stays)
-        part = damped_part(layer, inverse, drag, dv, h, lambda x: taken_off(x, stays))
-        v = v + jnp.where(drag.dissipates, part, 0)
+        v = v + damped_part(layer, inverse, drag, dv, h, lambda x: taken_off(x, stays))
     found = begin_friction(method, system, q, v, t, params, h, stays)  # who stays: rounding of dv is left in v
     sig, tau = found.friction
     rubbing = layer._replace(system=smooth_system(system, sig, tau, found.L))

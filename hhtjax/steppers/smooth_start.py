@@ -205,10 +205,11 @@ def without_layer(method, layer, h, damped, corrects, finish):
 
 
 class Drag(NamedTuple):
-    """The map (C + C^T)/2, and whether it takes energy from every motion, which is taken on trust of large systems."""
+    """The map (C + C^T)/2, and whether it takes energy from every motion; None where that is asked only of the motions
+    that P leads to, as of large systems."""
 
     of: Any
-    dissipates: Any = True
+    dissipates: Any = None
 
 
 class Found(NamedTuple):
@@ -226,8 +227,7 @@ def finished(method, layer, inverse, drag, z, h, corrects):
     """The `Found`, from the solve with the matrix of the step, the map C, and z behind the implicit step."""
     v, bend = layer.base.v, layer.bend
     if drag is not None:
-        part = damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
-        v = v + jnp.where(drag.dissipates, part, 0)
+        v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
         bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
     z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend))
     if not corrects:
@@ -314,7 +314,7 @@ def damping(layer, factorize, at, tangent):
     def drag(x):
         return tangent(zero._replace(v=layer.located(x)))[: v.size]
 
-    if not isinstance(factorize, Trusted) and v.size <= LARGEST:
+    if not (isinstance(factorize, Trusted) or layer.system.linear):
         C = staged(partial(linear_map, drag), v.size)(v)
         C = (C + C.T) / 2
         return Drag(partial(matvec, C), dissipates(layer, C)), jnp.any(C != 0)
@@ -346,14 +346,22 @@ def dissipates(layer, C):
 
 
 def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
-    """P^4 [1 + (5 - 2 gamma) (1 - P)] dv. project: what keeps P x among the velocities that may change."""
+    """P^4 [1 + (5 - 2 gamma) (1 - P)] dv, or 0 where C gives energy.
 
-    def power(_, pair):
-        x = pair[0]
-        return project(response(layer, inverse, layer.V * layer.located(drag.of(x)))), x
+    project: what keeps P x among the velocities that may change.
+    """
 
-    x, before = lax.fori_loop(0, POWERS, power, (dv, dv))
-    return before + (POWERS - 2 * layer.V / h) * (before - x)
+    def power(_, carry):
+        x, _, fine = carry
+        pull = layer.V * layer.located(drag.of(x))
+        if drag.dissipates is None:
+            given = layer.system.inertia(layer.base.q, x, layer.base.t, layer.params)
+            fine = fine & (jnp.sum(x * pull) >= -GAINED * jnp.sum(x * given))
+        return project(response(layer, inverse, pull)), x, fine
+
+    fine = jnp.array(True) if drag.dissipates is None else drag.dissipates
+    x, before, fine = lax.fori_loop(0, POWERS, power, (dv, dv, fine))
+    return jnp.where(fine, before + (POWERS - 2 * layer.V / h) * (before - x), 0)
 
 
 def response(layer, inverse, force):

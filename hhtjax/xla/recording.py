@@ -116,6 +116,9 @@ class _Listing:
             return LOOPS[name](self, eqn, *values)
         if name in ("hhtjax_held", "hhtjax_watch", "optimization_barrier", "device_put"):
             return values
+        if name == "hhtjax_values":  # a function that autodiff keeps whole, such as a root
+            shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
+            return self.run(jax.make_jaxpr(eqn.params["f"])(shapes), values)
         if name == "hhtjax_inside":  # functions come in two forms: outside of a kernel LAPACK's
             return [known_pieces(np.bool_(False))]
         known = all(is_known(x) for value in values for x in value.flat)
