@@ -13,12 +13,14 @@ class Case(NamedTuple):
         script: a function of no arguments, that returns a number or a text.
         right: the number, or what the text must hold.
         within: by how much a number may differ from it.
+        is_long: whether it takes minutes, so that smoke runs leave it out.
     """
 
     what: str
     script: Callable[[], Any]
     right: Any
     within: float = 0.0
+    is_long: bool = False
 
     def holds(self, found):
         """Whether that is the right answer."""

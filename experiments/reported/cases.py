@@ -16,7 +16,7 @@ CASES = {
         Case("a coordinate without mass", scripts.massless_coordinate, "constraint"),
     ],
     "assembly": [
-        Case("three links, 300 guesses: not the nearest, silently", scripts.nearest_assembly, 0.0, 0.0),
+        Case("three links, 300 guesses: not the nearest, silently", scripts.nearest_assembly, 0.0, is_long=True),
     ],
     "dry friction": [
         Case(

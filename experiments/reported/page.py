@@ -56,7 +56,7 @@ def both(before, now):
 
 def cell(x):
     """A number or a text, in a table of Markdown."""
-    return shown(x).replace("|", "\\|").replace("*", "\\*")
+    return shown(x, most=240).replace("|", "\\|").replace("*", "\\*")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,8 @@ def answers(report, fast=False):
     rows = []
     for kind, cases in CASES.items():
         for case in cases[: 1 if fast else None]:
+            if fast and case.is_long:
+                continue
             found = answer(case.script)
             right = case.right if isinstance(case.right, str) else float(case.right)
             rows.append({"kind": kind, "what": case.what, "right": right, "found": found, "holds": case.holds(found)})
@@ -34,7 +36,7 @@ def answers(report, fast=False):
 def figure(before, now):
     """Errors over the mass, of each stepper, in each place."""
     kinds = list(now["error_over_F_by_k"])
-    drawn, axes = subplots(1, len(kinds), width=175, height=75, sharex=True, sharey=True)
+    drawn, axes = subplots(1, len(kinds), width=175, height=90, sharex=True, sharey=True)
     for place, kind in zip(np.ravel(axes), kinds, strict=True):
         for i, name in enumerate(starts.STEPPERS):
             for told, style in ((before, ":"), (now, "-")):
@@ -48,7 +50,7 @@ def figure(before, now):
         place.set_title(kind)
         place.set_xlabel("m (kg)")
     np.ravel(axes)[0].set_ylabel("error of q over F/k")
-    drawn.legend(loc="outside lower center", ncols=6)
+    drawn.legend(loc="outside lower center", ncols=4)
     return drawn
 
 
@@ -79,6 +81,6 @@ def run(report, fast):
     assert not wrong, f"wrong answers: {wrong}"
 
 
-def shown(x):
+def shown(x, most=60):
     """A number to six digits, a text cut."""
-    return f"{x:.6g}" if not isinstance(x, str) else x if len(x) <= 60 else f"{x[:57]}..."
+    return f"{x:.6g}" if not isinstance(x, str) else x if len(x) <= most else f"{x[: most - 3]}..."

@@ -26,7 +26,7 @@ from hhtjax.numerics.either import choose, namespace_of, while_loop
 
 ALIKE = 0.7  # cosine of two steps, from which on one tells how the residual bends along the other
 MOST_BENT = 1.5  # 2 |D a| over |D v|: beyond it v is no straight line any more, and a no correction of it
-LESS, AGAIN, FASTER = 4.0, 4.0, 6  # lam is divided by 4 after a good step, by 4 times more after each further one
+LESS, AGAIN, FASTER = 2.0, 4.0, 6  # lam is divided by 2 after a good step, by 4 times more after each further one
 
 
 class Course(NamedTuple):
@@ -51,7 +51,7 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
     derivative of what runs.
 
     With rho the decrease of the cost over that predicted, lam changes by the factor max(least, 1 - (2 rho - 1)^3) when
-    a step lowers the cost (Nielsen 1999); least is 1/4, and less by 4 with each step of rho > 0.9 that follows another.
+    a step lowers the cost (Nielsen 1999); least is 1/2, and less by 4 with each step of rho > 0.9 that follows another.
     When it does not, lam grows until |D v| is half as long, or a quarter after two failures, an eighth after three, ...
     It also grows until no entry of v is longer than that of `longest`. room: for how many iterations the history has
     room, where max_iterations is a tracer. enough: trial, step -> whether to end with a step like that, for STEP.
