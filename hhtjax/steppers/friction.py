@@ -16,6 +16,7 @@ directions of all forces, through as much as it could in a whole step.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ NOISE = 8  # roundings, of what it is the difference of, below which a number is
 LAGS = 20  # how often multipliers, and limits that depend on them, are made anew at the start
 
 
-def begin_friction(method, system, q, v, t, params, dt, still=False):
+def begin_friction(method, system, q, v, t, params, dt, still: Any = False):
     """The state at the start: who slides, who sticks, and the accelerations of that.
 
     still: (m,), joints that are at rest, whatever rounding their velocities show.

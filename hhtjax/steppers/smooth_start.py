@@ -317,7 +317,8 @@ def damping(layer, factorize, at, tangent):
     if not (isinstance(factorize, Trusted) or layer.system.linear):
         C = staged(partial(linear_map, drag), v.size)(v)
         C = (C + C.T) / 2
-        return Drag(partial(matvec, C), dissipates(layer, C)), jnp.any(C != 0)
+        fine = None if layer.system.matrices is not None else dissipates(layer, C)
+        return Drag(partial(matvec, C), fine), jnp.any(C != 0)
     pull = jax.linear_transpose(drag, v)  # large: no matrix is formed
 
     def both(x):
