@@ -317,8 +317,7 @@ def damping(layer, factorize, at, tangent):
     if not (isinstance(factorize, Trusted) or layer.system.linear):
         C = staged(partial(linear_map, drag), v.size)(v)
         C = (C + C.T) / 2
-        fine = None if layer.system.matrices is not None else dissipates(layer, C)
-        return Drag(partial(matvec, C), fine), jnp.any(C != 0)
+        return Drag(partial(matvec, C), dissipates(layer, C)), jnp.any(C != 0)
     pull = jax.linear_transpose(drag, v)  # large: no matrix is formed
 
     def both(x):
@@ -330,8 +329,10 @@ def damping(layer, factorize, at, tangent):
 def dissipates(layer, C):
     """Whether h gamma x^T C x > -GAINED x^T M x for all x: else P grows what it should take away.
 
-    So it is of every damper. It is not of a feedback without reaction, whose C is not symmetric.
+    So it is of every damper. It is not of a feedback without reaction, whose C is not symmetric. None of sparse systems.
     """
+    if layer.system.matrices is not None:
+        return None
     base, n = layer.base, layer.system.size
     A = lax.stop_gradient(layer.system.full_mass(base.q, base.t, layer.params) + layer.V / GAINED * C)
     unit = jnp.sqrt(jnp.maximum(jnp.abs(diagonal(A)), float(jnp.finfo(A.dtype).tiny)))
