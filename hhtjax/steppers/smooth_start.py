@@ -329,7 +329,8 @@ def damping(layer, factorize, at, tangent):
 def dissipates(layer, C):
     """Whether h gamma x^T C x > -GAINED x^T M x for all x: else P grows what it should take away.
 
-    So it is of every damper. It is not of a feedback without reaction, whose C is not symmetric. None of sparse systems.
+    So it is of every damper. It is not of a feedback without reaction, whose C is not symmetric. None where M is sparse:
+    then it is not known.
     """
     if layer.system.matrices is not None:
         return None
