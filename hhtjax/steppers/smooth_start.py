@@ -329,8 +329,7 @@ def damping(layer, factorize, at, tangent):
 def dissipates(layer, C):
     """Whether h gamma x^T C x > -GAINED x^T M x for all x: else P grows what it should take away.
 
-    So it is of every damper. It is not of a feedback without reaction, whose C is not symmetric. None where M is sparse:
-    then it is not known.
+    So it is of every damper, and not of a feedback without reaction, whose C is not symmetric. None where M is sparse.
     """
     if layer.system.matrices is not None:
         return None
