@@ -126,9 +126,13 @@ def solver_of_some(K, some):
     """The function b -> y of it, for many b: factorised once."""
     if len(K) == 1:
         return lambda b: jnp.where(some, b, 0) / jnp.where(some, K[0], 1)
-    block = jnp.where(some[:, None] & some[None, :], K, jnp.eye(len(K), dtype=K.dtype))
-    solve = solver(block)
+    solve = solver(block_of(K, some))
     return lambda b: solve(jnp.where(some, b, 0))
+
+
+def block_of(A, some):
+    """A on those rows and columns, beside ones."""
+    return jnp.where(some[:, None] & some[None, :], A, jnp.eye(len(A), dtype=A.dtype))
 
 
 def at_rest(K, rests, load, f):

@@ -21,7 +21,7 @@ from jax import lax
 from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems.constraints import jacobian, violation
-from hhtjax.systems.friction import at_rest, directions, responses, solver_of_some
+from hhtjax.systems.friction import at_rest, block_of, directions, responses, solver_of_some
 
 LIMIT = 1e-10  # relative size, squared, of what is left of a direction, below which it is rounding
 SLIGHT = 1e-9  # relative size of an acceleration, or of a time in a step, below which it is 0
@@ -151,13 +151,8 @@ def solver_of_positive(A, some):
         inverse = _inverse(lax.stop_gradient(A))
         return lambda b, trans=0: (inverse.T if trans else inverse) @ b
 
-    solve = solver(_alone(A, some), factorize)
+    solve = solver(block_of(A, some), factorize)
     return lambda b: solve(jnp.where(some, b, 0))
-
-
-def _alone(A, some):
-    """A on those rows and columns, beside ones."""
-    return jnp.where(some[:, None] & some[None, :], A, jnp.eye(len(A), dtype=A.dtype))
 
 
 def _inverse(A):
@@ -276,7 +271,7 @@ def smallest_in_box(K, load, f, moved):
         pull = b + PROXIMAL * old
         g = A @ u - pull
         pinned = ((u >= top) & (g < 0)) | ((u <= -top) & (g > 0)) | ~moved
-        step = -(_inverse(_alone(A, ~pinned)) @ jnp.where(pinned, 0, g))
+        step = -(_inverse(block_of(A, ~pinned)) @ jnp.where(pinned, 0, g))
         tried = jnp.concatenate([shorter[:, None] * step[None, :], -shorter[:, None] * g[None, :]])
         path = jnp.clip(u[None, :] + tried, -top[None, :], top[None, :])
         costs = jnp.sum(path * (path @ A / 2 - pull[None, :]), axis=1)
