@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import wraps
+from functools import cache, wraps
 from typing import Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
 
 import jax
@@ -95,11 +95,18 @@ def check_options(caller, **keywords: Any) -> Options:
     return options
 
 
-def _require_one_of(caller, name, options):
-    value, kind = getattr(options, name), get_type_hints(Options)[name]
+@cache
+def _words(name):
+    """What an option may be, by its annotation, which takes long to read."""
+    kind = get_type_hints(Options)[name]
     optional = type(None) in get_args(kind)
-    words = get_args(get_args(kind)[0] if optional else kind)
-    if not (value is None and optional) and value not in words:
+    return (*get_args(get_args(kind)[0] if optional else kind), *((None,) if optional else ()))
+
+
+def _require_one_of(caller, name, options):
+    value, allowed = getattr(options, name), _words(name)
+    if value not in allowed:
+        words = [word for word in allowed if word is not None]
         *others, last = (f'"{word}"' for word in words)
         raise ValueError(f"{caller}: `{name}` must be {', '.join(others)} or {last}; received {value!r}.")
 
