@@ -20,7 +20,7 @@ from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.smooth_friction import smoothed_friction
-from hhtjax.steppers.smooth_start import jumped, smoothed
+from hhtjax.steppers.smooth_start import DEFAULT, jumped, smoothed
 from hhtjax.steppers.stepper import State, Stepper, join_info
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
@@ -62,6 +62,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     solves_friction = True
     meets_events = True
     keeps_sparse = True
+    corrections = DEFAULT  # of the smooth start
 
     def begin(self, system, q, v, t, params, dt):
         """The state at the start, w0 = a0 = M^-1 Q."""
@@ -86,7 +87,14 @@ class GeneralizedAlpha(Controlled, Stepper):
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
         if self.options.start == "simple" or not system.positions:
             return after
-        return jumped(self, system.settled(new), before, after, (old, new), dt, answer)
+        system = system.settled(new)
+
+        def anew(s, params, dt):
+            start = begin_friction(self, system, s.q, s.v, s.t, params, dt)
+            return smoothed_friction(self, system, start, params, dt)
+
+        anew = None if system.friction is None else anew
+        return jumped(self, system, before, after, (old, new), dt, answer, anew)
 
     def corrects(self, system):
         """Whether a0 has the term of second order."""

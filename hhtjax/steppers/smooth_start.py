@@ -8,7 +8,7 @@ h^2 w (1/2 - beta/gamma) of it in q: any multiple of F/k. So a step begins behin
     M dv = h gamma Q(q + h (beta/gamma) dv, v + dv, t)     an implicit step of the velocity: by Newton, with S
     P = S^-1 h gamma (C + C^T)/2                           1 where damping is stiff, O(h) where the step resolves it
     v+ = v + P^4 [1 + (5 - 2 gamma) (1 - P)] dv
-    w <- w + S^-1 [Q(q, v+, t) - M w],  five times from 0
+    w <- w + S^-1 [Q(q, v+, t) - M w],  five times from 0 (see `Corrections`)
 
 Where the step resolves the motion v+ - v is O(h^5), and w is M^-1 Q but for O(h^5): order and error constants stay.
 Elsewhere w is bounded. Forces without dissipation, such as gyroscopic ones, have an antisymmetric C, and move no
@@ -44,12 +44,25 @@ from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import curvature, jacobian, reaction, violation
 from hhtjax.xla import linear_map, one_kernel, staged, traced
 
-POWERS, CORRECTIONS = 5, 5
+POWERS = 5
 ITERATIONS = 40  # of Newton's method, at most
 LARGEST = 64  # unknowns whose matrix is inverted
 STIFF = 0.03  # part of a jump of the acceleration by which damping changes it within a step, and h resolves it
 GAINED = 0.03  # part of the energy of a motion that a C may give it within a step, and still counts as a damper
 SHORTEST = 1e-3  # part of a Newton step below which there is no way on
+
+
+class Corrections(NamedTuple):
+    """w+ by `number` corrections, of which the last counts `last` times.
+
+    With R = 1 - S^-1 M, which is 1 where damping is stiff, w+ is (1 - R^5) M^-1 Q by default, and in that limit 1/h of
+    what v+ lacks."""
+
+    number: int
+    last: float
+
+
+DEFAULT = Corrections(5, 1.0)
 
 
 class Layer(NamedTuple):
@@ -144,13 +157,14 @@ def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=Fal
     return one_kernel(behind, s, around=True) if alone else behind(s)
 
 
-def jumped(method, system, s, after, both, h, answer):
+def jumped(method, system, s, after, both, h, answer, anew=None):
     """The state behind a jump of held inputs: `after`, but where what damps is stiff.
 
     That is so where the velocity of an explicit step, h gamma dw, changes the accelerations by more than a part of dw.
+    anew: the start from s with other params and h, in the place of changes to s: of dry friction, which is not linear.
     """
     new, dw, V = both[1], after.w - s.w, method.coefficients.gamma * h
-    if system.friction is not None or not reads_velocity(system, s, new):
+    if not reads_velocity(system, s, new):
         return after
     force = system.force(s.q, s.v + system.with_internal(V * dw, jnp.zeros_like(dw)), s.t, new)
     change = answer(force - system.force(s.q, s.v, s.t, new))
@@ -159,6 +173,8 @@ def jumped(method, system, s, after, both, h, answer):
 
     def smooth(_, s, both, h):
         old, new = map(thaw, both)
+        if anew is not None:
+            return anew(s, new, h)
         layer = Layer.of(method, system, new, h, s._replace(a=None, friction=None, memory=None))
         layer = layer._replace(offset=layer._replace(params=old).rows(layer.base))
         v, z, *_ = without_layer(method, layer, h, True, False, finished)
@@ -229,7 +245,7 @@ def finished(method, layer, inverse, drag, z, h, corrects):
     if drag is not None:
         v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
         bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
-    z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend))
+    z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend), method.corrections)
     if not corrects:
         return Found(v, z)
     dw, dL = layer.parts(z)
@@ -372,13 +388,21 @@ def response(layer, inverse, force):
     return layer.located(inverse(jnp.pad(force, (0, layer.zeros().size - n)))[:n])
 
 
-def corrected_by(layer, inverse, left):
+def corrected_by(layer, inverse, left, corrections=DEFAULT):
     """z with product(z) = -left, as far as the corrections go."""
 
     def correct(_, z):
         return z - inverse(left + layer.product(z))
 
-    return lax.fori_loop(0, CORRECTIONS, correct, layer.zeros())
+    number, last = corrections
+    if last == 1:
+        return lax.fori_loop(0, number, correct, layer.zeros())
+
+    def remember(i, both):
+        return correct(i, both[0]), both[0]
+
+    z, before = lax.fori_loop(0, number, remember, (layer.zeros(), layer.zeros()))
+    return before + last * (z - before)
 
 
 def rate_of(layer, s, inverse):

@@ -44,12 +44,29 @@ class OperatorSplitting(Stepper):
 
     def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
         """The state from which the first step goes, as of the `hht` family."""
-        hht = GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
         K, C, _ = state.memory
-        s = hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves, alone)
+        s = self.hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves, alone)
         left = system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)  # not 0 of what is stiff
         P = self.weighted_force(system, s.q, s.v, s.t, params) + left
         return s._replace(a=None, memory=Memory(K, C, P))
+
+    def jumped(self, system, before, after, old, new, dt, answer):
+        """The same where held inputs jump, of the changes."""
+        K, C, P = before.memory
+        both = before._replace(memory=None), after._replace(memory=None)
+        s = self.hht.jumped(system, *both, old, new, dt, answer)
+
+        def unweighted(s, params):
+            return system.force(s.q, s.v, s.t, params) - self.weighted_force(system, s.q, s.v, s.t, params)
+
+        change = system.inertia(s.q, s.w - before.w, s.t, new)
+        P = P + change - (unweighted(s, new) - unweighted(before, old))
+        return s._replace(memory=Memory(K, C, P))
+
+    @property
+    def hht(self):
+        """The method of which it is, on linear systems."""
+        return GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
 
     def weighted_force(self, system, q, v, t, params):
         """P, what alpha weighs: Q, or in the modified form Q at rest."""
