@@ -58,5 +58,5 @@ def finished(law, method, layer, inverse, drag, z, h, corrects):
     wdot = None
     if corrects:
         s = base._replace(v=v, w=z[:n], L=L)
-        wdot = taken_off(layer.parts(rate_of(rubbing, s, inverse))[0], sticks)
+        wdot = taken_off(layer.parts(rate_of(rubbing, s, inverse, h))[0], sticks)
     return Found(v, z, wdot, friction=found.friction)

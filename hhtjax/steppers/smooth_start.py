@@ -35,6 +35,7 @@ from jax import lax
 
 from hhtjax.description import freeze, thaw
 from hhtjax.numerics.elimination import UNROLLED, diagonal, inverse, matvec
+from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.implicit_root import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
@@ -46,9 +47,11 @@ from hhtjax.xla import linear_map, one_kernel, staged, traced
 
 POWERS = 5
 ITERATIONS = 40  # of Newton's method, at most
+STEPS = 3  # of it, which are differentiated: from the second on Hessians are right
 LARGEST = 64  # unknowns whose matrix is inverted
 STIFF = 0.03  # part of a jump of the acceleration by which damping changes it within a step, and h resolves it
 GAINED = 0.03  # part of the energy of a motion that a C may give it within a step, and still counts as a damper
+LATER = 1 / 16  # of h, for the rate of accelerations
 SHORTEST = 1e-3  # part of a Newton step below which there is no way on
 
 
@@ -69,7 +72,8 @@ class Layer(NamedTuple):
     """What is left of the equations at a start, or at a jump.
 
     base: the state, with accelerations and multipliers to which unknown changes z = (dw, dL) are added. offset: what
-    rows are to be. X, V: displacement and velocity by a unit of dw. B, bend: of constraints, None without."""
+    rows are to be. X, V: displacement and velocity by a unit of dw. B, bend: of constraints, None without. M:
+    None where it is not formed."""
 
     system: Any
     params: Any
@@ -79,6 +83,7 @@ class Layer(NamedTuple):
     V: Any
     B: Any
     bend: Any
+    M: Any = None
 
     @classmethod
     def of(cls, method, system, params, h, base, offset=0.0):
@@ -125,8 +130,18 @@ class Layer(NamedTuple):
     def product(self, z):
         """The part of the rows that z enters at the start itself: M dw - B^T dL, B dw."""
         dw, dL = self.parts(z)
-        force = self.system.inertia(self.base.q, dw, self.base.t, self.params)
+        force = self.inertia(dw)
         return force if dL is None else jnp.concatenate([force - matvec(self.B.T, dL), matvec(self.B, dw)])
+
+    def full_mass(self):
+        """M at the start, as a matrix."""
+        return self.system.full_mass(self.base.q, self.base.t, self.params) if self.M is None else self.M
+
+    def inertia(self, w):
+        """M w at the start."""
+        return (
+            matvec(self.M, w) if self.M is not None else self.system.inertia(self.base.q, w, self.base.t, self.params)
+        )
 
     def zeros(self):
         """z = 0."""
@@ -193,8 +208,7 @@ def reads_velocity(system, s, params):
 def without_layer(method, layer, h, damped, corrects, finish):
     """What `finish` makes of the implicit step: a `Found`.
 
-    The value comes from matrices, where these are small, and traces the force as seldom as can be, for programs that
-    compile in less time; derivatives from what is differentiable.
+    Small matrices are formed, once: what is differentiated then is products of these, and the force in one place.
     """
     options = method.options
 
@@ -207,9 +221,14 @@ def without_layer(method, layer, h, damped, corrects, finish):
         drag, damps = damping(known, factorize, at, tangent)
         return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
 
-    def by_matrices(method, data, h):
+    def by_matrices(find, method, data, h):
         known = layer.with_data(data)
-        z, inverse, C = expanded(known, damped)
+        if known.system.matrices is None:
+            known = known._replace(M=known.system.full_mass(known.base.q, known.base.t, known.params))
+        if known.system.linear or not damped:
+            z, inverse, C = expanded(known, known.zeros())
+        else:
+            z, inverse, C = find(known)
         drag = Drag(partial(matvec, C), dissipates(known, C)) if damped else None
         return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)._replace(damps=jnp.any(C != 0))
 
@@ -217,7 +236,7 @@ def without_layer(method, layer, h, damped, corrects, finish):
     large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
     if large or options.solve is not None or options.redundant is not None:
         return by_maps(method, data, h)
-    return derivative_at_need(by_maps, by_matrices, method, data, h)
+    return derivative_at_need(partial(by_matrices, differentiable), partial(by_matrices, searched), method, data, h)
 
 
 class Drag(NamedTuple):
@@ -251,44 +270,66 @@ def finished(method, layer, inverse, drag, z, h, corrects):
     dw, dL = layer.parts(z)
     base = layer.base
     s = base._replace(v=v, w=base.w + dw, L=None if dL is None else base.L + dL)
-    return Found(v, z, layer.parts(rate_of(layer, s, inverse))[0])
+    return Found(v, z, layer.parts(rate_of(layer, s, inverse, h))[0])
 
 
-def expanded(layer, damped):
-    """z behind the implicit step, and the inverse of the matrix of the step and C there, by one loop."""
+def expanded(layer, z):
+    """What Newton's step from z leads to, the inverse of the matrix of the step at z, and C there."""
+    dz, _, (inverse, C) = expansion(layer, z)
+    return z - dz, inverse, C
+
+
+def expansion(layer, z, invert=inverse):
+    """Newton's step at z, the energy that it is worth, and the inverse and C, from one loop over columns."""
     system, base, n = layer.system, layer.base, layer.system.size
+    dw, dL = layer.parts(z)
 
     def force(x, dv, dw):
         at = State(base.t, system.move(base.q, x), base.v + layer.located(dv), base.w + dw)
         return residual(system, layer.params, at)
 
-    def around(z):
-        dw, dL = layer.parts(z)
-        value, tangent = jax.linearize(force, layer.X * dw, layer.V * dw, dw)
+    value, tangent = jax.linearize(force, layer.X * dw, layer.V * dw, dw)
+    unit, none = jnp.eye(n, dtype=z.dtype), jnp.zeros((n, n), z.dtype)
+    directions = jnp.concatenate([layer.X * unit, none]), jnp.concatenate([none, unit]), jnp.concatenate([unit, none])
+    columns = lax.map(lambda along: tangent(*along), directions)
+    C = columns[n:].T
+    A = columns[:n].T + layer.V * C
+    if layer.B is not None:
+        rates = matvec(layer.B, base.w + dw) + layer.bend
+        value = jnp.concatenate([value - matvec(layer.B.T, base.L + dL), rates])
+        A = jnp.block([[A, -layer.B.T], [layer.B, jnp.zeros((len(layer.B), len(layer.B)), A.dtype)]])
+    S, value = invert(A), value - layer.offset
+    dz = matvec(S, value)
+    return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), (S, (C + C.T) / 2)
 
-        def columns(y):
-            return tangent(layer.X * y[:n], y[n:], y[:n])
 
-        J = jax.vmap(columns, out_axes=1)(jnp.eye(2 * n, dtype=z.dtype))
-        C = J[:, n:]
-        A = J[:, :n] + layer.V * C
-        if layer.B is not None:
-            value = jnp.concatenate([
-                value - matvec(layer.B.T, base.L + dL), matvec(layer.B, base.w + dw) + layer.bend
-            ])  # fmt: skip
-            A = jnp.block([[A, -layer.B.T], [layer.B, jnp.zeros((len(layer.B), len(layer.B)), A.dtype)]])
-        solve = inverse(A)
-        value = value - layer.offset
-        dz = matvec(solve, value)
-        return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), solve, (C + C.T) / 2
+def searched(layer):
+    """The same as `expanded` where Newton's method ends."""
+    n, N = layer.system.size, layer.zeros().size
+    empty = jnp.zeros((N, N), layer.base.v.dtype), jnp.zeros((n, n), layer.base.v.dtype)
+    z, dz, (inverse, C) = improved(partial(expansion, layer), layer.zeros(), empty)
+    return z - dz, inverse, C
 
-    z = layer.zeros()
-    if system.linear or not damped:
-        dz, _, solve, C = around(z)
-    else:
-        empty = jnp.zeros((z.size, z.size), z.dtype), jnp.zeros((n, n), z.dtype)
-        z, dz, solve, C = improved(around, z, *empty)
-    return z - dz, solve, C
+
+def differentiable(layer):
+    """The same, with derivatives: those of Newton's step where it ends, which are exact of order 2^k - 1 after k."""
+    find, constants = hoisted(lambda: searched(layer))
+    found = lax.stop_gradient(find(lax.stop_gradient(constants)))
+
+    def again(_, held):
+        dz, _, more = expansion(layer, held[0], differentiable_inverse)
+        return held[0] - dz, *more
+
+    moved = lax.fori_loop(0, STEPS, again, found)
+    return jax.tree.map(lambda value, x: value + (x - lax.stop_gradient(x)), found, moved)
+
+
+def differentiable_inverse(A):
+    """A^-1 with derivatives, of two steps of Newton and Schulz: X <- 2 X - X A X."""
+    S = X = inverse(A)
+    for _ in range(2):
+        X = 2 * X - X @ A @ X
+    return S + (X - lax.stop_gradient(X))
 
 
 def improved(around, z, *more):
@@ -349,8 +390,8 @@ def dissipates(layer, C):
     """
     if layer.system.matrices is not None:
         return None
-    base, n = layer.base, layer.system.size
-    A = lax.stop_gradient(layer.system.full_mass(base.q, base.t, layer.params) + layer.V / GAINED * C)
+    n = layer.system.size
+    A = lax.stop_gradient(layer.full_mass() + layer.V / GAINED * C)
     unit = jnp.sqrt(jnp.maximum(jnp.abs(diagonal(A)), float(jnp.finfo(A.dtype).tiny)))
     A, least = A / unit[:, None] / unit[None, :], n * float(jnp.finfo(A.dtype).eps)
 
@@ -373,7 +414,7 @@ def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
         x, _, fine = carry
         pull = layer.V * layer.located(drag.of(x))
         if drag.dissipates is None:
-            given = layer.system.inertia(layer.base.q, x, layer.base.t, layer.params)
+            given = layer.inertia(x)
             fine = fine & (jnp.sum(x * pull) >= -GAINED * jnp.sum(x * given))
         return project(response(layer, inverse, pull)), x, fine
 
@@ -405,11 +446,13 @@ def corrected_by(layer, inverse, left, corrections=DEFAULT):
     return before + last * (z - before)
 
 
-def rate_of(layer, s, inverse):
-    """(dw/dt, dL/dt) at the state s, by the same corrections."""
+def rate_of(layer, s, inverse, h):
+    """(dw/dt, dL/dt) at the state s, by the same corrections: a difference, over far less than h, for what is to be of
+    first order in h. A derivative would be one of third order of the constraints, and long to compile."""
     system, params = layer.system, layer.params
 
-    def rows(q, v, t):
+    def rows(later):
+        q, v, t = system.move(s.q, later * s.v), s.v + layer.located(later * s.w), s.t + later
         force = system.inertia(q, s.w, t, params) - system.force(q, v, t, params)
         if layer.B is None:
             return force
@@ -417,8 +460,8 @@ def rate_of(layer, s, inverse):
         _, bend = jax.jvp(lambda q, v, t: violation(system, q, v, t, params)[1], (q, v, t), along)
         return jnp.concatenate([force - reaction(system, q, t, params, s.L), bend])
 
-    along = system.rate(s.q, s.v), s.w, jnp.ones_like(s.t)
-    return corrected_by(layer, inverse, jax.jvp(rows, (s.q, s.v, s.t), along)[1])
+    before, after = lax.map(rows, jnp.stack([jnp.zeros_like(h), LATER * h]))
+    return corrected_by(layer, inverse, (after - before) / (LATER * h))
 
 
 def root(layer, factorize):
