@@ -25,7 +25,7 @@ from hhtjax.runs.given_steps import (
     steps_within,
     warn_of_jumps_in,
 )
-from hhtjax.runs.loop import flaw_at_start, given_sizes, loop_of, loop_over
+from hhtjax.runs.loop import flaw_at_start, given_sizes, grows_at_once, loop_of, loop_over
 from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
@@ -192,6 +192,7 @@ def simulate(
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
+        sizes["grows"] = jnp.ndim(dt) > 0 and grows_at_once(dt)
         return or_plain(partial(_simulate, problem, refined(dt, k), events, in_batch=is_in_batch(), **sizes, **kind))
 
     solution = run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
@@ -209,12 +210,12 @@ def _read_off(problem, times, dt, events, *, room):
     return one_kernel(run, problem, times, dt, events, around=True)  # what comes before and behind the loop too
 
 
-@partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "in_batch"))
-def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_batch):
+@partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "grows", "in_batch"))
+def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, grows, in_batch):
     flat, q, v, t0, params = problem.flat()
     dt = jnp.asarray(dt).astype(q.dtype)
-    loop_by, sizes = (loop_over, given_sizes(t0, dt)) if dt.ndim else (loop_of, dt)
-    plain = loop = loop_by(flat, problem.stepper, q, v, t0, params, sizes)
+    begun = flat, problem.stepper, q, v, t0, params
+    plain = loop = loop_over(*begun, given_sizes(t0, dt), grows=grows) if dt.ndim else loop_of(*begun, dt)
     if events is not None:
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room)
 

@@ -16,6 +16,7 @@ from hhtjax.runs.event_checks import refused_members, require_events
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.sweep_grid import (
     equal_times,
+    may_grow,
     require_one_grid,
     require_step_sizes,
     require_steps_within,
@@ -165,6 +166,7 @@ class Inputs(NamedTuple):
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
         fitting = {"rates": rates, "numbers": unknowns if lanes > 1 else None}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events, self.output
+        static["grows"] = self.times is not None and may_grow(self.dts, self.t0, self.times)
         return arguments, {**static, **fitting, "mesh": mesh, "progress": progress, "room": self.room}
 
 

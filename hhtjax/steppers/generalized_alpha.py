@@ -20,7 +20,7 @@ from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.smooth_friction import smoothed_friction
-from hhtjax.steppers.smooth_start import DEFAULT, jumped, smoothed
+from hhtjax.steppers.smooth_start import DEFAULT, grown, jumped, smoothed
 from hhtjax.steppers.stepper import State, Stepper, join_info
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
@@ -95,6 +95,15 @@ class GeneralizedAlpha(Controlled, Stepper):
 
         anew = None if system.friction is None else anew
         return jumped(self, system, before, after, (old, new), dt, answer, anew)
+
+    def grown(self, system, state, params, dt):
+        """The state, or where what damps is too stiff for dt a smooth start from it."""
+        smooth = smoothed if system.friction is None else smoothed_friction
+        return grown(self, system.settled(params), state, params, dt, smooth)
+
+    def throws(self, system):
+        """Unless there are no positions, or the recursion is to be literal."""
+        return self.options.start != "simple" and system.positions > 0
 
     def corrects(self, system):
         """Whether a0 has the term of second order."""

@@ -42,7 +42,7 @@ from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
-from hhtjax.systems.constraints import curvature, jacobian, reaction, violation
+from hhtjax.systems.constraints import answers, curvature, jacobian, reaction, violation
 from hhtjax.xla import linear_map, one_kernel, staged, traced
 
 POWERS = 5
@@ -50,6 +50,7 @@ ITERATIONS = 40  # of Newton's method, at most
 STEPS = 3  # of it, which are differentiated: from the second on Hessians are right
 LARGEST = 64  # unknowns whose matrix is inverted
 STIFF = 0.03  # part of a jump of the acceleration by which damping changes it within a step, and h resolves it
+LEAVES = 0.3  # part of its accelerations by which a motion changes them in a long step, so that this begins anew
 GAINED = 0.03  # part of the energy of a motion that a C may give it within a step, and still counts as a damper
 LATER = 1 / 16  # of h, for the rate of accelerations
 SHORTEST = 1e-3  # part of a Newton step below which there is no way on
@@ -148,24 +149,27 @@ class Layer(NamedTuple):
         return jnp.zeros(self.system.size + self.system.num_constraints, self.base.v.dtype)
 
 
-def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=False, finish=None):
+def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=False, finish=None, lags=False):
     """The state from which the first step h goes, behind the layer at the start s.
 
     moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M.
-    alone: whether no kernel is around. finish: what is made of the implicit step, by default `finished`.
+    alone: whether no kernel is around. finish: what is made of the implicit step, by default `finished`. lags: whether
+    a keeps what it is away from w, as far as the step resolves that.
     """
-    damped, corrects = reads_velocity(system, s, params), method.corrects(system)
+    damped, corrects = reads_velocity(system, s, params), method.corrects(system) and not lags
     if not (system.num_constraints or damped or corrects):
         return s  # M^-1 Q throws a velocity, but nothing that a spring holds
 
     def behind(s):
-        zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
+        lag = s.a - s.w if lags else None
+        zero = s._replace(w=jnp.zeros_like(s.w), a=lag, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
         layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
         found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
         w, L = layer.parts(found.z)
         if finish is None and not resolves:  # M^-1 Q as it is, where nothing damps
             w, L = choose(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
         a = w if found.wdot is None else method.corrected(system, found.v, w, found.wdot, h)
+        a = a if found.lag is None else a + found.lag
         s1 = s._replace(v=found.v, w=w, a=a, L=L)
         return s1 if found.friction is None else s1._replace(friction=found.friction)
 
@@ -175,16 +179,12 @@ def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=Fal
 def jumped(method, system, s, after, both, h, answer, anew=None):
     """The state behind a jump of held inputs: `after`, but where what damps is stiff.
 
-    That is so where the velocity of an explicit step, h gamma dw, changes the accelerations by more than a part of dw.
     anew: the start from s with other params and h, in the place of changes to s: of dry friction, which is not linear.
     """
-    new, dw, V = both[1], after.w - s.w, method.coefficients.gamma * h
+    new = both[1]
     if not reads_velocity(system, s, new):
         return after
-    force = system.force(s.q, s.v + system.with_internal(V * dw, jnp.zeros_like(dw)), s.t, new)
-    change = answer(force - system.force(s.q, s.v, s.t, new))
-    D = system.with_ones(diagonal(system.mass(s.q, s.t, new)))
-    stiff = jnp.sum(D * change**2) > STIFF**2 * jnp.sum(D * dw**2)
+    stiff = is_stiff(method, system, s, new, h, after.w - s.w, answer)
 
     def smooth(_, s, both, h):
         old, new = map(thaw, both)
@@ -198,6 +198,38 @@ def jumped(method, system, s, after, both, h, answer, anew=None):
         return s._replace(v=v, w=s.w + dw, a=a, L=L)
 
     return seldom(smooth, stiff, after, s, freeze(both), h)
+
+
+def grown(method, system, s, params, h, smooth=smoothed):
+    """The state from which a step h goes that is far longer than those before.
+
+    Where accelerations change by LEAVES of them within h, and damping is stiff, it is that of a smooth start: short
+    steps have left what long ones cannot follow. Elsewhere, as on a slow manifold, it is s."""
+    if not reads_velocity(system, s, params):
+        return s
+    answer = answers(system, s.q, s.t, params, method.redundant)
+    q, v = system.move(s.q, h * s.v), s.v + system.with_internal(h * s.w, jnp.zeros_like(s.w))
+    change = answer(system.force(q, v, s.t + h, params) - system.force(s.q, s.v, s.t, params))[0]
+    leaves = is_part(system, s, params, change, s.w, LEAVES)
+    leaves = leaves & is_stiff(method, system, s, params, h, s.w, lambda dQ: answer(dQ)[0], LEAVES)
+
+    def begin(s, params, h):
+        return smooth(method, system, s, thaw(params), h, lags=True)
+
+    return seldom(begin, leaves, s, freeze(params), h)
+
+
+def is_stiff(method, system, s, params, h, w, answer, part=STIFF):
+    """Whether the velocity of an explicit step, h gamma w, changes the accelerations by more than a part of w."""
+    v = s.v + system.with_internal(method.coefficients.gamma * h * w, jnp.zeros_like(w))
+    change = answer(system.force(s.q, v, s.t, params) - system.force(s.q, s.v, s.t, params))
+    return is_part(system, s, params, change, w, part)
+
+
+def is_part(system, s, params, change, w, part):
+    """Whether a change of accelerations is more than a part of these, in the norm of energy."""
+    D = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
+    return jnp.sum(D * change**2) > part**2 * jnp.sum(D * w**2)
 
 
 def reads_velocity(system, s, params):
@@ -248,14 +280,15 @@ class Drag(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Behind a layer: v+, the changes z = (dw, dL), dw/dt where it is asked for, whether anything damps at all, and
-    dry friction where there is some."""
+    """Behind a layer: v+, the changes z = (dw, dL), dw/dt where it is asked for, whether anything damps at all, dry
+    friction where there is some, and a - w where it is kept."""
 
     v: Any
     z: Any
     wdot: Any = None
     damps: Any = None
     friction: Any = None
+    lag: Any = None
 
 
 def finished(method, layer, inverse, drag, z, h, corrects):
@@ -265,8 +298,9 @@ def finished(method, layer, inverse, drag, z, h, corrects):
         v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
         bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
     z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend), method.corrections)
+    lag = lag_left(layer, inverse)
     if not corrects:
-        return Found(v, z)
+        return Found(v, z, lag=lag)
     dw, dL = layer.parts(z)
     base = layer.base
     s = base._replace(v=v, w=base.w + dw, L=None if dL is None else base.L + dL)
@@ -391,6 +425,8 @@ def dissipates(layer, C):
     if layer.system.matrices is not None:
         return None
     n = layer.system.size
+    moves = layer.located(jnp.ones(n, C.dtype))
+    C = moves[:, None] * C * moves[None, :]  # internal states keep theirs, whatever they do
     A = lax.stop_gradient(layer.full_mass() + layer.V / GAINED * C)
     unit = jnp.sqrt(jnp.maximum(jnp.abs(diagonal(A)), float(jnp.finfo(A.dtype).tiny)))
     A, least = A / unit[:, None] / unit[None, :], n * float(jnp.finfo(A.dtype).eps)
@@ -444,6 +480,15 @@ def corrected_by(layer, inverse, left, corrections=DEFAULT):
 
     z, before = lax.fori_loop(0, number, remember, (layer.zeros(), layer.zeros()))
     return before + last * (z - before)
+
+
+def lag_left(layer, inverse):
+    """Of a - w, which the layer's state holds as its a, what the step resolves."""
+    lag = layer.base.a
+    if lag is None:
+        return None
+    z = jnp.pad(lag, (0, layer.zeros().size - lag.size))
+    return layer.parts(corrected_by(layer, inverse, -layer.product(z)))[0]
 
 
 def rate_of(layer, s, inverse, h):

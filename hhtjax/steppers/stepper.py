@@ -159,6 +159,14 @@ class Stepper(Description):
         `before`: the same without. answer: dQ -> dw."""
         return after
 
+    def throws(self, system):
+        """Whether it leaves in q what does not fit a step, such as one far longer than those before."""
+        return False
+
+    def grown(self, system, state, params, dt):
+        """The state from which such a step goes, where `throws` says so: of the method and the state for dt."""
+        raise NotImplementedError
+
     def bind(self, system, params, dt):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
         raise NotImplementedError

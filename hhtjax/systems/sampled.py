@@ -120,9 +120,8 @@ def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
         order: 0, each value held until the next, as a D/A converter does; 1, linear; 3, cubic spline, twice
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
-    A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order
-    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). A jump within a step makes it of
-    order 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends steps
+    A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order.
+    A jump within a step makes it of order 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends steps
     at jumps at any distances, and `adaptive` finds them by itself. What is saved at a jump is the acceleration before
     it; `interpolate` uses it for v after it too.
 
