@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from hhtjax.description.copies import again
-from hhtjax.description.reads import JITTED, Look, Same, is_users
+from hhtjax.description.reads import JITTED, Look, Same, held, is_users
 
 MOST_STATES = 16  # of what a function reads, for which its programs are found again
 
@@ -27,29 +27,37 @@ def current(f) -> Any:
     (True, False, 6.0)
     """
     entry = _entries.get(id(f))
-    if entry is None or entry[0]() is not f:
+    if entry is None:
         return _first(f)
     _, known, origin = entry
-    return known.current(f if origin is None else origin)
+    return f if known is None else known.current(f if origin is None else origin)
 
 
-_entries: dict[int, tuple] = {}  # by the id of a function: weak reference to it, `Known`, and what it stands for
+# by the id of a function: weak reference to it, `Known`, None of what reads nothing, and what it stands for
+_entries: dict[int, tuple] = {}
 _methods: dict[tuple, tuple] = {}  # by those of an object and its function
 
 
 def _first(f):
     """The same of a function that has not been met."""
-    if isinstance(f, types.FunctionType | partial):
-        return _enter(f, Known()).current(f)
     if isinstance(f, types.MethodType):
         return _known_method(f).current(f)
-    if isinstance(f, JITTED | type | types.BuiltinFunctionType):
+    if isinstance(f, (types.FunctionType, partial)):
+        return _enter_first(f)
+    if isinstance(f, (JITTED, type, types.BuiltinFunctionType)):
         return f
     if is_dataclass(f) and type(f).__hash__ is not object.__hash__:  # equal ones share programs
         return _with_current_call(_with_current_fields(f))
     if is_users(type(f)) and type(f).__hash__ is object.__hash__:
-        return _enter(f, Known()).current(f)
+        return _enter_first(f)
     return f
+
+
+def _enter_first(f):
+    known = Known()
+    form = known.current(f)
+    _enter(f, None if known.look.is_empty else known)
+    return form
 
 
 def _enter(f, known, origin=None):
@@ -61,22 +69,17 @@ def _enter(f, known, origin=None):
 
     with suppress(TypeError):  # an object that does not allow it is known for one call
         _entries[key] = weakref.ref(f, gone), known, origin
-    return known
 
 
 def _known_method(f):
     """By its object and its function: a method is another object each time."""
-    key = _method_key(f)
-    if (entry := _methods.get(key)) is not None and entry[0]() is f.__self__:
+    key = id(f.__self__), id(f.__func__)
+    if (entry := _methods.get(key)) is not None:
         return entry[1]
     known = Known()
     with suppress(TypeError):
         _methods[key] = weakref.ref(f.__self__, lambda _: _methods.pop(key, None)), known
     return known
-
-
-def _method_key(f):
-    return id(f.__self__), id(f.__func__)
 
 
 def _with_current_fields(f):
@@ -121,12 +124,10 @@ class Known:
 
     def current(self, f):
         """What stands for f now."""
-        if self.look is not None and self.look.still_holds(f):
-            if (stands := self.states[-1][1]) is None:
-                return f
-            if (form := stands()) is not None:
-                return form
-        return self._found(f)
+        if self.look is None or self.look.holds(f) is None:
+            return self._found(f)
+        form = self.states[-1][1]
+        return f if form is None else form() or self._found(f)
 
     def _form(self, state, f):
         return f if state[1] is None else state[1]()
@@ -140,7 +141,7 @@ class Known:
             state, form = same[0], self._form(same[0], f)
         else:
             form = again(f) if self.states else f
-            if self.look.may_change():
+            if self.look.may_change:
                 form = Reading(form, f, self, self.look)
             if form is not f:
                 _enter(form, self, f)
@@ -163,10 +164,10 @@ class Reading:
         self._form, self._f, self._known, self._look = form, f, known, look
 
     def __call__(self, *args, **keywords):
-        before = [(x, tell, tell(x)) for x, tell in self._look.changeable(self._f)]
+        before = [(x, held(x)) for x in self._look.holds(self._f) or ()]
         try:
             return self._form(*args, **keywords)
         finally:
-            if changed := [x for x, tell, held in before if tell(x) != held]:
+            if changed := [x for x, known in before if held(x) != known]:
                 self._known.ignore(changed, self, self._f)
                 self._look = self._known.look
