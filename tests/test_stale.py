@@ -7,11 +7,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax import lax
 
 import hhtjax
 from hhtjax.description import current
+from hhtjax.xla import Programs
 
 k, measured, TRACES = 1.0, np.zeros(3), []
 DATA = {"k": [1.0]}
@@ -100,6 +102,79 @@ def test_a_run_reads_a_new_global_and_is_not_traced_again_without():
     assert counts[0] == counts[1] < counts[2] == counts[3] == counts[4]
 
 
+def run(system, params=None, q0=1.0, v0=0.0, **options):
+    """Ten steps of a hundredth."""
+    q0, v0 = jnp.full(1, q0), jnp.full(1, v0)
+    return hhtjax.simulate(system, hhtjax.rk4(), q0, v0, params, dt=0.01, num_steps=10, **options)
+
+
+def met():
+    """When a body has flown as far as a guard says, and its velocity after a push there."""
+    there = run(FREE, {"F": 0.0, "ahead": 100.0}, q0=-0.01, v0=1.0, events=[PUSH])
+    return there.events.t[0], there.v[-1, 0]
+
+
+def load(t):
+    return k + 0 * t
+
+
+def moved(q):
+    return k * q
+
+
+def from_k(p):
+    return p - k
+
+
+def from_scipy(which):
+    rhs = hhtjax.interop.scipy_rhs(SPRING_OF_K, np.ones(1), np.zeros(1))
+    return lambda: getattr(rhs, which)(0.0, rhs.y0)[1]  # the same at each call
+
+
+SPRING_OF_K = hhtjax.System(np.ones(1), lambda q, v, t, params: -k * q)
+FREE = hhtjax.System(np.ones(1), lambda q, v, t, params: 0 * q + params["F"])
+DRIVEN = hhtjax.System(np.ones(1), lambda q, v, t, params: 0 * q + params["F"](t))
+ON_CIRCLE = hhtjax.System(
+    np.ones(2), lambda q, v, t, params: 0 * q, lambda q, t, params: jnp.sum(q**2, keepdims=True) - k**2
+)
+LAGRANGIAN = hhtjax.System.from_lagrangian(lambda q, v, t, params: (v @ v - k * q @ q) / 2)
+DESCENT = optax.sgd(0.5)
+SLOW = {"gradient", "sweep", "lagrangian", "constraint", "events"}
+PUSH = hhtjax.Event(
+    guard=lambda q, v, t, p: 1 + p["ahead"] * (k / 100 - q[0]),
+    reset=lambda q, v, t, p: k * v,
+    switch=lambda p: {"F": p["F"] + k, "ahead": 0.0},
+)
+PLACES = {  # a value that is k, or what is to be found for it
+    "gradient": (lambda: jax.grad(lambda x: run(SPRING_OF_K, q0=x).q[-1, 0])(1.0), lambda k: np.cos(np.sqrt(k) * 0.1)),
+    "sweep": (
+        lambda: hhtjax.sweep(
+            SPRING_OF_K, hhtjax.rk4(), jnp.ones(1), jnp.zeros(1), dts=jnp.full(2, 0.01), duration=0.1, num_samples=1
+        ).q[1, -1, 0],
+        lambda k: np.cos(np.sqrt(k) * 0.1),
+    ),
+    "lagrangian": (lambda: run(LAGRANGIAN).q[-1, 0], lambda k: np.cos(np.sqrt(k) * 0.1)),
+    "constraint": (lambda: hhtjax.consistent_initial(ON_CIRCLE, jnp.array([3.0, 0.0]), jnp.zeros(2)).q[0], None),
+    "function among the params": (lambda: run(DRIVEN, {"F": load}).v[-1, 0], lambda k: k * 0.1),
+    "output": (lambda: run(FREE, {"F": 0.0}, output=moved).output[0, 0], None),
+    "events": (met, lambda k: (0.02 + k / 100, k + k * (0.08 - k / 100))),
+    "scipy_rhs": (from_scipy("fun"), lambda k: -k),
+    "its jacobian": (from_scipy("jac"), lambda k: [-k, 0]),
+    "fit by gradients": (lambda: hhtjax.fit(from_k, 1.5, DESCENT, covariance=False).params, None),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in PLACES]
+)
+def test_every_place_sees_what_has_changed(name):
+    value, expected = PLACES[name]
+    for number in (1.0, 2.0):
+        change_global(number)
+        wanted = number if expected is None else expected(number)
+        np.testing.assert_allclose(value(), wanted, rtol=1e-7, atol=1e-12)
+
+
 def test_a_fit_reads_the_new_record():
     global measured
 
@@ -118,3 +193,13 @@ def test_a_fit_reads_the_new_record():
 def test_what_reads_nothing_stands_for_itself():
     assert current(jnp.sin) is jnp.sin
     assert current(change_global) is change_global
+
+
+def test_a_loop_over_records_does_not_keep_all_programs(monkeypatch):
+    jitted = Programs(lambda force, q: force(q, None, None, None), static_argnums=0)
+    monkeypatch.setattr(sys.modules["hhtjax.description.current"], "programs", [jitted.quick])
+    for number in range(40):
+        change_global(float(number))
+        assert float(jitted(current(KINDS["global"][0]), 2.0)) == -2.0 * number
+        assert jitted.number() <= 17
+    assert jitted.number() > 1

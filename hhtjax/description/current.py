@@ -12,6 +12,7 @@ from hhtjax.description.copies import again
 from hhtjax.description.reads import JITTED, Look, Same, held, is_users
 
 MOST_STATES = 16  # of what a function reads, for which its programs are found again
+programs = weakref.WeakSet()  # jitted functions of the library: they keep what they compiled, and so what stands for f
 
 
 def current(f) -> Any:
@@ -146,7 +147,11 @@ class Known:
             if form is not f:
                 _enter(form, self, f)
             state = key, None if form is f else weakref.ref(form)
-        self.states = [*(x for x in alive if x is not state), state][-MOST_STATES:]
+        self.states = [*(x for x in alive if x is not state), state]
+        if len(self.states) > MOST_STATES:  # as in a loop over records: JAX would keep the programs of all
+            self.states = [state]
+            for program in programs:
+                program.clear_cache()
         return form
 
     def ignore(self, changed, form, f):
