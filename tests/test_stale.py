@@ -13,6 +13,7 @@ from jax import lax
 
 import hhtjax
 from hhtjax.description import current
+from hhtjax.identification import outside
 from hhtjax.xla import Programs
 
 k, measured, TRACES = 1.0, np.zeros(3), []
@@ -175,19 +176,36 @@ def test_every_place_sees_what_has_changed(name):
         np.testing.assert_allclose(value(), wanted, rtol=1e-7, atol=1e-12)
 
 
-def test_a_fit_reads_the_new_record():
+RECORDS = 1.0, 2.0, 5.0, 7.0
+HELD = {"record": measured}
+WAYS = {  # residuals that read a record; how many programs these records take
+    "as it is": (lambda p: p - measured, 2),
+    "by another function": (lambda p: p - by_helper() / 2 - measured / 2, 2),
+    "its mean": (lambda p: p * np.ones(2) - np.mean(measured), 2),
+    "as a number": (lambda p: p * np.ones(2) - float(measured[0]), 4),
+    "in a branch": (lambda p: p - (measured if measured[0] > 3 else 1.0 * measured), 4),
+    "by its kind": (lambda p: p - (measured if isinstance(measured, np.ndarray) else np.ones(3)), 4),
+    "in a dict, too": (lambda p: p - measured / 2 - HELD["record"] / 2, 4),
+}
+
+
+def by_helper():
+    return measured
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_fits_read_new_records(way):
+    """A record is data where what is computed from it can be traced, from the second program on."""
     global measured
-
-    def residuals(p):
-        return p * np.ones(3) - measured
-
-    found = []
-    for record in (np.full(3, 2.0), np.full(3, 5.0)):
-        measured = record
-        found.append(float(hhtjax.fit(residuals, 1.0, covariance=False).params))
-    measured[:] = 7.0
-    found.append(float(hhtjax.fit(residuals, 1.0, covariance=False).params))
-    np.testing.assert_allclose(found, [2, 5, 7], rtol=1e-9)
+    residuals, programs = WAYS[way]
+    found, before = [], outside._see.number()
+    for value in (*RECORDS, RECORDS[0]):
+        HELD["record"] = measured = np.full(3, value)
+        found.append(float(hhtjax.fit(residuals, 1.5, covariance=False).params))
+    np.testing.assert_allclose(found, [*RECORDS, RECORDS[0]], rtol=1e-9)
+    assert outside._see.number() - before == programs
+    measured[:] = 9.0
+    np.testing.assert_allclose(hhtjax.fit(residuals, 1.5, covariance=False).params, 9.0, rtol=1e-9)
 
 
 def test_what_reads_nothing_stands_for_itself():

@@ -8,10 +8,11 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from typing import Any
 
-from hhtjax.description.copies import again
-from hhtjax.description.reads import JITTED, Look, Same, held, is_users
+from hhtjax.description.copies import Copies, again
+from hhtjax.description.reads import JITTED, Look, Same, held, is_users, names_in
 
 MOST_STATES = 16  # of what a function reads, for which its programs are found again
+KINDS = {"isinstance", "type", "hasattr", "getattr"}
 programs = weakref.WeakSet()  # jitted functions of the library: they keep what they compiled, and so what stands for f
 
 
@@ -122,6 +123,8 @@ class Known:
         self.unread = set()
         self.states = []  # (key, weak reference to what stands for the function, None for itself), the latest last
         self.look: Any = None
+        self.kinds = weakref.WeakValueDictionary()  # `Kind`s, by the key without arrays
+        self.are_data = True  # arrays, as far as is known
 
     def current(self, f):
         """What stands for f now."""
@@ -169,10 +172,54 @@ class Reading:
         self._form, self._f, self._known, self._look = form, f, known, look
 
     def __call__(self, *args, **keywords):
-        before = [(x, held(x)) for x in self._look.holds(self._f) or ()]
+        read = self._look.holds(self._f)
+        before = [(x, held(x)) for x in read[0]] if read else []
         try:
             return self._form(*args, **keywords)
         finally:
             if changed := [x for x, known in before if held(x) != known]:
                 self._known.ignore(changed, self, self._f)
                 self._look = self._known.look
+
+
+class Kind:
+    """A function, whatever some arrays hold that it reads: these are data of its programs. Made by `with_data`."""
+
+    def __init__(self, f, known):
+        self.f, self.known, self.arrays = f, known, []
+
+    def of(self, arrays):
+        """The function that reads these arrays, tracers among them."""
+        return Copies(dict(zip(map(id, self.arrays), arrays, strict=True))).of(self.f)
+
+    def refuse(self):
+        """Arrays that cannot be traced are no data, here and later."""
+        self.known.are_data = False
+
+
+def with_data(f) -> tuple[Kind, list] | None:
+    """What stands for f, and the arrays of floats that it reads and that differ from those of its first program, which
+    are data. None where there is none: what a function reads stays part of its program as long as nothing changes.
+
+    What is computed from the data is traced with them. So an array stays part of the program where f could find it, or
+    keep it, elsewhere: where a way to it leads not through globals, cells and partials, and where f changes what it
+    reads. So it does where a tracer could mean another thing: where kinds are asked for.
+    """
+    current(f)
+    known = _entries.get(id(f), (None, None))[1]
+    if known is None or known.unread or not known.are_data or (found := known.look.holds(f)) is None:
+        return None
+    copies = Copies(dict(zip(map(id, found[1]), found[1], strict=True)))
+    copies.of(f)
+    if any(not KINDS.isdisjoint(names_in(x.__code__).read) for _, x in copies.made.values() if hasattr(x, "__code__")):
+        return None
+    key, data, before = list(known.look.key), [], known.states[0][0]
+    for x, (number, at) in zip(found[1], known.look.arrays.values(), strict=True):
+        if copies.placed[id(x)] == number and len(before) == len(key) and before[at] != key[at]:
+            data.append(x)
+            key[at] = type(x), x.shape, x.dtype.str
+    if not data:
+        return None
+    kind = known.kinds.setdefault(tuple(key), Kind(f, known))
+    kind.arrays = data
+    return kind, data

@@ -15,6 +15,7 @@ import sys
 import sysconfig
 import types
 import weakref
+from collections import Counter
 from dataclasses import fields, is_dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -131,7 +132,7 @@ class Look:
     Every call of `simulate` looks, so the program is written as Python, of a line for a value: that takes 0.1 us, where
     a walk over all values takes 0.7.
 
-    holds: of the function, () or what it reads and could change itself; None where something differs.
+    holds: of the function, what it reads and could change itself, and its `arrays`; None where something differs.
     key: equal to that of another look where the programs that JAX makes of the function are the same.
     """
 
@@ -140,6 +141,7 @@ class Look:
         self.unread = unread
         self.values, self.names, self.lines = [f], ["f"], []
         self.space, self.may_change = {}, []  # what the lines know by name; names of what the function may change
+        self.arrays = {}  # of floats: name -> id, later number of places at which it is read; and where in key it is
         self.key: Any = []
         self._seen, self._kept = {}, []
         i = 0
@@ -147,6 +149,8 @@ class Look:
             self._visit(i, self.values[i])
             i += 1
         self.key = (*self.key, *map(Same, self.values[i:]))
+        places = Counter(map(id, self.values))
+        self.arrays = {name: (places[x], at) for name, (x, at) in self.arrays.items()} if i == len(self.values) else {}
         self.is_empty = not self.lines
         self.holds = self._program()
         self._watch()
@@ -154,8 +158,8 @@ class Look:
 
     def _program(self):
         """Of the lines; what is of another kind than it was may raise anything."""
-        found = "".join(f"{name}, " for name in self.may_change)
-        body = "".join(f"  {line}\n" for line in [*self.lines, f"return ({found})"])
+        changed, arrays = ("".join(f"{name}, " for name in names) for names in (self.may_change, self.arrays))
+        body = "".join(f"  {line}\n" for line in [*self.lines, f"return ({changed}), ({arrays})"])
         exec(f"def holds(f):\n try:\n{body} except Exception:\n  return None", self.space)
         return self.space["holds"]
 
@@ -192,6 +196,8 @@ class Look:
             self._visit_new(i, x)
 
     def _visit_new(self, i, x):
+        if isinstance(x, (np.ndarray, jax.Array)) and x.ndim and np.issubdtype(x.dtype, np.floating):
+            self.arrays[self.names[i]] = id(x), len(self.key)
         if Same(x) in self.unread:
             self.key.append(Same(x))
         elif isinstance(x, np.ndarray) and x.dtype != object:
