@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching
 
@@ -52,13 +53,13 @@ def _closed(f, *args):
     `jax.closure_convert` does it too, and keeps every f that it has met.
     """
     trace, like = jax.make_jaxpr(f, return_shape=True)(*args)
-    moves = [isinstance(x, jax.core.Tracer) and jnp.issubdtype(x.dtype, jnp.inexact) for x in trace.consts]
+    moves = [isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact) for x in trace.consts]
 
     def call(*args):
         leaves = iter(jax.tree.leaves(args))
         given = [next(leaves) for _ in trace.jaxpr.invars]
         constants = [next(leaves) if move else x for x, move in zip(trace.consts, moves, strict=True)]
-        return jax.tree.unflatten(jax.tree.structure(like), jax.core.eval_jaxpr(trace.jaxpr, constants, *given))
+        return jax.tree.unflatten(jax.tree.structure(like), eval_jaxpr(trace.jaxpr, constants, *given))
 
     return call, [x for x, move in zip(trace.consts, moves, strict=True) if move]
 
