@@ -38,8 +38,8 @@ which compiles anew:
 >>> end() < before
 True
 
-So what changes often belongs into params (or, for the data of a fit, into `records`): that costs no compilation, and
-has derivatives. `simulate` says what holds inside a jit of yours.
+So what changes often belongs into params: that costs no compilation, and has derivatives. `fit` says what it does with
+data; `simulate`, what holds inside a jit of yours.
 
 The first call
 --------------
