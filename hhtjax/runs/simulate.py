@@ -15,6 +15,7 @@ from hhtjax.runs.controlled import run_controlled
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
+from hhtjax.runs.factors import known_factors
 from hhtjax.runs.given_steps import (
     EqualSteps,
     refined,
@@ -192,7 +193,8 @@ def simulate(
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
-        return or_plain(partial(_simulate, problem, refined(dt, k), events, in_batch=is_in_batch(), **sizes, **kind))
+        data = problem, refined(dt, k), events, known_factors(problem, refined(dt, k))
+        return or_plain(partial(_simulate, *data, in_batch=is_in_batch(), **sizes, **kind))
 
     solution = run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
     return told("simulate", solution, throw)
@@ -210,11 +212,11 @@ def _read_off(problem, times, dt, events, *, room):
 
 
 @partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "in_batch"))
-def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_batch):
+def _simulate(problem, dt, events, factors, *, num_steps, save_every, progress, room, in_batch):
     flat, q, v, t0, params = problem.flat()
     dt = jnp.asarray(dt).astype(q.dtype)
     loop_by, sizes = (loop_over, given_sizes(t0, dt)) if dt.ndim else (loop_of, dt)
-    plain = loop = loop_by(flat, problem.stepper, q, v, t0, params, sizes)
+    plain = loop = loop_by(flat._replace(factors=factors), problem.stepper, q, v, t0, params, sizes)
     if events is not None:
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room)
 

@@ -129,11 +129,14 @@ def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=Fal
     damped, corrects = reads_velocity(system, s, params), method.corrects(system)
     if not (system.num_constraints or damped or corrects):
         return s  # M^-1 Q throws a velocity, but nothing that a spring holds
+    size = 0 * h if resolves else h
+    # of a linear system outside of the kernel: a loop of the user's around short runs then does it once
+    known = factors(method, system, params, method.coefficients.gamma * size) if by_factors(method, system) else None
 
     def behind(s):
         zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
-        layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
-        found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
+        layer = Layer.of(method, system, params, size, zero)
+        found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished, known)
         w, L = layer.parts(found.z)
         if finish is None and not resolves:  # M^-1 Q as it is, where nothing damps
             w, L = choose(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
@@ -174,8 +177,26 @@ def reads_velocity(system, s, params):
     return traced(lambda v: system.force(s.q, v, s.t, params), s.v).reads(None)[0]
 
 
-def without_layer(method, layer, h, damped, corrects, finish):
-    """What `finish` makes of the implicit step: a `Found`.
+def by_factors(method, system):
+    """Whether the matrix of the implicit step is one of a linear system that is factorised, not inverted."""
+    return system.linear and (system.size > UNROLLED or method.options.solve is not None)
+
+
+def factors(method, system, params, V):
+    """What the matrix of the implicit step is factorised by. V: h gamma."""
+    if system.factors is not None:
+        system = system._replace(factors=system.factors._replace(step=system.factors.start))
+    return at_start(method).factorization(system, params, V / method.coefficients.gamma)
+
+
+def at_start(method):
+    """The method whose step the implicit one is: Newmark's."""
+    c = method.coefficients
+    return replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
+
+
+def without_layer(method, layer, h, damped, corrects, finish, factorize=None):
+    """What `finish` makes of the implicit step: a `Found`. factorize: `factors`, where they are known.
 
     The value comes from matrices, where these are small, and traces the force as seldom as can be, for programs that
     compile in less time; derivatives from what is differentiable.
@@ -183,12 +204,11 @@ def without_layer(method, layer, h, damped, corrects, finish):
     options = method.options
 
     def by_maps(method, data, h):
-        known, c = layer.with_data(data), method.coefficients
-        newmark = replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
-        factorize = newmark.factorization(known.system, known.params, known.V / c.gamma)
-        z = known.zeros() if known.system.linear or not damped else root(known, factorize)
-        inverse, z, at, tangent = newton_step(known, factorize, z)
-        drag, damps = damping(known, factorize, at, tangent)
+        known = layer.with_data(data)
+        how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
+        z = known.zeros() if known.system.linear or not damped else root(known, how)
+        inverse, z, at, tangent = newton_step(known, how, z)
+        drag, damps = damping(known, how, at, tangent)
         return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
 
     def by_matrices(method, data, h):

@@ -159,6 +159,10 @@ class Stepper(Description):
         `before`: the same without. answer: dQ -> dw."""
         return after
 
+    def factors_of(self, system, dt) -> Any:
+        """What is factorised once for many runs of a linear system of constant matrices, as `FlatSystem.factors`."""
+        return None
+
     def bind(self, system, params, dt):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
         raise NotImplementedError

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 
-from hhtjax.numerics.elimination import factorize, matvec
-from hhtjax.numerics.linear_solve import solver
+from hhtjax.numerics.elimination import by_factors, factorize, matvec
+from hhtjax.numerics.linear_solve import reuse, solver
 from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
@@ -46,6 +46,7 @@ class FlatSystem(NamedTuple):
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
     settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
     diagonals: Callable | None = None  # params -> M, C, K (None where absent), where all of them are diagonals (n,)
+    factors: Any = None  # `Factors` for the steps of a run, where they are known before it
 
     def settled(self, params):
         """What `settle` gives, where there is something to settle."""
@@ -78,6 +79,8 @@ class FlatSystem(NamedTuple):
 
     def mass_solver(self, M, factorize=factorize):
         """The function Q -> M^-1 Q, and what works on z as it is; factorised once."""
+        if self.factors is not None and self.factors.mass is not None:
+            factorize = reuse(factorize, by_factors(self.factors.mass))
         inverse = (lambda Q: Q / M) if M.ndim == 1 else solver(M, factorize)
         return partial(self._of_positions, inverse)
 
@@ -130,6 +133,15 @@ class FlatSystem(NamedTuple):
         if n == self.size:
             return f(x)
         return jnp.concatenate([f(x[:n]), x[n:]]) if n else x
+
+
+class Factors(NamedTuple):
+    """Of a linear system of constant matrices, by `panels.lu`: of M (None of a diagonal), of the matrices of the start
+    and of the step."""
+
+    mass: Any
+    start: Any
+    step: Any
 
 
 class Local(NamedTuple):

@@ -131,6 +131,13 @@ class LinearSystem(Description):
             object.__setattr__(new, name, value)
         return new
 
+    def alone(self):
+        """The matrices without any force."""
+        new = object.__new__(LinearSystem)
+        for name in vars(self):
+            object.__setattr__(new, name, getattr(self, name) if name in "MCK" else None)
+        return new
+
     def linear_force(self, q, v, t, params):
         """f(t) - C v - K q, a pytree structured like v."""
         v, unravel = ravel_pytree(v)
