@@ -165,7 +165,7 @@ def flaw_at_start(system, flat, start, params):
     """What is wrong with the mass there, where it is a function; a constant one has been looked at."""
     if not callable(getattr(system, "mass", None)):
         return None
-    return mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None)
+    return mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None or system.massless is not None)
 
 
 def no_failure(info):

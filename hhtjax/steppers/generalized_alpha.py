@@ -88,6 +88,11 @@ class GeneralizedAlpha(Controlled, Stepper):
             return after
         return jumped(self, system.settled(new), before, after, (old, new), dt, answer)
 
+    @property
+    def starts_massless(self):
+        """Whether the start is a smooth one."""
+        return self.options.start != "simple"
+
     def corrects(self, system):
         """Whether a0 has the term of second order."""
         start = self.options.start

@@ -46,6 +46,7 @@ class FlatSystem(NamedTuple):
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
     settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
     diagonals: Callable | None = None  # params -> M, C, K (None where absent), where all of them are diagonals (n,)
+    massless: Any = None  # G with M G M = M, where M is singular
     factors: Any = None  # `Factors` for the steps of a run, where they are known before it
 
     def settled(self, params):
@@ -79,6 +80,8 @@ class FlatSystem(NamedTuple):
 
     def mass_solver(self, M, factorize=factorize):
         """The function Q -> M^-1 Q, and what works on z as it is; factorised once."""
+        if self.massless is not None:
+            return partial(self._of_positions, partial(matvec, jnp.asarray(self.massless).astype(M.dtype)))
         if self.factors is not None and self.factors.mass is not None:
             factorize = reuse(factorize, by_factors(self.factors.mass))
         inverse = (lambda Q: Q / M) if M.ndim == 1 else solver(M, factorize)
@@ -195,6 +198,7 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
         product = partial(_flat_product, system, unravel, unravel_rates, dtype)
         flat = flat._replace(product=consistent(product))
     if linear:
+        flat = flat._replace(massless=system.massless)
         flat = with_known_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
         flat, q, v = _with_internal(system, flat, q, v0, z0)

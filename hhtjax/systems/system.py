@@ -124,6 +124,7 @@ class System(Description):
     internal: Callable | None = None
     friction: Callable | None = None
     sliding: Callable | None = None
+    massless = None  # of a `LinearSystem` alone
     depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
     def __post_init__(self):
@@ -232,6 +233,7 @@ class FirstOrderSystem(Description):
     constraint = None
     internal = None
     friction = None
+    massless = None
 
     def __post_init__(self):
         require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")
@@ -250,10 +252,21 @@ def _require_constraint(constraint):
         ) from None
 
 
-def require_system(caller, system):
-    """An error for what is no system."""
+def require_system(caller, system, massless=False):
+    """An error for what is no system, or has coordinates without mass where these are not possible."""
     if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
         raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
+    if not massless:
+        require_masses(caller, system, "give them some")
+
+
+def require_masses(caller, system, without):
+    """An error for coordinates without mass, with which something is not possible."""
+    if system.massless is not None:
+        raise NotImplementedError(
+            f"{caller}: the `M` of the system is singular, and coordinates without mass have no acceleration of their "
+            f"own: {without}."
+        )
 
 
 def require_smooth(caller, system):
