@@ -32,6 +32,7 @@ from hhtjax.runs.problem import Problem
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
 from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_grid import equal_times, require_times
+from hhtjax.steppers.newton import callbacks_named
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Programs, is_in_batch, on_scalars, one_kernel, or_plain
@@ -174,12 +175,17 @@ def simulate(
         times = require_times(times, problem.t0, dtype, "simulate")
         dt = require_steps_to("simulate", times, dt, num_steps, save_every, problem.t0)
         if progress:
-            raise NotImplementedError("simulate: with `times` and a number for `dt`, leave `progress` out.")
+            raise NotImplementedError(
+                "simulate: with `times` and a number for `dt`, leave `progress` out: the number of steps is data then, "
+                "and all of them are one program, between whose parts nothing can be drawn. For a bar give `num_steps` "
+                "and read the run off by hhtjax.interpolate(run, times)."
+            )
         if events is not None:
             events = require_events("simulate", problem, events, dt)
 
         def run_to(k):
-            return or_plain(partial(_read_off, problem, times, dt / k, events, room=room, rates=kind["rates"]))
+            with callbacks_named():
+                return or_plain(partial(_read_off, problem, times, dt / k, events, room=room, rates=kind["rates"]))
 
         solution = run_to(1) if extrapolate == 1 else extrapolated(run_to, extrapolate, stepper.order, join_info)
         return told("simulate", solution, throw)
@@ -194,7 +200,8 @@ def simulate(
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
         data = problem, refined(dt, k), events, known_factors(problem, refined(dt, k))
-        return or_plain(partial(_simulate, *data, in_batch=is_in_batch(), **sizes, **kind))
+        with callbacks_named():
+            return or_plain(partial(_simulate, *data, in_batch=is_in_batch(), **sizes, **kind))
 
     solution = run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
     return told("simulate", solution, throw)

@@ -39,6 +39,7 @@ from hhtjax.numerics.implicit_root import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
+from hhtjax.steppers.newton import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import curvature, jacobian, reaction, violation
@@ -268,10 +269,10 @@ def expanded(layer, damped):
 
     def around(z):
         dw, dL = layer.parts(z)
-        value, tangent = jax.linearize(force, layer.X * dw, layer.V * dw, dw)
+        value, tangent = linearized(lambda x: force(*x), (layer.X * dw, layer.V * dw, dw))
 
         def columns(y):
-            return tangent(layer.X * y[:n], y[n:], y[:n])
+            return tangent((layer.X * y[:n], y[n:], y[:n]))
 
         J = jax.vmap(columns, out_axes=1)(jnp.eye(2 * n, dtype=z.dtype))
         C = J[:, n:]
@@ -322,7 +323,7 @@ def improved(around, z, *more):
 def newton_step(layer, factorize, z):
     """The solve with the matrix at z, the z that it leads to, the state there, and the tangent of the rows."""
     at, along = jax.linearize(layer.path, z)
-    value, tangent = jax.linearize(layer.rows, at)
+    value, tangent = linearize_rows(layer.rows, at)
     inverse = factorize_map(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
     return inverse, z - inverse(value), at, tangent
 
@@ -414,7 +415,8 @@ def rate_of(layer, s, inverse):
         return jnp.concatenate([force - reaction(system, q, t, params, s.L), bend])
 
     along = system.rate(s.q, s.v), s.w, jnp.ones_like(s.t)
-    return corrected_by(layer, inverse, jax.jvp(rows, (s.q, s.v, s.t), along)[1])
+    change = linearized(lambda x: rows(*x), (s.q, s.v, s.t), lambda f, x: jax.jvp(f, (x,), (along,)))[1]
+    return corrected_by(layer, inverse, change)
 
 
 def root(layer, factorize):
@@ -426,7 +428,7 @@ def root(layer, factorize):
 
     def search(z):
         def around_it(z):
-            value, tangent = jax.linearize(f, z)
+            value, tangent = linearized(f, z)
             dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
             return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
 

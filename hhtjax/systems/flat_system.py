@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 
+from hhtjax.checks import describe
 from hhtjax.numerics.elimination import by_factors, factorize, matvec
 from hhtjax.numerics.linear_solve import reuse, solver
 from hhtjax.numerics.sparse_matrix import combined
@@ -265,6 +266,10 @@ def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):
             if matrix is not None:
                 check_matrix(caller, name, matrix, n, dtype, params)
     else:
+        if getattr(system.mass, "is_lagrangian", False):
+            L = evaluate(caller, "lagrangian", system.mass.lagrangian, q0, v0, t0, params)
+            if getattr(L, "shape", None) != ():
+                raise ValueError(f"{caller}: `lagrangian` must give a scalar, of shape (); received {describe(L)}.")
         at = (q0, *timed(system.mass, 1, t0), params) if callable(system.mass) else ()
         check_matrix(caller, "mass", system.mass, n, dtype, *at)
     if linear and system.load is not None:

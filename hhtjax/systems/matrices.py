@@ -196,7 +196,7 @@ def _require_sparse_mass(caller, name, M):
         raise ValueError(f"{caller}: `{name}` must be symmetric; received one that differs from its transpose.")
 
 
-UNSYMMETRIC, INDEFINITE = 1, 2  # what mass_flaw finds
+UNSYMMETRIC, INDEFINITE, OF_VELOCITY = 1, 2, 3  # what may be wrong with a mass
 
 
 def mass_flaw(M, massless):

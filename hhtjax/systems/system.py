@@ -159,8 +159,9 @@ class System(Description):
         the velocity of the body, add (dM/dt) v to `force`.
 
         Args:
-            lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v: M is evaluated at
-                v = 0. Every coordinate needs a mass; `hhtjax.systems` has the ways for one that has none.
+            lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v, as M is that of
+                v = 0: where it is not, `check` says so. Every coordinate needs a mass; `hhtjax.systems` has the ways
+                for one that has none.
             force: F, the forces that no potential holds (damping, inputs): `force(q, v, t, params)`.
             internal: as for `System`; then `force(q, v, z, t, params)`.
             friction, sliding, constraint: as for `System`. (Events are arguments of `simulate`.)

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
 KNOWN = "EvalTrace", "DynamicJaxprTrace"  # without any, and inside a jit
 
@@ -61,6 +62,42 @@ def is_in_batch():
     while trace is not None and type(trace).__name__ != "BatchTrace":
         trace = getattr(trace, "parent_trace", None)
     return trace is not None
+
+
+def forward_only(x, words):
+    """The array x, of which a reverse derivative is refused in these words, and not in JAX's.
+
+    Args:
+        x: an array.
+        words: of the error.
+
+    Returns:
+        The same array.
+
+    Raises:
+        TypeError: in reverse mode.
+
+    >>> import jax
+    >>> f = lambda x: forward_only(2 * x, "no reverse derivative")
+    >>> float(jax.jvp(f, (1.0,), (1.0,))[1])
+    2.0
+    >>> jax.grad(f)(1.0)
+    Traceback (most recent call last):
+    TypeError: no reverse derivative
+    """
+    return forward_only_p.bind(x, words=words)
+
+
+def _refuse(cotangent, x, words):
+    raise TypeError(words)
+
+
+forward_only_p = Primitive("hhtjax_forward_only")
+forward_only_p.def_impl(lambda x, words: x)
+forward_only_p.def_abstract_eval(lambda x, words: x)
+ad.deflinear2(forward_only_p, _refuse)
+batching.defvectorized(forward_only_p)
+mlir.register_lowering(forward_only_p, lambda ctx, x, words: [x])
 
 
 class _Here(Primitive):
