@@ -8,23 +8,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import all_concrete, is_array, is_tracing, known_now
+from hhtjax.description import all_concrete, is_array, known_now
 from hhtjax.numerics.elimination import UNROLLED
 from hhtjax.numerics.panels import LARGEST
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.linear_system import LinearSystem
+from hhtjax.xla import is_traced
 
 
 def known_factors(problem, dt):
     """The `Factors` for the steps dt of a run, while something is traced; None where they are not constant, or large:
     a program would hold them."""
     system, stepper = problem.system, problem.stepper
-    if not isinstance(system, LinearSystem) or jnp.ndim(dt):
+    if not isinstance(system, LinearSystem) or not is_traced() or jnp.ndim(dt):
         return None
     given = [A for A in (system.M, system.C, system.K) if A is not None]
     if not all(map(is_array, given)) or not any(A.ndim == 2 for A in given) or not UNROLLED < len(system.M) <= LARGEST:
         return None
-    if not all_concrete((given, stepper, dt)) or not is_tracing():
+    if not all_concrete((given, stepper, dt)):
         return None
     return known_now(_factors, system.alone(), stepper, np.asarray(dt, jax.tree.leaves(problem.q0)[0].dtype))
 

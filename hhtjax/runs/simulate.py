@@ -25,6 +25,7 @@ from hhtjax.runs.given_steps import (
     require_steps_to,
     steps_within,
     warn_of_jumps_in,
+    warn_of_jumps_to,
 )
 from hhtjax.runs.loop import flaw_at_start, given_sizes, loop_of, loop_over
 from hhtjax.runs.output import require_output, savings
@@ -176,12 +177,13 @@ def simulate(
         dt = require_steps_to("simulate", times, dt, num_steps, save_every, problem.t0)
         if progress:
             raise NotImplementedError(
-                "simulate: with `times` and a number for `dt`, leave `progress` out: the number of steps is data then, "
+                "simulate: with `times` and a number for `dt`, leave `progress` out. The number of steps is data, "
                 "and all of them are one program, between whose parts nothing can be drawn. For a bar give `num_steps` "
                 "and read the run off by hhtjax.interpolate(run, times)."
             )
         if events is not None:
             events = require_events("simulate", problem, events, dt)
+        warn_of_jumps_to(problem, dt, times)
 
         def run_to(k):
             with callbacks_named():
