@@ -14,7 +14,8 @@ from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_law import is_settled
 from hhtjax.steppers.stepper import Info, entered, join_info, public
 from hhtjax.systems import held
-from hhtjax.systems.matrices import mass_flaw
+from hhtjax.systems.lagrangian import mass_reads_velocity
+from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
 
 GROWTH = 2.05  # of a step, up to which the recursion follows
 
@@ -183,7 +184,11 @@ def flaw_at_start(system, flat, start, params):
     """What is wrong with the mass there, where it is a function; a constant one has been looked at."""
     if not callable(getattr(system, "mass", None)):
         return None
-    return mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None)
+    flaw = mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None or system.massless is not None)
+    if not getattr(system.mass, "is_lagrangian", False):
+        return flaw
+    at = flat.unravel(start.q), flat.unravel_rates(flat.located(start.v)), start.t, params
+    return jnp.where((flaw == 0) & mass_reads_velocity(system.mass.lagrangian, *at), OF_VELOCITY, flaw)
 
 
 def no_failure(info):

@@ -40,6 +40,7 @@ from hhtjax.numerics.implicit_root import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
+from hhtjax.steppers.newton import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import answers, curvature, jacobian, reaction, violation
@@ -159,12 +160,15 @@ def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=Fal
     damped, corrects = reads_velocity(system, s, params), method.corrects(system) and not lags
     if not (system.num_constraints or damped or corrects):
         return s  # M^-1 Q throws a velocity, but nothing that a spring holds
+    size = 0 * h if resolves else h
+    # of a linear system outside of the kernel: a loop of the user's around short runs then does it once
+    known = factors(method, system, params, method.coefficients.gamma * size) if by_factors(method, system) else None
 
     def behind(s):
         lag = s.a - s.w if lags else None
         zero = s._replace(w=jnp.zeros_like(s.w), a=lag, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
-        layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
-        found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
+        layer = Layer.of(method, system, params, size, zero)
+        found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished, known)
         w, L = layer.parts(found.z)
         if finish is None and not resolves:  # M^-1 Q as it is, where nothing damps
             w, L = choose(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
@@ -237,38 +241,56 @@ def reads_velocity(system, s, params):
     return traced(lambda v: system.force(s.q, v, s.t, params), s.v).reads(None)[0]
 
 
-def without_layer(method, layer, h, damped, corrects, finish):
-    """What `finish` makes of the implicit step: a `Found`.
+def by_factors(method, system):
+    """Whether the matrix of the implicit step is one of a linear system that is factorised, not inverted."""
+    return system.linear and (system.size > UNROLLED or method.options.solve is not None)
+
+
+def factors(method, system, params, V):
+    """What the matrix of the implicit step is factorised by. V: h gamma."""
+    if system.factors is not None:
+        system = system._replace(factors=system.factors._replace(step=system.factors.start))
+    return at_start(method).factorization(system, params, V / method.coefficients.gamma)
+
+
+def at_start(method):
+    """The method whose step the implicit one is: Newmark's."""
+    c = method.coefficients
+    return replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
+
+
+def without_layer(method, layer, h, damped, corrects, finish, factorize=None):
+    """What `finish` makes of the implicit step: a `Found`. factorize: `factors`, where they are known.
 
     Small matrices are formed, once: what is differentiated then is products of these, and the force in one place.
     """
     options = method.options
 
     def by_maps(method, data, h):
-        known, c = layer.with_data(data), method.coefficients
-        newmark = replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
-        factorize = newmark.factorization(known.system, known.params, known.V / c.gamma)
-        z = known.zeros() if known.system.linear or not damped else root(known, factorize)
-        inverse, z, at, tangent = newton_step(known, factorize, z)
-        drag, damps = damping(known, factorize, at, tangent)
+        known = layer.with_data(data)
+        how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
+        z = known.zeros() if known.system.linear or not damped else root(known, how)
+        inverse, z, at, tangent = newton_step(known, how, z)
+        drag, damps = damping(known, how, at, tangent)
         return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
 
-    def by_matrices(find, method, data, h):
+    def by_matrices(find, invert, method, data, h):
         known = layer.with_data(data)
         if known.system.matrices is None:
             known = known._replace(M=known.system.full_mass(known.base.q, known.base.t, known.params))
         if known.system.linear or not damped:
-            z, inverse, C = expanded(known, known.zeros())
+            z, S, C = expanded(known, invert)
         else:
-            z, inverse, C = find(known)
+            z, S, C = find(known)
         drag = Drag(partial(matvec, C), dissipates(known, C)) if damped else None
-        return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)._replace(damps=jnp.any(C != 0))
+        return finish(method, known, partial(matvec, S), drag, z, h, corrects)._replace(damps=jnp.any(C != 0))
 
     data = layer.data()
     large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
     if large or options.solve is not None or options.redundant is not None:
         return by_maps(method, data, h)
-    return derivative_at_need(partial(by_matrices, differentiable), partial(by_matrices, searched), method, data, h)
+    moving = partial(by_matrices, differentiable, differentiable_inverse)
+    return derivative_at_need(moving, partial(by_matrices, searched, inverse), method, data, h)
 
 
 class Drag(NamedTuple):
@@ -307,9 +329,10 @@ def finished(method, layer, inverse, drag, z, h, corrects):
     return Found(v, z, layer.parts(rate_of(layer, s, inverse, h))[0])
 
 
-def expanded(layer, z):
-    """What Newton's step from z leads to, the inverse of the matrix of the step at z, and C there."""
-    dz, _, (inverse, C) = expansion(layer, z)
+def expanded(layer, invert):
+    """What Newton's step from 0 leads to, the inverse of the matrix of the step there, and C."""
+    z = layer.zeros()
+    dz, _, (inverse, C) = expansion(layer, z, invert)
     return z - dz, inverse, C
 
 
@@ -322,10 +345,10 @@ def expansion(layer, z, invert=inverse):
         at = State(base.t, system.move(base.q, x), base.v + layer.located(dv), base.w + dw)
         return residual(system, layer.params, at)
 
-    value, tangent = jax.linearize(force, layer.X * dw, layer.V * dw, dw)
+    value, tangent = linearized(lambda x: force(*x), (layer.X * dw, layer.V * dw, dw))
     unit, none = jnp.eye(n, dtype=z.dtype), jnp.zeros((n, n), z.dtype)
     directions = jnp.concatenate([layer.X * unit, none]), jnp.concatenate([none, unit]), jnp.concatenate([unit, none])
-    columns = lax.map(lambda along: tangent(*along), directions)
+    columns = lax.map(tangent, directions)
     C = columns[n:].T
     A = columns[:n].T + layer.V * C
     if layer.B is not None:
@@ -393,7 +416,7 @@ def improved(around, z, *more):
 def newton_step(layer, factorize, z):
     """The solve with the matrix at z, the z that it leads to, the state there, and the tangent of the rows."""
     at, along = jax.linearize(layer.path, z)
-    value, tangent = jax.linearize(layer.rows, at)
+    value, tangent = linearize_rows(layer.rows, at)
     inverse = factorize_map(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
     return inverse, z - inverse(value), at, tangent
 
@@ -518,7 +541,7 @@ def root(layer, factorize):
 
     def search(z):
         def around_it(z):
-            value, tangent = jax.linearize(f, z)
+            value, tangent = linearized(f, z)
             dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
             return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
 
