@@ -81,10 +81,15 @@ def past_events(force):
     return hhtjax.simulate(hhtjax.System(np.ones(2), force), hhtjax.hht(), *start, dt=0.02, num_steps=2, events=[event])
 
 
-@pytest.mark.parametrize("run", [on_circle, past_events])
-def test_a_callback_whose_rate_is_needed_is_named(run):
+def test_a_callback_whose_rate_is_needed_is_named():
     with pytest.raises(ValueError, match="this stepper needs the derivatives of the force"):
-        run(damped)
+        past_events(damped)
+
+
+def test_a_callback_of_the_time_beside_a_constraint():
+    """Of which the start takes a difference."""
+    expected = on_circle(lambda q, v, t, k: -k * q + jnp.sin(t) - 0.5 * v).q
+    np.testing.assert_allclose(on_circle(damped).q, expected, rtol=1e-12)
 
 
 def test_reverse_derivatives_through_a_loop_are_refused_in_words():

@@ -52,9 +52,8 @@ def callbacks_named():
             raise
         raise ValueError(
             "this stepper needs the derivatives of the force (and mass and constraint) in q and v, and in t where it "
-            'is `rosenbrock`, has start="corrected", as by default with constraints, or meets events; '
-            "`jax.pure_callback` and `io_callback`, which are called there, have none. Give them some by "
-            "`jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
+            "is `rosenbrock` or meets events; `jax.pure_callback` and `io_callback`, which are called there, have "
+            "none. Give them some by `jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
         ) from error
 
 
