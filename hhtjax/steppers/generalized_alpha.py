@@ -89,11 +89,11 @@ class GeneralizedAlpha(Controlled, Stepper):
             return after
         system = system.settled(new)
 
-        def anew(s, params, dt):
+        def again(s, params, dt):
             start = begin_friction(self, system, s.q, s.v, s.t, params, dt)
             return smoothed_friction(self, system, start, params, dt)
 
-        anew = None if system.friction is None else anew
+        anew = None if system.friction is None else again
         return jumped(self, system, before, after, (old, new), dt, answer, anew)
 
     def grown(self, system, state, params, dt):
