@@ -176,6 +176,7 @@ def test_jumps_within_steps_are_told():
         (lambda: run(u, dt=0.04, num_steps=5), "simulate: a held input.* at t = 0.1,"),
         (lambda: run(uneven, dt=0.1, num_steps=5), "simulate: .* at t = 0.25,"),
         (lambda: run(u, dt=jnp.array([0.1, 0.05, 0.1])), "at t = 0.2,"),
+        (lambda: run(u, dt=0.04, times=[0.07, 0.15]), "simulate: .* at t = 0.1,"),
         (lambda: runs(u, dts=[0.05, 0.04], duration=0.4, num_samples=2), "sweep: .* at t = 0.1,"),
         (lambda: runs(uneven, dts=[0.1], times=[0.1, 0.3]), "sweep: .* at t = 0.25,"),
     ]
@@ -184,6 +185,7 @@ def test_jumps_within_steps_are_told():
             call()
     run(u, dt=0.1 / 3, num_steps=12)  # warnings are errors here
     run(u, dt=0.04, num_steps=2)  # ends before
+    run(u, dt=0.05, times=[0.07, 0.16])
     run(uneven, dt=jnp.array([0.1, 0.15, 0.15, 0.3]))
     runs(uneven, dts=[0.1, jnp.inf], times=[0.1, 0.25, 0.4])
     jax.jit(lambda dt: run(u, dt=dt, num_steps=5).q)(0.04)

@@ -165,19 +165,59 @@ def test_diagonal_and_missing_matrices_equal_the_full_ones():
         np.testing.assert_allclose(end, ends[0], rtol=1e-12)
 
 
-def test_a_linear_system_is_factorised_outside_the_loop():
-    """Counted in the jaxpr of the run: one LU, and it stands outside every scan."""
+def short_runs(system, q0, load, dt):
+    """The ends of 20 runs of 5 steps, one after the other."""
+
+    def period(carry, t0):
+        run = hhtjax.simulate(system, hhtjax.hht(), *carry, load, t0=t0, dt=dt, num_steps=5, save_every=5)
+        return (run.q[-1], run.v[-1]), run.q[-1]
+
+    return jax.lax.scan(period, (q0, jnp.zeros_like(q0)), 0.05 * jnp.arange(20.0))[1]
+
+
+def loaded(K, n):
+    M, C, _ = matrices(n)
+    return hhtjax.LinearSystem(M, C, K, force=lambda t, load: load * jnp.cos(3 * t) * jnp.linspace(0.0, 1.0, n))
+
+
+@pytest.mark.slow
+def test_linear_systems_are_factorised_outside_of_loops():
+    """Of their steps, and of the user's around short runs: what is constant is so before XLA sees it, else M, and the
+    matrices of the start and of the step, once."""
     n = 12
-    M, C, K = matrices(n)
-    system = hhtjax.LinearSystem(M, C, K)
+    K = jnp.asarray(matrices(n)[2])
 
-    def end(q0):
-        return hhtjax.simulate(system, hhtjax.hht(), q0, jnp.zeros(n), dt=0.01, num_steps=1000, save_every=1000).q[-1]
+    def text(f, *args):
+        return jax.jit(f).lower(*args).compile().as_text()
 
-    text = jax.jit(end).lower(jnp.zeros(n)).compile().as_text()
-    loops = [part for part in text.split("\n\n") if "lapack_dgetrf" in part and "ENTRY" not in part]
-    assert "lapack_dgetrf" in text
-    assert not loops
+    constant = text(lambda q0: short_runs(loaded(K, n), q0, 1.0, 0.01), jnp.ones(n))
+    assert "getrf" not in constant
+    traced = text(lambda q0, K: short_runs(loaded(K, n), q0, 1.0, 0.01), jnp.ones(n), K)
+    (entry,) = (part for part in traced.split("\n\n") if "ENTRY" in part)
+    assert traced.count('"lapack_dgetrf_ffi"') == entry.count('"lapack_dgetrf_ffi"') == 3
+
+
+@pytest.mark.slow
+def test_factors_made_before_change_no_value_and_no_derivative():
+    n = 12
+    K = jnp.asarray(matrices(n)[2])
+
+    @jax.jit
+    def both(q0, load, dt, K):
+        def known(load):
+            return short_runs(loaded(np.asarray(matrices(n)[2]), n), q0, load, 0.01)[-1]
+
+        def traced(load):
+            return short_runs(loaded(K, n), q0, load, dt)[-1]
+
+        return [known(load), jax.jacfwd(known)(load), jax.grad(lambda x: known(x).sum())(load)], traced(load)
+
+    (end, tangent, gradient), other = both(jnp.ones(n), 2.0, 0.01, K)
+    np.testing.assert_allclose(end, other, rtol=1e-9, atol=1e-11)
+    h = 1e-3
+    difference = (both(jnp.ones(n), 2.0 + h, 0.01, K)[1] - both(jnp.ones(n), 2.0 - h, 0.01, K)[1]) / (2 * h)
+    np.testing.assert_allclose(tangent, difference, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(gradient, jnp.sum(tangent), rtol=1e-9)
 
 
 def test_diagonal_systems_are_stepped_without_a_matrix():

@@ -58,3 +58,40 @@ def called_of_q(q, v, t, k):
 def test_a_callback_without_a_needed_derivative_is_named(force, name):
     with pytest.raises(ValueError, match="this stepper needs the derivatives of the force"):
         end(force, name)
+
+
+def damped(q, v, t, k):
+    return called(q, v, t, k) - 0.5 * v
+
+
+def test_a_callback_of_the_time_beside_a_damper():
+    """Of which the smooth start takes derivatives; the time stays as it is."""
+    expected = end(lambda q, v, t, k: -k * q + jnp.sin(t) - 0.5 * v, "hht")
+    np.testing.assert_allclose(end(damped, "hht"), expected, rtol=1e-12)
+
+
+def on_circle(force):
+    system = hhtjax.System(np.ones(2), force, constraint=lambda q, t, params: (q @ q - 1.0)[None])
+    return hhtjax.simulate(system, hhtjax.hht(), jnp.array([1.0, 0.0]), jnp.zeros(2), 3.0, dt=0.02, num_steps=2)
+
+
+def past_events(force):
+    event = hhtjax.Event(lambda q, v, t, k: q[0] - 0.9, reset=hhtjax.impact(0.5))
+    start = jnp.ones(2), jnp.zeros(2), 3.0
+    return hhtjax.simulate(hhtjax.System(np.ones(2), force), hhtjax.hht(), *start, dt=0.02, num_steps=2, events=[event])
+
+
+def test_a_callback_whose_rate_is_needed_is_named():
+    with pytest.raises(ValueError, match="this stepper needs the derivatives of the force"):
+        past_events(damped)
+
+
+def test_a_callback_of_the_time_beside_a_constraint():
+    """Of which the start takes a difference."""
+    expected = on_circle(lambda q, v, t, k: -k * q + jnp.sin(t) - 0.5 * v).q
+    np.testing.assert_allclose(on_circle(damped).q, expected, rtol=1e-12)
+
+
+def test_reverse_derivatives_through_a_loop_are_refused_in_words():
+    with pytest.raises(TypeError, match=r"lax.while_loop.* has forward derivatives only"):
+        jax.grad(lambda k: end(iterated, "hht", k).sum())(3.0)

@@ -238,3 +238,23 @@ def test_other_arguments_are_refused():
             System(function, force)
     with pytest.raises(TypeError, match=r"System: `inertia` is called as inertia\(q, w, params\)"):
         System(mass, force, inertia=lambda q, w, v, params: w)
+
+
+def run_by(lagrangian, q0=1.0, v0=0.0):
+    system = hhtjax.System.from_lagrangian(lagrangian)
+    return hhtjax.simulate(system, hhtjax.hht(), jnp.array([q0]), jnp.array([v0]), dt=0.01, num_steps=2)
+
+
+@pytest.mark.filterwarnings("ignore::hhtjax.FailedRunWarning")
+@pytest.mark.parametrize("v0", [0.0, 0.5])
+def test_energies_that_are_not_quadratic_are_named(v0):
+    """Also from rest; what is quadratic in other words passes."""
+    run = run_by(lambda q, v, t, p: 0.5 * v[0] ** 2 + 0.25 * v[0] ** 4 - 0.5 * q[0] ** 2, v0=v0)
+    with pytest.raises(hhtjax.SimulationError, match=r"same at all velocities.*quadratic in v"):
+        run.check()
+    run_by(lambda q, v, t, p: 0.25 * v @ v + 0.25 * v[0] ** 2.0 + v[0] * q[0] - 0.5 * q[0] ** 2, v0=v0).check()
+
+
+def test_a_lagrangian_that_is_no_scalar_is_named():
+    with pytest.raises(ValueError, match=r"`lagrangian` must give a scalar, of shape \(\); received shape \(1,\)"):
+        run_by(lambda q, v, t, p: 0.5 * v**2 - 0.5 * q**2)

@@ -16,7 +16,7 @@ from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.sparse_system import require_dense
-from hhtjax.systems.system import LinearSystem, System
+from hhtjax.systems.system import LinearSystem, System, require_masses
 
 # of suggest_step_size
 GRID = np.geomspace(1e-5, 1e6, 600)  # |lambda| h
@@ -143,6 +143,7 @@ def suggest_step_size(
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
     require_dense(caller, system, params)
+    require_masses(caller, system, "give them some")
     params = freeze(params)
     q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
     require_capable(caller, system, stepper, q0, v0)

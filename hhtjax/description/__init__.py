@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from hhtjax.description.current import current
+from hhtjax.description.current import Kind, current, programs, with_data  # noqa: F401
 
 VERSION = "0.1.0"  # of the library
 

@@ -1,7 +1,9 @@
-"""Copies of functions, with copies of the functions that they call."""
+"""Copies of functions, with copies of the functions that they call, or with other arrays in the place of theirs."""
 
 import types
+from collections import Counter
 from functools import partial
+from typing import Any
 
 from hhtjax.description.reads import is_users, names_in
 
@@ -28,13 +30,21 @@ class _Globals(dict):
 
 
 class Copies:
-    """Of functions, as they are made."""
+    """Of functions, as they are made.
 
-    def __init__(self):
+    others: by the id of an array, what the copies read in its place; placed: in how many places they do.
+    """
+
+    def __init__(self, others=None):
+        self.others: Any = others or {}
+        self.placed = Counter()
         self.made = {}  # by id: the copy, and the function, which keeps its id
 
     def of(self, x):
-        """The copy of a function; anything else as it is."""
+        """The copy of a function, or what stands for an array; anything else as it is."""
+        if id(x) in self.others:
+            self.placed[id(x)] += 1
+            return self.others[id(x)]
         if id(x) in self.made:
             return self.made[id(x)][0]
         if isinstance(x, types.FunctionType):
@@ -46,17 +56,20 @@ class Copies:
             return type(x)(self.of(x.func), *map(self.of, x.args), **{k: self.of(y) for k, y in x.keywords.items()})
         return x
 
+    def _differs(self, x):
+        return isinstance(x, COPIED) or id(x) in self.others
+
     def _of_function(self, f):
         code, usual, contents = f.__code__, f.__globals__, _contents(f)
         names, read = names_in(code), []
         if is_users(f):
             writes_globals = names.written - set(code.co_freevars)  # and has to find its own
-            read = [] if writes_globals else [x for x in names.read if x in usual and isinstance(usual[x], COPIED)]
-        elif not any(isinstance(x, COPIED) for x in contents):
+            read = [] if writes_globals else [x for x in names.read if x in usual and self._differs(usual[x])]
+        elif not any(map(self._differs, contents)):
             return f
         space = _Globals(usual) if read else usual
         named = zip(code.co_freevars, contents, strict=True)
-        own = [isinstance(x, COPIED) and name not in names.written for name, x in named]
+        own = [self._differs(x) and name not in names.written for name, x in named]
         cells = [types.CellType() if mine else cell for mine, cell in zip(own, f.__closure__ or (), strict=True)]
         new = types.FunctionType(code, space, f.__name__, f.__defaults__, tuple(cells))
         new.__kwdefaults__, new.__qualname__, new.__module__ = f.__kwdefaults__, f.__qualname__, f.__module__

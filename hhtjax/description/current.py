@@ -8,10 +8,12 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from typing import Any
 
-from hhtjax.description.copies import again
-from hhtjax.description.reads import JITTED, Look, Same, is_users
+from hhtjax.description.copies import Copies, again
+from hhtjax.description.reads import JITTED, Look, Same, held, is_users, names_in
 
 MOST_STATES = 16  # of what a function reads, for which its programs are found again
+KINDS = {"isinstance", "type", "hasattr", "getattr"}
+programs = weakref.WeakSet()  # jitted functions of the library: they keep what they compiled, and so what stands for f
 
 
 def current(f) -> Any:
@@ -27,29 +29,37 @@ def current(f) -> Any:
     (True, False, 6.0)
     """
     entry = _entries.get(id(f))
-    if entry is None or entry[0]() is not f:
+    if entry is None:
         return _first(f)
     _, known, origin = entry
-    return known.current(f if origin is None else origin)
+    return f if known is None else known.current(f if origin is None else origin)
 
 
-_entries: dict[int, tuple] = {}  # by the id of a function: weak reference to it, `Known`, and what it stands for
+# by the id of a function: weak reference to it, `Known`, None of what reads nothing, and what it stands for
+_entries: dict[int, tuple] = {}
 _methods: dict[tuple, tuple] = {}  # by those of an object and its function
 
 
 def _first(f):
     """The same of a function that has not been met."""
-    if isinstance(f, types.FunctionType | partial):
-        return _enter(f, Known()).current(f)
     if isinstance(f, types.MethodType):
         return _known_method(f).current(f)
-    if isinstance(f, JITTED | type | types.BuiltinFunctionType):
+    if isinstance(f, (types.FunctionType, partial)):
+        return _enter_first(f)
+    if isinstance(f, (JITTED, type, types.BuiltinFunctionType)):
         return f
     if is_dataclass(f) and type(f).__hash__ is not object.__hash__:  # equal ones share programs
         return _with_current_call(_with_current_fields(f))
     if is_users(type(f)) and type(f).__hash__ is object.__hash__:
-        return _enter(f, Known()).current(f)
+        return _enter_first(f)
     return f
+
+
+def _enter_first(f):
+    known = Known()
+    form = known.current(f)
+    _enter(f, None if known.look.is_empty else known)
+    return form
 
 
 def _enter(f, known, origin=None):
@@ -61,22 +71,17 @@ def _enter(f, known, origin=None):
 
     with suppress(TypeError):  # an object that does not allow it is known for one call
         _entries[key] = weakref.ref(f, gone), known, origin
-    return known
 
 
 def _known_method(f):
     """By its object and its function: a method is another object each time."""
-    key = _method_key(f)
-    if (entry := _methods.get(key)) is not None and entry[0]() is f.__self__:
+    key = id(f.__self__), id(f.__func__)
+    if (entry := _methods.get(key)) is not None:
         return entry[1]
     known = Known()
     with suppress(TypeError):
         _methods[key] = weakref.ref(f.__self__, lambda _: _methods.pop(key, None)), known
     return known
-
-
-def _method_key(f):
-    return id(f.__self__), id(f.__func__)
 
 
 def _with_current_fields(f):
@@ -118,15 +123,15 @@ class Known:
         self.unread = set()
         self.states = []  # (key, weak reference to what stands for the function, None for itself), the latest last
         self.look: Any = None
+        self.kinds = weakref.WeakValueDictionary()  # `Kind`s, by the key without arrays
+        self.are_data = True  # arrays, as far as is known
 
     def current(self, f):
         """What stands for f now."""
-        if self.look is not None and self.look.still_holds(f):
-            if (stands := self.states[-1][1]) is None:
-                return f
-            if (form := stands()) is not None:
-                return form
-        return self._found(f)
+        if self.look is None or self.look.holds(f) is None:
+            return self._found(f)
+        form = self.states[-1][1]
+        return f if form is None else form() or self._found(f)
 
     def _form(self, state, f):
         return f if state[1] is None else state[1]()
@@ -140,12 +145,16 @@ class Known:
             state, form = same[0], self._form(same[0], f)
         else:
             form = again(f) if self.states else f
-            if self.look.may_change():
+            if self.look.may_change:
                 form = Reading(form, f, self, self.look)
             if form is not f:
                 _enter(form, self, f)
             state = key, None if form is f else weakref.ref(form)
-        self.states = [*(x for x in alive if x is not state), state][-MOST_STATES:]
+        self.states = [*(x for x in alive if x is not state), state]
+        if len(self.states) > MOST_STATES:  # as in a loop over records: JAX would keep the programs of all
+            self.states = [state]
+            for program in programs:
+                program.clear_cache()
         return form
 
     def ignore(self, changed, form, f):
@@ -163,10 +172,54 @@ class Reading:
         self._form, self._f, self._known, self._look = form, f, known, look
 
     def __call__(self, *args, **keywords):
-        before = [(x, tell, tell(x)) for x, tell in self._look.changeable(self._f)]
+        read = self._look.holds(self._f)
+        before = [(x, held(x)) for x in read[0]] if read else []
         try:
             return self._form(*args, **keywords)
         finally:
-            if changed := [x for x, tell, held in before if tell(x) != held]:
+            if changed := [x for x, known in before if held(x) != known]:
                 self._known.ignore(changed, self, self._f)
                 self._look = self._known.look
+
+
+class Kind:
+    """A function, whatever some arrays hold that it reads: these are data of its programs. Made by `with_data`."""
+
+    def __init__(self, f, known):
+        self.f, self.known, self.arrays = f, known, []
+
+    def of(self, arrays):
+        """The function that reads these arrays, tracers among them."""
+        return Copies(dict(zip(map(id, self.arrays), arrays, strict=True))).of(self.f)
+
+    def refuse(self):
+        """Arrays that cannot be traced are no data, here and later."""
+        self.known.are_data = False
+
+
+def with_data(f) -> tuple[Kind, list] | None:
+    """What stands for f, and the arrays of floats that it reads and that differ from those of its first program, which
+    are data. None where there is none: what a function reads stays part of its program as long as nothing changes.
+
+    What is computed from the data is traced with them. So an array stays part of the program where f could find it, or
+    keep it, elsewhere: where a way to it leads not through globals, cells and partials, and where f changes what it
+    reads. So it does where a tracer could mean another thing: where kinds are asked for.
+    """
+    current(f)
+    known = _entries.get(id(f), (None, None))[1]
+    if known is None or known.unread or not known.are_data or (found := known.look.holds(f)) is None:
+        return None
+    copies = Copies(dict(zip(map(id, found[1]), found[1], strict=True)))
+    copies.of(f)
+    if any(not KINDS.isdisjoint(names_in(x.__code__).read) for _, x in copies.made.values() if hasattr(x, "__code__")):
+        return None
+    key, data, before = list(known.look.key), [], known.states[0][0]
+    for x, (number, at) in zip(found[1], known.look.arrays.values(), strict=True):
+        if copies.placed[id(x)] == number and len(before) == len(key) and before[at] != key[at]:
+            data.append(x)
+            key[at] = type(x), x.shape, x.dtype.str
+    if not data:
+        return None
+    kind = known.kinds.setdefault(tuple(key), Kind(f, known))
+    kind.arrays = data
+    return kind, data

@@ -15,10 +15,9 @@ import sys
 import sysconfig
 import types
 import weakref
+from collections import Counter
 from dataclasses import fields, is_dataclass
 from functools import lru_cache, partial
-from itertools import count
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -106,113 +105,86 @@ class Same:
         return type(other) is Same and (x := self.ref()) is not None and x is other.ref()
 
 
-# ------------------------------------------------------------------------------------- from a value to what it reads
+def held(x):
+    """What a container, an object or an array holds now."""
+    if isinstance(x, np.ndarray):
+        return x.tobytes()
+    x = x if isinstance(x, CONTAINERS) else vars(x)
+    return list(map(id, _entries(x)))
 
 
-def _globals(f, getter):
-    return getter(f.__globals__)
+def _entries(x):
+    return [*x, *x.values()] if isinstance(x, dict) else [*x]
 
 
-def _cells(f, places):
-    return [f.__closure__[i].cell_contents for i in places]
+@lru_cache(maxsize=4096)
+def _reader(suffix):
+    return eval(f"lambda x: x{suffix}")
 
 
-def _defaults(f, _):
-    return [*(f.__defaults__ or ()), *(f.__kwdefaults__ or {}).values()]
-
-
-def _partial(f, _):
-    return [f.func, *f.args, *f.keywords, *f.keywords.values()]
-
-
-def _method(f, _):
-    return [f.__func__, f.__self__]
-
-
-def _attributes(x, names):
-    return [vars(x)[name] for name in names]
-
-
-def _fields(x, names):
-    return [getattr(x, name) for name in names]
-
-
-def _entries(x, _):
-    return [*x, *x.values()] if isinstance(x, dict) else list(x)
-
-
-def _vars(x, _):
-    return [*vars(x), *vars(x).values()]
-
-
-def _property(x, _):
-    return [x.fget]
-
-
-def _inside(x, _):
-    return [x.__func__]
+def _no(f):
+    return None
 
 
 class Look:
-    """All that a function reads, as a walk from it that can be repeated.
+    """All that a function reads, and a program that looks whether it is the same.
 
-    values: found so far, the function first; steps: (what, i, with which), each appending what it finds at values[i];
-    key: the same where programs are.
+    Every call of `simulate` looks, so the program is written as Python, of a line for a value: that takes 0.1 us, where
+    a walk over all values takes 0.7.
+
+    holds: of the function, what it reads and could change itself, and its `arrays`; None where something differs.
+    key: equal to that of another look where the programs that JAX makes of the function are the same.
     """
 
     def __init__(self, f, unread=()):
         """unread: containers that the function itself changes, such as a list that it appends to."""
         self.unread = unread
-        self.values, self.steps, self.arrays, self.contents = [f], [], [], []
+        self.values, self.names, self.lines = [f], ["f"], []
+        self.space, self.may_change = {}, []  # what the lines know by name; names of what the function may change
+        self.arrays = {}  # of floats: name -> id, later number of places at which it is read; and where in key it is
         self.key: Any = []
-        self._seen, self._kept, self.is_broken = {}, [], False
+        self._seen, self._kept = {}, []
         i = 0
         while i < min(len(self.values), MOST_VALUES):
             self._visit(i, self.values[i])
             i += 1
         self.key = (*self.key, *map(Same, self.values[i:]))
+        places = Counter(map(id, self.values))
+        self.arrays = {name: (places[x], at) for name, (x, at) in self.arrays.items()} if i == len(self.values) else {}
+        self.is_empty = not self.lines
+        self.holds = self._program()
         self._watch()
-        self.ids = list(map(id, self.values))
-        del self.values, self._seen
+        del self.values, self.names, self.lines, self.space, self._seen
 
-    def still_holds(self, f):
-        """Whether f reads now what it did."""
-        if not self.steps:
-            return True
-        try:
-            values = self.walk(f)
-        except Exception:  # something is of another kind than it was
-            return False
-        if self.is_broken or list(map(id, values)) != self.ids:
-            return False
-        return not self.arrays or all(values[i].tobytes() == known for i, known in self.arrays)
+    def _program(self):
+        """Of the lines; what is of another kind than it was may raise anything."""
+        changed, arrays = ("".join(f"{name}, " for name in names) for names in (self.may_change, self.arrays))
+        body = "".join(f"  {line}\n" for line in [*self.lines, f"return ({changed}), ({arrays})"])
+        exec(f"def holds(f):\n try:\n{body} except Exception:\n  return None", self.space)
+        return self.space["holds"]
 
-    def walk(self, f):
-        """All values now."""
-        values = [f]
-        for step, i, given in self.steps:
-            values += step(values[i], given)
-        return values
+    def _read(self, i, *suffixes):
+        """Values that the one at i has: an expression for each."""
+        first = len(self.values)
+        for n, suffix in enumerate(suffixes, first):
+            x = _reader(suffix)(self.values[i])
+            self.lines.append(f"if id(x{n} := {self.names[i]}{suffix}) != {id(x)}: return None")
+            self.names.append(f"x{n}")
+            self.values.append(x)
+        self.key.append(suffixes)
+        return first
 
-    def may_change(self):
-        """Whether there is something that the function itself could change."""
-        return bool(self.contents or self.arrays)
-
-    def changeable(self, f):
-        """The containers and the arrays, each with what tells what it holds."""
-        try:
-            values = self.walk(f)
-        except Exception:  # something is of another kind than it was
-            return []
-        entries = [(values[i], partial(_ids_inside, step)) for step, i in self.contents]
-        return entries + [(values[i], np.ndarray.tobytes) for i, _ in self.arrays]
-
-    def _step(self, step, i, given=None):
-        self.steps.append((step, i, given))
-        found = step(self.values[i], given)
+    def _read_entries(self, i, x, suffix="", may_change=True):
+        """All that a container holds; with suffix, one that the value at i has."""
+        found, n, name = _entries(x), len(self.values), self.names[i] + suffix
+        entries = f"[*{name}, *{name}.values()]" if isinstance(x, dict) else f"[*{name}]"
+        self.lines.append(f"if [*map(id, x{n} := {entries})] != known{n}: return None")
+        self.space[f"known{n}"] = list(map(id, found))
+        self.names += [f"x{n}[{k}]" for k in range(len(found))]
         self.values += found
-        self.key.append(len(found))
-        return found
+        self.key += type(x), len(found)
+        if may_change:
+            self.may_change.append(self.names[i])
 
     def _visit(self, i, x):
         if isinstance(x, PLAIN):
@@ -224,24 +196,24 @@ class Look:
             self._visit_new(i, x)
 
     def _visit_new(self, i, x):
+        if isinstance(x, (np.ndarray, jax.Array)) and x.ndim and np.issubdtype(x.dtype, np.floating):
+            self.arrays[self.names[i]] = id(x), len(self.key)
         if Same(x) in self.unread:
             self.key.append(Same(x))
         elif isinstance(x, np.ndarray) and x.dtype != object:
-            data = x.tobytes()
-            self.arrays.append((i, data))
-            self.key.append((type(x), x.shape, x.dtype.str, data))
+            self._visit_array(i, x)
         elif isinstance(x, types.FunctionType):
             self._visit_function(i, x)
         elif isinstance(x, types.MethodType):
-            self._step(_method, i)
+            self._read(i, ".__func__", ".__self__")
         elif isinstance(x, partial):
-            self._step(_partial, i)
+            self._read(i, ".func", ".args", ".keywords")
         elif isinstance(x, CONTAINERS):
-            self._visit_container(i, x, _entries, not isinstance(x, (tuple, frozenset)))
+            self._read_entries(i, x, may_change=not isinstance(x, (tuple, frozenset)))
         elif isinstance(x, property):
-            self._step(_property, i)
+            self._read(i, ".fget")
         elif isinstance(x, (staticmethod, classmethod)):
-            self._step(_inside, i)
+            self._read(i, ".__func__")
         elif isinstance(x, (types.ModuleType, jax.Array, JITTED)):
             self.key.append(Same(x))
         elif isinstance(x, type):
@@ -249,35 +221,38 @@ class Look:
         else:
             self._visit_object(i, x)
 
+    def _visit_array(self, i, x):
+        data = x.tobytes()
+        self.key.append((type(x), x.shape, x.dtype.str, data))
+        self.space[f"data{i}"] = data
+        self.lines.append(f"if {self.names[i]}.tobytes() != data{i}: return None")
+        self.may_change.append(self.names[i])
+
     def _visit_function(self, i, f):
         self.key.append(Same(f.__code__))
         if f.__closure__:
             written = names_in(f.__code__).written if is_users(f) else ()
-            places = [
-                k
-                for k, (name, cell) in enumerate(zip(f.__code__.co_freevars, f.__closure__, strict=True))
-                if name not in written and _is_filled(cell)
-            ]
-            self._step(_cells, i, places)
-        if f.__defaults__ or f.__kwdefaults__:
-            self._step(_defaults, i)
+            cells = enumerate(zip(f.__code__.co_freevars, f.__closure__, strict=True))
+            places = [k for k, (name, cell) in cells if name not in written and _is_filled(cell)]
+            self._read(i, *(f".__closure__[{k}].cell_contents" for k in places))
+        if f.__defaults__:
+            self._read(i, ".__defaults__")
+        if f.__kwdefaults__:
+            self._read(i, ".__kwdefaults__")
         if vars(f):
-            self._visit_container(i, f, _vars, True)
-        if not is_users(f):
-            return
-        names = names_in(f.__code__)
-        read = [name for name in names.read if name in f.__globals__ and not _is_fixed(f.__globals__[name])]
-        if read:
-            getter = itemgetter(*read, read[0])  # of two at least, which is a tuple
-            self._visit_attributes(len(self.values), self._step(_globals, i, getter), names.attributes)
+            self._read_entries(i, vars(f), ".__dict__")
+        if is_users(f):
+            names = names_in(f.__code__)
+            read = [name for name in names.read if name in f.__globals__ and not _is_fixed(f.__globals__[name])]
+            self._read_attributes(self._read(i, *(f".__globals__[{name!r}]" for name in read)), names.attributes)
 
-    def _visit_attributes(self, first, found, names, depth=3):
-        """What may be read of the user's modules among these values, by the names that a function mentions."""
-        for i, x in zip(count(first), found):
+    def _read_attributes(self, first, names, depth=3):
+        """What may be read of the user's modules among the latest values, by the names that a function mentions."""
+        for i in range(first, len(self.values)):
+            x = self.values[i]
             if depth and isinstance(x, types.ModuleType) and is_users(x):
                 mine = sorted(name for name in names if name in vars(x))
-                if mine:
-                    self._visit_attributes(len(self.values), self._step(_attributes, i, mine), names, depth - 1)
+                self._read_attributes(self._read(i, *_in_dict(mine)), names, depth - 1)
 
     def _visit_class(self, i, x):
         self.key.append(Same(x))
@@ -287,39 +262,31 @@ class Look:
                 for name, y in vars(x).items()
                 if name == "__call__" or not (name.startswith("__") or isinstance(y, types.MemberDescriptorType))
             ]
-            self._step(_attributes, i, mine)
-            self._step(_fields, i, ["__bases__"])
+            bases = [f".__bases__[{k}]" for k, base in enumerate(x.__bases__) if is_users(base)]
+            self._read(i, *_in_dict(mine), *bases)
 
     def _visit_object(self, i, x):
         kind = type(x)
+        self.key.append(Same(kind))
         if is_dataclass(x):
-            self.key.append(Same(kind))
-            self._step(_fields, i, [field.name for field in fields(x) if hasattr(x, field.name)])
+            self._read(i, *(f".{field.name}" for field in fields(x) if hasattr(x, field.name)))
         elif is_users(kind) and hasattr(x, "__dict__"):
-            self.key.append(Same(kind))
-            self._visit_container(i, x, _vars, True)
+            self._read_entries(i, vars(x), ".__dict__")
         elif callable(x) and isinstance(getattr(x, "__wrapped__", None), types.FunctionType) and hasattr(x, "__dict__"):
-            self._visit_container(i, x, _vars, False)  # such as `jax.custom_jvp`
+            self._read_entries(i, vars(x), ".__dict__", may_change=False)  # such as `jax.custom_jvp`
         else:
             self.key.append(Same(x))
             return
         if is_users(kind):
-            self._step(_fields, i, ["__class__"])
-
-    def _visit_container(self, i, x, step, may_change):
-        self.key.append(type(x))
-        self._step(step, i)
-        if may_change:
-            self.contents.append((step, i))
+            self._read(i, ".__class__")
 
     def _watch(self):
         """Ids are compared, and nothing kept alive that could not die for it: who dies breaks the look."""
-
         me = weakref.ref(self)
 
         def broken(_):
             if (look := me()) is not None:
-                look.is_broken = True
+                look.holds = _no
 
         for x in self.values[1:]:
             if isinstance(x, PLAIN):
@@ -331,8 +298,8 @@ class Look:
                     self._kept.append(x)
 
 
-def _ids_inside(step, x):
-    return list(map(id, step(x, None)))
+def _in_dict(names):
+    return [f".__dict__[{name!r}]" for name in names]
 
 
 def _is_filled(cell):

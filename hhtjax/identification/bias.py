@@ -32,7 +32,7 @@ from hhtjax.steppers.stepper import Stepper, require_stepper
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.mass import mass_at
 from hhtjax.systems.sparse_system import require_dense
-from hhtjax.systems.system import LinearSystem, System, require_smooth
+from hhtjax.systems.system import LinearSystem, System, require_masses, require_smooth
 
 OSCILLATES = 1e-9  # |Im s|/|s| above which a mode counts as an oscillation
 LOST = 1e3  # distance of an eigenvalue of the steps from that of a mode which does not oscillate in them
@@ -128,6 +128,7 @@ def step_size_bias(
     require_stepper("step_size_bias", stepper)
     if not isinstance(system, (System, LinearSystem)):
         raise TypeError(f"step_size_bias: `system` must be a System or LinearSystem; received {system!r}.")
+    require_masses("step_size_bias", system, "give them some")
     frozen = require_params("step_size_bias", params)
     _require_flags(correct, params)
     _require_point(q, v)

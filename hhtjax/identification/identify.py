@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_function, require_number
-from hhtjax.description import current, is_concrete, thaw
+from hhtjax.description import current, is_concrete, is_tracing, thaw, with_data
 from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
     check_options,
@@ -92,7 +92,9 @@ def fit(
         progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
 
     A function is traced and compiled once, and anew where something that it reads from outside differs, as `simulate`
-    says; arrays are compared by their bytes. Data that change from call to call cost no compilation as `records`.
+    says; arrays are compared by their bytes. Arrays of floats are then data, if what is computed from them can be
+    traced: a loop over records of one length, in which `residuals` read a variable, compiles for the first and for the
+    second alone. What takes a number out of an array, as `float(y[0])` or `if y.max() > 1`, is compiled for each.
 
     Estimates have derivatives, forward and reverse, in all that a fit is given and its residuals read, but where it
     starts: those of the minimum, H dx + (dg/dd) dd = 0 with g = dc/dx the slope of the cost and H = dg/dx, by the
@@ -136,10 +138,22 @@ def fit(
     if of_records:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
     alone = is_outside(options, params0, data)
-    residuals, options = current(residuals), options._replace(loss=options.loss and current(options.loss))
-    result = or_plain(partial(solve_outside if alone else solve, residuals, options, params0, data))
+    options = options._replace(loss=options.loss and current(options.loss))
+    result = _solved(solve_outside if alone else solve, residuals, options, params0, data)
     result = result._replace(params=thaw(result.params))
     return _finished("fit", result, weights) if is_concrete(result.code) else result
+
+
+def _solved(solver, residuals, options, params0, data):
+    """The fit by a solver, with arrays that the residuals read as data, where another fit has read others before."""
+    found = None if is_tracing() or data.records is not None else with_data(residuals)
+    if found is not None:
+        kind, arrays = found
+        try:
+            return or_plain(partial(solver, kind, options, params0, data._replace(read=arrays)))
+        except Exception:  # NumPy cannot take a tracer, say; what is wrong otherwise is told below
+            kind.refuse()
+    return or_plain(partial(solver, current(residuals), options, params0, data))
 
 
 @shown

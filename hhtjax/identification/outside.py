@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import all_concrete, freeze, is_tracing
+from hhtjax.description import all_concrete, freeze, is_tracing, programs
 from hhtjax.identification.arguments import LEVENBERG_MARQUARDT
 from hhtjax.identification.arrow import Arrow, ArrowTrial, arrow_trial
 from hhtjax.identification.gauss_newton import Dense, DenseTrial, dense_trial
@@ -66,6 +66,9 @@ def _begin(residuals, options, params0, data):
         own, one = [parts.own0.ravel()], (x0, parts.own0[0], first(data.records))
     kind = Kind(x0.size, parts.shapes, chooses_steps(*hoisted(parts.f, *one), *one))
     return jnp.concatenate([x0, *own]), parts.w, kind
+
+
+programs.add(_begin)
 
 
 @partial(Programs, static_argnums=(0, 1))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import thaw
+from hhtjax.description import Kind, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.residuals import check_residuals, spread_weights
 from hhtjax.identification.samples import require_own_samples
@@ -24,6 +24,11 @@ class Data(NamedTuple):
     tolerance: Any
     records: Any
     starts: Any
+    read: Any = None  # arrays that the residuals read, where these are a `Kind`
+
+    def function(self, residuals):
+        """The residuals, with what they read."""
+        return residuals.of(self.read) if isinstance(residuals, Kind) else residuals
 
 
 class Coordinates:
@@ -92,6 +97,7 @@ class DenseParts(NamedTuple):
 
 def dense_parts(residuals, coordinates, data) -> DenseParts:
     """One residual function of all parameters, with priors as further rows."""
+    residuals = data.function(residuals)
     params0 = coordinates.params(coordinates.x0)
     shapes = check_residuals("fit", residuals, coordinates.x0.size, params0)
     require_own_samples("fit", residuals, shapes, params0)

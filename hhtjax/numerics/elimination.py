@@ -61,11 +61,15 @@ def factorize(A):
         return partial(_substitute_scalars, *_lu_scalars(A))
     if A.shape[-1] <= UNROLLED:
         return partial(_substitute, _lu(A))
-    if A.shape[-1] <= LOOPED:
-        factors = choose(_lu, panels.lu, A)
-        ways = _substitute, _by_lapack
-        return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
-    return partial(_by_lapack, panels.lu(A))
+    return by_factors(choose(_lu, panels.lu, A) if A.shape[-1] <= LOOPED else panels.lu(A))
+
+
+def by_factors(factors):
+    """The same of a full matrix of more than UNROLLED unknowns, by `panels.lu` of it."""
+    if len(factors[0]) > LOOPED:
+        return partial(_by_lapack, factors)
+    ways = _substitute, _by_lapack
+    return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
 
 
 def inverse(A):

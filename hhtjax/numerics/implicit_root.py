@@ -1,7 +1,9 @@
 """Roots with the derivatives of the implicit function, of every order and in every mode."""
 
+from functools import partial
+
 import jax
-from jax.custom_derivatives import zero_from_primal
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
 from hhtjax.numerics.hoisted import opened
 from hhtjax.xla import together
@@ -43,14 +45,19 @@ def implicit_root(f, guess, search, tangent_solve):
         _, in_search, _, guess = structure.unflatten(given)
         return jax.tree.leaves(find(in_search, guess))
 
-    @root.defjvp
+    @partial(root.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
         (given,), (moved,) = primals, tangents
         found = together(root, given)
         in_residual, _, in_response, _ = structure.unflatten(given)
         w, more = told.unflatten(found)
-        moves = structure.unflatten(moved)[0]
-        _, change = jax.jvp(lambda constants: residual(constants, w), (in_residual,), (moves,))
+        constants, inside = jax.tree.flatten(in_residual)
+        moves = {i: dx for i, dx in enumerate(moved[: len(constants)]) if not isinstance(dx, SymbolicZero)}
+
+        def of_moving(moving):  # what does not move, such as the time, needs no derivative
+            return residual(inside.unflatten([moving.get(i, x) for i, x in enumerate(constants)]), w)
+
+        _, change = jax.jvp(of_moving, ({i: constants[i] for i in moves},), (moves,))
         dw = -respond(in_response, w, change)
         return found, jax.tree.leaves((dw, jax.tree.map(zero_from_primal, more)))
 

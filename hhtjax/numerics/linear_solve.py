@@ -10,8 +10,13 @@ from jax import lax
 
 from hhtjax.numerics.elimination import diagonal, factorize, matvec
 from hhtjax.numerics.low_rank import AtState
-from hhtjax.xla import linear_map, part, staged
+from hhtjax.xla import forward_only, linear_map, part, staged
 
+FORWARD_ONLY = (
+    "a force (or mass, or constraint) with a `lax.while_loop`, or a `lax.fori_loop` of unknown length, has forward "
+    "derivatives only, jax.jvp and jax.jacfwd: for reverse ones write it with `lax.scan`, or a `lax.fori_loop` of "
+    "known length, or give it derivatives by `jax.custom_jvp`, as of an implicit function."
+)
 RANK_TOLERANCE = 1e-9  # relative size of a singular value of dependent columns; in float32 100 roundings
 
 
@@ -54,7 +59,7 @@ def _solve(f, b, inverse):
         return call(transpose_solve=lambda _, y: inverse(y, trans=1))
     except (ValueError, NotImplementedError):
         # JAX transposes f at once, and a `while_loop` in a user's force has no transpose: only reverse mode needs one
-        return call()
+        return forward_only(call(), FORWARD_ONLY)
 
 
 class Trusted:

@@ -34,14 +34,15 @@ class Changing:
     """A `factorize` for A0 and a part J that depends on the state: `around` a state it is complete.
 
     slope: state -> the linear function of a change of state that gives the change of the nonlinear force, (k,) or (n,).
-    spread: E, (k,) -> (n,); size: k, None for a J of all rows and columns.
+    spread: E, (k,) -> (n,); size: k, None for a J of all rows and columns. inverse: what `factorize` makes of A0, where
+    it is known.
     """
 
-    def __init__(self, A0, slope, spread, size):
+    def __init__(self, A0, slope, spread, size, inverse=None):
         self.A0, self.slope, self.spread, self.size = lax.stop_gradient(A0), slope, spread, size
         if size is None:
             return
-        self.inverse = factorize(A0)
+        self.inverse = factorize(A0) if inverse is None else inverse
         self.columns = jax.vmap(spread)(jnp.eye(size, dtype=A0.dtype))  # E^T
         self.Z = [jax.vmap(lambda e, trans=trans: self.inverse(e, trans=trans))(self.columns).T for trans in (0, 1)]
         self.S = self.columns @ self.Z[0]
@@ -95,9 +96,9 @@ class Known(AtState):
 class Constant(Changing, AtState):
     """A `factorize` for A0 alone."""
 
-    def __init__(self, A0):
+    def __init__(self, A0, inverse=None):
         self.A0 = lax.stop_gradient(A0)
-        self.inverse = factorize(self.A0)
+        self.inverse = factorize(self.A0) if inverse is None else inverse
 
     def around(self, state, along):
         """Itself, at every state."""

@@ -41,6 +41,6 @@ def kept(A):
     return (Factorized if isinstance(A, Sparse) else Constant)(A)
 
 
-def changing(A, slope, spread, size):
+def changing(A, slope, spread, size, inverse=None):
     """The `Changing` of a matrix and a part."""
-    return (ChangingSparse if isinstance(A, Sparse) else Changing)(A, slope, spread, size)
+    return (ChangingSparse if isinstance(A, Sparse) else Changing)(A, slope, spread, size, inverse)

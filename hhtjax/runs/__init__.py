@@ -38,8 +38,8 @@ which compiles anew:
 >>> end() < before
 True
 
-So what changes often belongs into params (or, for the data of a fit, into `records`): that costs no compilation, and
-has derivatives. `simulate` says what holds inside a jit of yours.
+So what changes often belongs into params: that costs no compilation, and has derivatives. `fit` says what it does with
+data; `simulate`, what holds inside a jit of yours.
 
 The first call
 --------------
@@ -77,7 +77,8 @@ force, for a limit on its rate) goes along in the carry. This one takes a mass t
 
 Each run begins anew, where the force jumps, so that the method keeps its order; derivatives pass through all, and each
 is one kernel: 1500 periods of a crane, of five steps each, take half the time of the same on plain JAX, where their
-ends alone are kept (`save_every=5`), and .7 of it where all steps are.
+ends alone are kept (`save_every=5`), and .7 of it where all steps are. The matrices of a `LinearSystem` are factorised
+once, before the scan. Each start takes some 12 solves more; `hht(start="simple")` does without, where nothing is stiff.
 Internal states go on from `run.z[-1]`. What is held, but known before, is `sampled(order=0)`.
 
 Sweeps

@@ -24,7 +24,7 @@ from hhtjax.runs.read_off import kept, output_between, solution_at, with_output
 from hhtjax.runs.sweep_grid import require_times
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems import held
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_masses
 from hhtjax.xla import Programs, largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
 
 
@@ -240,5 +240,6 @@ def usual_step(t0, times):
 def checked_times(caller, problem, times, control):
     """times, for a stepper that can be controlled."""
     require_controlled(caller, problem.stepper)
+    require_masses(caller, problem.system, "take steps without error control")
     require_single(caller, control)
     return require_times(times, problem.t0, jax.tree.leaves(problem.q0)[0].dtype, caller)

@@ -12,7 +12,7 @@ from hhtjax.description import freeze, is_concrete, is_real, known_now, thaw
 from hhtjax.runs.event_times import nearness
 from hhtjax.systems import held, returned
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
-from hhtjax.systems.system import FirstOrderSystem
+from hhtjax.systems.system import FirstOrderSystem, require_masses
 from hhtjax.xla import Programs
 
 AT_GUARD = 1e3  # roundings of the terms of a guard that count as zero
@@ -31,6 +31,7 @@ def require_events(caller, problem, events, step):
             f"{caller}: {type(problem.stepper).__name__} cannot begin anew behind an event; use hht() or another of "
             "its family, rosenbrock(), rowda(), rk4() or dopri5()."
         )
+    require_masses(caller, problem.system, "leave out `events`")
     for i, event in enumerate(events):
         _require_shapes(f"{caller}: events[{i}]", problem, event)
     events = tuple(events)

@@ -16,6 +16,10 @@ def require_steps(caller, stepper, dt, num_steps, parts=1):
     """dt, a number or (N,), and the number of steps, each of which may be divided into so many parts."""
     dt = np.asarray(dt) if isinstance(dt, (list, tuple)) else dt
     if not (is_array(dt) and dt.ndim):
+        if num_steps is None:
+            raise ValueError(
+                f"{caller}: `num_steps` must be a positive integer; received None. Or give `duration`, or `times`."
+            )
         num_steps = require_integer(caller, "num_steps", num_steps)
         if num_steps * parts >= 2**31:
             most = f"be less than {2**31 // parts}, because steps are counted in 32 bits"
@@ -135,9 +139,15 @@ def refined(dt, k):
     return jnp.repeat(dt / k, k) if jnp.ndim(dt) else dt / k
 
 
-def warn_of_jumps_in(problem, dt, num_steps):
+def warn_of_jumps_to(problem, dt, times):
+    """The same of equal steps to the last of these times."""
+    if held.holds(problem.params) and all_concrete((dt, times, problem.t0)):
+        warn_of_jumps_in(problem, dt, int(np.ceil((float(times[-1]) - float(problem.t0)) / float(dt) - 1e-6)), 5)
+
+
+def warn_of_jumps_in(problem, dt, num_steps, level=4):
     """A warning where a held input jumps within one of these steps, as far as all is known."""
     if held.holds(problem.params) and all_concrete((dt, problem.t0)):
         dt, t0 = np.asarray(dt, float), np.asarray(problem.t0, float)
         times = t0 + np.append(0.0, np.cumsum(dt) if dt.ndim else num_steps * dt)
-        held.warn_of_jumps("simulate", problem.params, times, lambda H: H * 0 + (1 if dt.ndim else num_steps), 4)
+        held.warn_of_jumps("simulate", problem.params, times, lambda H: H * 0 + (1 if dt.ndim else num_steps), level)

@@ -5,14 +5,19 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from hhtjax.numerics.seldom import choose, if_any
+from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.numerics.seldom import choose, if_any, seldom
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_law import is_settled
 from hhtjax.steppers.stepper import Info, entered, join_info, public
 from hhtjax.systems import held
-from hhtjax.systems.matrices import mass_flaw
+from hhtjax.systems.lagrangian import mass_reads_velocity
+from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
+
+GROWTH = 2.05  # of a step, up to which the recursion follows
 
 
 class Loop(NamedTuple):
@@ -58,10 +63,10 @@ def given_sizes(t0, dt):
     return lambda number: [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
 
 
-def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False):
+def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=False):
     """The same with steps of any sizes: number of steps taken -> the next, the one before, and where it ends.
 
-    resolves: whether the first is one of error control."""
+    resolves: whether the first is one of error control. grows: of `resized_step`."""
     stepper = stepper.astype(q.dtype)
     none = jnp.zeros((), jnp.int32)
     first = sizes(none)[0]
@@ -70,7 +75,7 @@ def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False):
         @partial(jax.jit, inline=True)  # traced once, wherever it is called
         def step(state, number):
             h, last, end = sizes(number)
-            state, info = resized_step(flat, stepper, params, h, last)(state)
+            state, info = resized_step(flat, stepper, params, h, last, grows)(state)
             return state._replace(t=end), info
 
         return step
@@ -94,20 +99,34 @@ def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False):
     return Loop(carry, advance(params), keep, no_info, advance, lambda count: tuple(sizes(count)[:2]), start)
 
 
-def resized_step(flat, stepper, params, dt, last):
-    """State -> (State, Info) for a step dt after one of another size."""
+def grows_at_once(dt):
+    """Whether some of these steps (N,), as far as they are known, are too long behind the one before."""
+    return not is_concrete(dt) or bool(np.any(np.asarray(dt)[1:] > GROWTH * np.asarray(dt)[:-1]))
+
+
+def resized_step(flat, stepper, params, dt, last, grows=False):
+    """State -> (State, Info) for a step dt after one of another size; grows: whether it may be far longer."""
 
     def step(state):
         resized, state = stepper.resized(state, dt / last)
+        if grows and stepper.throws(flat):
+
+            def begin(state, params, dt):
+                return resized.grown(flat, state, held.before(thaw(params), state.t, last), dt)
+
+            state = seldom(begin, dt > GROWTH * last, state, freeze(params), dt)
         return held.bind(resized, flat, params, dt, last)(state)
 
     return step
 
 
-def advance_from(flat, stepper, dtype, params, t, dt, count, last=None):
+def advance_from(flat, stepper, dtype, params, t, dt, count, last=None, grows=False):
     """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken, each of size `last`."""
     stepper = stepper.astype(dtype)
-    take_step = held.bind(stepper, flat, params, dt) if last is None else resized_step(flat, stepper, params, dt, last)
+    if last is None:
+        take_step = held.bind(stepper, flat, params, dt)
+    else:
+        take_step = resized_step(flat, stepper, params, dt, last, grows)
     return counted(take_step, flat, t, dt, count)
 
 
@@ -165,7 +184,11 @@ def flaw_at_start(system, flat, start, params):
     """What is wrong with the mass there, where it is a function; a constant one has been looked at."""
     if not callable(getattr(system, "mass", None)):
         return None
-    return mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None)
+    flaw = mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None or system.massless is not None)
+    if not getattr(system.mass, "is_lagrangian", False):
+        return flaw
+    at = flat.unravel(start.q), flat.unravel_rates(flat.located(start.v)), start.t, params
+    return jnp.where((flaw == 0) & mass_reads_velocity(system.mass.lagrangian, *at), OF_VELOCITY, flaw)
 
 
 def no_failure(info):

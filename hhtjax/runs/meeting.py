@@ -55,9 +55,10 @@ def pass_events(ways, params, part, h):
     are as `freeze` leaves them, here and in what this calls, and `Ways.params` thaws them."""
     ways = ways.during(params, part.start.t, h)
     if ways.middle is not None:
-        old = held.before(ways.events.with_modes(params, part.met.modes), part.start.t, part.last)
-        new = ways.params(params, part.met.modes)
-        part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new, h))
+        known, t = ways.events.with_modes(params, part.met.modes), part.start.t
+        old, new = held.before(known, t, part.last), ways.params(params, part.met.modes)
+        here = held.passed(known, t, part.last, h)
+        part = part._replace(start=held.jump(ways.stepper, ways.flat, part.start, old, new, h, here))
 
     @checkpoint  # what all slots keep for reverse mode takes longer to compile than to compute one again
     def slot(part, _):

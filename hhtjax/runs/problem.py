@@ -10,10 +10,12 @@ from jax.core import Tracer
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import is_concrete, thaw
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.systems import held
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.rubbing import with_known_rows
+from hhtjax.systems.system import require_masses
 
 
 class Problem(NamedTuple):
@@ -32,9 +34,11 @@ class Problem(NamedTuple):
     @classmethod
     def checked(cls, caller, system, stepper, q0, v0, params, t0, z0):
         """The same of what a user hands over, or an error that names what is wrong with it."""
-        require_system(caller, system)
+        require_system(caller, system, massless=True)
         require_stepper(caller, stepper)
         params = require_params(caller, params)
+        if held.holds(params):
+            require_masses(caller, system, "leave out held inputs, sampled(order=0)")
         _refuse_checked_axes(caller, q0, v0, params, t0, z0)
         require_number(caller, "t0", t0, np.isfinite, "be finite")
         q0, v0, z0 = initial_values(caller, system, q0, v0, z0, level=4)

@@ -15,6 +15,7 @@ from hhtjax.runs.controlled import run_controlled
 from hhtjax.runs.event_checks import require_events
 from hhtjax.runs.events import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
+from hhtjax.runs.factors import known_factors
 from hhtjax.runs.given_steps import (
     EqualSteps,
     refined,
@@ -24,13 +25,15 @@ from hhtjax.runs.given_steps import (
     require_steps_to,
     steps_within,
     warn_of_jumps_in,
+    warn_of_jumps_to,
 )
-from hhtjax.runs.loop import flaw_at_start, given_sizes, loop_of, loop_over
+from hhtjax.runs.loop import flaw_at_start, given_sizes, grows_at_once, loop_of, loop_over
 from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
 from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_grid import equal_times, require_times
+from hhtjax.steppers.newton import callbacks_named
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Programs, is_in_batch, on_scalars, one_kernel, or_plain
@@ -173,12 +176,18 @@ def simulate(
         times = require_times(times, problem.t0, dtype, "simulate")
         dt = require_steps_to("simulate", times, dt, num_steps, save_every, problem.t0)
         if progress:
-            raise NotImplementedError("simulate: with `times` and a number for `dt`, leave `progress` out.")
+            raise NotImplementedError(
+                "simulate: with `times` and a number for `dt`, leave `progress` out. The number of steps is data, "
+                "and all of them are one program, between whose parts nothing can be drawn. For a bar give `num_steps` "
+                "and read the run off by hhtjax.interpolate(run, times)."
+            )
         if events is not None:
             events = require_events("simulate", problem, events, dt)
+        warn_of_jumps_to(problem, dt, times)
 
         def run_to(k):
-            return or_plain(partial(_read_off, problem, times, dt / k, events, room=room, rates=kind["rates"]))
+            with callbacks_named():
+                return or_plain(partial(_read_off, problem, times, dt / k, events, room=room, rates=kind["rates"]))
 
         solution = run_to(1) if extrapolate == 1 else extrapolated(run_to, extrapolate, stepper.order, join_info)
         return told("simulate", solution, throw)
@@ -192,7 +201,10 @@ def simulate(
 
     def run(k):
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
-        return or_plain(partial(_simulate, problem, refined(dt, k), events, in_batch=is_in_batch(), **sizes, **kind))
+        sizes["grows"] = jnp.ndim(dt) > 0 and grows_at_once(dt)
+        data = problem, refined(dt, k), events, known_factors(problem, refined(dt, k))
+        with callbacks_named():
+            return or_plain(partial(_simulate, *data, in_batch=is_in_batch(), **sizes, **kind))
 
     solution = run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
     return told("simulate", solution, throw)
@@ -209,12 +221,12 @@ def _read_off(problem, times, dt, events, *, room):
     return one_kernel(run, problem, times, dt, events, around=True)  # what comes before and behind the loop too
 
 
-@partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "in_batch"))
-def _simulate(problem, dt, events, *, num_steps, save_every, progress, room, in_batch):
+@partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "grows", "in_batch"))
+def _simulate(problem, dt, events, factors, *, num_steps, save_every, progress, room, grows, in_batch):
     flat, q, v, t0, params = problem.flat()
     dt = jnp.asarray(dt).astype(q.dtype)
-    loop_by, sizes = (loop_over, given_sizes(t0, dt)) if dt.ndim else (loop_of, dt)
-    plain = loop = loop_by(flat, problem.stepper, q, v, t0, params, sizes)
+    begun = flat._replace(factors=factors), problem.stepper, q, v, t0, params
+    plain = loop = loop_over(*begun, given_sizes(t0, dt), grows=grows) if dt.ndim else loop_of(*begun, dt)
     if events is not None:
         loop = loop_with_events(plain, flat, problem.stepper, events, params, *room)
 

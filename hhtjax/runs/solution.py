@@ -15,7 +15,7 @@ from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
 from hhtjax.steppers.friction_law import DEPENDENT
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
-from hhtjax.systems.matrices import MASSLESS, UNSYMMETRIC
+from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY
 
 
 class FailedRunWarning(RuntimeWarning):
@@ -81,7 +81,11 @@ QUANTITIES = (
     "the position q", "the velocity v", "the acceleration", "the vector of multipliers",
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
-MASS = (None, "symmetric", "positive definite")
+MASS = (None, "symmetric", "positive definite", "the same at all velocities")
+WAYS = {
+    INDEFINITE: f". {MASSLESS}",
+    OF_VELOCITY: ": from_lagrangian takes energies that are quadratic in v. Write others as a System(mass, force)",
+}
 INTERNAL_STATE = 4  # among them
 
 
@@ -239,7 +243,7 @@ class Solution(NamedTuple):
         found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
         _, newton, quantity, row, left, friction, mass, event, guard = found
         if mass:
-            way = "" if mass == UNSYMMETRIC else f". {MASSLESS}"
+            way = WAYS.get(int(mass), "")
             return f"`mass` must be {MASS[mass]}; at the start it is not{way}"
         if event:
             what, advice = EVENTS[int(event)]

@@ -133,9 +133,24 @@ def sweep(
         return told("sweep", found, throw)
 
 
-@partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room"))
+@partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room", "grows"))
 def run_sweep(
-    system, data, dts, duration, t0, times, events, output=None, *, mapped, num_samples, lanes, mesh, progress, room
+    system,
+    data,
+    dts,
+    duration,
+    t0,
+    times,
+    events,
+    output=None,
+    *,
+    mapped,
+    num_samples,
+    lanes,
+    mesh,
+    progress,
+    room,
+    grows,
 ):
     """The sweep of `Inputs`, compiled."""
     if progress:
@@ -159,7 +174,7 @@ def run_sweep(
 
     def member(leaves, dt, substeps, longest):
         grid = dt, substeps, longest, t0, num_samples, times
-        return run_member(system, jax.tree.unflatten(structure, leaves), *grid, events, room, output)
+        return run_member(system, jax.tree.unflatten(structure, leaves), *grid, events, room, output, grows)
 
     def block(leaves, dts, substeps, numbered):
         number, members = numbered

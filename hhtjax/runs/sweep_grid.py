@@ -6,6 +6,7 @@ import numpy as np
 
 from hhtjax.checks import require_integer, require_number
 from hhtjax.description import all_concrete, is_array, is_concrete, is_real
+from hhtjax.runs.loop import GROWTH
 
 
 def require_one_grid(stepper, duration, num_samples, times):
@@ -101,6 +102,14 @@ def fit_to_times(dts, times):
     size = jnp.where(increasing, jnp.maximum(jnp.abs(times[1:]), jnp.abs(times[:-1])), 0)
     slack = eps * (64 + 4 * size / H)  # H is a difference of rounded times
     return jax.vmap(lambda dt: _fit(dt, H, (dt > 0) & increasing, slack))(dts)
+
+
+def may_grow(dts, t0, times):
+    """Whether steps may be too long behind the one before, as far as all is known: one after a short interval."""
+    if not all_concrete((dts, t0, times)):
+        return True
+    H = np.diff(np.asarray(times, float), prepend=float(t0))
+    return bool(np.any(np.minimum(H[1:], np.max(dts)) > GROWTH * H[:-1]))
 
 
 def _fit(dts, H, fine, slack):

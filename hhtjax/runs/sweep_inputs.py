@@ -16,6 +16,7 @@ from hhtjax.runs.event_checks import refused_members, require_events
 from hhtjax.runs.problem import Problem
 from hhtjax.runs.sweep_grid import (
     equal_times,
+    may_grow,
     require_one_grid,
     require_step_sizes,
     require_steps_within,
@@ -27,6 +28,7 @@ from hhtjax.systems.consistent import distances, examine, require_consistent
 from hhtjax.systems.initial_values import initial_values
 from hhtjax.systems.returned import notes_on_lists
 from hhtjax.systems.rubbing import with_known_rows
+from hhtjax.systems.system import require_masses
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 VECTORS = 32  # members, of fewer of which LLVM often writes loops out, one member after the other
@@ -55,13 +57,16 @@ class Inputs(NamedTuple):
     @classmethod
     def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes, times=None, z0=None):
         """An error that names what is wrong, or the inputs."""
-        require_system("sweep", system)
+        require_system("sweep", system, massless=True)
         require_stepper("sweep", stepper)
         params = require_params("sweep", params)
+        if held.holds(params):
+            require_masses("sweep", system, "leave out held inputs, sampled(order=0)")
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
         if isinstance(dts, Adaptive):
             require_controlled("sweep", stepper)
+            require_masses("sweep", system, "take steps without error control")
             size = _members(dts, dict(zip(NAMES, (stepper, q0, v0, params, z0), strict=True)), in_axes)
         else:
             dts = require_step_sizes(dts)
@@ -165,6 +170,7 @@ class Inputs(NamedTuple):
         static = {"mapped": self.mapped, "num_samples": self.num_samples, "lanes": lanes}
         fitting = {"rates": rates, "numbers": unknowns if lanes > 1 else None}
         arguments = self.system, data, dts, self.duration, self.t0, self.times, self.events, self.output
+        static["grows"] = self.times is not None and may_grow(self.dts, self.t0, self.times)
         return arguments, {**static, **fitting, "mesh": mesh, "progress": progress, "room": self.room}
 
 

@@ -15,15 +15,16 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.xla import on_scalars, one_kernel, or_alone
 
 
-def run_member(system, data, dt, substeps, longest, t0, num_samples, times, events, room, output=None):
+def run_member(system, data, dt, substeps, longest, t0, num_samples, times, events, room, output=None, grows=False):
     """One member; it rests from `substeps` to `longest`, where its block still works.
 
     With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval, and
-    after the first step there, where that is to know of the steps before.
+    after the first step there, where that is to know of the steps before. grows: of `resized_step`.
     """
     stepper, q0, v0, params, z0 = *data[:3], thaw(data[3]), data[4]
     flat, q, v = flatten("sweep", system, q0, v0, t0, params, z0)
-    resizes = times is not None and stepper.resizes
+    grows = grows and stepper.throws(flat)
+    resizes = times is not None and (stepper.resizes or grows)
     whole = in_two_parts if resizes else lambda *intervals: intervals
     intervals = None if times is None else whole(times[:-1], dt, substeps, longest)
     plain = loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
@@ -31,7 +32,7 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
         loop = loop_with_events(plain, flat, stepper, events, params, *room)
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
     save, as_saved = savings(form, loop, flat, output, params)
-    pace = _paces(flat, stepper, params, loop, form, substeps, longest)
+    pace = _paces(flat, stepper, params, loop, form, substeps, longest, grows)
 
     def part(carry, here):
         advance, substeps, longest = pace(carry[0], here)
@@ -58,7 +59,7 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
     return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution
 
 
-def _paces(flat, stepper, params, loop, form, substeps, longest):
+def _paces(flat, stepper, params, loop, form, substeps, longest, grows):
     """The function of a run and an interval that gives the step, and how many the member takes, and its block."""
 
     def stepped(bound, sizes):
@@ -75,7 +76,7 @@ def _paces(flat, stepper, params, loop, form, substeps, longest):
         count = run[1] if taken is None else run[1] - taken
 
         def bound(params):
-            return advance_from(flat, stepper, h.dtype, params, t, h, count, last)
+            return advance_from(flat, stepper, h.dtype, params, t, h, count, last, grows)
 
         return stepped(bound, lambda _: (h, h if last is None else last)), mine, most
 

@@ -14,13 +14,13 @@ from hhtjax.numerics.linear_solve import Structured, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.estimate import Controlled
 from hhtjax.steppers.friction import begin_friction, bind_friction
-from hhtjax.steppers.linear_part import factorized_once, linear_part
+from hhtjax.steppers.linear_part import factorized_once, factors_of, linear_part
 from hhtjax.steppers.linearization import linearized_step, refresh
 from hhtjax.steppers.newton import linearized_solve, newton
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.smooth_friction import smoothed_friction
-from hhtjax.steppers.smooth_start import jumped, smoothed
+from hhtjax.steppers.smooth_start import DEFAULT, at_start, grown, jumped, smoothed
 from hhtjax.steppers.stepper import State, Stepper, join_info
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
@@ -62,6 +62,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     solves_friction = True
     meets_events = True
     keeps_sparse = True
+    corrections = DEFAULT  # of the smooth start
 
     def begin(self, system, q, v, t, params, dt):
         """The state at the start, w0 = a0 = M^-1 Q."""
@@ -86,7 +87,28 @@ class GeneralizedAlpha(Controlled, Stepper):
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
         if self.options.start == "simple" or not system.positions:
             return after
-        return jumped(self, system.settled(new), before, after, (old, new), dt, answer)
+        system = system.settled(new)
+
+        def again(s, params, dt):
+            start = begin_friction(self, system, s.q, s.v, s.t, params, dt)
+            return smoothed_friction(self, system, start, params, dt)
+
+        anew = None if system.friction is None else again
+        return jumped(self, system, before, after, (old, new), dt, answer, anew)
+
+    def grown(self, system, state, params, dt):
+        """The state, or where what damps is too stiff for dt a smooth start from it."""
+        smooth = smoothed if system.friction is None else smoothed_friction
+        return grown(self, system.settled(params), state, params, dt, smooth)
+
+    def throws(self, system):
+        """Unless there are no positions, or the recursion is to be literal."""
+        return self.options.start != "simple" and system.positions > 0
+
+    @property
+    def starts_massless(self):
+        """Whether the start is a smooth one."""
+        return self.options.start != "simple"
 
     def corrects(self, system):
         """Whether a0 has the term of second order."""
@@ -139,6 +161,10 @@ class GeneralizedAlpha(Controlled, Stepper):
         if system.linear and system.friction is None:
             return factorized_once(self, system, params, dt)
         return linear_part(self, system, params, dt) or self.factorize
+
+    def factors_of(self, system, dt):
+        """The `Factors` of a linear system of constant matrices, for those who make them once for many runs."""
+        return factors_of(self, at_start(self), system, dt)
 
     def bind(self, system, params, dt):
         """The step; for a linear system its matrix is factorised here, once."""

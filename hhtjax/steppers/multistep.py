@@ -48,6 +48,10 @@ class Multistep(Stepper):
         memory = Memory(unknown[:, : q.size], unknown, jnp.zeros((), jnp.int32))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
+    def jumped(self, system, before, after, old, new, dt, answer):
+        """`after`, where held inputs jump, with nothing to remember: what was before has another w."""
+        return after._replace(memory=after.memory._replace(count=jnp.zeros_like(after.memory.count)))
+
     def bind(self, system, params, dt):
         """Newton on M(q1) w1 = Q(q1, v1, t1); the first two steps are the starter's."""
         r = partial(residual, system, params)
@@ -105,7 +109,8 @@ def houbolt(tolerance=1e-10, max_iterations=20) -> Houbolt:
     holds a rounding error of 1e-16 |q|/h. A first-order system gets BDF3, y1' = (11 y1 - 18 y + 9 y_-1 - 2 y_-2)/(6 h),
     of order 3.
 
-    The first two steps are those of `rosenbrock(rho_inf=0)`. Steps must be of one size.
+    The first two steps, and two behind each jump of a held input, are those of `rosenbrock(rho_inf=0)`. Steps must be
+    of one size.
 
     Args:
         tolerance, max_iterations: of Newton's iteration, as in `hht`.
@@ -133,8 +138,8 @@ def park(tolerance=1e-10, max_iterations=20) -> Park:
         M(q1) w1 = Q(q1, v1, t1)
 
     Order 2, unconditionally stable, spectral radius 0 at infinite frequency, with little damping at low ones: a damping
-    ratio of 8e-7 for omega h = 0.1. The first two steps are those of `rosenbrock(rho_inf=0)`. Steps must be of one
-    size.
+    ratio of 8e-7 for omega h = 0.1. The first two steps, and two behind each jump of a held input, are those of
+    `rosenbrock(rho_inf=0)`. Steps must be of one size.
 
     Args:
         tolerance, max_iterations: of Newton's iteration, as in `hht`.

@@ -1,5 +1,6 @@
 """How a step is solved: by one linearisation, or by Newton's iteration."""
 
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -37,15 +38,22 @@ def solve_and_keep(r, path, w, factorize, at=None, again=False):
 
 def linearized(f, x, linearize=jax.linearize):
     """f(x) and its tangent there; a word where a callback has no derivative."""
-    try:
+    with callbacks_named():
         return linearize(f, x)
+
+
+@contextmanager
+def callbacks_named():
+    """Says which derivatives are needed, where a callback has none."""
+    try:
+        yield
     except ValueError as error:
         if "callbacks do not support JVP" not in str(error):
             raise
         raise ValueError(
-            "this stepper needs the derivatives of the force (and mass and constraint) in q and v, `rosenbrock` in t; "
-            "`jax.pure_callback` and `io_callback`, which are called there, have none. Give them some by "
-            "`jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
+            "this stepper needs the derivatives of the force (and mass and constraint) in q and v, and in t where it "
+            "is `rosenbrock` or meets events; `jax.pure_callback` and `io_callback`, which are called there, have "
+            "none. Give them some by `jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
         ) from error
 
 

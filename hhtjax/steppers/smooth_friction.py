@@ -12,16 +12,16 @@ import jax.numpy as jnp
 
 from hhtjax.numerics.elimination import matvec
 from hhtjax.steppers.friction import begin_friction, direction, smooth_system
-from hhtjax.steppers.smooth_start import Found, corrected_by, damped_part, rate_of, smoothed
+from hhtjax.steppers.smooth_start import Found, corrected_by, damped_part, lag_left, rate_of, smoothed
 from hhtjax.systems.constraints import curvature
 from hhtjax.systems.friction import directions, own_rate
 from hhtjax.systems.friction_rows import depends, rows_of
 
 
-def smoothed_friction(method, system, s, params, h, moves=True, resolves=False, alone=False):
+def smoothed_friction(method, system, s, params, h, moves=True, resolves=False, alone=False, lags=False):
     """As `smoothed`."""
     free = system._replace(friction=None)
-    return smoothed(method, free, s, params, h, moves, resolves, alone, partial(finished, system.friction))
+    return smoothed(method, free, s, params, h, moves, resolves, alone, partial(finished, system.friction), lags)
 
 
 def finished(law, method, layer, inverse, drag, z, h, corrects):
@@ -58,5 +58,5 @@ def finished(law, method, layer, inverse, drag, z, h, corrects):
     wdot = None
     if corrects:
         s = base._replace(v=v, w=z[:n], L=L)
-        wdot = taken_off(layer.parts(rate_of(rubbing, s, inverse))[0], sticks)
-    return Found(v, z, wdot, friction=found.friction)
+        wdot = taken_off(layer.parts(rate_of(rubbing, s, inverse, h))[0], sticks)
+    return Found(v, z, wdot, friction=found.friction, lag=lag_left(layer, inverse))

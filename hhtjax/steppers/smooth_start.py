@@ -8,7 +8,7 @@ h^2 w (1/2 - beta/gamma) of it in q: any multiple of F/k. So a step begins behin
     M dv = h gamma Q(q + h (beta/gamma) dv, v + dv, t)     an implicit step of the velocity: by Newton, with S
     P = S^-1 h gamma (C + C^T)/2                           1 where damping is stiff, O(h) where the step resolves it
     v+ = v + P^4 [1 + (5 - 2 gamma) (1 - P)] dv
-    w <- w + S^-1 [Q(q, v+, t) - M w],  five times from 0
+    w <- w + S^-1 [Q(q, v+, t) - M w],  five times from 0 (see `Corrections`)
 
 Where the step resolves the motion v+ - v is O(h^5), and w is M^-1 Q but for O(h^5): order and error constants stay.
 Elsewhere w is bounded. Forces without dissipation, such as gyroscopic ones, have an antisymmetric C, and move no
@@ -35,28 +35,47 @@ from jax import lax
 
 from hhtjax.description import freeze, thaw
 from hhtjax.numerics.elimination import UNROLLED, diagonal, inverse, matvec
+from hhtjax.numerics.hoisted import hoisted
 from hhtjax.numerics.implicit_root import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
+from hhtjax.steppers.newton import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
-from hhtjax.systems.constraints import curvature, jacobian, reaction, violation
+from hhtjax.systems.constraints import answers, curvature, jacobian, reaction, violation
 from hhtjax.xla import linear_map, one_kernel, staged, traced
 
-POWERS, CORRECTIONS = 5, 5
+POWERS = 5
 ITERATIONS = 40  # of Newton's method, at most
+STEPS = 3  # of it, which are differentiated: from the second on Hessians are right
 LARGEST = 64  # unknowns whose matrix is inverted
 STIFF = 0.03  # part of a jump of the acceleration by which damping changes it within a step, and h resolves it
+LEAVES = 0.3  # part of its accelerations by which a motion changes them in a long step, so that this begins anew
 GAINED = 0.03  # part of the energy of a motion that a C may give it within a step, and still counts as a damper
+LATER = 1 / 16  # of h, for the rate of accelerations
 SHORTEST = 1e-3  # part of a Newton step below which there is no way on
+
+
+class Corrections(NamedTuple):
+    """w+ by `number` corrections, of which the last counts `last` times.
+
+    With R = 1 - S^-1 M, which is 1 where damping is stiff, w+ is (1 - R^5) M^-1 Q by default, and in that limit 1/h of
+    what v+ lacks."""
+
+    number: int
+    last: float
+
+
+DEFAULT = Corrections(5, 1.0)
 
 
 class Layer(NamedTuple):
     """What is left of the equations at a start, or at a jump.
 
     base: the state, with accelerations and multipliers to which unknown changes z = (dw, dL) are added. offset: what
-    rows are to be. X, V: displacement and velocity by a unit of dw. B, bend: of constraints, None without."""
+    rows are to be. X, V: displacement and velocity by a unit of dw. B, bend: of constraints, None without. M:
+    None where it is not formed."""
 
     system: Any
     params: Any
@@ -66,6 +85,7 @@ class Layer(NamedTuple):
     V: Any
     B: Any
     bend: Any
+    M: Any = None
 
     @classmethod
     def of(cls, method, system, params, h, base, offset=0.0):
@@ -112,53 +132,68 @@ class Layer(NamedTuple):
     def product(self, z):
         """The part of the rows that z enters at the start itself: M dw - B^T dL, B dw."""
         dw, dL = self.parts(z)
-        force = self.system.inertia(self.base.q, dw, self.base.t, self.params)
+        force = self.inertia(dw)
         return force if dL is None else jnp.concatenate([force - matvec(self.B.T, dL), matvec(self.B, dw)])
+
+    def full_mass(self):
+        """M at the start, as a matrix."""
+        return self.system.full_mass(self.base.q, self.base.t, self.params) if self.M is None else self.M
+
+    def inertia(self, w):
+        """M w at the start."""
+        return (
+            matvec(self.M, w) if self.M is not None else self.system.inertia(self.base.q, w, self.base.t, self.params)
+        )
 
     def zeros(self):
         """z = 0."""
         return jnp.zeros(self.system.size + self.system.num_constraints, self.base.v.dtype)
 
 
-def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=False, finish=None):
+def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=False, finish=None, lags=False):
     """The state from which the first step h goes, behind the layer at the start s.
 
     moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M.
-    alone: whether no kernel is around. finish: what is made of the implicit step, by default `finished`.
+    alone: whether no kernel is around. finish: what is made of the implicit step, by default `finished`. lags: whether
+    a keeps what it is away from w, as far as the step resolves that.
     """
-    damped, corrects = reads_velocity(system, s, params), method.corrects(system)
+    damped, corrects = reads_velocity(system, s, params), method.corrects(system) and not lags
     if not (system.num_constraints or damped or corrects):
         return s  # M^-1 Q throws a velocity, but nothing that a spring holds
+    size = 0 * h if resolves else h
+    # of a linear system outside of the kernel: a loop of the user's around short runs then does it once
+    known = factors(method, system, params, method.coefficients.gamma * size) if by_factors(method, system) else None
 
     def behind(s):
-        zero = s._replace(w=jnp.zeros_like(s.w), a=None, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
-        layer = Layer.of(method, system, params, 0 * h if resolves else h, zero)
-        found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished)
+        lag = s.a - s.w if lags else None
+        zero = s._replace(w=jnp.zeros_like(s.w), a=lag, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
+        layer = Layer.of(method, system, params, size, zero)
+        found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished, known)
         w, L = layer.parts(found.z)
         if finish is None and not resolves:  # M^-1 Q as it is, where nothing damps
             w, L = choose(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
         a = w if found.wdot is None else method.corrected(system, found.v, w, found.wdot, h)
+        a = a if found.lag is None else a + found.lag
         s1 = s._replace(v=found.v, w=w, a=a, L=L)
         return s1 if found.friction is None else s1._replace(friction=found.friction)
 
     return one_kernel(behind, s, around=True) if alone else behind(s)
 
 
-def jumped(method, system, s, after, both, h, answer):
+def jumped(method, system, s, after, both, h, answer, anew=None):
     """The state behind a jump of held inputs: `after`, but where what damps is stiff.
 
-    That is so where the velocity of an explicit step, h gamma dw, changes the accelerations by more than a part of dw.
+    anew: the start from s with other params and h, in the place of changes to s: of dry friction, which is not linear.
     """
-    new, dw, V = both[1], after.w - s.w, method.coefficients.gamma * h
-    if system.friction is not None or not reads_velocity(system, s, new):
+    new = both[1]
+    if not reads_velocity(system, s, new):
         return after
-    force = system.force(s.q, s.v + system.with_internal(V * dw, jnp.zeros_like(dw)), s.t, new)
-    change = answer(force - system.force(s.q, s.v, s.t, new))
-    D = system.with_ones(diagonal(system.mass(s.q, s.t, new)))
-    stiff = jnp.sum(D * change**2) > STIFF**2 * jnp.sum(D * dw**2)
+    stiff = is_stiff(method, system, s, new, h, after.w - s.w, answer)
 
     def smooth(_, s, both, h):
         old, new = map(thaw, both)
+        if anew is not None:
+            return anew(s, new, h)
         layer = Layer.of(method, system, new, h, s._replace(a=None, friction=None, memory=None))
         layer = layer._replace(offset=layer._replace(params=old).rows(layer.base))
         v, z, *_ = without_layer(method, layer, h, True, False, finished)
@@ -169,39 +204,93 @@ def jumped(method, system, s, after, both, h, answer):
     return seldom(smooth, stiff, after, s, freeze(both), h)
 
 
+def grown(method, system, s, params, h, smooth=smoothed):
+    """The state from which a step h goes that is far longer than those before.
+
+    Where accelerations change by LEAVES of them within h, and damping is stiff, it is that of a smooth start: short
+    steps have left what long ones cannot follow. Elsewhere, as on a slow manifold, it is s."""
+    if not reads_velocity(system, s, params):
+        return s
+    answer = answers(system, s.q, s.t, params, method.redundant)
+    q, v = system.move(s.q, h * s.v), s.v + system.with_internal(h * s.w, jnp.zeros_like(s.w))
+    change = answer(system.force(q, v, s.t + h, params) - system.force(s.q, s.v, s.t, params))[0]
+    leaves = is_part(system, s, params, change, s.w, LEAVES)
+    leaves = leaves & is_stiff(method, system, s, params, h, s.w, lambda dQ: answer(dQ)[0], LEAVES)
+
+    def begin(s, params, h):
+        return smooth(method, system, s, thaw(params), h, lags=True)
+
+    return seldom(begin, leaves, s, freeze(params), h)
+
+
+def is_stiff(method, system, s, params, h, w, answer, part=STIFF):
+    """Whether the velocity of an explicit step, h gamma w, changes the accelerations by more than a part of w."""
+    v = s.v + system.with_internal(method.coefficients.gamma * h * w, jnp.zeros_like(w))
+    change = answer(system.force(s.q, v, s.t, params) - system.force(s.q, s.v, s.t, params))
+    return is_part(system, s, params, change, w, part)
+
+
+def is_part(system, s, params, change, w, part):
+    """Whether a change of accelerations is more than a part of these, in the norm of energy."""
+    D = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
+    return jnp.sum(D * change**2) > part**2 * jnp.sum(D * w**2)
+
+
 def reads_velocity(system, s, params):
     """Whether the force depends on v."""
     return traced(lambda v: system.force(s.q, v, s.t, params), s.v).reads(None)[0]
 
 
-def without_layer(method, layer, h, damped, corrects, finish):
-    """What `finish` makes of the implicit step: a `Found`.
+def by_factors(method, system):
+    """Whether the matrix of the implicit step is one of a linear system that is factorised, not inverted."""
+    return system.linear and (system.size > UNROLLED or method.options.solve is not None)
 
-    The value comes from matrices, where these are small, and traces the force as seldom as can be, for programs that
-    compile in less time; derivatives from what is differentiable.
+
+def factors(method, system, params, V):
+    """What the matrix of the implicit step is factorised by. V: h gamma."""
+    if system.factors is not None:
+        system = system._replace(factors=system.factors._replace(step=system.factors.start))
+    return at_start(method).factorization(system, params, V / method.coefficients.gamma)
+
+
+def at_start(method):
+    """The method whose step the implicit one is: Newmark's."""
+    c = method.coefficients
+    return replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
+
+
+def without_layer(method, layer, h, damped, corrects, finish, factorize=None):
+    """What `finish` makes of the implicit step: a `Found`. factorize: `factors`, where they are known.
+
+    Small matrices are formed, once: what is differentiated then is products of these, and the force in one place.
     """
     options = method.options
 
     def by_maps(method, data, h):
-        known, c = layer.with_data(data), method.coefficients
-        newmark = replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
-        factorize = newmark.factorization(known.system, known.params, known.V / c.gamma)
-        z = known.zeros() if known.system.linear or not damped else root(known, factorize)
-        inverse, z, at, tangent = newton_step(known, factorize, z)
-        drag, damps = damping(known, factorize, at, tangent)
+        known = layer.with_data(data)
+        how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
+        z = known.zeros() if known.system.linear or not damped else root(known, how)
+        inverse, z, at, tangent = newton_step(known, how, z)
+        drag, damps = damping(known, how, at, tangent)
         return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
 
-    def by_matrices(method, data, h):
+    def by_matrices(find, invert, method, data, h):
         known = layer.with_data(data)
-        z, inverse, C = expanded(known, damped)
+        if known.system.matrices is None:
+            known = known._replace(M=known.system.full_mass(known.base.q, known.base.t, known.params))
+        if known.system.linear or not damped:
+            z, S, C = expanded(known, invert)
+        else:
+            z, S, C = find(known)
         drag = Drag(partial(matvec, C), dissipates(known, C)) if damped else None
-        return finish(method, known, partial(matvec, inverse), drag, z, h, corrects)._replace(damps=jnp.any(C != 0))
+        return finish(method, known, partial(matvec, S), drag, z, h, corrects)._replace(damps=jnp.any(C != 0))
 
     data = layer.data()
     large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
     if large or options.solve is not None or options.redundant is not None:
         return by_maps(method, data, h)
-    return derivative_at_need(by_maps, by_matrices, method, data, h)
+    moving = partial(by_matrices, differentiable, differentiable_inverse)
+    return derivative_at_need(moving, partial(by_matrices, searched, inverse), method, data, h)
 
 
 class Drag(NamedTuple):
@@ -213,14 +302,15 @@ class Drag(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Behind a layer: v+, the changes z = (dw, dL), dw/dt where it is asked for, whether anything damps at all, and
-    dry friction where there is some."""
+    """Behind a layer: v+, the changes z = (dw, dL), dw/dt where it is asked for, whether anything damps at all, dry
+    friction where there is some, and a - w where it is kept."""
 
     v: Any
     z: Any
     wdot: Any = None
     damps: Any = None
     friction: Any = None
+    lag: Any = None
 
 
 def finished(method, layer, inverse, drag, z, h, corrects):
@@ -229,50 +319,74 @@ def finished(method, layer, inverse, drag, z, h, corrects):
     if drag is not None:
         v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
         bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
-    z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend))
+    z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend), method.corrections)
+    lag = lag_left(layer, inverse)
     if not corrects:
-        return Found(v, z)
+        return Found(v, z, lag=lag)
     dw, dL = layer.parts(z)
     base = layer.base
     s = base._replace(v=v, w=base.w + dw, L=None if dL is None else base.L + dL)
-    return Found(v, z, layer.parts(rate_of(layer, s, inverse))[0])
+    return Found(v, z, layer.parts(rate_of(layer, s, inverse, h))[0])
 
 
-def expanded(layer, damped):
-    """z behind the implicit step, and the inverse of the matrix of the step and C there, by one loop."""
+def expanded(layer, invert):
+    """What Newton's step from 0 leads to, the inverse of the matrix of the step there, and C."""
+    z = layer.zeros()
+    dz, _, (inverse, C) = expansion(layer, z, invert)
+    return z - dz, inverse, C
+
+
+def expansion(layer, z, invert=inverse):
+    """Newton's step at z, the energy that it is worth, and the inverse and C, from one loop over columns."""
     system, base, n = layer.system, layer.base, layer.system.size
+    dw, dL = layer.parts(z)
 
     def force(x, dv, dw):
         at = State(base.t, system.move(base.q, x), base.v + layer.located(dv), base.w + dw)
         return residual(system, layer.params, at)
 
-    def around(z):
-        dw, dL = layer.parts(z)
-        value, tangent = jax.linearize(force, layer.X * dw, layer.V * dw, dw)
+    value, tangent = linearized(lambda x: force(*x), (layer.X * dw, layer.V * dw, dw))
+    unit, none = jnp.eye(n, dtype=z.dtype), jnp.zeros((n, n), z.dtype)
+    directions = jnp.concatenate([layer.X * unit, none]), jnp.concatenate([none, unit]), jnp.concatenate([unit, none])
+    columns = lax.map(tangent, directions)
+    C = columns[n:].T
+    A = columns[:n].T + layer.V * C
+    if layer.B is not None:
+        rates = matvec(layer.B, base.w + dw) + layer.bend
+        value = jnp.concatenate([value - matvec(layer.B.T, base.L + dL), rates])
+        A = jnp.block([[A, -layer.B.T], [layer.B, jnp.zeros((len(layer.B), len(layer.B)), A.dtype)]])
+    S, value = invert(A), value - layer.offset
+    dz = matvec(S, value)
+    return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), (S, (C + C.T) / 2)
 
-        def columns(y):
-            return tangent(layer.X * y[:n], y[n:], y[:n])
 
-        J = jax.vmap(columns, out_axes=1)(jnp.eye(2 * n, dtype=z.dtype))
-        C = J[:, n:]
-        A = J[:, :n] + layer.V * C
-        if layer.B is not None:
-            value = jnp.concatenate([
-                value - matvec(layer.B.T, base.L + dL), matvec(layer.B, base.w + dw) + layer.bend
-            ])  # fmt: skip
-            A = jnp.block([[A, -layer.B.T], [layer.B, jnp.zeros((len(layer.B), len(layer.B)), A.dtype)]])
-        solve = inverse(A)
-        value = value - layer.offset
-        dz = matvec(solve, value)
-        return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), solve, (C + C.T) / 2
+def searched(layer):
+    """The same as `expanded` where Newton's method ends."""
+    n, N = layer.system.size, layer.zeros().size
+    empty = jnp.zeros((N, N), layer.base.v.dtype), jnp.zeros((n, n), layer.base.v.dtype)
+    z, dz, (inverse, C) = improved(partial(expansion, layer), layer.zeros(), empty)
+    return z - dz, inverse, C
 
-    z = layer.zeros()
-    if system.linear or not damped:
-        dz, _, solve, C = around(z)
-    else:
-        empty = jnp.zeros((z.size, z.size), z.dtype), jnp.zeros((n, n), z.dtype)
-        z, dz, solve, C = improved(around, z, *empty)
-    return z - dz, solve, C
+
+def differentiable(layer):
+    """The same, with derivatives: those of Newton's step where it ends, which are exact of order 2^k - 1 after k."""
+    find, constants = hoisted(lambda: searched(layer))
+    found = lax.stop_gradient(find(lax.stop_gradient(constants)))
+
+    def again(_, held):
+        dz, _, more = expansion(layer, held[0], differentiable_inverse)
+        return held[0] - dz, *more
+
+    moved = lax.fori_loop(0, STEPS, again, found)
+    return jax.tree.map(lambda value, x: value + (x - lax.stop_gradient(x)), found, moved)
+
+
+def differentiable_inverse(A):
+    """A^-1 with derivatives, of two steps of Newton and Schulz: X <- 2 X - X A X."""
+    S = X = inverse(A)
+    for _ in range(2):
+        X = 2 * X - X @ A @ X
+    return S + (X - lax.stop_gradient(X))
 
 
 def improved(around, z, *more):
@@ -302,7 +416,7 @@ def improved(around, z, *more):
 def newton_step(layer, factorize, z):
     """The solve with the matrix at z, the z that it leads to, the state there, and the tangent of the rows."""
     at, along = jax.linearize(layer.path, z)
-    value, tangent = jax.linearize(layer.rows, at)
+    value, tangent = linearize_rows(layer.rows, at)
     inverse = factorize_map(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
     return inverse, z - inverse(value), at, tangent
 
@@ -333,8 +447,10 @@ def dissipates(layer, C):
     """
     if layer.system.matrices is not None:
         return None
-    base, n = layer.base, layer.system.size
-    A = lax.stop_gradient(layer.system.full_mass(base.q, base.t, layer.params) + layer.V / GAINED * C)
+    n = layer.system.size
+    moves = layer.located(jnp.ones(n, C.dtype))
+    C = moves[:, None] * C * moves[None, :]  # internal states keep theirs, whatever they do
+    A = lax.stop_gradient(layer.full_mass() + layer.V / GAINED * C)
     unit = jnp.sqrt(jnp.maximum(jnp.abs(diagonal(A)), float(jnp.finfo(A.dtype).tiny)))
     A, least = A / unit[:, None] / unit[None, :], n * float(jnp.finfo(A.dtype).eps)
 
@@ -357,7 +473,7 @@ def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
         x, _, fine = carry
         pull = layer.V * layer.located(drag.of(x))
         if drag.dissipates is None:
-            given = layer.system.inertia(layer.base.q, x, layer.base.t, layer.params)
+            given = layer.inertia(x)
             fine = fine & (jnp.sum(x * pull) >= -GAINED * jnp.sum(x * given))
         return project(response(layer, inverse, pull)), x, fine
 
@@ -372,20 +488,39 @@ def response(layer, inverse, force):
     return layer.located(inverse(jnp.pad(force, (0, layer.zeros().size - n)))[:n])
 
 
-def corrected_by(layer, inverse, left):
+def corrected_by(layer, inverse, left, corrections=DEFAULT):
     """z with product(z) = -left, as far as the corrections go."""
 
     def correct(_, z):
         return z - inverse(left + layer.product(z))
 
-    return lax.fori_loop(0, CORRECTIONS, correct, layer.zeros())
+    number, last = corrections
+    if last == 1:
+        return lax.fori_loop(0, number, correct, layer.zeros())
+
+    def remember(i, both):
+        return correct(i, both[0]), both[0]
+
+    z, before = lax.fori_loop(0, number, remember, (layer.zeros(), layer.zeros()))
+    return before + last * (z - before)
 
 
-def rate_of(layer, s, inverse):
-    """(dw/dt, dL/dt) at the state s, by the same corrections."""
+def lag_left(layer, inverse):
+    """Of a - w, which the layer's state holds as its a, what the step resolves."""
+    lag = layer.base.a
+    if lag is None:
+        return None
+    z = jnp.pad(lag, (0, layer.zeros().size - lag.size))
+    return layer.parts(corrected_by(layer, inverse, -layer.product(z)))[0]
+
+
+def rate_of(layer, s, inverse, h):
+    """(dw/dt, dL/dt) at the state s, by the same corrections: a difference, over far less than h, for what is to be of
+    first order in h. A derivative would be one of third order of the constraints, and long to compile."""
     system, params = layer.system, layer.params
 
-    def rows(q, v, t):
+    def rows(later):
+        q, v, t = system.move(s.q, later * s.v), s.v + layer.located(later * s.w), s.t + later
         force = system.inertia(q, s.w, t, params) - system.force(q, v, t, params)
         if layer.B is None:
             return force
@@ -393,8 +528,8 @@ def rate_of(layer, s, inverse):
         _, bend = jax.jvp(lambda q, v, t: violation(system, q, v, t, params)[1], (q, v, t), along)
         return jnp.concatenate([force - reaction(system, q, t, params, s.L), bend])
 
-    along = system.rate(s.q, s.v), s.w, jnp.ones_like(s.t)
-    return corrected_by(layer, inverse, jax.jvp(rows, (s.q, s.v, s.t), along)[1])
+    before, after = lax.map(rows, jnp.stack([jnp.zeros_like(h), LATER * h]))
+    return corrected_by(layer, inverse, (after - before) / (LATER * h))
 
 
 def root(layer, factorize):
@@ -406,7 +541,7 @@ def root(layer, factorize):
 
     def search(z):
         def around_it(z):
-            value, tangent = jax.linearize(f, z)
+            value, tangent = linearized(f, z)
             dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
             return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
 

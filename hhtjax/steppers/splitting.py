@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from hhtjax.description import is_concrete
 from hhtjax.numerics.elimination import matvec
 from hhtjax.numerics.linear_solve import solve
+from hhtjax.numerics.seldom import choose
 from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
 from hhtjax.steppers.options import check_options, require_alpha
 from hhtjax.steppers.residual import hht_coefficients
@@ -44,12 +45,41 @@ class OperatorSplitting(Stepper):
 
     def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
         """The state from which the first step goes, as of the `hht` family."""
-        hht = GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
-        K, C, _ = state.memory
-        s = hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves, alone)
+        s = self.hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves, alone)
+        return self.begun(system, s, params, state.memory)
+
+    def begun(self, system, s, params, memory):
+        """A state of the `hht` family as one of this method."""
         left = system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)  # not 0 of what is stiff
         P = self.weighted_force(system, s.q, s.v, s.t, params) + left
-        return s._replace(a=None, memory=Memory(K, C, P))
+        return s._replace(a=None, memory=memory._replace(P=P))
+
+    def throws(self, system):
+        """Unless there are no positions."""
+        return system.positions > 0
+
+    def grown(self, system, state, params, dt):
+        """As of the `hht` family."""
+        s = self.hht.grown(system, state._replace(a=state.w, memory=None), params, dt)
+        return choose(jnp.any(s.v != state.v), self.begun(system, s, params, state.memory), state)
+
+    def jumped(self, system, before, after, old, new, dt, answer):
+        """The same where held inputs jump, of the changes."""
+        K, C, P = before.memory
+        both = before._replace(memory=None), after._replace(memory=None)
+        s = self.hht.jumped(system, *both, old, new, dt, answer)
+
+        def unweighted(s, params):
+            return system.force(s.q, s.v, s.t, params) - self.weighted_force(system, s.q, s.v, s.t, params)
+
+        change = system.inertia(s.q, s.w - before.w, s.t, new)
+        P = P + change - (unweighted(s, new) - unweighted(before, old))
+        return s._replace(memory=Memory(K, C, P))
+
+    @property
+    def hht(self):
+        """The method of which it is, on linear systems."""
+        return GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
 
     def weighted_force(self, system, q, v, t, params):
         """P, what alpha weighs: Q, or in the modified form Q at rest."""

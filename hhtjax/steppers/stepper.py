@@ -12,6 +12,7 @@ from hhtjax.description.presentation import known, shown
 from hhtjax.systems import held, kinematics
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.system import require_masses
 from hhtjax.systems.system import require_system as require_system
 
 
@@ -141,6 +142,7 @@ class Stepper(Description):
     resizes = False  # whether `resized` does anything
     estimate_order: int | None = None  # power of h with which the estimated error of a step falls; None without
     dense_term = False  # whether its memory is what dense output adds to cubics
+    starts_massless = False  # whether it starts without dividing by M
     redundant: str | None = None  # how constraints that depend on each other are solved
 
     def begin(self, system, q, v, t, params, dt) -> State:
@@ -158,6 +160,18 @@ class Stepper(Description):
         """`after`, the state where held inputs jump, with M dw = Q(new) - Q(old), or what else a step dt asks for;
         `before`: the same without. answer: dQ -> dw."""
         return after
+
+    def throws(self, system):
+        """Whether it leaves in q what does not fit a step, such as one far longer than those before."""
+        return False
+
+    def grown(self, system, state, params, dt):
+        """The state from which such a step goes, where `throws` says so: of the method and the state for dt."""
+        raise NotImplementedError
+
+    def factors_of(self, system, dt) -> Any:
+        """What is factorised once for many runs of a linear system of constant matrices, as `FlatSystem.factors`."""
+        return None
 
     def bind(self, system, params, dt):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
@@ -220,6 +234,8 @@ def require_stepper(caller, stepper):
 def require_capable(caller, system, stepper, q0, v0):
     """An error for a constraint, a rotation, internal states or friction that the stepper does not know."""
     name = type(stepper).__name__
+    if not stepper.starts_massless:
+        require_masses(caller, system, 'take hht(), or another of its family, with a smooth start, not start="simple"')
     if system.constraint is not None and not stepper.solves_constraints:
         raise NotImplementedError(
             f"{caller}: {name} cannot solve the `constraint`; use hht() or another of its family."

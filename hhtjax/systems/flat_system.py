@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 
-from hhtjax.numerics.elimination import factorize, matvec
-from hhtjax.numerics.linear_solve import solver
+from hhtjax.checks import describe
+from hhtjax.numerics.elimination import by_factors, factorize, matvec
+from hhtjax.numerics.linear_solve import reuse, solver
 from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
@@ -46,6 +47,8 @@ class FlatSystem(NamedTuple):
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
     settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
     diagonals: Callable | None = None  # params -> M, C, K (None where absent), where all of them are diagonals (n,)
+    massless: Any = None  # G with M G M = M, where M is singular
+    factors: Any = None  # `Factors` for the steps of a run, where they are known before it
 
     def settled(self, params):
         """What `settle` gives, where there is something to settle."""
@@ -78,6 +81,10 @@ class FlatSystem(NamedTuple):
 
     def mass_solver(self, M, factorize=factorize):
         """The function Q -> M^-1 Q, and what works on z as it is; factorised once."""
+        if self.massless is not None:
+            return partial(self._of_positions, partial(matvec, jnp.asarray(self.massless).astype(M.dtype)))
+        if self.factors is not None and self.factors.mass is not None:
+            factorize = reuse(factorize, by_factors(self.factors.mass))
         inverse = (lambda Q: Q / M) if M.ndim == 1 else solver(M, factorize)
         return partial(self._of_positions, inverse)
 
@@ -132,6 +139,15 @@ class FlatSystem(NamedTuple):
         return jnp.concatenate([f(x[:n]), x[n:]]) if n else x
 
 
+class Factors(NamedTuple):
+    """Of a linear system of constant matrices, by `panels.lu`: of M (None of a diagonal), of the matrices of the start
+    and of the step."""
+
+    mass: Any
+    start: Any
+    step: Any
+
+
 class Local(NamedTuple):
     """A nonlinear force beside a linear system."""
 
@@ -183,6 +199,7 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
         product = partial(_flat_product, system, unravel, unravel_rates, dtype)
         flat = flat._replace(product=consistent(product))
     if linear:
+        flat = flat._replace(massless=system.massless)
         flat = with_known_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
         flat, q, v = _with_internal(system, flat, q, v0, z0)
@@ -249,6 +266,10 @@ def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):
             if matrix is not None:
                 check_matrix(caller, name, matrix, n, dtype, params)
     else:
+        if getattr(system.mass, "is_lagrangian", False):
+            L = evaluate(caller, "lagrangian", system.mass.lagrangian, q0, v0, t0, params)
+            if getattr(L, "shape", None) != ():
+                raise ValueError(f"{caller}: `lagrangian` must give a scalar, of shape (); received {describe(L)}.")
         at = (q0, *timed(system.mass, 1, t0), params) if callable(system.mass) else ()
         check_matrix(caller, "mass", system.mass, n, dtype, *at)
     if linear and system.load is not None:

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import all_concrete
+from hhtjax.description import all_concrete, freeze, thaw
+from hhtjax.numerics.seldom import seldom
 from hhtjax.systems.constraints import answers
 from hhtjax.systems.friction_rows import depends, held_back
 from hhtjax.systems.sampled import SLOP, Sampled
@@ -89,7 +90,13 @@ def entered(stepper, system, params, dt, last, s):
     if not holds(params):
         return params, s
     now = held_at(params, s.t + dt / 2)
-    return now, jump(stepper, system, s, before(params, s.t, last), now, dt)
+    return now, jump(stepper, system, s, before(params, s.t, last), now, dt, passed(params, s.t, last, dt))
+
+
+def passed(params, t, last, dt):
+    """Whether a step dt from t has another sample of a held input than the one before, last, which ended there."""
+    held = filter(_is_held, jax.tree.leaves(params, is_leaf=_is_held))
+    return jnp.any(jnp.stack([x.place_before(t, last) != x.place(t + dt / 2) for x in held]))
 
 
 def jump_after(params, t):
@@ -100,10 +107,22 @@ def jump_after(params, t):
     return jnp.min(jnp.stack([*times, jnp.full_like(t, jnp.inf)]))
 
 
-def jump(stepper, system, s, old, new, h):
+def jump(stepper, system, s, old, new, h, here=None):
     """The state with the accelerations and multipliers that belong to the new params, for a step h.
 
-    What damps far too stiffly for the step changes its velocity, too: see `Stepper.jumped`."""
+    What damps far too stiffly for the step changes its velocity, too: see `Stepper.jumped`. here: whether there is a
+    jump at all, as far as that is known; not whether values differ, as derivatives in equal ones are those of a jump.
+    """
+
+    def behind(s, old, new, h):
+        return behind_jump(stepper, system, s, thaw(old), thaw(new), h)
+
+    both = freeze(old), freeze(new)
+    return behind(s, *both, h) if here is None else seldom(behind, here, s, *both, h)
+
+
+def behind_jump(stepper, system, s, old, new, h):
+    """The state behind a jump."""
     dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
     answer = answers(system, s.q, s.t, new, stepper.redundant)
     dw, dL = answer(dQ)

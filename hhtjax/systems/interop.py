@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import Description, as_float, thaw
+from hhtjax.description import Description, as_float, current, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.constraints import acceleration_and_multipliers
@@ -183,15 +183,20 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
         require_consistent(caller, system, q0, v0, t0, params, z0=z0)
     flat = flat_ode(system, q0, v0, z0)
     packed, unpack = _packed(params)
-    rate, jacobian = _compiled(flat.rate, unpack)
+    functions = [f for f in vars(system).values() if callable(f)]
+    state, programs = [], ()  # of what the functions read
 
-    def call(program, t, y):
-        return np.asarray(program(np.float64(t), y, packed))
+    def call(which, t, y):
+        nonlocal state, programs
+        now = list(map(current, functions))
+        if not programs or now != state:
+            state, programs = now, _compiled(flat.rate, jax.tree.structure(flat.rate), unpack)
+        return np.asarray(programs[which](np.float64(t), y, packed))
 
     def unravel(y):
         return flat.unravel(jnp.asarray(y)) if np.ndim(y) == 1 else jax.vmap(flat.unravel)(jnp.asarray(y).T)
 
-    return ScipyRHS(partial(call, rate), np.asarray(flat.y0), unravel, partial(call, jacobian))
+    return ScipyRHS(partial(call, 0), np.asarray(flat.y0), unravel, partial(call, 1))
 
 
 def _ode(system, t, y, params):
@@ -243,8 +248,9 @@ def _same(x):
 
 
 @lru_cache(maxsize=64)
-def _compiled(rate, unpack):
-    """Right-hand side and Jacobian as compiled functions of (t, y, packed params)."""
+def _compiled(rate, structure, unpack):
+    """Right-hand side and Jacobian as compiled functions of (t, y, packed params). structure: of rate."""
+    rate = jax.tree.unflatten(structure, jax.tree.leaves(rate))  # with what stands for its functions
 
     def program(t, y, packed):
         return rate(t, y, thaw(unpack(packed)))

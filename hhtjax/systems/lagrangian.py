@@ -5,7 +5,11 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jax.flatten_util import ravel_pytree
+
+from hhtjax.xla import traced
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,27 @@ class LagrangianInertia:
     def __call__(self, q, w, t, params):
         q, w = (jax.tree.map(jnp.asarray, x) for x in (q, w))
         zero = jax.tree.map(jnp.zeros_like, w)
-        momentum = jax.grad(lambda v: self.lagrangian(q, v, t, params))
-        return jax.jvp(momentum, (zero,), (w,))[1]
+        return product_at(self.lagrangian, q, zero, w, t, params)
+
+
+def product_at(lagrangian, q, v, w, t, params):
+    """d2L/dv2 w at a velocity."""
+    momentum = jax.grad(lambda v: lagrangian(q, v, t, params))
+    return jax.jvp(momentum, (v,), (w,))[1]
+
+
+def mass_reads_velocity(lagrangian, q, v, t, params):
+    """Whether d2L/dv2 depends on v, so that L is none of a mass matrix; looked at where v enters it at all."""
+    flat, unravel = ravel_pytree(v)
+    some = jnp.asarray(1 + 0.618 * np.arange(flat.size) % 0.5, flat.dtype)
+
+    product = traced(lambda v: ravel_pytree(product_at(lagrangian, q, unravel(v), unravel(some), t, params))[0], flat)
+    if not product.reads(None)[0]:
+        return jnp.array(False)
+    rest, far = product(jnp.zeros_like(flat)), 1 + jnp.max(jnp.abs(flat))
+    changes = jnp.stack([product(x) - rest for x in (flat, flat + 0.01 * far * some, flat - far * some)])
+    rounding = max(1e-6, 1e3 * float(jnp.finfo(flat.dtype).eps))
+    return lax.stop_gradient(jnp.any(jnp.abs(changes) > rounding * jnp.max(jnp.abs(rest))))  # not where it is NaN
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from hhtjax.description import Description, is_array
 from hhtjax.numerics.elimination import matvec
 from hhtjax.numerics.sparse_matrix import Sparse, of_dense
 from hhtjax.systems.friction import require_friction
-from hhtjax.systems.matrices import as_matrix, constant_matrix, require_mass
+from hhtjax.systems.matrices import UNDAMPED, as_matrix, constant_matrix, massless_inverse, require_mass
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -30,8 +30,12 @@ class LinearSystem(Description):
             K may be None. Rows follow `jax.flatten_util.ravel_pytree(v)`. Sparse matrices of more than 300 rows stay
             sparse, are factorised by SciPy's SuperLU, and solved with in each step by the `hht` family, `rosenbrock`
             and `rowda`, with the same derivatives; smaller ones become dense, or diagonals.
-            M must be regular, as the acceleration at the start is M^-1 times the forces: for coordinates without mass
-            take a `System` with a `constraint`, or internal states (`hhtjax.systems`, coordinates without mass).
+            M may be singular where M and C are arrays, and C damps all coordinates without mass, such as the node
+            between a spring and a damper: with the `hht` family, whose smooth start never divides by M, and fixed
+            steps, without events, held inputs and friction. q is of order 2, v as well but for alpha = 0, where that
+            of a weak damper swings. Accelerations of such coordinates are 0 at the start, and tend to the right ones
+            as the spectral radius at infinity decays. A coordinate without mass on springs alone follows the others,
+            K22 q2 = f2 - K21 q1: eliminate it, or give it a damper, as of 1e-6 h K22.
         force: f, `force(t, params)`, a pytree structured like v; None for free vibration.
         nonlinear: g, `nonlinear(q, v, t, params)`, a pytree structured like v. With `at`: of the coordinates q[at] and
             v[at], (k,) each, the forces (k,) on these.
@@ -73,6 +77,7 @@ class LinearSystem(Description):
     at: tuple[int, ...] | None
     friction: Callable | None
     sliding: Callable | None
+    massless: Any  # G with M G M = M of a singular M, else None
 
     def __init__(self, M, C=None, K=None, force=None, nonlinear=None, at=None, friction=None, sliding=None):
         for name, matrix in (("M", M), ("C", C), ("K", K)):
@@ -94,8 +99,12 @@ class LinearSystem(Description):
         if any(isinstance(getattr(self, name), Sparse) for name in known):
             for name in known:
                 object.__setattr__(self, name, of_dense(getattr(self, name)))
-        if "M" in known:
-            require_mass("LinearSystem", "M", self.M)
+        massless = massless_inverse(self.M, self.C) if "M" in known else None
+        object.__setattr__(self, "massless", massless)
+        if "M" in known and massless is None:
+            require_mass("LinearSystem", "M", self.M, way=UNDAMPED)
+        if massless is not None and friction is not None:
+            raise NotImplementedError("LinearSystem: with a singular `M`, leave `friction` out.")
         if force is not None:
             require_function("LinearSystem", "force", force, "force(t, params)")
         if nonlinear is not None:
@@ -129,6 +138,13 @@ class LinearSystem(Description):
         new = object.__new__(LinearSystem)
         for name, value in {**vars(self), "M": M, "C": C, "K": K}.items():
             object.__setattr__(new, name, value)
+        return new
+
+    def alone(self):
+        """The matrices without any force."""
+        new = object.__new__(LinearSystem)
+        for name in vars(self):
+            object.__setattr__(new, name, getattr(self, name) if name in "MCK" else None)
         return new
 
     def linear_force(self, q, v, t, params):

@@ -131,10 +131,40 @@ def _dense(caller, name, matrix):
     return entries.toarray()
 
 
-def require_mass(caller, name, M, massless=False):
+UNDAMPED = (
+    "In a LinearSystem a coordinate without mass has to be damped, however weakly, by a constant array `C`. One with "
+    "springs alone follows the others, K22 q2 = f2 - K21 q1: eliminate it, or give it a damper, as of 1e-6 h K22"
+)
+
+
+def massless_inverse(M, C):
+    """G with M G M = M, of a singular M where C damps all coordinates without mass; None of others, and of tracers."""
+    if isinstance(M, Sparse) or not is_array(C) or not (is_concrete(M) and is_concrete(C)) or len(M) > LARGEST_CHECKED:
+        return None
+    M, C = (np.diag(x) if x.ndim == 1 else np.asarray(x) for x in (M, C))
+    d = np.diagonal(M)
+    rounding = 4 * len(M) * float(np.finfo(np.result_type(M, np.float32)).eps)
+    if np.min(d) < 0 or np.max(d) == 0 or np.max(np.abs(M - M.T)) > SYMMETRIC * np.max(d):
+        return None
+    unit = 1 / np.sqrt(np.where(d == 0, 1, d))
+    values, vectors = np.linalg.eigh(unit[:, None] * M * unit)
+    rest = values <= rounding
+    if not np.any(rest) or values[0] < -rounding:
+        return None
+    N = unit[:, None] * vectors[:, rest]
+    damped = N.T @ (C + C.T) @ N
+    size = np.diagonal(damped)
+    if np.min(size) <= 0 or np.linalg.eigvalsh(damped / np.sqrt(np.outer(size, size)))[0] <= rounding:
+        return None
+    W = unit[:, None] * vectors[:, ~rest]
+    return W / values[~rest] @ W.T
+
+
+def require_mass(caller, name, M, massless=False, way=MASSLESS):
     """An error for a constant M that is not symmetric, or not positive definite; with constraints it may be singular.
 
-    In units in which its diagonal is 1. Tracers pass, and what is too large for a look at each run.
+    In units in which its diagonal is 1. Tracers pass, and what is too large for a look at each run. way: what to do
+    where it is singular.
     """
     if isinstance(M, Sparse):
         return _require_sparse_mass(caller, name, M)
@@ -152,7 +182,7 @@ def require_mass(caller, name, M, massless=False):
     if smallest < -rounding or (not massless and smallest <= rounding):
         if smallest < -rounding:
             raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is not.")
-        raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is singular. {MASSLESS}.")
+        raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is singular. {way}.")
 
 
 def _require_sparse_mass(caller, name, M):
@@ -166,7 +196,7 @@ def _require_sparse_mass(caller, name, M):
         raise ValueError(f"{caller}: `{name}` must be symmetric; received one that differs from its transpose.")
 
 
-UNSYMMETRIC, INDEFINITE = 1, 2  # what mass_flaw finds
+UNSYMMETRIC, INDEFINITE, OF_VELOCITY = 1, 2, 3  # what may be wrong with a mass
 
 
 def mass_flaw(M, massless):

@@ -69,11 +69,19 @@ class Sampled:
 
     def held_before(self, t, dt):
         """Of a held input the value that a step dt, or shorter, had which ended at t."""
+        return self.polynomials[self.place_before(t, dt), 0]
+
+    def place(self, t):
+        """Of a held input which of its values is that at t."""
+        return (self._uniform if self.times is None else self._find)(t, len(self.polynomials), 1)[0]
+
+    def place_before(self, t, dt):
+        """Of a held input which of its values a step dt, or shorter, had that ended at t."""
         if self.times is None:
-            return self(t - dt / 2)
+            return self.place(t - dt / 2)
         t = jnp.asarray(t).astype(self.times.dtype)
         now, before = (self._last_before(x, len(self.times)) for x in (t + self._rounding(t), t - self._rounding(t)))
-        return jnp.where(now > before, self.polynomials[before, 0], self(t - dt / 2))  # steps may differ at a sample
+        return jnp.where(now > before, before, self.place(t - dt / 2))  # steps may differ at a sample
 
     def jump_after(self, t):
         """Of a held input the time of its first jump after t; inf where there is none."""
@@ -112,9 +120,8 @@ def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
         order: 0, each value held until the next, as a D/A converter does; 1, linear; 3, cubic spline, twice
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
-    A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order
-    (but for `houbolt`, `park` and `operator_splitting`, which remember earlier steps). A jump within a step makes it of
-    order 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends steps
+    A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order.
+    A jump within a step makes it of order 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends steps
     at jumps at any distances, and `adaptive` finds them by itself. What is saved at a jump is the acceleration before
     it; `interpolate` uses it for v after it too.
 

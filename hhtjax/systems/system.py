@@ -124,6 +124,7 @@ class System(Description):
     internal: Callable | None = None
     friction: Callable | None = None
     sliding: Callable | None = None
+    massless = None  # of a `LinearSystem` alone
     depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
     def __post_init__(self):
@@ -158,8 +159,9 @@ class System(Description):
         the velocity of the body, add (dM/dt) v to `force`.
 
         Args:
-            lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v: M is evaluated at
-                v = 0. Every coordinate needs a mass; `hhtjax.systems` has the ways for one that has none.
+            lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v, as M is that of
+                v = 0: where it is not, `check` says so. Every coordinate needs a mass; `hhtjax.systems` has the ways
+                for one that has none.
             force: F, the forces that no potential holds (damping, inputs): `force(q, v, t, params)`.
             internal: as for `System`; then `force(q, v, z, t, params)`.
             friction, sliding, constraint: as for `System`. (Events are arguments of `simulate`.)
@@ -232,6 +234,7 @@ class FirstOrderSystem(Description):
     constraint = None
     internal = None
     friction = None
+    massless = None
 
     def __post_init__(self):
         require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")
@@ -250,10 +253,21 @@ def _require_constraint(constraint):
         ) from None
 
 
-def require_system(caller, system):
-    """An error for what is no system."""
+def require_system(caller, system, massless=False):
+    """An error for what is no system, or has coordinates without mass where these are not possible."""
     if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
         raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
+    if not massless:
+        require_masses(caller, system, "give them some")
+
+
+def require_masses(caller, system, without):
+    """An error for coordinates without mass, with which something is not possible."""
+    if system.massless is not None:
+        raise NotImplementedError(
+            f"{caller}: the `M` of the system is singular, and coordinates without mass have no acceleration of their "
+            f"own: {without}."
+        )
 
 
 def require_smooth(caller, system):

@@ -39,7 +39,7 @@ True
 The door
 --------
 
-The rest of the library knows 28 functions of this room, and works as well on plain JAX, several times slower.
+The rest of the library knows 30 functions of this room, and works as well on plain JAX, several times slower.
 
     one_kernel(f, *args)      f(*args) as one kernel, where XLA can
     staged(f)                 f, whose results a kernel computes once
@@ -50,7 +50,9 @@ The rest of the library knows 28 functions of this room, and works as well on pl
     structural(x)             x, whose zeros are such by structure
     traced(f, *args)          f, traced once, with word of which arguments its results are made of
     is_untouched()            whether neither a derivative nor a batch is being made here
+    is_traced()               whether what runs here becomes part of a program
     is_in_batch()             whether a batch is being made here
+    forward_only(x, words)    x, of which a reverse derivative is refused in these words
     largest_in_batch(x)       x, of which a batch has the largest, as a whole
     in_turn(f, asked, x)      f(x), of which a batch visits only members that ask
     or_alone(x)               x of a member of a batch, True where there is none
@@ -108,7 +110,7 @@ from hhtjax.xla.rows import block_written, row_written
 from hhtjax.xla.scalars import on_scalars
 from hhtjax.xla.sines import RANGE, polynomial_sines
 from hhtjax.xla.traced import traced
-from hhtjax.xla.transforms import is_in_batch, is_untouched
+from hhtjax.xla.transforms import forward_only, is_in_batch, is_traced, is_untouched
 from hhtjax.xla.turns import in_turn
 from hhtjax.xla.two_ways import TwoWays, derivative, together
 
@@ -130,8 +132,10 @@ __all__ = [
     "consistent",
     "derivative",
     "explain",
+    "forward_only",
     "in_turn",
     "is_in_batch",
+    "is_traced",
     "is_untouched",
     "largest_in_batch",
     "linear_map",

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching
 
@@ -42,8 +43,25 @@ def one_kernel(f, *args, around=False):
     """
     if not is_on():
         return f(*args) if around else named(LOOP, f)(*args)
-    f, constants = jax.closure_convert(f, *args)
+    f, constants = _closed(f, *args)
     return _watch(named(AROUND if around else KERNEL, f)(*_watch(args), *_watch(constants)))
+
+
+def _closed(f, *args):
+    """f as a function of its arguments and of floats that it closes over, and these: what may have derivatives.
+
+    `jax.closure_convert` does it too, and keeps every f that it has met.
+    """
+    trace, like = jax.make_jaxpr(f, return_shape=True)(*args)
+    moves = [isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact) for x in trace.consts]
+
+    def call(*args):
+        leaves = iter(jax.tree.leaves(args))
+        given = [next(leaves) for _ in trace.jaxpr.invars]
+        constants = [next(leaves) if move else x for x, move in zip(trace.consts, moves, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(like), eval_jaxpr(trace.jaxpr, constants, *given))
+
+    return call, [x for x, move in zip(trace.consts, moves, strict=True) if move]
 
 
 def staged(f, size=None):

@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 
+from hhtjax.description import programs
 from hhtjax.xla.gate import is_on
 from hhtjax.xla.kernels import QUICKLY
 
@@ -40,6 +41,7 @@ class Programs:
         f = _quickly(self.usual)  # traced once for all
         self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
+        programs.update((self.usual, self.quick, self.wide))
 
     def of(self, rates=0, numbers=None):
         """The one for a system of so many rates, 0 where nothing is known of one. numbers: in the position of a member

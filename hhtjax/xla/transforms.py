@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
 KNOWN = "EvalTrace", "DynamicJaxprTrace"  # without any, and inside a jit
 
@@ -26,6 +27,28 @@ def is_untouched():
     [True, True, False, False, True]
     """
     return type(_here.bind()).__name__ in KNOWN
+
+
+def is_traced():
+    """Whether what runs here becomes part of a program, or of a derivative or a batch, in less than a microsecond.
+
+    Args:
+        None.
+
+    Returns:
+        A boolean, known while a function is being traced; True where a JAX says it in words that are not known.
+
+    Raises:
+        Nothing.
+
+    >>> import jax
+    >>> seen = []
+    >>> for change in (lambda f: f, jax.jit, jax.grad):
+    ...     _ = change(lambda x: seen.append(is_traced()) or x)(1.0)
+    >>> seen
+    [False, True, True]
+    """
+    return type(_here.bind()).__name__ != KNOWN[0]
 
 
 def batch_size(args, axes):
@@ -61,6 +84,42 @@ def is_in_batch():
     while trace is not None and type(trace).__name__ != "BatchTrace":
         trace = getattr(trace, "parent_trace", None)
     return trace is not None
+
+
+def forward_only(x, words):
+    """The array x, of which a reverse derivative is refused in these words, and not in JAX's.
+
+    Args:
+        x: an array.
+        words: of the error.
+
+    Returns:
+        The same array.
+
+    Raises:
+        TypeError: in reverse mode.
+
+    >>> import jax
+    >>> f = lambda x: forward_only(2 * x, "no reverse derivative")
+    >>> float(jax.jvp(f, (1.0,), (1.0,))[1])
+    2.0
+    >>> jax.grad(f)(1.0)
+    Traceback (most recent call last):
+    TypeError: no reverse derivative
+    """
+    return forward_only_p.bind(x, words=words)
+
+
+def _refuse(cotangent, x, words):
+    raise TypeError(words)
+
+
+forward_only_p = Primitive("hhtjax_forward_only")
+forward_only_p.def_impl(lambda x, words: x)
+forward_only_p.def_abstract_eval(lambda x, words: x)
+ad.deflinear2(forward_only_p, _refuse)
+batching.defvectorized(forward_only_p)
+mlir.register_lowering(forward_only_p, lambda ctx, x, words: [x])
 
 
 class _Here(Primitive):
