@@ -140,6 +140,7 @@ class Look:
         """unread: containers that the function itself changes, such as a list that it appends to."""
         self.unread = unread
         self.values, self.names, self.lines = [f], ["f"], []
+        self.given = set()  # ids of the keywords of partials, of which the function gets copies
         self.space, self.may_change = {}, []  # what the lines know by name; names of what the function may change
         self.arrays = {}  # of floats: name -> id, later number of places at which it is read; and where in key it is
         self.key: Any = []
@@ -208,8 +209,10 @@ class Look:
             self._read(i, ".__func__", ".__self__")
         elif isinstance(x, partial):
             self._read(i, ".func", ".args", ".keywords")
+            self.given.add(id(x.keywords))
         elif isinstance(x, CONTAINERS):
-            self._read_entries(i, x, may_change=not isinstance(x, (tuple, frozenset)))
+            fixed = isinstance(x, (tuple, frozenset)) or id(x) in self.given
+            self._read_entries(i, x, may_change=not fixed)
         elif isinstance(x, property):
             self._read(i, ".fget")
         elif isinstance(x, (staticmethod, classmethod)):
