@@ -86,7 +86,9 @@ def page(scenes, causes, grades=GRADES, letters=LETTERS, columns_are="step size 
     axes.set_xticks(
         (columns + 1) * np.arange(len(methods)) + columns / 2, ["\n".join(wrap(name, 10)) for name in methods]
     )
-    axes.set_yticks(pitch * np.arange(len(scenes)) + 1.5, [name.replace(", ", ",\n") for name in scenes])
+    parts = [name.replace(", ", ",\n").split("\n") for name in scenes]
+    names = ["\n".join(line for part in some for line in wrap(part, 20)) for some in parts]
+    axes.set_yticks(pitch * np.arange(len(scenes)) + 1.5, names)
     axes.set_xlim(-1, (columns + 1) * len(methods))
     axes.set_ylim(pitch * len(scenes), -0.5)
     axes.xaxis.tick_top()

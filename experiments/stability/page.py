@@ -139,8 +139,8 @@ def _rows(found):
 def once_wrong(gallery, adaptive, way):
     """Silently wrong cells of the gallery by a letter: that of their scene, method and alpha, verified in a way."""
     letters = Counter()
-    for name, scene in gallery["scenes"].items():
-        found = adaptive["scenes"][name]["grades"]
+    for name, of_scene in adaptive["scenes"].items():
+        scene, found = gallery["scenes"][name], of_scene["grades"]
         for method in (m for m in scene["grades"] if m in found):
             for row, now in zip(scene["grades"][method], found[method], strict=True):
                 letters[now[way]] += row.count("w")
