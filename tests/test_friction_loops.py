@@ -288,6 +288,55 @@ def test_what_a_start_shows_and_what_a_tracer_hides():
         jax.vmap(lambda c: hidden(c, hhtjax.hht()))(TWO).check()
 
 
+@pytest.mark.slow
+def test_joints_break_away_within_a_step():
+    """Where the load that grows is beyond their sum: order 2 of the motion, and of its derivative in the limit."""
+    pads = hhtjax.System(
+        ONE,
+        lambda q, v, t, p: 3 * jnp.sin(t) - 2 * q,
+        friction=lambda q, v, t, p: p * jnp.array([0.3, 0.7]),
+        sliding=lambda q, v, t, p: v * TWO,
+    )
+    limits, T = 1.1 + np.linspace(0, 0.3, 13), 1.5
+
+    def exact(F):
+        def rate(t, y):
+            return [y[1], 3 * np.sin(t) - 2 * y[0] - F]
+
+        return solve_ivp(rate, (np.arcsin(F / 3), T), [0, 0], "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+
+    def found(F, N):
+        run = hhtjax.simulate(pads, hhtjax.hht(), 0 * ONE, 0 * ONE, F, dt=T / N, num_steps=N)
+        return jnp.stack([run.q[-1, 0], run.v[-1, 0]])
+
+    values = np.array([exact(F) for F in limits])
+    slopes = np.array([(exact(F + 1e-4) - exact(F - 1e-4)) / 2e-4 for F in limits])
+    errors = []
+    for N in (50, 200):
+        both = jax.jit(jax.vmap(lambda F, N=N: jax.jvp(lambda F: found(F, N), (F,), (1.0,))))(jnp.asarray(limits))
+        errors.append([np.max(np.abs(x - y), axis=0) for x, y in zip(both, (values, slopes), strict=True)])
+    order = np.log2(np.divide(*errors)) / 2
+    assert np.all(np.abs(order - 2) < 0.1), order
+    assert np.max(errors[1]) < 5e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "steps",
+    [{"dt": 0.1, "num_steps": 30}, {"dt": hhtjax.adaptive(1e-4, 1e-7), "times": [2.5, 3.0]}],
+    ids=["fixed", "adaptive"],
+)
+def test_a_load_at_a_known_time_breaks_a_gear_away(steps):
+    """(u - 4) t^2/2 from then on: exact, since all is constant between."""
+    load, T = hhtjax.Event(at=2.013, switch=lambda u: u + 2.1), 3.0 - 2.013
+    system = hhtjax.System(
+        GEAR.mass, lambda q, v, t, u: jnp.stack([u, 0.0 * t]), gear, friction=lambda q, v, L, t, u: GEARED["F"]
+    )
+    run = hhtjax.simulate(system, hhtjax.hht(0.0), ZERO, ZERO, jnp.asarray(3.9), events=[load], **steps)
+    run.check()
+    np.testing.assert_allclose([run.q[-1, 0], run.v[-1, 0]], [T**2, 2 * T], rtol=1e-12)
+
+
 @needs_compiler
 @pytest.mark.slow
 def test_a_gear_in_c(tmp_path):

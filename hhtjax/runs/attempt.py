@@ -166,7 +166,7 @@ def next_end(trial, params, walk):
     t, end = walk.state.t, trial.end
     h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
     due = jnp.minimum(end, held.jump_after(params, t)) if held.holds(params) else end
-    if walk.met is not None and walk.met.over:
+    if trial.ways is not None and walk.met.over:
         due = jnp.minimum(due, trial.ways.events.due_after(t, walk.met.over))
     left = due - t
     lands = left <= reach  # what has doubled does, where jumps are equally far apart

@@ -7,8 +7,7 @@ As in friction_events.py sliding velocities go linearly between events, in direc
 
 An event is that a joint which slides comes to rest; all that come to rest with it do so at once, as those of one
 freedom. Who rests then, and who slides on, is the box problem of all joints at rest, with their mean loads in the
-rest of the step: so a joint at rest that breaks away does it where the step, or a piece of it, begins. That moves
-velocities by O(h^2), once, where a load grows beyond what holds it; a reversal has no error of that kind.
+rest of the step. Another event is that loads which grow leave what joints at rest can hold.
 """
 
 from typing import Any, NamedTuple
@@ -17,11 +16,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.elimination import matvec
+from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.seldom import seldom
 from hhtjax.steppers.friction_events import EVENTS, PIECES, Moment
 from hhtjax.steppers.friction_law import Switch
-from hhtjax.systems.friction_rows import slides_in_box, slight
+from hhtjax.systems.friction_rows import leaves_box, slides_in_box, slight
 
 BEYOND = 2.0  # theta of a step that is done
 
@@ -96,22 +95,24 @@ def _by_pieces(at, course):
 
 
 def _piece(at, course):
-    """On to the next joint that comes to rest, or to the end of the step; and there, who starts to slide."""
+    """On to the next joints that come to rest or break away, or to the end of the step."""
     f, smooth, rest = course.f, course.f == 0, 1 - at.theta
     middle = (1 + at.theta) / 2
-    sig = _directions(at, course, middle)
+    sig, until, breaks = _directions(at, course, middle)
     rests = (sig == 0) & ~smooth
     speed = _speed(sig, rests, course, middle)
     stops = ~rests & ~smooth & (sig * speed < 0)
     wait = jnp.where(stops, jnp.maximum(-at.s / jnp.where(stops, speed, 1), 0), jnp.inf)
-    first = wait[jnp.argmin(wait)]
+    first = jnp.minimum(wait[jnp.argmin(wait)], until)
     due = first < rest
     go = jnp.where(due, first, rest)
-    who = due & (wait <= go + slight(f.dtype))
+    soon = go + slight(f.dtype)
+    who = due & (wait <= soon)
     s = at.s + go * speed
     slid = at.slid + go * (at.s + s) / 2
     theta = jnp.where(due, at.theta + go, jnp.where(at.theta < 1, 1.0, BEYOND))
-    return Moment(theta, jnp.where(who | rests, 0, s), jnp.where(who, 0, sig), slid, at.kept & ~who)
+    to = jnp.where(who, 0, jnp.where(due & (until <= soon), breaks, sig))
+    return Moment(theta, jnp.where(who | rests, 0, s), to, slid, at.kept & ~who)
 
 
 def _change(sig, rests, course, theta):
@@ -119,13 +120,27 @@ def _change(sig, rests, course, theta):
     return jnp.where(rests, 0, sig * course.f) - (course.start + theta * course.rise)
 
 
-def _directions(at, course, theta):
-    """Who slides, and where to, with the loads of this time; of joints at rest those that nothing can hold."""
-    at, course = lax.stop_gradient((at, course))
-    rests = (at.sig == 0) & (course.f != 0)
-    load = course.c - matvec(course.Wh, _change(at.sig, rests, course, theta))
-    slides, _ = slides_in_box(course.Wh, course.least, rests, load, course.f, course.size)
-    return jnp.where(rests, slides, at.sig)
+def _load(sig, rests, course, theta):
+    """ds/dtheta where nothing holds joints at rest."""
+    return course.c - matvec(course.Wh, _change(sig, rests, course, theta))
+
+
+def _directions(at, course, middle):
+    """Who slides, and where to; how long joints at rest are held; and who slides then, and where to.
+
+    What the loads of the whole rest of the step leave at rest is held until they have grown beyond the limits. What
+    they are beyond already slides at once, if their means are."""
+    sig, rests = at.sig, (at.sig == 0) & (course.f != 0)
+    known, there = lax.stop_gradient((course, at.theta))
+    load = _load(sig, rests, known, lax.stop_gradient(middle))
+    now, _ = slides_in_box(known.Wh, known.least, rests, load, known.f, known.size)
+    loads = [_load(sig, rests, course, x) for x in (0.0, 1.0)]
+    time, leave = leaves_box(course.Wh, known.least, rests, loads, course.f, known.size)
+    until = time - at.theta
+    grows = lax.stop_gradient(time) > there + slight(time.dtype)
+    fixed = rests & (diagonal(known.Wh) <= known.least)  # whose motion is prescribed
+    sig = jnp.where(rests & (fixed | ~grows), now, sig)
+    return sig, jnp.where(grows, until, jnp.inf), jnp.where(rests & (leave != 0), leave, sig)
 
 
 def _speed(sig, rests, course, theta):

@@ -20,6 +20,7 @@ from jax import lax
 
 from hhtjax.numerics.elimination import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
+from hhtjax.numerics.seldom import choose
 from hhtjax.systems.constraints import jacobian, violation
 from hhtjax.systems.friction import at_rest, block_of, directions, responses, solver_of_some
 
@@ -224,7 +225,8 @@ def at_rest_in_box(rows, rests, load, f, size=0.0):
     unit = 1 / jnp.where(inside, diagonal(K), 1)
     solve = solver_of_positive(B @ (unit[:, None] * B.T), here)
     held = unit * (B.T @ solve(load - matvec(K, limited)))
-    found = jnp.where(inside, found, lax.stop_gradient(limited))
+    within = jnp.all(~inside | (jnp.abs(held) <= f))  # else its joints would hold more than they can
+    found = jnp.where(inside, jnp.where(within, lax.stop_gradient(held), found), lax.stop_gradient(limited))
     exact = found + unit * (B.T @ solve(load - matvec(K, found)))
     return sig, limited + jnp.where(inside, held + lax.stop_gradient(exact - held), 0)
 
@@ -240,6 +242,49 @@ def slides_in_box(K, least, rests, load, f, size=0.0):
     d = jnp.sign(rate)
     at_limit = ~moved | (d * tau >= f * (1 - 64 * float(jnp.finfo(f.dtype).eps)))
     return jnp.where(rests & at_limit & (jnp.abs(rate) > nothing), d, 0), tau
+
+
+def leaves_box(K, least, rests, loads, f, size=0.0):
+    """When loads that go linearly from one to the other of two, within a unit of time, leave what joints at rest can
+    hold for good, and who slides then, and where to; infinity and nobody where they do not.
+
+    The held loads are a convex set, {K tau, |tau| <= F}. Where the load at x is not in it, with the forces tau and the
+    acceleration r = load - K tau = K u of the box problem, a plane separates the two: u.load <= r.tau holds in the set.
+    The line crosses that plane nearer to the set: Newton's iteration on a convex distance, from the outside. Of the
+    derivative u has no part, as of all planes the one that is crossed first tells the time.
+    """
+    known = lax.stop_gradient((K, loads, f))
+    moved = rests & (diagonal(known[0]) > least)
+    inverse = solver_of_positive(known[0], independent(known[0], least, moved))
+
+    def plane_at(x):
+        K, (first, last), f = known
+        load = first + x * (last - first)
+        slides, tau = slides_in_box(K, least, moved, load, f, size)
+        return slides, tau, inverse(jnp.where(slides != 0, load - matvec(K, tau), 0))
+
+    def crossing(plane, K, loads, f):
+        slides, tau, u = plane
+        most = jnp.where(slides != 0, slides * f, tau)
+        first, last = (jnp.sum(u * x) for x in loads)
+        rise = last - first
+        return jnp.where(rise > 0, (jnp.sum(most * matvec(K, u)) - first) / jnp.where(rise > 0, rise, 1), 0)
+
+    def unfinished(carry):
+        x, _, change, i = carry
+        return (x > 0) & (change > slight(K.dtype)) & (i < ROUNDS)
+
+    def improve(carry):
+        x, old, _, i = carry
+        plane = plane_at(x)
+        beyond = jnp.any(plane[0] != 0)
+        new = jnp.where(beyond, jnp.clip(crossing(plane, *known), 0, x), x)
+        return new, choose(beyond, plane, old), x - new, i + 1
+
+    one, none = jnp.ones((), K.dtype), jnp.zeros_like(f)
+    _, plane, *_ = lax.while_loop(unfinished, improve, (one, (none, none, none), one, 0))
+    leaves = jnp.any(plane[0] != 0)
+    return jnp.where(leaves, crossing(plane, K, loads, f), jnp.inf), plane[0]
 
 
 def smallest_in_box(K, load, f, moved):
