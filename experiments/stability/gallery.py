@@ -138,7 +138,7 @@ CAUSES = {
     "sudden stiffness": "Linear: all forms of HHT are one map. Accurate only where the new frequency is resolved.",
     "negative damping": "Linear. Coarse steps lose the phase, or damp by more than the 2 % that the motion grows by.",
     "stick-slip": "Friction bounds every method; the slip is wrong until the step resolves its onset.",
-    "started far from its slow manifold": "Kim's start is the literal recursion, and overshoots; others start smoothly.",
+    "started far from its slow manifold": "Kim's start is the literal recursion, which overshoots; others are smooth.",
     "hardening chain": "As the hardening spring: the predictor alone blows up below the coarsest step.",
 }
 
