@@ -101,6 +101,15 @@ def test_a_circle_from_inside():
         assert found.moved == pytest.approx(np.max(np.abs(found.q - guess)))
 
 
+def test_links_that_are_too_short_are_not_converged():
+    """Under jit, too: a search that runs away leaves a part of Phi that is small beside q, but not small."""
+    for place in ([4.0, 1.0], [3.1, 0.0], [-2.0, 6.0]):
+        place = jnp.array(place)
+        assert not starts(system(end_is_held), CHAIN[None], place).converged[0]
+        with pytest.raises(ValueError, match=r"no q with Phi\(q, t\) = 0 found near `q0`: .* is left of it"):
+            hhtjax.consistent_initial(system(end_is_held), CHAIN, 0 * CHAIN, place)
+
+
 @pytest.mark.slow
 def test_derivatives_far_from_the_guess():
     """Of the nearest point, in the lengths: those of the conditions for a minimum."""

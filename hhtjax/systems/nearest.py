@@ -138,10 +138,10 @@ def _descend(p, z0):
 
     far = jnp.asarray(jnp.inf, z0.dtype)
     z, _, change, *_ = lax.while_loop(unfinished, improve, (z0, jnp.zeros_like(far), far, far, 0))
-    size = p.reach + jnp.sqrt(jnp.sum(p.d * z[:n] ** 2))
-    left = jnp.sum(p.unit * jnp.abs(p.constraint(z[:n])))
+    left, apart = (jnp.sum(p.unit * jnp.abs(Phi)) for Phi in (p.constraint(z[:n]), p.Phi))
     root = math.sqrt(eps)
-    return z, (change <= root * (1 + largest(z))) & (left <= root * (jnp.sqrt(jnp.min(p.d)) + size))
+    met = left <= root * (jnp.sqrt(jnp.min(p.d)) + p.reach + apart)  # not beside x: some searches run away
+    return z, (change <= root * (1 + largest(z))) & met
 
 
 def _step(p, z, rho):
