@@ -154,22 +154,26 @@ def test_quadratic_damping():
     assert np.all(np.log2(coarse / fine) > 1.9)
 
 
+def mass_of_rod(q, m):
+    return jnp.stack([jnp.ones(()), jnp.ones(()), m])
+
+
+def force_on_rod(q, v, t, m):
+    return jnp.stack([0 * t, -9.81 + 0 * t, 1 - K * q[2] - C * v[2]])
+
+
+# A pendulum in x, y, and the light node.
+ROD = hhtjax.System(mass_of_rod, force_on_rod, constraint=lambda q, t, m: (q[:1] ** 2 + q[1:2] ** 2 - 1) / 2)
+
+
 @pytest.mark.parametrize("formulation", ["ggl", pytest.param("index3", marks=pytest.mark.slow)])
 def test_beside_a_constraint(formulation):
-    """A pendulum in x, y, and the light node: with the default start of constraints."""
-
-    def mass(q, m):
-        return jnp.stack([jnp.ones(()), jnp.ones(()), m])
-
-    def force(q, v, t, m):
-        return jnp.stack([0 * t, -9.81 + 0 * t, 1 - K * q[2] - C * v[2]])
-
-    rod = hhtjax.System(mass, force, constraint=lambda q, t, m: (q[:1] ** 2 + q[1:2] ** 2 - 1) / 2)
+    """With the default start of constraints."""
     stepper = hhtjax.hht(-1 / 3, formulation=formulation)
 
     def run(m, h, num_steps):
         q0 = jnp.array([1.0, 0.0, 0.0])
-        found = hhtjax.simulate(rod, stepper, q0, jnp.zeros(3), m, dt=h, num_steps=num_steps)
+        found = hhtjax.simulate(ROD, stepper, q0, jnp.zeros(3), m, dt=h, num_steps=num_steps)
         return found.q[:, 2], found.failure.step
 
     assert np.all(errors(run, H) < 2e-3)
@@ -322,22 +326,59 @@ def test_where_held_inputs_jump_with_dry_friction():
     assert np.all(errors(run, H, lambda m, t: 0.8 * exact(m, t - 0.01), 0.1) < 2e-3)
 
 
+# 0.2 N against the motion of the light node. A second coordinate is there to be smooth.
+RUBBED = hhtjax.System(
+    lambda q, m: jnp.stack([m, jnp.ones(())]),
+    lambda q, v, t, m: jnp.stack([1 - K * q[0] - C * v[0], -4 * q[1]]),
+    friction=lambda q, v, t, m: jnp.array([0.2]),
+    sliding=lambda q, v, t, m: v[:1],
+)
+
+
 @pytest.mark.parametrize("v0", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_with_dry_friction(v0):
-    """0.2 N against the motion: 0.8 of it is left. A second coordinate is there to be smooth."""
-    system = hhtjax.System(
-        lambda q, m: jnp.stack([m, jnp.ones(())]),
-        lambda q, v, t, m: jnp.stack([1 - K * q[0] - C * v[0], -4 * q[1]]),
-        friction=lambda q, v, t, m: jnp.array([0.2]),
-        sliding=lambda q, v, t, m: v[:1],
-    )
+    """0.8 of the load is left."""
 
     def run(m, h, num_steps):
         start = jnp.array([0.0, 0.1]), jnp.array([v0, 0.0])
-        found = hhtjax.simulate(system, hhtjax.hht(-1 / 3), *start, m, dt=h, num_steps=num_steps)
+        found = hhtjax.simulate(RUBBED, hhtjax.hht(-1 / 3), *start, m, dt=h, num_steps=num_steps)
         return found.q[:, 0], found.failure.step
 
     assert np.all(errors(run, H, lambda m, t: 0.8 * exact(m, t, v0 / 0.8), 0.1) < 2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "system, start, node, part",
+    [(ROD, [1.0, 0.0, 0.0], 2, 1.0), (RUBBED, [0.0, 0.1], 0, 0.8)],
+    ids=["constraint", "friction"],
+)
+def test_short_steps_before_long_ones_elsewhere(system, start, node, part):
+    """Beside a constraint, and with dry friction; forward, reverse and differences in the load's place, too."""
+    sizes = np.full(60, H)
+    sizes[:3] = 1e-6 * H
+    q0, times = jnp.array(start), np.append(0.0, np.cumsum(sizes))
+
+    @jax.jit
+    def run(m, step, place=0.0):
+        dt = jnp.asarray(sizes).at[40].mul(step)
+        at = q0.at[node].add(place)
+        return hhtjax.simulate(system, hhtjax.hht(-1 / 3), at, 0 * q0, m, dt=dt).q[:, node]
+
+    for m in (1e-2, 1e-6, 1e-12):
+        assert K * np.max(np.abs(run(m, 1.0) - part * exact(m, times))) < 2e-3, m
+
+    def end(x):
+        return run(*x)[-1]
+
+    forward, reverse = jax.jit(jax.jacfwd(end)), jax.jit(jax.grad(end))
+    for m in (1e-2, 1e-6):
+        x = jnp.array([m, 1.0, 0.001])
+        found = forward(x)
+        np.testing.assert_allclose(reverse(x), found, rtol=1e-8, atol=1e-12)
+        for i, h in enumerate(np.array([1e-4 * m, 1e-5, 1e-6])):
+            change = (end(x.at[i].add(h)) - end(x.at[i].add(-h))) / (2 * h)
+            np.testing.assert_allclose(change, found[i], rtol=1e-4, atol=1e-7)
 
 
 def two_nodes(x, num_steps=4):
