@@ -60,7 +60,7 @@ def test_under_error_control_nothing_is_silently_wrong():
         assert [counts[x] for x in ("silently_wrong", "beyond", "named", "accurate")] == [
             letters.count(x) for x in adaptive.LETTERS
         ]
-    assert len(rows) == 21 * (6 * 3 + 3)
+    assert len(rows) == 22 * (6 * 3 + 3)
     assert found["cells"]["halved"]["silently_wrong"] == found["cells"]["tolerance"]["silently_wrong"] == 0
     assert found["cells"]["halved"]["beyond"] == 0
     tight = found["cells"]["tighten"]
