@@ -349,7 +349,7 @@ def test_with_dry_friction(v0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "system, start, node, part",
+    ("system", "start", "node", "part"),
     [(ROD, [1.0, 0.0, 0.0], 2, 1.0), (RUBBED, [0.0, 0.1], 0, 0.8)],
     ids=["constraint", "friction"],
 )
