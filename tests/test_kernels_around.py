@@ -1,7 +1,6 @@
 """Kernels with all that is around their loops; and what of a run is for batches only."""
 
 import os
-import re
 import subprocess
 import sys
 from functools import partial
@@ -15,9 +14,9 @@ from linked_pendulums import on_cpu, paths
 
 import hhtjax
 from hhtjax.xla import kernels
-from hhtjax.xla.lowering import UNTOLD, VERDICT
 
 x = jnp.linspace(0.1, 1.0, 4)
+KERNEL = 'xla_cpu_small_call = "true"'
 
 
 @on_cpu
@@ -31,8 +30,8 @@ def test_a_kernel_around_others():
 
         return kernels.one_kernel(whole, x, around=True)
 
-    for f, verdict in ((jnp.cos, "one kernel"), (jnp.sort, "plain: stablehlo.sort")):
-        assert f'{UNTOLD} = "{verdict}"' in jax.jit(partial(around, f)).lower(-x).as_text()
+    for f in (jnp.cos, jnp.sort):
+        assert jax.jit(partial(around, f)).lower(-x).as_text().count(KERNEL) == 1
         assert paths(partial(around, f), -x) == ("one kernel",)
         np.testing.assert_allclose(jax.jit(partial(around, f))(-x), f(-2 * x) + 1, rtol=1e-15)
 
@@ -47,7 +46,7 @@ def test_kernels_of_a_controlled_run_hold_all_that_is_around_their_loops(derivat
         return hhtjax.simulate(SPRING, hhtjax.hht(), q[None], ZERO, dt=dt, times=np.ones(1)).q[-1, 0]
 
     lowered = jax.jit(derivative(end)).lower(1.0).as_text()
-    assert re.findall(f'{UNTOLD} = "([^"]*)"', lowered) == number * ["one kernel"]
+    assert lowered.count(KERNEL) == number
 
 
 def in_order(q, v, t, params):
@@ -62,8 +61,8 @@ def test_the_users_line_that_stands_against_a_kernel_is_told():
         return hhtjax.simulate(hhtjax.System(np.ones(2), in_order), hhtjax.hht(), q, q, dt=0.1, num_steps=2).q[-1]
 
     line = in_order.__code__.co_firstlineno + 1
-    assert paths(end, x[:2]) == (f"plain: stablehlo.sort, test_kernels_around.py, line {line}, in in_order",)
-    assert f'{VERDICT} = "plain: stablehlo.sort"' in jax.jit(end).lower(x[:2]).as_text()
+    assert paths(end, x[:2]) == (f"plain: sort, test_kernels_around.py, line {line}, in in_order",)
+    assert "test_kernels_around" not in jax.jit(end).lower(x[:2]).as_text()
 
 
 def test_who_is_alone_goes_on():

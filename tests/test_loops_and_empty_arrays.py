@@ -7,7 +7,7 @@ import pytest
 from linked_pendulums import on_cpu, paths
 
 import hhtjax
-from hhtjax.xla import inspection, kernels
+from hhtjax.xla import fit_for_kernel, kernels
 
 
 def counted(q, v, t, params):
@@ -80,10 +80,10 @@ def test_branches_are_counted_by_themselves(monkeypatch):
     def told(f):
         return paths(loop(f), jnp.float32(0.5))[0]
 
-    monkeypatch.setattr(inspection, "MOST_OPERATIONS", 100)
+    monkeypatch.setattr(fit_for_kernel, "MOST_OPERATIONS", 100)
     assert "more than 100 operations" in told(lambda x: waves(waves(x)))
     assert told(seldom) == "one kernel"
-    monkeypatch.setattr(inspection, "MOST_IN_BRANCHES", 100)
+    monkeypatch.setattr(fit_for_kernel, "MOST_IN_BRANCH", 100)
     assert "more than 100 operations in branches" in told(seldom)
 
 

@@ -15,14 +15,14 @@ from functools import wraps
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 
 from hhtjax.xla.gate import is_on
 from hhtjax.xla.interpreter import alone, evaluate
-from hhtjax.xla.kernel_calls import compute_once
 
-SHORT = 512  # numbers; XLA divides no work on so few among threads, which in a kernel takes a second result
+SHORT = 1  # numbers
 EQUALITIES = {"eq", "ne"}
 CHOICES = {"max", "min", "reduce_max", "reduce_min", "cummax", "cummin"}  # JAX's derivatives ask who equals the result
 # what a number passes unchanged, or with another sign, and what makes the same number of the same numbers
@@ -192,9 +192,12 @@ def _lower(ctx, x):
     """A call that XLA does not inline."""
     n = ctx.avals_in[0].size
     call = jax.jit(lambda x: [x] if n <= SHORT else [x, x.ravel()[:1]])
-    results = mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_out=None), x)
-    compute_once(results[0].owner)
-    return results[:1]
+
+    def once(x):
+        with set_xla_metadata(inlineable="false"):
+            return call(x)[:1]
+
+    return mlir.lower_fun(once, multiple_results=True)(ctx, x)
 
 
 held_p = Primitive("hhtjax_held")

@@ -6,9 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from hhtjax.xla.gate import why_off
-from hhtjax.xla.kernels import LOOP
-from hhtjax.xla.lowering import VERDICT
+import hhtjax.xla.lowering  # noqa: F401
 from hhtjax.xla.source_lines import asked
 
 
@@ -59,33 +57,16 @@ def explain(f, *args) -> Explanation:
     >>> forward == back == "one kernel" or forward.startswith("plain: JAX")     # too old, or too new
     True
     """
-    start, lines = time.perf_counter(), {}
-    token = asked.set(lines)
+    start, paths = time.perf_counter(), {}
+    token = asked.set(paths)
     try:
         lowered = jax.jit(f).lower(*args)
     finally:
         asked.reset(token)
     compiled = lowered.compile()
     seconds = time.perf_counter() - start
-    off = f"plain: {why_off() or 'inside hhtjax.plain()'}"
-    told = rf'call @([^\s(]+)\([^\n]*{VERDICT} = "([^"]*)"|call @{LOOP}'
-    found = [x for text in _called(lowered.as_text()) for x in re.findall(told, text)]
-    paths = tuple(f"{verdict or off}{', ' * (name in lines)}{lines.get(name, '')}" for name, verdict in found)
     memory: Any = compiled.memory_analysis()
-    return Explanation(paths, seconds, None if memory is None else memory.temp_size_in_bytes)
-
-
-def _called(text):
-    """Of a lowered program the functions that `main` calls, directly or not, as they stand there: of what became a
-    kernel the form before remains."""
-    found = re.findall(r"func\.func .*?@([^\s(]+)\((.*?)(?=func\.func |\Z)", text, re.DOTALL)
-    inside, reached, waiting = dict(found), set(), ["main"]
-    while waiting:
-        name = waiting.pop()
-        if name in inside and name not in reached:
-            reached.add(name)
-            waiting += re.findall(r"call @([^\s(]+)\(", inside[name])
-    return [inside[name] for name in inside if name in reached]
+    return Explanation(tuple(paths.values()), seconds, None if memory is None else memory.temp_size_in_bytes)
 
 
 def calls(names, f, *args):

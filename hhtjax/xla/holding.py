@@ -2,95 +2,99 @@
 
 XLA:CPU fuses an operation into all that use it, and evaluates for each of them anew all that it comes from: of the
 14,000 operations of a spinning top's gradient it makes 37,000, and LLVM compiles them all. Across a call it fuses
-nothing. So what is much to evaluate, and used by several, is handed on by a call that gives it as it is: of this
-gradient 25,000 are left; it compiles in three quarters of the time, and runs in two thirds.
+nothing. So what is much to evaluate, and used by several, is handed on by a call that gives it as it is.
 """
 
-from jaxlib.mlir import ir
-from jaxlib.mlir.dialects import func
+from copy import copy
 
-from hhtjax.xla.inspection import ATTRIBUTES, callee
-from hhtjax.xla.kernel_calls import as_stage, compute_once, insert
-from hhtjax.xla.kernels import STAGED
-from hhtjax.xla.products import size
+import jax
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from hhtjax.xla.consistent import held_p
 
 LEAST = 40  # operations that are evaluated once more without a call; of fewer, nothing is gained
-WITH_REGIONS = {"stablehlo.case", "stablehlo.if", "stablehlo.while"}
-MADE_ONCE = WITH_REGIONS | {"stablehlo.custom_call", "stablehlo.dot_general"}  # by XLA in any case
-BROADCAST = "stablehlo.broadcast_in_dim"  # handed on before it is one
-FREE = {BROADCAST, *(f"stablehlo.{x}" for x in ("constant", "convert", "reshape", "slice", "transpose"))}
-SHORT = 512  # numbers; XLA divides no work on so few among threads
+CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"}
+LOOPS = {"cond", "while", "scan"}
+MADE_ONCE = LOOPS | {"dot_general", "hhtjax_held"}  # by XLA in any case
+BROADCAST = "broadcast_in_dim"  # handed on before it is one
+FREE = {BROADCAST, "convert_element_type", "reshape", "slice", "transpose", "squeeze", "expand_dims", "copy", "split"}
 
 
-def hold(module, names):
-    """Hands values on by calls in the functions of these names, each of which comes after those that it calls."""
-    calls, costs, uses = {}, {}, {}
-    for name in names:
-        (body,) = module.symbol_table[name].operation.regions[0]
-        costs[name] = _hold_in(module, body, calls, costs, uses)
-        uses[name] = [_number_of_uses(x, uses) for x in body.arguments]
+def with_values_held(closed):
+    """The closed jaxpr, in which such values are handed on by calls."""
+    return ClosedJaxpr(_Holder().held(closed.jaxpr)[0], closed.consts)
 
 
-def _number_of_uses(x, uses):
-    """Operations that take x, those in functions called with it too. uses: of arguments of these, by names."""
-    number = {}
-    for use in x.uses:
-        op = use.owner
-        is_open = op.name == "func.call" and ATTRIBUTES not in op.attributes and callee(op) in uses
-        number[op] = number.get(op, 0) + uses[callee(op)][use.operand_number] if is_open else 1
-    return sum(number.values())
+class _Holder:
+    """Of a jaxpr and of all within it, each once."""
+
+    def __init__(self):
+        self.done = {}  # id of a jaxpr: (it, what has become of it, costs of its results, uses of its arguments)
+
+    def held(self, jaxpr):
+        if id(jaxpr) not in self.done:
+            self.done[id(jaxpr)] = jaxpr, *self._held(jaxpr)
+        return self.done[id(jaxpr)][1:]
+
+    def _held(self, jaxpr):
+        eqns = [self._inside(eqn) for eqn in jaxpr.eqns]
+        uses = {}
+        for eqn, _, inner_uses in eqns:
+            for i, x in enumerate(eqn.invars):
+                if not isinstance(x, Literal):
+                    uses[x] = uses.get(x, 0) + (inner_uses[i] if inner_uses else 1)
+        for x in jaxpr.outvars:
+            if not isinstance(x, Literal):
+                uses[x] = uses.get(x, 0) + 1
+        new, cost, made = {}, {}, []
+        for eqn, costs, _ in eqns:
+            if new:
+                eqn = eqn.replace(invars=[x if isinstance(x, Literal) else new.get(x, x) for x in eqn.invars])
+            name = eqn.primitive.name
+            before = sum(cost.get(x, 0) for x in {x for x in eqn.invars if not isinstance(x, Literal)})
+            made.append(eqn)
+            for i, x in enumerate(eqn.outvars):
+                own = 0 if name in MADE_ONCE or costs == "once" else costs[i] if costs else name not in FREE
+                taken = 0 if name in MADE_ONCE or costs == "once" else before + own
+                if taken and name != BROADCAST and taken * (uses.get(x, 0) - 1) >= LEAST:
+                    made.append(_handed_on(eqn, x, new))
+                    taken = 0
+                    cost[new[x]] = 0
+                cost[x] = taken
+        outvars = [x if isinstance(x, Literal) else new.get(x, x) for x in jaxpr.outvars]
+        after = jaxpr.replace(eqns=made, outvars=outvars)
+        return after, [0 if isinstance(x, Literal) else cost.get(x, 0) for x in outvars], [
+            uses.get(x, 0) for x in jaxpr.invars
+        ]
+
+    def _inside(self, eqn):
+        """The equation with what is inside done, costs of its results as a call, uses of its arguments."""
+        name = eqn.primitive.name
+        if name not in CALLS and name not in LOOPS:
+            return eqn, None, None
+        told = []
+
+        def inner(x):
+            if isinstance(x, ClosedJaxpr):
+                after, *more = self.held(x.jaxpr)
+                told.append(more)
+                return ClosedJaxpr(after, x.consts)
+            return x
+
+        eqn = eqn.replace(params={key: jax.tree.map(inner, x) for key, x in eqn.params.items()})
+        if name in LOOPS:
+            return eqn, None, None
+        if (eqn.ctx.xla_metadata or {}).get("inlineable") == "false":
+            return eqn, "once", None
+        return eqn, *told[0]
 
 
-def _hold_in(module, block, calls, costs, uses):
-    """The same in a block: what each of its results takes where it is evaluated anew, in operations.
-
-    calls: those that hand on, by types; costs, uses: of results and arguments of the functions before, by names.
-    """
-    cost = {}
-    for op in [x.operation for x in block]:
-        if op.name in WITH_REGIONS:
-            for region in op.regions:
-                for inner in region:
-                    _hold_in(module, inner, calls, costs, uses)
-        for x, taken in zip(op.results, _costs_of(op, cost, costs), strict=True):
-            if taken and op.name != BROADCAST and taken * (_number_of_uses(x, uses) - 1) >= LEAST:
-                _hand_on(module, op, x, calls)
-                taken = 0
-            cost[x] = taken
-    return [cost.get(x, 0) for x in op.operands]
+def _handed_on(eqn, x, new):
+    """An equation that gives x by another name."""
+    other = new[x] = copy(x)  # a variable is known by its identity
+    return eqn.replace(
+        primitive=held_p, invars=[x], outvars=[other], params={}, effects=frozenset(), ctx=eqn.ctx
+    )
 
 
-def _costs_of(op, cost, costs):
-    """Of its results, where it is evaluated anew with all that its operands take."""
-    is_call = op.name == "func.call"
-    if op.name in MADE_ONCE or (is_call and (ATTRIBUTES in op.attributes or callee(op).startswith(STAGED))):
-        return [0] * len(op.results)
-    before = sum(cost.get(x, 0) for x in {*op.operands})
-    one_each = [op.name not in FREE] * len(op.results)
-    own = costs.get(callee(op), one_each) if is_call else one_each
-    return [before + x for x in own]
-
-
-def _hand_on(module, op, x, calls):
-    """A call in the place of the value x of op, for all that use it."""
-    uses = [(use.owner, use.operand_number) for use in x.uses]
-    if x.type not in calls:
-        calls[x.type] = _identity(module, x)
-    types, reference = calls[x.type]
-    with op.location, ir.InsertionPoint.after(op):
-        call = func.CallOp(types, reference, [x])
-    compute_once(call.operation)
-    for owner, i in uses:
-        owner.operands[i] = call.results[0]
-
-
-def _identity(module, x):
-    """A function that gives values like x as they are: the types of its results, and the reference to it."""
-    with x.owner.location:
-        function = func.FuncOp("hhtjax_held", ir.FunctionType.get([x.type], [x.type]), ip=module.ip)
-        with ir.InsertionPoint(function.add_entry_block()):
-            func.ReturnOp(function.arguments)
-    if size(x) > SHORT:
-        as_stage(function.operation)
-    types = ir.FunctionType(ir.TypeAttr(function.attributes["function_type"]).value).results
-    return types, insert(module, function.operation)
+__all__ = ["Jaxpr", "with_values_held"]

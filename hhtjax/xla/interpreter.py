@@ -35,9 +35,12 @@ def needed(jaxpr):
 def alone(eqn) -> Callable:
     """One operation of a jaxpr as a function of its arrays, to a list."""
 
+    found = eqn.primitive.get_bind_params(eqn.params)
+    functions, params = found if isinstance(found, tuple) else ((), found)  # an older JAX gives functions apart
+
     def f(*arrays):
         with eqn.ctx.manager, user_context(eqn.source_info.traceback):  # `explain` names the line that it comes from
-            results = eqn.primitive.bind(*arrays, **eqn.primitive.get_bind_params(eqn.params))
+            results = eqn.primitive.bind(*functions, *arrays, **params)
         return results if eqn.primitive.multiple_results else [results]
 
     return f

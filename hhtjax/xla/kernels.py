@@ -10,18 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer, eval_jaxpr
-from jax.extend.core import Primitive
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import ad, batching
 
-from hhtjax.xla.gate import is_on
+from hhtjax.xla.gate import is_on, why_off
+from hhtjax.xla.kernel_primitive import kernel_p
 
 # names of functions; autodiff and vmap keep them
 KERNEL, STAGED, PART = "hhtjax_one_kernel", "hhtjax_staged", "hhtjax_part"
-AROUND = KERNEL + "_around"
+AROUND = "hhtjax_around"
 QUICKLY = "hhtjax_quickly"  # of programs that XLA compiles by its older way
 WRITTEN_OUT = 32  # numbers of a sum in a loop, one after the other
-LOOP = "hhtjax_loop"  # where the machinery is off: a name for `explain` to find, and nothing else
 
 
 def one_kernel(f, *args, around=False):
@@ -41,27 +41,29 @@ def one_kernel(f, *args, around=False):
     >>> float(one_kernel(lambda x: 2 * x, jnp.array(3.0)))
     6.0
     """
-    if not is_on():
-        return f(*args) if around else named(LOOP, f)(*args)
-    f, constants = _closed(f, *args)
-    return _watch(named(AROUND if around else KERNEL, f)(*_watch(args), *_watch(constants)))
+    if off := why_off():
+        return f(*args) if around else _told(off, f(*args))
+    leaves, structure = jax.tree.flatten(args)
+    leaves = [jnp.asarray(x) for x in leaves]
+
+    def on_leaves(*leaves):
+        return f(*structure.unflatten(leaves))
+
+    trace, like = jax.make_jaxpr(on_leaves, return_shape=True)(*leaves)
+    closed, constants = _with_arguments(trace)
+    if closed.effects:
+        return f(*args) if around else _told(", ".join(sorted(map(str, closed.effects))), f(*args))
+    found = kernel_p.bind(*leaves, *constants, closed=closed, name=AROUND if around else KERNEL)
+    return jax.tree.structure(like).unflatten(found)
 
 
-def _closed(f, *args):
-    """f as a function of its arguments and of floats that it closes over, and these: what may have derivatives.
-
-    `jax.closure_convert` does it too, and keeps every f that it has met.
-    """
-    trace, like = jax.make_jaxpr(f, return_shape=True)(*args)
-    moves = [isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact) for x in trace.consts]
-
-    def call(*args):
-        leaves = iter(jax.tree.leaves(args))
-        given = [next(leaves) for _ in trace.jaxpr.invars]
-        constants = [next(leaves) if move else x for x, move in zip(trace.consts, moves, strict=True)]
-        return jax.tree.unflatten(jax.tree.structure(like), eval_jaxpr(trace.jaxpr, constants, *given))
-
-    return call, [x for x, move in zip(trace.consts, moves, strict=True) if move]
+def _with_arguments(closed):
+    """The closed jaxpr with those of its constants that are being traced as arguments, and these: they may have
+    derivatives."""
+    moves = [isinstance(x, Tracer) for x in closed.consts]
+    constvars, more = ([x for x, m in zip(closed.jaxpr.constvars, moves, strict=True) if m == k] for k in (False, True))
+    consts, values = ([x for x, m in zip(closed.consts, moves, strict=True) if m == k] for k in (False, True))
+    return ClosedJaxpr(closed.jaxpr.replace(constvars=constvars, invars=[*closed.jaxpr.invars, *more]), consts), values
 
 
 def staged(f, size=None):
@@ -195,9 +197,10 @@ def named(name, f):
     return jax.jit(call)
 
 
-def _watch(tree):
-    """An identity on either side of a call: whatever autodiff makes of it, one is behind the call or its transpose."""
-    return jax.tree.map(watch_p.bind, tree)  # integers too: all that is used of a run may be the number of its steps
+def _told(why, tree):
+    """The results of a loop that is no kernel, for `explain` to find."""
+    loop = object()
+    return jax.tree.map(lambda x: told_p.bind(x, why=why, loop=loop), tree)
 
 
 def _largest(values, axes, kept):
@@ -235,8 +238,8 @@ alone_p.def_abstract_eval(lambda x: x)
 batching.primitive_batchers[alone_p] = lambda values, axes: (values[0], axes[0])
 
 
-watch_p = Primitive("hhtjax_watch")
-watch_p.def_impl(lambda x: x)
-watch_p.def_abstract_eval(lambda x: x)
-ad.deflinear2(watch_p, lambda cotangent, _: (watch_p.bind(cotangent),))
-batching.defvectorized(watch_p)
+told_p = Primitive("hhtjax_told")
+told_p.def_impl(lambda x, why, loop: x)
+told_p.def_abstract_eval(lambda x, why, loop: x)
+ad.deflinear2(told_p, lambda cotangent, _, why, loop: (told_p.bind(cotangent, why=why, loop=loop),))
+batching.defvectorized(told_p)

@@ -89,7 +89,8 @@ def _is_one(*arrays):
 
 
 def _is_spread(kind):
-    return not kind.manual_axis_type.empty or AxisType.Explicit in kind.sharding.mesh.axis_types
+    manual, mesh = getattr(kind, "manual_axis_type", None), kind.sharding.mesh  # older ones do not know of it
+    return (manual is not None and not manual.empty) or AxisType.Explicit in getattr(mesh, "axis_types", ())
 
 
 def _jvp_of_family(x, dx, n, family, jaxpr):

@@ -67,7 +67,7 @@ def block_written(array, block, number, axis=0):
     return write_p.bind(array, block, number, members=0, axis=axis)
 
 
-def _written(array, block, number, *, members, axis):
+def written(array, block, number, *, members, axis):
     """Along an axis of a member's; so many axes before are of members, with one number for all or one for each."""
     if not number.ndim:
         return lax.dynamic_update_slice_in_dim(array, block, number, members + axis)
@@ -133,10 +133,10 @@ def _batch(args, axes, *, members, axis):
 
 
 write_p = Primitive("hhtjax_row_written")
-write_p.def_impl(_written)
+write_p.def_impl(written)
 write_p.def_abstract_eval(_shape)
 batching.primitive_batchers[write_p] = _batch
 ad.primitive_jvps[write_p] = _jvp
 ad.primitive_transposes[write_p] = _transpose
 mlir.register_lowering(write_p, mlir.lower_fun(_scattered, multiple_results=False))
-mlir.register_lowering(write_p, mlir.lower_fun(_written, multiple_results=False), platform="cpu")
+mlir.register_lowering(write_p, mlir.lower_fun(written, multiple_results=False), platform="cpu")

@@ -9,14 +9,7 @@ from functools import lru_cache, reduce
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxlib.mlir import ir
-from jaxlib.mlir.dialects import func
-
-from hhtjax.xla.inspection import ATTRIBUTES, callee
-from hhtjax.xla.products import element_type
-
 NAME = "hhtjax_sines"
-FUNCTIONS = {"stablehlo.sine": lax.sin, "stablehlo.cosine": lax.cos}
 RANGE = 1e5  # largest |x|, rad
 ONES = 3 * 2.0**51  # beyond it the last bit of a number is one
 
@@ -120,98 +113,21 @@ def _with_sign(x, bits):
     return lax.bitcast_convert_type(_bits(x) ^ sign, jnp.float64)
 
 
-def write_sines(module, names):
-    """Calls in the place of all sines and cosines of float64 numbers in functions of a module: one for those that can
-    be computed together."""
-    written = {}
-    for name in names:
-        if not name.startswith(NAME):
-            for block in list(_blocks(module.symbol_table[name].operation)):
-                for group in list(_groups(block)):
-                    _replace(module, group, written)
-
-
-def _blocks(op):
-    for region in op.regions:
-        for block in region:
-            yield block
-            for inner in block:
-                yield from _blocks(inner.operation)
-
-
-def _groups(block):
-    """Lists of such operations of one shape, whose operands are known where the first of them is."""
-    group, since = [], []
-    for op in (x.operation for x in block):
-        if op.name in FUNCTIONS and element_type(op.results[0]) == "f64":
-            x = op.operands[0]
-            if group and (x.type != group[0].operands[0].type or x.owner in since):
-                yield group
-                group, since = [], []
-            group.append(op)
-        if group:
-            since.append(op)
-    if group:
-        yield group
-
-
-def _replace(module, group, written):
-    """One call for a list of operations."""
-    operands = list(dict.fromkeys(op.operands[0] for op in group))
-    wanted = tuple((op.name, operands.index(op.operands[0])) for op in group)
-    kind = ir.RankedTensorType(operands[0].type)
-    results: list[ir.Type] = [kind] * len(group)
-    key = tuple(kind.shape), len(operands), wanted
-    with group[0].location:
-        if key not in written:
-            written[key] = _insert(module, ir.Module.parse(_text(*key)))
-        with ir.InsertionPoint(group[0]):
-            call = func.CallOp(results, written[key], operands)
-        _compute_once(call.operation)
-    for op, result in zip(group, call.results, strict=True):
-        op.results[0].replace_all_uses_with(result)
-        op.erase()
-
-
-def _insert(module, source):
-    """The functions of another module, under names that are free: the reference to the first of them."""
-    names = {}
-    for function in reversed(list(source.body)):  # what is called stands behind
-        copy = function.operation.clone(ip=module.ip)
-        copy.attributes["sym_name"] = ir.StringAttr.get(NAME)
-        copy.attributes["sym_visibility"] = ir.StringAttr.get("private")
-        for call in _calls(copy):
-            call.attributes["callee"] = names[callee(call)]
-            _compute_once(call)
-        names[function.name.value] = ir.FlatSymbolRefAttr.get(module.symbol_table.insert(copy).value)
-    return names["main"]
-
-
-def _calls(function):
-    """The calls of a function."""
-    for block in _blocks(function):
-        yield from (x.operation for x in block if x.operation.name == "func.call")
-
-
-def _compute_once(call):
-    call.attributes[ATTRIBUTES] = ir.DictAttr.get({"inlineable": ir.StringAttr.get("false")})
-
-
 @lru_cache(maxsize=256)
-def _text(shape, count, wanted):
-    """A function of `count` arrays that gives what is wanted, [(name of an operation, number of its operand)]."""
-    stage = jax.jit if shape else lambda f: f  # on single numbers LLVM does it
+def sines(avals, wanted):
+    """A jaxpr of arrays that gives what is wanted, [("sin" or "cos", number of its operand)]."""
+    shape, functions = avals[0].shape, {"sin": lax.sin, "cos": lax.cos}
 
     def exact(*x):
-        return [FUNCTIONS[name](x[i]) for name, i in wanted]
+        return [functions[name](x[i]) for name, i in wanted]
 
     def fast(*x):
-        pairs = [dict(zip(FUNCTIONS, _sines_by_bits(y, stage), strict=True)) for y in x]
+        pairs = [dict(zip(functions, _sines_by_bits(y, lambda f: f), strict=True)) for y in x]
         return [pairs[i][name] for name, i in wanted]
 
     def both(*x):
         inside = reduce(lax.bitwise_and, (lax.abs(y) <= RANGE for y in x))
         return lax.cond(lax.reduce_and(inside, range(len(shape))) if shape else inside, fast, exact, *x)
 
-    with jax.enable_x64(True):
-        return jax.jit(both, keep_unused=True).lower(*[jax.ShapeDtypeStruct(shape, jnp.float64)] * count).as_text()
+    both.__name__ = NAME
+    return jax.make_jaxpr(jax.jit(both))(*avals)

@@ -180,16 +180,16 @@ def _needed(used, eqn):
     return [True, *(i in places for i in range(len(eqn.invars) - 1))], new
 
 
-def _values(asked, *args, closed, **params):
+def values(asked, *args, closed, **params):
     return _evaluated(closed, *args)
 
 
 # closed: the function; at_once: the same in the form of which derivatives are taken
 turn_p = Primitive("hhtjax_in_turn")
 turn_p.multiple_results = True
-turn_p.def_impl(_values)
+turn_p.def_impl(values)
 turn_p.def_effectful_abstract_eval(lambda *args, closed, **params: (closed.out_avals, closed.effects))
 batching.primitive_batchers[turn_p] = _batch
 ad.primitive_jvps[turn_p] = _jvp
 pe.dce_rules[turn_p] = _needed
-mlir.register_lowering(turn_p, mlir.lower_fun(_values, multiple_results=True))
+mlir.register_lowering(turn_p, mlir.lower_fun(values, multiple_results=True))

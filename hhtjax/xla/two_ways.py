@@ -95,17 +95,17 @@ def _divided(args, count):
     return list(args[:count]), list(args[count:])
 
 
-def _both(*args, ways, count):
+def both(*args, ways, count):
     values, dots = ways.forward(*_divided(args, count))
     return [*values, *dots]
 
 
-def _linear(*args, ways, count, backwards):
+def linear(*args, ways, count, backwards):
     x, given = _divided(args, count)
     return ways.reverse(x, given) if backwards else ways.forward(x, given)[1]
 
 
-def _values(*x, f):
+def values(*x, f):
     return f(list(x))
 
 
@@ -128,7 +128,7 @@ def _jvp_of_both(args, dots, ways, count):
         moves = map(ad.instantiate_zeros, dots[count:])
         changes = linear_p.bind(*args[:count], *moves, ways=ways, count=count, backwards=False)
         return out, [*(no_tangent(x) for x in out[: ways.number]), *changes]
-    return out, _jvp_by(_both, args, dots, ways=ways._replace(forward=ways.slow), count=count)[1]
+    return out, _jvp_by(both, args, dots, ways=ways._replace(forward=ways.slow), count=count)[1]
 
 
 def _jvp_of_linear(args, dots, ways, count, backwards):
@@ -141,7 +141,7 @@ def _jvp_of_linear(args, dots, ways, count, backwards):
     if any(type(dot) is not ad.Zero for dot in dots[:count]):
         slow = ways._replace(forward=ways.slow, reverse=ways.slow_reverse)
         moves = list(map(_instantiated, x, dots[:count]))
-        by_x = partial(_linear, ways=slow, count=count, backwards=backwards)
+        by_x = partial(linear, ways=slow, count=count, backwards=backwards)
         changes.append(jax.jvp(lambda *x: by_x(*x, *given), tuple(x), tuple(moves))[1])
     return call(*args), [sum(terms[1:], terms[0]) for terms in zip(*changes, strict=True)]
 
@@ -214,10 +214,10 @@ def _shapes(run, *args, **params):
     return [ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(partial(run, **params), *args)]
 
 
-values_p = _primitive("hhtjax_values", _values, _batch_values)
-linear_p = _primitive("hhtjax_linear", _linear, lambda *args, **params: _batch(linear_p, *args, **params))
-both_p = _primitive("hhtjax_both", _both, lambda *args, **params: _batch(both_p, *args, **params))
-ad.primitive_jvps[values_p] = partial(_jvp_by, _values)
+values_p = _primitive("hhtjax_values", values, _batch_values)
+linear_p = _primitive("hhtjax_linear", linear, lambda *args, **params: _batch(linear_p, *args, **params))
+both_p = _primitive("hhtjax_both", both, lambda *args, **params: _batch(both_p, *args, **params))
+ad.primitive_jvps[values_p] = partial(_jvp_by, values)
 ad.primitive_jvps[both_p] = _jvp_of_both
 ad.primitive_jvps[linear_p] = _jvp_of_linear
 ad.primitive_transposes[linear_p] = _transpose

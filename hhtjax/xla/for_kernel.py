@@ -1,0 +1,319 @@
+"""A jaxpr as a kernel needs it: with other operations in the place of those that XLA:CPU's emitter does not know.
+
+Products of small matrices become sums, scatters of few windows updates, sines of float64 numbers polynomials; of a
+function in two forms (`choose`) the one for kernels is taken. All else is copied as it is, without being traced again.
+"""
+
+import math
+from functools import lru_cache, partial, reduce
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.extend.core.primitives import closed_call_p
+
+from hhtjax.xla import rows, turns, two_ways
+from hhtjax.xla.fit_for_kernel import lengths
+from hhtjax.xla.kernel_primitive import of_jaxpr
+from hhtjax.xla.holding import with_values_held
+from hhtjax.xla.kernels import STAGED
+from hhtjax.xla.sines import sines
+
+MOST_TERMS = 32  # of the sum that a product is written as
+MOST_ROWS = 64  # in one of the factors, of the product that is written out; the other may be a batch
+EXACT = {np.dtype(x) for x in ("float32", "float64", "int32", "int64", "uint32", "uint64")}
+MOST_WINDOWS = 32  # of a scatter; beyond, it takes longer to compile than it is worth
+MOST_PLACES = 4096  # for a window, side by side; each of a step's updates may copy all
+COMBINED = {
+    "scatter": lambda before, given: given,
+    "scatter-add": lax.add,
+    "scatter_add": lax.add,
+    "scatter_mul": lax.mul,
+    "scatter_min": lax.min,
+    "scatter_max": lax.max,
+    "scatter_sub": lax.sub,
+}
+INSIDE = object()  # what becomes of the question whether a kernel holds it
+IDENTITIES = {"hhtjax_structural", "hhtjax_largest_in_batch"}
+OURS = {  # operations of this package -> what they do, a function of arrays and parameters
+    "hhtjax_row_written": rows.written,
+    "hhtjax_in_turn": turns.values,
+    "hhtjax_values": two_ways.values,
+    "hhtjax_linear": two_ways.linear,
+    "hhtjax_both": two_ways.both,
+}
+
+
+def for_kernel(closed):
+    """The closed jaxpr, as a kernel needs it."""
+    return with_values_held(_Copier(_in_kernel).copied(closed))
+
+
+def for_list(closed):
+    """The closed jaxpr, as it is run where it is no kernel: stages are computed once, kernels in it stay."""
+    return with_values_held(_Copier(_in_list).copied(closed))
+
+
+class _Copier:
+    """Copies jaxprs, each once: functions that are called often stay one function."""
+
+    def __init__(self, other):
+        """other: equation, copier -> the closed jaxpr that takes its place, or None."""
+        self.other, self.done = other, {}
+
+    def copied(self, closed):
+        return ClosedJaxpr(self.jaxpr(closed.jaxpr), closed.consts)
+
+    def jaxpr(self, jaxpr):
+        if id(jaxpr) not in self.done:
+            self.done[id(jaxpr)] = jaxpr, self._jaxpr(jaxpr)
+        return self.done[id(jaxpr)][1]
+
+    def _jaxpr(self, jaxpr):
+        new, eqns = {}, []  # what stands for a variable
+
+        def read(x):
+            return x if isinstance(x, Literal) else new.get(x, x)
+
+        for eqn in _with_sines_together(jaxpr.eqns) if self.other is _in_kernel else jaxpr.eqns:
+            invars = [read(x) for x in eqn.invars]
+            if self.other is _in_kernel:
+                if eqn.primitive.name in IDENTITIES:
+                    new[eqn.outvars[0]] = invars[0]
+                    continue
+                if eqn.primitive.name == "hhtjax_inside" or (
+                    invars and invars[0] is INSIDE and eqn.primitive.name != "cond"
+                ):  # the answer, and the same as an integer
+                    new[eqn.outvars[0]] = INSIDE
+                    continue
+            eqn = eqn.replace(invars=invars)
+            other = self.other(eqn, self)
+            if other is None:
+                eqns.append(self._with_copies(eqn))
+            else:
+                invars = invars[1:] if invars and invars[0] is INSIDE else invars
+                params = {"call_jaxpr": other}
+                eqns.append(
+                    eqn.replace(primitive=closed_call_p, invars=invars, params=params, effects=other.effects)
+                )
+        return jaxpr.replace(eqns=eqns, outvars=[read(x) for x in jaxpr.outvars])
+
+    def _with_copies(self, eqn):
+        """The equation with copies of the jaxprs in it."""
+
+        def copied(x):
+            if isinstance(x, ClosedJaxpr):
+                return self.copied(x)
+            return self.jaxpr(x) if isinstance(x, Jaxpr) else x
+
+        if not any(isinstance(x, (ClosedJaxpr, Jaxpr)) for x in jax.tree.leaves(list(eqn.params.values()))):
+            return eqn
+        return eqn.replace(params={key: jax.tree.map(copied, x) for key, x in eqn.params.items()})
+
+
+IDLE = {"broadcast_in_dim"}
+MANY = 4  # values of a conditional: of fewer, a loop is no better
+
+
+@of_jaxpr
+def computed_once(closed):
+    """The closed jaxpr as a call that XLA does not inline, and so computes once, however many users its values have.
+
+    What has a single result XLA may divide among threads, and then the kernel does not link: it gets a second one."""
+    number = len(closed.out_avals)
+
+    def f(*x):
+        found = jaxpr_as_fun(closed)(*x)
+        divisible = number == 1 and found[0].size > 1
+        return [*found, lax.slice(found[0], [0] * found[0].ndim, [1] * found[0].ndim)] if divisible else found
+
+    def call(*x):
+        with set_xla_metadata(inlineable="false"):
+            return jax.jit(f)(*x)[:number]
+
+    return jax.make_jaxpr(call)(*closed.in_avals)
+
+
+def _is_seldom(eqn):
+    """A conditional on a boolean that has nothing to do where that is false, and many values to pass on."""
+    branches = eqn.params["branches"]
+    if len(branches) != 2 or len(eqn.outvars) < MANY:
+        return False
+    return {x.primitive.name for x in branches[0].jaxpr.eqns} <= IDLE
+
+
+def _loop_at_most_once(eqn, copier):
+    """A loop in the place of a conditional: XLA copies what that passes on, in either branch; what a loop carries stays
+    where it is."""
+    idle, taken = (copier.copied(x) for x in eqn.params["branches"])
+    passed = {x: i for i, x in enumerate(idle.jaxpr.outvars) if not isinstance(x, Literal)}
+    place = [passed.get(x) for x in idle.jaxpr.invars]
+
+    def run(which, *x):
+        def body(carry):
+            given = [x if i is None else carry[1 + i] for x, i in zip(x, place, strict=True)]
+            return jnp.array(False), *jaxpr_as_fun(taken)(*given)
+
+        return lax.while_loop(lambda carry: carry[0], body, (which != 0, *jaxpr_as_fun(idle)(*x)))[1:]
+
+    return _traced(run, [x.aval for x in eqn.invars])
+
+
+def _is_staged(eqn):
+    return eqn.primitive.name in ("jit", "pjit") and eqn.params["name"].startswith(STAGED)
+
+
+def _in_list(eqn, copier):
+    """What takes the place of an equation of a list of kernels."""
+    return computed_once(copier.copied(eqn.params["jaxpr"])) if _is_staged(eqn) else None
+
+
+def _in_kernel(eqn, copier):
+    """What takes the place of an equation, a closed jaxpr; None where it stays."""
+    name, params = eqn.primitive.name, eqn.params
+    if name == "cond":
+        if eqn.invars[0] is INSIDE:
+            return copier.copied(params["branches"][1])
+        return _loop_at_most_once(eqn, copier) if _is_seldom(eqn) else None
+    if name == "hhtjax_kernel":
+        return copier.copied(params["closed"])
+    if name in ("hhtjax_family", "hhtjax_bilinear"):
+        return copier.copied(params["jaxpr"])
+    if _is_staged(eqn):
+        return computed_once(copier.copied(params["jaxpr"]))
+    avals = tuple(x.aval for x in eqn.invars)
+    if name in OURS:
+        return copier.copied(_traced(partial(OURS[name], **params), avals))
+    if name == "dot_general" and _is_to_write_out(eqn):
+        return _product(avals, params["dimension_numbers"])
+    if name in COMBINED and _is_of_few_windows(eqn):
+        return _traced(partial(_scattered, COMBINED[name], params["dimension_numbers"]), avals)
+    if name == "hhtjax_sines":
+        return sines(avals, params["wanted"])
+    return None
+
+
+def _traced(f, avals):
+    def run(*x):
+        found = f(*x)
+        return found if isinstance(found, (list, tuple)) else [found]
+
+    return jax.make_jaxpr(run)(*avals)
+
+
+# products
+
+
+def _is_to_write_out(eqn):
+    """Of two matrices, with few terms."""
+    terms, *sides = lengths(eqn)
+    types = {x.aval.dtype for x in (*eqn.invars, *eqn.outvars)}
+    few = 0 < terms <= MOST_TERMS and min(sides) <= MOST_ROWS
+    return min(sides) > 1 and few and len(types) == 1 and types <= EXACT
+
+
+@lru_cache(maxsize=256)
+def _product(avals, dimension_numbers):
+    """A product as a sum over its terms, each a column times a row."""
+    (over, batch) = dimension_numbers
+
+    def product(x, y):
+        rest = [[i for i in range(z.ndim) if i not in (*o, *b)] for z, o, b in zip((x, y), over, batch, strict=True)]
+        shapes = [x.shape[i] for i in batch[0]], [x.shape[i] for i in rest[0]], [y.shape[i] for i in rest[1]]
+        x = lax.transpose(x, (*batch[0], *rest[0], *over[0]))
+        y = lax.transpose(y, (*batch[1], *rest[1], *over[1]))
+        terms = math.prod(x.shape[x.ndim - len(over[0]) :])
+        sizes = [math.prod(shape) for shape in shapes]
+        x, y = x.reshape(sizes[0], sizes[1], terms), y.reshape(sizes[0], sizes[2], terms)
+        found = reduce(lax.add, (x[:, :, None, k] * y[:, None, :, k] for k in range(terms)))
+        return found.reshape(*shapes[0], *shapes[1], *shapes[2])
+
+    return computed_once(_traced(product, avals))
+
+
+# scatters
+
+
+def _is_of_few_windows(eqn):
+    """Of few windows, in a small array, none of a batch with places of its own."""
+    dims = eqn.params["dimension_numbers"]
+    x, indices, updates = (z.aval for z in eqn.invars)
+    number = math.prod(indices.shape[:-1])
+    usual = not getattr(dims, "operand_batching_dims", ()) and 0 not in updates.shape and 0 not in indices.shape
+    sizes = updates.size // max(number, 1)
+    clips = eqn.params["mode"] == lax.GatherScatterMode.CLIP
+    return usual and not clips and number <= MOST_WINDOWS and x.size <= MOST_PLACES * sizes
+
+
+def _scattered(combine, dims, x, indices, updates):
+    """A slice, an operation and an update for each window."""
+    windows = [i for i in range(updates.ndim) if i not in dims.update_window_dims]
+    lengths = iter(updates.shape[i] for i in dims.update_window_dims)
+    sizes = [1 if i in dims.inserted_window_dims else next(lengths) for i in range(x.ndim)]
+    for which in np.ndindex(indices.shape[:-1]):
+        at = lax.reshape(lax.slice(indices, (*which, 0), (*(i + 1 for i in which), indices.shape[-1])), (indices.shape[-1],))
+        start = [jnp.zeros((), indices.dtype)] * x.ndim
+        for number, axis in enumerate(dims.scatter_dims_to_operand_dims):
+            start[axis] = at[number]
+        fixed = dict(zip(windows, which, strict=True))
+        low = [fixed.get(i, 0) for i in range(updates.ndim)]
+        high = [fixed[i] + 1 if i in fixed else n for i, n in enumerate(updates.shape)]
+        given = lax.reshape(lax.slice(updates, low, high), sizes)
+        before = lax.dynamic_slice(x, start, sizes)
+        known = [
+            (start[axis] >= 0) & (start[axis] <= x.shape[axis] - sizes[axis])
+            for axis in dims.scatter_dims_to_operand_dims
+        ]
+        new = combine(before, given)
+        inside = reduce(lax.bitwise_and, known) if known else None  # a slice would move it there, a scatter drops it
+        new = new if inside is None else jnp.where(inside, new, before)
+        x = lax.dynamic_update_slice(x, new, start)
+    return x
+
+
+# sines
+
+
+def _with_sines_together(eqns):
+    """The equations, with one for all sines and cosines of float64 numbers that can be computed together."""
+    made, group, since = [], [], set()
+
+    def end():
+        if group:
+            operands = list(dict.fromkeys(x.invars[0] for x in group if not isinstance(x.invars[0], Literal)))
+            wanted = tuple((x.primitive.name, operands.index(x.invars[0])) for x in group)
+            made[made.index(None)] = group[0].replace(
+                primitive=_SINES, invars=operands, outvars=[x.outvars[0] for x in group], params={"wanted": wanted}
+            )
+        group.clear()
+        since.clear()
+
+    for eqn in eqns:
+        if eqn.primitive.name in ("sin", "cos") and _is_sine(eqn):
+            x = eqn.invars[0]
+            if group and (x.aval.shape != group[0].invars[0].aval.shape or x in since):
+                end()
+            if not group:
+                made.append(None)
+            group.append(eqn)
+        else:
+            made.append(eqn)
+        if group:
+            since.update(eqn.outvars)
+    end()
+    return made
+
+
+def _is_sine(eqn):
+    x = eqn.invars[0]
+    return not isinstance(x, Literal) and x.aval.dtype == np.float64 and eqn.params.get("accuracy") is None
+
+
+class _Name:
+    name = "hhtjax_sines"
+
+
+_SINES = _Name()
