@@ -22,7 +22,7 @@ from jax.interpreters import ad, batching, mlir
 from hhtjax.xla.gate import is_on
 from hhtjax.xla.interpreter import alone, evaluate
 
-SHORT = 1  # numbers
+SHORT = 512  # numbers; XLA divides no work on so few among threads, which in a kernel takes a second result
 EQUALITIES = {"eq", "ne"}
 CHOICES = {"max", "min", "reduce_max", "reduce_min", "cummax", "cummin"}  # JAX's derivatives ask who equals the result
 # what a number passes unchanged, or with another sign, and what makes the same number of the same numbers
@@ -190,14 +190,8 @@ def _jvp(primals, tangents):
 
 def _lower(ctx, x):
     """A call that XLA does not inline."""
-    n = ctx.avals_in[0].size
-    call = jax.jit(lambda x: [x] if n <= SHORT else [x, x.ravel()[:1]])
-
-    def once(x):
-        with set_xla_metadata(inlineable="false"):
-            return call(x)[:1]
-
-    return mlir.lower_fun(once, multiple_results=True)(ctx, x)
+    call = jax.jit(lambda x: [x] if x.size <= SHORT else [x, x.ravel()[:1]])
+    return mlir.lower_fun(lambda x: set_xla_metadata(call(x)[0], inlineable="false"), multiple_results=False)(ctx, x)
 
 
 held_p = Primitive("hhtjax_held")

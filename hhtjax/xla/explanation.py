@@ -1,6 +1,5 @@
 """What became of a run in the compiled program."""
 
-import re
 import time
 from typing import Any, NamedTuple
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import lax
 
 from hhtjax.xla.parameters import ELEMENTWISE
 
@@ -32,17 +31,29 @@ SUMS = {
     *("argmax", "argmin", "reduce", "reduce_max", "reduce_min", "reduce_prod", "reduce_sum", "reduce_and", "reduce_or"),
     *("cumlogsumexp", "cummax", "cummin", "cumprod", "cumsum", "reduce_xor"),
 }
-INSIDE = {"while", "scan", "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat2"} | {
+INSIDE = {
+    "while",
+    "scan",
+    "jit",
+    "pjit",
+    "closed_call",
+    "core_call",
+    "custom_jvp_call",
+    "custom_vjp_call",
+    "remat2",
+} | {
     *("checkpoint", "custom_vjp_call_jaxpr", "remat", "custom_linear_solve", "hhtjax_kernel", "custom_lin"),
 }
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "bool", "int32", "int64", "uint32", "uint64")}
 
 
 class Verdict(NamedTuple):
-    """objection: why it cannot be one kernel, or None; eqn: the operation in question, where it is one."""
+    """objection: why it cannot be one kernel, or None; eqn: the operation in question, where it is one; operations: of
+    one that can, their number."""
 
     objection: Any
     eqn: Any = None
+    operations: int = 0
 
 
 class _Objection(Exception):
@@ -52,10 +63,9 @@ class _Objection(Exception):
 def verdict(jaxpr):
     """The `Verdict` on a jaxpr, all that it calls included."""
     try:
-        total, in_branches = _count(jaxpr, MOST_OPERATIONS)
+        return Verdict(None, None, sum(_count(jaxpr, MOST_OPERATIONS)))
     except _Objection as found:
         return Verdict(*found.args)
-    return Verdict(None)
 
 
 def inner(eqn):

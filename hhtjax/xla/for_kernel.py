@@ -11,15 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.extend.core.primitives import closed_call_p
 
 from hhtjax.xla import rows, turns, two_ways
-from hhtjax.xla.fit_for_kernel import lengths
-from hhtjax.xla.kernel_primitive import of_jaxpr
+from hhtjax.xla.calls import computed_once, kernel
+from hhtjax.xla.fit_for_kernel import lengths, verdict
 from hhtjax.xla.holding import with_values_held
-from hhtjax.xla.kernels import STAGED
+from hhtjax.xla.kernel_primitive import of_jaxpr
+from hhtjax.xla.kernels import PART, STAGED
 from hhtjax.xla.sines import sines
 
 MOST_TERMS = 32  # of the sum that a product is written as
@@ -36,6 +36,8 @@ COMBINED = {
     "scatter_max": lax.max,
     "scatter_sub": lax.sub,
 }
+LEAST = 6  # operations of a stage that is a kernel; fewer are one fusion or two anyway
+LARGEST = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
 INSIDE = object()  # what becomes of the question whether a kernel holds it
 IDENTITIES = {"hhtjax_structural", "hhtjax_largest_in_batch"}
 OURS = {  # operations of this package -> what they do, a function of arrays and parameters
@@ -49,20 +51,20 @@ OURS = {  # operations of this package -> what they do, a function of arrays and
 
 def for_kernel(closed):
     """The closed jaxpr, as a kernel needs it."""
-    return with_values_held(_Copier(_in_kernel).copied(closed))
+    return with_values_held(_Copier(_in_kernel, sines=True).copied(closed))
 
 
-def for_list(closed):
-    """The closed jaxpr, as it is run where it is no kernel: stages are computed once, kernels in it stay."""
-    return with_values_held(_Copier(_in_list).copied(closed))
+def for_list(closed, stages_are_kernels):
+    """The closed jaxpr, as it is run where it is no kernel: stages are computed once, or kernels; kernels in it stay."""
+    return with_values_held(_Copier(partial(_in_list, stages_are_kernels)).copied(closed))
 
 
 class _Copier:
     """Copies jaxprs, each once: functions that are called often stay one function."""
 
-    def __init__(self, other):
-        """other: equation, copier -> the closed jaxpr that takes its place, or None."""
-        self.other, self.done = other, {}
+    def __init__(self, other, sines=False):
+        """other: equation, copier -> the closed jaxpr that takes its place, or None; sines: as polynomials."""
+        self.other, self.sines, self.done = other, sines, {}
 
     def copied(self, closed):
         return ClosedJaxpr(self.jaxpr(closed.jaxpr), closed.consts)
@@ -78,7 +80,7 @@ class _Copier:
         def read(x):
             return x if isinstance(x, Literal) else new.get(x, x)
 
-        for eqn in _with_sines_together(jaxpr.eqns) if self.other is _in_kernel else jaxpr.eqns:
+        for eqn in _with_sines_together(jaxpr.eqns) if self.sines else jaxpr.eqns:
             invars = [read(x) for x in eqn.invars]
             if self.other is _in_kernel:
                 if eqn.primitive.name in IDENTITIES:
@@ -96,9 +98,7 @@ class _Copier:
             else:
                 invars = invars[1:] if invars and invars[0] is INSIDE else invars
                 params = {"call_jaxpr": other}
-                eqns.append(
-                    eqn.replace(primitive=closed_call_p, invars=invars, params=params, effects=other.effects)
-                )
+                eqns.append(eqn.replace(primitive=closed_call_p, invars=invars, params=params, effects=other.effects))
         return jaxpr.replace(eqns=eqns, outvars=[read(x) for x in jaxpr.outvars])
 
     def _with_copies(self, eqn):
@@ -116,25 +116,6 @@ class _Copier:
 
 IDLE = {"broadcast_in_dim"}
 MANY = 4  # values of a conditional: of fewer, a loop is no better
-
-
-@of_jaxpr
-def computed_once(closed):
-    """The closed jaxpr as a call that XLA does not inline, and so computes once, however many users its values have.
-
-    What has a single result XLA may divide among threads, and then the kernel does not link: it gets a second one."""
-    number = len(closed.out_avals)
-
-    def f(*x):
-        found = jaxpr_as_fun(closed)(*x)
-        divisible = number == 1 and found[0].size > 1
-        return [*found, lax.slice(found[0], [0] * found[0].ndim, [1] * found[0].ndim)] if divisible else found
-
-    def call(*x):
-        with set_xla_metadata(inlineable="false"):
-            return jax.jit(f)(*x)[:number]
-
-    return jax.make_jaxpr(call)(*closed.in_avals)
 
 
 def _is_seldom(eqn):
@@ -162,13 +143,41 @@ def _loop_at_most_once(eqn, copier):
     return _traced(run, [x.aval for x in eqn.invars])
 
 
-def _is_staged(eqn):
-    return eqn.primitive.name in ("jit", "pjit") and eqn.params["name"].startswith(STAGED)
+def _is_named(name, eqn):
+    return eqn.primitive.name in ("jit", "pjit") and eqn.params["name"].startswith(name)
 
 
-def _in_list(eqn, copier):
+_is_staged = partial(_is_named, STAGED)
+
+
+def _in_list(stages_are_kernels, eqn, copier):
     """What takes the place of an equation of a list of kernels."""
-    return computed_once(copier.copied(eqn.params["jaxpr"])) if _is_staged(eqn) else None
+    if _is_staged(eqn) or (stages_are_kernels and _is_named(PART, eqn)):
+        found = _stage_kernel(eqn.params["jaxpr"]) if stages_are_kernels else None
+        if found is not None or _is_staged(eqn):
+            return found or computed_once(copier.copied(eqn.params["jaxpr"]))
+    return _expanded(eqn, copier)
+
+
+@of_jaxpr
+def _stage_kernel(closed):
+    """A stage as a kernel, where it makes one, and is worth one; None of all else. With sines of XLA's own: polynomials,
+    of which a kernel takes many at a time, take longer to compile."""
+    form = _Copier(_in_kernel).copied(closed)
+    found = verdict(form.jaxpr)
+    if found.objection or found.operations < LEAST or any(x.size > LARGEST for x in (*form.in_avals, *form.out_avals)):
+        return None
+    return jax.make_jaxpr(kernel(form))(*form.in_avals)
+
+
+def _expanded(eqn, copier):
+    """What an operation of this package does; None of any other."""
+    name, params = eqn.primitive.name, eqn.params
+    if name in ("hhtjax_family", "hhtjax_bilinear"):
+        return copier.copied(params["jaxpr"])
+    if name in OURS:
+        return copier.copied(_traced(partial(OURS[name], **params), [x.aval for x in eqn.invars]))
+    return None
 
 
 def _in_kernel(eqn, copier):
@@ -180,20 +189,16 @@ def _in_kernel(eqn, copier):
         return _loop_at_most_once(eqn, copier) if _is_seldom(eqn) else None
     if name == "hhtjax_kernel":
         return copier.copied(params["closed"])
-    if name in ("hhtjax_family", "hhtjax_bilinear"):
-        return copier.copied(params["jaxpr"])
     if _is_staged(eqn):
         return computed_once(copier.copied(params["jaxpr"]))
     avals = tuple(x.aval for x in eqn.invars)
-    if name in OURS:
-        return copier.copied(_traced(partial(OURS[name], **params), avals))
     if name == "dot_general" and _is_to_write_out(eqn):
         return _product(avals, params["dimension_numbers"])
     if name in COMBINED and _is_of_few_windows(eqn):
         return _traced(partial(_scattered, COMBINED[name], params["dimension_numbers"]), avals)
     if name == "hhtjax_sines":
         return sines(avals, params["wanted"])
-    return None
+    return _expanded(eqn, copier)
 
 
 def _traced(f, avals):
@@ -254,7 +259,9 @@ def _scattered(combine, dims, x, indices, updates):
     lengths = iter(updates.shape[i] for i in dims.update_window_dims)
     sizes = [1 if i in dims.inserted_window_dims else next(lengths) for i in range(x.ndim)]
     for which in np.ndindex(indices.shape[:-1]):
-        at = lax.reshape(lax.slice(indices, (*which, 0), (*(i + 1 for i in which), indices.shape[-1])), (indices.shape[-1],))
+        at = lax.reshape(
+            lax.slice(indices, (*which, 0), (*(i + 1 for i in which), indices.shape[-1])), (indices.shape[-1],)
+        )
         start = [jnp.zeros((), indices.dtype)] * x.ndim
         for number, axis in enumerate(dims.scatter_dims_to_operand_dims):
             start[axis] = at[number]

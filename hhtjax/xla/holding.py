@@ -12,9 +12,10 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from hhtjax.xla.consistent import held_p
 
+ONCE = "hhtjax_once"  # name of a function that XLA computes once
 LEAST = 40  # operations that are evaluated once more without a call; of fewer, nothing is gained
-CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"}
-LOOPS = {"cond", "while", "scan"}
+CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2"}
+LOOPS = {"cond", "while", "scan", "custom_linear_solve"}
 MADE_ONCE = LOOPS | {"dot_general", "hhtjax_held"}  # by XLA in any case
 BROADCAST = "broadcast_in_dim"  # handed on before it is one
 FREE = {BROADCAST, "convert_element_type", "reshape", "slice", "transpose", "squeeze", "expand_dims", "copy", "split"}
@@ -63,9 +64,11 @@ class _Holder:
                 cost[x] = taken
         outvars = [x if isinstance(x, Literal) else new.get(x, x) for x in jaxpr.outvars]
         after = jaxpr.replace(eqns=made, outvars=outvars)
-        return after, [0 if isinstance(x, Literal) else cost.get(x, 0) for x in outvars], [
-            uses.get(x, 0) for x in jaxpr.invars
-        ]
+        return (
+            after,
+            [0 if isinstance(x, Literal) else cost.get(x, 0) for x in outvars],
+            [uses.get(x, 0) for x in jaxpr.invars],
+        )
 
     def _inside(self, eqn):
         """The equation with what is inside done, costs of its results as a call, uses of its arguments."""
@@ -79,12 +82,16 @@ class _Holder:
                 after, *more = self.held(x.jaxpr)
                 told.append(more)
                 return ClosedJaxpr(after, x.consts)
+            if isinstance(x, Jaxpr):
+                after, *more = self.held(x)
+                told.append(more)
+                return after
             return x
 
         eqn = eqn.replace(params={key: jax.tree.map(inner, x) for key, x in eqn.params.items()})
         if name in LOOPS:
             return eqn, None, None
-        if (eqn.ctx.xla_metadata or {}).get("inlineable") == "false":
+        if eqn.params.get("name") == ONCE:
             return eqn, "once", None
         return eqn, *told[0]
 
@@ -92,9 +99,4 @@ class _Holder:
 def _handed_on(eqn, x, new):
     """An equation that gives x by another name."""
     other = new[x] = copy(x)  # a variable is known by its identity
-    return eqn.replace(
-        primitive=held_p, invars=[x], outvars=[other], params={}, effects=frozenset(), ctx=eqn.ctx
-    )
-
-
-__all__ = ["Jaxpr", "with_values_held"]
+    return eqn.replace(primitive=held_p, invars=[x], outvars=[other], params={}, effects=frozenset(), ctx=eqn.ctx)

@@ -209,9 +209,7 @@ def _transposed(closed, linear, given):
         def f(*moving):
             return jaxpr_as_fun(closed)(*_merged(known, moving, linear))
 
-        full = [
-            next(cotangents) if g else jnp.zeros(x.shape, x.dtype) for g, x in zip(given, out_avals, strict=True)
-        ]
+        full = [next(cotangents) if g else jnp.zeros(x.shape, x.dtype) for g, x in zip(given, out_avals, strict=True)]
         back = jax.linear_transpose(f, *_parted(closed.in_avals, linear)[1])
         return back(full)
 

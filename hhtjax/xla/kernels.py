@@ -20,7 +20,6 @@ from hhtjax.xla.kernel_primitive import kernel_p
 # names of functions; autodiff and vmap keep them
 KERNEL, STAGED, PART = "hhtjax_one_kernel", "hhtjax_staged", "hhtjax_part"
 AROUND = "hhtjax_around"
-QUICKLY = "hhtjax_quickly"  # of programs that XLA compiles by its older way
 WRITTEN_OUT = 32  # numbers of a sum in a loop, one after the other
 
 

@@ -7,25 +7,22 @@ something stands against it, the function runs as a list of kernels, and the fun
 asked anew. Platforms other than the CPU never see it.
 """
 
-from functools import reduce
+from contextvars import ContextVar
 from inspect import signature
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jax.core import eval_jaxpr
-from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
-from hhtjax.xla.fit_for_kernel import DTYPES, verdict
+from hhtjax.xla.calls import kernel
+from hhtjax.xla.fit_for_kernel import verdict
 from hhtjax.xla.for_kernel import for_kernel, for_list
 from hhtjax.xla.kernel_primitive import kernel_p, of_jaxpr
 from hhtjax.xla.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
 from hhtjax.xla.source_lines import asked, line_of
 
+quickly: ContextVar = ContextVar("hhtjax_quickly", default=False)  # compiled by XLA's older way
 DIVIDED = "partitioned over devices; shard_map leaves each its own kernel"
 
 
@@ -37,19 +34,20 @@ def _as_kernel(closed):
 
 
 @of_jaxpr
-def _as_list(closed):
+def _as_list(closed, stages_are_kernels):
     """The jaxpr in the form for a list of kernels."""
-    return for_list(closed)
+    return for_list(closed, stages_are_kernels)
 
 
 def _lower(ctx, *args, closed, name):
-    form, (objection, eqn) = _as_kernel(closed)
-    if _is_partitioned(ctx.module_context.axis_context):
+    form, (objection, eqn, _) = _as_kernel(closed)
+    is_divided = _is_partitioned(ctx.module_context.axis_context)
+    if is_divided:
         objection, eqn = DIVIDED, None
     if name != AROUND:
         line = eqn and line_of(eqn)
         _tell(object(), f"plain: {objection}{', ' if line else ''}{line or ''}" if objection else "one kernel")
-    run = jaxpr_as_fun(_as_list(closed)) if objection else _kernel(form)
+    run = jaxpr_as_fun(_as_list(closed, not (is_divided or quickly.get()))) if objection else kernel(form)
     return mlir.lower_fun(run, multiple_results=True)(ctx, *args)
 
 
@@ -62,35 +60,6 @@ def _tell(loop, path):
 def _lower_told(ctx, x, why, loop):
     _tell(loop, f"plain: {why}")
     return [x]
-
-
-def _kernel(form):
-    """The function of a closed jaxpr as a kernel.
-
-    XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once a constant is put in its place.
-    So the kernel returns a number that takes an element of each, and the values are hidden from XLA."""
-    number = len(form.out_avals)
-
-    def kernel(*args):
-        return [*eval_jaxpr(form.jaxpr, form.consts, *args), *_of_each(args)]
-
-    def call(*args):
-        hidden = lax.optimization_barrier(args)
-        with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
-            return jax.jit(kernel)(*hidden)[:number]
-
-    return call
-
-
-def _of_each(values):
-    """A sum of elements of all, and what no sum takes: to return each by itself would take a buffer each."""
-    terms, rest = [], []
-    for x in values:
-        if x.size and x.dtype in DTYPES:
-            terms.append(lax.slice(x, [0] * x.ndim, [1] * x.ndim).reshape(()).astype(np.float32))
-        else:
-            rest.append(x)
-    return [*([reduce(jnp.add, terms)] if terms else []), *rest]
 
 
 def _is_partitioned(axes):

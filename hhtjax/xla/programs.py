@@ -10,14 +10,13 @@ batch of double pendulums then takes half the time.
 For a jit of one's own: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
 """
 
-from functools import wraps
 from typing import Any
 
 import jax
 
 from hhtjax.description import programs
 from hhtjax.xla.gate import is_on
-from hhtjax.xla.kernels import QUICKLY
+from hhtjax.xla.lowering import quickly
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 MOST_QUICK = 32  # rates; with 40, steps of a beam take 1.2 times as long
@@ -38,7 +37,6 @@ class Programs:
     def __init__(self, f, **static):
         """static: of `jax.jit`."""
         self.usual: Any = jax.jit(f, **static)
-        f = _quickly(self.usual)  # traced once for all
         self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
         programs.update((self.usual, self.quick, self.wide))
@@ -52,8 +50,10 @@ class Programs:
 
     def __call__(self, *args, rates=0, numbers=None, **keywords):
         """The values of the function."""
+        program = self.of(rates, numbers)
+        token = quickly.set(program is not self.usual)
         try:
-            return self.of(rates, numbers)(*args, **keywords)
+            return program(*args, **keywords)
         except ValueError as error:  # there are options inside a jit of the user's
             if "compiler_options" not in str(error):
                 raise
@@ -61,19 +61,10 @@ class Programs:
             if "No such compile option" not in str(error):
                 raise
             Programs.are_refused = True
+        finally:
+            quickly.reset(token)
         return self.usual(*args, **keywords)
 
     def number(self):
         """Of all that have been compiled."""
         return sum(program._cache_size() for program in (self.usual, self.quick, self.wide))
-
-
-def _quickly(f):
-    """f by a name that tells how it is compiled."""
-
-    @wraps(f)
-    def call(*args, **keywords):
-        return f(*args, **keywords)
-
-    call.__name__ = f"{QUICKLY}_{f.__name__.strip('_')}"
-    return call

@@ -9,6 +9,7 @@ from functools import lru_cache, reduce
 import jax
 import jax.numpy as jnp
 from jax import lax
+
 NAME = "hhtjax_sines"
 RANGE = 1e5  # largest |x|, rad
 ONES = 3 * 2.0**51  # beyond it the last bit of a number is one
