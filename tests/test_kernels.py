@@ -7,7 +7,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from linked_pendulums import LIGHT, N, end, links, loss, on_cpu, paths, run
+from linked_pendulums import LIGHT, N, end, loss, on_cpu, paths, run
 
 import hhtjax
 from hhtjax.xla import fit_for_kernel, kernels

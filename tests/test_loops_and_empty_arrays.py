@@ -83,7 +83,7 @@ def test_branches_are_counted_by_themselves(monkeypatch):
     monkeypatch.setattr(fit_for_kernel, "MOST_OPERATIONS", 100)
     assert "more than 100 operations" in told(lambda x: waves(waves(x)))
     assert told(seldom) == "one kernel"
-    monkeypatch.setattr(fit_for_kernel, "MOST_IN_BRANCH", 100)
+    monkeypatch.setattr(fit_for_kernel, "MOST_IN_BRANCHES", 100)
     assert "more than 100 operations in branches" in told(seldom)
 
 

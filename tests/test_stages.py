@@ -8,8 +8,7 @@ from jax import lax
 from linked_pendulums import on_cpu
 
 import hhtjax
-from hhtjax.xla import Programs, kernels, lowering
-from hhtjax.xla.kernels import QUICKLY
+from hhtjax.xla import for_kernel, kernels, lowering
 
 x = jnp.linspace(-0.4, 1.1, 6)
 KERNEL = 'xla_cpu_small_call = "true"'
@@ -61,7 +60,7 @@ def lowered(f, x, name="a_user"):
 @pytest.mark.compiled
 @pytest.mark.parametrize(
     ("f", "x", "number"),
-    [(run, x, 1), (jax.grad(loss), x, 3), (jax.vmap(run), jnp.stack([x, x[::-1], x**2]), 1)],
+    [(run, x, 1), (jax.grad(loss), x, 4), (jax.vmap(run), jnp.stack([x, x[::-1], x**2]), 1)],
     ids=["values", "reverse", "batch"],
 )
 def test_stages_as_kernels_give_what_plain_jax_gives(f, x, number):
@@ -77,17 +76,12 @@ def test_stages_as_kernels_give_what_plain_jax_gives(f, x, number):
 @pytest.mark.parametrize(("limit", "value", "number"), [("LEAST", 1000, 0), ("LARGEST", 35, 1)])
 def test_short_and_large_stages_are_no_kernels(monkeypatch, limit, value, number):
     """But what a large one holds is."""
-    monkeypatch.setattr(lowering, limit, value)
+    monkeypatch.setattr(for_kernel, limit, value)
     assert lowered(run, x).as_text().count(KERNEL) == number
 
 
 @on_cpu
 def test_nothing_changes_where_fusions_compile_quickly():
-    assert lowered(run, x, QUICKLY).as_text().count(KERNEL) == 0
-
-
-@on_cpu
-def test_programs_tell_how_they_are_compiled():
-    twice = Programs(lambda x: 2 * x)
-    for program, tells in ((twice.quick, True), (twice.wide, True), (twice.usual, False)):
-        assert (QUICKLY in program.lower(1.0).as_text()) == tells
+    token = lowering.quickly.set(True)
+    assert lowered(run, x).as_text().count(KERNEL) == 0
+    lowering.quickly.reset(token)

@@ -67,7 +67,9 @@ def computed_once(closed):
 
     def body(*args):
         found = jaxpr_as_fun(closed)(*args)
-        return [*found, _first(found[0])] if number == 1 and found[0].size > 1 else found
+        if number > 1 or found[0].size <= 1:
+            return found
+        return [*found, _first(next((x for x in args if x.size), found[0]))]  # of what is known before all else
 
     body.__name__ = ONCE
     call = _with_attributes(body, inlineable="false")

@@ -52,14 +52,13 @@ def explain(f, *args) -> Explanation:
     >>> def height(c):
     ...     run = hhtjax.simulate(ball, hhtjax.hht(), jnp.array([9.0]), jnp.array([0.0]), c, dt=0.01, num_steps=50)
     ...     return run.q[-1, 0]
-    >>> forward, back = hhtjax.explain(jax.grad(height), 0.1).paths
-    >>> forward == back == "one kernel" or forward.startswith("plain: JAX")     # too old, or too new
-    True
+    >>> hhtjax.explain(jax.grad(height), 0.1).paths                             # forward, and back
+    ('one kernel', 'one kernel')
     """
     start, paths = time.perf_counter(), {}
     token = asked.set(paths)
     try:
-        lowered = jax.jit(f).lower(*args)
+        lowered = jax.jit(lambda *args: f(*args)).lower(*args)  # anew: JAX keeps what it has lowered
     finally:
         asked.reset(token)
     compiled = lowered.compile()

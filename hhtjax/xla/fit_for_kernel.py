@@ -9,19 +9,22 @@ import math
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.xla.parameters import ELEMENTWISE
 
 LARGEST_SUM = 4095  # numbers of a sum; XLA hands larger ones to another library
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
-MOST_OPERATIONS = 12_000  # of more, compiling takes long, or fails: LLVM takes 20 s for a gradient of 12,500
-MOST_IN_BRANCH = 10_000  # the same in one branch, and in all together
+MOST_OPERATIONS = 15_000  # of more, compiling takes long, or fails: LLVM takes 20 s for a gradient of 12,500
+MOST_IN_BRANCH = 12_500  # the same in one branch, which is seldom taken
+MOST_IN_BRANCHES = 15_000  # and in all together
 
 KNOWN = ELEMENTWISE | {
     *("broadcast_in_dim", "concatenate", "dynamic_slice", "dynamic_update_slice", "expand_dims", "gather", "iota"),
     *("pad", "reshape", "rev", "shift_right_arithmetic", "shift_left", "shift_right_logical", "slice", "split"),
     *("squeeze", "stack", "transpose", "unstack", "optimization_barrier", "reduce_precision", "clz"),
+    *("empty", "empty2", "eq_to", "le_to", "lt_to"),
     *("bessel_i1e", "digamma", "erf_inv", "erfc", "lgamma", "zeta", "copy_p", "pvary", "pcast", "population_count"),
     *("random_bits", "random_fold_in", "random_seed", "random_split", "random_unwrap", "random_wrap", "threefry2x32"),
     *("nextafter", "xla_metadata_value", "acosh", "square"),
@@ -32,40 +35,42 @@ SUMS = {
     *("cumlogsumexp", "cummax", "cummin", "cumprod", "cumsum", "reduce_xor"),
 }
 INSIDE = {
-    "while",
-    "scan",
-    "jit",
-    "pjit",
-    "closed_call",
-    "core_call",
-    "custom_jvp_call",
-    "custom_vjp_call",
-    "remat2",
-} | {
-    *("checkpoint", "custom_vjp_call_jaxpr", "remat", "custom_linear_solve", "hhtjax_kernel", "custom_lin"),
+    *(
+        "checkpoint",
+        "closed_call",
+        "core_call",
+        "custom_jvp_call",
+        "custom_lin",
+        "custom_linear_solve",
+        "hhtjax_kernel",
+    ),
+    *("custom_vjp_call", "custom_vjp_call_jaxpr", "jit", "pjit", "remat", "remat2", "scan", "while"),
 }
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "bool", "int32", "int64", "uint32", "uint64")}
 
 
 class Verdict(NamedTuple):
-    """objection: why it cannot be one kernel, or None; eqn: the operation in question, where it is one; operations: of
-    one that can, their number."""
+    """objection: why it cannot be one kernel, or None; eqns: the operation in question, and those around it;
+    operations: of one that can be, their number."""
 
     objection: Any
-    eqn: Any = None
+    eqns: tuple = ()
     operations: int = 0
 
 
 class _Objection(Exception):
-    """Ends the search."""
+    """Ends the search: why, and the operations, the innermost first."""
+
+    def __init__(self, why, *eqns):
+        self.why, self.eqns = why, eqns
 
 
 def verdict(jaxpr):
     """The `Verdict` on a jaxpr, all that it calls included."""
     try:
-        return Verdict(None, None, sum(_count(jaxpr, MOST_OPERATIONS)))
+        return Verdict(None, operations=sum(_count(jaxpr, MOST_OPERATIONS)))
     except _Objection as found:
-        return Verdict(*found.args)
+        return Verdict(found.why, found.eqns)
 
 
 def inner(eqn):
@@ -84,25 +89,27 @@ def _count(jaxpr, most):
     for eqn in jaxpr.eqns:
         number += 1
         name = eqn.primitive.name
-        if name == "cond":
-            counts = [sum(_count(x, MOST_IN_BRANCH)) for x in inner(eqn)]
-            in_branches += sum(counts)
-        elif name in INSIDE:
+        if name in INSIDE or name == "cond":
             for x in inner(eqn):
-                more, branches = _count(x, most)
+                try:
+                    more, branches = _count(x, MOST_IN_BRANCH if name == "cond" else most)
+                except _Objection as found:
+                    found.eqns = (*found.eqns, eqn)
+                    raise
+                if name == "cond":
+                    more, branches = 0, more + branches
                 number, in_branches = number + more, in_branches + branches
-        else:
-            objection = _objection(eqn, name)
-            if objection:
-                raise _Objection(objection, eqn)
-        if number > most or in_branches > MOST_IN_BRANCH:
-            raise _Objection(f"more than {most} operations{' in branches' if in_branches > MOST_IN_BRANCH else ''}")
+        elif objection := _objection(eqn, name):
+            raise _Objection(objection, eqn)
+        if number > most:
+            raise _Objection(f"more than {most} operations")
+        if in_branches > MOST_IN_BRANCHES:
+            raise _Objection(f"more than {MOST_IN_BRANCHES} operations in branches")
     return number, in_branches
 
 
 def _objection(eqn, name):
-    avals = [x.aval for x in (*eqn.invars, *eqn.outvars)]
-    odd = [x for x in avals if getattr(x, "dtype", None) not in DTYPES and not _is_key(x)]
+    odd = [x.aval for x in (*eqn.invars, *eqn.outvars) if not _is_usual(x.aval)]
     if odd:
         return f"{name} of {odd[0].str_short()}"
     if name in KNOWN:
@@ -115,8 +122,10 @@ def _objection(eqn, name):
     return name
 
 
-def _is_key(aval):
-    return jax.dtypes.issubdtype(getattr(aval, "dtype", None), jax.dtypes.extended) or aval.dtype == jax.dtypes.float0
+def _is_usual(aval):
+    """Of numbers that the emitter has been seen with; keys of random numbers are arrays of these."""
+    dtype: Any = getattr(aval, "dtype", None)
+    return dtype in DTYPES or dtype == jax.dtypes.float0 or jnp.issubdtype(dtype, jax.dtypes.extended)
 
 
 def lengths(eqn):

@@ -20,6 +20,7 @@ from hhtjax.xla.fit_for_kernel import lengths, verdict
 from hhtjax.xla.holding import with_values_held
 from hhtjax.xla.kernel_primitive import of_jaxpr
 from hhtjax.xla.kernels import PART, STAGED
+from hhtjax.xla.parameters import replaces
 from hhtjax.xla.sines import sines
 
 MOST_TERMS = 32  # of the sum that a product is written as
@@ -27,14 +28,8 @@ MOST_ROWS = 64  # in one of the factors, of the product that is written out; the
 EXACT = {np.dtype(x) for x in ("float32", "float64", "int32", "int64", "uint32", "uint64")}
 MOST_WINDOWS = 32  # of a scatter; beyond, it takes longer to compile than it is worth
 MOST_PLACES = 4096  # for a window, side by side; each of a step's updates may copy all
-COMBINED = {
-    "scatter": lambda before, given: given,
-    "scatter-add": lax.add,
-    "scatter_add": lax.add,
-    "scatter_mul": lax.mul,
-    "scatter_min": lax.min,
-    "scatter_max": lax.max,
-    "scatter_sub": lax.sub,
+COMBINED = {"scatter": lambda before, given: given} | {  # an older JAX writes some of them otherwise
+    f"scatter{mark}{name}": getattr(lax, name) for mark in "-_" for name in ("add", "sub", "mul", "min", "max")
 }
 LEAST = 6  # operations of a stage that is a kernel; fewer are one fusion or two anyway
 LARGEST = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
@@ -55,7 +50,7 @@ def for_kernel(closed):
 
 
 def for_list(closed, stages_are_kernels):
-    """The closed jaxpr, as it is run where it is no kernel: stages are computed once, or kernels; kernels in it stay."""
+    """The closed jaxpr, as it is run where it is no kernel: stages are computed once, or kernels; kernels stay."""
     return with_values_held(_Copier(partial(_in_list, stages_are_kernels)).copied(closed))
 
 
@@ -67,7 +62,9 @@ class _Copier:
         self.other, self.sines, self.done = other, sines, {}
 
     def copied(self, closed):
-        return ClosedJaxpr(self.jaxpr(closed.jaxpr), closed.consts)
+        if id(closed) not in self.done:
+            self.done[id(closed)] = closed, ClosedJaxpr(self.jaxpr(closed.jaxpr), closed.consts)
+        return self.done[id(closed)][1]
 
     def jaxpr(self, jaxpr):
         if id(jaxpr) not in self.done:
@@ -153,19 +150,20 @@ _is_staged = partial(_is_named, STAGED)
 def _in_list(stages_are_kernels, eqn, copier):
     """What takes the place of an equation of a list of kernels."""
     if _is_staged(eqn) or (stages_are_kernels and _is_named(PART, eqn)):
-        found = _stage_kernel(eqn.params["jaxpr"]) if stages_are_kernels else None
+        found = _stage_kernel(eqn.params["jaxpr"], LEAST, LARGEST) if stages_are_kernels else None
         if found is not None or _is_staged(eqn):
             return found or computed_once(copier.copied(eqn.params["jaxpr"]))
     return _expanded(eqn, copier)
 
 
 @of_jaxpr
-def _stage_kernel(closed):
-    """A stage as a kernel, where it makes one, and is worth one; None of all else. With sines of XLA's own: polynomials,
-    of which a kernel takes many at a time, take longer to compile."""
+def _stage_kernel(closed, least, largest):
+    """A stage as a kernel, where it makes one, and is worth one; None of all else.
+
+    With sines of XLA's own: polynomials, of which a kernel takes many at a time, take longer to compile."""
     form = _Copier(_in_kernel).copied(closed)
     found = verdict(form.jaxpr)
-    if found.objection or found.operations < LEAST or any(x.size > LARGEST for x in (*form.in_avals, *form.out_avals)):
+    if found.objection or found.operations < least or any(x.size > largest for x in (*form.in_avals, *form.out_avals)):
         return None
     return jax.make_jaxpr(kernel(form))(*form.in_avals)
 
@@ -247,9 +245,10 @@ def _is_of_few_windows(eqn):
     dims = eqn.params["dimension_numbers"]
     x, indices, updates = (z.aval for z in eqn.invars)
     number = math.prod(indices.shape[:-1])
-    usual = not getattr(dims, "operand_batching_dims", ()) and 0 not in updates.shape and 0 not in indices.shape
+    usual = not getattr(dims, "operand_batching_dims", ()) and number and 0 not in updates.shape
     sizes = updates.size // max(number, 1)
     clips = eqn.params["mode"] == lax.GatherScatterMode.CLIP
+    usual = usual and (eqn.primitive.name != "scatter" or replaces(eqn.params["update_jaxpr"]))
     return usual and not clips and number <= MOST_WINDOWS and x.size <= MOST_PLACES * sizes
 
 

@@ -10,6 +10,11 @@ import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 
 VARIABLE = "HHTJAX_PLAIN"  # 1: off
+OLDEST = (
+    0,
+    7,
+    2,
+)  # the first JAX that compiles kernels with all that they may hold; older ones end the process over some
 
 _plain: ContextVar = ContextVar("hhtjax_plain", default=False)
 # part of the key under which JAX keeps a compiled function, so that both forms of it can be there
@@ -81,6 +86,8 @@ def or_plain(run: Callable, again: Callable | None = None):
 
 def why_off():
     """Why the machinery is off, in words; None where it is on."""
+    if jax.__version_info__ < OLDEST:
+        return f"JAX {jax.__version__} is older than {'.'.join(map(str, OLDEST))}"
     if _plain.get():
         return "inside hhtjax.plain()"
     wish = os.environ.get(VARIABLE, "")

@@ -1,10 +1,10 @@
 """How XLA:CPU shall cut a program into kernels, decided when it is lowered.
 
-A call that bears `xla_cpu_small_call` is compiled into one kernel, with all its loops. Such a kernel must hold only what
-its emitter knows: with LAPACK, sort, a large scatter or product, compilation fails. So the function is looked through
-first (fit_for_kernel.py), in the form that it has as a kernel (for_kernel.py), with vmap and autodiff done. Where
-something stands against it, the function runs as a list of kernels, and the functions in it that may be kernels are
-asked anew. Platforms other than the CPU never see it.
+A call that bears `xla_cpu_small_call` is compiled into one kernel, with all its loops. Such a kernel must hold only
+what its emitter knows: with LAPACK, sort, a large scatter or product, compilation fails. So the function is looked
+through first (fit_for_kernel.py), in the form that it has as a kernel (for_kernel.py), with vmap and autodiff done.
+Where something stands against it, the function runs as a list of kernels, and the functions in it that may be kernels
+are asked anew. Platforms other than the CPU never see it.
 """
 
 from contextvars import ContextVar
@@ -16,7 +16,7 @@ from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
 from hhtjax.xla.calls import kernel
-from hhtjax.xla.fit_for_kernel import verdict
+from hhtjax.xla.fit_for_kernel import inner, verdict
 from hhtjax.xla.for_kernel import for_kernel, for_list
 from hhtjax.xla.kernel_primitive import kernel_p, of_jaxpr
 from hhtjax.xla.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
@@ -40,15 +40,29 @@ def _as_list(closed, stages_are_kernels):
 
 
 def _lower(ctx, *args, closed, name):
-    form, (objection, eqn, _) = _as_kernel(closed)
+    if tuple(ctx.module_context.platforms) != ("cpu",) or not closed.jaxpr.eqns:
+        return mlir.lower_fun(jaxpr_as_fun(closed), multiple_results=True)(ctx, *args)
+    form, (objection, eqns, _) = _as_kernel(closed)
     is_divided = _is_partitioned(ctx.module_context.axis_context)
     if is_divided:
-        objection, eqn = DIVIDED, None
+        objection, eqns = DIVIDED, ()
+    if name == AROUND and not objection and asked.get() is not None:
+        for _ in range(_number_of_kernels(closed.jaxpr)):
+            _tell(object(), "one kernel")
     if name != AROUND:
-        line = eqn and line_of(eqn)
+        line = next(filter(None, map(line_of, eqns)), None) if asked.get() is not None else None
         _tell(object(), f"plain: {objection}{', ' if line else ''}{line or ''}" if objection else "one kernel")
     run = jaxpr_as_fun(_as_list(closed, not (is_divided or quickly.get()))) if objection else kernel(form)
     return mlir.lower_fun(run, multiple_results=True)(ctx, *args)
+
+
+def _number_of_kernels(jaxpr):
+    """In a jaxpr."""
+    number = 0
+    for eqn in jaxpr.eqns:
+        is_one = eqn.primitive is kernel_p and eqn.params["name"] != AROUND
+        number += 1 if is_one else sum(map(_number_of_kernels, inner(eqn)))
+    return number
 
 
 def _tell(loop, path):
@@ -71,9 +85,7 @@ def _is_partitioned(axes):
 
 # a cached lowering would tell `explain` nothing; an older JAX keeps none
 UNCACHED: Any = {"cacheable": False} if "cacheable" in signature(mlir.register_lowering).parameters else {}
-PLAIN = mlir.lower_fun(lambda *args, closed, name: jaxpr_as_fun(closed)(*args), multiple_results=True)
-mlir.register_lowering(kernel_p, PLAIN)
-mlir.register_lowering(kernel_p, _lower, platform="cpu", **UNCACHED)
+mlir.register_lowering(kernel_p, _lower, **UNCACHED)
 mlir.register_lowering(told_p, _lower_told, **UNCACHED)
 mlir.register_lowering(inside_p, lambda ctx, x: [mlir.ir_constant(np.bool_(False))])
 mlir.register_lowering(structural_p, lambda ctx, x: [x])

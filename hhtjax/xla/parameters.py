@@ -52,7 +52,7 @@ def _mode(value):
     return value in (modes.CLIP, modes.FILL_OR_DROP, modes.PROMISE_IN_BOUNDS)
 
 
-def _replaces(jaxpr):
+def replaces(jaxpr):
     """Whether an update of a scatter takes the place of what was there; others compute with both."""
     if jaxpr is None:
         return True
@@ -87,7 +87,7 @@ UNDERSTOOD = {
     **{f"reduce_{kind}": _SUM for kind in ("sum", "prod", "max", "min", "and", "or")},
     "reshape": {**_of_any("new_sizes", "dimensions"), "sharding": _none},
     "rev": _of_any("dimensions"),
-    "scatter": {**_GATHERED, "update_jaxpr": _replaces, "update_consts": _empty},
+    "scatter": {**_GATHERED, "update_jaxpr": replaces, "update_consts": _empty},
     "slice": _of_any("start_indices", "limit_indices", "strides"),
     "split": _of_any("sizes", "axis"),
     "squeeze": _of_any("dimensions"),
