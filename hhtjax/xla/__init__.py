@@ -1,4 +1,4 @@
-"""How a run becomes one kernel: the only reader of jaxprs, of MLIR, and of JAX's version.
+"""How a run becomes one kernel: the only reader of jaxprs, and of JAX's version.
 
 On the CPU the whole loop over the steps becomes one kernel, that is, one compiled function without
 calls to others; gradients and batches too, wherever XLA can compile it so: up to 16 unknowns, without sorting,
@@ -28,7 +28,8 @@ Measured, against C, by structure, batches and gradients, on a page, `experiment
 time beside diffrax, SciPy, MuJoCo and exudyn, losses included, on another, `experiments/work_precision/README.md`.
 
 All this may change rounding, and nothing else. Who doubts a number runs the same on plain JAX, and compares; the
-environment variable `HHTJAX_PLAIN=1` does it for a whole process.
+environment variable `HHTJAX_PLAIN=1` does it for a whole process. With a JAX newer than the last one tested it is so
+from the start, and `explain` says so (`HHTJAX_PLAIN=0` tries it all the same).
 
 >>> with hhtjax.plain():
 ...     expected = fall(0.1)

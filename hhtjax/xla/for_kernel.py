@@ -33,6 +33,8 @@ COMBINED = {"scatter": lambda before, given: given} | {  # an older JAX writes s
 }
 LEAST = 6  # operations of a stage that is a kernel; fewer are one fusion or two anyway
 LARGEST = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
+IDLE = {"broadcast_in_dim"}  # what a branch may hold that has nothing to do
+MANY = 4  # values of a conditional: of fewer, a loop is no better
 INSIDE = object()  # what becomes of the question whether a kernel holds it
 IDENTITIES = {"hhtjax_structural", "hhtjax_largest_in_batch"}
 OURS = {  # operations of this package -> what they do, a function of arrays and parameters
@@ -109,10 +111,6 @@ class _Copier:
         if not any(isinstance(x, (ClosedJaxpr, Jaxpr)) for x in jax.tree.leaves(list(eqn.params.values()))):
             return eqn
         return eqn.replace(params={key: jax.tree.map(copied, x) for key, x in eqn.params.items()})
-
-
-IDLE = {"broadcast_in_dim"}
-MANY = 4  # values of a conditional: of fewer, a loop is no better
 
 
 def _is_seldom(eqn):

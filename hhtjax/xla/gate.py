@@ -1,4 +1,4 @@
-"""Whether the machinery is on: unless a user says no."""
+"""Whether the machinery is on: with the versions of JAX that it is tested with, and unless a user says no."""
 
 import os
 import warnings
@@ -9,12 +9,13 @@ from contextvars import ContextVar
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 
-VARIABLE = "HHTJAX_PLAIN"  # 1: off
+VARIABLE = "HHTJAX_PLAIN"  # 1: off; 0: on, also with a JAX newer than those tested
 OLDEST = (
     0,
     7,
     2,
 )  # the first JAX that compiles kernels with all that they may hold; older ones end the process over some
+NEWEST = 0, 10, 2  # the last one with which the conformance tests have passed
 
 _plain: ContextVar = ContextVar("hhtjax_plain", default=False)
 # part of the key under which JAX keeps a compiled function, so that both forms of it can be there
@@ -27,8 +28,8 @@ def plain():
 
     Functions traced inside are kept apart from those traced outside, so a jitted function gives the plain result inside
     and the fast one outside; of several threads it holds for the one that is inside. The environment variable
-    HHTJAX_PLAIN=1, set before the first run, does the same for a whole process. `explain` tells which way was taken,
-    and why.
+    HHTJAX_PLAIN=1, set before the first run, does the same for a whole process; HHTJAX_PLAIN=0 tries the fast way also
+    with a JAX newer than those tested. `explain` tells which way was taken, and why.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0, 2.0]), force=lambda q, v, t, c: -9.81 - c * v)
@@ -87,13 +88,21 @@ def or_plain(run: Callable, again: Callable | None = None):
 def why_off():
     """Why the machinery is off, in words; None where it is on."""
     if jax.__version_info__ < OLDEST:
-        return f"JAX {jax.__version__} is older than {'.'.join(map(str, OLDEST))}"
+        return f"JAX {jax.__version__} is older than {_words(OLDEST)}"
     if _plain.get():
         return "inside hhtjax.plain()"
     wish = os.environ.get(VARIABLE, "")
     if wish not in ("", "0", "1"):
         raise ValueError(f"hhtjax: the environment variable {VARIABLE} must be 0 or 1; received {wish!r}.")
-    return f"{VARIABLE}=1" if wish == "1" else None
+    if wish == "1":
+        return f"{VARIABLE}=1"
+    if jax.__version_info__ > NEWEST and wish != "0":
+        return f"JAX {jax.__version__} is newer than {_words(NEWEST)}, the last one tested; {VARIABLE}=0 tries it all the same"
+    return None
+
+
+def _words(version):
+    return ".".join(map(str, version))
 
 
 def is_on():

@@ -260,4 +260,4 @@ ad.primitive_transposes[kernel_p] = _transpose
 batching.fancy_primitive_batchers[kernel_p] = _batch
 pe.custom_partial_eval_rules[kernel_p] = _divide
 pe.partial_eval_jaxpr_custom_rules[kernel_p] = _divide_equation
-pe.dce_rules[kernel_p] = lambda used, eqn: _eliminated(list(used), eqn)
+pe.dce_rules[kernel_p] = lambda used, *more: _eliminated(list(used), more[-1])  # a newer JAX tells more

@@ -1,9 +1,9 @@
-"""Names by which a program tells where kernels shall be: a loop as one, and a barrier that fusion does not cross.
+"""How a program says where kernels shall be: a loop as one, and a barrier that fusion does not cross.
 
 XLA:CPU runs a loop body as a list of kernels. Each costs a call, and so does every buffer between them: on a small
 mechanism several times what the arithmetic costs. And what is fused is evaluated anew in every user: the sines of a
-system once for every column of its Jacobian. So functions get names here, which autodiff and vmap keep, and an identity
-stands on either side of a loop: when the program is lowered, with vmap and autodiff done, it lets lowering.py decide.
+system once for every column of its Jacobian. So a loop becomes one operation here (kernel_primitive.py), which autodiff
+and vmap keep, and functions get names. When the program is lowered, with vmap and autodiff done, lowering.py decides.
 """
 
 import jax
