@@ -97,7 +97,8 @@ def why_off():
     if wish == "1":
         return f"{VARIABLE}=1"
     if jax.__version_info__ > NEWEST and wish != "0":
-        return f"JAX {jax.__version__} is newer than {_words(NEWEST)}, the last one tested; {VARIABLE}=0 tries it all the same"
+        newest = _words(NEWEST)
+        return f"JAX {jax.__version__} is newer than {newest}, the last one tested; {VARIABLE}=0 tries it all the same"
     return None
 
 
