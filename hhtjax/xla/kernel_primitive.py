@@ -48,7 +48,8 @@ def _seen_moving(x, marks):
         marks[:] = [not isinstance(dot, SymbolicZero) for dot in dx]
         return x, dx
 
-    return list(seen(*x))
+    seen(*x)  # for its rule alone: of a list of which nothing moves it would stay, and hold known and unknown together
+    return x
 
 
 def _seen_in_batch(x, marks):
@@ -63,7 +64,14 @@ def _seen_in_batch(x, marks):
         marks[:] = differ
         return x, tuple(differ)
 
-    return list(seen(*x))
+    seen(*x)
+    return x
+
+
+def _pruned(closed):
+    """The closed jaxpr without what no result is made of."""
+    jaxpr, _ = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), instantiate=True)
+    return ClosedJaxpr(jaxpr, closed.consts)
 
 
 def _abstract(*avals, closed, name):
@@ -92,7 +100,7 @@ def _forward(closed, moves):
         return [*out, *_parted(changes, moved)[1]]
 
     given = [aval.to_tangent_aval() for aval in _parted(closed.in_avals, moves)[1]]
-    return jax.make_jaxpr(both)(*closed.in_avals, *given), tuple(moved)
+    return _pruned(jax.make_jaxpr(both)(*closed.in_avals, *given)), tuple(moved)
 
 
 def _parted(values, marks):
@@ -238,13 +246,14 @@ def _batched(closed, axes, size, axis_name):
 
     def batch(*x):
         found = jax.vmap(member, in_axes=axes, axis_size=size, axis_name=axis_name)(*x)
+        marks[:] = [mark or not size for mark in marks]  # nobody has what members would share
         return [x if mark else x[0] for x, mark in zip(found, marks, strict=True)]
 
     avals = [
         x if axis is None else ShapedArray((*x.shape[:axis], size, *x.shape[axis:]), x.dtype, x.weak_type)
         for x, axis in zip(closed.in_avals, axes, strict=True)
     ]
-    return jax.make_jaxpr(batch)(*avals), [0 if mark else None for mark in marks]
+    return _pruned(jax.make_jaxpr(batch)(*avals)), [0 if mark else None for mark in marks]
 
 
 def _batch(data, args, axes, closed, name):
