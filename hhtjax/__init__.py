@@ -51,41 +51,35 @@ from hhtjax.identification.arguments import Gaussian
 from hhtjax.identification.bias import step_size_bias
 from hhtjax.identification.comparison import compare
 from hhtjax.identification.identify import fit, multistart
-from hhtjax.identification.measured import windows
+from hhtjax.identification.initial_guesses import equation_error, fit_progressively
 from hhtjax.identification.refinement import refine
 from hhtjax.identification.result import FitResult
-from hhtjax.identification.sensors import accelerometer, measure
-from hhtjax.identification.starts import equation_error, fit_progressively
+from hhtjax.identification.sensors import accelerometer, measure, windows
 from hhtjax.identification.transforms import bounded, fixed, positive
 from hhtjax.numerics.structured_solve import banded, conjugate_gradients
 from hhtjax.runs.adaptive import adaptive
-from hhtjax.runs.choose import Steps
-from hhtjax.runs.chosen import choose_steps
-from hhtjax.runs.event_log import Events
+from hhtjax.runs.controlled_run import choose_steps
+from hhtjax.runs.error_control import Steps
 from hhtjax.runs.interpolate import Interpolant, interpolate
 from hhtjax.runs.simulate import simulate
-from hhtjax.runs.solution import FailedRunWarning, Failure, SimulationError, Solution
+from hhtjax.runs.solution import Events, FailedRunWarning, Failure, SimulationError, Solution
 from hhtjax.runs.sweep import sweep
 from hhtjax.runs.sweep_to_disk import load_sweep, sweep_to_disk
 from hhtjax.steppers.collocation import collocation, wilson
-from hhtjax.steppers.explicit import rk4
-from hhtjax.steppers.explicit_pair import dopri5
-from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, newmark
-from hhtjax.steppers.implicit_euler import implicit_euler
+from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, implicit_euler, newmark
 from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_euler
 from hhtjax.steppers.multistep import houbolt, park
 from hhtjax.steppers.rosenbrock import rosenbrock, rowda
+from hhtjax.steppers.runge_kutta import dopri5, rk4
 from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.systems import interop
-from hhtjax.systems.band_limited import band_limited, band_limited_motion, spline_gain_error
-from hhtjax.systems.consistent import ConsistentInitial, consistent_initial
 from hhtjax.systems.events import Event, impact
-from hhtjax.systems.held import JumpWarning
-from hhtjax.systems.initial_values import PrecisionWarning
+from hhtjax.systems.initial_conditions import ConsistentInitial, PrecisionWarning, consistent_initial
 from hhtjax.systems.matrices import sparse
-from hhtjax.systems.sampled import Sampled, sampled
+from hhtjax.systems.sampled import Sampled, band_limited, band_limited_motion, sampled, spline_gain_error
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.systems.zero_order_hold import JumpWarning
 from hhtjax.xla import Explanation, explain, plain
 
 __all__ = [  # noqa: RUF022

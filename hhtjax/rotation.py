@@ -7,7 +7,7 @@ psi (3,), in rad, is a rotation vector: a turn by the angle |psi| about psi. Wit
          T    = I - c2 P + c3 P^2    c3 = (t - sin t) / t^3
          T^-1 = I + P/2 + d P^2      d = (1 - (t/2) cot(t/2)) / t^2
 
-c1, c2 and c3 are functions of Stumpff (numerics/stumpff.py), analytic in x: values and derivatives, forward and
+c1, c2 and c3 are functions of Stumpff (rotation.py), analytic in x: values and derivatives, forward and
 reverse, are right at psi = 0 too. Every function keeps the dtype, but integers become floats, and raises TypeError for
 what is no array of real numbers, ValueError for another shape. From and to quaternions: `from_quat`, `as_quat` of
 jax.scipy.spatial.transform.Rotation.
@@ -16,6 +16,7 @@ Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """
 
 from functools import partial, reduce
+from math import factorial
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +24,7 @@ import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_real
-from hhtjax.numerics.stumpff import coefficients
-from hhtjax.xla import Bilinear, structural
+from hhtjax.xla import Bilinear, Family, structural
 
 __all__ = [
     "cross",
@@ -288,3 +288,63 @@ def _real(caller, name, x, shape):
     if x.shape != shape:
         raise ValueError(f"{caller}: `{name}` must have shape {shape}; received {x.shape}.")
     return jnp.asarray(x, None if jnp.issubdtype(x.dtype, jnp.floating) else jnp.result_type(float))
+
+
+# ----------------------------------------------------------------------------
+# The functions of Stumpff, of which finite rotations are made: ck(x) = 1/k! - x/(k + 2)! + x^2/(k + 4)! - ...
+#
+#     c(k) = 1/k! - x c(k + 2),        dc(k)/dx = (k c(k + 2) - c(k + 1))/2
+#
+# With t = sqrt(x), c1 = sin t / t and c2 = (1 - cos t) / t^2. Analytic in x; values and derivatives of all orders are
+# right at x = 0 too. A derivative takes c(n + 1) and c(n + 2) and nothing else: one pair of series, as the value does.
+
+
+NEAR, TERMS = 4, 11  # x below which two neighbours are series, of so many terms; the recursion up cancels towards 0
+
+
+def coefficients(x):
+    """c1, ..., c5 at a scalar x >= 0.
+
+    >>> [round(1 / float(c)) for c in coefficients(jnp.array(0.0))]
+    [1, 2, 6, 24, 120]
+    """
+    return stumpff(5, x)
+
+
+def members(n, x):
+    """c1, ..., cn: power series and recursion down for x < NEAR, definitions and recursion up beyond.
+
+    >>> len(members(7, jnp.array(1.0)))
+    7
+    """
+    small = x < NEAR
+    y, x = jnp.where(small, x, 0), jnp.where(small, NEAR, x)  # no overflow in the branch not taken
+    near = [series(n, y), series(n - 1, y)]
+    for k in range(n - 2, 0, -1):
+        near.append(1 / factorial(k) - y * near[-2])
+    t = jnp.sqrt(x)
+    s, c = jnp.sin(t / 2) / t, jnp.cos(t / 2)  # 1 - cos t would cancel towards 2 pi
+    far, inverse = [2 * s * c, 2 * s**2], 1 / x
+    for k in range(1, n - 1):
+        far.append((1 / factorial(k) - far[-2]) * inverse)
+    return tuple(jnp.where(small, a, b) for a, b in zip(reversed(near), far, strict=True))
+
+
+def rule(stumpff, n, x, dx):
+    """Values and tangents."""
+    c1, *c = stumpff(n + 2, x)
+    half = dx / 2
+    return (c1, *c[: n - 1]), tuple((k * c[k] - c[k - 1]) * half for k in range(1, n + 1))
+
+
+def series(k, y):
+    """ck, to rounding for 0 <= y < NEAR.
+
+    >>> float(series(1, jnp.array(0.0)))
+    1.0
+    """
+    first, *rest = [(-1) ** j / factorial(2 * j + k) for j in reversed(range(TERMS))]
+    return reduce(lambda value, c: value * y + c, rest, jnp.full_like(y, first))
+
+
+stumpff = Family(members, rule)

@@ -21,10 +21,9 @@ from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from verdicts import judge
 
+from hhtjax.jaxpr.linear_maps import linear_map
+from hhtjax.jaxpr.scalars import by_scalars, in_stages, join, split
 from hhtjax.xla.kernels import STAGED, staged
-from hhtjax.xla.linear_maps import linear_map
-from hhtjax.xla.scalars import by_scalars, join, split
-from hhtjax.xla.sharing import in_stages
 
 RTOL = 1e-12
 

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import pytest
 
 import hhtjax
-from hhtjax.xla import gate
-from hhtjax.xla.source_lines import asked
+from hhtjax.jaxpr.interpreter import asked
+from hhtjax.xla import compat
 
 on_cpu = pytest.mark.skipif(
-    jax.default_backend() != "cpu" or not gate.is_on(),
+    jax.default_backend() != "cpu" or not compat.is_on(),
     reason="kernels are cut on the CPU only",
 )
 N = 5

@@ -11,8 +11,7 @@ from helpers import ONE, SPRING, ZERO, run
 from scipy.integrate import solve_ivp
 
 import hhtjax
-from hhtjax.runs.chosen import chosen_steps
-from hhtjax.runs.controlled import run_recorded
+from hhtjax.runs.controlled_run import chosen_steps, run_recorded
 from hhtjax.scenes import pendulum, top
 
 SAMPLES = 32

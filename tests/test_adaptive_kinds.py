@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from test_held import SYSTEM, VALUES
 
 import hhtjax
-from hhtjax.runs.chosen import Grid
+from hhtjax.runs.controlled_run import Grid
 from hhtjax.scenes import belt, dry_oscillator
 
 START = np.array([0.4, -0.3]), np.array([0.0, 1.0])

@@ -13,7 +13,7 @@ from zoo import EVERY
 import hhtjax
 from hhtjax.scenes import Scene, double_pendulum
 from hhtjax.scenes.arm import chain, lagrange, lagrangian, newton_euler, swing
-from hhtjax.systems.mass import mass_at
+from hhtjax.systems.system import mass_at
 
 FORMULATIONS = {"newton_euler": newton_euler, "lagrange": lagrange}
 DOWNWARD = [0.0, 1.0, 0.0]  # a positive angle about it lowers a link that points along x

@@ -7,7 +7,7 @@ import pytest
 
 import hhtjax
 from hhtjax.identification.refinement import Refined, StepSizeWarning, needed_levels
-from hhtjax.numerics.richardson import richardson
+from hhtjax.runs.extrapolate import richardson
 
 t = jnp.arange(0.0, 30.0, 0.35)
 K, C = 1.0, 0.04

@@ -11,7 +11,7 @@ from descriptions import DESCRIPTIONS, ONE, TWO, lagrangian, pull, run
 
 import hhtjax
 from hhtjax import LinearSystem, System
-from hhtjax.runs.choose import Steps, trimmed
+from hhtjax.runs.error_control import Steps, trimmed
 from hhtjax.scenes import double_pendulum
 
 # ---------------------------------------------------------------------------------------------- jit

@@ -6,9 +6,9 @@ import pytest
 
 import hhtjax
 from hhtjax.runs.sweep_inputs import LANES, NUMBERS, VECTORS, lanes_for, least_lanes
-from hhtjax.xla import Programs, gate, plain
+from hhtjax.xla import Programs, compat, plain
 
-ARE_TAKEN = gate.is_on() and jax.default_backend() == "cpu"
+ARE_TAKEN = compat.is_on() and jax.default_backend() == "cpu"
 
 
 def of_twice(**static):
@@ -40,7 +40,7 @@ def test_few_unknowns_take_options_and_no_jit_of_a_user_has_them():
 @pytest.mark.skipif(not ARE_TAKEN, reason="no options here")
 @pytest.mark.parametrize("numbers", [None, 2])
 def test_an_option_that_xla_does_not_know_is_tried_once(numbers, monkeypatch):
-    monkeypatch.setattr("hhtjax.xla.programs.QUICK", {"xla_cpu_of_another_time": True})
+    monkeypatch.setattr("hhtjax.xla.lowering.QUICK", {"xla_cpu_of_another_time": True})
     monkeypatch.setattr(Programs, "are_refused", False)
     programs = of_twice()
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_of_another_time"):  # so it reaches the compiler

@@ -14,16 +14,16 @@ from operations_table import ARGUMENTS, TABLE
 from program_writer import HEADER, usual_promotion
 from zoo import each
 
-from hhtjax.numerics.elimination import matvec
-from hhtjax.numerics.stumpff import stumpff
-from hhtjax.rotation import cross
-from hhtjax.xla import gate, linear_maps, parameters, scalar_calls, scalar_rules
+from hhtjax.jaxpr import linear_maps, scalar_rules, scalars
+from hhtjax.numerics.dense_lu import matvec
+from hhtjax.primitives.batching import in_turn
+from hhtjax.rotation import cross, stumpff
+from hhtjax.xla import compat
 from hhtjax.xla.consistent import held
 from hhtjax.xla.kernels import largest_in_batch, staged, structural
-from hhtjax.xla.turns import in_turn
 
 pytestmark = [
-    pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX"),
+    pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX"),
     pytest.mark.filterwarnings("ignore"),  # NumPy's, about NaN, overflow, and division by zero
 ]
 NAMES = re.compile(r"(?<![\w.'])[a-zA-Z](?![\w('])")
@@ -88,9 +88,9 @@ def test_same_numbers(group, turn):
 @pytest.mark.slow
 def test_every_rule_has_its_rows():
     """Every operation that some rule is for occurs in the table or its derivatives, so a new rule comes with rows."""
-    rules = {*scalar_rules.RULES, *scalar_rules.NUMPY, *scalar_rules.SHORT, *scalar_calls.CALLS, *linear_maps.RULES}
+    rules = {*scalar_rules.RULES, *scalar_rules.NUMPY, *scalar_rules.SHORT, *scalars.CALLS, *linear_maps.RULES}
     programs = [of_plain_jax(text).plain.jaxpr for texts in TABLE.values() for text in texts]
-    assert rules | set(parameters.UNDERSTOOD) <= {eqn.primitive.name for x in programs for eqn in everywhere(x)}
+    assert rules | set(scalar_rules.UNDERSTOOD) <= {eqn.primitive.name for x in programs for eqn in everywhere(x)}
 
 
 @pytest.mark.slow

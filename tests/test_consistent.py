@@ -7,10 +7,10 @@ import pytest
 from jax import lax
 
 import hhtjax
-from hhtjax.xla import consistent, gate
-from hhtjax.xla.scalars import by_scalars, join, split
+from hhtjax.jaxpr.scalars import by_scalars, join, split
+from hhtjax.xla import compat, consistent
 
-pytestmark = pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")
+pytestmark = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
 
 CHOICES = {
     "max": jnp.max,

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hhtjax.numerics import counted_loop
-from hhtjax.numerics.counted_loop import LONGEST, SLOTS, repeat
+from hhtjax.numerics import differentiable_while
+from hhtjax.numerics.differentiable_while import LONGEST, SLOTS, repeat
 from hhtjax.xla import one_kernel, row_written
 
 AT = 1e-2, 1.3
@@ -91,8 +91,8 @@ def test_members_of_a_batch_with_counts_of_their_own():
 
 def test_blocks_of_every_level_end_wherever_they_may(monkeypatch):
     """Two iterations to a block, two blocks to the next: all counts of three levels."""
-    monkeypatch.setattr(counted_loop, "SLOTS", 2)
-    monkeypatch.setattr(counted_loop, "LONGEST", 8)
+    monkeypatch.setattr(differentiable_while, "SLOTS", 2)
+    monkeypatch.setattr(differentiable_while, "LONGEST", 8)
 
     def step(i, x, a):
         return x + a * jnp.sin(x + i)
@@ -124,8 +124,8 @@ def test_one_copy_of_the_iteration_for_all_levels_and_nothing_kept_that_is_only_
     found = jax.jit(jax.grad(loss))
     program = found.lower(0.3, 5).as_text()
     assert program.count("stablehlo.sine") == 2
-    assert f"tensor<{counted_loop.LEVELS * SLOTS + 1}xf64>" in program
-    assert f"tensor<{counted_loop.LEVELS * SLOTS + 1}x7x11xf64>" not in program
+    assert f"tensor<{differentiable_while.LEVELS * SLOTS + 1}xf64>" in program
+    assert f"tensor<{differentiable_while.LEVELS * SLOTS + 1}x7x11xf64>" not in program
     h = 1e-6
     central = (loss(0.3 + h, 5) - loss(0.3 - h, 5)) / (2 * h)
     np.testing.assert_allclose(found(0.3, 5), central, rtol=1e-8)

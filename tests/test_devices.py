@@ -10,8 +10,8 @@ from jax.sharding import PartitionSpec
 
 import hhtjax
 from experiments.sweeps.devices import case, swept
-from hhtjax.xla import gate
-from hhtjax.xla.parameters import is_understood
+from hhtjax.jaxpr.scalar_rules import is_understood
+from hhtjax.xla import compat
 
 MEMBERS = 300
 
@@ -42,7 +42,7 @@ def test_a_mesh_of_one_device_changes_nothing():
     jax.tree.map(np.testing.assert_array_equal, run(None), run(jax.make_mesh((1,), ("anything",))))
 
 
-@pytest.mark.skipif(not gate.is_on(), reason="this JAX evaluates nothing on scalars")
+@pytest.mark.skipif(not compat.is_on(), reason="this JAX evaluates nothing on scalars")
 def test_inside_shard_map_operations_are_understood():
     """JAX gives arrays that are made there a sharding, which says nothing."""
 

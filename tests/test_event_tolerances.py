@@ -11,8 +11,8 @@ from zoo import each
 
 import hhtjax
 from hhtjax import Event, SimulationError, System, adaptive, hht, impact, rowda, simulate, sweep
-from hhtjax.runs.chosen import chosen_steps, run_over
-from hhtjax.runs.freezing import with_steps_for
+from hhtjax.runs.controlled_run import chosen_steps, run_over
+from hhtjax.runs.frozen_steps import with_steps_for
 
 BALL = System(ONE, lambda q, v, t, p: -p["g"] - p["k"] * q - p["c"] * v)  # with a spring and a damper
 STEPPER = hht(linearize="predictor")  # half the program of "auto"

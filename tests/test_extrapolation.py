@@ -8,9 +8,8 @@ from zoo import PROBLEMS, as_data, ends_of_two, reference, run
 
 import hhtjax
 from hhtjax import rotation
-from hhtjax.runs.event_log import Events
 from hhtjax.runs.extrapolate import extrapolated
-from hhtjax.runs.solution import Failure, Solution
+from hhtjax.runs.solution import Events, Failure, Solution
 from hhtjax.steppers.stepper import Info
 
 DUFFING = PROBLEMS["forced Duffing"]

@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 import hhtjax
-from hhtjax.identification.progress import BAD_START
+from hhtjax.identification.least_squares import BAD_START
 
 t = jnp.linspace(0.0, 3.0, 40)
 NOISE = 0.02 * np.random.default_rng(1).normal(size=t.size)

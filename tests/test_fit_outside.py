@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.identification import outside, problem
-from hhtjax.identification.outside import is_outside
+from hhtjax.identification import problem
+from hhtjax.identification.problem import is_outside
 from hhtjax.identification.transforms import bounded, fixed, positive
 
 T = jnp.linspace(0.0, 2.0, 40)
@@ -117,8 +117,8 @@ def test_a_new_function_compiles_its_residuals_and_little_more():
 
 def test_many_residuals_are_one_program(monkeypatch):
     calls = []
-    monkeypatch.setattr(outside, "solve", lambda *args: calls.append(args) or problem.solve(*args))
-    t = jnp.linspace(0.0, 2.0, outside.MANY // 2 + 1)
+    monkeypatch.setattr(problem, "solve", lambda *args: calls.append(args) or problem.solve(*args))
+    t = jnp.linspace(0.0, 2.0, problem.MANY // 2 + 1)
     y = 3.0 * jnp.exp(-1.3 * t) + 0.01 * jnp.sin(300.0 * t)
 
     def residuals(p):
@@ -126,7 +126,7 @@ def test_many_residuals_are_one_program(monkeypatch):
 
     expected = hhtjax.fit(residuals, jnp.ones(2))
     assert len(calls) == 1
-    monkeypatch.setattr(outside, "MANY", 10**6)
+    monkeypatch.setattr(problem, "MANY", 10**6)
     found = hhtjax.fit(residuals, jnp.ones(2))
     assert len(calls) == 1
     np.testing.assert_allclose(found.params, expected.params, rtol=1e-9)

@@ -12,7 +12,7 @@ from helpers import ONE, ZERO
 
 import hhtjax
 from hhtjax.identification.problem import solve
-from hhtjax.runs.freezing import with_steps_for
+from hhtjax.runs.frozen_steps import with_steps_for
 
 
 def force(q, v, t, p):

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.steppers.friction_events import run_events
-from hhtjax.steppers.friction_law import switch
+from hhtjax.steppers.friction_switching import run_events, switch
 from hhtjax.systems.friction import at_rest
 
 

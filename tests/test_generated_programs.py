@@ -10,10 +10,10 @@ from jax import lax
 from program_writer import function, program, usual_promotion
 from verdicts import judge
 
-from hhtjax.xla import gate
+from hhtjax.xla import compat
 
 pytestmark = [
-    pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX"),
+    pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX"),
     pytest.mark.filterwarnings("ignore"),  # NumPy's, about NaN, overflow, and division by zero
 ]
 

@@ -8,13 +8,14 @@ import zoo
 from jax import lax
 
 from experiments.benchmarks.chain import FORMULATIONS, chain
-from hhtjax.xla import gate, linear_map, linear_maps
+from hhtjax.jaxpr import linear_maps
+from hhtjax.xla import compat, linear_map
 
 N = 6
 A = jnp.asarray(np.random.default_rng(0).standard_normal((N, N)))
 B = jnp.asarray(np.random.default_rng(1).standard_normal((N, N, 3)))
 C = A[0]
-old = pytest.mark.skipif(not gate.is_on(), reason="this JAX takes unit vectors one by one")
+old = pytest.mark.skipif(not compat.is_on(), reason="this JAX takes unit vectors one by one")
 
 MAPS = {
     "itself": lambda x: x,

@@ -18,9 +18,9 @@ from matrices import (
 )
 
 from hhtjax import explain
-from hhtjax.numerics.elimination import UNROLLED, factorize, matvec
+from hhtjax.numerics.dense_lu import UNROLLED, factorize, matvec
 from hhtjax.numerics.linear_solve import factorize_with, solve, solve_map
-from hhtjax.xla import gate, kernels
+from hhtjax.xla import compat, kernels
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -180,7 +180,7 @@ def test_one_factorisation_serves_many_right_hand_sides_and_the_transpose(factor
     assert np.allclose(transposed, np.linalg.solve(A.T, b), rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.skipif(not gate.is_on(), reason="this JAX makes no kernels")
+@pytest.mark.skipif(not compat.is_on(), reason="this JAX makes no kernels")
 @pytest.mark.parametrize("made", [zero_diagonal, permuted, bad_rows])
 def test_elimination_is_a_loop_inside_a_kernel_and_lapack_s_elsewhere(made):
     """Both forms, both directions, a batch, and the derivatives; none leaves the other's traces in the program."""

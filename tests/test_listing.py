@@ -14,8 +14,7 @@ from operations_table import TABLE
 from program_writer import usual_promotion
 from test_conformance import expression
 
-from hhtjax.export.helpers import helper
-from hhtjax.export.statements import NotWritten, Statements
+from hhtjax.export.statements import NotWritten, Statements, helper
 from hhtjax.xla import NotListed, Scalar, listed
 
 pytestmark = [needs_compiler, pytest.mark.filterwarnings("ignore")]

@@ -8,9 +8,8 @@ from scipy.optimize import least_squares
 import hhtjax
 from hhtjax.identification.arguments import check_options
 from hhtjax.identification.gauss_newton import Seen
-from hhtjax.identification.least_squares import levenberg_marquardt
-from hhtjax.identification.outside import Outside
-from hhtjax.identification.progress import CONVERGED
+from hhtjax.identification.least_squares import CONVERGED, levenberg_marquardt
+from hhtjax.identification.problem import Outside
 
 LIMIT = check_options("fit", 0.0, None, None, None, None, True, 2, False).max_iterations
 

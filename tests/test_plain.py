@@ -10,7 +10,7 @@ import pytest
 from linked_pendulums import N, end, links, loss, on_cpu, paths
 
 import hhtjax
-from hhtjax.xla import fit_for_kernel, gate, kernels
+from hhtjax.xla import compat, fit_for_kernel, kernels
 
 GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged"
 
@@ -40,14 +40,14 @@ def test_plain_leaves_nothing_of_the_machinery():
 def test_plain_holds_for_its_own_thread():
     def is_on_in_plain():
         with hhtjax.plain():
-            return gate.is_on(), paths(lambda params: end(params), 2.0)
+            return compat.is_on(), paths(lambda params: end(params), 2.0)
 
     with ThreadPoolExecutor(1) as other:
         with hhtjax.plain():
-            assert other.submit(gate.is_on).result()
-            assert not gate.is_on()
+            assert other.submit(compat.is_on).result()
+            assert not compat.is_on()
         assert other.submit(is_on_in_plain).result() == (False, ("plain: inside hhtjax.plain()",))
-        assert other.submit(gate.is_on).result()
+        assert other.submit(compat.is_on).result()
 
 
 @pytest.mark.slow
@@ -77,13 +77,13 @@ def test_a_sweep_gives_the_same_without_the_machinery():
 )
 def test_the_environment_and_the_version_of_jax(version, wish, why, monkeypatch):
     monkeypatch.setattr(jax, "__version_info__", version)
-    monkeypatch.setenv(gate.VARIABLE, wish)
+    monkeypatch.setenv(compat.VARIABLE, wish)
     (path,) = paths(lambda params: end(params), 2.0)  # new for JAX
     assert re.match(why, path)
 
 
 def test_a_wish_that_is_none(monkeypatch):
-    monkeypatch.setenv(gate.VARIABLE, "yes")
+    monkeypatch.setenv(compat.VARIABLE, "yes")
     with pytest.raises(ValueError, match="HHTJAX_PLAIN must be 0 or 1; received 'yes'"):
         end(2.0)
 

@@ -8,7 +8,7 @@ from matrices import (
     random_matrix,
 )
 
-from hhtjax.numerics.elimination import UNROLLED, matvec
+from hhtjax.numerics.dense_lu import UNROLLED, matvec
 from hhtjax.numerics.linear_solve import factorize_least_squares
 
 

@@ -7,8 +7,8 @@ import pytest
 from helpers import ONE, ZERO
 
 import hhtjax
-from hhtjax.runs.controlled import in_two_passes, run_recorded
-from hhtjax.runs.problem import Problem
+from hhtjax.runs.controlled_run import in_two_passes, run_recorded
+from hhtjax.runs.inputs import Problem
 
 SWING = hhtjax.System(ONE, lambda q, v, t, k: -k * jnp.sin(q) - 0.1 * v)
 CASES = {  # system, stepper, q0, v0, params

@@ -13,7 +13,7 @@ import hhtjax
 from hhtjax import Events, Failure, FitResult, Info, Interpolant, Solution, State
 from hhtjax.description.presentation import MOST, overwrite, shown
 from hhtjax.identification import History, ModeBias, Uncertainty
-from hhtjax.identification.progress import COST, LIMIT
+from hhtjax.identification.least_squares import COST, LIMIT
 from hhtjax.identification.transforms import fixed, scaled
 
 VALUE = 0.123456789  # of every array here

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from hhtjax.xla import block_written, gate, largest_in_batch, one_kernel, row_written
+from hhtjax.xla import block_written, compat, largest_in_batch, one_kernel, row_written
 
 BATCHES = {  # axes of array, row and number, the inner batch first
     "one": [],
@@ -108,7 +108,7 @@ def noted(x, rows):
     return lax.fori_loop(0, 200, step, (x, rows, jnp.zeros((), jnp.int32), 0 * x))
 
 
-@pytest.mark.skipif(not gate.is_on(), reason="this JAX makes no kernels")
+@pytest.mark.skipif(not compat.is_on(), reason="this JAX makes no kernels")
 def test_a_conditional_becomes_a_loop():
     """In a kernel, with the same values; and in its loop nothing of the size of the rows is copied."""
     x, rows = jnp.array([[1.0, 1.2], [0.5, 1.5]]), jnp.zeros((2, 50, 2))

@@ -8,11 +8,12 @@ import zoo
 from jax import lax
 
 import hhtjax
+from hhtjax.jaxpr import scalars
+from hhtjax.jaxpr.scalars import Scalars, by_scalars, join, pays, split
 from hhtjax.scenes import double_pendulum, slider_crank
-from hhtjax.xla import gate, kernels, scalars, structural
-from hhtjax.xla.scalars import Scalars, by_scalars, join, pays, split
+from hhtjax.xla import compat, kernels, structural
 
-old = pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")
+old = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
 M = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 3.0]])
 
 

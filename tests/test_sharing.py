@@ -8,11 +8,12 @@ import zoo
 from jax import lax
 
 import hhtjax
+from hhtjax.jaxpr import scalars
+from hhtjax.jaxpr.scalars import by_scalars, split
 from hhtjax.scenes import double_pendulum
-from hhtjax.xla import gate, kernels, sharing
-from hhtjax.xla.scalars import by_scalars, split
+from hhtjax.xla import compat, kernels
 
-pytestmark = pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")
+pytestmark = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
 
 
 def bounce(x, y):
@@ -35,7 +36,7 @@ FUNCTIONS = {
 
 
 def in_stages(f):
-    return lambda *args: sharing.in_stages(kernels.STAGED, f, *args)
+    return lambda *args: scalars.in_stages(kernels.STAGED, f, *args)
 
 
 def names(jaxpr):

@@ -11,7 +11,7 @@ from zoo import PROBLEMS, STEPPERS, run
 import hhtjax
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.scenes import double_pendulum
-from hhtjax.systems.mass import mass_at
+from hhtjax.systems.system import mass_at
 
 DUFFING = PROBLEMS["forced Duffing"]
 

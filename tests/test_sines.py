@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hhtjax.xla import RANGE, gate, one_kernel
+from hhtjax.xla import RANGE, compat, one_kernel
 from hhtjax.xla.sines import NAME
 
-pytestmark = pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")
+pytestmark = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
 
 
 def both(x):
@@ -61,7 +61,7 @@ def test_every_number_has_its_sine_alone_and_among_others(x):
 @pytest.mark.slow
 def test_values_and_derivatives_alone_and_in_batches():
     xs = np.linspace(-3, 3, 7)
-    with gate.plain():
+    with compat.plain():
         expected = [jax.vmap(f)(xs) for f in FORMS]
     for f, exact in zip(FORMS, expected, strict=True):
         assert NAME in program(f, xs[0])

@@ -10,8 +10,8 @@ from zoo import EVERY
 
 import hhtjax
 from hhtjax import LinearSystem
-from hhtjax.numerics import superlu
-from hhtjax.numerics.elimination import factorize
+from hhtjax.numerics import sparse_matrix
+from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.sparse_matrix import of_scipy
 
 N = 24
@@ -97,7 +97,7 @@ def test_derivatives(name, local):
 @pytest.mark.slow
 def test_batches_of_starts_and_of_matrices():
     """More matrices than factors are kept; and a sweep."""
-    number = superlu.KEPT + 2
+    number = sparse_matrix.KEPT + 2
     ks, scales = jnp.linspace(10.0, 60.0, number), jnp.linspace(0.5, 1.0, number)
 
     stepper = hhtjax.hht(linearize="predictor")
@@ -152,7 +152,7 @@ def test_pivots_are_free_where_the_diagonal_is_none():
     """And a factor that is not there any more is made again."""
     A = of_scipy(sparse.csr_array(np.array([[0.0, 2.0, 0.0], [1.0, 0.0, 1e-3], [0.0, 5.0, 1.0]])))
     solve, b = factorize(A), jnp.array([2.0, 1.0, 7.0])
-    superlu._factors.clear()
+    sparse_matrix._factors.clear()
     np.testing.assert_allclose(solve(b), np.linalg.solve(A.tocoo().toarray(), b), rtol=1e-13)
 
 

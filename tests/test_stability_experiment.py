@@ -15,7 +15,7 @@ from experiments.page import find
 from experiments.stability import adaptive, dry, tolerances
 from experiments.stability.grades import cells
 from experiments.stability.scenes import all_cases
-from hhtjax.runs.attempt import PI
+from hhtjax.runs.error_control import PI
 
 ROOT = Path(__file__).parents[1]
 

@@ -13,7 +13,7 @@ from jax import lax
 
 import hhtjax
 from hhtjax.description import current
-from hhtjax.identification import outside
+from hhtjax.identification import problem
 from hhtjax.xla import Programs
 
 k, measured, TRACES = 1.0, np.zeros(3), []
@@ -198,12 +198,12 @@ def test_fits_read_new_records(way):
     """A record is data where what is computed from it can be traced, from the second program on."""
     global measured
     residuals, programs = WAYS[way]
-    found, before = [], outside._see.number()
+    found, before = [], problem._see.number()
     for value in (*RECORDS, RECORDS[0]):
         HELD["record"] = measured = np.full(3, value)
         found.append(float(hhtjax.fit(residuals, 1.5, covariance=False).params))
     np.testing.assert_allclose(found, [*RECORDS, RECORDS[0]], rtol=1e-9)
-    assert outside._see.number() - before == programs
+    assert problem._see.number() - before == programs
     measured[:] = 9.0
     np.testing.assert_allclose(hhtjax.fit(residuals, 1.5, covariance=False).params, 9.0, rtol=1e-9)
 

@@ -10,7 +10,7 @@ import zoo
 from jax import lax
 
 import hhtjax
-from hhtjax.numerics.counted_loop import repeat
+from hhtjax.numerics.differentiable_while import repeat
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.scenes import pendulum
 

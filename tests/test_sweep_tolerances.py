@@ -10,7 +10,7 @@ import zoo
 from helpers import ONE, ZERO, check_message
 
 import hhtjax
-from hhtjax.runs.sweep_chosen import run_chosen
+from hhtjax.runs.sweep_controlled import run_chosen
 from hhtjax.scenes import pendulum
 
 TIMES = 2 + np.array([0.1, 0.13, 0.9, 1.3, 2.5])  # from t0 = 2

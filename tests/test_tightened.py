@@ -7,8 +7,8 @@ from helpers import ONE, ZERO
 from scipy.integrate import solve_ivp
 
 import hhtjax
-from hhtjax.runs import tightened
-from hhtjax.runs.controlled import rounds
+from hhtjax.runs import controlled_run
+from hhtjax.runs.controlled_run import rounds
 
 STEPPER = hhtjax.hht(alpha=-0.05, linearize="predictor")
 TIMES = np.linspace(0, 1, 33)[1:]
@@ -83,7 +83,7 @@ def test_derivatives_are_those_of_the_accepted_steps():
 def test_what_cannot_be_reached_is_named(monkeypatch):
     with pytest.raises(hhtjax.SimulationError, match=r"stopped at t = 0.\d+: max_steps=500 used up"):
         controlled(rtol=1e-2, max_steps=500).check()
-    monkeypatch.setattr(tightened, "ROUNDS", 2)
+    monkeypatch.setattr(controlled_run, "ROUNDS", 2)
     run = controlled(system=hardening())
     assert float(run.steps.tightened) == 0.25
     told = (

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jax import lax
 
-from hhtjax.xla import block_written, gate, in_turn, one_kernel
+from hhtjax.xla import block_written, compat, in_turn, one_kernel
 
-pytestmark = pytest.mark.skipif(not gate.is_on(), reason="with this JAX all go at once")
+pytestmark = pytest.mark.skipif(not compat.is_on(), reason="with this JAX all go at once")
 BATCHES = {  # axes of the target, the shared scale, the threshold; the inner batch first
     "one": [],
     "each its own": [(0, None, None)],

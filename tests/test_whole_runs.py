@@ -12,9 +12,9 @@ import zoo
 from program_writer import usual_promotion
 
 import hhtjax
-from hhtjax.xla import gate
+from hhtjax.xla import compat
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not gate.is_on(), reason="plain arrays with this version of JAX")]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")]
 STEPS = 8
 
 

@@ -30,8 +30,8 @@ from experiments.identification.data import (
 from experiments.identification.scatter import over_scatter
 from experiments.parts import rounded
 from experiments.report import COLOURS, MARKERS, Report
-from hhtjax.numerics.richardson import richardson
 from hhtjax.plot import fit_against_data, legend, subplots
+from hhtjax.runs.extrapolate import richardson
 
 SUBSTEPS = 8
 MODELS = {

@@ -13,7 +13,7 @@ from experiments.report import COLOURS, side_by_side
 from hhtjax import hht, kim_hht, kim_implicit_euler
 from hhtjax.plot import error_against_h, subplots, work_precision
 from hhtjax.scenes import arm
-from hhtjax.systems.mass import mass_at
+from hhtjax.systems.system import mass_at
 
 ALPHA = -0.05
 METHODS = {

@@ -18,11 +18,9 @@ from experiments.cells import SAMPLES, geometric_mean, solve_reference
 from experiments.report import side_by_side
 from experiments.stability.gallery import FAST_SCENES
 from experiments.stability.scenes import all_cases
-from hhtjax.runs.attempt import PI, Controller
-from hhtjax.runs.choose import choose
-from hhtjax.runs.chosen import run_over
-from hhtjax.runs.controlled import verified
-from hhtjax.runs.problem import Problem
+from hhtjax.runs.controlled_run import run_over, verified
+from hhtjax.runs.error_control import PI, Controller, select_steps
+from hhtjax.runs.inputs import Problem
 
 RTOLS = 1e-2, 1e-3, 1e-4, 1e-5
 ATOL = 1e-3  # over rtol
@@ -57,7 +55,7 @@ def controlled(scene, rtol, controller, method):
     times = duration * jnp.arange(1, SAMPLES + 1) / SAMPLES
     problem = Problem.checked("controller", system, METHODS[method], q0, v0, params, 0.0, None)
     control = hhtjax.adaptive(rtol, ATOL * rtol, max_steps=MAX_STEPS)
-    steps, ends, _ = choose(problem, times[-1], control, controller=controller)
+    steps, ends, _ = select_steps(problem, times[-1], control, controller=controller)
     run, finer = (run_over(problem, times, ends, steps.accepted, halved=halved) for halved in (False, True))
     alarm = verified(run, finer, control, METHODS[method].order)
     return steps._replace(dt=None), jnp.max(alarm["error"]) > alarm["allowed"], run.q

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 import hhtjax
 from experiments.work_precision.cases import SAMPLES, cases, flat, march
 from experiments.work_precision.timing import sweep
-from hhtjax.numerics.richardson import richardson
+from hhtjax.runs.extrapolate import richardson
 from hhtjax.xla import one_kernel
 
 SMOOTH = hhtjax.hht(linearize="predictor")

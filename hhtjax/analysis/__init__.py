@@ -15,12 +15,20 @@ Which step a system needs is answered by `suggest_step_size`; what a run made or
 error falls as it should by `observed_order`.
 """
 
-from hhtjax.analysis.amplification import amplification_matrix, constraint_matrix, oscillator_matrix
+from hhtjax.analysis.amplification import (
+    amplification_matrix,
+    constraint_matrix,
+    damping_ratio,
+    oscillator_matrix,
+    overshoot,
+    period_elongation,
+    spectral_radius,
+    stability_region,
+)
 from hhtjax.analysis.convergence import ObservedOrder, observed_order
 from hhtjax.analysis.energy import EnergyBalance, energy_balance
 from hhtjax.analysis.jordan import Eigenvalue, jordan_structure, transient_growth
 from hhtjax.analysis.modal import ModalReduction, NormalModes, modal_reduction, modes
-from hhtjax.analysis.oscillator import damping_ratio, overshoot, period_elongation, spectral_radius, stability_region
 from hhtjax.analysis.step_size import Mode, StepSize, suggest_step_size
 
 __all__ = [

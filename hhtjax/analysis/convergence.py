@@ -11,7 +11,7 @@ from hhtjax.checks import require_number, require_params
 from hhtjax.description import thaw
 from hhtjax.description.presentation import shown
 from hhtjax.steppers.stepper import begun, require_stepper
-from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.xla import Programs
 
 

@@ -6,16 +6,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.analysis.event_rows import with_event_rows
-from hhtjax.analysis.friction_work import friction_work, switches
 from hhtjax.checks import require_function
 from hhtjax.description import current, freeze, thaw
 from hhtjax.description.presentation import shown
-from hhtjax.runs.interpolate import interpolate
+from hhtjax.numerics.dense_lu import matvec
+from hhtjax.runs.interpolate import interpolate, on_axes
 from hhtjax.runs.output import require_path
 from hhtjax.runs.solution import Solution
-from hhtjax.systems import held
+from hhtjax.systems import zero_order_hold
+from hhtjax.systems.constraints import answers
 from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.friction import directions, responses
+from hhtjax.systems.friction_rows import rows_of
 from hhtjax.systems.system import LinearSystem, System
 
 
@@ -122,7 +124,7 @@ def _balance(system, solution, run, across, params, potential):
 
     def over_interval(first, between, last, H):
         """Simpson's rule; a held input has the value that it has inside."""
-        inside = held.held_at(params, between[2])
+        inside = zero_order_hold.held_at(params, between[2])
         P, P_middle, P_end = (power(q, v, t, L, inside) for q, v, t, L in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
 
@@ -147,7 +149,7 @@ def _points(flat, solution, run, params):
     """q, v and t at the saved times of the run, which is the solution with its events, and q, v, t and L between."""
     t, L = run.t, run.multipliers
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
-    jumps = held.holds(params) or (switches(run) if flat.friction else False)
+    jumps = zero_order_hold.holds(params) or (switches(run) if flat.friction else False)
     q, v = _between(solution, run, H, middle, jumps if not flat.blocks else False)
     ends = _vectors(run.q), _vectors((run.v, run.z)), t
     between = q, v, middle, None if L is None else (L[1:] + L[:-1]) / 2
@@ -169,3 +171,105 @@ def _between(solution, run, H, middle, jumps):
 def _vectors(tree):
     """Leaves joined, a vector for each time."""
     return jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(tree)], axis=1)
+
+
+# ----------------------------------------------------------------------------
+# A run whose events are saved times, too.
+
+
+VALUES = "t", "q", "v", "acceleration", "multipliers", "z", "zdot", "friction", "sticking"
+
+
+def with_event_rows(solution):
+    """The `Solution` with a row before and a row behind each event, in the order of time; between which rows an event
+    lies, and the places of the rows that were saved.
+
+    What an event does not tell is there as at the saved time before it, and behind it. Where `events` has room left,
+    the last row repeats.
+    """
+    events, last = solution.events, solution.t.shape[0] - 1
+    met = ~jnp.isnan(events.t)
+    behind = jnp.where(met, jnp.clip(jnp.searchsorted(solution.t, events.t), 1, last), last)
+    told = {"t": (events.t,) * 2, "q": (events.q,) * 2, "v": (events.before, events.after), "z": (events.z,) * 2}
+
+    def known(new, old):
+        return jnp.where(on_axes(met, new), new, old)
+
+    def rows(name):
+        saved = getattr(solution, name)
+        sides = [jax.tree.map(lambda x, i=i: x[i], saved) for i in (jnp.where(met, behind - 1, last), behind)]
+        if name in told:
+            sides = [jax.tree.map(known, new, old) for new, old in zip(told[name], sides, strict=True)]
+        return jax.tree.map(lambda x, y, z: jnp.concatenate([_alternating(x, y), z]), *sides, saved)
+
+    found = {name: rows(name) for name in VALUES}
+    first = jnp.arange(found["t"].shape[0]) == 2 * met.size  # an event at the very start comes behind it
+    order = jnp.argsort(jnp.where(first, -jnp.inf, jnp.where(jnp.isnan(found["t"]), jnp.inf, found["t"])), stable=True)
+    across = (order[:-1] < 2 * met.size) & (order[:-1] % 2 == 0)
+    saved = jnp.argsort(order)[2 * met.size :]
+    return solution._replace(**jax.tree.map(lambda x: x[order], found)), across, saved
+
+
+def _alternating(x, y):
+    """x0, y0, x1, y1, ..."""
+    return jnp.stack([x, y], axis=1).reshape(-1, *x.shape[1:])
+
+
+# ----------------------------------------------------------------------------
+# The work of dry friction between the saved times of a run.
+
+
+def directions_of(solution):
+    """In which direction each joint slides: (K + 1, m), 0 where it sticks."""
+    return jnp.where(solution.sticking, 0, jnp.sign(solution.friction))
+
+
+def switches(solution):
+    """Whether some joint switches in an interval: (K, 1)."""
+    sig = directions_of(solution)
+    return jnp.any(sig[1:] != sig[:-1], axis=1, keepdims=True)
+
+
+def friction_work(flat, solution, ends, middles, w, params):
+    """What dry friction did to the system in each interval, minus the integral of tau' H v: (K,).
+
+    H v = s + c, where c is the speed of what a joint rubs on. Joints that keep on: Simpson's rule, with the limit in
+    the middle where they slide. Of one that switches, s goes to 0 at theta h and on from there, both linearly, over
+    the distance d; and the jump of w, which is not in the change of v, tells the mean of tau, for c:
+
+        integral tau s = h (theta tau0 s0 + (1 - theta) tau1 s1)/2,    d = h (theta s0 + (1 - theta) s1)/2
+        mean tau = (tau0 + tau1)/2 + K^-1 H [(w0 + w1)/2 - (v1 - v0)/h],    K = H G
+
+    ends: q, v, t at the saved times, middles: q, v, t, L between; w: (K + 1, N).
+    """
+    h, v = jnp.diff(solution.t), ends[1]
+    unseen = (w[1:] + w[:-1]) / 2 - jnp.diff(v, axis=0) / jnp.where(h > 0, h, 1)[:, None]
+    saved = (*ends, solution.friction, directions_of(solution))
+    first, last = (jax.tree.map(lambda x, part=part: x[part], saved) for part in (slice(-1), slice(1, None)))
+    return -h * jax.vmap(partial(_power, flat, params))(first, middles, last, unseen)
+
+
+def _power(flat, params, first, middle, last, unseen):
+    """The mean of tau' H v over an interval; a held input has the value that it has inside."""
+    (*_, tau0, sig0), (q, v, t, L), (*_, tau1, sig1) = first, middle, last
+    params = zero_order_hold.held_at(params, t)
+    places = first[:3], (q, v, t), last[:3]
+    s = [flat.friction.sliding(*at, params) for at in places]
+    c = [-flat.friction.sliding(q, 0 * v, t, params) for q, v, t in places]
+    f, mean = flat.friction.limit(q, v, L, t, params), (tau0 + tau1) / 2
+    tau = tau0, jnp.where(sig0 == 0, mean, sig0 * f), tau1
+    steady = _simpson([tau * (s + c) for tau, s, c in zip(tau, s, c, strict=True)])
+
+    apart = s[0] - s[2]
+    theta = jnp.clip((2 * _simpson(s) - s[2]) / jnp.where(apart == 0, 1, apart), 0, 1)
+    H = directions(flat, q, t, params)
+    G, pulls = responses(answers(flat, q, t, params, "least_squares"), H)
+    rows = rows_of(flat, q, t, params, H, G, pulls, False, dependent=True)
+    mean = jnp.clip(mean + rows.solve(rows.K, jnp.ones(len(f), bool), matvec(H, unseen)), -f, f)
+    switched = (theta * tau0 * s[0] + (1 - theta) * tau1 * s[2]) / 2 + mean * _simpson(c)
+    return jnp.sum(jnp.where(sig0 == sig1, steady, switched))
+
+
+def _simpson(x):
+    """The mean over an interval, of values at its ends and in its middle."""
+    return (x[0] + 4 * x[1] + x[2]) / 6

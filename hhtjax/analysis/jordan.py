@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hhtjax.analysis.checks import require_matrix
+from hhtjax.analysis.amplification import require_matrix
 from hhtjax.checks import require_integer, require_number
 
 

@@ -10,8 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.export import files
-from hhtjax.export.fields import distinct, units_of
-from hhtjax.export.model import Given, Layout, Numbers, begin, derivative_field, given, step, with_derivatives
+from hhtjax.export.model import (
+    Given,
+    Layout,
+    Numbers,
+    begin,
+    derivative_field,
+    distinct,
+    given,
+    step,
+    units_of,
+    with_derivatives,
+)
 from hhtjax.export.statements import NotWritten, Statements
 from hhtjax.xla import Listing, NotListed, listed
 

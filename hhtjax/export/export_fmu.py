@@ -22,9 +22,9 @@ import numpy as np
 from hhtjax.checks import require_number
 from hhtjax.description import VERSION
 from hhtjax.export.export_c import ExportedC, exported
-from hhtjax.export.expressions import number
-from hhtjax.export.fields import distinct, fields
 from hhtjax.export.fmi3 import wrapper
+from hhtjax.export.model import distinct, fields
+from hhtjax.export.statements import number
 
 FLAGS = "-std=c99", "-O3", "-fPIC", "-shared", "-fvisibility=hidden"
 EPOCH = 1980, 1, 1, 0, 0, 0  # of every file in the archive, so that the same model is the same archive

@@ -6,10 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hhtjax.description import VERSION
-from hhtjax.export.expressions import TYPES, number
-from hhtjax.export.fields import Field
-from hhtjax.export.helpers import helper
-from hhtjax.export.model import FLAGS, Given, Numbers
+from hhtjax.export.model import FLAGS, Field, Given, Numbers
+from hhtjax.export.statements import TYPES, helper, number
 from hhtjax.xla import Listing, Scalar
 
 TAKEN = "fmi3", "math", "stdbool", "stddef", "stdint", "stdlib", "string"  # .h or .c

@@ -100,13 +100,12 @@ from hhtjax.identification.comparison import Comparison, NestedTest, compare
 from hhtjax.identification.identifiability import IdentifiabilityWarning
 from hhtjax.identification.identify import Multistart, fit, multistart
 from hhtjax.identification.inference import Profile, Score, prediction_errors, profile, score_test
-from hhtjax.identification.measured import Windows, windows, wrap_angle
-from hhtjax.identification.progress import History
+from hhtjax.identification.initial_guesses import equation_error, fit_progressively
+from hhtjax.identification.least_squares import History
 from hhtjax.identification.refinement import Refined, StepSizeWarning, refine
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import Uncertainty
-from hhtjax.identification.sensors import accelerometer, measure
-from hhtjax.identification.starts import equation_error, fit_progressively
+from hhtjax.identification.sensors import Windows, accelerometer, measure, windows, wrap_angle
 from hhtjax.identification.transforms import bounded, fixed, positive
 
 __all__ = [

@@ -18,7 +18,7 @@ from hhtjax.identification.evidence import (
     weights_of,
 )
 from hhtjax.identification.identifiability import parameter_names, parameter_values
-from hhtjax.identification.left_out import leave_out, require_residuals_of
+from hhtjax.identification.inference import leave_out, require_residuals_of
 from hhtjax.identification.result import FitResult
 
 

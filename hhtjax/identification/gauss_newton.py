@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.identification.losses import Objective
-from hhtjax.numerics.either import choose, namespace_of, svd
+from hhtjax.numerics.array_namespace import choose, namespace_of, svd
 
 PART = 512  # rows
 

@@ -26,10 +26,9 @@ from hhtjax.identification.arguments import (
     require_leading_axis,
 )
 from hhtjax.identification.identifiability import warn_undetermined
-from hhtjax.identification.outside import is_outside, solve_outside
-from hhtjax.identification.parts import Data
-from hhtjax.identification.problem import solve
-from hhtjax.identification.progress import BAD_START, NO_INFLUENCE
+from hhtjax.identification.least_squares import BAD_START, NO_INFLUENCE
+from hhtjax.identification.parameter_vector import Data
+from hhtjax.identification.problem import is_outside, solve, solve_outside
 from hhtjax.identification.residuals import check_weights, first_bad
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS

@@ -3,26 +3,19 @@
 What ended it is a code.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from hhtjax.identification.gauss_newton import or_one
-from hhtjax.identification.progress import (
-    BAD_START,
-    COST,
-    GRADIENT,
-    LIMIT,
-    NO_INFLUENCE,
-    RUNNING,
-    STEP,
-    STUCK,
-    History,
-    record,
-    show,
-)
-from hhtjax.numerics.either import choose, namespace_of, while_loop
+from hhtjax.description.presentation import overwrite, shown
+from hhtjax.identification.gauss_newton import deviation, or_one
+from hhtjax.identification.losses import Objective
+from hhtjax.numerics.array_namespace import choose, namespace_of, while_loop, with_entry
 
 ALIKE = 0.7  # cosine of two steps, from which on one tells how the residual bends along the other
 MOST_BENT = 1.5  # 2 |D a| over |D v|: beyond it v is no straight line any more, and a no correction of it
@@ -171,3 +164,176 @@ def _within(problem, now, course, longest):
 def _bounded(longest, dtype):
     """The longest steps, so that inf is too long."""
     return np.minimum(longest, np.finfo(dtype).max).astype(dtype)
+
+
+# ----------------------------------------------------------------------------
+# Fits whose residuals simulate under error control: steps are frozen, and chosen again, until the estimates stay.
+#
+# Steps that are chosen anew for each trial make the cost jump by what tolerances leave, and Levenberg-Marquardt ends
+# where it jumps down by chance. So a first round, which does that, comes near, to steps of a small part of the standard
+# errors. Those after it keep the steps that are chosen where the round before has ended. These are for the motion
+# there, and wrong far away: a frozen round that moves the estimates by no more than such a part is the last.
+
+
+MOST = 5  # rounds with frozen steps
+SMALL = 0.1  # standard errors
+
+
+def in_rounds(problem_for, x, longest, tolerance, max_iterations, progress):
+    """`levenberg_marquardt` in rounds; also how many had frozen steps.
+
+    problem_for: y, whether steps are chosen at each trial -> the problem, with steps as for y if they are not.
+    """
+
+    def unfinished(carry):
+        return carry[-1]
+
+    def one(carry):
+        best, history, before, _, choices, _ = carry
+        fresh = choices < 0
+        problem = problem_for(best.x, fresh)
+        limits = tolerance, max_iterations - before, progress, max_iterations
+
+        def near(trial, step, problem=problem, fresh=fresh):
+            return fresh & (problem.length(trial, step) <= SMALL * deviation(trial))
+
+        found, new, iterations, code = levenberg_marquardt(problem, best.x, longest, *limits, near)
+        history = History(*map(partial(joined, before, fresh), history, new))
+        moved = problem.length(found, found.x - best.x)
+        small = SMALL * deviation(found) + tolerance * problem.length(found, found.x)
+        choices, before = choices + 1, before + iterations
+        failed = (code == BAD_START) | (code == NO_INFLUENCE) | (before >= max_iterations)
+        settled = (moved <= small) & ~fresh
+        last = choices == MOST
+        code = jnp.where(last & ~settled & ~failed, UNSETTLED, code)
+        return found, history, before, code, choices, ~(failed | settled | last)
+
+    start = problem_for(x, jnp.array(True))
+    empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
+    zero = jnp.zeros((), jnp.int32)
+    carry = start.nothing(x), History(empty, empty, empty), zero, zero + RUNNING, zero - 1, jnp.array(True)
+    best, history, iterations, code, choices, _ = lax.while_loop(unfinished, one, carry)
+    return best, history, iterations, code, choices
+
+
+def joined(before, fresh, old, new):
+    """The history of a round behind that of those before it, after so many iterations."""
+    behind = jnp.arange(old.size, dtype=jnp.int32) > before
+    return jnp.where(behind | fresh, jnp.roll(new, before), old)
+
+
+# ----------------------------------------------------------------------------
+# Any optax optimiser on the cost; like Levenberg-Marquardt, a `lax.while_loop` that ends with a code.
+
+
+class Smooth(NamedTuple):
+    """A cost of residuals f(x) (m,), of which reverse mode gives the gradient."""
+
+    f: Callable
+    objective: Objective
+
+    def cost(self, x):
+        """Of all residuals."""
+        return self.objective.cost(self.f(x))
+
+    def read(self, _):
+        """Nothing: residuals are evaluated apart."""
+        return ()
+
+    def slopes(self, x):
+        """The gradient of the cost: (1, p)."""
+        return jax.grad(self.cost)(x)[None, :]
+
+
+def descend(problem, x, optimizer, tolerance, max_iterations, progress, patience=5):
+    """An optax optimiser on the cost of a `Smooth` problem; returns the best point it saw."""
+    import optax  # where a fit needs it: see `for_many`
+
+    optimizer = optax.with_extra_args_support(optimizer)
+    running = jnp.asarray(RUNNING, jnp.int32)
+
+    def unfinished(carry):
+        return carry[-1] == RUNNING
+
+    def improve(carry):
+        x, state, best, before, step, quiet, iteration, history, _ = carry
+        value, gradient = jax.value_and_grad(problem.cost)(x)
+        best = jax.tree.map(partial(jnp.where, value < best[1]), (x, value), best)
+        history = record(history, iteration, value, step, None)
+        quiet = jnp.where(jnp.abs(before - value) <= tolerance * value, quiet + 1, 0)
+        code = jnp.where(iteration == max_iterations, LIMIT, running)
+        code = jnp.where(quiet >= patience, COST, code)
+        level = jnp.where((iteration == 0) & (value > 0), NO_INFLUENCE, GRADIENT)
+        code = jnp.where(jnp.all(gradient == 0), level, code)
+        code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
+        if progress:
+            show(iteration, value, step, code)
+        updates, state = optimizer.update(gradient, state, x, value=value, grad=gradient, value_fn=problem.cost)
+        updates = jnp.where(code == RUNNING, jnp.asarray(updates), 0)
+        iteration = jnp.where(code == RUNNING, iteration + 1, iteration)
+        return x + updates, state, best, value, jnp.max(jnp.abs(updates)), quiet, iteration, history, code
+
+    infinity = jnp.asarray(jnp.inf, x.dtype)
+    empty = jnp.full(max_iterations + 1, jnp.nan, x.dtype)
+    begin = x, optimizer.init(x), (x, infinity), infinity, jnp.zeros((), x.dtype)
+    zero = jnp.zeros((), jnp.int32)
+    carry = (*begin, zero, zero, History(empty, empty, None), running)
+    _, _, (x, _), _, _, _, iterations, history, code = lax.while_loop(unfinished, improve, carry)
+    return x, history, iterations, code
+
+
+# ----------------------------------------------------------------------------
+# How a fit went: why it ended, its history, and what it shows on the way.
+
+
+RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE, UNSETTLED = range(9)
+CONVERGED = COST, STEP, GRADIENT
+REASONS = {
+    RUNNING: "still running",
+    COST: "converged: the cost changes by less than tolerance",
+    STEP: "converged: the step is smaller than tolerance",
+    GRADIENT: "converged: the gradient vanishes to within tolerance",
+    LIMIT: "stopped: max_iterations reached",
+    STUCK: "stopped: no step lowers the cost",
+    BAD_START: "failed: the residual is not finite at params0",
+    NO_INFLUENCE: "failed: no parameter changes the residual at params0",
+    UNSETTLED: "stopped: the estimates change whenever steps are chosen anew; take a smaller rtol",
+}
+NO_SLOPE = (
+    "a finite residual with a derivative that is not finite: roots, norms and max(x, 0)**1.5 have none, or no second "
+    "one, at 0, where max(x, 1e-12) has"
+)
+
+
+@shown
+class History(NamedTuple):
+    """The course of a fit, per iteration, the start first.
+
+    Attributes:
+        cost: after the iteration.
+        step: largest entry of the step in the scaled coordinates, 0 where it was taken back.
+        damping: of Levenberg-Marquardt (None for optax).
+    """
+
+    cost: Any
+    step: Any
+    damping: Any
+
+
+def record(history, i, *values):
+    """The history with the values of iteration i; None where there are none."""
+    return History(*(None if x is None else with_entry(x, i, y) for x, y in zip(history, values, strict=True)))
+
+
+def show(iteration, cost, step, code):
+    """A line on stderr, the same one at every iteration; at the end with the reason."""
+
+    def tell(iteration, cost, step, code):
+        what = f"step {float(step):.3g}" if step else "no step" if iteration else "start"
+        what = what if code == RUNNING else REASONS[int(code)]
+        overwrite(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", last=code != RUNNING)
+
+    if namespace_of(cost) is np:
+        tell(iteration, cost, step, code)
+    else:
+        jax.debug.callback(tell, iteration, cost, step, code)

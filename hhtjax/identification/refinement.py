@@ -17,7 +17,7 @@ from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import NAMED, FitResult
-from hhtjax.numerics.richardson import richardson
+from hhtjax.runs.extrapolate import richardson
 from hhtjax.steppers.options import Options
 from hhtjax.steppers.residual import Coefficients
 from hhtjax.steppers.stepper import Stepper, require_stepper

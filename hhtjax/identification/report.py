@@ -22,7 +22,7 @@ from hhtjax.identification.evidence import (
     whiteness,
 )
 from hhtjax.identification.identifiability import parameter_names, parameter_values, why_undetermined
-from hhtjax.identification.progress import CONVERGED, REASONS
+from hhtjax.identification.least_squares import CONVERGED, REASONS
 
 CLOSE = 0.95  # correlation of two estimates that is worth a word
 MOST_PAIRS = 3

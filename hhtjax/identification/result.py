@@ -15,7 +15,7 @@ from hhtjax.description import freeze, is_concrete, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
-from hhtjax.identification.progress import COST, GRADIENT, REASONS, STEP, History
+from hhtjax.identification.least_squares import COST, GRADIENT, REASONS, STEP, History
 from hhtjax.identification.sandwich import Uncertainty, correlation
 
 FEW = 16  # degrees of freedom

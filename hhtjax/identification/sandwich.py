@@ -26,7 +26,7 @@ import numpy as np
 
 from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import triangle
-from hhtjax.numerics.either import eigh, namespace_of, svd
+from hhtjax.numerics.array_namespace import eigh, namespace_of, svd
 
 SEGMENTS = 32
 LEAST = 8  # segments that tell of a variance by how much they disagree

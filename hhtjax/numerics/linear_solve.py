@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.elimination import diagonal, factorize, matvec
+from hhtjax.numerics.dense_lu import diagonal, factorize, matvec
 from hhtjax.numerics.low_rank import AtState
 from hhtjax.xla import forward_only, linear_map, part, staged
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.elimination import factorize, matvec
+from hhtjax.numerics.dense_lu import factorize, matvec
 from hhtjax.xla import linear_map
 
 

@@ -18,16 +18,13 @@ try:
 except ModuleNotFoundError as error:
     raise ImportError("hhtjax.plot needs matplotlib: pip install 'hhtjax[plot]'") from error
 
-from hhtjax.plot.comparisons import held_out
 from hhtjax.plot.convergence import error_against_h, work_precision
-from hhtjax.plot.energies import energy_balance
-from hhtjax.plot.fits import correlations, estimates, profile
+from hhtjax.plot.fits import correlations, estimates, fit_overview, held_out, profile
 from hhtjax.plot.mechanisms import animation, configuration
-from hhtjax.plot.overview import fit_overview
 from hhtjax.plot.records import fit_against_data
 from hhtjax.plot.steps import damping_ratio, period_elongation, spectral_radius, stability_region
 from hhtjax.plot.styles import COLOURS, LINES, MARKERS, PARAMETERS, legend, save, style, subplots
-from hhtjax.plot.trajectories import constraint_drift, phase_plane, trajectory
+from hhtjax.plot.trajectories import constraint_drift, energy_balance, phase_plane, trajectory
 
 __all__ = [
     "COLOURS",

@@ -6,11 +6,12 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_number
+from hhtjax.identification.comparison import Comparison
 from hhtjax.identification.identifiability import parameter_names, parameter_values
 from hhtjax.identification.inference import Profile
 from hhtjax.identification.result import FitResult
-from hhtjax.plot.records import MEASURED
-from hhtjax.plot.styles import COLOURS, MARKERS, canvas, legend, look, with_unit
+from hhtjax.plot.records import MEASURED, densities
+from hhtjax.plot.styles import COLOURS, MARKERS, PAGE, canvas, legend, look, style, subplots, with_unit
 
 SHOWN_NUMBERS = 8  # parameters up to which the correlations are written into the matrix
 
@@ -194,3 +195,122 @@ def _require_fit(caller, name, result):
         raise TypeError(f"{caller}: `{name}` must be a FitResult, as of fit; received {type(result).__name__}.")
     if result.uncertainty is None:
         raise ValueError(f"{caller}: `{name}` must have a covariance; received a fit made with covariance=False.")
+
+
+# ----------------------------------------------------------------------------
+# A fit on one page.
+
+
+def fit_overview(
+    result: FitResult,
+    sampling_rate: float = 1.0,
+    *,
+    unit: str | None = None,
+    time_unit: str = "s",
+    frequency_unit: str = "Hz",
+) -> Any:
+    """What a fit leaves over, in time and frequency, and below it estimates and correlations, where it has any.
+
+    The residual is that of the first channel, of the first record where there are many, as in `FitResult.residual`; its
+    spectrum that of `hhtjax.plot.fit_against_data`. Where the parameters cannot be drawn as in
+    `hhtjax.plot.estimates`, because the estimate is 0, they are left out there.
+
+    Args:
+        result: a `FitResult`, whose residuals (of each record) have time as their first axis, 8 of them or more.
+        sampling_rate: residuals in a unit of time.
+        unit: of the residual. time_unit, frequency_unit: as in `hhtjax.plot.fit_against_data`.
+
+    Returns:
+        Axes (4,): residual, its spectrum, estimates, correlations; (2,) of a fit without covariance.
+
+    Raises:
+        TypeError, ValueError: no fit; a sampling rate that is not positive; residuals that are too few.
+
+    >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
+    >>> t = jnp.arange(100.0)
+    >>> result = hhtjax.fit(lambda p: p["a"] - 2.0 - jnp.sin(t), {"a": 1.0})
+    >>> axes = hhtjax.plot.fit_overview(result, 10.0, unit="mm")
+    >>> [ax.get_ylabel() for ax in axes[:1]], axes[2].get_xlabel()
+    (['residual (mm)'], '95 % interval (% of the estimate)')
+    >>> plt.close(axes[0].figure)
+    """
+    if not isinstance(result, FitResult):
+        raise TypeError(f"fit_overview: `result` must be a FitResult, as of fit; received {type(result).__name__}.")
+    require_number(
+        "fit_overview", "sampling_rate", sampling_rate, lambda x: np.isfinite(x) and x > 0, "be positive and finite"
+    )
+    residual = _first_channel(result)
+    believed = result.uncertainty is not None
+    with style():
+        axes = subplots(1 + believed, 2, width=PAGE, height=65 * (1 + believed))[1].ravel()
+        axes[0].plot(np.arange(len(residual)) / sampling_rate, residual, color=COLOURS[0], lw=0.7)
+        axes[0].set(xlabel=with_unit("t", time_unit), ylabel=with_unit("residual", unit))
+        densities(axes[1], {"residual": residual}, sampling_rate, unit, frequency_unit)
+        if believed:
+            names, values = parameter_names(result.params), parameter_values(result.params)
+            estimates(result, entries=[names[i] for i in np.flatnonzero(result.free) if values[i] != 0], ax=axes[2])
+            correlations(result, ax=axes[3])
+    return axes
+
+
+def _first_channel(result):
+    """The residual over time, (N,)."""
+    leaf = np.asarray(jax.tree.leaves(result.residual)[0], float)
+    leaf = leaf if result.starts is None else leaf[0]
+    residual = leaf.reshape(leaf.shape[0], -1)[:, 0] if leaf.ndim else leaf.reshape(1)
+    if len(residual) < 8:
+        raise ValueError(f"fit_overview: `result` must have 8 residuals or more; received {len(residual)}.")
+    return residual
+
+
+# ----------------------------------------------------------------------------
+# A chart of models side by side: their errors on segments that were left out.
+
+
+GREY = "#808080"
+
+
+def held_out(found: Comparison, *, unit: str | None = None, ax: Any = None) -> Any:
+    """Errors of each model on the segments that its fit did not see: each segment, and the root of their mean square,
+
+        sqrt(mean_g e_g^2),    e_g: rms of the residual on segment g by the parameters fitted to the others.
+
+    The model that `compare` takes is filled.
+
+    Args:
+        found: of `compare`, given the residual functions.
+        unit: of the residuals.
+        ax: axes to draw into; None for a figure of its own.
+
+    Returns:
+        The axes.
+
+    Raises:
+        TypeError, ValueError: no comparison, or one without errors on segments.
+
+    >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
+    >>> errors = np.array([[2.0, 3.0], [1.0, 1.0]])
+    >>> k, none = np.array([1, 2]), np.zeros(2)
+    >>> found = hhtjax.identification.Comparison(("line", "cubic"), k, 99, 99.0, none, none, none, (), errors)
+    >>> ax = hhtjax.plot.held_out(found, unit="mm")
+    >>> [text.get_text() for text in ax.get_yticklabels()], ax.get_xlabel()
+    (['line (1)', 'cubic (2)'], 'held-out rms (mm)')
+    >>> plt.close(ax.figure)
+    """
+    if not isinstance(found, Comparison):
+        raise TypeError(f"held_out: `found` must be a Comparison, of compare; received {type(found).__name__}.")
+    if found.held_out is None:
+        raise ValueError("held_out: `found` has no errors on segments; give `residuals` to compare.")
+    count = len(found.names)
+    with canvas("held_out", ax, height=22 + 8 * count) as (panel,):
+        for i, errors in enumerate(found.held_out):
+            segments = "each segment" if i == 0 else None
+            panel.plot(errors, np.full(len(errors), i), "|", color=GREY, ms=7, label=segments)
+        for name, face, words in zip(("o", "s"), ("white", COLOURS[0]), ("together", "taken"), strict=True):
+            at = [i for i in range(count) if (found.names[i] == found.chosen) == (name == "s")]
+            panel.plot(found.cross_validated[at], at, name, color=COLOURS[0], mfc=face, label=words)
+        panel.set_yticks(range(count), [f"{n} ({k})" for n, k in zip(found.names, found.parameters, strict=True)])
+        panel.set_ylim(count - 0.5, -0.5)
+        panel.set_xlabel(with_unit("held-out rms", unit))
+        legend(panel)
+    return panel

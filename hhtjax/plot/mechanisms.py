@@ -9,8 +9,7 @@ from matplotlib.animation import FuncAnimation
 from matplotlib.ticker import MaxNLocator
 
 from hhtjax.checks import require_function, require_number
-from hhtjax.plot.entries import require_run
-from hhtjax.plot.styles import COLOURS, canvas, legend, look, with_unit
+from hhtjax.plot.styles import COLOURS, canvas, legend, look, require_run, with_unit
 from hhtjax.runs.interpolate import interpolate
 
 

@@ -8,14 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import freeze, is_concrete, thaw
-from hhtjax.numerics.seldom import choose, if_any, seldom
+from hhtjax.description import all_concrete, freeze, is_array, is_concrete, known_now, thaw
+from hhtjax.numerics.batched_cond import choose, if_any, seldom
+from hhtjax.numerics.dense_lu import LARGEST, UNROLLED
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
-from hhtjax.steppers.friction_law import is_settled
+from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import Info, entered, join_info, public
-from hhtjax.systems import held
-from hhtjax.systems.lagrangian import mass_reads_velocity
+from hhtjax.systems import zero_order_hold
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
+from hhtjax.systems.system import mass_reads_velocity
+from hhtjax.xla import is_traced
 
 GROWTH = 2.05  # of a step, up to which the recursion follows
 
@@ -42,14 +46,16 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     stepper = stepper.astype(q.dtype)
 
     def take_step(params):
-        return jax.jit(held.bind(stepper, flat, params, dt), inline=True)  # traced once, wherever it is called
+        return jax.jit(
+            zero_order_hold.bind(stepper, flat, params, dt), inline=True
+        )  # traced once, wherever it is called
 
     step = take_step(params)
 
     def advance(now):
         return counted(step if now is params else take_step(now), flat, t0, dt)
 
-    start, first = entered(stepper, flat, q, v, t0, held.before(params, t0, dt), dt, alone=True)
+    start, first = entered(stepper, flat, q, v, t0, zero_order_hold.before(params, t0, dt), dt, alone=True)
     no_info = neutral_info(jax.eval_shape(step, first)[1])
     carry = first, jnp.zeros((), jnp.int32), no_failure(no_info)
     keep = partial(saved, flat)
@@ -93,7 +99,7 @@ def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=Fals
         return next_step
 
     how = {"resolves": resolves, "alone": not resolves}
-    start, begun = entered(stepper, flat, q, v, t0, held.before(params, t0, first), first, **how)
+    start, begun = entered(stepper, flat, q, v, t0, zero_order_hold.before(params, t0, first), first, **how)
     no_info = neutral_info(jax.eval_shape(step, begun, none)[1])
     carry, keep = (begun, none, no_failure(no_info)), partial(saved, flat)
     return Loop(carry, advance(params), keep, no_info, advance, lambda count: tuple(sizes(count)[:2]), start)
@@ -112,10 +118,10 @@ def resized_step(flat, stepper, params, dt, last, grows=False):
         if grows and stepper.throws(flat):
 
             def begin(state, params, dt):
-                return resized.grown(flat, state, held.before(thaw(params), state.t, last), dt)
+                return resized.grown(flat, state, zero_order_hold.before(thaw(params), state.t, last), dt)
 
             state = seldom(begin, dt > GROWTH * last, state, freeze(params), dt)
-        return held.bind(resized, flat, params, dt, last)(state)
+        return zero_order_hold.bind(resized, flat, params, dt, last)(state)
 
     return step
 
@@ -124,7 +130,7 @@ def advance_from(flat, stepper, dtype, params, t, dt, count, last=None, grows=Fa
     """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken, each of size `last`."""
     stepper = stepper.astype(dtype)
     if last is None:
-        take_step = held.bind(stepper, flat, params, dt)
+        take_step = zero_order_hold.bind(stepper, flat, params, dt)
     else:
         take_step = resized_step(flat, stepper, params, dt, last, grows)
     return counted(take_step, flat, t, dt, count)
@@ -243,3 +249,31 @@ def neutral_info(shapes):
     """What `join_info` leaves unchanged."""
     neutral = Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
     return neutral if neutral.dependent_row is None else neutral._replace(dependent_row=-1 - neutral.dependent_row)
+
+
+# ----------------------------------------------------------------------------
+# What short runs of one linear system, in a scan of the user's, have in common: factorised once, where it is written.
+#
+# XLA takes what does not change out of a loop, but not where all that does not change is constant: there each run
+# factorised its matrices.
+
+
+def known_factors(problem, dt):
+    """The `Factors` for the steps dt of a run, while something is traced; None where they are not constant, or large:
+    a program would hold them."""
+    system, stepper = problem.system, problem.stepper
+    if not isinstance(system, LinearSystem) or not is_traced() or jnp.ndim(dt):
+        return None
+    given = [A for A in (system.M, system.C, system.K) if A is not None]
+    if not all(map(is_array, given)) or not any(A.ndim == 2 for A in given) or not UNROLLED < len(system.M) <= LARGEST:
+        return None
+    if not all_concrete((given, stepper, dt)):
+        return None
+    return known_now(_factors, system.alone(), stepper, np.asarray(dt, jax.tree.leaves(problem.q0)[0].dtype))
+
+
+@jax.jit
+def _factors(system, stepper, dt):
+    zero = jnp.zeros(len(system.M), dt.dtype)
+    flat, *_ = flatten("simulate", system, zero, zero, 0 * dt, None)
+    return stepper.astype(dt.dtype).factors_of(flat, dt)

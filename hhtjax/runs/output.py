@@ -8,13 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hhtjax.checks import describe, require_function
+from hhtjax.checks import check_dtype, describe, require_function
 from hhtjax.description import Description, is_array
 from hhtjax.runs.loop import as_solution, with_flaw
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import public
-from hhtjax.systems import held
-from hhtjax.systems.returned import check_dtype
+from hhtjax.systems import zero_order_hold
 
 NAMES = ("q", "v", "w", "L", "z", "zdot", "friction", "sticking", "t", "params")
 SIGNATURE = "of some of q, v, w, L, z, zdot, friction, sticking, t and params, by these names"
@@ -99,7 +98,7 @@ def output_of(output, flat, params, state):
 
 def output_at_start(flat, output, params, start, h):
     """The same where a run starts, with a step h."""
-    return output_of(output, flat, held.before(params, start.t, h), start)
+    return output_of(output, flat, zero_order_hold.before(params, start.t, h), start)
 
 
 def output_at(output, found, t, params):
@@ -134,9 +133,9 @@ def savings(form, loop, flat, output, params):
     def save(carry, last=None):
         state, count, _, *met = carry
         now = loop.now(*met) if met else params
-        if held.holds(now):  # as that step has had them
+        if zero_order_hold.holds(now):  # as that step has had them
             last = loop.sizes(jnp.maximum(count - 1, 0))[0] if last is None else last
-            now = held.before(now, state.t, last)
+            now = zero_order_hold.before(now, state.t, last)
         return state.t, output_of(output, flat, now, state)
 
     def solution(path, dt, info, failure, flaw):

@@ -10,30 +10,29 @@ from jax import lax
 from hhtjax.checks import require_integer
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.runs.adaptive import Adaptive
-from hhtjax.runs.chosen import follow
-from hhtjax.runs.controlled import run_controlled
-from hhtjax.runs.event_checks import require_events
-from hhtjax.runs.events import loop_with_events, with_told_events
+from hhtjax.runs.controlled_run import follow, run_controlled
+from hhtjax.runs.event_loop import loop_with_events, with_told_events
 from hhtjax.runs.extrapolate import MOST, extrapolated
-from hhtjax.runs.factors import known_factors
-from hhtjax.runs.given_steps import (
+from hhtjax.runs.inputs import (
     EqualSteps,
+    Problem,
+    equal_times,
     refined,
     require_control_alone,
+    require_events,
     require_one_length,
+    require_sample_times,
     require_steps,
     require_steps_to,
     steps_within,
     warn_of_jumps_in,
     warn_of_jumps_to,
 )
-from hhtjax.runs.loop import flaw_at_start, given_sizes, grows_at_once, loop_of, loop_over
+from hhtjax.runs.loop import flaw_at_start, given_sizes, grows_at_once, known_factors, loop_of, loop_over
 from hhtjax.runs.output import require_output, savings
-from hhtjax.runs.problem import Problem
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
 from hhtjax.runs.solution import Solution, told
-from hhtjax.runs.sweep_grid import equal_times, require_times
-from hhtjax.steppers.newton import callbacks_named
+from hhtjax.steppers.implicit_solve import callbacks_named
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Programs, is_in_batch, on_scalars, one_kernel, or_plain
@@ -173,7 +172,7 @@ def simulate(
         return told("simulate", run_controlled(problem, times, dt, progress, events, room), throw)
     kind = {"rates": problem.rates(), "numbers": sum(map(jnp.size, jax.tree.leaves(problem.q0)))}
     if times is not None:
-        times = require_times(times, problem.t0, dtype, "simulate")
+        times = require_sample_times(times, problem.t0, dtype, "simulate")
         dt = require_steps_to("simulate", times, dt, num_steps, save_every, problem.t0)
         if progress:
             raise NotImplementedError(

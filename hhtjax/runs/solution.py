@@ -10,12 +10,11 @@ import numpy as np
 from hhtjax.checks import require_number
 from hhtjax.description import all_concrete, is_concrete
 from hhtjax.description.presentation import Table, all_known, between, brief, known, leaf_rows, shown
-from hhtjax.runs.event_failures import EVENTS
-from hhtjax.runs.faults import bad_samples, bad_steps, first_bad
-from hhtjax.steppers.friction_law import DEPENDENT
+from hhtjax.steppers.friction_switching import DEPENDENT
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
 from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY
+from hhtjax.xla import block_written
 
 
 class FailedRunWarning(RuntimeWarning):
@@ -344,3 +343,175 @@ def told(caller, solution, throw):
             raise SimulationError(f"{caller}: {fault}")
         warnings.warn(f"{caller}: {fault}", FailedRunWarning, stacklevel=3)
     return solution
+
+
+# ----------------------------------------------------------------------------
+# What was wrong with the times and the step sizes of a run, in words: what was traced is not known before.
+
+
+ORDER = "`times` must increase, and lie after t0; with it they were {}."
+ALIKE = "times are alike in {}, near t = {:g}: count from a t0 near zero, or take float64."
+
+
+def first_bad(bad):
+    """The index of the first bad member of a batch, and words for it; () and none where there is no batch."""
+    member = tuple(int(i) for i in np.argwhere(bad)[0])
+    words = f"member {', '.join(map(str, member))} ({np.count_nonzero(bad)} of {bad.size} failed), "
+    return member, words if member else ""
+
+
+def bad_samples(t, dt):
+    """Of a run under error control, with times (..., K + 1) and the steps that it chose, NaN behind the last."""
+    if not np.all(np.diff(t) >= 0):  # behind an event that ends the run they are its end
+        return ORDER.format(t)
+    return ALIKE.format(t.dtype, t.flat[0]) if np.any(dt == 0) else None
+
+
+def bad_steps(t, dt, has_events):
+    """Of a run with given steps, and of a sweep, whose dt are NaN where they would be longer than between samples."""
+    gaps, unknown = np.diff(t), np.isnan(dt)
+    is_over_times = t.ndim > 1 and dt.shape == gaps.shape
+    if is_over_times and unknown.any() and not np.all((gaps > 0) & np.isfinite(gaps)):
+        return ORDER.format(t)
+    if np.any(dt <= 0):
+        return f"`dt` must be positive and finite; it was {dt[dt <= 0].flat[0]:g}."
+    if unknown.any():
+        which = first_bad(unknown.reshape(*t.shape[:-1], -1).any(axis=-1))[1]
+        return f"{which}`dt` must be positive and finite, and in a sweep at most the distance of the samples."
+    if np.any(gaps < 0):
+        return ORDER.format(t)
+    alike = gaps == 0
+    if has_events:  # one may have ended the run, at the last time
+        alike &= (t[..., 1:] < t[..., -1:]) | (t[..., :1] == t[..., -1:])
+    return ALIKE.format(t.dtype, t.flat[0]) if alike.any() else None
+
+
+# ----------------------------------------------------------------------------
+# What a run tells of its events.
+
+
+WHOLE = 65  # numbers, at least: an array of fewer would be taken to pieces
+
+
+@shown
+class Events(NamedTuple):
+    """The events of a run, in their order; with `keep_events` entries, NaN (of `which` -1) beyond those that were met.
+
+    Attributes:
+        count: how many were met, also those beyond the entries.
+        t: (keep_events,), when; differentiable.
+        which: (keep_events,), the number of the event.
+        q: where, like q0 with a leading axis; None of a first-order system.
+        before, after: v before and after each, like v0 with a leading axis; y of a first-order system.
+        z: internal states there, None without.
+        rate: (keep_events,), dg/dt before, the part of multipliers as they change over the step. Where it is small
+            beside the velocities the motion grazes the guard, and derivatives are huge, at last infinite.
+    """
+
+    count: Any
+    t: Any
+    which: Any
+    q: Any
+    before: Any
+    after: Any
+    z: Any
+    rate: Any
+
+    def _verdict(self):
+        """How many, and whether some are lost; of a batch the fewest and the most."""
+        count, times = known(self.count), known(self.t)
+        if count is None or times is None or not count.size or not times.ndim:
+            return ""
+        lost = f", {times.shape[-1]} kept" if count.max() > times.shape[-1] else ""
+        return f"{between(count)} {'event' if count.max() == count.min() == 1 else 'events'}{lost}"
+
+
+class Log(NamedTuple):
+    """The events met so far, on vectors: how many, and a column of numbers for each that is kept, NaN beyond, and for
+    those of one step more, of which nothing is told."""
+
+    count: Any
+    columns: Any
+
+    @classmethod
+    def empty(cls, like, keep, at_once):
+        """Room for so many columns like this one, and for so many in a step."""
+        number = max(keep + at_once, -(-WHOLE // like.size))
+        return cls(jnp.zeros((), jnp.int32), jnp.full((like.size, number), jnp.nan, like.dtype))
+
+    def with_more(self, rows, there, keep):
+        """With the first of these, as many as are there, as long as there is room; the others are NaN."""
+        places = jnp.cumsum(there, dtype=self.count.dtype) - 1
+        numbers = jnp.arange(len(places), dtype=places.dtype)
+        here = there[None, :] & (places[None, :] == numbers[:, None])  # some that are not there may be before
+        rows = jnp.sum(jnp.where(here[:, :, None], rows[None], 0), axis=1)
+        rows = jnp.where(jnp.any(here, axis=1)[:, None], rows, jnp.nan)
+        columns = block_written(self.columns, rows.T, jnp.minimum(self.count, keep), axis=1)
+        return Log(self.count + jnp.sum(there, dtype=self.count.dtype), columns)
+
+    def told(self, flat, keep):
+        """As `Events`."""
+        n, N, columns = flat.positions, flat.size, self.columns[:, :keep]
+        end = len(columns) - 2 * N  # of q, in which a rotation has nine numbers
+        t, which, rate, *columns = jnp.split(columns, [1, 2, 3, end, end + N])
+        which = jnp.where(jnp.isnan(which[0]), -1, which[0]).astype(jnp.int32)
+        q, before, after = (x.reshape(-1, 1) if len(x) == 1 else x.T for x in columns)  # no copy
+        z = None if n in (0, N) else jax.vmap(flat.unravel_internal)(before[:, n:])
+        q, unravel = (jax.vmap(flat.unravel)(q), flat.unravel_rates) if n else (None, flat.unravel)
+        before, after = (jax.vmap(lambda v: unravel(flat.located(v) if n else v))(v) for v in (before, after))
+        return Events(self.count, t[0], which, q, before, after, z, rate[0])
+
+
+def row_of(t, which, rate, q, before, after):
+    """What is noted of an event."""
+    return jnp.concatenate([jnp.stack([t, which.astype(t.dtype), rate]), q, before, after])
+
+
+# ----------------------------------------------------------------------------
+# What may go wrong at an event, as data and in words.
+
+
+FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE, THROWN, SINGULAR = range(10)
+EVENTS = {  # what it is, before the number of the event, and what to do about it
+    MANY: (
+        "more than max_events in a step, the first of them event",
+        "A motion that comes to rest on a guard gives infinitely many: let it rest by a stiff force, or a constraint "
+        "that the event switches on. Else take a smaller dt, or a larger max_events",
+    ),
+    STAYS: (
+        "the motion stays beyond the guard of event",
+        "A body that rests there needs a stiff force, or a constraint that the event switches on. An event that turns "
+        "nothing back needs a guard that depends on the mode its switch changes. A force that jumps there needs a "
+        "mode, too",
+    ),
+    ALONG: (
+        "no velocity changes the guard of event",
+        "An impact needs a guard that depends on q, and a motion that may follow it",
+    ),
+    CORNER: (
+        "another event happens at the same time as event",
+        "Impacts one after the other are not the same as at once: say what happens by one event with its own reset",
+    ),
+    DIFFER: (
+        "the runs that extrapolate joins do not meet the same events, the first of them event",
+        "Take a smaller dt, or leave extrapolate out",
+    ),
+    NO_NUMBER: (
+        "q and v are numbers, but not the guard of event",
+        "A guard must be a number beyond its zero, too: q, not sqrt(q)",
+    ),
+    NEGATIVE: (
+        "behind an event, with the params of its switch and the v of its reset, negative is the guard of event",
+        "Guards are positive where the motion goes on: behind its event one may need the other sign, by the mode that "
+        "the switch changes, or another level",
+    ),
+    THROWN: (
+        "what another event changes takes the motion at once beyond the guard of event",
+        "A guard of the velocity jumps with that, and one of params with a switch: say what happens by one event with "
+        "a reset and a switch of its own, or let the guard depend on a mode",
+    ),
+    SINGULAR: (
+        "the constraint determines no acceleration behind event",
+        f"What its reset and its switch make of v and the params must be numbers, and rows independent. {SWITCHED_OFF}",
+    ),
+}

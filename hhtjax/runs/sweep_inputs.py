@@ -9,25 +9,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from hhtjax.checks import require_integer, require_number, require_params
+from hhtjax.checks import notes_on_lists, require_integer, require_number, require_params
 from hhtjax.description import all_concrete, is_array, is_concrete, known_now
 from hhtjax.runs.adaptive import Adaptive, lengths, require_controlled
-from hhtjax.runs.event_checks import refused_members, require_events
-from hhtjax.runs.problem import Problem
-from hhtjax.runs.sweep_grid import (
+from hhtjax.runs.inputs import (
+    Problem,
     equal_times,
     may_grow,
+    refused_members,
+    require_events,
     require_one_grid,
+    require_sample_times,
     require_step_sizes,
     require_steps_within,
-    require_times,
 )
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
-from hhtjax.systems import held
-from hhtjax.systems.consistent import distances, examine, require_consistent
-from hhtjax.systems.initial_values import initial_values
-from hhtjax.systems.returned import notes_on_lists
-from hhtjax.systems.rubbing import with_known_rows
+from hhtjax.systems import zero_order_hold
+from hhtjax.systems.initial_conditions import distances, examine, initial_values, require_consistent, with_known_rows
 from hhtjax.systems.system import require_masses
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
@@ -60,7 +58,7 @@ class Inputs(NamedTuple):
         require_system("sweep", system, massless=True)
         require_stepper("sweep", stepper)
         params = require_params("sweep", params)
-        if held.holds(params):
+        if zero_order_hold.holds(params):
             require_masses("sweep", system, "leave out held inputs, sampled(order=0)")
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
@@ -74,16 +72,16 @@ class Inputs(NamedTuple):
         (q0, v0, z0), mapped = _initial_values(system, q0, v0, params, z0, stepper, in_axes, size)
         if isinstance(dts, Adaptive):
             times = equal_times(t0, duration, num_samples) if times is None else times
-            times = require_times(times, t0, jax.tree.leaves(q0)[0].dtype)
+            times = require_sample_times(times, t0, jax.tree.leaves(q0)[0].dtype)
             num_samples = times.size
         elif times is None:
             require_steps_within(dts, 0.0, duration, num_samples)
         else:
-            times = require_times(times, t0, jax.tree.leaves(q0)[0].dtype)
+            times = require_sample_times(times, t0, jax.tree.leaves(q0)[0].dtype)
             num_samples = times.size
             require_steps_within(dts, t0, times[-1])
         data = stepper, q0, v0, params, z0
-        if held.holds(params) and not isinstance(dts, Adaptive):
+        if zero_order_hold.holds(params) and not isinstance(dts, Adaptive):
             _warn_of_jumps(params, t0, equal_times(t0, duration, num_samples) if times is None else times, dts)
         require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
         if system.constraint is not None:
@@ -294,4 +292,6 @@ def _warn_of_jumps(params, t0, times, dts):
     if all_concrete((t0, times, dts)):
         dts = np.unique(np.asarray(dts, float))
         times = np.append(np.asarray(t0, float), np.asarray(times, float))
-        held.warn_of_jumps("sweep", params, times, lambda H: np.maximum(np.ceil(H[:, None] / dts * (1 - 1e-9)), 1), 5)
+        zero_order_hold.warn_of_jumps(
+            "sweep", params, times, lambda H: np.maximum(np.ceil(H[:, None] / dts * (1 - 1e-9)), 1), 5
+        )

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.numerics.elimination import matvec
+from hhtjax.numerics.dense_lu import matvec
 from hhtjax.rotation import cross
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System

@@ -11,9 +11,9 @@ from functools import partial
 from typing import Any
 
 from hhtjax.checks import require_number
-from hhtjax.numerics.elimination import factorize
+from hhtjax.numerics.dense_lu import factorize
 from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
-from hhtjax.steppers.newton import newton
+from hhtjax.steppers.implicit_solve import newton
 from hhtjax.steppers.options import Options, check_options
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.smooth_start import Corrections

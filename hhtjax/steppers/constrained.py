@@ -16,8 +16,8 @@ C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13, 1985; A. Cardona
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.elimination import diagonal, matvec
-from hhtjax.steppers.newton import linearized_solve, newton
+from hhtjax.numerics.dense_lu import diagonal, matvec
+from hhtjax.steppers.implicit_solve import linearized_solve, newton
 from hhtjax.steppers.stepper import State, join_info
 from hhtjax.systems.constraints import (
     acceleration_and_multipliers,

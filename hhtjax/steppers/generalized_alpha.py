@@ -9,19 +9,24 @@ from typing import Any, Unpack
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_concrete
-from hhtjax.numerics.elimination import factorize
+from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
-from hhtjax.steppers.estimate import Controlled
-from hhtjax.steppers.friction import begin_friction, bind_friction
-from hhtjax.steppers.linear_part import factorized_once, factors_of, linear_part
-from hhtjax.steppers.linearization import linearized_step, refresh
-from hhtjax.steppers.newton import linearized_solve, newton
+from hhtjax.steppers.friction import begin_friction, bind_friction, smoothed_friction
+from hhtjax.steppers.implicit_solve import (
+    factorized_once,
+    factors_of,
+    linear_part,
+    linearized_solve,
+    linearized_step,
+    newton,
+    refresh,
+)
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
-from hhtjax.steppers.smooth_friction import smoothed_friction
 from hhtjax.steppers.smooth_start import DEFAULT, at_start, grown, jumped, smoothed
 from hhtjax.steppers.stepper import State, Stepper, join_info
+from hhtjax.steppers.variable_step import Controlled
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
 
@@ -330,3 +335,42 @@ def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> Genera
     rho = require_number("generalized_alpha", "rho_inf", rho_inf, lambda x: 0 <= x <= 1, "lie in [0, 1]")
     weights = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
     return GeneralizedAlpha(coefficients(*weights), 2, check_options("generalized_alpha", **options))
+
+
+# ----------------------------------------------------------------------------
+# Fully implicit Euler: the generalised-alpha machinery with another update.
+
+
+@dataclass(frozen=True, eq=False)
+class ImplicitEuler(GeneralizedAlpha):
+    """Implicit Euler; made by `implicit_euler`."""
+
+    def advance(self, s, dt, w):
+        """v1 = v + h w1, x = h v1."""
+        v = s.v + dt * w
+        return dt * v, v, w, w
+
+
+def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=None) -> ImplicitEuler:
+    """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), solved by Newton.
+
+    Order 1, L-stable, strongly damping: the reference for robustness, not for accuracy. Constraints (GGL), rotations
+    (in charts), internal states and dry friction are solved as by `hht`.
+
+    Args:
+        iterations: None, Newton until `tolerance`; k, that many Newton iterations.
+        tolerance, max_iterations, solve: as in `hht`.
+
+    Returns:
+        A `Stepper`.
+
+    Raises:
+        TypeError, ValueError: an argument of the wrong kind, or out of its range.
+
+    >>> import hhtjax
+    >>> hhtjax.implicit_euler().order
+    1
+    """
+    newton = {"iterations": iterations, "tolerance": tolerance, "max_iterations": max_iterations}
+    options = check_options("implicit_euler", **newton, linearize="predictor", start="simple", solve=solve)
+    return ImplicitEuler(Coefficients(0.0, 0.0, 1.0, 1.0), 1, options)

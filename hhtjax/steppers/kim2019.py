@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description import is_concrete
-from hhtjax.numerics.elimination import factorize
+from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import solve
-from hhtjax.steppers.newton import newton
+from hhtjax.steppers.implicit_solve import newton
 from hhtjax.steppers.options import Options, check_options, require_alpha
 from hhtjax.steppers.residual import hht_coefficients
 from hhtjax.steppers.stepper import Info, State, Stepper

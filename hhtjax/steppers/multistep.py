@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.elimination import factorize
-from hhtjax.steppers.newton import newton
+from hhtjax.numerics.dense_lu import factorize
+from hhtjax.steppers.implicit_solve import newton
 from hhtjax.steppers.options import Options, check_options
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.rosenbrock import rosenbrock

@@ -34,13 +34,13 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import freeze, thaw
-from hhtjax.numerics.elimination import UNROLLED, diagonal, inverse, matvec
-from hhtjax.numerics.hoisted import hoisted
-from hhtjax.numerics.implicit_root import implicit_root
+from hhtjax.numerics.batched_cond import choose, derivative_at_need, seldom
+from hhtjax.numerics.closures import hoisted
+from hhtjax.numerics.dense_lu import UNROLLED, diagonal, inverse, matvec
+from hhtjax.numerics.differentiable_while import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
-from hhtjax.numerics.seldom import choose, derivative_at_need, seldom
-from hhtjax.steppers.newton import linearize_rows, linearized
+from hhtjax.steppers.implicit_solve import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import answers, curvature, jacobian, reaction, violation

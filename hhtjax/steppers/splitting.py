@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description import is_concrete
-from hhtjax.numerics.elimination import matvec
+from hhtjax.numerics.batched_cond import choose
+from hhtjax.numerics.dense_lu import matvec
 from hhtjax.numerics.linear_solve import solve
-from hhtjax.numerics.seldom import choose
 from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
 from hhtjax.steppers.options import check_options, require_alpha
 from hhtjax.steppers.residual import hht_coefficients

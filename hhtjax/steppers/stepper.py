@@ -9,9 +9,9 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import Description
 from hhtjax.description.presentation import known, shown
-from hhtjax.systems import held, kinematics
+from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.system import require_masses
 from hhtjax.systems.system import require_system as require_system
 
@@ -204,7 +204,7 @@ class Stepper(Description):
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params, state.z)
         w = ravel_pytree((state.w if flat.positions else state.v, state.zdot))[0]
         a = None if state.a is None else ravel_pytree((state.a, state.za))[0]
-        step = held.bind(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
+        step = zero_order_hold.bind(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
         state, info = step(State(state.t, q, v, w, a, state.L, state.memory, friction=state.friction))
         return _unravel(flat, state), info
 
@@ -215,7 +215,8 @@ def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
     flat, q, v = flatten(caller, system, q0, v0, t0, params, z0)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
     return _unravel(
-        flat, entered(stepper.astype(q.dtype), flat, q, v, t0, held.before(params, t0, dt), dt, alone=True)[1]
+        flat,
+        entered(stepper.astype(q.dtype), flat, q, v, t0, zero_order_hold.before(params, t0, dt), dt, alone=True)[1],
     )
 
 

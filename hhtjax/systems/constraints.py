@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.numerics.elimination import UNROLLED, matvec
+from hhtjax.numerics.dense_lu import UNROLLED, matvec
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, factorize_saddle_point, solver
 from hhtjax.systems import kinematics
 from hhtjax.xla import linear_map, staged

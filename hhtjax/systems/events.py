@@ -2,7 +2,7 @@
 
     g(q, v, t) > 0 where the motion is allowed;   at g = 0:  v := reset(q, v, t),  params := switch(params),  or the end
 
-How a step finds the time is in hhtjax/runs/meeting.py.
+How a step finds the time is in hhtjax/runs/event_step.py.
 """
 
 import inspect
@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import in_words, require_function, require_number
 from hhtjax.description import Description, as_float, freeze, is_array, is_concrete, is_real, thaw
-from hhtjax.numerics.seldom import seldom
+from hhtjax.numerics.batched_cond import seldom
 from hhtjax.systems.constraints import answers, pull_back
 from hhtjax.systems.sampled import SLOP
 from hhtjax.xla import consistent

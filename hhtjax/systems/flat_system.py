@@ -8,17 +8,15 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 
-from hhtjax.checks import describe
-from hhtjax.numerics.elimination import by_factors, factorize, matvec
+from hhtjax.checks import check_like, check_matrix, count, describe, evaluate, telling_of_arguments
+from hhtjax.numerics.dense_lu import by_factors, factorize, matvec
 from hhtjax.numerics.linear_solve import reuse, solver
 from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
-from hhtjax.systems.mass import mass_at, product_at, timed
+from hhtjax.systems.linear_system import with_known_matrices
 from hhtjax.systems.matrices import as_matrix
-from hhtjax.systems.returned import check_like, check_matrix, count, evaluate, telling_of_arguments
-from hhtjax.systems.sparse_system import with_known_matrices
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, mass_at, product_at, timed
 from hhtjax.xla import consistent
 
 

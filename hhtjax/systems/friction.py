@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from hhtjax import checks
 from hhtjax.checks import describe, require_function
-from hhtjax.numerics.elimination import diagonal, matvec
+from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
-from hhtjax.systems import returned
 from hhtjax.xla import consistent, linear_map
 
 MOST = 16  # directions of friction
@@ -51,9 +51,9 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
     dtype, n = ravel_pytree(q0)[0].dtype, flat.positions
     z = () if z0 is None else (z0,)
     L = (jnp.zeros(flat.num_constraints, dtype),) if flat.num_constraints else ()
-    F = returned.evaluate(caller, "friction", system.friction, q0, v0, *z, *L, t0, params)
+    F = checks.evaluate(caller, "friction", system.friction, q0, v0, *z, *L, t0, params)
     if system.sliding is None:
-        returned.check_like(caller, "friction", F, "v0", v0, dtype)
+        checks.check_like(caller, "friction", F, "v0", v0, dtype)
         m = n
         if m > MOST:
             raise ValueError(
@@ -61,12 +61,12 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
                 "give `sliding`, the sliding velocities of those that rub."
             )
     else:
-        m = returned.count(caller, "sliding", system.sliding, MOST, dtype, q0, v0, t0, params)
+        m = checks.count(caller, "sliding", system.sliding, MOST, dtype, q0, v0, t0, params)
         if not hasattr(F, "shape") or F.shape != (m,):
             raise ValueError(
                 f"{caller}: `friction` must return ({m},), one limit for each of `sliding`; received {describe(F)}."
             )
-        returned.check_dtype(caller, "friction", F, dtype)
+        checks.check_dtype(caller, "friction", F, dtype)
     unravel_internal = (lambda V: ()) if z0 is None else (lambda V: (flat.unravel_internal(V[n:]),))
 
     def limit(q, V, L, t, params):

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.numerics.elimination import diagonal, matvec
+from hhtjax.numerics.batched_cond import choose
+from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
-from hhtjax.numerics.seldom import choose
 from hhtjax.systems.constraints import jacobian, violation
 from hhtjax.systems.friction import at_rest, block_of, directions, responses, solver_of_some
 

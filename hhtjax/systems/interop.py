@@ -20,10 +20,9 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import Description, as_float, current, thaw
 from hhtjax.description.presentation import shown
-from hhtjax.systems.consistent import require_consistent
 from hhtjax.systems.constraints import acceleration_and_multipliers
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.initial_values import initial_values
+from hhtjax.systems.initial_conditions import initial_values, require_consistent
 from hhtjax.systems.system import FirstOrderSystem, require_smooth, require_system
 
 __all__ = ["FlatODE", "ScipyRHS", "diffrax_term", "flat_ode", "ode", "scipy_rhs"]

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax import rotation
-from hhtjax.numerics.elimination import matvec
+from hhtjax.numerics.dense_lu import matvec
 
 
 class Block(NamedTuple):

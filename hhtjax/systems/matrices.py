@@ -5,7 +5,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.numerics.panels import pivots
+from hhtjax.numerics.dense_lu import pivots
 from hhtjax.numerics.sparse_matrix import Sparse, of_scipy
 
 LARGEST_CHECKED = 256  # rows of a mass matrix that is looked at

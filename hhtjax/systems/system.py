@@ -4,13 +4,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from hhtjax.checks import require_function
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.checks import positional_names, require_function, takes
 from hhtjax.description import Description
 from hhtjax.systems.friction import require_friction
-from hhtjax.systems.lagrangian import InternalLagrangianForce, LagrangianForce, LagrangianInertia, LagrangianMass
 from hhtjax.systems.linear_system import LinearSystem
-from hhtjax.systems.mass import require_inertial
 from hhtjax.systems.matrices import constant_matrix, require_mass
+from hhtjax.xla import traced
 
 __all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_smooth", "require_system"]
 
@@ -277,3 +282,123 @@ def require_smooth(caller, system):
             f"{caller}: `system` has dry friction, which is no function of q and v: leave `friction` out, or put a "
             "smooth one into `force`."
         )
+
+
+# ----------------------------------------------------------------------------
+# Mass, inertia and force of Lagrange's equations by autodiff. Classes: equal Lagrangians give equal systems.
+
+
+@dataclass(frozen=True)
+class LagrangianMass:
+    """M(q, t) = d2L/dv2, which no v enters: at v = 0."""
+
+    lagrangian: Callable
+    is_lagrangian = True  # knows no rotations
+
+    def __call__(self, q, t, params):
+        zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))
+        return jax.hessian(lambda v: self.lagrangian(q, unravel(v), t, params))(zero)
+
+
+@dataclass(frozen=True)
+class LagrangianInertia:
+    """M(q, t) w, the derivative of the momentum dL/dv in the direction w: one column of the Hessian, not all."""
+
+    lagrangian: Callable
+
+    def __call__(self, q, w, t, params):
+        q, w = (jax.tree.map(jnp.asarray, x) for x in (q, w))
+        zero = jax.tree.map(jnp.zeros_like, w)
+        return lagrangian_product(self.lagrangian, q, zero, w, t, params)
+
+
+def lagrangian_product(lagrangian, q, v, w, t, params):
+    """d2L/dv2 w at a velocity."""
+    momentum = jax.grad(lambda v: lagrangian(q, v, t, params))
+    return jax.jvp(momentum, (v,), (w,))[1]
+
+
+def mass_reads_velocity(lagrangian, q, v, t, params):
+    """Whether d2L/dv2 depends on v, so that L is none of a mass matrix; looked at where v enters it at all."""
+    flat, unravel = ravel_pytree(v)
+    some = jnp.asarray(1 + 0.618 * np.arange(flat.size) % 0.5, flat.dtype)
+
+    product = traced(
+        lambda v: ravel_pytree(lagrangian_product(lagrangian, q, unravel(v), unravel(some), t, params))[0], flat
+    )
+    if not product.reads(None)[0]:
+        return jnp.array(False)
+    rest, far = product(jnp.zeros_like(flat)), 1 + jnp.max(jnp.abs(flat))
+    changes = jnp.stack([product(x) - rest for x in (flat, flat + 0.01 * far * some, flat - far * some)])
+    rounding = max(1e-6, 1e3 * float(jnp.finfo(flat.dtype).eps))
+    return lax.stop_gradient(jnp.any(jnp.abs(changes) > rounding * jnp.max(jnp.abs(rest))))  # not where it is NaN
+
+
+@dataclass(frozen=True)
+class LagrangianForce:
+    """Q(q, v, t) = F + dL/dq - d/ds (dL/dv)(q + s v, t + s)."""
+
+    lagrangian: Callable
+    force: Callable | None
+
+    def __call__(self, q, v, t, params):
+        q, v = (jax.tree.map(jnp.asarray, x) for x in (q, v))
+        t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(q)))
+
+        def momentum(q, t):
+            return jax.grad(self.lagrangian, argnums=1)(q, v, t, params)
+
+        _, convective = jax.jvp(momentum, (q, t), (v, jnp.ones_like(t)))
+        Q = jax.tree.map(jnp.subtract, jax.grad(self.lagrangian)(q, v, t, params), convective)
+        return Q if self.force is None else jax.tree.map(jnp.add, Q, self.force(q, v, t, params))
+
+
+@dataclass(frozen=True)
+class InternalLagrangianForce:
+    """The same where F depends on internal states z too."""
+
+    lagrangian: Callable
+    force: Callable | None
+
+    def __call__(self, q, v, z, t, params):
+        Q = LagrangianForce(self.lagrangian, None)(q, v, t, params)
+        return Q if self.force is None else jax.tree.map(jnp.add, Q, self.force(q, v, z, t, params))
+
+
+# ----------------------------------------------------------------------------
+# The mass of a system at a position and a time: a function of (q, params), or of (q, t, params).
+#
+# Equations with M(q, t) ask for nothing new of a stepper: w is the acceleration that M(q, t) w = Q(q, v, t) gives at a
+# time, so a residual at (q1, v1, t1) takes M there, and derivatives in t pass through it. The rate of M is part of the
+# momentum's, d/dt (M v) = M w + Mdot v, and belongs into Q: there `from_lagrangian` puts it.
+
+
+TIMES = "t", "time"  # names that an argument for the time may have
+
+
+def takes_time(function: Callable, before: int) -> bool:
+    """Whether a function takes t behind so many arguments, and before params: it tells by the name."""
+    names = positional_names(function)
+    named = len(names) > before + 1 and names[before].lstrip("_") in TIMES
+    return named and takes(function, before + 2)  # a decorator may have filled it in
+
+
+def require_inertial(caller: str, name: str, function: Callable, before: tuple[str, ...]) -> None:
+    """An error for what is no function of these and params, nor one of these, t and params."""
+    more = ("t",) if callable(function) and takes_time(function, len(before)) else ()
+    require_function(caller, name, function, f"{name}({', '.join((*before, *more, 'params'))})")
+
+
+def timed(function: Callable, before: int, t) -> tuple:
+    """(t,) for a function that takes the time behind so many arguments, () for one that does not."""
+    return (t,) if takes_time(function, before) else ()
+
+
+def mass_at(system, q, t, params):
+    """M of a system with pytrees, as its user gave it: a function's value, or the constant array."""
+    return system.mass(q, *timed(system.mass, 1, t), params) if callable(system.mass) else system.mass
+
+
+def product_at(system, q, w, t, params):
+    """M w by the system's own `inertia`, a pytree."""
+    return system.inertia(q, w, *timed(system.inertia, 2, t), params)

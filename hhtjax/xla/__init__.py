@@ -96,23 +96,29 @@ NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule w
 all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
 """
 
+from hhtjax.jaxpr.interpreter import traced
+from hhtjax.jaxpr.linear_maps import linear_map
+from hhtjax.jaxpr.listing import Listing, Scalar
+from hhtjax.jaxpr.recording import NotListed, listed
+from hhtjax.jaxpr.scalars import on_scalars
+from hhtjax.primitives.atomic_functions import Bilinear, Family
+from hhtjax.primitives.batching import block_written, in_turn, row_written
+from hhtjax.primitives.host_callback import on_host
+from hhtjax.primitives.two_mode_derivative import (
+    TwoWays,
+    derivative,
+    forward_only,
+    is_in_batch,
+    is_traced,
+    is_untouched,
+    together,
+)
+from hhtjax.xla.compat import or_plain, plain
 from hhtjax.xla.consistent import consistent
 from hhtjax.xla.explanation import Explanation, calls, explain
-from hhtjax.xla.gate import or_plain, plain
-from hhtjax.xla.host import on_host
 from hhtjax.xla.kernels import choose, largest_in_batch, one_kernel, or_alone, part, staged, structural
-from hhtjax.xla.linear_maps import linear_map
-from hhtjax.xla.listing import Listing, Scalar
-from hhtjax.xla.operations import Bilinear, Family
-from hhtjax.xla.programs import QUICK, WIDE, Programs
-from hhtjax.xla.recording import NotListed, listed
-from hhtjax.xla.rows import block_written, row_written
-from hhtjax.xla.scalars import on_scalars
+from hhtjax.xla.lowering import QUICK, WIDE, Programs
 from hhtjax.xla.sines import RANGE, polynomial_sines
-from hhtjax.xla.traced import traced
-from hhtjax.xla.transforms import forward_only, is_in_batch, is_traced, is_untouched
-from hhtjax.xla.turns import in_turn
-from hhtjax.xla.two_ways import TwoWays, derivative, together
 
 __all__ = [
     "QUICK",

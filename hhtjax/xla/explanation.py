@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 
 import hhtjax.xla.lowering  # noqa: F401
-from hhtjax.xla.source_lines import asked
+from hhtjax.jaxpr.interpreter import asked
 
 
 class Explanation(NamedTuple):

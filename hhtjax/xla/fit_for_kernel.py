@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.xla.parameters import ELEMENTWISE
+from hhtjax.jaxpr.scalar_rules import ELEMENTWISE
 
 LARGEST_SUM = 4095  # numbers of a sum; XLA hands larger ones to another library
 LARGEST_MATRIX = 4096  # elements of one that meets a vector

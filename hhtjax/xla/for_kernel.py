@@ -5,22 +5,24 @@ function in two forms (`choose`) the one for kernels is taken. All else is copie
 """
 
 import math
+from copy import copy
 from functools import lru_cache, partial, reduce
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import eval_jaxpr
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.extend.core.primitives import closed_call_p
 
-from hhtjax.xla import rows, turns, two_ways
-from hhtjax.xla.calls import computed_once, kernel
-from hhtjax.xla.fit_for_kernel import lengths, verdict
-from hhtjax.xla.holding import with_values_held
+from hhtjax.jaxpr.scalar_rules import replaces
+from hhtjax.primitives import batching, two_mode_derivative
+from hhtjax.xla.consistent import held_p
+from hhtjax.xla.fit_for_kernel import DTYPES, lengths, verdict
 from hhtjax.xla.kernel_primitive import of_jaxpr
 from hhtjax.xla.kernels import PART, STAGED
-from hhtjax.xla.parameters import replaces
 from hhtjax.xla.sines import sines
 
 MOST_TERMS = 32  # of the sum that a product is written as
@@ -38,11 +40,11 @@ MANY = 4  # values of a conditional: of fewer, a loop is no better
 INSIDE = object()  # what becomes of the question whether a kernel holds it
 IDENTITIES = {"hhtjax_structural", "hhtjax_largest_in_batch"}
 OURS = {  # operations of this package -> what they do, a function of arrays and parameters
-    "hhtjax_row_written": rows.written,
-    "hhtjax_in_turn": turns.values,
-    "hhtjax_values": two_ways.values,
-    "hhtjax_linear": two_ways.linear,
-    "hhtjax_both": two_ways.both,
+    "hhtjax_row_written": batching.written,
+    "hhtjax_in_turn": batching.values,
+    "hhtjax_values": two_mode_derivative.values,
+    "hhtjax_linear": two_mode_derivative.linear,
+    "hhtjax_both": two_mode_derivative.both,
 }
 
 
@@ -321,3 +323,166 @@ class _Name:
 
 
 _SINES = _Name()
+
+
+# ----------------------------------------------------------------------------
+# Values of a kernel that several operations use, computed once.
+#
+# XLA:CPU fuses an operation into all that use it, and evaluates for each of them anew all that it comes from: of the
+# 14,000 operations of a spinning top's gradient it makes 37,000, and LLVM compiles them all. Across a call it fuses
+# nothing. So what is much to evaluate, and used by several, is handed on by a call that gives it as it is.
+
+
+ONCE = "hhtjax_once"  # name of a function that XLA computes once
+LEAST_HELD = 40  # operations that are evaluated once more without a call; of fewer, nothing is gained
+CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2"}
+LOOPS = {"cond", "while", "scan", "custom_linear_solve"}
+MADE_ONCE = LOOPS | {"dot_general", "hhtjax_held"}  # by XLA in any case
+BROADCAST = "broadcast_in_dim"  # handed on before it is one
+FREE = {BROADCAST, "convert_element_type", "reshape", "slice", "transpose", "squeeze", "expand_dims", "copy", "split"}
+
+
+def with_values_held(closed):
+    """The closed jaxpr, in which such values are handed on by calls."""
+    return ClosedJaxpr(_Holder().held(closed.jaxpr)[0], closed.consts)
+
+
+class _Holder:
+    """Of a jaxpr and of all within it, each once."""
+
+    def __init__(self):
+        self.done = {}  # id of a jaxpr: (it, what has become of it, costs of its results, uses of its arguments)
+
+    def held(self, jaxpr):
+        if id(jaxpr) not in self.done:
+            self.done[id(jaxpr)] = jaxpr, *self._held(jaxpr)
+        return self.done[id(jaxpr)][1:]
+
+    def _held(self, jaxpr):
+        eqns = [self._inside(eqn) for eqn in jaxpr.eqns]
+        uses = {}
+        for eqn, _, inner_uses in eqns:
+            for i, x in enumerate(eqn.invars):
+                if not isinstance(x, Literal):
+                    uses[x] = uses.get(x, 0) + (inner_uses[i] if inner_uses else 1)
+        for x in jaxpr.outvars:
+            if not isinstance(x, Literal):
+                uses[x] = uses.get(x, 0) + 1
+        new, cost, made = {}, {}, []
+        for eqn, costs, _ in eqns:
+            if new:
+                eqn = eqn.replace(invars=[x if isinstance(x, Literal) else new.get(x, x) for x in eqn.invars])
+            name = eqn.primitive.name
+            before = sum(cost.get(x, 0) for x in {x for x in eqn.invars if not isinstance(x, Literal)})
+            made.append(eqn)
+            for i, x in enumerate(eqn.outvars):
+                own = 0 if name in MADE_ONCE or costs == "once" else costs[i] if costs else name not in FREE
+                taken = 0 if name in MADE_ONCE or costs == "once" else before + own
+                if taken and name != BROADCAST and taken * (uses.get(x, 0) - 1) >= LEAST_HELD:
+                    made.append(_handed_on(eqn, x, new))
+                    taken = 0
+                    cost[new[x]] = 0
+                cost[x] = taken
+        outvars = [x if isinstance(x, Literal) else new.get(x, x) for x in jaxpr.outvars]
+        after = jaxpr.replace(eqns=made, outvars=outvars)
+        return (
+            after,
+            [0 if isinstance(x, Literal) else cost.get(x, 0) for x in outvars],
+            [uses.get(x, 0) for x in jaxpr.invars],
+        )
+
+    def _inside(self, eqn):
+        """The equation with what is inside done, costs of its results as a call, uses of its arguments."""
+        name = eqn.primitive.name
+        if name not in CALLS and name not in LOOPS:
+            return eqn, None, None
+        told = []
+
+        def inner(x):
+            if isinstance(x, ClosedJaxpr):
+                after, *more = self.held(x.jaxpr)
+                told.append(more)
+                return ClosedJaxpr(after, x.consts)
+            if isinstance(x, Jaxpr):
+                after, *more = self.held(x)
+                told.append(more)
+                return after
+            return x
+
+        eqn = eqn.replace(params={key: jax.tree.map(inner, x) for key, x in eqn.params.items()})
+        if name in LOOPS:
+            return eqn, None, None
+        if eqn.params.get("name") == ONCE:
+            return eqn, "once", None
+        return eqn, *told[0]
+
+
+def _handed_on(eqn, x, new):
+    """An equation that gives x by another name."""
+    other = new[x] = copy(x)  # a variable is known by its identity
+    return eqn.replace(primitive=held_p, invars=[x], outvars=[other], params={}, effects=frozenset(), ctx=eqn.ctx)
+
+
+# ----------------------------------------------------------------------------
+# Calls that bear attributes for XLA:CPU: what is called is compiled into one kernel, or computed once.
+
+
+def kernel(form):
+    """The function of a closed jaxpr as one kernel.
+
+    XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once a constant is put in its place.
+    So the kernel returns a number that takes an element of each, and the values are hidden from XLA."""
+    number = len(form.out_avals)
+
+    def body(*args):
+        return [*eval_jaxpr(form.jaxpr, form.consts, *args), *_of_each(args)]
+
+    body = _with_attributes(body, inlineable="false", xla_cpu_small_call="true")
+    return lambda *args: body(*lax.optimization_barrier(args))[:number]
+
+
+def _with_attributes(f, **attributes):
+    """f, which returns a list, as a call that bears these."""
+    call = jax.jit(f, keep_unused=True)
+
+    def bearing(*args):
+        found = call(*args)
+        return [set_xla_metadata(found[0], **attributes), *found[1:]]  # it finds what made the value
+
+    return bearing
+
+
+def _of_each(values):
+    """A sum of elements of all, and what no sum takes: to return each by itself would take a buffer each."""
+    terms, rest = [], []
+    for x in values:
+        if x.size and x.dtype in DTYPES:
+            terms.append(_first(x).reshape(()).astype(np.float32))
+        else:
+            rest.append(x)
+    return [*([reduce(jnp.add, terms)] if terms else []), *rest]
+
+
+def _first(x):
+    """An element, with as many axes."""
+    return lax.slice(x, [0] * x.ndim, [1] * x.ndim)
+
+
+@of_jaxpr
+def computed_once(closed):
+    """The closed jaxpr as a call that XLA does not inline, and so computes once, however many users its values have.
+
+    What has a single result XLA may divide among threads, and then the kernel does not link: it gets a second one."""
+    number = len(closed.out_avals)
+    if not number:
+        return closed
+
+    def body(*args):
+        found = jaxpr_as_fun(closed)(*args)
+        if number > 1 or found[0].size <= 1:
+            return found
+        return [*found, _first(next((x for x in args if x.size), found[0]))]  # of what is known before all else
+
+    body.__name__ = ONCE
+    call = _with_attributes(body, inlineable="false")
+    return jax.make_jaxpr(lambda *args: call(*args)[:number])(*closed.in_avals)

@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import ad, batching
 
-from hhtjax.xla.gate import is_on, why_off
+from hhtjax.xla.compat import is_on, why_off
 from hhtjax.xla.kernel_primitive import kernel_p
 
 # names of functions; autodiff and vmap keep them

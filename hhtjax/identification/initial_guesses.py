@@ -1,0 +1,177 @@
+"""Where a fit starts: parameters from the equation of motion itself, and longer and longer parts of a record."""
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.checks import evaluate, require_function
+from hhtjax.identification.identify import fit
+from hhtjax.identification.result import FitResult
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.sampled import Sampled, band_limited_motion, sampled
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, mass_at, require_smooth, require_system
+
+ARGUMENTS = set(inspect.signature(fit).parameters) - {"params0"}
+MARGIN = 1.0  # periods of the cutoff left out at both ends
+
+
+def equation_error(
+    system: System | LinearSystem | FirstOrderSystem,
+    values: Any,
+    dt: Any = None,
+    cutoff: Any = None,
+    t0: float = 0.0,
+    *,
+    times: Any = None,
+) -> Callable[[Any], Any]:
+    """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
+
+    Of a `FirstOrderSystem` y' - f(y, t, params), for a measured y.
+
+    Nothing is simulated, and most parameters enter linearly: so the fit converges from anywhere, and its estimate is a
+    start for the fit through the simulation. It is no more than that, because noise and filter bias it.
+
+    Args:
+        system: without constraints and rotations, all of whose coordinates are measured.
+        values: positions, a pytree like q with a leading axis of samples. dt: sampling period, s.
+        cutoff: Hz, between the frequencies of the motion and those of the noise.
+        t0: time of the first sample.
+        times: (samples,), in the place of dt and t0: sample times at any distances. The values are then those of the
+            cubic spline through them, `sampled(values, times=)`, as many as the samples, at equal distances: the cutoff
+            has to stay well below half the sampling rate of the sparsest part.
+
+    Returns:
+        A function of params, whose result is (samples without both ends, n), in units of force.
+
+    Raises:
+        TypeError, ValueError: what is no system; as `band_limited_motion` and `sampled`; no samples between the ends.
+        NotImplementedError: a system with constraints, internal states or dry friction; when called, with rotations.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
+    >>> t = 0.01 * jnp.arange(1000.0)
+    >>> q = jnp.exp(-0.1 * t) * jnp.cos(3.0 * t)                                        # k = 9.01, c = 0.2
+    >>> found = hhtjax.fit(hhtjax.equation_error(spring, q[:, None], 0.01, cutoff=5.0), {"k": 1.0, "c": 1.0})
+    >>> f"{float(found.params['k']):.1f} {float(found.params['c']):.1f}"
+    '9.0 0.2'
+    """
+    require_system("equation_error", system)
+    if system.constraint is not None:
+        raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
+    if system.internal is not None:
+        raise NotImplementedError("equation_error: `system` has internal states, which are not measured.")
+    require_smooth("equation_error", system)
+    if times is not None:
+        values, dt, t0 = _at_equal_distances(values, dt, t0, times)
+    motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)
+    q, v, a = jax.tree.transpose(jax.tree.structure(values), jax.tree.structure((0, 0, 0)), motion)
+    samples = jax.tree.leaves(q)[0].shape[0]
+    left_out = int(jnp.ceil(MARGIN / (cutoff * dt)))
+    if samples <= 2 * left_out:
+        raise ValueError(
+            f"equation_error: `values` must have more than {2 * left_out} samples, because at both ends a period of "
+            f"the cutoff is left out; received {samples}."
+        )
+    t = t0 + jnp.linspace(0, dt * (samples - 1), samples)
+    inside = jax.tree.map(lambda y: y[left_out : samples - left_out], (q, v, a, t))
+
+    def residuals(params):
+        def one(q, v, a, t):
+            _require_no_rotations(system, q, t, params)
+            flat, x, rate = flatten("equation_error", system, q, v, t, params)
+            t = t.astype(rate.dtype)
+            known = flat.force(x, rate, t, params)
+            return flat.inertia(x, ravel_pytree(a if flat.positions else v)[0], t, params) - known
+
+        return jax.vmap(one)(*inside)
+
+    return residuals
+
+
+def _require_no_rotations(system, q, t, params):
+    """An error for positions (3, 3) whose mass is that of angular velocities (3,)."""
+    turning = sum(x.size for x in jax.tree.leaves(q) if x.shape[-2:] == (3, 3))
+    if turning and isinstance(system, System):
+        M = evaluate("equation_error", "mass", partial(mass_at, system), q, t, params)
+        rows = sum(x.size for x in jax.tree.leaves(q)) - turning + turning // 3
+        if getattr(M, "shape", None) in ((rows,), (rows, rows)):
+            raise NotImplementedError(
+                "equation_error: `system` has rotations, whose angular velocities are no derivatives of what `values` "
+                "holds."
+            )
+
+
+def _at_equal_distances(values, dt, t0, times):
+    """The values at as many times at equal distances, their sampling period, and the time of the first."""
+    splines = jax.tree.map(lambda y: sampled(y, dt, t0, times=times), values)
+    t0, end, count = float(times[0]), float(times[-1]), len(times)
+    dt = (end - t0) / (count - 1)
+    return jax.tree.map(lambda u: u(t0 + dt * np.arange(count)), splines, is_leaf=_is_spline), dt, t0
+
+
+def _is_spline(x):
+    return isinstance(x, Sampled)
+
+
+def fit_progressively(
+    problem_at: Callable[[Any, FitResult | None], dict[str, Any]], params0: Any, horizons: Any, **options: Any
+) -> FitResult:
+    """One `fit` after the other, each to a longer part of the data, and each from where the one before ended.
+
+    Over a short part a motion depends on its parameters almost linearly; over a long or chaotic one the cost has many
+    minima, and only the lowest is right. The early fits are cheap too.
+
+    Args:
+        problem_at: (horizon, before) -> the arguments of `fit` for it, a dict with "residuals" and perhaps "records",
+            "starts", "weights". before: the `FitResult` of the last horizon, None for the first. With `windows` of that
+            duration it is multiple shooting.
+        params0: as in `fit`. horizons: a sequence of what problem_at takes, the shortest first.
+        options: of every fit, where problem_at says nothing else. Only the last one computes a covariance.
+
+    Returns:
+        The last `FitResult`.
+
+    Raises:
+        TypeError, ValueError: problem_at is no function of two, or what it returns no arguments of `fit`; no horizon.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> t = jnp.linspace(0.0, 30.0, 600)
+    >>> measured = jnp.sin(3.0 * t)
+    >>> def problem_at(n, before):
+    ...     return {"residuals": lambda w: jnp.sin(w * t[:n]) - measured[:n]}
+    >>> [round(float(hhtjax.fit_progressively(problem_at, 1.5, h).params), 3) == 3.0 for h in ([600], [20, 600])]
+    [False, True]
+    """
+    require_function("fit_progressively", "problem_at", problem_at, "problem_at(horizon, before)")
+    try:
+        horizons = list(horizons)
+    except TypeError:
+        raise TypeError(f"fit_progressively: `horizons` must be a sequence; received {horizons!r}.") from None
+    if not horizons:
+        raise ValueError("fit_progressively: `horizons` must hold at least one; received none.")
+    params, result = params0, None
+    for i, horizon in enumerate(horizons):
+        last = i == len(horizons) - 1
+        rest: dict[str, Any] = options if last else options | {"covariance": False}
+        result = fit(**{"params0": params} | rest | _problem(problem_at(horizon, result), horizon))
+        params = result.params
+    assert result is not None
+    return result
+
+
+def _problem(found, horizon):
+    """What problem_at returned, if `fit` can take it."""
+    where = f"fit_progressively: `problem_at` must return a dict of arguments of `fit`; received at horizon {horizon!r}"
+    if not isinstance(found, dict):
+        raise TypeError(f"{where} a {type(found).__name__}.")
+    if wrong := [name for name in found if name not in ARGUMENTS]:
+        raise ValueError(f"{where} {wrong[0]!r}, which is none.")
+    if "residuals" not in found:
+        raise ValueError(f"{where} {', '.join(found) or 'an empty one'}, without residuals.")
+    return found

@@ -1,0 +1,156 @@
+"""What a fit is made of: a vector of coordinates, residuals as functions of it, and their weights."""
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.description import Kind, thaw
+from hhtjax.identification import transforms as tf
+from hhtjax.identification.residuals import check_residuals, require_own_samples, spread_weights
+
+
+class Data(NamedTuple):
+    """The traced arguments of a fit besides params0: pytrees, or None where there is nothing."""
+
+    scale: Any
+    weights: Any
+    prior: Any
+    tolerance: Any
+    records: Any
+    starts: Any
+    read: Any = None  # arrays that the residuals read, where these are a `Kind`
+
+    def function(self, residuals):
+        """The residuals, with what they read."""
+        return residuals.of(self.read) if isinstance(residuals, Kind) else residuals
+
+
+class Coordinates:
+    """params as a function of the vector x that the optimiser moves."""
+
+    def __init__(self, transforms, params0, scale):
+        self.leaves, self.structure = jax.tree.flatten(params0)
+        self.scales = jax.tree.leaves(scale)
+        self.transforms = transforms
+        self.free = [i for i, T in enumerate(transforms) if T is not tf.fixed]
+        start = [transforms[i].coordinate(self.leaves[i], self.scales[i]) for i in self.free]
+        x0, self.unravel = ravel_pytree(start)
+        self.x0 = x0.astype(x0.dtype)  # as x is later: what is traced for a Python number is traced anew
+        self.longest = longest_steps(transforms, self.leaves)
+
+    def free_leaves(self, x):
+        """The fitted leaves."""
+        return [
+            self.transforms[i].parameter(y, self.scales[i]) for i, y in zip(self.free, self.unravel(x), strict=True)
+        ]
+
+    def params(self, x):
+        """All leaves, as params0 has them."""
+        changed = dict(zip(self.free, self.free_leaves(x), strict=True))
+        return thaw(self.structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(self.leaves)]))
+
+    def bend(self):
+        """x -> p''/p' of the fitted entries; None where no bound makes it differ from 0."""
+
+        def of(x):
+            leaves = zip(self.free, self.unravel(x), strict=True)
+            return ravel_pytree([self.transforms[i].bend(y) for i, y in leaves])[0]
+
+        return None if np.all(np.isinf(self.longest)) else of
+
+    def slope(self, x):
+        """dp/dx of the fitted entries."""
+        return jax.jvp(lambda x: ravel_pytree(self.free_leaves(x))[0], (x,), (jnp.ones_like(x),))[1]
+
+    def of_prior(self, prior):
+        """Means and standard deviations for the fitted leaves."""
+        pairs = [self.structure.flatten_up_to(prior)[i] for i in self.free]
+        return [pair.mean for pair in pairs], [pair.deviation for pair in pairs]
+
+
+def longest_steps(transforms, leaves, own=0):
+    """Of the vector x, within which a transform is about straight, (p + own,); own: how many unknowns of records."""
+    pairs = [(T, x) for T, x in zip(transforms, leaves, strict=True) if T is not tf.fixed]
+    steps = [np.broadcast_to(T.longest_step, np.shape(x)).ravel() for T, x in pairs]
+    return np.concatenate([*steps, np.full(own, np.inf)])
+
+
+class DenseParts(NamedTuple):
+    """Of a fit without records: residuals and priors f(x) (m + k,), their weights w, and the first m as a pytree."""
+
+    f: Any
+    w: Any
+    unravel: Any
+    shapes: tuple  # of the leaves of the residuals
+
+    @property
+    def m(self):
+        """How many are no priors."""
+        return sum(map(math.prod, self.shapes))
+
+
+def dense_parts(residuals, coordinates, data) -> DenseParts:
+    """One residual function of all parameters, with priors as further rows."""
+    residuals = data.function(residuals)
+    params0 = coordinates.params(coordinates.x0)
+    shapes = check_residuals("fit", residuals, coordinates.x0.size, params0)
+    require_own_samples("fit", residuals, shapes, params0)
+    leaves = spread_weights("fit", data.weights, shapes)
+    w, unravel = ravel_pytree(jax.tree.unflatten(jax.tree.structure(shapes), leaves))
+    if data.prior is not None:
+        means, deviations = coordinates.of_prior(data.prior)
+        w = jnp.concatenate([w, 1 / ravel_pytree(deviations)[0]])
+
+    def f(x):
+        r, _ = ravel_pytree(residuals(coordinates.params(x)))
+        if data.prior is None:
+            return r
+        away = [p - mean for p, mean in zip(coordinates.free_leaves(x), means, strict=True)]
+        return jnp.concatenate([r, ravel_pytree(away)[0]])
+
+    return DenseParts(f, w, unravel, tuple(leaf.shape for leaf in leaves))
+
+
+class RecordParts(NamedTuple):
+    """Of a fit of records: residuals f(x, own, record) (m,), weights w (records, m), unknowns own0 (records, k), and
+    both as pytrees."""
+
+    f: Any
+    w: Any
+    own0: Any
+    unravel: Any
+    unravel_start: Any
+    shapes: tuple  # of the leaves of the residuals, all records together
+
+
+def record_parts(residuals, coordinates, data) -> RecordParts:
+    """One residual function of each record, with a start of its own."""
+    _, unravel_start = ravel_pytree(first(data.starts))
+    own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
+
+    def every(params, starts, records):
+        return jax.vmap(partial(residuals, params))(starts, records)
+
+    unknowns, params0 = coordinates.x0.size + own0.size, coordinates.params(coordinates.x0)
+    shapes = check_residuals("fit", every, unknowns, params0, data.starts, data.records)
+    one = params0, first(data.starts), first(data.records)
+    require_own_samples("fit", residuals, jax.tree.map(lambda y: y.update(shape=y.shape[1:]), shapes), *one)
+    leaves = spread_weights("fit", data.weights, shapes)
+    weights = jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+    w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)
+    _, unravel = ravel_pytree(first(weights))
+
+    def f(x, own, record):
+        return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
+
+    return RecordParts(f, w, own0, jax.vmap(unravel), jax.vmap(unravel_start), tuple(x.shape for x in leaves))
+
+
+def first(tree):
+    """Of its leading axis."""
+    return jax.tree.map(lambda x: x[0], tree)

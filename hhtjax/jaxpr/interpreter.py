@@ -1,0 +1,134 @@
+"""A traced function, evaluated anew with other values than arrays."""
+
+from collections.abc import Callable
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jax.core import eval_jaxpr
+from jax.extend.core import Literal
+from jax.extend.source_info_util import user_context
+from jax.interpreters import partial_eval as pe
+
+
+def evaluate(jaxpr, values, apply, of_literal=lambda x: x):
+    """The values of a jaxpr's results.
+
+    values: of its constants and arguments; apply: (operation, values) -> values of its results; of_literal: number in
+    the program -> value.
+    """
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], values, strict=True))
+
+    def read(atom):
+        return of_literal(atom.val) if isinstance(atom, Literal) else known[atom]
+
+    for eqn in needed(jaxpr):
+        known.update(zip(eqn.outvars, apply(eqn, [read(x) for x in eqn.invars]), strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def needed(jaxpr):
+    """The operations that the results come from: what nobody asks for may have no derivative."""
+    wanted, found = {x for x in jaxpr.outvars if not isinstance(x, Literal)}, []
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or not wanted.isdisjoint(eqn.outvars):
+            found.append(eqn)
+            wanted.update(x for x in eqn.invars if not isinstance(x, Literal))
+    return found[::-1]
+
+
+def alone(eqn) -> Callable:
+    """One operation of a jaxpr as a function of its arrays, to a list."""
+
+    found = eqn.primitive.get_bind_params(eqn.params)
+    functions, params = found if isinstance(found, tuple) else ((), found)  # an older JAX gives functions apart
+
+    def f(*arrays):
+        with eqn.ctx.manager, user_context(eqn.source_info.traceback):  # `explain` names the line that it comes from
+            results = eqn.primitive.bind(*functions, *arrays, **params)
+        return results if eqn.primitive.multiple_results else [results]
+
+    return f
+
+
+# ----------------------------------------------------------------------------
+# A function that is traced once: without what nobody asks for, and with word of what it reads.
+
+
+class Traced(NamedTuple):
+    """A function that has been traced; made by `traced`.
+
+    Attributes:
+        jaxpr: it as a program of JAX.
+        constants: what it closes over.
+        result: shapes and dtypes of its results.
+    """
+
+    jaxpr: Any
+    constants: Any
+    result: Any
+
+    def __call__(self, *args):
+        found = eval_jaxpr(self.jaxpr, self.constants, *jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(self.result), found)
+
+    def reads(self, needed):
+        """Which of the arrays in its arguments it makes those of its results from that are needed: lists of booleans.
+
+        Args:
+            needed: for each array in the results; None: all.
+
+        Returns:
+            For each array in the arguments.
+
+        Raises:
+            AssertionError: there are fewer or more results.
+        """
+        needed = [True] * len(self.jaxpr.outvars) if needed is None else list(needed)
+        return pe.dce_jaxpr(self.jaxpr, needed)[1]
+
+
+def traced(f, *like):
+    """f, traced once, of arguments like these, without operations that no result is made of.
+
+    XLA would drop these too, but not from what it computes once, such as a stage, nor from the tracing and lowering
+    before it. Each operation keeps the line that it comes from, which an inlined jit forgets.
+
+    Args:
+        f: a function of pytrees of arrays.
+        *like: these, or tracers of theirs.
+
+    Returns:
+        `Traced`, a function with the same values.
+
+    Raises:
+        whatever f raises.
+
+    >>> import jax.numpy as jnp
+    >>> f = traced(lambda x, y: {"double": 2 * x, "y": y}, jnp.array(1.0), jnp.array(1.0))
+    >>> float(f(jnp.array(3.0), jnp.array(1.0))["double"]), f.reads(None), f.reads([True, False])
+    (6.0, [True, True], [True, False])
+    """
+    trace, result = jax.make_jaxpr(f, return_shape=True)(*like)
+    needed, _ = pe.dce_jaxpr(trace.jaxpr, [True] * len(trace.out_avals), instantiate=True)
+    return Traced(needed, trace.consts, result)
+
+
+# ----------------------------------------------------------------------------
+# Where in a user's files an operation comes from.
+
+
+OURS = str(Path(__file__).parents[1])
+THEIRS = str(Path(str(jax.__file__)).parent)
+# {loop: what has become of it}, while `explain` asks
+asked: ContextVar = ContextVar("hhtjax_paths", default=None)
+
+
+def line_of(eqn):
+    """ "file.py, line 12, in force" of the innermost function that is neither JAX's nor ours; None where none is."""
+    traceback = getattr(eqn.source_info, "traceback", None)
+    for frame in getattr(traceback, "frames", ()):
+        if not frame.file_name.startswith((OURS, THEIRS, "<")):
+            return f"{Path(frame.file_name).name}, line {frame.line_num}, in {frame.function_name}"
+    return None

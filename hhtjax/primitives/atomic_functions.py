@@ -1,0 +1,131 @@
+"""Functions that stay one operation, whatever becomes of them.
+
+Autodiff writes a function out anew wherever it differentiates it, and once more in all that it keeps; vmap writes it
+again. Of an operation they ask for nothing but its rule, and what it computes is written when the program is. Of all
+that JAX traced for the gradient of a chain of bodies, a quarter had been finite rotations and cross products.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+from jax.sharding import AxisType
+
+from hhtjax.primitives.two_mode_derivative import batch_size, in_front
+from hhtjax.xla.compat import is_on
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """The function (n, x) -> the first n members of a family at a floating array x, a tuple.
+
+    Attributes:
+        members: n, x -> the tuple, each like x, element by element.
+        rule: this function, n, x, dx -> values and tangents, tuples, by other members.
+
+    >>> waves = Family(
+    ...     lambda n, x: tuple(jnp.sin(x + k * jnp.pi / 2) for k in range(n)),
+    ...     lambda waves, n, x, dx: (waves(n, x), tuple(y * dx for y in waves(n + 1, x)[1:])))
+    >>> [round(float(jax.grad(lambda x: waves(2, x)[k])(0.0)), 6) + 0.0 for k in range(2)]
+    [1.0, 0.0]
+    """
+
+    members: Callable
+    rule: Callable
+
+    def __call__(self, n, x):
+        x = jnp.asarray(x)
+        if not _is_one(x):
+            return self.plain(n, x)
+        return tuple(family_p.bind(x, n=n, family=self, jaxpr=self.plain.trace(n, x).jaxpr))
+
+    @cached_property
+    def plain(self):
+        """The same on plain JAX."""
+        members = jax.custom_jvp(self.members, nondiff_argnums=(0,))
+        members.defjvp(lambda n, x, dx: self.rule(self.plain, n, *x, *dx))
+        return jax.jit(members, static_argnums=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Bilinear:
+    """The bilinear function f of two arrays, each with as many leading axes more as the other.
+
+    Attributes:
+        f: x, y -> z, for any number of leading axes.
+        first: z, y -> x, the transpose of x -> f(x, y).
+        second: x, z -> y, that of y -> f(x, y).
+
+    >>> inner = Bilinear(
+    ...     lambda x, y: jnp.sum(x * y, axis=-1), lambda z, y: z[..., None] * y, lambda x, z: z[..., None] * x)
+    >>> print(jax.grad(inner)(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])))
+    [3. 4.]
+    """
+
+    f: Callable
+    first: Callable
+    second: Callable
+
+    def __call__(self, x, y):
+        dtype = jnp.result_type(x, y)
+        x, y = (jnp.asarray(z, dtype) for z in (x, y))
+        if not _is_one(x, y):
+            return self.plain(x, y)
+        return bilinear_p.bind(x, y, product=self, jaxpr=self.plain.trace(x, y).jaxpr)
+
+    @cached_property
+    def plain(self):
+        """The same on plain JAX."""
+        return jax.jit(self.f)
+
+
+def _is_one(*arrays):
+    """Not where types say how arrays are spread over devices: each operation of JAX has a rule for that."""
+    return is_on() and not any(map(_is_spread, map(jax.typeof, arrays)))
+
+
+def _is_spread(kind):
+    manual, mesh = getattr(kind, "manual_axis_type", None), kind.sharding.mesh  # older ones do not know of it
+    return (manual is not None and not manual.empty) or AxisType.Explicit in getattr(mesh, "axis_types", ())
+
+
+def _jvp_of_family(x, dx, n, family, jaxpr):
+    return tuple(map(list, family.rule(family, n, *x, *map(ad.instantiate_zeros, dx))))
+
+
+def _batch_of_families(x, axes, n, family, jaxpr):
+    return list(family(n, *x)), [*axes] * n
+
+
+def _batch_of_products(values, axes, product, jaxpr):
+    size = batch_size(values, axes)
+    return product(*(in_front(x, axis, size) for x, axis in zip(values, axes, strict=True))), 0
+
+
+family_p = Primitive("hhtjax_family")
+family_p.multiple_results = True
+family_p.def_impl(lambda x, n, family, jaxpr: list(family.plain(n, x)))
+family_p.def_abstract_eval(lambda x, n, family, jaxpr: [x.update(weak_type=False)] * n)
+ad.primitive_jvps[family_p] = _jvp_of_family
+batching.primitive_batchers[family_p] = _batch_of_families
+
+
+bilinear_p = Primitive("hhtjax_bilinear")
+bilinear_p.def_impl(lambda x, y, product, jaxpr: product.plain(x, y))
+bilinear_p.def_abstract_eval(lambda x, y, product, jaxpr: jaxpr.out_avals[0])
+ad.defbilinear(
+    bilinear_p,
+    lambda z, x, y, product, jaxpr: product.first(z, y),
+    lambda z, x, y, product, jaxpr: product.second(x, z),
+)
+batching.primitive_batchers[bilinear_p] = _batch_of_products
+
+
+for operation in (family_p, bilinear_p):
+    mlir.register_lowering(
+        operation, mlir.lower_fun(lambda *x, jaxpr, **_: jaxpr_as_fun(jaxpr)(*x), multiple_results=True)
+    )

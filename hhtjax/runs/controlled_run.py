@@ -1,0 +1,492 @@
+"""A run under error control: its steps chosen and its samples kept in one pass, or chosen and run; and its error."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+
+from hhtjax.checks import require_integer
+from hhtjax.description import all_concrete, is_tracing
+from hhtjax.numerics.batched_cond import derivative_by
+from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.numerics.closures import hoisted
+from hhtjax.numerics.differentiable_while import repeat
+from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
+from hhtjax.runs.error_control import Steps, select_steps, trimmed
+from hhtjax.runs.event_loop import loop_with_events, with_told_events
+from hhtjax.runs.event_step import Pieces
+from hhtjax.runs.frozen_steps import frozen, is_pair, run_and_choice
+from hhtjax.runs.inputs import Problem, require_events, require_sample_times
+from hhtjax.runs.interpolate import kept, output_between, solution_at, with_output
+from hhtjax.runs.loop import flaw_at_start, loop_over, resting, with_flaw
+from hhtjax.runs.output import beside_path, output_at_start, without_path
+from hhtjax.runs.solution import Solution
+from hhtjax.steppers.stepper import Stepper
+from hhtjax.systems import zero_order_hold
+from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_masses
+from hhtjax.xla import Programs, is_untouched, largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
+
+
+def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
+    """The run that `simulate` returns for an `Adaptive` in the place of dt."""
+    times = checked_times("simulate", problem, times, control)
+    if events is not None:
+        events = require_events("simulate", problem, events, usual_step(problem.t0, times))
+    problem = problem._replace(output=beside_path(problem.output, control))
+    start, alone = (problem, times, control, events), is_untouched() and not is_pair()
+    if control.verify == "tighten":
+        run = run_tightened(start, alone, progress, room)
+        return run if problem.output is None else without_path(run)
+    in_one = alone and passes_alone(problem, events)
+    if in_one:  # else the program that chooses steps for a derivative or a batch is that of `choose_steps`
+        run, steps, ends = or_plain(partial(run_in_one, problem, times, unverified(control), progress=progress))
+        choice = lax.stop_gradient(start)
+    else:
+        start, choice = run_and_choice(start)
+        run, steps, ends = run_in_two(start, choice, progress, room)
+    if control.verify:
+        better = finer(start, choice, steps, ends, room, in_one)
+        run = run._replace(**verified(run, better, start[2], problem.stepper.order))
+    steps = trimmed(steps)
+    run = run._replace(dt=steps.dt, steps=steps)
+    return run if problem.output is None else without_path(run)
+
+
+def passes_alone(problem, events):
+    """Whether the steps and the samples are found in one pass, where nothing is made of the run."""
+    return events is None and problem.system.friction is None
+
+
+def unverified(control):
+    """The same steps."""
+    return replace(control, verify=False)
+
+
+def finer(start, choice, steps, ends, room, in_one):
+    """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
+    if start[2].verify != "tolerance":
+        return over(start, steps, ends, room, halved=True)
+    *begin, looser, theirs = choice
+    if in_one:
+        return or_plain(partial(run_in_one, *begin, scaled(unverified(looser), 1 / 4)))[0]
+    return run_in_two(start, (*begin, scaled(looser, 1 / 4), theirs), room=room)[0]
+
+
+def run_in_two(start, choice, progress=False, room=()):
+    """The `Solution` of a start, (problem, times, control, events), over the steps for a choice, another; its `Steps`,
+    and the times at which they end."""
+    steps, ends = steps_for(choice, progress, room)
+    return over(start, steps, ends, room), steps, ends
+
+
+def over(start, steps, ends, room=(), halved=False):
+    """The `Solution` over these steps, each halved or not."""
+    problem, times, _, events = start
+    keywords = {"halved": halved, "room": room, "rates": problem.rates()}
+    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
+
+
+def run_tightened(start, alone, progress, room):
+    """The run with steps for as much of the tolerance as makes its error what was asked for."""
+    start, choice = (start, lax.stop_gradient(start)) if alone else run_and_choice(start)
+    problem, times, control, events = choice
+    choice = problem, times, unverified(control), events
+    last = or_plain(partial(rounds, choice, progress=progress, room=room, rates=problem.rates()))
+    again = partial(over, room=room)
+    if alone and not is_tracing():
+        run = last.run
+    elif is_pair() or not is_tracing():  # no jit, of which a derivative may or may not be made
+        run = again(start, last.steps, last.ends)
+    else:
+        run = accepted_run(last, again, start)
+    steps = trimmed(last.steps)._replace(tightened=last.share)
+    return run._replace(dt=steps.dt, steps=steps, error=last.error, allowed=last.allowed)
+
+
+@partial(Programs, static_argnames=("progress", "room"))
+def rounds(choice, progress, room):
+    """The last `Round`; no tracer of autodiff may come in."""
+    problem, times, control, events = choice
+
+    def once(share):
+        tighter = scaled(control, share)
+        if passes_alone(problem, events):
+            return run_in_one(problem, times, tighter, progress)
+        again = problem, times, tighter, events
+        return run_in_two(again, again, progress, room)
+
+    return frozen(partial(tighten, once, partial(compared, control=control)), problem.times(1.0))
+
+
+@partial(Programs, static_argnames=("progress",))
+def run_recorded(problem, times, control, progress=False):
+    """The same in one pass, but for what vmap makes of it; without derivatives."""
+
+    def record(problem, times, control):
+        steps, ends, run = select_steps(
+            problem, problem.times(times[-1]), control, progress, times=problem.times(times)
+        )
+        return run, steps, ends
+
+    @custom_vmap
+    def in_one(problem, times, control):
+        return one_kernel(record, problem, times, control, around=True)
+
+    @in_one.def_vmap
+    def _(size, batched, *args):
+        axes = jax.tree.map(lambda mapped: 0 if mapped else None, batched)
+        found = jax.vmap(partial(in_two_passes, progress=progress), axes, axis_size=size)(*args)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return in_one(problem, times, control)
+
+
+def in_two_passes(problem, times, control, progress=False):
+    """The same."""
+    start = problem, times, control, None
+    return run_in_two(start, lax.stop_gradient(start), progress)
+
+
+def run_in_one(problem, times, control, progress=False):
+    """The same, with the derivatives of two passes, in a jit that may be one of a derivative or a batch."""
+    data = problem, times, control
+    in_one, in_two = (
+        partial(run_recorded, progress=progress, rates=problem.rates()),
+        partial(in_two_passes, progress=progress),
+    )
+    if not is_tracing():
+        return in_one(*data)
+    in_one, closed_over = hoisted(in_one, *data)
+    if not all_concrete(closed_over):
+        return in_two(*data)
+    return derivative_by(in_two, partial(in_one, closed_over), *data)
+
+
+# ----------------------------------------------------------------------------
+# Runs over chosen steps, read off at any times: differentiable, the steps being constant.
+
+
+@partial(Programs, static_argnames=("progress", "room"))
+def chosen_steps(problem, end, control, events=None, progress=False, room=()):
+    """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in.
+
+    One kernel, what comes before and behind the loop too: each part that stands alone costs about a microsecond.
+    """
+
+    def found(problem, end, control, events):
+        return select_steps(problem, problem.times(end), control, progress, events, room)[:2]
+
+    return frozen(partial(one_kernel, found, around=True), problem, end, control, events)
+
+
+def steps_for(choice, progress, room):
+    """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
+    problem, times, control, events = choice
+    control, problem = replace(control, verify=False), problem._replace(output=None)
+    keywords = {"progress": progress, "room": room[:1], "rates": problem.rates()}
+    return or_plain(partial(chosen_steps, problem, times[-1], control, events, **keywords))
+
+
+class Grid(NamedTuple):
+    """Frozen steps from t0 on. ends: (N,), inf behind the last; counts: (K,), how many there are from one of the times
+    to the next, the last of them ending at it or beyond; reached: the end of the last."""
+
+    t0: Any
+    ends: Any
+    counts: Any
+    reached: Any
+
+    @classmethod
+    def of(cls, t0, times, ends, accepted, halved=False):
+        """Those with these ends, of which so many were accepted; each halved or not."""
+        reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
+        wanted = jnp.minimum(times, reached)
+        needed = jnp.searchsorted(ends, wanted)
+        needed = needed + (t0 < wanted).astype(needed.dtype)
+        if halved:
+            starts = jnp.concatenate([t0[None], ends[:-1]])
+            ends = jnp.stack([(starts + ends) / 2, ends], 1).ravel()
+            needed = 2 * needed - ((needed > 0) & (ends[2 * needed - 2] >= times)).astype(needed.dtype)
+        return cls(t0, ends, jnp.diff(needed, prepend=0).astype(jnp.int32), reached)
+
+    def loop(self, flat, stepper, q, v, t0, params):
+        """The `Loop` over its steps."""
+        return loop_over(flat, stepper, q, v, t0, params, self.sizes, resolves=True)
+
+    def sizes(self, number):
+        """Of a step its size, that of the one before, and where it ends; behind the last 1, and inf."""
+
+        def time(taken):
+            end = lax.dynamic_index_in_dim(self.ends, jnp.maximum(taken - 1, 0), keepdims=False)
+            return jnp.where(taken > 0, end, self.t0)
+
+        before, start, end = (time(number + i) for i in (-1, 0, 1))
+        is_there = jnp.isfinite(end) & (number < self.ends.size)
+        h = jnp.where(is_there, end - start, 1)
+        last = jnp.where(jnp.isfinite(start) & (number > 0), start - before, h)
+        return h, last, jnp.where(is_there, end, jnp.inf)
+
+
+@partial(Programs, static_argnames=("halved", "room"))
+def run_over(problem, times, ends, accepted, events=None, halved=False, room=()):
+    """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
+
+    def run(problem, times, ends, accepted, events):
+        t0, times = problem.times(problem.t0), problem.times(times)
+        return follow(problem, times, Grid.of(t0, times, ends, accepted, halved), events, room)
+
+    return one_kernel(run, problem, times, ends, accepted, events, around=True)  # as above
+
+
+def follow(problem, times, grid, events=None, room=()):
+    """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
+    flat, q, v, t0, params = problem.flat()
+    longest = largest_in_batch(grid.counts)
+    plain = loop = grid.loop(flat, problem.stepper, q, v, t0, params)
+    if events is not None:
+        more = {"in_pieces": True, "with_modes": problem.output is not None}
+        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, **more)
+    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
+    begun = partial(begun_with, flat, problem.stepper, params, loop)
+    keep, read = partial(kept, flat, problem.stepper), None
+    if problem.output is not None:
+        read = partial(output_in, loop, flat, problem.output, params, keep, times[-1] - loop.carry[0].t)
+        if not problem.output.beside_path:
+            keep = None
+    interval = to_next_sample(loop, form, begun, keep, in_pieces=events is not None, read=read)
+
+    def samples(carry):
+        return lax.scan(interval, (carry[0] if events is None else (), carry), (grid.counts, longest, times))
+
+    (_, (state, _, failure, *met)), (around, found, info) = one_kernel(samples, form.tree)
+    start = loop.start
+    flaw = flaw_at_start(problem.system, flat, start, params)
+    if met:
+        met = form.joined(met[0])
+        times = jnp.where(met.ended, jnp.minimum(times, state.t), times)
+    run = solution_at(flat, start, form.joined(around), times, grid.reached, info, with_flaw(failure, flaw))
+    if problem.output is not None:
+        first = loop.sizes(jnp.zeros((), jnp.int32))[0]
+        at_start = output_at_start(flat, problem.output, params, start, first)
+        run = with_output(run, at_start, form.joined(found), times, grid.reached)
+    return with_told_events(flat, run, met, room[1]) if met else run
+
+
+def to_next_sample(loop, form, begun, keep, in_pieces, read=None):
+    """The body of the scan over the times: steps until one of them ends at the time or beyond, and both ends of that.
+
+    in_pieces: of the part of it between events, of which its `Pieces` tell; else the state before is carried along.
+    keep: what is kept of both, None for nothing; read: what else, of both, the run and the time.
+    """
+    advance, begun = form.of(loop.advance), form.of(begun)
+
+    @checkpoint
+    def interval(carry, now):
+        count, most, time = now
+
+        def step(i, carry):
+            last, run, info = carry
+            here = or_alone(i < count)
+            last = () if in_pieces else jax.tree.map(partial(jnp.where, here), begun(run), last)
+            return last, *resting(advance, in_pieces, run, info, here)
+
+        last, run, info = repeat(step, (*carry, loop.no_info), most)
+        pair = form.of(Pieces.around)(run[3].pieces, time) if in_pieces else (last, run[0])
+        around = None if keep is None else tuple(map(form.of(keep), pair[:2]))
+        found = None if read is None else form.of(read)(pair, run, time)
+        return (last, run), (around, found, info)
+
+    return interval
+
+
+def output_in(loop, flat, output, params, keep, long, pair, run, time):
+    """The output of a run at a time between a pair of states, with their modes where there are events."""
+    first, second, *modes = pair
+    if modes:
+        state, _, _, met = run
+        time = jnp.where(met.ended, jnp.minimum(time, state.t), time)
+        params = loop.now(met._replace(modes=modes[0] or met.modes))
+    return output_between(flat, output, params, (keep(first), keep(second)), time, long)
+
+
+def begun_with(flat, stepper, params, loop, run):
+    """The state with which the next step of a run begins: behind a jump of held inputs."""
+    state, count, _ = run
+    h, last = loop.sizes(count)
+    return zero_order_hold.entered(stepper, flat, params, h, last, state)[1]
+
+
+def choose_steps(
+    system: System | LinearSystem | FirstOrderSystem,
+    stepper: Stepper,
+    q0: Any,
+    v0: Any = None,
+    params: Any = None,
+    *,
+    times: Any,
+    z0: Any = None,
+    t0: Any = 0.0,
+    progress: bool = False,
+    events: Any = None,
+    max_events: int = 2,
+    **tolerances: Any,
+) -> Steps:
+    """The steps that error control takes: `simulate(..., dt=adaptive(...))` without the run.
+
+    The run over them, `simulate(..., dt=steps.dt)`, is differentiable, smooth in all its arguments, and frozen: it is
+    for the motion that the steps were chosen for, and others near by.
+
+    Args:
+        system, stepper, q0, v0, params, z0, t0, progress, events, max_events: those of `simulate`.
+        times: (K,); steps go to the last, and end at no other.
+        **tolerances: those of `adaptive`: rtol, atol, and others; not `verify`, which takes runs.
+
+    Returns:
+        `Steps`, constant to derivatives. Nothing raises while they are chosen: call `steps.check()`.
+
+    Raises:
+        TypeError, ValueError, NotImplementedError: those of `simulate` and `adaptive`; a stepper without an estimate.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> oscillator = hhtjax.LinearSystem(M=jnp.ones(1), C=jnp.full(1, 8.0), K=jnp.full(1, 16.0))
+    >>> start = jnp.ones(1), jnp.zeros(1)
+    >>> steps = hhtjax.choose_steps(oscillator, hhtjax.hht(), *start, times=[4.0], rtol=1e-3, atol=1e-6)
+    >>> steps.check()
+    >>> run = hhtjax.simulate(oscillator, hhtjax.hht(), *start, dt=steps.dt)
+    >>> bool(steps.dt[-1] > 10 * steps.dt[0]), bool(abs(run.q[-1, 0] - 17 * jnp.exp(-16.0)) < 1e-3)
+    (True, True)
+    """
+    problem = Problem.checked("choose_steps", system, stepper, q0, v0, params, t0, z0)
+    control = adaptive(**tolerances)
+    if control.verify:
+        raise ValueError(
+            f"choose_steps: leave `verify` out; received {control.verify!r}. It takes runs: `simulate` with "
+            f"dt=adaptive(..., verify={control.verify!r}) returns its steps as `run.steps`."
+        )
+    times = checked_times("choose_steps", problem, times, control)
+    room = (require_integer("choose_steps", "max_events", max_events),)
+    if events is not None:
+        events = require_events("choose_steps", problem, events, usual_step(problem.t0, times))
+    return trimmed(steps_for(lax.stop_gradient((problem, times, control, events)), progress, room)[0])
+
+
+def usual_step(t0, times):
+    """How long a step may be before any is chosen: a thousandth of the run."""
+    return (times[-1] - t0) / 1000
+
+
+def checked_times(caller, problem, times, control):
+    """times, for a stepper that can be controlled."""
+    require_controlled(caller, problem.stepper)
+    require_masses(caller, problem.system, "take steps without error control")
+    require_single(caller, control)
+    return require_sample_times(times, problem.t0, jax.tree.leaves(problem.q0)[0].dtype, caller)
+
+
+# ----------------------------------------------------------------------------
+# Steps for the error of a whole run: chosen again for a smaller tolerance, until that error is what was asked for.
+#
+# Each round is the finer run by which the one before is judged, and it by that one: errors of runs follow the
+# tolerance, so that of the round, with a share s of it, is s / (s_before - s) of the difference between both.
+
+
+ENOUGH, AIM = 0.8, 0.6  # of the tolerance: errors are stated to a tenth or two; and for the next round
+LEAST, MOST = 1 / 16, 1 / 4  # of the share before: beyond, the coarser run may be too far off to judge by
+ROUNDS = 8
+
+
+class Round(NamedTuple):
+    """run, steps, ends: what was found; share: of the tolerance that the steps were chosen for, and following: that of
+    the next round; error, allowed: those of the `Solution`; is_open: whether more is to be done; number: of rounds."""
+
+    run: Any
+    steps: Any
+    ends: Any
+    share: Any
+    following: Any
+    error: Any
+    allowed: Any
+    is_open: Any
+    number: Any
+
+    def told(self):
+        """What the `Solution` tells of it."""
+        return {"error": self.error, "allowed": self.allowed}
+
+
+def tighten(once, judge, one):
+    """The last `Round`; none of it is differentiable, and all of it may be a batch, which goes on until all are done.
+
+    once: share -> run, `Steps`, their ends; judge: a run, the one before, share of their difference -> error, allowed;
+    one: the share to begin with, or one for each member.
+    """
+    found = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(once, one))
+    error, allowed = jax.tree.map(jnp.zeros_like, jax.eval_shape(judge, found[0], found[0], one))
+    run, steps, ends = found
+    begun = Round(run, steps, ends, 2 * one, one, error, allowed, one > 0, jnp.zeros((), jnp.int32))
+
+    def goes_on(last):
+        return jnp.any(last.is_open) & (last.number < ROUNDS)
+
+    def following(last):
+        is_first = last.number == 0
+        share = jnp.where(last.is_open, last.following, one)  # what costs least, for those who wait for others
+        run, steps, ends = once(share)
+        error, allowed = judge(run, last.run, jnp.where(last.is_open, share / (last.share - share), one))
+        worst = jnp.where(is_first, jnp.inf, jnp.max(error, axis=-1))
+        factor = jnp.where(is_first, MOST, jnp.clip(AIM * allowed / worst, LEAST, MOST))
+        is_open = ~(worst <= ENOUGH * allowed) & (steps.stop == 0) & last.is_open
+        new = Round(run, steps, ends, share, share * factor, error, allowed, is_open, last.number + 1)
+
+        def kept(old, x):
+            was_open = last.is_open.reshape(last.is_open.shape + (1,) * (x.ndim - last.is_open.ndim))
+            return x if x.ndim < last.is_open.ndim else jnp.where(was_open, x, old)
+
+        return jax.tree.map(kept, last, new)
+
+    return lax.while_loop(goes_on, following, begun)
+
+
+def accepted_run(last, over, start):
+    """`last.run`, with the derivatives of over(start, steps, ends), a run over its steps that only they ask for."""
+    over, closed_over = hoisted(over, start, last.steps, last.ends)
+
+    def again(_, *args):
+        return over(*args)
+
+    return derivative_by(again, lambda run, *_: run, last.run, closed_over, start, last.steps, last.ends)
+
+
+# ----------------------------------------------------------------------------
+# The error of a whole run under error control, by another run of it.
+
+
+ALARM = 10  # times what was asked for, above which the error of a run is a failure
+
+
+def scaled(control, share):
+    """So much of the tolerance."""
+    return replace(control, **{name: share * getattr(control, name) for name in ("rtol", "atol", "atol_v")})
+
+
+def verified(run, finer, control, order):
+    """What a `Solution` tells of its error, by Richardson from a finer run; constant to derivatives."""
+    left = 0.25 if control.verify == "tolerance" else 0.5**order  # of the error
+    error, tolerance = compared(run, finer, 1 / (1 - left), control)
+    return {"error": error, "allowed": ALARM * tolerance}
+
+
+def compared(run, other, share, control):
+    """So much of the difference at each of the times, in its largest coordinate, and what is asked for."""
+
+    def largest(q):
+        return jnp.max(jnp.stack([jnp.max(jnp.abs(x).reshape(len(x), -1), axis=1) for x in jax.tree.leaves(q)]), axis=0)
+
+    q, others, control = lax.stop_gradient((run.q, other.q, control))
+    error = largest(jax.tree.map(jnp.subtract, others, q)) * share
+    rtol, atol = (jnp.asarray(x).astype(error.dtype) for x in (control.rtol, control.atol))
+    return error, rtol * jnp.max(largest(q)) + atol

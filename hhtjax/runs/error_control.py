@@ -1,0 +1,532 @@
+"""One step under error control: tried, judged by the estimate of its error, taken or not; and how long the next is."""
+
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from hhtjax.description import freeze, is_concrete
+from hhtjax.description.presentation import overwrite, shown
+from hhtjax.numerics.approximate_math import rough_exp, rough_log, without_rounding
+from hhtjax.numerics.batched_cond import choose, seldom_alone
+from hhtjax.numerics.batched_cond import choose as either
+from hhtjax.runs.event_loop import before_any
+from hhtjax.runs.event_step import SHORT, Part, Ways, asks, pass_events, reaching
+from hhtjax.runs.interpolate import kept, output_between, solution_at, with_output
+from hhtjax.runs.loop import flaw_at_start, neutral_info, no_failure, resized_step, saved, with_flaw
+from hhtjax.runs.output import output_at_start
+from hhtjax.runs.progress import announce, steps_between
+from hhtjax.runs.solution import EVENTS, FINE, MANY, SimulationError, first_bad
+from hhtjax.steppers.stepper import entered, join_info
+from hhtjax.systems import kinematics, zero_order_hold
+from hhtjax.systems.events import flatten_events
+from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, row_written, staged
+
+LOWEST = 1e-4  # error of the step before, as the controller sees it
+ROUNDINGS = 16  # of t, of which a step is at least
+DONE, TOO_SHORT, TOO_MANY, BROKEN, AT_EVENT = range(5)
+
+
+class Controller(NamedTuple):
+    """Of the factors by which steps change: the PI controller's exponents, divided by the order of the estimate, and
+    bounds behind a step that was accepted. Growth by more than 2 is unstable for some methods."""
+
+    safety: Any = 0.9
+    proportional: Any = 0.7
+    integral: Any = 0.4
+    least: Any = 0.2
+    most: Any = 2.0
+
+
+PI = Controller()
+
+
+class Walk(NamedTuple):
+    """What the loop carries."""
+
+    state: Any
+    h: Any
+    last: Any
+    past: Any
+    before: Any  # logarithm of the error of the last accepted step
+    error: Any
+    q_size: Any
+    v_size: Any
+    accepted: Any
+    rejected: Any
+    stop: Any
+    met: Any = None  # of events
+
+
+class Trial(NamedTuple):
+    """How steps are tried, to the time `end`. ways, past_events: how to pass events, and what a try becomes by it."""
+
+    flat: Any
+    stepper: Any
+    params: Any
+    end: Any
+    bounds: Any
+    max_steps: int
+    ways: Any = None
+    past_events: Any = None
+    controller: Controller = PI
+
+    def params_of(self, walk):
+        """The params of the next step."""
+        return self.params if self.ways is None else self.ways.events.with_modes(self.params, walk.met.modes)
+
+
+class Try(NamedTuple):
+    """A step that was tried: the walk if it is accepted, its error, the step to try next, what of it must not fall
+    below the least step, and why there are no more steps if it does."""
+
+    walk: Walk
+    error: Any
+    h: Any
+    shortest: Any
+    why: Any
+
+
+class Begun(NamedTuple):
+    """What else is known of a try: the state it began with, when it was to end, and its `Info`."""
+
+    state: Any
+    end: Any
+    info: Any
+
+
+class Bounds(NamedTuple):
+    """Tolerances and bounds in the dtype of the state. scale: the tolerance of the run, relative to that of a step."""
+
+    rtol: Any
+    atol: Any  # of positions
+    atol_v: Any  # (N,), of velocities and of internal states
+    scale: Any
+    least: Any
+    most: Any
+
+    @classmethod
+    def of(cls, flat, stepper, control, t0, end):
+        """Those of an `Adaptive`."""
+        names = "rtol", "atol", "atol_v", "dt_min", "dt_max"
+        rtol, atol, atol_v, least, most = (jnp.asarray(getattr(control, name)).astype(t0.dtype) for name in names)
+        n, N = flat.positions, flat.size
+        rounding = ROUNDINGS * float(jnp.finfo(t0.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(end))
+        each = jnp.concatenate([jnp.full(n, atol_v), jnp.full(N - n, atol)])
+        power = 1 - stepper.estimate_order / stepper.order
+        return cls(rtol, atol, each, rtol**power, jnp.maximum(least, rounding), most)
+
+    def relative(self, flat, errors, q_size, v_size):
+        """The largest error, 1 where it is the tolerance."""
+        # reciprocals, which are there before the errors are
+        error = jnp.max(jnp.abs(errors.v) * (self.scale / (self.atol_v + self.rtol * v_size)))
+        if flat.positions:
+            e_q = jnp.abs(flat.located(errors.q)) * (self.scale / (self.atol + self.rtol * q_size))
+            error = jnp.maximum(error, jnp.max(e_q))
+        return error
+
+    def first(self, state, v_size, span):
+        """A step that changes v by about its tolerance, and not more than a hundredth of all."""
+        tiny = float(jnp.finfo(span.dtype).tiny)
+        slow = (self.atol_v + self.rtol * v_size) / self.scale / jnp.maximum(jnp.abs(state.w), tiny)
+        h = jnp.minimum(jnp.min(jnp.sqrt(slow)), jnp.minimum(span / 100, self.most))
+        return jnp.where(h > self.least, h, jnp.minimum(span / 100, self.most))
+
+
+def sizes(flat, state):
+    """Of positions and rates."""
+    return kinematics.sizes(flat.blocks, state.q), jnp.abs(state.v)
+
+
+def next_step(h, error, before, accept, order, pi=PI):
+    """The PI controller: Gustafsson's, in the form of Hairer and Wanner, Sec. IV.2; before, and what is returned beside
+    the step, are logarithms of errors."""
+    now = rough_log(jnp.maximum(error, 1e-10))
+    slope = jnp.where(accept, -pi.proportional / order, -1 / order)
+    exponent = slope * now + jnp.where(accept, pi.integral / order * before, 0)
+    least, most = jnp.where(accept, pi.least, 0.1), jnp.where(accept, pi.most, 0.9)
+    factor = jnp.clip(pi.safety * rough_exp(exponent), least, most)
+    return h * factor, jnp.maximum(now, float(np.log(LOWEST)))
+
+
+def judged(state, info, error):
+    """The error of a step, infinite where something that it tells is not fine."""
+    for x in (state.q, state.v, state.w, state.L):
+        error = error if x is None else error + jnp.sum(0 * x)  # NaN where one is not finite
+    fine = error < jnp.inf
+    independent = None if info.dependent_row is None else info.dependent_row < 0
+    for told in (info.converged, info.solved, independent):
+        fine = fine if told is None else fine & told
+    return jnp.where(fine, error, jnp.inf)
+
+
+def is_walking(walk, end):
+    """Whether there is more to try."""
+    going = (walk.state.t < end) & (walk.stop == DONE)
+    return going if walk.met is None else going & ~walk.met.ended
+
+
+def next_end(trial, params, walk):
+    """The next step, and the time at which it ends: that of the walk, or one or two halves, to the end, or a jump.
+
+    Without rounding: what is left until a jump, less than the steps, and halved, would differ between a run and a batch
+    by more than the steps before, and so on from jump to jump.
+    """
+    t, end = walk.state.t, trial.end
+    h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
+    due = jnp.minimum(end, zero_order_hold.jump_after(params, t)) if zero_order_hold.holds(params) else end
+    if trial.ways is not None and walk.met.over:
+        due = jnp.minimum(due, trial.ways.events.due_after(t, walk.met.over))
+    left = due - t
+    lands = left <= reach  # what has doubled does, where jumps are equally far apart
+    h = jnp.where(lands, left, jnp.minimum(h, without_rounding(left / 2, more=1)))  # the second half is no longer
+    return h, jnp.where(lands, due, t + h)
+
+
+def attempt(trial, walk):
+    """Walk -> Walk after one try, and how that began."""
+    bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
+    h, t1 = next_end(trial, params, walk)
+    resized, state = trial.stepper.resized(walk.state, h / walk.last)
+    now, state = zero_order_hold.entered(resized, trial.flat, params, h, walk.last, state)
+    s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, walk.past)(state)
+    s1 = s1._replace(t=t1)
+    q_size, v_size = map(jnp.maximum, (walk.q_size, walk.v_size), sizes(trial.flat, s1))
+    error = judged(s1, info, bounds.relative(trial.flat, errors, q_size, v_size))
+    error = staged(lambda x: x)(error)
+    h1, before = next_step(h, error, walk.before, error <= 1, order, trial.controller)
+    h1 = jnp.minimum(h1, bounds.most)
+    new = walk._replace(state=s1, last=h, past=past, before=before, q_size=q_size, v_size=v_size)
+    tried = Try(new._replace(accepted=walk.accepted + 1), error, h1, h1, why_short(error))
+    if trial.ways is not None:
+        tried = trial.past_events(trial, tried, walk, h)
+    return taken(trial, walk, tried), Begun(state, s1.t, info)
+
+
+def taken(trial, walk, tried):
+    """The walk after a try: taken, or to be taken again."""
+    accept = tried.error <= 1
+    again = walk._replace(rejected=walk.rejected + 1)
+    if walk.met is not None:  # what is wrong there
+        again = again._replace(met=walk.met._replace(code=tried.walk.met.code, event=tried.walk.met.event))
+    walk = jax.tree.map(partial(jnp.where, accept), tried.walk, again)._replace(h=tried.h, error=tried.error)
+    fine = accept | (tried.shortest >= trial.bounds.least)
+    spent = (walk.accepted + walk.rejected >= trial.max_steps) & is_walking(walk, trial.end)
+    return walk._replace(stop=jnp.where(fine, jnp.where(spent, TOO_MANY, DONE), tried.why).astype(jnp.int32))
+
+
+def why_short(error):
+    """Why there are no more steps if this one has become too short."""
+    return jnp.where(error < jnp.inf, TOO_SHORT, BROKEN)
+
+
+def begin(trial, q, v, t0):
+    """The walk before its first step, and the state at t0 as it is saved. The method starts with the longest of these,
+    of which others are parts."""
+    flat, stepper, bounds = trial.flat, trial.stepper, trial.bounds
+    longest = jnp.minimum((trial.end - t0) / 100, bounds.most)
+    start, state = entered(
+        stepper, flat, q, v, t0, zero_order_hold.before(trial.params, t0, longest), longest, resolves=True
+    )
+    q_size, v_size = sizes(flat, state)
+    h = bounds.first(state, v_size, trial.end - t0)
+    one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)
+    past = stepper.begin_estimates(flat, state)
+    walk = Walk(state, h, longest, past, 0 * one, one, q_size, v_size, none, none, none)
+    if trial.ways is not None:
+        walk = walk._replace(met=before_any(trial.ways, trial.params, t0))
+    return walk, start
+
+
+# ----------------------------------------------------------------------------
+# Events under error control: a step that is accepted passes them, and what is left of it behind them is judged anew.
+#
+# The estimate of a step knows nothing of what comes behind an event, where the force may be another: so the rest has
+# one of its own, as of a first step. If it is too large the whole step is tried again, with a shorter rest. And if
+# there is another event in the rest, the step is tried again up to the middle between both, for what is between has no
+# estimate. Where an event cannot be passed, shorter steps are tried too.
+
+
+def trial_of(problem, end, bounds, max_steps, events=None, room=()):
+    """How the steps of a problem are tried, with events or without."""
+    flat, q, v, t0, params = problem.flat()
+    stepper = problem.stepper.astype(q.dtype)
+    trial = Trial(flat, stepper, params, end, bounds, max_steps)
+    if events is None:
+        return trial
+
+    def one(h):
+        return resized_step(flat, stepper, params, h, h)(stepper.begin(flat, q, v, t0, params, h))
+
+    no_info = neutral_info(jax.eval_shape(one, end)[1])
+    flat_events = flatten_events(flat, events, params, (q, v, t0), stepper.redundant)
+    ways = Ways(flat, stepper, flat_events, room[0], no_info, reaching(flat, stepper, no_info))
+    return trial._replace(ways=ways, past_events=past_events)
+
+
+def past_events(trial, tried, walk, h):
+    """The try, past the events in its step."""
+    now = trial.ways.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
+    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, now, walk.met.over, h)
+    return seldom_alone(partial(passed, trial), asked, tried, walk, h)
+
+
+def passed(trial, tried, walk, h):
+    """The same where there may be one."""
+    ways = trial.ways
+    met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE))
+    part = Part.whole(ways, walk.state, tried.walk.state, ways.no_info, h, walk.last, met, ~met.ended)
+    part, (rows, there) = pass_events(ways, freeze(trial.params), part, h)
+    noted = jnp.asarray((*ways.events.noted, True))[rows[:, 1].astype(jnp.int32)]
+    there = there & ~noted  # which have nothing behind them
+    times = jnp.where(there, rows[:, 0], jnp.inf)
+    first = jnp.min(times)
+    later = there & (times > first + SHORT * h)
+    second = jnp.min(jnp.where(later, times, jnp.inf))
+    middle = jnp.where(jnp.any(later), (first + second) / 2 - walk.state.t, h / 2)
+    code = jnp.where((part.met.code == FINE) & jnp.any(later), MANY, part.met.code).astype(met.code.dtype)
+    part = part._replace(met=part.met._replace(code=code))
+    lost = tried._replace(
+        walk=tried.walk._replace(met=part.met), error=jnp.full_like(tried.error, jnp.inf), h=middle, shortest=middle,
+        why=jnp.full_like(tried.why, AT_EVENT),
+    )  # fmt: skip
+    judged = choose(part.divided > 0, behind(trial, tried, walk, part, h), tried)
+    return choose(code == FINE, judged, lost)
+
+
+def behind(trial, tried, walk, part, h):
+    """The try with the error of the rest behind an event; so long as that is too large, the rest becomes shorter."""
+    past, met = trial.stepper.begin_estimates(trial.flat, part.end), part.met
+    reached = [(walk.q_size, walk.v_size), *(sizes(trial.flat, s) for s in (part.start, part.end))]  # and no farther
+    q_size, v_size = (reduce(jnp.maximum, x) for x in zip(*reached, strict=True))
+    new = tried.walk._replace(
+        state=part.end, past=past, before=jnp.zeros_like(h), q_size=q_size, v_size=v_size, met=met
+    )
+    rest = jnp.maximum(part.rest, SHORT * h)
+    params = zero_order_hold.held_at(trial.params_of(new), part.start.t + rest / 2)
+    errors = trial.stepper.bind_estimated(trial.flat, params, rest, past)(part.start)[2]
+    error = jnp.where(met.ended, 0, trial.bounds.relative(trial.flat, errors, q_size, v_size))
+    error = judged(part.end, part.info, error)
+    small = jnp.maximum(error, float(jnp.finfo(h.dtype).tiny))
+    best = trial.controller.safety * small ** (-1 / trial.stepper.estimate_order)
+    shorter = rest * jnp.clip(best, 0.1, 0.9)
+    h = jnp.where(error <= 1, jnp.minimum(h, rest * best), h - rest + shorter)
+    return Try(new, error, h, shorter, why_short(error))
+
+
+# ----------------------------------------------------------------------------
+# Steps chosen by their errors: one loop, in which a rejected step is taken again, shorter.
+
+
+WHY = {
+    TOO_SHORT: "the step size fell below dt_min={:.3g}, the error estimate being {:.3g} times the tolerance",
+    TOO_MANY: "max_steps={} used up; take more of them, or a larger rtol",
+    BROKEN: "the step is not finite, at dt_min={:.3g} either",
+}
+
+
+@shown
+class Steps(NamedTuple):
+    """What error control chose.
+
+    Attributes:
+        dt: (N,) the accepted steps; inside jit (max_steps,), NaN behind them.
+        accepted, rejected: their numbers.
+        reached: the time at which they end; that of the last sample, unless they failed.
+        stop: why they ended: 0 all well, 1 below dt_min, 2 max_steps used up, 3 not finite, 4 what went wrong at an
+            event.
+        estimate: of the last step tried, relative to the tolerance.
+        dt_min: below which steps were not to fall.
+        event, guard: those of `Failure`, of the last step tried; None without events.
+        tightened: with `verify="tighten"` how much of the tolerance they were chosen for; None without.
+    """
+
+    dt: Any
+    accepted: Any
+    rejected: Any
+    reached: Any
+    stop: Any
+    estimate: Any
+    dt_min: Any
+    event: Any = None
+    guard: Any = None
+    tightened: Any = None
+
+    def check(self):
+        """Raises `SimulationError` naming why, and at which time, steps ended too early; for a batch the first."""
+        if fault := self._fault():
+            raise SimulationError(f"choose_steps: {fault}")
+
+    def _fault(self):
+        """What is wrong, in words."""
+        stop = np.asarray(self.stop)
+        if not stop.any():
+            return None
+        member, which = first_bad(stop)
+        accepted, rejected, reached, why, estimate, least = (np.asarray(x)[member] for x in self[1:7])
+        if why == AT_EVENT:
+            event, guard = np.asarray(self.event)[member], np.asarray(self.guard)[member]
+            what, advice = EVENTS[int(event)]
+            return f"{which}stopped at t = {reached:.6g}: {what} {guard}. {advice}."
+        values = {TOO_SHORT: (least, estimate), TOO_MANY: (accepted + rejected,), BROKEN: (least,)}[int(why)]
+        return f"{which}stopped at t = {reached:.6g}: {WHY[int(why)].format(*values)}."
+
+    def _verdict(self):
+        return "" if not is_concrete(self.stop) else self._fault() or "all accepted"
+
+
+def select_steps(problem, end, control, progress=False, events=None, room=(), controller=PI, times=None):
+    """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf behind them; no tracer of autodiff may
+    come in. times: where samples are kept on the way, (K,); the third result is the `Solution` there, or None."""
+    if progress:
+        announce()
+    flat, q, v, t0, _ = problem.flat()
+    bounds = Bounds.of(flat, problem.stepper, control, t0, end)
+    trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
+    walk, start = begin(trial, q, v, t0)
+    plain = partial(attempt, trial._replace(ways=None))
+    form = on_scalars(plain, walk, derivatives=False)  # as in a run: events are seldom
+    one_try = form.of(plain if trial.ways is None else partial(attempt, trial))
+    recorder: Any = None
+    if times is not None:
+        sensed = () if problem.output is None else (problem.output, trial.params, times[-1] - t0)
+        recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, walk)[1].info, *sensed)
+
+    def unfinished(carry):  # one answer for a batch: else vmap has each try copy the ends of all members
+        return largest_in_batch(is_walking(carry[0], end))
+
+    def body(carry):
+        walk, ends, since = carry
+        new, begun = one_try(walk)
+        here = or_alone(is_walking(walk, end))
+        new = jax.tree.map(partial(jnp.where, here), new, walk)
+        accepted = new.accepted > walk.accepted
+        ends = row_written(ends, jnp.where(accepted, begun.end, jnp.inf), walk.accepted)
+        return new, ends, recorder and recorder.add(since, begun, accepted)
+
+    def tries(carry):
+        return largest_in_batch(carry[0].accepted + carry[0].rejected)
+
+    def walked(carry, ahead):
+        """The walk on, while `ahead`; with a bar in blocks of tries, each a kernel."""
+        if not progress:
+            return lax.while_loop(ahead, body, carry)
+
+        def some(carry):
+            limit = tries(carry) + steps_between(control.max_steps, q.size)
+            block = partial(lax.while_loop, lambda x: ahead(x) & (tries(x) < limit), body)
+            carry = one_kernel(block, carry)
+            over, t = ~unfinished(carry), carry[0].state.t
+            lax.cond(over | (tries(carry) >= limit), lambda: show((t - t0) / (end - t0), over), lambda: None)
+            return carry
+
+        return lax.while_loop(ahead, some, carry)
+
+    def to_sample(carry, time):
+        walk, ends, since = walked(carry, lambda x: unfinished(x) & (x[0].state.t < time))
+        since, around = recorder.sample(since, walk.state, time)
+        return (walk, ends, since), around
+
+    def run(walk):
+        carry = walk, jnp.full(control.max_steps, jnp.inf, t0.dtype), recorder and recorder.none
+        return (walked(carry, unfinished), None) if times is None else lax.scan(to_sample, carry, times)
+
+    (walk, ends, _), around = (run if progress else partial(one_kernel, run))(form.tree)
+    steps = as_steps(form.joined(walk), ends, t0, bounds.least)
+    if times is None:
+        return steps, ends, None
+    return steps, ends, solution(problem, start, form.joined(around), times, steps.reached)
+
+
+def as_steps(walk, times, t0, least):
+    """The `Steps` of a walk that is over, which end at these times."""
+    numbers = jnp.arange(times.size, dtype=jnp.int32)
+    dt = jnp.where(numbers < walk.accepted, jnp.diff(times, prepend=t0), jnp.nan)
+    steps = Steps(dt, walk.accepted, walk.rejected, walk.state.t, walk.stop, walk.error, least)
+    if walk.met is None:
+        return steps
+    return steps._replace(event=jnp.where(walk.stop == AT_EVENT, walk.met.code, 0), guard=walk.met.event)
+
+
+def show(share, over):
+    """A bar on stderr; over: whether it is the last."""
+
+    def bar(share, over):
+        done = int(100 * min(float(share), 1.0))
+        overwrite(f"[{'#' * (done * 40 // 100):<40}] {done} % of the time", last=bool(over))
+
+    jax.debug.callback(bar, share, over)
+
+
+def trimmed(steps):
+    """Without what is behind the accepted ones, of a batch the most, where their numbers are known."""
+    if not is_concrete(steps.accepted):
+        return steps
+    dt, accepted = map(np.asarray, (steps.dt, steps.accepted))  # jnp would compile a program for each number
+    return steps._replace(dt=jax.device_put(dt[..., : np.max(accepted)]))
+
+
+# ----------------------------------------------------------------------------
+# What lies around the sample times, kept while steps are chosen: a run under error control in one pass.
+#
+# The values are those of a run over the chosen steps, to rounding; a step that was accepted has not failed. Derivatives
+# and batches are those of that run, in a second pass, as is what happens within steps: events, and dry friction.
+
+
+class Since(NamedTuple):
+    """Of the steps since the last sample. first: what was saved at the beginning of the last; info: theirs, joined."""
+
+    first: Any
+    info: Any
+
+
+class Recorder(NamedTuple):
+    """How walks in one form are recorded. none: `Since` before the first try; begin, end: what is kept of a state."""
+
+    none: Since
+    begin: Any
+    end: Any
+    read: Any = None
+    alone: bool = False  # whether that is all that is kept
+
+    @classmethod
+    def of(cls, flat, stepper, form, info, output=None, params=None, long=None):
+        """info: that of a try, for its structure. output: what is read off, with params; long: of `read_between`."""
+        begin, end = form.of(partial(saved, flat)), form.of(partial(kept, flat, stepper))
+        since = Since(begin(form.tree.state), neutral_info(info))
+        if output is None:
+            return cls(since, begin, end)
+
+        def read(first, second, time):
+            return output_between(flat, output, params, ((first, None), second), time, long)
+
+        return cls(since, begin, end, form.of(read), not output.beside_path)
+
+    def add(self, since, begun, accepted):
+        """Since, with a try; of one that is rejected the beginning too: it is that of the next."""
+        return Since(self.begin(begun.state), either(accepted, join_info(since.info, begun.info), since.info))
+
+    def sample(self, since, state, time):
+        """Since a sample before this state, and what lies around it: in a step, whose end this is."""
+        end = self.end(state)
+        found = None if self.read is None else self.read(since.first, end, time)
+        return since._replace(info=self.none.info), (
+            None if self.alone else ((since.first, None), end),
+            found,
+            since.info,
+        )
+
+
+def solution(problem, start, around, times, reached):
+    """The `Solution` at the times, from what was kept around them."""
+    flat, _, _, _, params = problem.flat()
+    around, found, info = around
+    flaw, failure = flaw_at_start(problem.system, flat, start, params), no_failure(jax.tree.map(lambda x: x[0], info))
+    run = solution_at(flat, start, around, times, reached, info, with_flaw(failure, flaw))
+    if problem.output is None:
+        return run
+    at_start = output_at_start(flat, problem.output, params, start, (times[-1] - start.t) / 100)
+    return with_output(run, at_start, found, times, reached)

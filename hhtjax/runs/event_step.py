@@ -1,0 +1,505 @@
+"""A step across events: find the first, step to it, change the velocity or the params, begin anew, go on to the end.
+
+    0 = g(step(s, tau)),   e = step(s, tau),   v := reset(e),  params := switch(params),   s1 = step(begin(e), h - tau)
+
+so that the grid stays what it was, and the order that of the stepper. tau is found on the cubic through g and its rate
+at both ends, and made exact by Newton, on steps of size tau; its derivative is that of the implicit function.
+A rest of a millionth of the step is a Taylor polynomial: skipping it would lose the derivative of tau.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from hhtjax.description import freeze, thaw
+from hhtjax.numerics.batched_cond import choose, if_any, seldom
+from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.runs.loop import resized_step
+from hhtjax.runs.solution import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, SINGULAR, STAYS, THROWN, row_of
+from hhtjax.steppers.stepper import entered, join_info
+from hhtjax.systems import zero_order_hold
+from hhtjax.systems.sampled import SLOP
+from hhtjax.xla import staged
+
+
+def asks(ways, s, s1, params, over, h):
+    """Whether an event may fall into the step from s to s1: no more than a look at both ends, in few operations."""
+    (g0, d0), (g1, d1) = ways.events.still.both(ways.flat, *lax.stop_gradient((s, s1)), params, over, h)
+    noted = np.asarray(ways.events.noted) & ~np.asarray(ways.events.timed)
+    if any(ways.events.timed):
+        g1 = g1 - lateness(ways.events, s1.t)
+    below = ~(g1 > 0) & (~noted | (g0 > 0) | (d0 > 0))
+    cross_below = g0 * (d1 - d0) <= d0 * (g1 - g0 - d1 * h)  # tangents at both ends; a division is dear
+    return jnp.any(below | ((d0 < 0) & (d1 > 0) & cross_below))
+
+
+def pass_events(ways, params, part, h):
+    """The step across all events in it: a `Part`, of which end, info and met are to be used, and what to note of
+    them, rows and whether each is there. Members that have not asked stay as they are. params
+    are as `freeze` leaves them, here and in what this calls, and `Ways.params` thaws them."""
+    ways = ways.during(params, part.start.t, h)
+    if ways.middle is not None:
+        known, t = ways.events.with_modes(params, part.met.modes), part.start.t
+        old, new = zero_order_hold.before(known, t, part.last), ways.params(params, part.met.modes)
+        here = zero_order_hold.passed(known, t, part.last, h)
+        part = part._replace(start=zero_order_hold.jump(ways.stepper, ways.flat, part.start, old, new, h, here))
+
+    @checkpoint  # what all slots keep for reverse mode takes longer to compile than to compute one again
+    def slot(part, _):
+        going = part.asked & (part.met.code == FINE) & ~part.met.ended
+        return if_any(partial(meet_or_flag, ways), going, (part, unnoted(part.start)), going, h, params)
+
+    part, noted = lax.scan(slot, part, length=ways.slots)
+    part = flag(part, part.asked & ~part.met.ended, MANY, jnp.ones_like(part.passed))
+    met = part.met
+
+    def anew(s, params):
+        return begin(ways, s.q, s.v, s.t, thaw(params), h, moves=False)
+
+    now = freeze(ways.params(params, met.modes))
+    end = seldom(anew, (part.divided > 0) & ~met.ended, part.end, now)
+
+    def known(s):
+        lost = {name: jnp.where(met.code == FINE, getattr(s, name), jnp.nan) for name in ("q", "v", "w")}
+        return s._replace(**lost)
+
+    if met.pieces is not None:
+        met = met._replace(pieces=met.pieces._replace(end=known(met.pieces.end)))
+    return part._replace(end=known(end), met=met), noted
+
+
+def unnoted(s):
+    """The row of no event, and that it is not there."""
+    row = row_of(s.t, jnp.zeros((), jnp.int32), s.t, s.q, s.v, s.v)
+    return jnp.full_like(row, jnp.nan), jnp.array(False)
+
+
+def meet_or_flag(ways, now, going, h, params):
+    """The part behind its first event, if it has one, and what to note; with what is wrong, if something is."""
+    part, noted = now
+    found = look(ways, part, params, h)
+    here = going & jnp.any(found.hit)
+    part = flag(part, going & ~here, NEGATIVE, found.negative)
+    part = flag(part, going & ~here, STAYS, found.stays)
+    part = flag(part, going & ~here, NO_NUMBER, found.unknown)
+    part = part._replace(asked=jnp.where(going, here, part.asked))
+    return seldom(partial(meet, ways), here, (part, noted), found, h, params)
+
+
+def flag(part, bad, code, which):
+    """The part with what went wrong, if it did: at the first of these events."""
+    met = part.met
+    bad = bad & jnp.any(which) & (met.code == FINE)
+    first = jnp.min(jnp.where(which, jnp.arange(which.size, dtype=met.event.dtype), which.size))
+    met = met._replace(code=jnp.where(bad, code, met.code), event=jnp.where(bad, first, met.event))
+    return part._replace(met=met)
+
+
+def begin(ways, q, v, t, params, h, moves=True):
+    """The state from which a step of size h goes at a new start; moves: whether its velocity may be another."""
+    return staged(lambda q, v, t, h: entered(ways.stepper, ways.flat, q, v, t, params, h, moves=moves)[1])(q, v, t, h)
+
+
+def meet(ways, now, found, h, params):
+    """The part of the step behind its first event, and what to note of that."""
+    part, *_ = now
+    events, met = ways.events, part.met
+    known = lax.stop_gradient((params, met.modes, part))
+    tau, near = lax.stop_gradient(first_time(ways, ways.params(*known[:2]), known[2], found, h))
+    i, this = first_of(events, part, found, near)
+    now = ways.params(params, met.modes)
+    tau = located(ways, now, part, this, found, tau, h)
+    e, info = reached(ways, now, part, tau, h)
+    Ldot = events.slope(part.start, part.end, part.rest)
+    g, d = events.rates(ways.flat, e, now, met.over, Ldot)
+    rate = pick(this, d)
+    missed = ~(jnp.abs(pick(this, g)) <= beside_zero(rate, h, pick(this, found.size)))
+    missed = missed & ~(pick(this, found.jumped.astype(h.dtype)) > 0)
+    v, modes = events.outcome(i, e, now, events.with_modes(params, met.modes))
+    row = row_of(e.t, i, rate, e.q, e.v, v)
+
+    over = events.passed(i, met.over)
+    again = jnp.asarray(events.timed)  # a time that is over is no longer its guard
+    passed = part._replace(passed=part.passed | ((this > 0) & ~again), met=met._replace(over=over))
+    new = behind(ways, part, (e, info, tau, g, d), (v, modes, over), i, this, near, h, params)
+    noted, touches = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, found.touches))
+    new = choose(noted, passed, new)  # what changes nothing divides no step
+    stays, many = missed & jnp.all(jnp.isfinite(e.v)), ~noted & (part.divided == ways.max_events)
+    code = jnp.where(many, MANY, jnp.where(stays, STAYS, new.met.code)).astype(met.code.dtype)
+    new = new._replace(met=new.met._replace(code=code, event=jnp.where(stays | many, i, new.met.event)))
+    none = missed & touches
+    return choose(none, passed, new), (row, ~none & ~many)
+
+
+def behind(ways, part, at, outcome, i, this, near, h, params):
+    """The part of the step behind event i. at: the state and the `Info` before it, when, and g and dg/dt of all."""
+    events, (e, info, tau, g, d), (v, modes, over) = ways.events, at, outcome
+    then = ways.params(params, modes)
+    ends = pick(this, jnp.asarray(events.ends, h.dtype)) > 0
+    rest = jnp.where(ends, 0, part.rest - tau)
+    start = begin(ways, e.q, v, e.t, then, h)  # whole: what is left may be far too short to tell what is stiff
+    end, more = go(ways, then, start, rest, h, h)
+    end = end._replace(t=jnp.where(ends, e.t, part.end.t))
+
+    g1, d1 = events.rates(ways.flat, start, then, over, events.slope(start, end, rest))
+    near_and_due = near & ~part.passed & ~jnp.asarray(events.noted)
+    going_on = jnp.any(part.due)
+    beside = jnp.where(going_on, part.beside, near_and_due)
+    due = jnp.where(going_on, part.due, near_and_due) & ~(this > 0)
+    same = (jnp.abs(d1 - d) <= nearness(h) * jnp.abs(d)) & (jnp.abs(g1 - g) <= nearness(h) * h * jnp.abs(d))
+    same = same | jnp.asarray(events.timed)  # nothing changes those
+    corner = jnp.any(beside & ~(this > 0) & ~same)  # in another order they might have other outcomes
+    code = jnp.where(corner, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
+    if ways.flat.num_constraints:
+        code = jnp.where((code == FINE) & ~jnp.all(jnp.isfinite(start.w)), SINGULAR, code)
+    code = jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE).astype(part.met.code.dtype)
+
+    pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end, modes)
+    met = Met(modes, ends, code, i, pieces=pieces, over=over)
+    infos = join_info(join_info(choose(part.divided > 0, part.info, ways.no_info), info), more)
+    asked = asks(ways, start, end, then, over, rest) | jnp.any(due)
+    passed = part.passed & near & (d1 < 0)
+    new = Part(start, end, infos, rest, h, met, part.divided + 1, asked, passed, beside, due)
+    slack = nearness(h) * h * (jnp.abs(d) + jnp.abs(d1)) + shaken(events.still, start, then, over)
+    slack = slack + ROUNDINGS * eps(h) * jnp.abs(g)
+    jumps = (g > slack) & (g1 < -slack) & ~near & ~(this > 0)
+    jumps = jumps & ~jnp.asarray(np.asarray(events.noted) | np.asarray(events.forced))
+    return flag(new, ~ends, THROWN, jumps)
+
+
+# ----------------------------------------------------------------------------
+# What a step across events is made of: how to step, what the run carries along, and what is left of the step.
+
+
+SHORT = 1e-6  # part of a step: a rest that needs no step
+
+
+class Ways(NamedTuple):
+    """How to step, and what to look for."""
+
+    flat: Any
+    stepper: Any
+    events: Any
+    max_events: int
+    no_info: Any
+    reach: Any  # of `reaching`
+    keep: int = 0  # how many events are noted
+    middle: Any = None  # of the step, where inputs are held
+
+    def during(self, params, t, h):
+        """The same in a step h from t on."""
+        return self._replace(middle=t + h / 2) if zero_order_hold.holds(params) else self
+
+    @property
+    def slots(self):
+        """How often a step is looked at. Between events that divide it, of which there may be max_events, each noted
+        one may happen once, and one that only seemed to touch its guard; in the end there is none."""
+        return (self.max_events + 1) * (2 + sum(self.events.noted))
+
+    def params(self, params, modes):
+        """Those with these modes, as they are in this step."""
+        params = self.events.with_modes(params, modes)
+        return params if self.middle is None else zero_order_hold.held_at(params, self.middle)
+
+
+class Met(NamedTuple):
+    """What a run with events carries along: numbers that switches changed, whether it has ended, what went wrong (code
+    and event), the `Log`, where it is read off between its steps the pieces of the last, and of each event with known
+    times how many of them are over."""
+
+    modes: list
+    ended: Any
+    code: Any
+    event: Any
+    log: Any = None
+    pieces: Any = None
+    over: Any = ()
+
+
+class Part(NamedTuple):
+    """What is left of a step: from `start` to `end`, of the size `rest`; `last` is the size start.a is made for.
+
+    Of each event: whether it is behind the motion, though the guard may not say so; whether it was met at the start,
+    beside others; whether it is still to happen there."""
+
+    start: Any
+    end: Any
+    info: Any
+    rest: Any
+    last: Any
+    met: Met
+    divided: Any  # number of events that came before and divided the step
+    asked: Any  # whether there may be one
+    passed: Any
+    beside: Any
+    due: Any
+
+    @classmethod
+    def whole(cls, ways, start, end, info, h, last, met, asked=False):
+        """A step."""
+        none, no = jnp.zeros(len(ways.events.noted), bool), jnp.zeros_like(met.ended)
+        return cls(start, end, info, h, last, met, jnp.zeros_like(met.event), no | asked, none, none, none)
+
+
+def go(ways, params, s, tau, last, h):
+    """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
+    return ways.reach(freeze(params), s, tau, last, h)
+
+
+def reaching(flat, stepper, no_info):
+    """What `go` calls: one function for all places of a program, so that it is traced once."""
+
+    @staged
+    def reach(params, s, tau, last, h):
+        short = tau <= SHORT * h
+        s1, info = resized_step(flat, stepper, thaw(params), jnp.maximum(tau, SHORT * h), last)(s)
+        return choose(short, drifted(flat, s, tau), s1), choose(short, no_info, info)
+
+    return reach
+
+
+def drifted(flat, s, h):
+    """The state a very short time h later."""
+    s1 = s._replace(t=s.t + h, q=flat.move(s.q, h * (s.v + h / 2 * s.w)), v=s.v + h * s.w)
+    return flat.tidy(s1)
+
+
+# ----------------------------------------------------------------------------
+# A step across events in its pieces, each smooth: what lies between the ends of a step is read off in one of them.
+
+
+class Pieces(NamedTuple):
+    """The parts of a step between its events, in their order: states (max_events + 1, ...) at which they start and end;
+    those there are not start at infinity. modes: in each the numbers that switches have changed, where asked for."""
+
+    start: Any
+    end: Any
+    modes: Any = ()
+
+    @classmethod
+    def none(cls, state, number, modes=()):
+        """Room for so many, like a state, none of them there."""
+        like, modes = jax.tree.map(lambda x: jnp.stack([jnp.zeros_like(x)] * number), (state, modes))
+        return cls(like._replace(t=jnp.full_like(like.t, jnp.inf)), like, modes)
+
+    def whole(self, start, end, modes=()):
+        """A step without events."""
+
+        def first(rows, x):
+            return jnp.concatenate([x[None], rows[1:]])
+
+        pieces = jax.tree.map(first, self, Pieces(start, end, modes if self.modes else self.modes))
+        later = jnp.full_like(pieces.start.t[1:], jnp.inf)
+        return pieces._replace(start=pieces.start._replace(t=jnp.concatenate([pieces.start.t[:1], later])))
+
+    def divided(self, event, start, end, modes=()):
+        """The last of them ends at an event; a new one is behind it."""
+        new = jnp.sum(jnp.isfinite(self.start.t), dtype=jnp.int32)
+
+        def put(rows, x, here):
+            here = jnp.arange(len(rows), dtype=new.dtype) == here
+            return jnp.where(here.reshape(-1, *[1] * x.ndim), x[None], rows)
+
+        ends = jax.tree.map(partial(put, here=new - 1), self.end, event)
+        pairs = (self.start, start), (ends, end), (self.modes, modes if self.modes else self.modes)
+        return Pieces(*(jax.tree.map(partial(put, here=new), old, x) for old, x in pairs))
+
+    def around(self, t):
+        """The start and the end of the one in which a time lies, and the modes."""
+        i = jnp.maximum(jnp.sum(self.start.t <= t, dtype=jnp.int32) - 1, 0)
+        return jax.tree.map(lambda rows: lax.dynamic_index_in_dim(rows, i, keepdims=False), self)
+
+
+# ----------------------------------------------------------------------------
+# When the first of the events in a part of a step happens.
+
+
+TOGETHER = 1e-9  # part of a step: two events that are one
+ON_CUBIC, IMPROVEMENTS = 10, 40  # iterations, at most
+NEARLY = 1e-8  # part of a step: the next iteration would change a rounding
+ROUNDINGS = 16  # of the terms of a guard, and of what it changes by in a step, that count as zero
+JUDGED = 1e-3  # part of a step: of a shorter rest the next step tells whether the motion leaves the guard
+ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, quadratic improvement
+
+
+class Found(NamedTuple):
+    """Of each event: whether it falls into the part of a step, whether by a jump before that, where about (0 to 1),
+    before where, whether it only touches there, whether the motion stays beyond it, and was made to by the event
+    before, whether it is no number, and how large the guard is."""
+
+    hit: Any
+    jumped: Any
+    place: Any
+    limit: Any
+    touches: Any
+    stays: Any
+    negative: Any
+    unknown: Any
+    size: Any
+
+
+def look(ways, part, params, h):
+    """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
+    part, params = lax.stop_gradient((part, params))
+    now = ways.params(params, part.met.modes)
+    events, over = ways.events.still, part.met.over
+    (g0, d0), (g1, d1) = events.both(ways.flat, part.start, part.end, now, over, part.rest)
+    rounding = shaken(events, part.end, now, over) + ROUNDINGS * eps(h) * h * jnp.maximum(jnp.abs(d0), jnp.abs(d1))
+    rounding = jnp.where(jnp.isfinite(rounding), rounding, 0)
+    g1 = g1 - lateness(events, part.end.t)
+    noted, timed, forced = (jnp.asarray(x) for x in (events.noted, events.timed, events.forced))
+    rising = (d0 > 0) & (d1 > 0)
+    left = rising & (g1 > -nearness(g1) * h * d1)  # behind an event g is a rounding of either sign
+    negative = (part.divided > 0) & (g0 < -beside_zero(d0, h, jnp.abs(g0) + jnp.abs(g1)))
+    returns = (d0 > 0) & ~rising & (~noted | (g0 > -nearness(g0) * h * d0))
+    d0, d1 = d0 * part.rest, d1 * part.rest
+    a, b = 3 * (g1 - g0) - 2 * d0 - d1, 2 * (g0 - g1) + d0 + d1
+
+    def cubic(x):
+        return g0 + x * (d0 + x * (a + x * b))
+
+    turns = (d0 < 0) & (d1 > 0)
+    root = jnp.sqrt(jnp.maximum(a * a - 3 * b * d0, 0))
+    bottom = jnp.where(turns, -d0 / jnp.where(turns, a + root, 1), 1)  # where the cubic has its minimum
+    below = turns & (cubic(bottom) < -rounding)
+    turns = turns & (g0 > 0) & (g1 > 0)
+    touches, lowest = turns & below, jnp.where(turns, bottom, 1)
+    rests = (g0 <= rounding) & (g1 >= -rounding) & ~below & ~timed  # at its guard to rounding: the next step tells
+    fresh = (part.divided == 0) & (g0 <= 0) & (g0 >= -rounding)  # at its guard, and not by an event of this step
+    falls = fresh & (((d0 <= 0) & (g1 < -rounding)) | below) & ~noted
+    at_once = falls | ((g0 <= 0) & (g1 <= 0) & (timed | (forced & ~noted)))
+    hit = ~part.passed & (touches | ((g1 <= 0) & ((g0 > 0) | returns) & ~rests) | at_once)
+    hit, lowest = jnp.where(jnp.any(part.due), part.due, hit), jnp.where(part.due | at_once, 0, lowest)
+
+    def improve(now):
+        low, high, x, _, k = now
+        y, slope = cubic(x), d0 + x * (2 * a + x * 3 * b)
+        low, high = jnp.where(y > 0, x, low), jnp.where(y > 0, high, x)
+        new = improved(x, y, slope, low, high)
+        return low, high, new, jnp.max(jnp.where(hit, jnp.abs(new - x), 0)), k + 1
+
+    def unfinished(now):
+        *_, change, k = now
+        return (change > NEARLY) & (k < ON_CUBIC)
+
+    first = jnp.zeros_like(g0), lowest, lowest / 2, jnp.full_like(part.rest, jnp.inf), 0
+    place = lax.while_loop(unfinished, improve, first)[2]
+    stays = (g1 < -rounding) & (part.rest > JUDGED * h) & ~hit & ~left & ~noted
+    unknown = jnp.isnan(g1) & jnp.all(jnp.isfinite(part.end.q)) & jnp.all(jnp.isfinite(part.end.v))
+    place = jnp.where(hit, place, jnp.inf)
+    found = Found(
+        hit, at_once & hit & forced, place, lowest, touches, stays, stays & negative, unknown, jnp.abs(g0) + jnp.abs(g1)
+    )
+    return lax.stop_gradient(found)
+
+
+def shaken(events, s, params, over):
+    """How much each guard changes where q and v do by roundings: of the size of those of its terms."""
+
+    def moved(x):
+        k = np.arange(x.size)
+        uneven = np.where(k % 2, -1, 1) * (0.75 + 0.618034 * k % 0.5)
+        return x * (1 + ROUNDINGS * eps(x) * jnp.asarray(uneven, x.dtype))
+
+    return jnp.abs(events.guards(s._replace(q=moved(s.q), v=moved(s.v)), params, over) - events.guards(s, params, over))
+
+
+def lateness(events, t):
+    """By how much an event may come after the end of a step, by rounding, and still be one of it."""
+    return jnp.where(jnp.asarray(events.timed), SLOP * eps(t) * jnp.abs(t), 0)
+
+
+def first_time(ways, params, part, found, h):
+    """When the first of the events happens, and which are at that time: by Newton on all of them, kept between where
+    none is beyond its guard and where one is, from where the first cubic has its zero."""
+
+    def unfinished(now):
+        *_, change, k = now
+        return (change > ENOUGH * h) & (k < IMPROVEMENTS)
+
+    def improve(now):
+        low, high, tau, *_, k = now
+        s, _ = reached(ways, params, part, tau, h)
+        g, d = events.rates(ways.flat, s, params, part.met.over, Ldot)
+        above = jnp.all((g > 0) | ~found.hit)
+        low, high = jnp.where(above, tau, low), jnp.where(above, high, tau)
+        times = jnp.where(d < 0, tau - g / jnp.where(d < 0, d, 1), jnp.inf)
+        times = jnp.where(jnp.abs(times - high) <= nearness(h) * h, jnp.minimum(times, high), times)  # but for rounding
+        within = found.hit & ((times > low) | (times == tau)) & (times <= high)
+        new = jnp.min(jnp.where(within, times, jnp.inf))
+        new = jnp.where(new < jnp.inf, new, (low + high) / 2)
+        near = jnp.abs(times - new) <= nearness(h) * h
+        return low, high, new, near, jnp.abs(new - tau), k + 1
+
+    events = ways.events.still
+    Ldot = events.slope(part.start, part.end, part.rest)
+    tau = jnp.clip(jnp.min(found.place), 0, 1) * part.rest
+    high = jnp.min(jnp.where(found.hit, found.limit, 1)) * part.rest
+    begin = jnp.zeros_like(tau), high, tau, jnp.zeros_like(found.hit), jnp.full_like(tau, jnp.inf), 0
+    _, _, tau, near, *_ = lax.while_loop(unfinished, improve, begin)
+    return tau, near
+
+
+def first_of(events, part, found, near):
+    """The number of the event to be met now, and 1 for it: of those at one time the noted ones are first, for they see
+    the motion as it comes, and one that ends the run is last."""
+    ranks = np.where(events.noted, 0, np.where(events.ends, 2, 1)) * len(events.noted)
+    order = jnp.asarray(ranks + np.arange(ranks.size), jnp.int32)
+    there = near & ~part.passed
+    there = jnp.where(jnp.any(there), there, found.hit & (found.place == jnp.min(found.place)))
+    there = jnp.where(jnp.any(part.due), part.due, there)
+    this = there & (order == jnp.min(jnp.where(there, order, 3 * order.size)))
+    numbers = jnp.arange(order.size, dtype=jnp.int32)
+    return jnp.min(jnp.where(this, numbers, numbers.size)), this.astype(found.place.dtype)
+
+
+def reached(ways, params, part, tau, h):
+    """`go` from the start of a part. Where a guard sees multipliers they go over from a line to those of the step:
+    these are of order 2, but in a very short one they are not those of the start, and a guard must not jump."""
+    s, info = go(ways, params, part.start, tau, part.last, h)
+    if any(ways.events.forced):
+        line = part.start.L + tau * ways.events.slope(part.start, part.end, part.rest)
+        s = s._replace(L=line + tau / jnp.where(part.rest > 0, part.rest, 1) * (s.L - line))
+    return s, info
+
+
+def located(ways, params, part, this, found, tau, h):
+    """The time of an event, with its derivative; of multipliers that have jumped below zero that of the start."""
+    jumped = pick(this, found.jumped.astype(h.dtype)) > 0
+
+    def guard(tau):
+        s, _ = reached(ways, params, part, tau, h)
+        g = pick(this, ways.events.guards(s, params, part.met.over))
+        return jnp.where(jumped, -tau, g) if any(ways.events.forced) else g
+
+    return lax.custom_root(guard, tau, lambda _, tau: tau, lambda g, y: y / g(jnp.ones_like(y)))
+
+
+def improved(x, y, slope, low, high):
+    """A zero by a step of Newton's method from x, where y falls; the middle where it does not, or leaves its bounds."""
+    new = x - y / jnp.where(slope < 0, slope, 1)
+    return jnp.where((slope < 0) & (new >= low) & (new <= high), new, (low + high) / 2)
+
+
+def beside_zero(rate, h, size):
+    """How far from zero a guard may be where its event was found, of numbers of this size."""
+    return 1e-3 * jnp.abs(rate) * h + 1e3 * eps(h) * size
+
+
+def nearness(x):
+    """The part of a step within which two times are one."""
+    return max(TOGETHER, 1e3 * eps(x))
+
+
+def eps(x):
+    """A rounding of 1."""
+    return float(jnp.finfo(x.dtype).eps)
+
+
+def pick(this, x):
+    """The number of this event; others may be anything."""
+    return jnp.sum(jnp.where(this > 0, x, 0))

@@ -1,0 +1,66 @@
+"""Steps that are chosen for one point, while the run over them is of another: how a fit freezes the steps of its runs.
+
+The residuals are evaluated for two points at once, as a batch whose axis has a name. Wherever they simulate under error
+control, inside whatever of jit, vmap and scan, the run takes the first point, and the choice of its steps the second.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.description import is_array
+from hhtjax.numerics.closures import hoisted
+from hhtjax.xla import calls
+
+PAIR = "hhtjax: a run, and the choice of its steps"
+CONTROLLED = {"run_over", "run_recorded", "run_chosen"}  # names of what runs over the steps that have been chosen
+
+
+def with_steps_for(f, x, y):
+    """f(x) of an array x, with the steps of all runs under error control as for y.
+
+    >>> bool(with_steps_for(jnp.sin, jnp.ones(2), jnp.zeros(2))[0] == jnp.sin(1.0))
+    True
+    """
+    pair = jnp.stack([x, lax.stop_gradient(y)])
+    return jax.tree.map(lambda found: found[0], jax.vmap(f, axis_name=PAIR)(pair))
+
+
+def run_and_choice(data):
+    """What a run starts from, and what its steps are chosen for, constant to derivatives: the same, but inside
+    `with_steps_for`."""
+    if not is_pair():
+        return data, lax.stop_gradient(data)
+    both = jax.tree.map(lambda x: lax.all_gather(x, PAIR) if is_array(x) else (x, x), data)
+    run, choice = (jax.tree.map(lambda x, two, i=i: two[i], data, both) for i in (0, 1))
+    return run, lax.stop_gradient(choice)
+
+
+def frozen(f, *args):
+    """f(*args), constant to derivatives also in what f closes over, as a force does over what is differentiated.
+
+    args: the second of `run_and_choice`. To be called inside a jit: it compiles f anew.
+
+    >>> float(jax.grad(lambda x: x * frozen(lambda y: x * y, 5.0))(3.0))
+    15.0
+    """
+    call, closed_over = hoisted(f, *args)
+    return call(run_and_choice(closed_over)[1], *args)
+
+
+def chooses_steps(f, *args):
+    """Whether there are runs under error control in f(*args).
+
+    >>> chooses_steps(jnp.sin, jnp.ones(2))
+    False
+    """
+    return calls(CONTROLLED, f, *args)
+
+
+def is_pair():
+    """Whether both points of `with_steps_for` are here."""
+    try:
+        lax.axis_index(PAIR)
+    except NameError:
+        return False
+    return True

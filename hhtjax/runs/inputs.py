@@ -1,0 +1,588 @@
+"""What a run starts from: the checks of what a user hands over, and the same on vectors."""
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from hhtjax import checks
+from hhtjax.checks import describe, require_function, require_integer, require_number, require_params
+from hhtjax.description import all_concrete, freeze, is_array, is_concrete, is_real, known_now, thaw
+from hhtjax.runs.event_step import nearness
+from hhtjax.runs.loop import GROWTH, loop_of
+from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.systems import zero_order_hold
+from hhtjax.systems.events import Event, Impact, flatten_events, require_times
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.initial_conditions import initial_values, require_consistent, with_known_rows
+from hhtjax.systems.system import FirstOrderSystem, require_masses
+from hhtjax.xla import Programs
+
+
+class Problem(NamedTuple):
+    """A system, how to step it, and from where; params hold no functions, as `freeze` leaves them. output: an `Output`,
+    where a run saves that in place of its path."""
+
+    system: Any
+    stepper: Any
+    q0: Any
+    v0: Any
+    params: Any
+    t0: Any
+    z0: Any
+    output: Any = None
+
+    @classmethod
+    def checked(cls, caller, system, stepper, q0, v0, params, t0, z0):
+        """The same of what a user hands over, or an error that names what is wrong with it."""
+        require_system(caller, system, massless=True)
+        require_stepper(caller, stepper)
+        params = require_params(caller, params)
+        if zero_order_hold.holds(params):
+            require_masses(caller, system, "leave out held inputs, sampled(order=0)")
+        _refuse_checked_axes(caller, q0, v0, params, t0, z0)
+        require_number(caller, "t0", t0, np.isfinite, "be finite")
+        q0, v0, z0 = initial_values(caller, system, q0, v0, z0, level=4)
+        require_capable(caller, system, stepper, q0, v0)
+        if system.friction is not None:
+            system = with_known_rows(caller, system, q0, v0, t0, params, z0)
+        if system.constraint is not None:
+            require_consistent(caller, system, q0, v0, t0, params, stepper.redundant, z0)
+        t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew
+        return cls(system, stepper, q0, v0, params, t0, z0)
+
+    def rates(self):
+        """How many there are, of coordinates: a rotation has three, and nine numbers."""
+        return sum(map(jnp.size, jax.tree.leaves(self.q0 if self.v0 is None else self.v0)))
+
+    def times(self, t):
+        """Times in the dtype of the state."""
+        return jnp.asarray(t).astype(jax.tree.leaves(self.q0)[0].dtype)
+
+    def flat(self):
+        """The system on vectors, q, v, t0 and the params."""
+        params = thaw(self.params)
+        flat, q, v = flatten("simulate", self.system, self.q0, self.v0, self.t0, params, self.z0)
+        return flat, q, v, self.times(self.t0), params
+
+
+def _refuse_checked_axes(caller, *args):
+    """Under `check_vma` of `jax.shard_map` each array says over which axes it varies. Constants must say so too, and
+    those of loops, branches and Jacobians do not here."""
+    for x in jax.tree.leaves(args):
+        kind = getattr(jax.typeof(x), "mat", None) if isinstance(x, Tracer) else None
+        if kind is not None and kind.varying:
+            raise TypeError(
+                f"{caller}: inside `jax.shard_map` with check_vma=True, its default; received arguments that vary over "
+                f"the axes {sorted(kind.varying)}. Write jax.shard_map(..., check_vma=False): the values are the same. "
+                "`sweep` spreads its members over devices by itself."
+            )
+
+
+# ----------------------------------------------------------------------------
+# Steps of sizes that are given, one by one: the checks of what a user hands over.
+
+
+def require_steps(caller, stepper, dt, num_steps, parts=1):
+    """dt, a number or (N,), and the number of steps, each of which may be divided into so many parts."""
+    dt = np.asarray(dt) if isinstance(dt, (list, tuple)) else dt
+    if not (is_array(dt) and dt.ndim):
+        if num_steps is None:
+            raise ValueError(
+                f"{caller}: `num_steps` must be a positive integer; received None. Or give `duration`, or `times`."
+            )
+        num_steps = require_integer(caller, "num_steps", num_steps)
+        if num_steps * parts >= 2**31:
+            most = f"be less than {2**31 // parts}, because steps are counted in 32 bits"
+            raise ValueError(f"{caller}: `num_steps` must {most}; received {num_steps}.")
+        require_number(caller, "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+        return float(dt) if is_concrete(dt) else dt, num_steps  # other number types would be compiled anew
+    if not is_real(dt):
+        raise TypeError(f"{caller}: `dt` must be real numbers; received {dt!r}.")
+    if dt.ndim != 1 or not dt.size:
+        raise ValueError(f"{caller}: `dt` must be a number, or of shape (N,), one step or more; received {dt.shape}.")
+    if num_steps is not None and require_integer(caller, "num_steps", num_steps) != dt.size:
+        raise ValueError(
+            f"{caller}: `num_steps` must be the length of dt, {dt.size}, or left out; received {num_steps}."
+        )
+    if stepper.needs_equal_steps:
+        raise NotImplementedError(
+            f"{caller}: {type(stepper).__name__} needs steps of one size: give `dt` as a number, or another stepper."
+        )
+    if is_concrete(dt):
+        fine = (np.asarray(dt) > 0) & np.isfinite(dt)
+        if not fine.all():
+            bad = int(np.argmin(fine))
+            raise ValueError(f"{caller}: `dt` must be positive and finite; received dt[{bad}] = {dt[bad]}.")
+    return dt, dt.size
+
+
+def require_control_alone(caller, times, num_steps, save_every, extrapolate):
+    """An error unless error control comes with times, and with nothing that belongs to steps of given sizes."""
+    if times is None:
+        raise TypeError(f"{caller}: with dt=adaptive(...), give `times`, (K,), at the last of which the run ends.")
+    others = ("num_steps", num_steps, None), ("save_every", save_every, 1), ("extrapolate", extrapolate, 1)
+    for name, value, default in others:
+        if value != default:
+            raise ValueError(f"{caller}: with dt=adaptive(...), leave `{name}` out; received {value!r}.")
+
+
+def require_steps_to(caller, times, dt, num_steps, save_every, t0):
+    """dt, of the steps that are read off at `times`."""
+    for name, value, default in (("num_steps", num_steps, None), ("save_every", save_every, 1)):
+        if value != default:
+            raise ValueError(f"{caller}: with `times`, leave `{name}` out; received {value!r}.")
+    dt = _require_one_size(caller, dt, "times")
+    if all_concrete((dt, times, t0)) and (times[-1] - t0) / dt >= 2**31:
+        raise ValueError(f"{caller}: `dt` must take fewer than 2^31 steps to times[-1]={times[-1]}; received {dt}.")
+    return dt
+
+
+def _require_one_size(caller, dt, beside):
+    """dt, a number."""
+    if isinstance(dt, (list, tuple)) or (is_array(dt) and dt.ndim):
+        raise NotImplementedError(
+            f"{caller}: with `{beside}`, `dt` must be a number or adaptive(...); received {np.shape(dt)}. Leave "
+            f"`{beside}` out, and read the run off by `interpolate`."
+        )
+    require_number(caller, "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    return float(dt) if is_concrete(dt) else dt
+
+
+def require_one_length(caller, duration, num_samples, **others):
+    """An error where a run gets its length by `duration`, and by something else too."""
+    if duration is None:
+        raise TypeError(f"{caller}: `num_samples` goes with `duration`; received {num_samples!r} alone.")
+    require_number(caller, "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    for name, value in others.items():
+        if value is not None and not (name == "save_every" and value == 1):
+            instead = ": give `num_samples`" if name == "save_every" else ""
+            raise ValueError(f"{caller}: with `duration`, leave `{name}` out{instead}; received {value!r}.")
+    if num_samples is not None:
+        require_integer(caller, "num_samples", num_samples)
+
+
+def steps_within(caller, dtype, dt, duration, num_samples):
+    """dt, num_steps and save_every, with steps that are made smaller, if need be, to land on equal samples."""
+    dt = _require_one_size(caller, dt, "duration")
+    if not all_concrete((dt, duration)):
+        raise TypeError(
+            f"{caller}: with `duration`, `dt` and `duration` must be known, because the number of steps is part of the "
+            "program: give `num_steps`, or take `sweep`, for which they are data."
+        )
+    H = float(duration) / (num_samples or 1)
+    if dt > H * (1 + 1e-6):
+        raise ValueError(
+            f"{caller}: `dt` must be at most {H:.6g}, the distance of the samples (duration={duration:.6g}, "
+            f"num_samples={num_samples or 1}); received {dt:.6g}."
+        )
+    substeps = max(math.ceil(H / dt * (1 - 64 * float(jnp.finfo(dtype).eps))), 1)
+    num_steps = substeps * (num_samples or 1)
+    return float(duration) / num_steps, num_steps, 1 if num_samples is None else substeps
+
+
+class EqualSteps(NamedTuple):
+    """Steps of one size from t0 on. counts: (K,), how many there are from one of some times to the next, the last of
+    them ending at it or beyond; reached: how far they can be read off."""
+
+    dt: Any
+    counts: Any
+    reached: Any
+
+    @classmethod
+    def to(cls, t0, times, dt):
+        """Those to each of the times; none of a traced size that is not positive."""
+        fine, eps = (dt > 0) & jnp.isfinite(dt), 8 * float(jnp.finfo(dt.dtype).eps)
+        h = jnp.where(fine, dt, 1)
+        number = (times - t0) / h
+        rounding = eps * (jnp.abs(number) + jnp.maximum(jnp.abs(times), jnp.abs(t0)) / h)
+        number = jnp.where(fine, jnp.maximum(jnp.ceil(number - rounding), 1), 0).astype(jnp.int32)
+        counts = jnp.maximum(jnp.diff(number, prepend=0), 0)
+        return cls(dt, counts, jnp.where(fine, jnp.inf, t0))
+
+    def loop(self, flat, stepper, q, v, t0, params):
+        """The `Loop` over them."""
+        return loop_of(flat, stepper, q, v, t0, params, self.dt)
+
+
+def refined(dt, k):
+    """k steps in the place of each."""
+    return jnp.repeat(dt / k, k) if jnp.ndim(dt) else dt / k
+
+
+def warn_of_jumps_to(problem, dt, times):
+    """The same of equal steps to the last of these times."""
+    if zero_order_hold.holds(problem.params) and all_concrete((dt, times, problem.t0)):
+        warn_of_jumps_in(problem, dt, int(np.ceil((float(times[-1]) - float(problem.t0)) / float(dt) - 1e-6)), 5)
+
+
+def warn_of_jumps_in(problem, dt, num_steps, level=4):
+    """A warning where a held input jumps within one of these steps, as far as all is known."""
+    if zero_order_hold.holds(problem.params) and all_concrete((dt, problem.t0)):
+        dt, t0 = np.asarray(dt, float), np.asarray(problem.t0, float)
+        times = t0 + np.append(0.0, np.cumsum(dt) if dt.ndim else num_steps * dt)
+        zero_order_hold.warn_of_jumps(
+            "simulate", problem.params, times, lambda H: H * 0 + (1 if dt.ndim else num_steps), level
+        )
+
+
+# ----------------------------------------------------------------------------
+# The checks of events before a run.
+
+
+AT_GUARD = 1e3  # roundings of the terms of a guard that count as zero
+
+
+def require_events(caller, problem, events, step):
+    """The events as a tuple, or an error for what is none, or does not fit the problem. step: the size of the first,
+    of a run under error control what may be; where it is not known, a rate of rounding counts as one."""
+    if isinstance(events, Event) or not isinstance(events, (list, tuple)) or not events:
+        raise TypeError(f"{caller}: `events` must be a list of Event(...); received {events!r}.")
+    for i, event in enumerate(events):
+        if not isinstance(event, Event):
+            raise TypeError(f"{caller}: `events[{i}]` must be an Event(...); received {event!r}.")
+    if not problem.stepper.meets_events:
+        raise NotImplementedError(
+            f"{caller}: {type(problem.stepper).__name__} cannot begin anew behind an event; use hht() or another of "
+            "its family, rosenbrock(), rowda(), rk4() or dopri5()."
+        )
+    require_masses(caller, problem.system, "leave out `events`")
+    for i, event in enumerate(events):
+        _require_shapes(f"{caller}: events[{i}]", problem, event)
+    events = tuple(events)
+    found = known_now(_guards_at_start, problem, events)
+    if found is not None:
+        start = Start(*found)
+        if start.is_at_guard(events).any():
+            start = start._replace(second=known_now(_second_at_start, problem, events))
+        _require_start(caller, events, start, _known_step(step))
+    return events
+
+
+def refused_members(problem_of, arrays, axes, events, steps):
+    """Numbers of those members of a batch that `require_events` refuses for their values, as far as these are known.
+
+    problem_of: arrays -> a member's `Problem`; axes: of the arrays, as for `jax.vmap`; steps: as there, of each member.
+    """
+
+    def of_all(f):
+        return known_now(jax.vmap(lambda arrays: f(problem_of(arrays), events), (axes,)), arrays)
+
+    found = of_all(_guards_at_start)
+    if found is None:
+        return []
+    start = Start(*found)
+    if start.is_at_guard(events).any():
+        start = start._replace(second=of_all(_second_at_start))
+    impacts = np.array([isinstance(event.reset, Impact) for event in events])
+    bad = start.is_beyond(events, _known_step(steps)) | (
+        impacts & (start.on_velocity | ~((start.e >= 0) & (start.e <= 1)))
+    )
+    return np.flatnonzero(bad.any(axis=1))
+
+
+def _known_step(step):
+    """A step, or those of all members, (B, 1); 0 where it is not known."""
+    return np.asarray(step)[..., None] if is_concrete(step) else 0.0
+
+
+def _require_shapes(caller, problem, event):
+    """An error for a guard that is no number, and for what a reset or a switch returns."""
+    params, first_order = thaw(problem.params), isinstance(problem.system, FirstOrderSystem)
+    if event.at is not None:
+        _require_known_times(caller, params, event)
+    at = (problem.q0,) if first_order else (problem.q0, problem.v0) + (() if problem.z0 is None else (problem.z0,))
+    at, dtype = (*at, problem.t0, params), jax.tree.leaves(problem.q0)[0].dtype
+    arguments = "y, t, params" if first_order else "q, v, t, params" if problem.z0 is None else "q, v, z, t, params"
+    guard = _with_multipliers(caller, problem, event)
+    for name, function in (("guard", guard), ("reset", event.reset), ("switch", event.switch)):
+        whole = name != "switch" or event.switch_sees_state
+        if function is not None and not isinstance(function, Impact):
+            require_function(caller, name, function, f"{name}({arguments if whole else 'params'})")
+    if guard is not None:
+        g = checks.evaluate(caller, "guard", guard, *at)
+        if not hasattr(g, "shape") or g.shape not in [(), (1,)]:
+            raise TypeError(f"{caller}: `guard` must return a number; received {describe(g)}.")
+        checks.check_dtype(caller, "guard", g, dtype)
+    if isinstance(event.reset, Impact):
+        _require_impact(caller, params, event.reset, first_order)
+    elif event.reset is not None:
+        name, like = ("q0", problem.q0) if first_order else ("v0", problem.v0)
+        checks.check_like(caller, "reset", checks.evaluate(caller, "reset", event.reset, *at), name, like, dtype)
+    if event.switch is not None:
+        seen = at if event.switch_sees_state else (params,)
+        _require_same(caller, params, checks.evaluate(caller, "switch", lambda *x: freeze(event.switch(*x)), *seen))
+
+
+def _require_known_times(caller, params, event):
+    """An error for known times that are none."""
+    if not callable(event.at):
+        return
+    times = checks.evaluate(caller, "at", event.at, params)
+    if not hasattr(times, "dtype") or not is_real(np.zeros((), times.dtype)) or times.ndim > 1:
+        raise TypeError(f"{caller}: `at` must return a time, or (K,) times; received {describe(times)}.")
+    found = known_now(lambda params: jnp.asarray(event.at(params)), params)
+    if found is not None:
+        require_times(caller, found)
+
+
+def _with_multipliers(caller, problem, event):
+    """The guard as a function without multipliers, which it may see."""
+    if not event.sees_multipliers:
+        return event.guard
+    system = problem.system
+    if system.constraint is None:
+        raise ValueError(f"{caller}: the `guard` asks for `multipliers`, and the system has no constraint.")
+    if isinstance(event.reset, Impact):
+        raise ValueError(f"{caller}: the `guard` of an impact must depend on q and t only, not on multipliers.")
+    if problem.stepper.options.formulation == "index3":
+        raise NotImplementedError(
+            f'{caller}: the `guard` asks for `multipliers`, and with formulation="index3" those of a step that is '
+            "divided are of order 0: leave `formulation` out."
+        )
+    at = problem.q0, problem.t0, thaw(problem.params)
+    m, dtype = (
+        checks.evaluate(caller, "constraint", system.constraint, *at).shape,
+        jax.tree.leaves(problem.q0)[0].dtype,
+    )
+    return partial(event.guard, multipliers=jnp.zeros(m, dtype))
+
+
+def _require_impact(caller, params, law, first_order):
+    """An error for an impact that has no velocity to change, or no restitution."""
+    if first_order:
+        raise TypeError(
+            f"{caller}: an impact needs velocities, and a FirstOrderSystem has none: give reset(y, t, params)."
+        )
+    e = law.restitution
+    if isinstance(e, str) and not (isinstance(params, dict) and e in params):
+        raise ValueError(f"{caller}: `restitution` of the impact must be the name of one in params; received {e!r}.")
+    e = law.coefficient(params)
+    require_number(caller, "restitution", e, lambda e: 0 <= e <= 1, "lie in [0, 1]")
+
+
+def _require_same(caller, params, after):
+    """An error for params that a switch has given another form."""
+    before = freeze(params)
+    if jax.tree.structure(before) != jax.tree.structure(after):
+        raise TypeError(
+            f"{caller}: `switch` must return params like its own, {describe(before)}; received {describe(after)}."
+        )
+    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True):
+        if jnp.shape(x) != y.shape or jnp.result_type(x) != y.dtype:
+            raise TypeError(
+                f"{caller}: `switch` must keep shapes and dtypes; params{jax.tree_util.keystr(path)} was "
+                f"{describe(x)}, and became {describe(y)}."
+            )
+
+
+class Start(NamedTuple):
+    """What is known of all guards where a run starts: g and dg/dt, what g is the sum of, whether it depends on v, the
+    restitution, 0 without, and d2g/dt2, where that was asked for."""
+
+    g: Any
+    rate: Any
+    terms: Any
+    on_velocity: Any
+    e: Any
+    second: Any = 0.0
+
+    def is_at_guard(self, events):
+        """Of each event, whether its guard is zero but for rounding: (..., E)."""
+        numbers = np.finfo(self.g.dtype)
+        zero = np.abs(self.g) <= AT_GUARD * numbers.eps * np.maximum(self.terms, numbers.tiny)
+        return zero & _is_guarded(events)
+
+    def is_beyond(self, events, step):
+        """Whether the start is beyond its guard, or at it and not leaving: (..., E). Of a motion that is back at its
+        guard within a rounding of a step the acceleration tells."""
+        soon = nearness(self.g) * step * np.abs(self.second)
+        leaves = np.where(np.abs(self.rate) <= soon, np.greater(self.second, 0), self.rate > 0)
+        return _is_guarded(events) & ~(self.g > 0) & ~(self.is_at_guard(events) & leaves)
+
+
+def _is_guarded(events):
+    """Whether an event has a guard that a motion must not be beyond."""
+    return np.array([not event.is_noted and event.guard is not None for event in events])
+
+
+@Programs
+def _guards_at_start(problem, events):
+    """What `Start` tells, but for d2g/dt2."""
+    flat, q, v, t0, params = problem.flat()
+    flat_events = flatten_events(flat, events, params, (q, v, t0), problem.stepper.redundant)
+    start, over = _begun(problem, flat, q, v, t0, params), flat_events.before_any(t0)
+    Ldot = None if start.L is None else jnp.zeros_like(start.L)
+    g, rates = flat_events.rates(flat, start, params, over, Ldot)
+    along_q, along_v = (
+        jax.jacfwd(f)(x)
+        for f, x in (
+            (lambda q: flat_events.guards(start._replace(q=q), params, over), q),
+            (lambda v: flat_events.guards(start._replace(v=v), params, over), v),
+        )
+    )
+    terms = jnp.sum(jnp.abs(along_q * q[None, :]), axis=1)
+    if any(flat_events.forced):
+        along_L = jax.jacfwd(lambda L: flat_events.guards(start._replace(L=L), params, over))(start.L)
+        size = jnp.max(jnp.abs(flat.force(q, v, t0, params)))  # that of what the multipliers are the difference of
+        terms = terms + jnp.sum(jnp.abs(along_L), axis=1) * size
+    laws = [event.reset if isinstance(event.reset, Impact) else Impact(0.0) for event in events]
+    e = jnp.stack([jnp.asarray(law.coefficient(params)).astype(q.dtype) for law in laws])
+    return g, rates, terms, jnp.any(along_v != 0, axis=1), e
+
+
+@Programs
+def _second_at_start(problem, events):
+    """d2g/dt2 of all events, along the motion from the start."""
+    flat, q, v, t0, params = problem.flat()
+    flat_events = flatten_events(flat, events, params, (q, v, t0), problem.stepper.redundant)
+    over = flat_events.before_any(t0)
+
+    def along(f):
+        def rate(q, v, t):
+            s = _begun(problem, flat, q, v, t, params)
+            return jax.jvp(f, (q, v, t), (flat.rate(q, v), s.w, jnp.ones_like(t)))[1]
+
+        return rate
+
+    def guards(q, v, t):
+        return flat_events.guards(_begun(problem, flat, q, v, t, params), params, over)
+
+    return along(along(guards))(q, v, t0)
+
+
+def _begun(problem, flat, q, v, t, params):
+    """The state at the start."""
+    size = jnp.ones_like(t)
+    return problem.stepper.astype(v.dtype).begin(flat, q, v, t, zero_order_hold.before(params, t, size), size)
+
+
+def _require_start(caller, events, start, step):
+    """An error for a start beyond a guard, and an impact along a velocity."""
+    beyond, at_guard = start.is_beyond(events, step), start.is_at_guard(events)
+    for i, event in enumerate(events):
+        if isinstance(event.reset, Impact) and start.on_velocity[i]:
+            raise ValueError(f"{caller}: events[{i}]: the `guard` of an impact must depend on q and t only, not on v.")
+        if beyond[i]:
+            rests = f" and the second derivative {start.second[i]:.6g}" if at_guard[i] else ""
+            raise ValueError(
+                f"{caller}: the start is beyond the guard of events[{i}]: it is {start.g[i]:.6g}, with the rate "
+                f"{start.rate[i]:.6g}{rests}; it must be positive, or zero and rising."
+            )
+
+
+# ----------------------------------------------------------------------------
+# The times at which a sweep is sampled: the checks of what a user hands over, and the steps that land on them.
+
+
+def require_one_grid(stepper, duration, num_samples, times):
+    """An error unless the samples are given in one of the two ways, and in one that the stepper can step on."""
+    given = [x is not None for x in (duration, num_samples, times)]
+    if given not in ([True, True, False], [False, False, True]):
+        raise TypeError(
+            "sweep: give `duration` and `num_samples`, or `times` alone; "
+            f"received duration={duration!r}, num_samples={num_samples!r}, times={times!r}."
+        )
+    if times is not None:
+        if stepper.needs_equal_steps:
+            raise NotImplementedError(
+                f"sweep: {type(stepper).__name__} needs steps of one size, which differ between `times`: give "
+                "`duration` and `num_samples`, or another stepper."
+            )
+        return
+    require_integer("sweep", "num_samples", num_samples)
+    require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+
+
+def equal_times(t0, duration, num_samples):
+    """The times of so many samples at equal distances."""
+    return t0 + duration * np.arange(1, num_samples + 1) / num_samples
+
+
+def require_sample_times(times, t0, dtype, caller="sweep"):
+    """times (K,) in the dtype of the state, in which they must increase, checked as far as they are known."""
+    times = times if is_array(times) else np.asarray(times)
+    if not is_real(times):
+        raise TypeError(f"{caller}: `times` must be real numbers; received {times!r}.")
+    if times.ndim != 1 or not times.size:
+        raise ValueError(f"{caller}: `times` must have shape (K,), one or more; received {times.shape}.")
+    if not is_concrete(times):
+        return times
+    times = np.asarray(times).astype(dtype)
+    if not np.all(np.isfinite(times)):
+        bad = int(np.argmin(np.isfinite(times)))
+        raise ValueError(f"{caller}: `times` must be finite; received times[{bad}] = {times[bad]}.")
+    before = np.full(1, t0 if is_concrete(t0) else -np.inf, dtype)
+    late = np.diff(times, prepend=before) > 0
+    if not late.all():
+        bad = int(np.argmin(late))
+        last = f"times[{bad - 1}] = {times[bad - 1]}" if bad else f"t0 = {before[0]}"
+        at_start = " Leave t0 out: the start is saved in any case." if not bad and times[0] == before[0] else ""
+        raise ValueError(
+            f"{caller}: `times` must be strictly increasing, and after t0, in {times.dtype}; "
+            f"received times[{bad}] = {times[bad]} after {last}.{at_start}"
+        )
+    return times
+
+
+def require_step_sizes(dts):
+    """dts as an array (B,)."""
+    dts = dts if is_array(dts) else np.asarray(dts)
+    if not is_real(dts):
+        raise TypeError(f"sweep: `dts` must be real numbers; received {dts!r}.")
+    if dts.ndim != 1 or not dts.size:
+        raise ValueError(f"sweep: `dts` must have shape (B,), one step size for each member; received {dts.shape}.")
+    return dts
+
+
+def require_steps_within(dts, start, end, num_samples=None):
+    """An error for step sizes that are not positive, take too many steps, or exceed the distance of equal samples."""
+    if not all_concrete((dts, start, end)):
+        return
+    h, span = np.asarray(dts, float), float(end) - float(start)
+    limit, at_most = np.inf, ""
+    if num_samples is not None:
+        limit = span / num_samples
+        at_most = (
+            f", and at most {limit:.6g}, the distance of the samples (duration={span:.6g}, num_samples={num_samples})"
+        )
+    fine = (h > 0) & (h <= limit * (1 + 1e-6))
+    if not fine.all():
+        bad = int(np.argmin(fine))
+        raise ValueError(f"sweep: `dts` must be positive{at_most}; received dts[{bad}] = {h[bad]:.6g}.")
+    if span / h.min() >= 2**31:
+        raise ValueError(f"sweep: `dts` must take fewer than 2^31 steps; received dts[{h.argmin()}] = {h.min():.6g}.")
+
+
+def fit_to_samples(dts, H):
+    """The numbers of steps between two samples, and the step sizes; NaN where a traced dt is not in (0, H]."""
+    slack = 64 * float(jnp.finfo(dts.dtype).eps)
+    return _fit(dts, H, (dts > 0) & (dts <= H * (1 + 1e-6)), slack)
+
+
+def fit_to_times(dts, times):
+    """The same for each interval, (B, K); NaN where a traced dt is not positive, or a time not after the last."""
+    H, eps = jnp.diff(times), float(jnp.finfo(dts.dtype).eps)
+    increasing = (H > 0) & jnp.isfinite(H)
+    H = jnp.where(increasing, H, 1)
+    size = jnp.where(increasing, jnp.maximum(jnp.abs(times[1:]), jnp.abs(times[:-1])), 0)
+    slack = eps * (64 + 4 * size / H)  # H is a difference of rounded times
+    return jax.vmap(lambda dt: _fit(dt, H, (dt > 0) & increasing, slack))(dts)
+
+
+def may_grow(dts, t0, times):
+    """Whether steps may be too long behind the one before, as far as all is known: one after a short interval."""
+    if not all_concrete((dts, t0, times)):
+        return True
+    H = np.diff(np.asarray(times, float), prepend=float(t0))
+    return bool(np.any(np.minimum(H[1:], np.max(dts)) > GROWTH * H[:-1]))
+
+
+def _fit(dts, H, fine, slack):
+    """The least numbers of steps in H that are no longer than dts, but for the slack, and their sizes."""
+    substeps = jnp.maximum(jnp.ceil(H / jnp.where(fine, dts, H) * (1 - slack)), 1).astype(jnp.int32)
+    return substeps, jnp.where(fine, H / substeps.astype(dts.dtype), jnp.nan)

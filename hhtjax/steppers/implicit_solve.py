@@ -1,0 +1,361 @@
+"""How a step is solved: by one linearisation, or by Newton's iteration."""
+
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from hhtjax.numerics import dense_lu
+from hhtjax.numerics.batched_cond import choose, derivative_of, seldom
+from hhtjax.numerics.closures import hoisted
+from hhtjax.numerics.dense_lu import by_factors, diagonal
+from hhtjax.numerics.differentiable_while import implicit_root
+from hhtjax.numerics.linear_solve import Trusted, factorize_map, invert_and_bound, reuse, solve_map
+from hhtjax.numerics.low_rank import Constant, around
+from hhtjax.numerics.sparse_solve import changing, kept
+from hhtjax.steppers.residual import residual
+from hhtjax.steppers.stepper import Info, State
+from hhtjax.systems import kinematics
+from hhtjax.systems.flat_system import Factors
+from hhtjax.xla import staged, traced
+
+RELATIVE = 1e-6  # of the terms of a row, above which its residual is never small; nor above what `tolerance` is of 1
+SHAKE, NOISE, SHAKES = 2, 32, 3  # roundings by which a state is changed; how much more than that passes; how often
+
+
+def linearized_solve(r, path, w, factorize, at=None, again=False):
+    """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)), and its `Info`.
+
+    One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's. again: one solve
+    more, of the residual at the end, which becomes `Info.defect`.
+    """
+    w, info, *_ = solve_and_keep(r, path, w, factorize, at, again)
+    return w, info
+
+
+def solve_and_keep(r, path, w, factorize, at=None, again=False):
+    """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
+    expansion = Expand(partial(linearize_rows, r), partial(jax.linearize, path), w)(at)
+    return *solve_expanded(r, path, w, factorize, again, expansion), expansion.along
+
+
+def linearized(f, x, linearize=jax.linearize):
+    """f(x) and its tangent there; a word where a callback has no derivative."""
+    with callbacks_named():
+        return linearize(f, x)
+
+
+@contextmanager
+def callbacks_named():
+    """Says which derivatives are needed, where a callback has none."""
+    try:
+        yield
+    except ValueError as error:
+        if "callbacks do not support JVP" not in str(error):
+            raise
+        raise ValueError(
+            "this stepper needs the derivatives of the force (and mass and constraint) in q and v, and in t where it "
+            "is `rosenbrock` or meets events; `jax.pure_callback` and `io_callback`, which are called there, have "
+            "none. Give them some by `jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
+        ) from error
+
+
+def linearize_rows(r, s, linearize=jax.linearize):
+    """r and its tangent about a state s, for changes that leave the time as it is.
+
+    Where r cannot be differentiated, as with a `jax.pure_callback` of the time, the time is held.
+    """
+    try:
+        return linearize(r, s)
+    except ValueError:
+        return linearized(lambda x: r(x._replace(t=s.t)), s, linearize)
+
+
+class Expansion(NamedTuple):
+    """Of r about a state. value: of r at path(w), by its tangent there; here: r there; along: the tangent of path."""
+
+    value: Any
+    at: Any
+    tangent: Any
+    along: Any
+    here: Any
+
+
+class Expand:
+    """State -> the `Expansion` about it, or about path(w) for None. r, path: what `jax.linearize` makes of them."""
+
+    def __init__(self, r, path, w):
+        self.r, self.path, self.w = r, path, w
+        self.predicted, self.other = staged(self._predicted, w.size), staged(self._other, w.size)
+
+    def __call__(self, at=None, first=None):
+        """The `Expansion`; first: that about path(w) where it is known, and with it the path."""
+        if at is None:
+            return Expansion(*self.predicted(self.w))
+        start, along = staged(self.path, self.w.size)(self.w) if first is None else (first.at, first.along)
+        value, tangent, here = self.other(start, at)
+        return Expansion(value, at, tangent, along, here)
+
+    def _predicted(self, w):
+        start, along = self.path(w)
+        here, tangent = self.r(start)
+        return here, start, tangent, along, here
+
+    def _other(self, start, at):
+        here, tangent = self.r(at)
+        return here + tangent(jax.tree.map(jnp.subtract, start, at)), tangent, here
+
+
+def solve_expanded(r, path, w, factorize, again, expansion):
+    """w1 with r(path(w1)) = 0 by the expansion, its `Info`, and the solve."""
+    value, at, tangent, along, _ = expansion
+
+    def f(dw):
+        return tangent(along(dw))
+
+    factorize = around(factorize, lambda: (at, along))
+    inverse = factorize_map(f, value, factorize)
+    dw = inverse(value)
+    w1, info = w - dw, told(factorize, left_by(factorize, f, value, dw))
+    return w1, info._replace(defect=inverse(staged(r, w.size)(path(w1)))) if again else info, inverse
+
+
+def left_by(factorize, f, b, x):
+    """What x leaves of b = f(x), relative to it; None for the library's own solve, which needs no proof."""
+    return factorize.leaves(f, b, x) if isinstance(factorize, Trusted) else None
+
+
+def told(factorize, left, info=Info()):  # noqa: B008 (a tuple)
+    """The `Info` of a step with a solve that left so much."""
+    return info if left is None else info._replace(solve_residual=left, solved=factorize.accepts(left))
+
+
+def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
+    """Newton on r(path(w)) from w, s being the state before, until each row of r is small beside its own terms:
+
+        |r_i| <= tolerance and |r_i| <= relative (|A| |w|)_i,    or each is no larger than rounding makes it,
+
+    relative being RELATIVE, or the tolerance if that is less: so units in which all terms are small do not loosen it.
+
+    So no row is measured by the forces of another. The second is asked where an iteration no longer halves a row.
+
+    Differentiated by the implicit-function theorem, forward and reverse.
+    """
+
+    relative = jnp.minimum(RELATIVE, jnp.maximum(tolerance, SHAKE * NOISE * float(jnp.finfo(w.dtype).eps)))
+
+    def f(w):
+        return r(path(w))
+
+    def search(w):
+        def unfinished(carry):
+            _, value, iterations, converged, _ = carry
+            return ~converged & (iterations < max_iterations) & jnp.all(jnp.isfinite(value))
+
+        def improve(carry):
+            w0, _, iterations, _, left = carry
+            before, tangent = staged(partial(linearized, f), w.size)(w0)
+            here = around(factorize, lambda: jax.linearize(path, w0))
+            inverse, terms = invert_and_bound(tangent, w, here)
+            dw = inverse(before, trans=0)
+            w1 = w0 - dw
+            value = f(w1)
+            limit = jnp.minimum(tolerance, relative * terms(w1))
+            large = jnp.abs(value) > limit
+            stalled = jnp.any(large & (jnp.abs(value) > 0.5 * jnp.abs(before)))
+            small = ~jnp.any(large) | is_rounding(system, r, s, path(w1), value, limit, stalled)
+            if isinstance(factorize, Trusted):
+                left = jnp.maximum(left, factorize.leaves(tangent, before, dw))
+            return w1, value, iterations + 1, small, left
+
+        left = jnp.zeros((), w.dtype) if isinstance(factorize, Trusted) else None
+        begin = w, jnp.zeros_like(w), jnp.zeros((), jnp.int32), jnp.array(False), left
+        w, value, iterations, converged, left = lax.while_loop(unfinished, improve, begin)
+        # as floats: integers have no tangents, which an evaluation on scalars cannot hand on
+        return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype), left)
+
+    def tangent_solve(g, y):
+        return solve_map(g, y, factorize)
+
+    w, (size, iterations, converged, left) = implicit_root(f, w, search, tangent_solve)
+    return w, told(factorize, left, Info(size, iterations.astype(jnp.int32), converged > 0))
+
+
+def is_rounding(system, r, s0, s1, value, limit, ask):
+    """If asked, whether each row of r is below its limit, or changes by as much where s1 is rounded otherwise.
+
+    A loop, and no condition: of those that vmap makes it takes the steps that some member needs.
+    """
+    sizes = term_sizes(system, s0, s1)
+
+    def unsettled(carry):
+        i, allowed = carry
+        return ask & (i < SHAKES) & ~jnp.all(jnp.abs(value) <= allowed)
+
+    def shake(carry):
+        i, allowed = carry
+        shaken = s1._replace(**{name: getattr(s1, name) + _shake(size, i) for name, size in sizes.items()})
+        return i + 1, jnp.maximum(allowed, NOISE * jnp.abs(r(shaken) - value))
+
+    _, allowed = lax.while_loop(unsettled, shake, (jnp.zeros((), jnp.int32), limit))
+    return ask & jnp.all(jnp.abs(value) <= allowed)
+
+
+def term_sizes(system, s0, s1):
+    """Sizes of what the numbers of the state s1, reached from s0, are sums of, and their roundings relative to."""
+    h = s1.t - s0.t
+    w = jnp.abs(s0.w) + jnp.abs(s1.w)
+    v = jnp.abs(s0.v) + jnp.abs(s1.v) + h * w
+    sizes = {"q": kinematics.terms(system.blocks, s0.q, s1.q, system.located(h * v)), "v": v, "w": w}
+    return sizes if s1.L is None else sizes | {"L": jnp.abs(s0.L) + jnp.abs(s1.L)}
+
+
+def _shake(size, i):
+    """A few roundings, of both signs and uneven, so that equal terms do not cancel; others for each i."""
+    k, golden = np.arange(size.size), 0.618034
+    first = (0.75 + golden * k % 0.5) * np.where(k % 2, -1, 1)
+    more = (0.75 + golden**2 * k % 0.5) * np.where(k % 3, 1, -1)
+    unit = SHAKE * float(jnp.finfo(size.dtype).eps)
+    return size * (jnp.asarray(unit * first, size.dtype) + i.astype(size.dtype) * jnp.asarray(unit * more, size.dtype))
+
+
+# ----------------------------------------------------------------------------
+# The matrix of the step of a linear system, or of the linear part of one, factorised once for a whole run.
+
+
+def factorized_once(method, system, params, dt):
+    """The factorised matrix of a linear system, in the place of `factorize`."""
+    if system.knows_matrices and method.options.solve is None:
+        return kept(step_matrix(method, system, params, dt))
+    known = known_inverse(system)
+    return reuse(method.factorize, known or method.factorize(step_matrix(method, system, params, dt)))
+
+
+def known_inverse(system):
+    """The solve with the matrix of the step, where its factors are known."""
+    return None if system.factors is None else by_factors(system.factors.step)
+
+
+def factors_of(method, start, system, dt):
+    """The `Factors` of a linear system of constant matrices; start: the method with whose matrix a run starts."""
+    if method.options.solve is not None:
+        return None
+    step, first = (dense_lu.lu(step_matrix(x, system, None, dt)) for x in (method, start))
+    M = system.mass(jnp.zeros(system.size, dt.dtype), 0 * dt, None)
+    return Factors(None if M.ndim == 1 else dense_lu.lu(M), first, step)
+
+
+def linear_part(method, system, params, dt):
+    """A `Changing` that knows the linear part, and adds the Jacobian of a force beside it at each state.
+
+    None where there is no such part to be kept; also of a linear system without friction, for which it is all.
+    """
+    local = system.local
+    if method.options.solve is not None:
+        return None
+    if local is not None:
+        return with_local(step_matrix(method, local.linear, params, dt), local, params, known_inverse(system))
+    if system.linear and system.friction is not None:
+        return Constant(step_matrix(method, system, params, dt), known_inverse(system))
+    return None
+
+
+def with_local(A, local, params, inverse=None):
+    """The `Changing` of the matrix of the linear part, and the Jacobian of the force beside it."""
+
+    def slope(s):
+        return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
+
+    if A.ndim == 1 and local.size is None:  # the force beside it has a full Jacobian
+        A = jnp.diag(A)
+    return changing(A, slope, local.spread, local.size, inverse)
+
+
+def step_matrix(method, system, params, dt):
+    """The matrix of the step of a linear system; a diagonal one (n,)."""
+    zero = jnp.zeros(1 if system.knows_matrices else system.size, dt.dtype)
+    rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
+    path = partial(method.arrive, system, rest, dt)
+    if system.knows_matrices:
+        _, change = jax.jvp(path, (zero,), (jnp.ones_like(zero),))  # the same for every unknown
+        return system.step_matrix(params, change.w[0], change.v[0], change.q[0])
+    return jax.jacfwd(lambda w: residual(system, params, path(w)))(zero)
+
+
+# ----------------------------------------------------------------------------
+# The state about which the non-iterative step expands its residual: where it is worth the most.
+
+
+HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
+
+
+def linearized_step(system, params, r, path, s, dt, factorize, where, again=False):
+    """w at t + dt by one linearisation of r, about the state that `where` says, and its `Info`."""
+    if where == "predictor":
+        return linearized_solve(r, path, s.w, factorize, None, again)
+    now = s._replace(t=s.t + dt)
+    if where == "state":
+        return linearized_solve(r, path, s.w, factorize, now, again)
+    held = now._replace(q=system.move(s.q, dt * s.v))
+    if where == "held":
+        return linearized_solve(r, path, s.w, factorize, held, again)
+
+    # each traced once, for both states that r is expanded about
+    rows = partial(linearize_rows, r, linearize=linearize)
+    expand = Expand(traced(rows, now), traced(partial(linearize, path), s.w), s.w)
+
+    @jax.jit
+    def solution(expansion):
+        return solve_expanded(r, path, s.w, factorize, again, expansion)[:2]
+
+    def about(at, first=None):
+        expansion = expand(at, first)
+        return *solution(expansion), expansion
+
+    D = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
+    limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
+    ways = path(s.w), held, lambda r: jnp.sum(r * (r / D)), limit
+    # derivatives by one expansion about the state that was chosen: through both they would take longer to compile
+    return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better_solve(about, *ways[1:]))
+
+
+def linearize(f, x):
+    """As JAX does it, with a tangent that can leave a jit, and is traced once, however often it is called."""
+    value, tangent = jax.linearize(f, x)
+    call, constants = hoisted(tangent, x)
+    return value, jax.tree_util.Partial(call, constants)
+
+
+def better_state(r, predicted, held, size, limit):
+    """The predicted state; or the held one, where the residual at the predicted is large, and the larger one."""
+    size = staged(lambda s, size=size: size(r(s)))
+    predicted_size = size(predicted)
+    use_predictor = lax.cond(predicted_size <= limit, lambda: jnp.array(True), lambda: predicted_size <= size(held))
+    return choose(use_predictor, predicted, held)
+
+
+def better_solve(about, held, size, limit):
+    """The solution about that state, with a second evaluation of r only where the first residual is large.
+
+    A branch around it all, and no choice of a state before it: the processor goes on while it waits for the residual.
+    """
+    w, info, first = about(None)
+    predicted_size = size(first.here)
+
+    def better(found):
+        w, info, expansion = about(held, first)
+        return choose(predicted_size <= size(expansion.here), found, (w, info))
+
+    return seldom(better, ~(predicted_size <= limit), (w, info))
+
+
+def refresh(system, params, c, s, factorize):
+    """The state with the acceleration that its q and v ask for, w = M^-1 Q, and what the solve left."""
+    Q = system.force(s.q, s.v, s.t, params)
+    w = system.acceleration(s.q, s.v, s.t, params, factorize)
+    left = left_by(factorize, lambda w: system.inertia(s.q, w, s.t, params), Q, w)
+    return s._replace(w=w, a=s.a + (1 - c.alpha_f) / (1 - c.alpha_m) * (w - s.w)), told(factorize, left)

@@ -1,0 +1,178 @@
+"""Steps of unequal size that keep order 2: the generalised-alpha family after a change of the step.
+
+The algorithmic acceleration a_n belongs to the time t_n + s h_old, s = alpha_m - alpha_f and h_old the step before. A
+step h = r h_old expects it at t_n + s h, and has an error of O(h) in a, of order 1 in the end. Two rules mend that,
+without a solve; both leave r = 1 as it is:
+
+    r <= 1    a is moved:  a := w + r (a - w)
+    r > 1     a stays, and the coefficients of this step know where it is, with sigma = s/r:
+              gamma = (1/2 - sigma)/(1 + s - sigma),  beta = (gamma + 1/2)^2/4,
+              alpha_f := alpha_f + alpha_m (s - sigma)
+
+The first alone makes steps that grow and shrink in turn unstable; the second alone loses half an order with index 3.
+Where r = 1 the rules meet: a derivative in the step sizes is there that of one side, off by O(h^3).
+For s = 0 (Newmark, the trapezoidal rule) there is nothing to mend. Steps that grow by more than 2 at once can make
+strongly damping methods (rho near 0) unstable. In index-3 form multipliers are of order 1.4 only where steps change;
+in GGL form, the default, of order 2.
+
+Without damping (alpha = 0, rho_inf = 1) constraints leave w and the multipliers one weakly stable mode: a step from
+known v has w1 = -w + 2 (v1 - v)/h, errors e1 = -e - h^2 w''/6. Equal steps keep e near -h^2 w''/12; each change of
+h^2 adds to what alternates, for ever. Of random steps that is a random walk: with 80 % of jitter (a pendulum in GGL
+form, 100 to 6400 steps) w is of order 1.47 and L of 1.43; q and v are of order 2.03, as are the means of w and L over
+both ends of a step (2.01, 2.02). With alpha = -0.05 w and L are of order 1.98 and 1.97: damp, where they matter.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.description import is_concrete
+from hhtjax.steppers.residual import Coefficients, weighted
+
+
+class Resizing:
+    """What the family does when the step changes: the two rules above."""
+
+    coefficients: Coefficients
+
+    @property
+    def resizes(self):
+        """Whether there is anything to mend, alpha_m != alpha_f; a tracer may be."""
+        shift = self.coefficients.alpha_m - self.coefficients.alpha_f
+        return not (is_concrete(shift) and shift == 0)
+
+    def resized(self, state, r):
+        """The method and the state for a step r times as long as the one before."""
+        if not self.resizes:
+            return self, state
+        return replace(self, coefficients=adapted(self.coefficients, r)), moved(state, r)  # pyright: ignore[reportArgumentType]
+
+
+def moved(state, r):
+    """The state with a where steps r times as long expect it, for r <= 1; of vectors or of pytrees."""
+    shrunk = jnp.minimum(r, 1) - 1
+
+    def move(a, w):
+        return a + shrunk.astype(jnp.result_type(a)) * (a - w)
+
+    w = state.v if state.w is None else state.w  # of a first-order system as its user sees it
+    a = jax.tree.map(move, state.a, w)
+    return state._replace(a=a, za=None if state.za is None else jax.tree.map(move, state.za, state.zdot))
+
+
+def adapted(c, r):
+    """The coefficients of a step r times as long as the one before, for r > 1."""
+    s = c.alpha_m - c.alpha_f
+    grown = jnp.maximum(r, 1)
+    gamma = (grown / 2 - s) / (grown * (1 + s) - s)  # not through sigma, a division to wait for
+    new = Coefficients(c.alpha_m, c.alpha_f + weighted(c.alpha_m, s - s / grown), (gamma + 0.5) ** 2 / 4, gamma)
+    return c._replace(**{
+        name: jnp.where(grown > 1, getattr(new, name), getattr(c, name)) for name in ("alpha_f", "beta", "gamma")
+    })  # fmt: skip
+
+
+# ----------------------------------------------------------------------------
+# The error of a step, estimated without a further factorisation: what error control is made of.
+#
+# Local errors of the generalised-alpha family, s = alpha_m - alpha_f (for the next two lines see Arnold, Bruls 2007):
+#
+#     e_q = c_q h^2 (w1 - w),    c_q = beta + s/2 - 1/6
+#     e_v = c_v h^3 w'',         c_v = 1/12 - s^2/2 + s (alpha_m + alpha_f - 1)/2
+#
+# w'' is the second divided difference of w over this step and the one before. Both take the end of the step at its
+# word. A linearisation may have missed what is there, a contact say; so the residual at the end goes through the same
+# factors,
+#
+#     d = -S^-1 r(q1, v1, w1, t1),    e_q := |e_q| + beta k h^2 |d|,  e_v := |e_v| + gamma k h |d|,
+#     k = (1 - alpha_f)/(1 - alpha_m)
+#
+# for one more residual and substitution. Where dry friction switches, w jumps: the jump is taken off w1 first, which so
+# belongs to the branch of w, and r has the friction that the step found. What stays is the change of the other forces
+# over the step: it must be resolved on both sides of the switch, whose time is found by lines. At a jump of a held
+# input w jumps between two steps; its slope, of which w'' is made, does not, but for dampers.
+#
+# Methods of several stages have an embedded one of lower order instead, and those with a matrix g h d and g^2 h^2 d
+# besides.
+
+
+class Errors(NamedTuple):
+    """Of a step, (N,): of the displacement, whose entries beyond the positions mean nothing, and of the rates."""
+
+    q: Any
+    v: Any
+
+
+class Past(NamedTuple):
+    """What the estimate of the family remembers of the step before: (w1 - w)/h, and h, which is 0 before the first."""
+
+    slope: Any
+    h: Any
+
+
+class Controlled(Resizing):
+    """The generalised-alpha family under error control."""
+
+    coefficients: Coefficients
+    order: int
+    options: Any
+
+    @property
+    def estimate_order(self):
+        """3, for methods of order 2."""
+        return 3 if self.order == 2 else None
+
+    def begin_estimates(self, system, state):
+        """No step before."""
+        return Past(jnp.zeros_like(state.w), jnp.zeros_like(state.t))
+
+    def bind_estimated(self, system, params, dt, past):
+        """State -> State, Info, Errors, Past, by the formulas above."""
+        asks = not system.linear and self.options.iterations is not None  # else nothing is left at the end
+        asks = asks or system.friction is not None  # what switched
+        step = replace(self, estimating=asks).bind(system, params, dt)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+        def estimated(s):
+            s1, info = step(s)
+            w1 = s1.w if info.switched is None else s1.w - info.switched
+            errors, now = family_errors(self.coefficients, dt, s.w, w1, past, info.defect)
+            return s1, info._replace(defect=None, switched=None), errors, now
+
+        return estimated
+
+
+def family_errors(c, h, w, w1, past, d):
+    """The errors of a step from the accelerations w to w1, and what is to be remembered; d: S^-1 r, or None."""
+    s = c.alpha_m - c.alpha_f
+    rate = 1 / h
+    slope = (w1 - w) * rate
+    jerk = jnp.where(past.h > 0, 2 / (h + past.h), rate / 2) * (slope - past.slope)  # which is 0 before the first
+    e_q = jnp.abs((c.beta + s / 2 - 1 / 6) * h**2 * (w1 - w))
+    e_v = jnp.abs((1 / 12 - s**2 / 2 + s * (c.alpha_m + c.alpha_f - 1) / 2) * h**3 * jerk)
+    if d is not None:
+        k = (1 - c.alpha_f) / (1 - c.alpha_m) * jnp.abs(d[: w.size])  # multipliers are behind
+        e_q, e_v = e_q + c.beta * h**2 * k, e_v + c.gamma * h * k
+    return Errors(e_q, e_v), Past(slope, h)
+
+
+class Embedded:
+    """A method of several stages, among which is one of lower order: their difference is the estimate."""
+
+    def begin_estimates(self, system, state):
+        """Nothing is remembered."""
+        return ()
+
+    def bind_estimated(self, system, params, dt, past):
+        """State -> State, Info, Errors, ()."""
+        step = self.bind_pair(system, params, dt)
+
+        def estimated(s):
+            s1, info, errors = step(s)
+            return s1, info, errors, ()
+
+        return estimated
+
+    def bind_pair(self, system, params, dt) -> Any:
+        """State -> State, Info, Errors."""
+        raise NotImplementedError
