@@ -24,7 +24,7 @@ import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import is_array, is_real
-from hhtjax.xla import Bilinear, Family, structural
+from hhtjax.primitives import Bilinear, Family, structural
 
 __all__ = [
     "cross",

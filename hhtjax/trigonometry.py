@@ -16,7 +16,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from hhtjax.xla import RANGE, polynomial_sines, staged
+from hhtjax.primitives import staged
+from hhtjax.xla import RANGE, polynomial_sines
 
 __all__ = ["cos", "sin", "sincos"]
 

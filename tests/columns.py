@@ -23,7 +23,7 @@ from verdicts import judge
 
 from hhtjax.jaxpr.linear_maps import linear_map
 from hhtjax.jaxpr.scalars import by_scalars, in_stages, join, split
-from hhtjax.xla.kernels import STAGED, staged
+from hhtjax.primitives.kernels import STAGED, staged
 
 RTOL = 1e-12
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import pytest
 
 import hhtjax
-from hhtjax.jaxpr.interpreter import asked
-from hhtjax.xla import compat
+from hhtjax.primitives import compat
+from hhtjax.primitives.interpreter import asked
 
 on_cpu = pytest.mark.skipif(
     jax.default_backend() != "cpu" or not compat.is_on(),

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import pytest
 
 import hhtjax
+from hhtjax.primitives import compat, plain
 from hhtjax.runs.sweep_inputs import LANES, NUMBERS, VECTORS, lanes_for, least_lanes
-from hhtjax.xla import Programs, compat, plain
+from hhtjax.xla import Programs
 
 ARE_TAKEN = compat.is_on() and jax.default_backend() == "cpu"
 

@@ -16,11 +16,11 @@ from zoo import each
 
 from hhtjax.jaxpr import linear_maps, scalar_rules, scalars
 from hhtjax.numerics.dense_lu import matvec
+from hhtjax.primitives import compat
 from hhtjax.primitives.batching import in_turn
+from hhtjax.primitives.consistent import held
+from hhtjax.primitives.kernels import largest_in_batch, staged, structural
 from hhtjax.rotation import cross, stumpff
-from hhtjax.xla import compat
-from hhtjax.xla.consistent import held
-from hhtjax.xla.kernels import largest_in_batch, staged, structural
 
 pytestmark = [
     pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX"),

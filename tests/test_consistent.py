@@ -8,7 +8,7 @@ from jax import lax
 
 import hhtjax
 from hhtjax.jaxpr.scalars import by_scalars, join, split
-from hhtjax.xla import compat, consistent
+from hhtjax.primitives import compat, consistent
 
 pytestmark = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
 

@@ -7,7 +7,7 @@ import pytest
 
 from hhtjax.numerics import differentiable_while
 from hhtjax.numerics.differentiable_while import LONGEST, SLOTS, repeat
-from hhtjax.xla import one_kernel, row_written
+from hhtjax.primitives import one_kernel, row_written
 
 AT = 1e-2, 1.3
 COUNT = 5

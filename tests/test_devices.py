@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec
 import hhtjax
 from experiments.sweeps.devices import case, swept
 from hhtjax.jaxpr.scalar_rules import is_understood
-from hhtjax.xla import compat
+from hhtjax.primitives import compat
 
 MEMBERS = 300
 

@@ -10,7 +10,7 @@ from jax import lax
 from program_writer import function, program, usual_promotion
 from verdicts import judge
 
-from hhtjax.xla import compat
+from hhtjax.primitives import compat
 
 pytestmark = [
     pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX"),

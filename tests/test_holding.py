@@ -9,7 +9,8 @@ import pytest
 from linked_pendulums import on_cpu
 
 import hhtjax
-from hhtjax.xla import for_kernel, kernels
+from hhtjax.primitives import kernels
+from hhtjax.xla import for_kernel
 
 x = jnp.linspace(0.4, 1.1, 3)
 LONG = for_kernel.LEAST_HELD  # products in the chain

@@ -10,7 +10,8 @@ import pytest
 from linked_pendulums import LIGHT, N, end, loss, on_cpu, paths, run
 
 import hhtjax
-from hhtjax.xla import fit_for_kernel, kernels
+from hhtjax.primitives import kernels
+from hhtjax.xla import fit_for_kernel
 
 x = jnp.linspace(0.1, 1.0, 4)
 order = jnp.array([1, 0, 3, 2])

@@ -13,7 +13,7 @@ from helpers import SPRING, ZERO
 from linked_pendulums import on_cpu, paths
 
 import hhtjax
-from hhtjax.xla import kernels
+from hhtjax.primitives import kernels
 
 x = jnp.linspace(0.1, 1.0, 4)
 KERNEL = 'xla_cpu_small_call = "true"'

@@ -8,8 +8,8 @@ import zoo
 from jax import lax
 
 from experiments.benchmarks.chain import FORMULATIONS, chain
-from hhtjax.jaxpr import linear_maps
-from hhtjax.xla import compat, linear_map
+from hhtjax.jaxpr import linear_map, linear_maps
+from hhtjax.primitives import compat
 
 N = 6
 A = jnp.asarray(np.random.default_rng(0).standard_normal((N, N)))

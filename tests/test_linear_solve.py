@@ -20,7 +20,7 @@ from matrices import (
 from hhtjax import explain
 from hhtjax.numerics.dense_lu import UNROLLED, factorize, matvec
 from hhtjax.numerics.linear_solve import factorize_with, solve, solve_map
-from hhtjax.xla import compat, kernels
+from hhtjax.primitives import compat, kernels
 
 
 @pytest.mark.parametrize("n", SIZES)

@@ -15,7 +15,7 @@ from program_writer import usual_promotion
 from test_conformance import expression
 
 from hhtjax.export.statements import NotWritten, Statements, helper
-from hhtjax.xla import NotListed, Scalar, listed
+from hhtjax.jaxpr import NotListed, Scalar, listed
 
 pytestmark = [needs_compiler, pytest.mark.filterwarnings("ignore")]
 # what has no counterpart in C, or none yet; with options that are not understood; a loop that vmap has made of several

@@ -7,7 +7,8 @@ import pytest
 from linked_pendulums import on_cpu, paths
 
 import hhtjax
-from hhtjax.xla import fit_for_kernel, kernels
+from hhtjax.primitives import kernels
+from hhtjax.xla import fit_for_kernel
 
 
 def counted(q, v, t, params):

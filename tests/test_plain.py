@@ -10,7 +10,8 @@ import pytest
 from linked_pendulums import N, end, links, loss, on_cpu, paths
 
 import hhtjax
-from hhtjax.xla import compat, fit_for_kernel, kernels
+from hhtjax.primitives import compat, kernels
+from hhtjax.xla import fit_for_kernel
 
 GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged"
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from hhtjax.xla import block_written, compat, largest_in_batch, one_kernel, row_written
+from hhtjax.primitives import block_written, compat, largest_in_batch, one_kernel, row_written
 
 BATCHES = {  # axes of array, row and number, the inner batch first
     "one": [],

@@ -10,8 +10,8 @@ from jax import lax
 import hhtjax
 from hhtjax.jaxpr import scalars
 from hhtjax.jaxpr.scalars import Scalars, by_scalars, join, pays, split
+from hhtjax.primitives import compat, kernels, structural
 from hhtjax.scenes import double_pendulum, slider_crank
-from hhtjax.xla import compat, kernels, structural
 
 old = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
 M = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 3.0]])

@@ -10,8 +10,8 @@ from jax import lax
 import hhtjax
 from hhtjax.jaxpr import scalars
 from hhtjax.jaxpr.scalars import by_scalars, split
+from hhtjax.primitives import compat, kernels
 from hhtjax.scenes import double_pendulum
-from hhtjax.xla import compat, kernels
 
 pytestmark = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
 

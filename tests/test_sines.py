@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hhtjax.xla import RANGE, compat, one_kernel
+from hhtjax.primitives import compat, one_kernel
+from hhtjax.xla import RANGE
 from hhtjax.xla.sines import NAME
 
 pytestmark = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")

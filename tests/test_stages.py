@@ -8,7 +8,8 @@ from jax import lax
 from linked_pendulums import on_cpu
 
 import hhtjax
-from hhtjax.xla import for_kernel, kernels, lowering
+from hhtjax.primitives import kernels
+from hhtjax.xla import for_kernel, lowering
 
 x = jnp.linspace(-0.4, 1.1, 6)
 KERNEL = 'xla_cpu_small_call = "true"'

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from hhtjax.xla import block_written, compat, in_turn, one_kernel
+from hhtjax.primitives import block_written, compat, in_turn, one_kernel
 
 pytestmark = pytest.mark.skipif(not compat.is_on(), reason="with this JAX all go at once")
 BATCHES = {  # axes of the target, the shared scale, the threshold; the inner batch first

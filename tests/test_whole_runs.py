@@ -12,7 +12,7 @@ import zoo
 from program_writer import usual_promotion
 
 import hhtjax
-from hhtjax.xla import compat
+from hhtjax.primitives import compat
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")]
 STEPS = 8

@@ -1,7 +1,7 @@
 """One step at a time, at 1 kHz from Python: latency, deadlines, hardware in the loop, a constant amount of work.
 
 The step is compiled ahead of time, with the state as one vector, so that a call hands over two arrays; it is one kernel
-(hhtjax/xla/kernels.py) where XLA can. The same program exported, written to bytes and read again. Latencies of
+(hhtjax/primitives/kernels.py) where XLA can. The same program exported, written to bytes and read again. Latencies of
 calls back to back, and of calls started at each millisecond; a deadline is missed if the answer is not there a
 millisecond later.
 """
@@ -21,8 +21,8 @@ from jax.flatten_util import ravel_pytree
 import hhtjax
 from experiments.report import COLOURS
 from hhtjax.plot import legend, subplots
+from hhtjax.primitives import one_kernel
 from hhtjax.scenes import double_pendulum, squeezer, vehicle
-from hhtjax.xla import one_kernel
 
 PERIOD = 1e-3  # s
 CALLS, FAST_CALLS = 100_000, 300

@@ -12,10 +12,11 @@ from scipy.integrate import solve_ivp
 import hhtjax
 from experiments.benchmarks.chain import chain
 from experiments.cardona_geradin1989.index_1 import unconstrained, violation
+from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.dense_lu import factorize, matvec
 from hhtjax.numerics.linear_solve import reuse, solve
+from hhtjax.primitives import one_kernel
 from hhtjax.scenes import Scene, double_pendulum, duffing, squeezer, top
-from hhtjax.xla import on_scalars, one_kernel
 
 SAMPLES = 50  # times at which positions are compared
 TRIGONOMETRY = hhtjax.trigonometry

@@ -9,8 +9,8 @@ from jax.flatten_util import ravel_pytree
 import hhtjax
 from experiments.work_precision.cases import SAMPLES, cases, flat, march
 from experiments.work_precision.timing import sweep
+from hhtjax.primitives import one_kernel
 from hhtjax.runs.extrapolate import richardson
-from hhtjax.xla import one_kernel
 
 SMOOTH = hhtjax.hht(linearize="predictor")
 METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a step if it does not count them

@@ -23,7 +23,7 @@ from hhtjax.export.model import (
     with_derivatives,
 )
 from hhtjax.export.statements import NotWritten, Statements
-from hhtjax.xla import Listing, NotListed, listed
+from hhtjax.jaxpr import Listing, NotListed, listed
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from hhtjax.description import VERSION
 from hhtjax.export.model import FLAGS, Field, Given, Numbers
 from hhtjax.export.statements import TYPES, helper, number
-from hhtjax.xla import Listing, Scalar
+from hhtjax.jaxpr import Listing, Scalar
 
 TAKEN = "fmi3", "math", "stdbool", "stddef", "stdint", "stdlib", "string"  # .h or .c
 

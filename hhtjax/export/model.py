@@ -10,6 +10,7 @@ import numpy as np
 
 from hhtjax.checks import require_params
 from hhtjax.description import all_concrete, thaw
+from hhtjax.primitives import structural
 from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import INTERNAL, entered, require_capable, require_stepper, require_system
 from hhtjax.systems import zero_order_hold
@@ -18,7 +19,6 @@ from hhtjax.systems.initial_conditions import initial_values, with_known_rows
 from hhtjax.systems.linear_system import require_dense
 from hhtjax.systems.sampled import Sampled
 from hhtjax.systems.system import FirstOrderSystem
-from hhtjax.xla import structural
 
 # ----------------------------------------------------------------------------
 # Names in C for the leaves of a pytree: q["arm"]["angle"] is q_arm_angle, an array of numbers if it has a shape.

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hhtjax.xla import Scalar
+from hhtjax.jaxpr import Scalar
 
 HELPED = {"max": "max", "min": "min", "clamp": ("max", "min"), "sign": "sign"}
 

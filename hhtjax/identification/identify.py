@@ -32,7 +32,7 @@ from hhtjax.identification.problem import is_outside, solve, solve_outside
 from hhtjax.identification.residuals import check_weights, first_bad
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
-from hhtjax.xla import or_plain
+from hhtjax.primitives import or_plain
 
 
 def fit(

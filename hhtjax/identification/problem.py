@@ -22,8 +22,9 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import LEAST, count_segments, in_time, uncertainty, used_up, variance_inflation
 from hhtjax.numerics.array_namespace import namespace_of
 from hhtjax.numerics.closures import hoisted
+from hhtjax.primitives import is_untouched
 from hhtjax.runs.frozen_steps import chooses_steps, with_steps_for
-from hhtjax.xla import Programs, is_untouched
+from hhtjax.xla import Programs
 
 
 class _Solved(NamedTuple):
@@ -189,8 +190,8 @@ def _with_frozen_steps(problem, y, fresh):
 #
 # Levenberg-Marquardt and the covariances are a thousand small operations, which run once an iteration, and which XLA
 # would compile anew with every function of residuals: of a pendulum's fit that was two thirds of the time. They are the
-# lines of a fit inside a jit (`hhtjax.numerics.array_namespace`). Where runs choose their steps, and for many residuals, the
-# whole fit is one program, `solve`, as it is there.
+# lines of a fit inside a jit (`hhtjax.numerics.array_namespace`). Where runs choose their steps, and for many
+# residuals, the whole fit is one program, `solve`, as it is there.
 
 
 MANY = 100_000  # entries of a Jacobian; with more, memory that one program keeps saves more time than compiling takes

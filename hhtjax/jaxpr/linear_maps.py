@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.jaxpr.interpreter import alone, evaluate
 from hhtjax.jaxpr.scalar_rules import is_understood
-from hhtjax.xla.compat import is_on
-from hhtjax.xla.kernels import structural
+from hhtjax.primitives.compat import is_on
+from hhtjax.primitives.interpreter import alone, evaluate
+from hhtjax.primitives.kernels import structural
 
 
 def linear_map(f, like):

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.jaxpr.interpreter import alone, evaluate, line_of
 from hhtjax.jaxpr.listing import Block, Listing, Operation, Scalar, everywhere, pruned
 from hhtjax.jaxpr.recorder import LARGE, Recorder, as_operand
 from hhtjax.jaxpr.scalar_rules import (
@@ -25,6 +24,7 @@ from hhtjax.jaxpr.scalar_rules import (
     is_structural,
     is_understood,
 )
+from hhtjax.primitives.interpreter import alone, evaluate, line_of
 
 UNKNOWN = "unknown"
 MOST = 100_000  # operations: of more, a compiler takes minutes

@@ -1,7 +1,7 @@
 """Arithmetic on arrays in pieces.
 
 What moves numbers about costs nothing. What is done with numbers is what the program says, IEEE, with the signs of
-zeros, NaN and infinities: only x * 1, x / 1, x - 0 and x + -0 are x. With structural zeros it is less (pieces.py).
+zeros, NaN and infinities: only x * 1, x / 1, x - 0 and x + -0 are x. With structural zeros it is less.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.jaxpr.listing import Scalar
-from hhtjax.xla.consistent import held
+from hhtjax.primitives.consistent import held
 
 # ----------------------------------------------------------------------------
 # Small arrays taken to pieces: NumPy arrays of objects, which are scalars, traced or known.

@@ -19,7 +19,6 @@ import numpy as np
 from jax import lax
 from jax.extend.core import Literal
 
-from hhtjax.jaxpr.interpreter import alone, evaluate, needed
 from hhtjax.jaxpr.listing import FUNCTIONS
 from hhtjax.jaxpr.scalar_rules import (
     ELEMENTWISE,
@@ -35,8 +34,9 @@ from hhtjax.jaxpr.scalar_rules import (
     whole,
 )
 from hhtjax.primitives.batching import in_turn
-from hhtjax.xla.compat import is_on
-from hhtjax.xla.kernels import STAGED, named
+from hhtjax.primitives.compat import is_on
+from hhtjax.primitives.interpreter import alone, evaluate, needed
+from hhtjax.primitives.kernels import STAGED, named
 
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
 MOST_IN_VALUES = 2500  # where nobody asks for derivatives; of more compiling takes longer than it saves

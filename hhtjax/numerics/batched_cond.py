@@ -9,7 +9,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from hhtjax.description import all_concrete
 from hhtjax.numerics.closures import hoisted
-from hhtjax.xla import in_turn, largest_in_batch
+from hhtjax.primitives import in_turn, largest_in_batch
 
 
 def choose(where, x, y):

@@ -2,7 +2,7 @@
 
 A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
 up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones; up to
-`LOOPED` it is a loop in a kernel, and LAPACK's elsewhere. Hundreds are LAPACK's in panels (panels.py).
+`LOOPED` it is a loop in a kernel, and LAPACK's elsewhere. Hundreds are LAPACK's in panels.
 """
 
 from functools import partial
@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.numerics.sparse_matrix import Sparse, factorize_sparse
-from hhtjax.xla import Bilinear, choose, structural
+from hhtjax.primitives import Bilinear, choose, structural
 
 UNROLLED = 8
 LOOPED = 16

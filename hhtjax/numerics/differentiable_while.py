@@ -12,7 +12,7 @@ from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.closures import hoisted, opened
-from hhtjax.xla import TwoWays, derivative, row_written, staged, together, traced
+from hhtjax.primitives import TwoWays, derivative, row_written, staged, together, traced
 
 SLOTS, LEVELS = 64, 3
 LONGEST = SLOTS**LEVELS  # iterations that reverse mode can go back

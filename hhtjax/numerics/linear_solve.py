@@ -8,9 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import diagonal, factorize, matvec
 from hhtjax.numerics.low_rank import AtState
-from hhtjax.xla import forward_only, linear_map, part, staged
+from hhtjax.primitives import forward_only, part, staged
 
 FORWARD_ONLY = (
     "a force (or mass, or constraint) with a `lax.while_loop`, or a `lax.fori_loop` of unknown length, has forward "
@@ -175,7 +176,7 @@ def factorize_least_squares(n):
 def solve(A, b, factorize=factorize):
     """x with A x = b, for A (n, n) and b (n,), differentiable in both.
 
-    LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (elimination.py); Cramer's rule for n = 2.
+    LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (dense_lu.py); Cramer's rule for n = 2.
     A singular A gives inf or NaN.
 
     >>> import jax.numpy as jnp

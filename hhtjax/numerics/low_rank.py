@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import factorize, matvec
-from hhtjax.xla import linear_map
 
 
 class AtState:

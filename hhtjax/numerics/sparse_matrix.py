@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.xla import on_host
+from hhtjax.primitives import on_host
 
 PADDING = 2  # slots for each entry, up to which all entries have places in layers
 WRITTEN_OUT = 32  # layers, up to which a product is one loop

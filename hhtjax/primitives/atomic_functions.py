@@ -15,8 +15,8 @@ from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.sharding import AxisType
 
+from hhtjax.primitives.compat import is_on
 from hhtjax.primitives.two_mode_derivative import batch_size, in_front
-from hhtjax.xla.compat import is_on
 
 
 @dataclass(frozen=True, eq=False)

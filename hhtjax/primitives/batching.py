@@ -12,9 +12,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
-from hhtjax.jaxpr.interpreter import alone, evaluate
+from hhtjax.primitives.compat import is_on
+from hhtjax.primitives.interpreter import alone, evaluate
 from hhtjax.primitives.two_mode_derivative import batch_size, in_front, no_tangent
-from hhtjax.xla.compat import is_on
 
 
 def row_written(array, row, number):

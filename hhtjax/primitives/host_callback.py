@@ -13,8 +13,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
+from hhtjax.primitives.compat import is_on
 from hhtjax.primitives.two_mode_derivative import batch_size
-from hhtjax.xla.compat import is_on
 
 
 def on_host(f, like, *args):

@@ -11,10 +11,12 @@ from jax.custom_batching import custom_vmap
 
 from hhtjax.checks import require_integer
 from hhtjax.description import all_concrete, is_tracing
+from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.closures import hoisted
 from hhtjax.numerics.differentiable_while import repeat
+from hhtjax.primitives import is_untouched, largest_in_batch, one_kernel, or_alone, or_plain
 from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
 from hhtjax.runs.error_control import Steps, select_steps, trimmed
 from hhtjax.runs.event_loop import loop_with_events, with_told_events
@@ -28,7 +30,7 @@ from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_masses
-from hhtjax.xla import Programs, is_untouched, largest_in_batch, on_scalars, one_kernel, or_alone, or_plain
+from hhtjax.xla import Programs
 
 
 def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:

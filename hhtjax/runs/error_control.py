@@ -10,9 +10,11 @@ from jax import lax
 
 from hhtjax.description import freeze, is_concrete
 from hhtjax.description.presentation import overwrite, shown
+from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.approximate_math import rough_exp, rough_log, without_rounding
 from hhtjax.numerics.batched_cond import choose, seldom_alone
 from hhtjax.numerics.batched_cond import choose as either
+from hhtjax.primitives import largest_in_batch, one_kernel, or_alone, row_written, staged
 from hhtjax.runs.event_loop import before_any
 from hhtjax.runs.event_step import SHORT, Part, Ways, asks, pass_events, reaching
 from hhtjax.runs.interpolate import kept, output_between, solution_at, with_output
@@ -23,7 +25,6 @@ from hhtjax.runs.solution import EVENTS, FINE, MANY, SimulationError, first_bad
 from hhtjax.steppers.stepper import entered, join_info
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.systems.events import flatten_events
-from hhtjax.xla import largest_in_batch, on_scalars, one_kernel, or_alone, row_written, staged
 
 LOWEST = 1e-4  # error of the step before, as the controller sees it
 ROUNDINGS = 16  # of t, of which a step is at least

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from hhtjax.description import freeze
 from hhtjax.numerics.batched_cond import choose, if_any
 from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.primitives import in_turn
 from hhtjax.runs.event_step import Met, Part, Pieces, Ways, asks, pass_events, reaching, unnoted
 from hhtjax.runs.loop import first_failure
 from hhtjax.runs.solution import FINE, Log
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.events import flatten_events
-from hhtjax.xla import in_turn
 
 
 def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False, with_modes=False):

@@ -11,6 +11,7 @@ from jax import lax
 from hhtjax.description import all_concrete, freeze, is_array, is_concrete, known_now, thaw
 from hhtjax.numerics.batched_cond import choose, if_any, seldom
 from hhtjax.numerics.dense_lu import LARGEST, UNROLLED
+from hhtjax.primitives import is_traced
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import Info, entered, join_info, public
@@ -19,7 +20,6 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
 from hhtjax.systems.system import mass_reads_velocity
-from hhtjax.xla import is_traced
 
 GROWTH = 2.05  # of a step, up to which the recursion follows
 

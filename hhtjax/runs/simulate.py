@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.checks import require_integer
+from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
+from hhtjax.primitives import is_in_batch, one_kernel, or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.controlled_run import follow, run_controlled
 from hhtjax.runs.event_loop import loop_with_events, with_told_events
@@ -35,7 +37,7 @@ from hhtjax.runs.solution import Solution, told
 from hhtjax.steppers.implicit_solve import callbacks_named
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
-from hhtjax.xla import Programs, is_in_batch, on_scalars, one_kernel, or_plain
+from hhtjax.xla import Programs
 
 
 def simulate(

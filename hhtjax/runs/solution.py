@@ -10,11 +10,11 @@ import numpy as np
 from hhtjax.checks import require_number
 from hhtjax.description import all_concrete, is_concrete
 from hhtjax.description.presentation import Table, all_known, between, brief, known, leaf_rows, shown
+from hhtjax.primitives import block_written
 from hhtjax.steppers.friction_switching import DEPENDENT
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
 from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY
-from hhtjax.xla import block_written
 
 
 class FailedRunWarning(RuntimeWarning):

@@ -9,9 +9,11 @@ from jax import lax
 from jax.sharding import NamedSharding, PartitionSpec
 
 from hhtjax.description import thaw
+from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.differentiable_while import repeat
+from hhtjax.primitives import one_kernel, or_alone, or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.event_loop import loop_with_events, with_told_events
 from hhtjax.runs.inputs import fit_to_samples, fit_to_times
@@ -22,7 +24,7 @@ from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_controlled import sweep_chosen
 from hhtjax.runs.sweep_inputs import VECTORS, Inputs
 from hhtjax.systems.flat_system import flatten
-from hhtjax.xla import Programs, on_scalars, one_kernel, or_alone, or_plain
+from hhtjax.xla import Programs
 
 
 def sweep(

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.jaxpr import on_scalars
+from hhtjax.primitives import one_kernel, or_plain
 from hhtjax.runs.controlled_run import Grid, accepted_run, compared, follow, scaled, tighten, verified
 from hhtjax.runs.error_control import Bounds, as_steps, attempt, begin, is_walking, trial_of, trimmed
 from hhtjax.runs.frozen_steps import frozen, is_pair, run_and_choice
@@ -15,7 +17,7 @@ from hhtjax.runs.inputs import Problem
 from hhtjax.runs.output import beside_path, without_path
 from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
-from hhtjax.xla import Programs, on_scalars, one_kernel, or_plain
+from hhtjax.xla import Programs
 
 
 def sweep_chosen(inputs, progress):

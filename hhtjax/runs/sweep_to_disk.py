@@ -14,11 +14,11 @@ import numpy as np
 
 from hhtjax.checks import require_integer
 from hhtjax.description import VERSION, all_concrete
+from hhtjax.primitives import or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.output import require_output
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
-from hhtjax.xla import or_plain
 
 
 def sweep_to_disk(

@@ -92,14 +92,14 @@ out, and a family that knows them sets `solves_internal = True`.
 >>> abs(float(run.q[-1, 0] - jnp.cos(10.0))) < 5e-3
 True
 
-A method that remembers something of the size of the last step has a `resized`, too, as in `unequal.py`.
+A method that remembers something of the size of the last step has a `resized`, too, as in `variable_step.py`.
 
 A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
 `implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
 refusals are tested on all problems there; what is its own gets a test with a closed form.
 
 For error control, `simulate(..., dt=adaptive(...))`, a method also has an `estimate_order` k, a `begin_estimates`, and
-a `bind_estimated`, whose step returns the errors, of size h^k, too (`estimate.py`).
+a `bind_estimated`, whose step returns the errors, of size h^k, too (`variable_step.py`).
 
 Sources
 -------

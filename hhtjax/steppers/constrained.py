@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.numerics.dense_lu import diagonal, matvec
+from hhtjax.primitives import part
 from hhtjax.steppers.implicit_solve import linearized_solve, newton
 from hhtjax.steppers.stepper import State, join_info
 from hhtjax.systems.constraints import (
@@ -26,7 +27,6 @@ from hhtjax.systems.constraints import (
     violation,
     violation_and_reaction,
 )
-from hhtjax.xla import part
 
 
 def begin_constrained(method, system, q, v, t, params):

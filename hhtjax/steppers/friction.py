@@ -6,7 +6,7 @@ start of the step. Joints that stick, or switch inside the step, get a multiplie
     w1 = wf - G dtau,    G = A^-1 H^T,    s1 = sf - W dtau,    W = H dv/dw G,
 
 by the one factorisation of A, f standing for the free step, with sig. A switch is resolved within the step, by the
-motion on either side of it (friction_law.py; of several joints, friction_events.py). Behind it w, a, v and q go along G
+motion on either side of it (friction_switching.py). Behind it w, a, v and q go along G
 to where the new branch has them: the jump of the acceleration never enters the recursion, which therefore does not
 ring, and what sticks stays where it is.
 

@@ -226,7 +226,7 @@ def is_settled(left):
 # ----------------------------------------------------------------------------
 # What the dry friction of joints does within a step where their directions may depend on each other.
 #
-# As in friction_events.py sliding velocities go linearly between events, in directions that the rows of a basis have
+# As above, sliding velocities go linearly between events, in directions that the rows of a basis have
 # (friction_rows.py):
 #
 #     ds/dtheta = c - Wh (phi - base),    phi = sig f where sliding,    theta = (t - t0)/h

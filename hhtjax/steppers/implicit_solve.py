@@ -17,11 +17,11 @@ from hhtjax.numerics.differentiable_while import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, invert_and_bound, reuse, solve_map
 from hhtjax.numerics.low_rank import Constant, around
 from hhtjax.numerics.sparse_solve import changing, kept
+from hhtjax.primitives import staged, traced
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State
 from hhtjax.systems import kinematics
 from hhtjax.systems.flat_system import Factors
-from hhtjax.xla import staged, traced
 
 RELATIVE = 1e-6  # of the terms of a row, above which its residual is never small; nor above what `tolerance` is of 1
 SHAKE, NOISE, SHAKES = 2, 32, 3  # roundings by which a state is changed; how much more than that passes; how often

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description import is_concrete
+from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import solve
 from hhtjax.steppers.implicit_solve import newton
@@ -19,7 +20,6 @@ from hhtjax.steppers.residual import hht_coefficients
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import acceleration_and_multipliers, reaction
-from hhtjax.xla import linear_map
 
 
 def linearize_at_state(system, params, s):

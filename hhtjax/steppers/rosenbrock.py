@@ -24,11 +24,11 @@ from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import factorize_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.sparse_solve import kept
+from hhtjax.primitives import staged
 from hhtjax.steppers.implicit_solve import linearized, with_local
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.variable_step import Embedded, Errors
-from hhtjax.xla import staged
 
 EMBEDDED = 0.47990028, 0.51762038, 0.00247934, 0.0  # of order 2, L-stable, from the stages of `rowda`
 

@@ -8,9 +8,9 @@ from jax import lax
 
 from hhtjax.description import is_concrete
 from hhtjax.numerics.dense_lu import SCALAR
+from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.variable_step import Embedded, Errors
-from hhtjax.xla import staged
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,17 +34,18 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import freeze, thaw
+from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.batched_cond import choose, derivative_at_need, seldom
 from hhtjax.numerics.closures import hoisted
 from hhtjax.numerics.dense_lu import UNROLLED, diagonal, inverse, matvec
 from hhtjax.numerics.differentiable_while import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
+from hhtjax.primitives import one_kernel, staged, traced
 from hhtjax.steppers.implicit_solve import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import answers, curvature, jacobian, reaction, violation
-from hhtjax.xla import linear_map, one_kernel, staged, traced
 
 POWERS = 5
 ITERATIONS = 40  # of Newton's method, at most

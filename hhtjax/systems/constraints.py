@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import UNROLLED, matvec
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, factorize_saddle_point, solver
+from hhtjax.primitives import staged
 from hhtjax.systems import kinematics
-from hhtjax.xla import linear_map, staged
 
 GRADIENT = 64  # times what roundings of q change a constraint and its gradient, below which it has none
 SWITCHED_OFF = (

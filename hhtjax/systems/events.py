@@ -20,9 +20,9 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import in_words, require_function, require_number
 from hhtjax.description import Description, as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.numerics.batched_cond import seldom
+from hhtjax.primitives import consistent
 from hhtjax.systems.constraints import answers, pull_back
 from hhtjax.systems.sampled import SLOP
-from hhtjax.xla import consistent
 
 
 @dataclass(frozen=True, eq=False)

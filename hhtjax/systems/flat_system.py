@@ -12,12 +12,12 @@ from hhtjax.checks import check_like, check_matrix, count, describe, evaluate, t
 from hhtjax.numerics.dense_lu import by_factors, factorize, matvec
 from hhtjax.numerics.linear_solve import reuse, solver
 from hhtjax.numerics.sparse_matrix import combined
+from hhtjax.primitives import consistent
 from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.linear_system import with_known_matrices
 from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, mass_at, product_at, timed
-from hhtjax.xla import consistent
 
 
 class FlatSystem(NamedTuple):

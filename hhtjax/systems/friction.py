@@ -17,9 +17,10 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax import checks
 from hhtjax.checks import describe, require_function
+from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
-from hhtjax.xla import consistent, linear_map
+from hhtjax.primitives import consistent
 
 MOST = 16  # directions of friction
 FEW = 8  # up to so many are taken to be independent of each other, unless something speaks against it

@@ -12,10 +12,10 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import positional_names, require_function, takes
 from hhtjax.description import Description
+from hhtjax.primitives import traced
 from hhtjax.systems.friction import require_friction
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass
-from hhtjax.xla import traced
 
 __all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_smooth", "require_system"]
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 
 import hhtjax.xla.lowering  # noqa: F401
-from hhtjax.jaxpr.interpreter import asked
+from hhtjax.primitives.interpreter import asked
 
 
 class Explanation(NamedTuple):

@@ -19,10 +19,10 @@ from jax.extend.core.primitives import closed_call_p
 
 from hhtjax.jaxpr.scalar_rules import replaces
 from hhtjax.primitives import batching, two_mode_derivative
-from hhtjax.xla.consistent import held_p
+from hhtjax.primitives.consistent import held_p
+from hhtjax.primitives.kernel_primitive import of_jaxpr
+from hhtjax.primitives.kernels import PART, STAGED
 from hhtjax.xla.fit_for_kernel import DTYPES, lengths, verdict
-from hhtjax.xla.kernel_primitive import of_jaxpr
-from hhtjax.xla.kernels import PART, STAGED
 from hhtjax.xla.sines import sines
 
 MOST_TERMS = 32  # of the sum that a product is written as

@@ -17,12 +17,12 @@ from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
 from hhtjax.description import programs
-from hhtjax.jaxpr.interpreter import asked, line_of
-from hhtjax.xla.compat import is_on
+from hhtjax.primitives.compat import is_on
+from hhtjax.primitives.interpreter import asked, line_of
+from hhtjax.primitives.kernel_primitive import kernel_p, of_jaxpr
+from hhtjax.primitives.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
 from hhtjax.xla.fit_for_kernel import inner, verdict
 from hhtjax.xla.for_kernel import for_kernel, for_list, kernel
-from hhtjax.xla.kernel_primitive import kernel_p, of_jaxpr
-from hhtjax.xla.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
 
 quickly: ContextVar = ContextVar("hhtjax_quickly", default=False)  # compiled by XLA's older way
 DIVIDED = "partitioned over devices; shard_map leaves each its own kernel"

@@ -19,8 +19,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 
-from hhtjax.jaxpr.interpreter import alone, evaluate
-from hhtjax.xla.compat import is_on
+from hhtjax.primitives.compat import is_on
+from hhtjax.primitives.interpreter import alone, evaluate
 
 SHORT = 512  # numbers; XLA divides no work on so few among threads, which in a kernel takes a second result
 EQUALITIES = {"eq", "ne"}

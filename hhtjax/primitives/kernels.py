@@ -14,8 +14,8 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import ad, batching
 
-from hhtjax.xla.compat import is_on, why_off
-from hhtjax.xla.kernel_primitive import kernel_p
+from hhtjax.primitives.compat import is_on, why_off
+from hhtjax.primitives.kernel_primitive import kernel_p
 
 # names of functions; autodiff and vmap keep them
 KERNEL, STAGED, PART = "hhtjax_one_kernel", "hhtjax_staged", "hhtjax_part"
