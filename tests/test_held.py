@@ -10,7 +10,7 @@ from zoo import as_data
 
 import hhtjax
 from hhtjax.scenes import pendulum
-from hhtjax.systems import zero_order_hold
+from hhtjax.steppers.stepper import behind_jump
 from hhtjax.systems.flat_system import flatten
 
 LIGHT = hhtjax.hht(-0.3, linearize="predictor")  # half the program of "auto"
@@ -113,7 +113,7 @@ def test_a_jump_leads_to_the_start_under_the_new_force():
     def states():
         old, new = (stepper.init(system, scene.q0, scene.v0, p, dt=0.1) for p in params)
         flat, _, _ = flatten("test", system, scene.q0, scene.v0, 0.0, params[0])
-        return old, new, zero_order_hold.jump(stepper, flat, old, *params, 0.1)
+        return old, new, behind_jump(stepper, flat, old, *params, 0.1)
 
     old, new, found = states()
     for name in ("w", "L"):

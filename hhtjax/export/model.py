@@ -12,8 +12,7 @@ from hhtjax.checks import require_params
 from hhtjax.description import all_concrete, thaw
 from hhtjax.primitives import structural
 from hhtjax.steppers.friction_switching import is_settled
-from hhtjax.steppers.stepper import INTERNAL, entered, require_capable, require_stepper, require_system
-from hhtjax.systems import zero_order_hold
+from hhtjax.steppers.stepper import INTERNAL, behind_jump, entered, require_capable, require_stepper, require_system
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, with_known_rows
 from hhtjax.systems.linear_system import require_dense
@@ -217,7 +216,7 @@ def step(made: Given, numbers: Numbers):
         old, now = numbers.params(values, before), numbers.params(values, u)
         flat, stepper = made.flat(state.t, now), made.stepper.astype(made.dtype)
         if numbers.inputs:
-            state = zero_order_hold.jump(stepper, flat, state, old, now, dt)
+            state = behind_jump(stepper, flat, state, old, now, dt)
         state, info = stepper.bind(flat, now, dt)(state)
         return state, _flags(state, info)
 

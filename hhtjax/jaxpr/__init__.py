@@ -18,14 +18,15 @@ or a new option of an old one, makes programs slower, and never wrong.
 A rule for an operation
 -----------------------
 
-An operation (a primitive of JAX) that has no rule runs on whole arrays, and ends a kernel if XLA cannot fuse it: so add
-one only where `explain` names it in a program that matters. In `scalar_rules.py` the table `UNDERSTOOD` states the
-parameters and the values that the rule understands; there is the rule itself, too, a function of the operation and of
-arrays in pieces that returns the pieces of the results, or None for whole arrays. `linear_maps.py` has what is needed
-to know which result depends on which unknown. Then put expressions with all its options into `tests/operations_table.py`:
-`tests/test_conformance.py` compares values, forward and reverse derivatives and batches with those of plain JAX, with
-NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule without an entry. Random programs of
-all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py` looks at what XLA compiled.
+An operation (a primitive of JAX) that has no rule runs on whole arrays, and ends a kernel if XLA cannot fuse it: so
+add one only where `explain` names it in a program that matters. In `scalar_rules.py` the table `UNDERSTOOD` states
+the parameters and the values that the rule understands; there is the rule itself, too, a function of the operation
+and of arrays in pieces that returns the pieces of the results, or None for whole arrays. `linear_maps.py` has what is
+needed to know which result depends on which unknown. Then put expressions with all its options into
+`tests/operations_table.py`: `tests/test_conformance.py` compares values, forward and reverse derivatives and batches
+with those of plain JAX, with NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule without
+an entry. Random programs of all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py`
+looks at what XLA compiled.
 """
 
 from hhtjax.jaxpr.linear_maps import linear_map as linear_map

@@ -27,8 +27,7 @@ from hhtjax.runs.interpolate import kept, output_between, solution_at, with_outp
 from hhtjax.runs.loop import flaw_at_start, loop_over, resting, with_flaw
 from hhtjax.runs.output import beside_path, output_at_start, without_path
 from hhtjax.runs.solution import Solution
-from hhtjax.steppers.stepper import Stepper
-from hhtjax.systems import zero_order_hold
+from hhtjax.steppers.stepper import Stepper, step_start
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_masses
 from hhtjax.xla import Programs
 
@@ -319,7 +318,7 @@ def begun_with(flat, stepper, params, loop, run):
     """The state with which the next step of a run begins: behind a jump of held inputs."""
     state, count, _ = run
     h, last = loop.sizes(count)
-    return zero_order_hold.entered(stepper, flat, params, h, last, state)[1]
+    return step_start(stepper, flat, params, h, last, state)[1]
 
 
 def choose_steps(

@@ -22,7 +22,7 @@ from hhtjax.runs.loop import flaw_at_start, neutral_info, no_failure, resized_st
 from hhtjax.runs.output import output_at_start
 from hhtjax.runs.progress import announce, steps_between
 from hhtjax.runs.solution import EVENTS, FINE, MANY, SimulationError, first_bad
-from hhtjax.steppers.stepper import entered, join_info
+from hhtjax.steppers.stepper import entered, join_info, step_start
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.systems.events import flatten_events
 
@@ -192,7 +192,7 @@ def attempt(trial, walk):
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
     h, t1 = next_end(trial, params, walk)
     resized, state = trial.stepper.resized(walk.state, h / walk.last)
-    now, state = zero_order_hold.entered(resized, trial.flat, params, h, walk.last, state)
+    now, state = step_start(resized, trial.flat, params, h, walk.last, state)
     s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, walk.past)(state)
     s1 = s1._replace(t=t1)
     q_size, v_size = map(jnp.maximum, (walk.q_size, walk.v_size), sizes(trial.flat, s1))

@@ -11,7 +11,7 @@ from hhtjax.primitives import in_turn
 from hhtjax.runs.event_step import Met, Part, Pieces, Ways, asks, pass_events, reaching, unnoted
 from hhtjax.runs.loop import first_failure
 from hhtjax.runs.solution import FINE, Log
-from hhtjax.systems import zero_order_hold
+from hhtjax.steppers.stepper import step_start
 from hhtjax.systems.events import flatten_events
 
 
@@ -52,7 +52,7 @@ def past_events(ways, params, bound, sizes):
         # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
         new, count = at_rest(here, (new, count), (state, before))
         if met.pieces is not None:
-            begun = zero_order_hold.entered(ways.stepper, ways.flat, now, h, last, state)[1]
+            begun = step_start(ways.stepper, ways.flat, now, h, last, state)[1]
             met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new, met.modes), met.pieces))
         part = Part.whole(ways, state, new, info, h, last, met._replace(log=None))
         counts = None if here is None else (before, count)

@@ -21,7 +21,7 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import staged
 from hhtjax.runs.loop import resized_step
 from hhtjax.runs.solution import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, SINGULAR, STAYS, THROWN, row_of
-from hhtjax.steppers.stepper import entered, join_info
+from hhtjax.steppers.stepper import behind_jump, entered, join_info
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.sampled import SLOP
 
@@ -46,7 +46,7 @@ def pass_events(ways, params, part, h):
         known, t = ways.events.with_modes(params, part.met.modes), part.start.t
         old, new = zero_order_hold.before(known, t, part.last), ways.params(params, part.met.modes)
         here = zero_order_hold.passed(known, t, part.last, h)
-        part = part._replace(start=zero_order_hold.jump(ways.stepper, ways.flat, part.start, old, new, h, here))
+        part = part._replace(start=behind_jump(ways.stepper, ways.flat, part.start, old, new, h, here))
 
     @checkpoint  # what all slots keep for reverse mode takes longer to compile than to compute one again
     def slot(part, _):

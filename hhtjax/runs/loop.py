@@ -14,7 +14,7 @@ from hhtjax.numerics.dense_lu import LARGEST, UNROLLED
 from hhtjax.primitives import is_traced
 from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
 from hhtjax.steppers.friction_switching import is_settled
-from hhtjax.steppers.stepper import Info, entered, join_info, public
+from hhtjax.steppers.stepper import Info, bound, entered, join_info, public
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.linear_system import LinearSystem
@@ -46,9 +46,7 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     stepper = stepper.astype(q.dtype)
 
     def take_step(params):
-        return jax.jit(
-            zero_order_hold.bind(stepper, flat, params, dt), inline=True
-        )  # traced once, wherever it is called
+        return jax.jit(bound(stepper, flat, params, dt), inline=True)  # traced once, wherever it is called
 
     step = take_step(params)
 
@@ -121,7 +119,7 @@ def resized_step(flat, stepper, params, dt, last, grows=False):
                 return resized.grown(flat, state, zero_order_hold.before(thaw(params), state.t, last), dt)
 
             state = seldom(begin, dt > GROWTH * last, state, freeze(params), dt)
-        return zero_order_hold.bind(resized, flat, params, dt, last)(state)
+        return bound(resized, flat, params, dt, last)(state)
 
     return step
 
@@ -130,7 +128,7 @@ def advance_from(flat, stepper, dtype, params, t, dt, count, last=None, grows=Fa
     """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken, each of size `last`."""
     stepper = stepper.astype(dtype)
     if last is None:
-        take_step = zero_order_hold.bind(stepper, flat, params, dt)
+        take_step = bound(stepper, flat, params, dt)
     else:
         take_step = resized_step(flat, stepper, params, dt, last, grows)
     return counted(take_step, flat, t, dt, count)

@@ -7,10 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import Description
+from hhtjax.description import Description, freeze, thaw
 from hhtjax.description.presentation import known, shown
+from hhtjax.numerics.batched_cond import seldom
 from hhtjax.systems import kinematics, zero_order_hold
+from hhtjax.systems.constraints import answers
 from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.friction_rows import depends, held_back
 from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.system import require_masses
 from hhtjax.systems.system import require_system as require_system
@@ -204,7 +207,7 @@ class Stepper(Description):
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params, state.z)
         w = ravel_pytree((state.w if flat.positions else state.v, state.zdot))[0]
         a = None if state.a is None else ravel_pytree((state.a, state.za))[0]
-        step = zero_order_hold.bind(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
+        step = bound(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
         state, info = step(State(state.t, q, v, w, a, state.L, state.memory, friction=state.friction))
         return _unravel(flat, state), info
 
@@ -224,6 +227,65 @@ def entered(stepper, system, q, v, t, params, dt, **how):
     """The state at a start, and that from which the first step dt goes. how: of `Stepper.smoothed`."""
     start = stepper.begin(system, q, v, t, params, dt)
     return start, stepper.smoothed(system, start, params, dt, **how)
+
+
+def bound(stepper, system, params, dt, last=None):
+    """The function State -> (State, Info) of `stepper.bind`, with held inputs constant over each step.
+
+    last: the step before, where it is another than dt."""
+    if system.matrices is not None and not stepper.keeps_sparse:
+        raise NotImplementedError(
+            f"{type(stepper).__name__} cannot keep the matrices of the system sparse; use hht() or another of its "
+            "family, rosenbrock(), rowda(), rk4() or dopri5(), or hand over arrays: K.toarray()."
+        )
+    if not zero_order_hold.holds(params):
+        return stepper.bind(system, params, dt)
+
+    def step(s):
+        now, s = step_start(stepper, system, params, dt, dt if last is None else last, s)
+        return stepper.bind(system, now, dt)(s)
+
+    return step
+
+
+def step_start(stepper, system, params, dt, last, s):
+    """The params of a step dt, and the state that it starts from; last: the step before."""
+    if not zero_order_hold.holds(params):
+        return params, s
+    now = zero_order_hold.held_at(params, s.t + dt / 2)
+    old, here = zero_order_hold.before(params, s.t, last), zero_order_hold.passed(params, s.t, last, dt)
+    return now, behind_jump(stepper, system, s, old, now, dt, here)
+
+
+def behind_jump(stepper, system, s, old, new, h, here=None):
+    """The state with the accelerations and multipliers that belong to the new params, for a step h:
+
+        M dw - B^T dL = Q(new) - Q(old),   B dw = 0
+
+    What damps far too stiffly for the step changes its velocity, too: see `Stepper.jumped`. here: whether there is a
+    jump at all, as far as that is known; not whether values differ, as derivatives in equal ones are those of a jump.
+    """
+
+    def behind(s, old, new, h):
+        return _behind_jump(stepper, system, s, thaw(old), thaw(new), h)
+
+    both = freeze(old), freeze(new)
+    return behind(s, *both, h) if here is None else seldom(behind, here, s, *both, h)
+
+
+def _behind_jump(stepper, system, s, old, new, h):
+    """The state behind a jump."""
+    dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
+    answer = answers(system, s.q, s.t, new, stepper.redundant)
+    dw, dL = answer(dQ)
+    if system.num_constraints:
+        L = s.L + dL
+    s1 = s
+    if system.friction is not None:
+        dw, friction, L = held_back(system, s, L, old, new, dw, answer, depends(system, stepper.redundant))
+        s1 = s._replace(friction=friction)
+    s1 = s1._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
+    return stepper.jumped(system, s, s1, old, new, h, lambda dQ: answer(dQ)[0])
 
 
 def require_stepper(caller, stepper):

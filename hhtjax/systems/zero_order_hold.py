@@ -1,9 +1,8 @@
 """Inputs that are held, `sampled(order=0)` in params: constant over a step, and a jump between two steps.
 
 A step that ends on a jump must not see the new value at its end, nor the next one the old value at its start. So a step
-gets the value in its middle, and where that differs from the step's before, the accelerations and multipliers that the
-state carries on take the jump along: M dw - B^T dL = Q(new) - Q(old), B dw = 0. Where a step
-ends on a sample of uneven times, the old value there is the one held until then.
+gets the value in its middle. Where a step ends on a sample of uneven times, the old value there is the one held until
+then. What the state takes along at a jump is in steppers/stepper.py, `behind_jump`.
 """
 
 import warnings
@@ -12,10 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import all_concrete, freeze, thaw
-from hhtjax.numerics.batched_cond import seldom
-from hhtjax.systems.constraints import answers
-from hhtjax.systems.friction_rows import depends, held_back
+from hhtjax.description import all_concrete
 from hhtjax.systems.sampled import SLOP, Sampled
 
 OFF_GRID = 1e-6  # of a step, from which on a jump within it is told: what it costs is as much of a step's error
@@ -68,31 +64,6 @@ def before(params, t, dt):
     return _with_held(params, lambda x: x.held_before(t, dt)) if holds(params) else params
 
 
-def bind(stepper, system, params, dt, last=None):
-    """`stepper.bind`, with held inputs constant over each step. last: the step before, where it is another than dt."""
-    if system.matrices is not None and not stepper.keeps_sparse:
-        raise NotImplementedError(
-            f"{type(stepper).__name__} cannot keep the matrices of the system sparse; use hht() or another of its "
-            "family, rosenbrock(), rowda(), rk4() or dopri5(), or hand over arrays: K.toarray()."
-        )
-    if not holds(params):
-        return stepper.bind(system, params, dt)
-
-    def step(s):
-        now, s = entered(stepper, system, params, dt, dt if last is None else last, s)
-        return stepper.bind(system, now, dt)(s)
-
-    return step
-
-
-def entered(stepper, system, params, dt, last, s):
-    """The params of a step dt, and the state that it starts from; last: the step before."""
-    if not holds(params):
-        return params, s
-    now = held_at(params, s.t + dt / 2)
-    return now, jump(stepper, system, s, before(params, s.t, last), now, dt, passed(params, s.t, last, dt))
-
-
 def passed(params, t, last, dt):
     """Whether a step dt from t has another sample of a held input than the one before, last, which ended there."""
     held = filter(_is_held, jax.tree.leaves(params, is_leaf=_is_held))
@@ -105,35 +76,6 @@ def jump_after(params, t):
     t = t + SLOP * float(jnp.finfo(t.dtype).eps) * jnp.abs(t)  # a jump that t is, in its dtype, is over
     times = [x.jump_after(t).astype(t.dtype) for x in leaves if _is_held(x)]
     return jnp.min(jnp.stack([*times, jnp.full_like(t, jnp.inf)]))
-
-
-def jump(stepper, system, s, old, new, h, here=None):
-    """The state with the accelerations and multipliers that belong to the new params, for a step h.
-
-    What damps far too stiffly for the step changes its velocity, too: see `Stepper.jumped`. here: whether there is a
-    jump at all, as far as that is known; not whether values differ, as derivatives in equal ones are those of a jump.
-    """
-
-    def behind(s, old, new, h):
-        return behind_jump(stepper, system, s, thaw(old), thaw(new), h)
-
-    both = freeze(old), freeze(new)
-    return behind(s, *both, h) if here is None else seldom(behind, here, s, *both, h)
-
-
-def behind_jump(stepper, system, s, old, new, h):
-    """The state behind a jump."""
-    dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
-    answer = answers(system, s.q, s.t, new, stepper.redundant)
-    dw, dL = answer(dQ)
-    if system.num_constraints:
-        L = s.L + dL
-    s1 = s
-    if system.friction is not None:
-        dw, friction, L = held_back(system, s, L, old, new, dw, answer, depends(system, stepper.redundant))
-        s1 = s._replace(friction=friction)
-    s1 = s1._replace(L=L, w=s.w + dw, a=None if s.a is None else s.a + dw)
-    return stepper.jumped(system, s, s1, old, new, h, lambda dQ: answer(dQ)[0])
 
 
 def _is_held(x):
