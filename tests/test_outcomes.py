@@ -12,7 +12,7 @@ from zoo import STEPPERS
 
 import hhtjax
 from hhtjax import SimulationError, System
-from hhtjax.runs.loop import first_failure, no_failure
+from hhtjax.runs.driver import first_failure, no_failure
 from hhtjax.steppers.stepper import Info, State
 
 

@@ -11,20 +11,18 @@ from jax.custom_batching import custom_vmap
 
 from hhtjax.checks import require_integer
 from hhtjax.description import all_concrete, is_tracing
-from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.closures import hoisted
 from hhtjax.numerics.differentiable_while import repeat
 from hhtjax.primitives import is_untouched, largest_in_batch, one_kernel, or_alone, or_plain
 from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
+from hhtjax.runs.driver import drive, resting, steps_of
 from hhtjax.runs.error_control import Steps, select_steps, trimmed
-from hhtjax.runs.event_loop import loop_with_events, with_told_events
 from hhtjax.runs.event_step import Pieces
 from hhtjax.runs.frozen_steps import frozen, is_pair, run_and_choice
 from hhtjax.runs.inputs import Problem, require_events, require_sample_times
 from hhtjax.runs.interpolate import kept, output_between, solution_at, with_output
-from hhtjax.runs.loop import flaw_at_start, loop_over, resting, with_flaw
 from hhtjax.runs.output import beside_path, output_at_start, without_path
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, step_start
@@ -216,7 +214,7 @@ class Grid(NamedTuple):
 
     def loop(self, flat, stepper, q, v, t0, params):
         """The `Loop` over its steps."""
-        return loop_over(flat, stepper, q, v, t0, params, self.sizes, resolves=True)
+        return steps_of(flat, stepper, q, v, t0, params, self.sizes, resolves=True)
 
     def sizes(self, number):
         """Of a step its size, that of the one before, and where it ends; behind the last 1, and inf."""
@@ -245,36 +243,40 @@ def run_over(problem, times, ends, accepted, events=None, halved=False, room=())
 
 def follow(problem, times, grid, events=None, room=()):
     """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
-    flat, q, v, t0, params = problem.flat()
-    longest = largest_in_batch(grid.counts)
-    plain = loop = grid.loop(flat, problem.stepper, q, v, t0, params)
-    if events is not None:
-        more = {"in_pieces": True, "with_modes": problem.output is not None}
-        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, **more)
-    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
+    return drive(problem, grid.loop, partial(_between, times=times, grid=grid), events, room, between=True)
+
+
+def _between(run, times, grid):
+    """Samples at these times, each read off in the step that ends there or beyond."""
+    problem, flat, params, loop, form = run
+    in_pieces = loop.now is not None
     begun = partial(begun_with, flat, problem.stepper, params, loop)
     keep, read = partial(kept, flat, problem.stepper), None
+    longest = largest_in_batch(grid.counts)
     if problem.output is not None:
         read = partial(output_in, loop, flat, problem.output, params, keep, times[-1] - loop.carry[0].t)
         if not problem.output.beside_path:
             keep = None
-    interval = to_next_sample(loop, form, begun, keep, in_pieces=events is not None, read=read)
+    interval = to_next_sample(loop, form, begun, keep, in_pieces, read)
 
     def samples(carry):
-        return lax.scan(interval, (carry[0] if events is None else (), carry), (grid.counts, longest, times))
+        return lax.scan(interval, (() if in_pieces else carry[0], carry), (grid.counts, longest, times))
 
-    (_, (state, _, failure, *met)), (around, found, info) = one_kernel(samples, form.tree)
-    start = loop.start
-    flaw = flaw_at_start(problem.system, flat, start, params)
-    if met:
-        met = form.joined(met[0])
-        times = jnp.where(met.ended, jnp.minimum(times, state.t), times)
-    run = solution_at(flat, start, form.joined(around), times, grid.reached, info, with_flaw(failure, flaw))
-    if problem.output is not None:
+    (_, carry), (around, found, info) = one_kernel(samples, form.tree)
+
+    def solution(failure):
+        state, _, _, *met = carry
+        ends = times
+        if met:
+            ends = jnp.where(form.joined(met[0]).ended, jnp.minimum(times, state.t), times)
+        run = solution_at(flat, loop.start, form.joined(around), ends, grid.reached, info, failure)
+        if problem.output is None:
+            return run
         first = loop.sizes(jnp.zeros((), jnp.int32))[0]
-        at_start = output_at_start(flat, problem.output, params, start, first)
-        run = with_output(run, at_start, form.joined(found), times, grid.reached)
-    return with_told_events(flat, run, met, room[1]) if met else run
+        at_start = output_at_start(flat, problem.output, params, loop.start, first)
+        return with_output(run, at_start, form.joined(found), ends, grid.reached)
+
+    return carry, solution
 
 
 def to_next_sample(loop, form, begun, keep, in_pieces, read=None):

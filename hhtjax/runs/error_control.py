@@ -15,14 +15,14 @@ from hhtjax.numerics.approximate_math import rough_exp, rough_log, without_round
 from hhtjax.numerics.batched_cond import choose, seldom_alone
 from hhtjax.numerics.batched_cond import choose as either
 from hhtjax.primitives import largest_in_batch, one_kernel, or_alone, row_written, staged
-from hhtjax.runs.event_loop import before_any
+from hhtjax.runs.driver import before_any, flaw_at_start, neutral_info, no_failure, saved, with_flaw
 from hhtjax.runs.event_step import SHORT, Part, Ways, asks, pass_events, reaching
 from hhtjax.runs.interpolate import kept, output_between, solution_at, with_output
-from hhtjax.runs.loop import flaw_at_start, neutral_info, no_failure, resized_step, saved, with_flaw
 from hhtjax.runs.output import output_at_start
 from hhtjax.runs.progress import announce, steps_between
 from hhtjax.runs.solution import EVENTS, FINE, MANY, SimulationError, first_bad
 from hhtjax.steppers.stepper import entered, join_info, step_start
+from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.systems.events import flatten_events
 

@@ -19,9 +19,9 @@ from hhtjax.description import freeze, thaw
 from hhtjax.numerics.batched_cond import choose, if_any, seldom
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import staged
-from hhtjax.runs.loop import resized_step
 from hhtjax.runs.solution import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, SINGULAR, STAYS, THROWN, row_of
 from hhtjax.steppers.stepper import behind_jump, entered, join_info
+from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.sampled import SLOP
 

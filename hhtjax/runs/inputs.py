@@ -12,9 +12,10 @@ from jax.core import Tracer
 from hhtjax import checks
 from hhtjax.checks import describe, require_function, require_integer, require_number, require_params
 from hhtjax.description import all_concrete, freeze, is_array, is_concrete, is_real, known_now, thaw
+from hhtjax.runs.driver import equal_steps
 from hhtjax.runs.event_step import nearness
-from hhtjax.runs.loop import GROWTH, loop_of
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.steppers.variable_step import GROWTH
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.flat_system import flatten
@@ -63,10 +64,10 @@ class Problem(NamedTuple):
         """Times in the dtype of the state."""
         return jnp.asarray(t).astype(jax.tree.leaves(self.q0)[0].dtype)
 
-    def flat(self):
+    def flat(self, caller="simulate"):
         """The system on vectors, q, v, t0 and the params."""
         params = thaw(self.params)
-        flat, q, v = flatten("simulate", self.system, self.q0, self.v0, self.t0, params, self.z0)
+        flat, q, v = flatten(caller, self.system, self.q0, self.v0, self.t0, params, self.z0)
         return flat, q, v, self.times(self.t0), params
 
 
@@ -206,7 +207,7 @@ class EqualSteps(NamedTuple):
 
     def loop(self, flat, stepper, q, v, t0, params):
         """The `Loop` over them."""
-        return loop_of(flat, stepper, q, v, t0, params, self.dt)
+        return equal_steps(flat, stepper, q, v, t0, params, self.dt)
 
 
 def refined(dt, k):

@@ -10,7 +10,7 @@ import numpy as np
 from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.batched_cond import choose, if_any
-from hhtjax.runs.loop import as_path, as_solution, saved
+from hhtjax.runs.driver import as_path, as_solution, saved
 from hhtjax.runs.output import output_at
 from hhtjax.runs.solution import Solution, told
 from hhtjax.steppers.stepper import State, public

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from hhtjax.checks import check_dtype, describe, require_function
 from hhtjax.description import Description, is_array
-from hhtjax.runs.loop import as_solution, with_flaw
+from hhtjax.runs.driver import as_solution
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import public
 from hhtjax.systems import zero_order_hold
@@ -121,11 +121,13 @@ def without_path(run):
     return run._replace(**dict.fromkeys(PATH))
 
 
-def savings(form, loop, flat, output, params):
-    """How a run saves: the function carry -> what is kept, and that of all kept, dt, info, failure, flaw -> `Solution`.
+def savings(run):
+    """How a `Run` saves: the function carry -> what is kept, and that of all kept, dt, info, failure -> `Solution`.
 
     The first takes the size of the step that has led there, too, where the loop does not know it.
     """
+    problem, flat, params, loop, form = run
+    output = problem.output
     if output is None:
         keep = form.of(loop.keep)
         return lambda carry, last=None: keep(carry[0]), partial(as_solution, flat, loop.start)
@@ -138,9 +140,9 @@ def savings(form, loop, flat, output, params):
             now = zero_order_hold.before(now, state.t, last)
         return state.t, output_of(output, flat, now, state)
 
-    def solution(path, dt, info, failure, flaw):
+    def solution(path, dt, info, failure):
         t, found = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), save((loop.start, *loop.carry[1:])), path)
-        return Solution(t, None, None, None, None, dt, info, with_flaw(failure, flaw), output=found)
+        return Solution(t, None, None, None, None, dt, info, failure, output=found)
 
     return form.of(save), solution
 

@@ -5,15 +5,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from hhtjax.checks import require_integer
-from hhtjax.jaxpr import on_scalars
+from hhtjax.description import all_concrete, is_array, is_concrete, known_now
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
-from hhtjax.primitives import is_in_batch, one_kernel, or_plain
+from hhtjax.numerics.dense_lu import LARGEST, UNROLLED
+from hhtjax.primitives import is_in_batch, is_traced, one_kernel, or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.controlled_run import follow, run_controlled
-from hhtjax.runs.event_loop import loop_with_events, with_told_events
+from hhtjax.runs.driver import drive, equal_steps, given_steps
 from hhtjax.runs.extrapolate import MOST, extrapolated
 from hhtjax.runs.inputs import (
     EqualSteps,
@@ -30,12 +32,13 @@ from hhtjax.runs.inputs import (
     warn_of_jumps_in,
     warn_of_jumps_to,
 )
-from hhtjax.runs.loop import flaw_at_start, given_sizes, grows_at_once, known_factors, loop_of, loop_over
 from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
 from hhtjax.runs.solution import Solution, told
 from hhtjax.steppers.implicit_solve import callbacks_named
 from hhtjax.steppers.stepper import Stepper, join_info
+from hhtjax.steppers.variable_step import GROWTH
+from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.xla import Programs
 
@@ -211,6 +214,11 @@ def simulate(
     return told("simulate", solution, throw)
 
 
+def grows_at_once(dt):
+    """Whether some of these steps (N,), as far as they are known, are too long behind the one before."""
+    return not is_concrete(dt) or bool(np.any(np.asarray(dt)[1:] > GROWTH * np.asarray(dt)[:-1]))
+
+
 @partial(Programs, static_argnames=("room",))
 def _read_off(problem, times, dt, events, *, room):
     """The run with equal steps, at times between them."""
@@ -224,22 +232,24 @@ def _read_off(problem, times, dt, events, *, room):
 
 @partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "grows", "in_batch"))
 def _simulate(problem, dt, events, factors, *, num_steps, save_every, progress, room, grows, in_batch):
-    flat, q, v, t0, params = problem.flat()
-    dt = jnp.asarray(dt).astype(q.dtype)
-    begun = flat._replace(factors=factors), problem.stepper, q, v, t0, params
-    plain = loop = loop_over(*begun, given_sizes(t0, dt), grows=grows) if dt.ndim else loop_of(*begun, dt)
-    if events is not None:
-        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room)
+    dt = problem.times(dt)
+    steps = partial(given_steps, dt=dt, grows=grows) if dt.ndim else partial(equal_steps, dt=dt)
+    size = {"every": save_every, "length": num_steps // save_every}
+    sampling = partial(_at_ends, dt=dt, in_batch=in_batch, progress=progress, **size)
+    return drive(problem, steps, sampling, events, room, factors=factors)
 
-    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)  # without events, which are seldom
+
+def _at_ends(run, dt, every, length, in_batch, progress):
+    """A sample at the end of each of `length` intervals of so many steps."""
+    loop, form = run.loop, run.form
     step = form.of(loop.advance)
-    save, as_saved = savings(form, loop, flat, problem.output, params)
+    save, as_saved = savings(run)
 
     def interval(carry, _):
-        if save_every == 1:
+        if every == 1:
             carry, info = step(carry)
         else:
-            (carry, info), _ = joined_steps((carry, loop.no_info), save_every)
+            (carry, info), _ = joined_steps((carry, loop.no_info), every)
         return carry, (save(carry), info)
 
     def joined_step(carry, _):
@@ -253,15 +263,11 @@ def _simulate(problem, dt, events, factors, *, num_steps, save_every, progress, 
     def intervals(carry, length):
         return one_kernel(lambda carry: checkpointed_scan(interval, carry, length, in_batch), carry)
 
-    length = num_steps // save_every
     if progress:
-        carry, (path, info) = _with_bar(intervals, joined_steps, save, loop, form.tree, length, save_every, q.size)
+        carry, (path, info) = _with_bar(intervals, joined_steps, save, loop, form.tree, length, every, run.flat.size)
     else:
         carry, (path, info) = intervals(form.tree, length)
-    _, _, failure, *met = carry
-    flaw = flaw_at_start(problem.system, flat, loop.start, params)
-    solution = as_saved(form.joined(path), dt, info, failure, flaw)
-    return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution
+    return carry, partial(as_saved, form.joined(path), dt, info)
 
 
 def _with_bar(intervals, joined_steps, save, loop, carry, length, save_every, unknowns):
@@ -283,3 +289,31 @@ def _with_bar(intervals, joined_steps, save, loop, carry, length, save_every, un
         return carry, (save(carry), info)
 
     return lax.scan(interval, carry, jnp.arange(length, dtype=jnp.int32))
+
+
+# ----------------------------------------------------------------------------
+# What short runs of one linear system, in a scan of the user's, have in common: factorised once, where it is written.
+#
+# XLA takes what does not change out of a loop, but not where all that does not change is constant: there each run
+# factorised its matrices.
+
+
+def known_factors(problem, dt):
+    """The `Factors` for the steps dt of a run, while something is traced; None where they are not constant, or large:
+    a program would hold them."""
+    system, stepper = problem.system, problem.stepper
+    if not isinstance(system, LinearSystem) or not is_traced() or jnp.ndim(dt):
+        return None
+    given = [A for A in (system.M, system.C, system.K) if A is not None]
+    if not all(map(is_array, given)) or not any(A.ndim == 2 for A in given) or not UNROLLED < len(system.M) <= LARGEST:
+        return None
+    if not all_concrete((given, stepper, dt)):
+        return None
+    return known_now(_factors, system.alone(), stepper, np.asarray(dt, jax.tree.leaves(problem.q0)[0].dtype))
+
+
+@jax.jit
+def _factors(system, stepper, dt):
+    zero = jnp.zeros(len(system.M), dt.dtype)
+    flat, *_ = flatten("simulate", system, zero, zero, 0 * dt, None)
+    return stepper.astype(dt.dtype).factors_of(flat, dt)

@@ -8,22 +8,20 @@ import numpy as np
 from jax import lax
 from jax.sharding import NamedSharding, PartitionSpec
 
-from hhtjax.description import thaw
-from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.differentiable_while import repeat
 from hhtjax.primitives import one_kernel, or_alone, or_plain
 from hhtjax.runs.adaptive import Adaptive
-from hhtjax.runs.event_loop import loop_with_events, with_told_events
-from hhtjax.runs.inputs import fit_to_samples, fit_to_times
-from hhtjax.runs.loop import advance_from, flaw_at_start, loop_of, resting
+from hhtjax.runs.driver import counted, drive, equal_steps, resting
+from hhtjax.runs.inputs import Problem, fit_to_samples, fit_to_times
 from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_controlled import sweep_chosen
 from hhtjax.runs.sweep_inputs import VECTORS, Inputs
-from hhtjax.systems.flat_system import flatten
+from hhtjax.steppers.stepper import bound
+from hhtjax.steppers.variable_step import resized_step
 from hhtjax.xla import Programs
 
 
@@ -229,66 +227,80 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
     With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval, and
     after the first step there, where that is to know of the steps before. grows: of `resized_step`.
     """
-    stepper, q0, v0, params, z0 = *data[:3], thaw(data[3]), data[4]
-    flat, q, v = flatten("sweep", system, q0, v0, t0, params, z0)
-    grows = grows and stepper.throws(flat)
+    stepper, q0, v0, params, z0 = data
+    problem = Problem(system, stepper, q0, v0, params, t0, z0, output)
+    steps = partial(equal_steps, dt=dt if times is None else dt[0])
+    intervals = dt, substeps, longest, num_samples, times
+    return drive(problem, steps, partial(_at_ends, intervals=intervals, grows=grows), events, room, caller="sweep")
+
+
+def _at_ends(run, intervals, grows):
+    """A sample at the end of each interval."""
+    dt, substeps, longest, num_samples, times = intervals
+    stepper, loop, form, past_events = run.problem.stepper, run.loop, run.form, run.loop.past is not None
+    grows = grows and stepper.throws(run.flat)
     resizes = times is not None and (stepper.resizes or grows)
-    whole = in_two_parts if resizes else lambda *intervals: intervals
-    intervals = None if times is None else whole(times[:-1], dt, substeps, longest)
-    plain = loop = loop_of(flat, stepper, q, v, t0, params, dt if times is None else dt[0])
-    if events is not None:
-        loop = loop_with_events(plain, flat, stepper, events, params, *room)
-    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)
-    save, as_saved = savings(form, loop, flat, output, params)
-    pace = _paces(flat, stepper, params, loop, form, substeps, longest, grows)
+    save, as_saved = savings(run)
+    pace = _paces(run, substeps, longest, grows)
 
     def part(carry, here):
         advance, substeps, longest = pace(carry[0], here)
 
         def step(i, carry):
-            run, info = carry
-            return resting(advance, events is not None, run, info, or_alone(i < substeps))
+            before, info = carry
+            return resting(advance, past_events, before, info, or_alone(i < substeps))
 
         return repeat(step, carry, longest), None
 
     @checkpoint
-    def interval(run, here):
-        carry = run, loop.no_info
-        (run, info), _ = lax.scan(part, carry, here) if resizes else part(carry, here)
-        last = None if here is None or output is None else here[1].ravel()[0]
-        return run, (save(run, last), info)
+    def interval(before, here):
+        carry = before, loop.no_info
+        (after, info), _ = lax.scan(part, carry, here) if resizes else part(carry, here)
+        last = None if here is None or run.problem.output is None else here[1].ravel()[0]
+        return after, (save(after, last), info)
 
     def samples(carry):
-        return lax.scan(interval, carry, intervals, num_samples)
+        if times is None:
+            return lax.scan(interval, carry, None, num_samples)
+        each = times[:-1], dt, substeps, longest
+        return lax.scan(interval, carry, in_two_parts(*each) if resizes else each)
 
-    (_, _, failure, *met), (path, info) = one_kernel(samples, form.tree)
-    flaw = flaw_at_start(system, flat, loop.start, params)
-    solution = as_saved(form.joined(path), dt, info, failure, flaw)
-    return with_told_events(flat, solution, form.joined(met[0]), room[1]) if met else solution
+    carry, (path, info) = one_kernel(samples, form.tree)
+    return carry, partial(as_saved, form.joined(path), dt, info)
 
 
-def _paces(flat, stepper, params, loop, form, substeps, longest, grows):
-    """The function of a run and an interval that gives the step, and how many the member takes, and its block."""
+def _paces(run, substeps, longest, grows):
+    """The function of what the loop carries and an interval that gives the step, and how many the member takes, and its
+    block."""
+    stepper, params, loop, form = run.problem.stepper, run.params, run.loop, run.form
 
-    def stepped(bound, sizes):
+    def stepped(step_for, sizes):
         """The step, with events one that rests."""
-        if loop.past is not None:
-            return form.of(loop.past(bound, sizes))
-        return form.of(bound(params))
+        return form.of(step_for(params) if loop.past is None else loop.past(step_for, sizes))
 
-    def pace(run, interval):
+    def pace(before, interval):
         if interval is None:
             return stepped(loop.bound, loop.sizes), substeps, longest
         t, h, mine, most, *part = interval
         taken, last = part or (None, None)
-        count = run[1] if taken is None else run[1] - taken
+        count = before[1] if taken is None else before[1] - taken
 
-        def bound(params):
-            return advance_from(flat, stepper, h.dtype, params, t, h, count, last, grows)
+        def from_here(params):
+            return advance_from(run.flat, stepper, h.dtype, params, t, h, count, last, grows)
 
-        return stepped(bound, lambda _: (h, h if last is None else last)), mine, most
+        return stepped(from_here, lambda _: (h, h if last is None else last)), mine, most
 
     return pace
+
+
+def advance_from(flat, stepper, dtype, params, t, dt, count, last=None, grows=False):
+    """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken, each of size `last`."""
+    stepper = stepper.astype(dtype)
+    if last is None:
+        take_step = bound(stepper, flat, params, dt)
+    else:
+        take_step = resized_step(flat, stepper, params, dt, last, grows)
+    return counted(take_step, flat, t, dt, count)
 
 
 def in_two_parts(t, dt, substeps, longest):

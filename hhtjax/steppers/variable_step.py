@@ -28,8 +28,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description import is_concrete
+from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.numerics.batched_cond import seldom
 from hhtjax.steppers.residual import Coefficients, weighted
+from hhtjax.steppers.stepper import bound
+from hhtjax.systems import zero_order_hold
+
+GROWTH = 2.05  # of a step, up to which the recursion follows
 
 
 class Resizing:
@@ -71,6 +76,22 @@ def adapted(c, r):
     return c._replace(**{
         name: jnp.where(grown > 1, getattr(new, name), getattr(c, name)) for name in ("alpha_f", "beta", "gamma")
     })  # fmt: skip
+
+
+def resized_step(flat, stepper, params, dt, last, grows=False):
+    """State -> (State, Info) for a step dt after one of another size; grows: whether it may be far longer."""
+
+    def step(state):
+        resized, state = stepper.resized(state, dt / last)
+        if grows and stepper.throws(flat):
+
+            def begin(state, params, dt):
+                return resized.grown(flat, state, zero_order_hold.before(thaw(params), state.t, last), dt)
+
+            state = seldom(begin, dt > GROWTH * last, state, freeze(params), dt)
+        return bound(resized, flat, params, dt, last)(state)
+
+    return step
 
 
 # ----------------------------------------------------------------------------

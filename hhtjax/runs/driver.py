@@ -1,27 +1,60 @@
-"""What a run is made of: the step that counts, watches and saves, for one run as for a sweep."""
+"""The way of every run: begin, step from sample to sample, and tell what came out.
+
+`simulate`, with equal steps, given steps or steps under error control, and each member of a `sweep` go through `drive`.
+They differ in how long their steps are, and in where their samples lie; events are there where they are asked for.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
-from hhtjax.description import all_concrete, freeze, is_array, is_concrete, known_now, thaw
-from hhtjax.numerics.batched_cond import choose, if_any, seldom
-from hhtjax.numerics.dense_lu import LARGEST, UNROLLED
-from hhtjax.primitives import is_traced
-from hhtjax.runs.solution import INTERNAL_STATE, Failure, Solution
+from hhtjax.description import freeze
+from hhtjax.jaxpr import on_scalars
+from hhtjax.numerics.batched_cond import choose, if_any
+from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.primitives import in_turn
+from hhtjax.runs.event_step import Met, Part, Pieces, Ways, asks, pass_events, reaching, unnoted
+from hhtjax.runs.solution import FINE, INTERNAL_STATE, Failure, Log, Solution
 from hhtjax.steppers.friction_switching import is_settled
-from hhtjax.steppers.stepper import Info, bound, entered, join_info, public
+from hhtjax.steppers.stepper import Info, bound, entered, join_info, public, step_start
+from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems import zero_order_hold
-from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.linear_system import LinearSystem
+from hhtjax.systems.events import flatten_events
 from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
 from hhtjax.systems.system import mass_reads_velocity
 
-GROWTH = 2.05  # of a step, up to which the recursion follows
+
+def drive(problem, steps, sampling, events=None, room=(), between=False, factors=None, caller="simulate"):
+    """The `Solution` of a `Problem`: every run of the library comes through here.
+
+    steps: (flat, stepper, q, v, t0, params) -> `Loop`, which knows how long steps are.
+    sampling: `Run` -> what its loop carries in the end, and the function that makes the `Solution` of a `Failure`.
+    events, room: a list of `Event`, how many of them may divide a step, and how many are told. between: whether samples
+        lie within steps, so that the pieces of the last one are kept.
+    factors: those of `FlatSystem`, where they are known. caller: whom an error in a user's function names.
+    """
+    flat, q, v, t0, params = problem.flat(caller)
+    plain = loop = steps(flat._replace(factors=factors), problem.stepper, q, v, t0, params)
+    if events is not None:
+        pieces = {"in_pieces": between, "with_modes": problem.output is not None}
+        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, **pieces)
+    form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)  # without events, which are seldom
+    (_, _, failure, *met), solution = sampling(Run(problem, flat, params, loop, form))
+    run = solution(with_flaw(failure, flaw_at_start(problem.system, flat, loop.start, params)))
+    return with_told_events(flat, run, form.joined(met[0]), room[1]) if met else run
+
+
+class Run(NamedTuple):
+    """A run before its first step. form: how what the loop carries is stepped, as arrays or number by number."""
+
+    problem: Any
+    flat: Any
+    params: Any
+    loop: Any
+    form: Any
 
 
 class Loop(NamedTuple):
@@ -41,8 +74,8 @@ class Loop(NamedTuple):
     now: Any = None
 
 
-def loop_of(flat, stepper, q, v, t0, params, dt):
-    """The loop over a stepper's steps."""
+def equal_steps(flat, stepper, q, v, t0, params, dt):
+    """The `Loop` over steps of one size."""
     stepper = stepper.astype(q.dtype)
 
     def take_step(params):
@@ -60,15 +93,19 @@ def loop_of(flat, stepper, q, v, t0, params, dt):
     return Loop(carry, counted(step, flat, t0, dt), keep, no_info, advance, lambda count: (dt, dt), start)
 
 
-def given_sizes(t0, dt):
-    """`sizes` of `loop_over` for steps dt (N,); NaN where one is not positive."""
+def given_steps(flat, stepper, q, v, t0, params, dt, grows):
+    """The `Loop` over steps dt (N,); NaN from one on that is not positive."""
     dt = jnp.where((dt > 0) & jnp.isfinite(dt), dt, jnp.nan)
     steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt)
-    return lambda number: [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
+
+    def sizes(number):
+        return [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
+
+    return steps_of(flat, stepper, q, v, t0, params, sizes, grows=grows)
 
 
-def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=False):
-    """The same with steps of any sizes: number of steps taken -> the next, the one before, and where it ends.
+def steps_of(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=False):
+    """The `Loop` over steps of any sizes: number of steps taken -> the next, the one before, and where it ends.
 
     resolves: whether the first is one of error control. grows: of `resized_step`."""
     stepper = stepper.astype(q.dtype)
@@ -103,37 +140,6 @@ def loop_over(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=Fals
     return Loop(carry, advance(params), keep, no_info, advance, lambda count: tuple(sizes(count)[:2]), start)
 
 
-def grows_at_once(dt):
-    """Whether some of these steps (N,), as far as they are known, are too long behind the one before."""
-    return not is_concrete(dt) or bool(np.any(np.asarray(dt)[1:] > GROWTH * np.asarray(dt)[:-1]))
-
-
-def resized_step(flat, stepper, params, dt, last, grows=False):
-    """State -> (State, Info) for a step dt after one of another size; grows: whether it may be far longer."""
-
-    def step(state):
-        resized, state = stepper.resized(state, dt / last)
-        if grows and stepper.throws(flat):
-
-            def begin(state, params, dt):
-                return resized.grown(flat, state, zero_order_hold.before(thaw(params), state.t, last), dt)
-
-            state = seldom(begin, dt > GROWTH * last, state, freeze(params), dt)
-        return bound(resized, flat, params, dt, last)(state)
-
-    return step
-
-
-def advance_from(flat, stepper, dtype, params, t, dt, count, last=None, grows=False):
-    """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken, each of size `last`."""
-    stepper = stepper.astype(dtype)
-    if last is None:
-        take_step = bound(stepper, flat, params, dt)
-    else:
-        take_step = resized_step(flat, stepper, params, dt, last, grows)
-    return counted(take_step, flat, t, dt, count)
-
-
 def counted(take_step, flat, t0, dt, before=None):
     """The step of a run, on (state, number of steps, first failure); also its `Info`. before: steps taken at t0."""
 
@@ -161,9 +167,8 @@ def saved(flat, state):
     return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot, state.friction
 
 
-def as_solution(flat, start, path, dt, info, failure, flaw=None):
-    """The start and the path after it as a `Solution`; flaw: of the mass at the start, as `mass_flaw` says it."""
-    failure = with_flaw(failure, flaw)
+def as_solution(flat, start, path, dt, info, failure):
+    """The start and the path after it as a `Solution`."""
     path = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
     return as_path(flat, path)._replace(dt=dt, info=info, failure=failure)
 
@@ -250,28 +255,97 @@ def neutral_info(shapes):
 
 
 # ----------------------------------------------------------------------------
-# What short runs of one linear system, in a scan of the user's, have in common: factorised once, where it is written.
-#
-# XLA takes what does not change out of a loop, but not where all that does not change is constant: there each run
-# factorised its matrices.
+# Events: what a run carries along for them, and what it tells of them.
 
 
-def known_factors(problem, dt):
-    """The `Factors` for the steps dt of a run, while something is traced; None where they are not constant, or large:
-    a program would hold them."""
-    system, stepper = problem.system, problem.stepper
-    if not isinstance(system, LinearSystem) or not is_traced() or jnp.ndim(dt):
-        return None
-    given = [A for A in (system.M, system.C, system.K) if A is not None]
-    if not all(map(is_array, given)) or not any(A.ndim == 2 for A in given) or not UNROLLED < len(system.M) <= LARGEST:
-        return None
-    if not all_concrete((given, stepper, dt)):
-        return None
-    return known_now(_factors, system.alone(), stepper, np.asarray(dt, jax.tree.leaves(problem.q0)[0].dtype))
+def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False, with_modes=False):
+    """The `Loop` with events: its carry has `Met` behind (state, number of steps, first failure).
+
+    in_pieces: whether that has the `Pieces` of the last step; with_modes: whether these have the modes.
+    """
+    start = loop.carry[0]
+    stepper = stepper.astype(start.v.dtype)
+    flat_events = flatten_events(flat, events, params, (start.q, start.v, start.t), stepper.redundant)
+    ways = Ways(flat, stepper, flat_events, max_events, loop.no_info, reaching(flat, stepper, loop.no_info), keep)
+    met = before_any(ways, params, start.t)
+    met = met._replace(log=Log.empty(unnoted(start)[0], keep, ways.slots))
+    if in_pieces:
+        met = met._replace(pieces=Pieces.none(start, max_events + 1, met.modes if with_modes else ()))
+    step = past_events(ways, params, loop.bound, loop.sizes)
+    more = {"past": partial(past_events, ways, params), "now": lambda met: flat_events.with_modes(params, met.modes)}
+    return loop._replace(carry=(*loop.carry, met), advance=step, **more)
 
 
-@jax.jit
-def _factors(system, stepper, dt):
-    zero = jnp.zeros(len(system.M), dt.dtype)
-    flat, *_ = flatten("simulate", system, zero, zero, 0 * dt, None)
-    return stepper.astype(dt.dtype).factors_of(flat, dt)
+def past_events(ways, params, bound, sizes):
+    """The step of a run with events, which rests where not `here`.
+
+    bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
+    """
+    events, pass_them = ways.events, passing(ways)
+    fixed = None if events.switches else bound(params)
+
+    def step(carry, here=None):
+        *run, met = carry
+        now = events.with_modes(params, met.modes)
+        (new, count, _), info = (fixed or bound(now))(tuple(run))
+        state, before, failure = run
+        h, last = sizes(before)
+        if any(events.ends):
+            new, info = choose(met.ended, state, new), choose(met.ended, ways.no_info, info)
+        # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
+        new, count = at_rest(here, (new, count), (state, before))
+        if met.pieces is not None:
+            begun = step_start(ways.stepper, ways.flat, now, h, last, state)[1]
+            met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new, met.modes), met.pieces))
+        part = Part.whole(ways, state, new, info, h, last, met._replace(log=None))
+        counts = None if here is None else (before, count)
+        asked = may_meet(ways, part, h, params)
+        part, log = if_any(pass_them, asked, (part, met.log), counts, h, freeze(params), kept=False)
+        told = first_failure(ways.flat, failure, count, part.end, part.info)
+        return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
+
+    return step
+
+
+def may_meet(ways, part, h, params):
+    """Whether there may be an event in a step."""
+    now = ways.during(params, part.start.t, h).params(params, part.met.modes)
+    asked = asks(ways, part.start, part.end, now, part.met.over, h)
+    return asked & ~part.met.ended if any(ways.events.ends) else asked
+
+
+def passing(ways):
+    """The function of a step and the log, with the counts of steps before and after it, that passes its events."""
+
+    @checkpoint  # reverse mode would keep all that is in there for each step
+    def noted(now, h, params):
+        part, log = now
+        part, (rows, there) = pass_events(ways, params, part, h)
+        return part, log.with_more(rows, there, ways.keep)
+
+    def pass_them(now, counts, h, params):
+        part, log = now
+        # who asks, anew: what is needed here alone is nothing that a step without events has to keep
+        asked = may_meet(ways, part, h, params)
+        if counts is not None:
+            asked = asked & (counts[0] != counts[1])  # members that do not rest
+        return in_turn(noted, asked, (part._replace(asked=asked), log), h, params)
+
+    return pass_them
+
+
+def at_rest(here, new, old):
+    """The new, or, where a member of a sweep rests, the old."""
+    return new if here is None else choose(here, new, old)
+
+
+def before_any(ways, params, t):
+    """`Met` before the first event."""
+    none = jnp.zeros((), jnp.int32)
+    return Met(ways.events.modes(params), jnp.array(False), none + FINE, none, over=ways.events.before_any(t))
+
+
+def with_told_events(flat, solution, met, keep):
+    """The `Solution` with its `Events`, and what was wrong with one of them."""
+    failure = solution.failure._replace(event=met.code, guard=met.event)
+    return solution._replace(events=met.log.told(flat, keep), failure=failure)
