@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.description import freeze
+from hhtjax.description import thaw
 from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.batched_cond import choose, if_any
 from hhtjax.numerics.checkpointed_scan import checkpoint
@@ -196,7 +196,7 @@ def flaw_at_start(system, flat, start, params):
     flaw = mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None or system.massless is not None)
     if not getattr(system.mass, "is_lagrangian", False):
         return flaw
-    at = flat.unravel(start.q), flat.unravel_rates(flat.located(start.v)), start.t, params
+    at = flat.unravel(start.q), flat.unravel_rates(flat.located(start.v)), start.t, thaw(params)
     return jnp.where((flaw == 0) & mass_reads_velocity(system.mass.lagrangian, *at), OF_VELOCITY, flaw)
 
 
@@ -300,7 +300,7 @@ def past_events(ways, params, bound, sizes):
         part = Part.whole(ways, state, new, info, h, last, met._replace(log=None))
         counts = None if here is None else (before, count)
         asked = may_meet(ways, part, h, params)
-        part, log = if_any(pass_them, asked, (part, met.log), counts, h, freeze(params), kept=False)
+        part, log = if_any(pass_them, asked, (part, met.log), counts, h, params, kept=False)
         told = first_failure(ways.flat, failure, count, part.end, part.info)
         return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import freeze, is_concrete
+from hhtjax.description import is_concrete
 from hhtjax.description.presentation import overwrite, shown
 from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.approximate_math import rough_exp, rough_log, without_rounding
@@ -280,7 +280,7 @@ def passed(trial, tried, walk, h):
     ways = trial.ways
     met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE))
     part = Part.whole(ways, walk.state, tried.walk.state, ways.no_info, h, walk.last, met, ~met.ended)
-    part, (rows, there) = pass_events(ways, freeze(trial.params), part, h)
+    part, (rows, there) = pass_events(ways, trial.params, part, h)
     noted = jnp.asarray((*ways.events.noted, True))[rows[:, 1].astype(jnp.int32)]
     there = there & ~noted  # which have nothing behind them
     times = jnp.where(there, rows[:, 0], jnp.inf)

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import freeze, thaw
 from hhtjax.numerics.batched_cond import choose, if_any, seldom
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import staged
@@ -39,8 +38,7 @@ def asks(ways, s, s1, params, over, h):
 
 def pass_events(ways, params, part, h):
     """The step across all events in it: a `Part`, of which end, info and met are to be used, and what to note of
-    them, rows and whether each is there. Members that have not asked stay as they are. params
-    are as `freeze` leaves them, here and in what this calls, and `Ways.params` thaws them."""
+    them, rows and whether each is there. Members that have not asked stay as they are."""
     ways = ways.during(params, part.start.t, h)
     if ways.middle is not None:
         known, t = ways.events.with_modes(params, part.met.modes), part.start.t
@@ -58,9 +56,9 @@ def pass_events(ways, params, part, h):
     met = part.met
 
     def anew(s, params):
-        return begin(ways, s.q, s.v, s.t, thaw(params), h, moves=False)
+        return begin(ways, s.q, s.v, s.t, params, h, moves=False)
 
-    now = freeze(ways.params(params, met.modes))
+    now = ways.params(params, met.modes)
     end = seldom(anew, (part.divided > 0) & ~met.ended, part.end, now)
 
     def known(s):
@@ -247,7 +245,7 @@ class Part(NamedTuple):
 
 def go(ways, params, s, tau, last, h):
     """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
-    return ways.reach(freeze(params), s, tau, last, h)
+    return ways.reach(params, s, tau, last, h)
 
 
 def reaching(flat, stepper, no_info):
@@ -256,7 +254,7 @@ def reaching(flat, stepper, no_info):
     @staged
     def reach(params, s, tau, last, h):
         short = tau <= SHORT * h
-        s1, info = resized_step(flat, stepper, thaw(params), jnp.maximum(tau, SHORT * h), last)(s)
+        s1, info = resized_step(flat, stepper, params, jnp.maximum(tau, SHORT * h), last)(s)
         return choose(short, drifted(flat, s, tau), s1), choose(short, no_info, info)
 
     return reach

@@ -66,9 +66,8 @@ class Problem(NamedTuple):
 
     def flat(self, caller="simulate"):
         """The system on vectors, q, v, t0 and the params."""
-        params = thaw(self.params)
-        flat, q, v = flatten(caller, self.system, self.q0, self.v0, self.t0, params, self.z0)
-        return flat, q, v, self.times(self.t0), params
+        flat, q, v = flatten(caller, self.system, self.q0, self.v0, self.t0, self.params, self.z0)
+        return flat, q, v, self.times(self.t0), self.params
 
 
 def _refuse_checked_axes(caller, *args):
@@ -362,7 +361,7 @@ def _require_impact(caller, params, law, first_order):
     e = law.restitution
     if isinstance(e, str) and not (isinstance(params, dict) and e in params):
         raise ValueError(f"{caller}: `restitution` of the impact must be the name of one in params; received {e!r}.")
-    e = law.coefficient(params)
+    e = law.coefficient(thaw(params))
     require_number(caller, "restitution", e, lambda e: 0 <= e <= 1, "lie in [0, 1]")
 
 
@@ -432,7 +431,7 @@ def _guards_at_start(problem, events):
         size = jnp.max(jnp.abs(flat.force(q, v, t0, params)))  # that of what the multipliers are the difference of
         terms = terms + jnp.sum(jnp.abs(along_L), axis=1) * size
     laws = [event.reset if isinstance(event.reset, Impact) else Impact(0.0) for event in events]
-    e = jnp.stack([jnp.asarray(law.coefficient(params)).astype(q.dtype) for law in laws])
+    e = jnp.stack([jnp.asarray(law.coefficient(thaw(params))).astype(q.dtype) for law in laws])
     return g, rates, terms, jnp.any(along_v != 0, axis=1), e
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import check_dtype, describe, require_function
-from hhtjax.description import Description, is_array
+from hhtjax.description import Description, is_array, thaw
 from hhtjax.runs.driver import as_solution
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import public
@@ -36,6 +36,8 @@ class Output(Description):
     def __call__(self, values, dtype):
         """The function of values, by name, checked while it is traced."""
         chosen = {name: values[name] for name in self.names}
+        if "params" in chosen:
+            chosen["params"] = thaw(chosen["params"])
         try:
             found = self.function(**chosen)
             return jax.tree.map(partial(_as_array, dtype=dtype), _checked(found, dtype))

@@ -33,7 +33,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import freeze, thaw
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.batched_cond import choose, derivative_at_need, seldom
 from hhtjax.numerics.closures import hoisted
@@ -99,12 +98,12 @@ class Layer(NamedTuple):
         return cls(system, params, base, offset, c.beta * h**2, c.gamma * h, B, bend)
 
     def data(self):
-        """What may be arguments of a function of JAX: all but the system, with params frozen."""
-        return freeze(self._replace(system=None))
+        """What may be arguments of a function of JAX: all but the system."""
+        return self._replace(system=None)
 
     def with_data(self, data):
         """The layer with these."""
-        return thaw(data)._replace(system=self.system)
+        return data._replace(system=self.system)
 
     def located(self, x):
         """x (N,) with 0 for internal states."""
@@ -192,7 +191,7 @@ def jumped(method, system, s, after, both, h, answer, anew=None):
     stiff = is_stiff(method, system, s, new, h, after.w - s.w, answer)
 
     def smooth(_, s, both, h):
-        old, new = map(thaw, both)
+        old, new = both
         if anew is not None:
             return anew(s, new, h)
         layer = Layer.of(method, system, new, h, s._replace(a=None, friction=None, memory=None))
@@ -202,7 +201,7 @@ def jumped(method, system, s, after, both, h, answer, anew=None):
         a, L = (None if x is None else x + change for x, change in ((s.a, dw), (s.L, dL)))
         return s._replace(v=v, w=s.w + dw, a=a, L=L)
 
-    return seldom(smooth, stiff, after, s, freeze(both), h)
+    return seldom(smooth, stiff, after, s, both, h)
 
 
 def grown(method, system, s, params, h, smooth=smoothed):
@@ -219,9 +218,9 @@ def grown(method, system, s, params, h, smooth=smoothed):
     leaves = leaves & is_stiff(method, system, s, params, h, s.w, lambda dQ: answer(dQ)[0], LEAVES)
 
     def begin(s, params, h):
-        return smooth(method, system, s, thaw(params), h, lags=True)
+        return smooth(method, system, s, params, h, lags=True)
 
-    return seldom(begin, leaves, s, freeze(params), h)
+    return seldom(begin, leaves, s, params, h)
 
 
 def is_stiff(method, system, s, params, h, w, answer, part=STIFF):

@@ -1,5 +1,6 @@
 """What every stepper shares: the state it carries, what it reports, and how it is called."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import Description, freeze, thaw
+from hhtjax.description import Description, freeze
 from hhtjax.description.presentation import known, shown
 from hhtjax.numerics.batched_cond import seldom
 from hhtjax.systems import kinematics, zero_order_hold
@@ -204,6 +205,7 @@ class Stepper(Description):
 
     def step(self, system, state, params, dt) -> tuple[State, Info]:
         """State one step dt after `state`, and what the step tells about itself."""
+        params = freeze(params)
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params, state.z)
         w = ravel_pytree((state.w if flat.positions else state.v, state.zdot))[0]
         a = None if state.a is None else ravel_pytree((state.a, state.za))[0]
@@ -215,6 +217,7 @@ class Stepper(Description):
 def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
     """What `Stepper.init` makes of checked initial values."""
     require_capable(caller, system, stepper, q0, v0)
+    params = freeze(params)
     flat, q, v = flatten(caller, system, q0, v0, t0, params, z0)
     dt, t0 = (jnp.asarray(x).astype(q.dtype) for x in (dt, t0))
     return _unravel(
@@ -266,11 +269,8 @@ def behind_jump(stepper, system, s, old, new, h, here=None):
     jump at all, as far as that is known; not whether values differ, as derivatives in equal ones are those of a jump.
     """
 
-    def behind(s, old, new, h):
-        return _behind_jump(stepper, system, s, thaw(old), thaw(new), h)
-
-    both = freeze(old), freeze(new)
-    return behind(s, *both, h) if here is None else seldom(behind, here, s, *both, h)
+    behind = partial(_behind_jump, stepper, system)
+    return behind(s, old, new, h) if here is None else seldom(behind, here, s, old, new, h)
 
 
 def _behind_jump(stepper, system, s, old, new, h):

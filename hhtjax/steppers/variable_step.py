@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.description import is_concrete
 from hhtjax.numerics.batched_cond import seldom
 from hhtjax.steppers.residual import Coefficients, weighted
 from hhtjax.steppers.stepper import bound
@@ -86,9 +86,9 @@ def resized_step(flat, stepper, params, dt, last, grows=False):
         if grows and stepper.throws(flat):
 
             def begin(state, params, dt):
-                return resized.grown(flat, state, zero_order_hold.before(thaw(params), state.t, last), dt)
+                return resized.grown(flat, state, zero_order_hold.before(params, state.t, last), dt)
 
-            state = seldom(begin, dt > GROWTH * last, state, freeze(params), dt)
+            state = seldom(begin, dt > GROWTH * last, state, params, dt)
         return bound(resized, flat, params, dt, last)(state)
 
     return step

@@ -234,7 +234,7 @@ class FlatEvents(NamedTuple):
     times: tuple  # (E,), the times at which it happens, (K,), or None
     switches: bool  # whether one of them changes params
     modes: Callable  # params -> a list of those of its numbers that a switch changes
-    with_modes: Callable  # params, frozen or not, modes -> params
+    with_modes: Callable  # params, modes -> params
 
     @property
     def timed(self):
@@ -308,7 +308,7 @@ def _first_left(times, over):
 def flatten_events(system, events, params, at, redundant=None):
     """The events of a `FlatSystem`. at: q, v, t of the start; redundant: how its constraints are solved."""
     changed = sorted({i for event in events if event.switch for i in _changed(system, event, params, at)})
-    times = tuple(None if event.at is None else event.times(params).astype(at[1].dtype) for event in events)
+    times = tuple(None if event.at is None else event.times(thaw(params)).astype(at[1].dtype) for event in events)
     guards = [None if event.guard is None else consistent(partial(_guard, system, event)) for event in events]
 
     def values(s, params, due):
@@ -321,22 +321,22 @@ def flatten_events(system, events, params, at, redundant=None):
         return [jnp.asarray(leaves[i]) for i in changed]
 
     def with_modes(params, modes):
-        leaves, structure = jax.tree.flatten(thaw(params))
+        leaves, structure = jax.tree.flatten(params)
         for i, x in zip(changed, modes, strict=True):
             leaves[i] = x
         return structure.unflatten(leaves)
 
-    def outcome_of(event, before, q, t, frozen):
-        (v, old), (now, params) = before, thaw(frozen)
+    def outcome_of(event, before, q, t, now, params):
+        v, old = before
         after = switched(system, event, q, v, t, params)
         new = [x.astype(y.dtype) for x, y in zip(modes(after), old, strict=True)]
         return _reset(system, event, redundant, q, v, t, now), new
 
     def outcome(i, s, now, params):
-        after, frozen = (s.v, modes(params)), freeze((now, params))
+        after = s.v, modes(params)
         for number, event in enumerate(events):
             if not event.is_noted:
-                after = seldom(partial(outcome_of, event), i == number, after, s.q, s.t, frozen)
+                after = seldom(partial(outcome_of, event), i == number, after, s.q, s.t, now, params)
         return after
 
     names = "is_noted", "terminal", "sees_multipliers"
@@ -348,7 +348,8 @@ def switched(system, event, q, v, t, params):
     """The params behind an event, from the flat state before it."""
     if event.switch is None:
         return params
-    return _on_vectors(system, event.switch, q, v, t, params) if event.switch_sees_state else event.switch(params)
+    whole = event.switch_sees_state
+    return freeze(_on_vectors(system, event.switch, q, v, t, params) if whole else event.switch(thaw(params)))
 
 
 def _guard(system, event, q, v, t, L, params):
@@ -359,6 +360,7 @@ def _guard(system, event, q, v, t, L, params):
 
 def _on_vectors(system, function, q, v, t, params):
     """A user's function at a flat state."""
+    params = thaw(params)
     if system.positions == 0:
         return function(system.unravel(v), t, params)
     internal = () if system.positions == system.size else (system.unravel_internal(v[system.positions :]),)
@@ -396,7 +398,7 @@ def _reset(system, event, redundant, q, v, t, params):
 
 def _bounced(system, guard, law, redundant, q, v, t, params):
     """v behind an impact; NaN where no velocity changes the guard."""
-    e = jnp.asarray(law.coefficient(params)).astype(v.dtype)
+    e = jnp.asarray(law.coefficient(thaw(params))).astype(v.dtype)
     gradient, g_t = jax.grad(lambda q, t: jnp.asarray(guard(q, v, t, params)).reshape(()), argnums=(0, 1))(q, t)
     n = pull_back(system, q, gradient)
     x, _ = answers(system, q, t, params, redundant)(n)

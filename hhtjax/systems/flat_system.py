@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import check_like, check_matrix, count, describe, evaluate, telling_of_arguments
+from hhtjax.description import thaw
 from hhtjax.numerics.dense_lu import by_factors, factorize, matvec
 from hhtjax.numerics.linear_solve import reuse, solver
 from hhtjax.numerics.sparse_matrix import combined
@@ -26,6 +27,9 @@ class FlatSystem(NamedTuple):
     An internal state is a rate that has no position: v = (velocity, z) and w = (acceleration, zdot) hold N rates, of
     which the first n have positions. Their force is (Q, g), and the mass of z is 1. A first-order system is the case
     n = 0. q is (n,) too, but for rotations, of which it holds the matrices.
+
+    params are everywhere as `freeze` leaves them, a pytree of arrays alone, which branches and loops can take. A user's
+    function gets them as the user gave them: whoever calls it thaws them.
     """
 
     mass: Callable  # q, t, params -> (n, n), or (n,) for a diagonal: of the rates that have positions
@@ -207,22 +211,22 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
 
 
 def _flat_mass(system, unravel, dtype, q, t, params):
-    return as_matrix(mass_at(system, unravel(q), t, params), dtype)
+    return as_matrix(mass_at(system, unravel(q), t, thaw(params)), dtype)
 
 
 def _flat_force(unravel_rates, system, unravel, dtype, q, v, t, params):
-    return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, params))[0].astype(dtype)
+    return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, thaw(params)))[0].astype(dtype)
 
 
 def _with_local(system, flat, dtype):
     """The system with its nonlinear force kept apart, too."""
 
     def linear_force(q, v, t, params):
-        Q = system.linear_force(flat.unravel(q), flat.unravel_rates(v), t, params)
+        Q = system.linear_force(flat.unravel(q), flat.unravel_rates(v), t, thaw(params))
         return ravel_pytree(Q)[0].astype(dtype)
 
     def local_force(q, v, t, params):
-        return system.local_force(flat.unravel(q), flat.unravel_rates(v), t, params).astype(dtype)
+        return system.local_force(flat.unravel(q), flat.unravel_rates(v), t, thaw(params)).astype(dtype)
 
     spread, size = partial(system.spread, n=flat.size), None if system.at is None else len(system.at)
     local = Local(flat._replace(force=consistent(linear_force)), consistent(local_force), spread, size)
@@ -235,7 +239,7 @@ def _with_internal(system, flat, q, v0, z0):
     unravel_internal = ravel_pytree(z0)[1]
 
     def force(q, V, t, params):
-        at = flat.unravel(q), *unravel(V), t, params
+        at = flat.unravel(q), *unravel(V), t, thaw(params)
         return ravel_pytree((system.force(*at), system.internal(*at)))[0].astype(V.dtype)
 
     return flat._replace(force=consistent(force), size=V.size, unravel_internal=unravel_internal), q, V
@@ -248,7 +252,7 @@ def _flatten_first_order(caller, system, y0, t0, params):
     check_like(caller, "rate", evaluate(caller, "rate", system.rate, y0, t0, params), "q0", y0, dtype)
 
     def rate(q, v, t, params):
-        return ravel_pytree(system.rate(unravel(v), t, params))[0].astype(dtype)
+        return ravel_pytree(system.rate(unravel(v), t, thaw(params)))[0].astype(dtype)
 
     def mass(q, t, params):
         return jnp.ones(0, dtype)
@@ -297,8 +301,8 @@ def _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params):
 
 
 def _flat_constraint(constraint, unravel, dtype, q, t, params):
-    return jnp.asarray(constraint(unravel(q), t, params)).astype(dtype)
+    return jnp.asarray(constraint(unravel(q), t, thaw(params))).astype(dtype)
 
 
 def _flat_product(system, unravel, unravel_rates, dtype, q, w, t, params):
-    return ravel_pytree(product_at(system, unravel(q), unravel_rates(w), t, params))[0].astype(dtype)
+    return ravel_pytree(product_at(system, unravel(q), unravel_rates(w), t, thaw(params)))[0].astype(dtype)

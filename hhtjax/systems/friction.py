@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax import checks
 from hhtjax.checks import describe, require_function
+from hhtjax.description import thaw
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
@@ -73,13 +74,13 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
     def limit(q, V, L, t, params):
         multipliers = (L,) if flat.num_constraints else ()
         at = flat.unravel(q), flat.unravel_rates(flat.located(V)), *unravel_internal(V), *multipliers
-        return ravel_pytree(system.friction(*at, t, params))[0].astype(dtype)
+        return ravel_pytree(system.friction(*at, t, thaw(params)))[0].astype(dtype)
 
     def sliding(q, V, t, params):
         v = flat.located(V)
         if system.sliding is None:
             return v
-        return jnp.asarray(system.sliding(flat.unravel(q), flat.unravel_rates(v), t, params)).astype(dtype)
+        return jnp.asarray(system.sliding(flat.unravel(q), flat.unravel_rates(v), t, thaw(params))).astype(dtype)
 
     dependent = m > min(n - flat.num_constraints, FEW) or system.depending
     return FrictionLaw(consistent(limit), consistent(sliding), m, dependent)

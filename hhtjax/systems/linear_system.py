@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import evaluate, require_function, require_integer
-from hhtjax.description import Description, is_array
+from hhtjax.description import Description, is_array, thaw
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.numerics.sparse_matrix import Sparse, of_dense
 from hhtjax.systems.friction import require_friction
@@ -219,7 +219,7 @@ def with_known_matrices(caller, system, flat, on_vectors, dtype, params):
 
     def matrices(params):
         given = {name: getattr(system, name) for name in shapes}
-        found = {name: as_matrix(A(params) if callable(A) else A, dtype) for name, A in given.items()}
+        found = {name: as_matrix(A(thaw(params)) if callable(A) else A, dtype) for name, A in given.items()}
         return [found.get(name) for name in "MCK"]
 
     if not any(isinstance(A, Sparse) for A in shapes.values()):
