@@ -56,6 +56,13 @@ def test_predicted_bias_is_measured_and_taken_back():
     assert again.stepper == stepper
     assert again.params == refined.params
     assert again.interval()[0]["k"] == refined.interval()[0]["k"]
+    for other in (
+        hhtjax.rk4(),
+        hhtjax.dopri5(),
+        hhtjax.rowda(),
+        hhtjax.rosenbrock(),
+    ):  # whose tableaus are named tuples
+        assert Refined.from_json(refined._replace(stepper=other).to_json()).stepper == other
 
 
 def test_only_numerical_damping_needs_a_third_level():

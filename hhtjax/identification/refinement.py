@@ -20,6 +20,8 @@ from hhtjax.identification.result import NAMED, FitResult
 from hhtjax.runs.extrapolate import richardson
 from hhtjax.steppers.options import Options
 from hhtjax.steppers.residual import Coefficients
+from hhtjax.steppers.rosenbrock import RosenbrockTableau
+from hhtjax.steppers.runge_kutta import ExplicitTableau
 from hhtjax.steppers.stepper import Stepper, require_stepper
 
 UNDAMPED = 1e-6  # damping ratio, rounding of float32 included
@@ -61,7 +63,7 @@ class Refined(NamedTuple):
     @staticmethod
     def from_json(text: str) -> "Refined":
         """What `to_json` wrote."""
-        classes = Refined, Coefficients, Options, *_subclasses(Stepper)
+        classes = Refined, Coefficients, Options, ExplicitTableau, RosenbrockTableau, *_subclasses(Stepper)
         return report.read(text, Refined, NAMED | {c.__name__: c for c in classes})
 
 

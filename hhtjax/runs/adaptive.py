@@ -126,6 +126,5 @@ def require_controlled(caller, stepper):
     """An error for a stepper without an estimate."""
     if stepper.estimate_order is None:
         raise NotImplementedError(
-            f"{caller}: {type(stepper).__name__} has no estimate of its error: give `dt` as a number, or take "
-            f"{WITH_ESTIMATES}."
+            f"{caller}: {stepper.name} has no estimate of its error: give `dt` as a number, or take {WITH_ESTIMATES}."
         )

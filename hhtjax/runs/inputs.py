@@ -111,7 +111,7 @@ def require_steps(caller, stepper, dt, num_steps, parts=1):
         )
     if stepper.needs_equal_steps:
         raise NotImplementedError(
-            f"{caller}: {type(stepper).__name__} needs steps of one size: give `dt` as a number, or another stepper."
+            f"{caller}: {stepper.name} needs steps of one size: give `dt` as a number, or another stepper."
         )
     if is_concrete(dt):
         fine = (np.asarray(dt) > 0) & np.isfinite(dt)
@@ -247,7 +247,7 @@ def require_events(caller, problem, events, step):
             raise TypeError(f"{caller}: `events[{i}]` must be an Event(...); received {event!r}.")
     if not problem.stepper.meets_events:
         raise NotImplementedError(
-            f"{caller}: {type(problem.stepper).__name__} cannot begin anew behind an event; use hht() or another of "
+            f"{caller}: {problem.stepper.name} cannot begin anew behind an event; use hht() or another of "
             "its family, rosenbrock(), rowda(), rk4() or dopri5()."
         )
     require_masses(caller, problem.system, "leave out `events`")
@@ -490,7 +490,7 @@ def require_one_grid(stepper, duration, num_samples, times):
     if times is not None:
         if stepper.needs_equal_steps:
             raise NotImplementedError(
-                f"sweep: {type(stepper).__name__} needs steps of one size, which differ between `times`: give "
+                f"sweep: {stepper.name} needs steps of one size, which differ between `times`: give "
                 "`duration` and `num_samples`, or another stepper."
             )
         return

@@ -94,6 +94,9 @@ True
 
 A method that remembers something of the size of the last step has a `resized`, too, as in `variable_step.py`.
 
+An explicit Runge-Kutta method is its tableau (`runge_kutta.py`), and a Rosenbrock method its (`rosenbrock.py`): the
+numbers and the order, with the error and dense output where it has them.
+
 A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
 `implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
 refusals are tested on all problems there; what is its own gets a test with a closed form.

@@ -33,7 +33,7 @@ from hhtjax.steppers.variable_step import Embedded, Errors
 EMBEDDED = 0.47990028, 0.51762038, 0.00247934, 0.0  # of order 2, L-stable, from the stages of `rowda`
 
 
-class Tableau(NamedTuple):
+class RosenbrockTableau(NamedTuple):
     """g, and the rows of A and G below the diagonal, of any length up to it; b, and the one of an embedded method."""
 
     g: Any
@@ -47,7 +47,7 @@ class Tableau(NamedTuple):
 class Rosenbrock(Embedded, Stepper):
     """A method given by its tableau; made by `rosenbrock` and `rowda`."""
 
-    tableau: Tableau
+    tableau: RosenbrockTableau
     order: int
 
     solves_internal = True
@@ -171,7 +171,7 @@ def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:
     """
     rho = require_number("rosenbrock", "rho_inf", rho_inf, lambda x: 0 <= x <= 1, "lie in [0, 1]")
     g = 0.5 / (1 + ((1 + rho) / 2) ** 0.5)
-    return Rosenbrock(Tableau(g, ((), (g,)), ((), (-2 * g**2,)), (1 - 0.5 / g, 0.5 / g), (1.0, 0.0)), 2)
+    return Rosenbrock(RosenbrockTableau(g, ((), (g,)), ((), (-2 * g**2,)), (1 - 0.5 / g, 0.5 / g), (1.0, 0.0)), 2)
 
 
 def rowda() -> Rosenbrock:
@@ -189,4 +189,6 @@ def rowda() -> Rosenbrock:
     """
     stage_2, stage_3 = (0.5,), (0.28, 0.72)  # stage 4 starts from where stage 3 does
     G = (), (-0.1121794871794876,), (2.54, -3.84), (29 / 75, -0.72, 1 / 30)
-    return Rosenbrock(Tableau(0.3, ((), stage_2, stage_3, stage_3), G, (2 / 3, 0.0, 1 / 30, 0.3), EMBEDDED), 3)
+    return Rosenbrock(
+        RosenbrockTableau(0.3, ((), stage_2, stage_3, stage_3), G, (2 / 3, 0.0, 1 / 30, 0.3), EMBEDDED), 3
+    )

@@ -149,6 +149,11 @@ class Stepper(Description):
     starts_massless = False  # whether it starts without dividing by M
     redundant: str | None = None  # how constraints that depend on each other are solved
 
+    @property
+    def name(self) -> str:
+        """Of the method, as messages give it."""
+        return type(self).__name__
+
     def begin(self, system, q, v, t, params, dt) -> State:
         """State at the initial time, for a `FlatSystem`."""
         raise NotImplementedError
@@ -238,7 +243,7 @@ def bound(stepper, system, params, dt, last=None):
     last: the step before, where it is another than dt."""
     if system.matrices is not None and not stepper.keeps_sparse:
         raise NotImplementedError(
-            f"{type(stepper).__name__} cannot keep the matrices of the system sparse; use hht() or another of its "
+            f"{stepper.name} cannot keep the matrices of the system sparse; use hht() or another of its "
             "family, rosenbrock(), rowda(), rk4() or dopri5(), or hand over arrays: K.toarray()."
         )
     if not zero_order_hold.holds(params):
@@ -296,7 +301,7 @@ def require_stepper(caller, stepper):
 
 def require_capable(caller, system, stepper, q0, v0):
     """An error for a constraint, a rotation, internal states or friction that the stepper does not know."""
-    name = type(stepper).__name__
+    name = stepper.name
     if not stepper.starts_massless:
         require_masses(caller, system, 'take hht(), or another of its family, with a smooth start, not start="simple"')
     if system.constraint is not None and not stepper.solves_constraints:
