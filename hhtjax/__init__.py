@@ -18,11 +18,13 @@ test says so (`tests/test_floors.py` holds the floors as data).
     identification    fits, and how far to trust them
     analysis          what a step does to a motion
     export            out of Python: a step as C, or as an FMU
-    runs              simulate, sweep, interpolate: steps in a loop
+    runs              simulate, sweep, interpolate; `driver.py` has the way that every run takes
     steppers          one step; `residual.py` has the method in thirty lines, one file for each family
     systems           what moves: pytrees outside, one flat vector inside; constraints, rotations, inputs
     numerics          solves, scans, loops, extrapolation: mathematics that knows no mechanics; rotation, trigonometry
-    xla               how a run becomes one kernel, behind one door; it alone reads what JAX keeps to itself
+    xla               how a run becomes one kernel on the CPU
+    jaxpr             evaluators of traced functions: number by number, as a matrix, as a list of operations
+    primitives        operations of JAX of our own, with their rules for derivatives and batches; JAX's version
     description       frozen descriptions, known by identity; checks: every check of an argument, once
 
 What holds everywhere:
@@ -35,7 +37,7 @@ What holds everywhere:
 * What a scene does not have costs nothing: without a constraint there is no row for it, with a constant mass no
   derivative of it.
 
-How to add a stepper is in `hhtjax.steppers`, a scene in `hhtjax.scenes`, a rule for an operation in `hhtjax.xla`. How
+How to add a stepper is in `hhtjax.steppers`, a scene in `hhtjax.scenes`, a rule for an operation in `hhtjax.jaxpr`. How
 to test it: the table of problems and steppers in `tests/zoo.py` drives the tests of order, derivatives, dtypes, batches
 and memory, so that a new entry is tested like all others. Beyond that, a test belongs to a behaviour, compares with
 what was not computed by the same code, and has been seen to fail.
