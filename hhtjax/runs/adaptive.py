@@ -59,7 +59,7 @@ def adaptive(
         atol_v: in that of v; by default atol per unit of time.
         dt_min, dt_max: bounds of the step; a step below dt_min is a failure that `check()` names. Never below 16
             roundings of t.
-        max_steps: steps at most, the rejected included. Part of the program; all else is data. Memory for so many is
+        max_steps: steps at most, the rejected included. SubStep of the program; all else is data. Memory for so many is
             filled in each call: no more than are needed, for 100,000 take some 10 to 100 microseconds.
         verify: True, run again with every step halved, and state `run.error`, the error of the whole run at each of
             `times`, for three times the solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|). Where

@@ -16,7 +16,7 @@ from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.batched_cond import choose, if_any
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import in_turn
-from hhtjax.runs.event_step import Met, Part, Pieces, Ways, asks, pass_events, reaching, unnoted
+from hhtjax.runs.event_step import EventContext, EventState, Pieces, SubStep, asks, pass_events, reaching, unnoted
 from hhtjax.runs.solution import FINE, INTERNAL_STATE, Failure, Log, Solution
 from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import Info, bound, entered, join_info, public, step_start
@@ -259,29 +259,31 @@ def neutral_info(shapes):
 
 
 def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False, with_modes=False):
-    """The `Loop` with events: its carry has `Met` behind (state, number of steps, first failure).
+    """The `Loop` with events: its carry has `EventState` behind (state, number of steps, first failure).
 
     in_pieces: whether that has the `Pieces` of the last step; with_modes: whether these have the modes.
     """
     start = loop.carry[0]
     stepper = stepper.astype(start.v.dtype)
     flat_events = flatten_events(flat, events, params, (start.q, start.v, start.t), stepper.redundant)
-    ways = Ways(flat, stepper, flat_events, max_events, loop.no_info, reaching(flat, stepper, loop.no_info), keep)
-    met = before_any(ways, params, start.t)
-    met = met._replace(log=Log.empty(unnoted(start)[0], keep, ways.slots))
+    context = EventContext(
+        flat, stepper, flat_events, max_events, loop.no_info, reaching(flat, stepper, loop.no_info), keep
+    )
+    met = before_any(context, params, start.t)
+    met = met._replace(log=Log.empty(unnoted(start)[0], keep, context.slots))
     if in_pieces:
         met = met._replace(pieces=Pieces.none(start, max_events + 1, met.modes if with_modes else ()))
-    step = past_events(ways, params, loop.bound, loop.sizes)
-    more = {"past": partial(past_events, ways, params), "now": lambda met: flat_events.with_modes(params, met.modes)}
+    step = past_events(context, params, loop.bound, loop.sizes)
+    more = {"past": partial(past_events, context, params), "now": lambda met: flat_events.with_modes(params, met.modes)}
     return loop._replace(carry=(*loop.carry, met), advance=step, **more)
 
 
-def past_events(ways, params, bound, sizes):
+def past_events(context, params, bound, sizes):
     """The step of a run with events, which rests where not `here`.
 
     bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
     """
-    events, pass_them = ways.events, passing(ways)
+    events, pass_them = context.events, passing(context)
     fixed = None if events.switches else bound(params)
 
     def step(carry, here=None):
@@ -291,42 +293,42 @@ def past_events(ways, params, bound, sizes):
         state, before, failure = run
         h, last = sizes(before)
         if any(events.ends):
-            new, info = choose(met.ended, state, new), choose(met.ended, ways.no_info, info)
+            new, info = choose(met.ended, state, new), choose(met.ended, context.no_info, info)
         # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
         new, count = at_rest(here, (new, count), (state, before))
         if met.pieces is not None:
-            begun = step_start(ways.stepper, ways.flat, now, h, last, state)[1]
+            begun = step_start(context.stepper, context.flat, now, h, last, state)[1]
             met = met._replace(pieces=at_rest(here, met.pieces.whole(begun, new, met.modes), met.pieces))
-        part = Part.whole(ways, state, new, info, h, last, met._replace(log=None))
+        part = SubStep.whole(context, state, new, info, h, last, met._replace(log=None))
         counts = None if here is None else (before, count)
-        asked = may_meet(ways, part, h, params)
+        asked = may_meet(context, part, h, params)
         part, log = if_any(pass_them, asked, (part, met.log), counts, h, params, kept=False)
-        told = first_failure(ways.flat, failure, count, part.end, part.info)
+        told = first_failure(context.flat, failure, count, part.end, part.info)
         return (part.end, count, at_rest(here, told, failure), part.met._replace(log=log)), part.info
 
     return step
 
 
-def may_meet(ways, part, h, params):
+def may_meet(context, part, h, params):
     """Whether there may be an event in a step."""
-    now = ways.during(params, part.start.t, h).params(params, part.met.modes)
-    asked = asks(ways, part.start, part.end, now, part.met.over, h)
-    return asked & ~part.met.ended if any(ways.events.ends) else asked
+    now = context.during(params, part.start.t, h).params(params, part.met.modes)
+    asked = asks(context, part.start, part.end, now, part.met.over, h)
+    return asked & ~part.met.ended if any(context.events.ends) else asked
 
 
-def passing(ways):
+def passing(context):
     """The function of a step and the log, with the counts of steps before and after it, that passes its events."""
 
     @checkpoint  # reverse mode would keep all that is in there for each step
     def noted(now, h, params):
         part, log = now
-        part, (rows, there) = pass_events(ways, params, part, h)
-        return part, log.with_more(rows, there, ways.keep)
+        part, (rows, there) = pass_events(context, params, part, h)
+        return part, log.with_more(rows, there, context.keep)
 
     def pass_them(now, counts, h, params):
         part, log = now
         # who asks, anew: what is needed here alone is nothing that a step without events has to keep
-        asked = may_meet(ways, part, h, params)
+        asked = may_meet(context, part, h, params)
         if counts is not None:
             asked = asked & (counts[0] != counts[1])  # members that do not rest
         return in_turn(noted, asked, (part._replace(asked=asked), log), h, params)
@@ -339,10 +341,12 @@ def at_rest(here, new, old):
     return new if here is None else choose(here, new, old)
 
 
-def before_any(ways, params, t):
-    """`Met` before the first event."""
+def before_any(context, params, t):
+    """`EventState` before the first event."""
     none = jnp.zeros((), jnp.int32)
-    return Met(ways.events.modes(params), jnp.array(False), none + FINE, none, over=ways.events.before_any(t))
+    return EventState(
+        context.events.modes(params), jnp.array(False), none + FINE, none, over=context.events.before_any(t)
+    )
 
 
 def with_told_events(flat, solution, met, keep):

@@ -16,7 +16,7 @@ from hhtjax.numerics.batched_cond import choose, seldom_alone
 from hhtjax.numerics.batched_cond import choose as either
 from hhtjax.primitives import largest_in_batch, one_kernel, or_alone, row_written, staged
 from hhtjax.runs.driver import before_any, flaw_at_start, neutral_info, no_failure, saved, with_flaw
-from hhtjax.runs.event_step import SHORT, Part, Ways, asks, pass_events, reaching
+from hhtjax.runs.event_step import SHORT, EventContext, SubStep, asks, pass_events, reaching
 from hhtjax.runs.interpolate import kept, output_between, solution_at, with_output
 from hhtjax.runs.output import output_at_start
 from hhtjax.runs.progress import announce, steps_between
@@ -62,8 +62,8 @@ class Walk(NamedTuple):
     met: Any = None  # of events
 
 
-class Trial(NamedTuple):
-    """How steps are tried, to the time `end`. ways, past_events: how to pass events, and what a try becomes by it."""
+class StepTrial(NamedTuple):
+    """How steps are tried, to the time `end`. context, past_events: how to pass events, and what a trial becomes so."""
 
     flat: Any
     stepper: Any
@@ -71,16 +71,16 @@ class Trial(NamedTuple):
     end: Any
     bounds: Any
     max_steps: int
-    ways: Any = None
+    context: Any = None
     past_events: Any = None
     controller: Controller = PI
 
     def params_of(self, walk):
         """The params of the next step."""
-        return self.params if self.ways is None else self.ways.events.with_modes(self.params, walk.met.modes)
+        return self.params if self.context is None else self.context.events.with_modes(self.params, walk.met.modes)
 
 
-class Try(NamedTuple):
+class TrialStep(NamedTuple):
     """A step that was tried: the walk if it is accepted, its error, the step to try next, what of it must not fall
     below the least step, and why there are no more steps if it does."""
 
@@ -179,15 +179,15 @@ def next_end(trial, params, walk):
     t, end = walk.state.t, trial.end
     h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
     due = jnp.minimum(end, zero_order_hold.jump_after(params, t)) if zero_order_hold.holds(params) else end
-    if trial.ways is not None and walk.met.over:
-        due = jnp.minimum(due, trial.ways.events.due_after(t, walk.met.over))
+    if trial.context is not None and walk.met.over:
+        due = jnp.minimum(due, trial.context.events.due_after(t, walk.met.over))
     left = due - t
     lands = left <= reach  # what has doubled does, where jumps are equally far apart
     h = jnp.where(lands, left, jnp.minimum(h, without_rounding(left / 2, more=1)))  # the second half is no longer
     return h, jnp.where(lands, due, t + h)
 
 
-def attempt(trial, walk):
+def trial_step(trial, walk):
     """Walk -> Walk after one try, and how that began."""
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
     h, t1 = next_end(trial, params, walk)
@@ -201,8 +201,8 @@ def attempt(trial, walk):
     h1, before = next_step(h, error, walk.before, error <= 1, order, trial.controller)
     h1 = jnp.minimum(h1, bounds.most)
     new = walk._replace(state=s1, last=h, past=past, before=before, q_size=q_size, v_size=v_size)
-    tried = Try(new._replace(accepted=walk.accepted + 1), error, h1, h1, why_short(error))
-    if trial.ways is not None:
+    tried = TrialStep(new._replace(accepted=walk.accepted + 1), error, h1, h1, why_short(error))
+    if trial.context is not None:
         tried = trial.past_events(trial, tried, walk, h)
     return taken(trial, walk, tried), Begun(state, s1.t, info)
 
@@ -237,8 +237,8 @@ def begin(trial, q, v, t0):
     one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)
     past = stepper.begin_estimates(flat, state)
     walk = Walk(state, h, longest, past, 0 * one, one, q_size, v_size, none, none, none)
-    if trial.ways is not None:
-        walk = walk._replace(met=before_any(trial.ways, trial.params, t0))
+    if trial.context is not None:
+        walk = walk._replace(met=before_any(trial.context, trial.params, t0))
     return walk, start
 
 
@@ -255,7 +255,7 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
     """How the steps of a problem are tried, with events or without."""
     flat, q, v, t0, params = problem.flat()
     stepper = problem.stepper.astype(q.dtype)
-    trial = Trial(flat, stepper, params, end, bounds, max_steps)
+    trial = StepTrial(flat, stepper, params, end, bounds, max_steps)
     if events is None:
         return trial
 
@@ -264,24 +264,24 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
 
     no_info = neutral_info(jax.eval_shape(one, end)[1])
     flat_events = flatten_events(flat, events, params, (q, v, t0), stepper.redundant)
-    ways = Ways(flat, stepper, flat_events, room[0], no_info, reaching(flat, stepper, no_info))
-    return trial._replace(ways=ways, past_events=past_events)
+    context = EventContext(flat, stepper, flat_events, room[0], no_info, reaching(flat, stepper, no_info))
+    return trial._replace(context=context, past_events=past_events)
 
 
 def past_events(trial, tried, walk, h):
     """The try, past the events in its step."""
-    now = trial.ways.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
-    asked = (tried.error <= 1) & asks(trial.ways, walk.state, tried.walk.state, now, walk.met.over, h)
+    now = trial.context.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
+    asked = (tried.error <= 1) & asks(trial.context, walk.state, tried.walk.state, now, walk.met.over, h)
     return seldom_alone(partial(passed, trial), asked, tried, walk, h)
 
 
 def passed(trial, tried, walk, h):
     """The same where there may be one."""
-    ways = trial.ways
+    context = trial.context
     met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE))
-    part = Part.whole(ways, walk.state, tried.walk.state, ways.no_info, h, walk.last, met, ~met.ended)
-    part, (rows, there) = pass_events(ways, trial.params, part, h)
-    noted = jnp.asarray((*ways.events.noted, True))[rows[:, 1].astype(jnp.int32)]
+    part = SubStep.whole(context, walk.state, tried.walk.state, context.no_info, h, walk.last, met, ~met.ended)
+    part, (rows, there) = pass_events(context, trial.params, part, h)
+    noted = jnp.asarray((*context.events.noted, True))[rows[:, 1].astype(jnp.int32)]
     there = there & ~noted  # which have nothing behind them
     times = jnp.where(there, rows[:, 0], jnp.inf)
     first = jnp.min(times)
@@ -315,7 +315,7 @@ def behind(trial, tried, walk, part, h):
     best = trial.controller.safety * small ** (-1 / trial.stepper.estimate_order)
     shorter = rest * jnp.clip(best, 0.1, 0.9)
     h = jnp.where(error <= 1, jnp.minimum(h, rest * best), h - rest + shorter)
-    return Try(new, error, h, shorter, why_short(error))
+    return TrialStep(new, error, h, shorter, why_short(error))
 
 
 # ----------------------------------------------------------------------------
@@ -388,9 +388,9 @@ def select_steps(problem, end, control, progress=False, events=None, room=(), co
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
     trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
     walk, start = begin(trial, q, v, t0)
-    plain = partial(attempt, trial._replace(ways=None))
+    plain = partial(trial_step, trial._replace(context=None))
     form = on_scalars(plain, walk, derivatives=False)  # as in a run: events are seldom
-    one_try = form.of(plain if trial.ways is None else partial(attempt, trial))
+    one_try = form.of(plain if trial.context is None else partial(trial_step, trial))
     recorder: Any = None
     if times is not None:
         sensed = () if problem.output is None else (problem.output, trial.params, times[-1] - t0)

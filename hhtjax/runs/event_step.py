@@ -25,40 +25,40 @@ from hhtjax.systems import zero_order_hold
 from hhtjax.systems.sampled import SLOP
 
 
-def asks(ways, s, s1, params, over, h):
+def asks(context, s, s1, params, over, h):
     """Whether an event may fall into the step from s to s1: no more than a look at both ends, in few operations."""
-    (g0, d0), (g1, d1) = ways.events.still.both(ways.flat, *lax.stop_gradient((s, s1)), params, over, h)
-    noted = np.asarray(ways.events.noted) & ~np.asarray(ways.events.timed)
-    if any(ways.events.timed):
-        g1 = g1 - lateness(ways.events, s1.t)
+    (g0, d0), (g1, d1) = context.events.still.both(context.flat, *lax.stop_gradient((s, s1)), params, over, h)
+    noted = np.asarray(context.events.noted) & ~np.asarray(context.events.timed)
+    if any(context.events.timed):
+        g1 = g1 - lateness(context.events, s1.t)
     below = ~(g1 > 0) & (~noted | (g0 > 0) | (d0 > 0))
     cross_below = g0 * (d1 - d0) <= d0 * (g1 - g0 - d1 * h)  # tangents at both ends; a division is dear
     return jnp.any(below | ((d0 < 0) & (d1 > 0) & cross_below))
 
 
-def pass_events(ways, params, part, h):
-    """The step across all events in it: a `Part`, of which end, info and met are to be used, and what to note of
+def pass_events(context, params, part, h):
+    """The step across all events in it: a `SubStep`, of which end, info and met are to be used, and what to note of
     them, rows and whether each is there. Members that have not asked stay as they are."""
-    ways = ways.during(params, part.start.t, h)
-    if ways.middle is not None:
-        known, t = ways.events.with_modes(params, part.met.modes), part.start.t
-        old, new = zero_order_hold.before(known, t, part.last), ways.params(params, part.met.modes)
+    context = context.during(params, part.start.t, h)
+    if context.middle is not None:
+        known, t = context.events.with_modes(params, part.met.modes), part.start.t
+        old, new = zero_order_hold.before(known, t, part.last), context.params(params, part.met.modes)
         here = zero_order_hold.passed(known, t, part.last, h)
-        part = part._replace(start=behind_jump(ways.stepper, ways.flat, part.start, old, new, h, here))
+        part = part._replace(start=behind_jump(context.stepper, context.flat, part.start, old, new, h, here))
 
     @checkpoint  # what all slots keep for reverse mode takes longer to compile than to compute one again
     def slot(part, _):
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
-        return if_any(partial(meet_or_flag, ways), going, (part, unnoted(part.start)), going, h, params)
+        return if_any(partial(meet_or_flag, context), going, (part, unnoted(part.start)), going, h, params)
 
-    part, noted = lax.scan(slot, part, length=ways.slots)
+    part, noted = lax.scan(slot, part, length=context.slots)
     part = flag(part, part.asked & ~part.met.ended, MANY, jnp.ones_like(part.passed))
     met = part.met
 
     def anew(s, params):
-        return begin(ways, s.q, s.v, s.t, params, h, moves=False)
+        return begin(context, s.q, s.v, s.t, params, h, moves=False)
 
-    now = ways.params(params, met.modes)
+    now = context.params(params, met.modes)
     end = seldom(anew, (part.divided > 0) & ~met.ended, part.end, now)
 
     def known(s):
@@ -76,16 +76,16 @@ def unnoted(s):
     return jnp.full_like(row, jnp.nan), jnp.array(False)
 
 
-def meet_or_flag(ways, now, going, h, params):
+def meet_or_flag(context, now, going, h, params):
     """The part behind its first event, if it has one, and what to note; with what is wrong, if something is."""
     part, noted = now
-    found = look(ways, part, params, h)
+    found = look(context, part, params, h)
     here = going & jnp.any(found.hit)
     part = flag(part, going & ~here, NEGATIVE, found.negative)
     part = flag(part, going & ~here, STAYS, found.stays)
     part = flag(part, going & ~here, NO_NUMBER, found.unknown)
     part = part._replace(asked=jnp.where(going, here, part.asked))
-    return seldom(partial(meet, ways), here, (part, noted), found, h, params)
+    return seldom(partial(meet, context), here, (part, noted), found, h, params)
 
 
 def flag(part, bad, code, which):
@@ -97,23 +97,25 @@ def flag(part, bad, code, which):
     return part._replace(met=met)
 
 
-def begin(ways, q, v, t, params, h, moves=True):
+def begin(context, q, v, t, params, h, moves=True):
     """The state from which a step of size h goes at a new start; moves: whether its velocity may be another."""
-    return staged(lambda q, v, t, h: entered(ways.stepper, ways.flat, q, v, t, params, h, moves=moves)[1])(q, v, t, h)
+    return staged(lambda q, v, t, h: entered(context.stepper, context.flat, q, v, t, params, h, moves=moves)[1])(
+        q, v, t, h
+    )
 
 
-def meet(ways, now, found, h, params):
+def meet(context, now, found, h, params):
     """The part of the step behind its first event, and what to note of that."""
     part, *_ = now
-    events, met = ways.events, part.met
+    events, met = context.events, part.met
     known = lax.stop_gradient((params, met.modes, part))
-    tau, near = lax.stop_gradient(first_time(ways, ways.params(*known[:2]), known[2], found, h))
+    tau, near = lax.stop_gradient(first_time(context, context.params(*known[:2]), known[2], found, h))
     i, this = first_of(events, part, found, near)
-    now = ways.params(params, met.modes)
-    tau = located(ways, now, part, this, found, tau, h)
-    e, info = reached(ways, now, part, tau, h)
+    now = context.params(params, met.modes)
+    tau = located(context, now, part, this, found, tau, h)
+    e, info = reached(context, now, part, tau, h)
     Ldot = events.slope(part.start, part.end, part.rest)
-    g, d = events.rates(ways.flat, e, now, met.over, Ldot)
+    g, d = events.rates(context.flat, e, now, met.over, Ldot)
     rate = pick(this, d)
     missed = ~(jnp.abs(pick(this, g)) <= beside_zero(rate, h, pick(this, found.size)))
     missed = missed & ~(pick(this, found.jumped.astype(h.dtype)) > 0)
@@ -123,27 +125,27 @@ def meet(ways, now, found, h, params):
     over = events.passed(i, met.over)
     again = jnp.asarray(events.timed)  # a time that is over is no longer its guard
     passed = part._replace(passed=part.passed | ((this > 0) & ~again), met=met._replace(over=over))
-    new = behind(ways, part, (e, info, tau, g, d), (v, modes, over), i, this, near, h, params)
+    new = behind(context, part, (e, info, tau, g, d), (v, modes, over), i, this, near, h, params)
     noted, touches = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, found.touches))
     new = choose(noted, passed, new)  # what changes nothing divides no step
-    stays, many = missed & jnp.all(jnp.isfinite(e.v)), ~noted & (part.divided == ways.max_events)
+    stays, many = missed & jnp.all(jnp.isfinite(e.v)), ~noted & (part.divided == context.max_events)
     code = jnp.where(many, MANY, jnp.where(stays, STAYS, new.met.code)).astype(met.code.dtype)
     new = new._replace(met=new.met._replace(code=code, event=jnp.where(stays | many, i, new.met.event)))
     none = missed & touches
     return choose(none, passed, new), (row, ~none & ~many)
 
 
-def behind(ways, part, at, outcome, i, this, near, h, params):
+def behind(context, part, at, outcome, i, this, near, h, params):
     """The part of the step behind event i. at: the state and the `Info` before it, when, and g and dg/dt of all."""
-    events, (e, info, tau, g, d), (v, modes, over) = ways.events, at, outcome
-    then = ways.params(params, modes)
+    events, (e, info, tau, g, d), (v, modes, over) = context.events, at, outcome
+    then = context.params(params, modes)
     ends = pick(this, jnp.asarray(events.ends, h.dtype)) > 0
     rest = jnp.where(ends, 0, part.rest - tau)
-    start = begin(ways, e.q, v, e.t, then, h)  # whole: what is left may be far too short to tell what is stiff
-    end, more = go(ways, then, start, rest, h, h)
+    start = begin(context, e.q, v, e.t, then, h)  # whole: what is left may be far too short to tell what is stiff
+    end, more = go(context, then, start, rest, h, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
 
-    g1, d1 = events.rates(ways.flat, start, then, over, events.slope(start, end, rest))
+    g1, d1 = events.rates(context.flat, start, then, over, events.slope(start, end, rest))
     near_and_due = near & ~part.passed & ~jnp.asarray(events.noted)
     going_on = jnp.any(part.due)
     beside = jnp.where(going_on, part.beside, near_and_due)
@@ -152,16 +154,16 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
     same = same | jnp.asarray(events.timed)  # nothing changes those
     corner = jnp.any(beside & ~(this > 0) & ~same)  # in another order they might have other outcomes
     code = jnp.where(corner, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
-    if ways.flat.num_constraints:
+    if context.flat.num_constraints:
         code = jnp.where((code == FINE) & ~jnp.all(jnp.isfinite(start.w)), SINGULAR, code)
     code = jnp.where(jnp.all(jnp.isfinite(e.v)), code, FINE).astype(part.met.code.dtype)
 
     pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end, modes)
-    met = Met(modes, ends, code, i, pieces=pieces, over=over)
-    infos = join_info(join_info(choose(part.divided > 0, part.info, ways.no_info), info), more)
-    asked = asks(ways, start, end, then, over, rest) | jnp.any(due)
+    met = EventState(modes, ends, code, i, pieces=pieces, over=over)
+    infos = join_info(join_info(choose(part.divided > 0, part.info, context.no_info), info), more)
+    asked = asks(context, start, end, then, over, rest) | jnp.any(due)
     passed = part.passed & near & (d1 < 0)
-    new = Part(start, end, infos, rest, h, met, part.divided + 1, asked, passed, beside, due)
+    new = SubStep(start, end, infos, rest, h, met, part.divided + 1, asked, passed, beside, due)
     slack = nearness(h) * h * (jnp.abs(d) + jnp.abs(d1)) + shaken(events.still, start, then, over)
     slack = slack + ROUNDINGS * eps(h) * jnp.abs(g)
     jumps = (g > slack) & (g1 < -slack) & ~near & ~(this > 0)
@@ -176,7 +178,7 @@ def behind(ways, part, at, outcome, i, this, near, h, params):
 SHORT = 1e-6  # part of a step: a rest that needs no step
 
 
-class Ways(NamedTuple):
+class EventContext(NamedTuple):
     """How to step, and what to look for."""
 
     flat: Any
@@ -204,7 +206,7 @@ class Ways(NamedTuple):
         return params if self.middle is None else zero_order_hold.held_at(params, self.middle)
 
 
-class Met(NamedTuple):
+class EventState(NamedTuple):
     """What a run with events carries along: numbers that switches changed, whether it has ended, what went wrong (code
     and event), the `Log`, where it is read off between its steps the pieces of the last, and of each event with known
     times how many of them are over."""
@@ -218,7 +220,7 @@ class Met(NamedTuple):
     over: Any = ()
 
 
-class Part(NamedTuple):
+class SubStep(NamedTuple):
     """What is left of a step: from `start` to `end`, of the size `rest`; `last` is the size start.a is made for.
 
     Of each event: whether it is behind the motion, though the guard may not say so; whether it was met at the start,
@@ -229,7 +231,7 @@ class Part(NamedTuple):
     info: Any
     rest: Any
     last: Any
-    met: Met
+    met: EventState
     divided: Any  # number of events that came before and divided the step
     asked: Any  # whether there may be one
     passed: Any
@@ -237,15 +239,15 @@ class Part(NamedTuple):
     due: Any
 
     @classmethod
-    def whole(cls, ways, start, end, info, h, last, met, asked=False):
+    def whole(cls, context, start, end, info, h, last, met, asked=False):
         """A step."""
-        none, no = jnp.zeros(len(ways.events.noted), bool), jnp.zeros_like(met.ended)
+        none, no = jnp.zeros(len(context.events.noted), bool), jnp.zeros_like(met.ended)
         return cls(start, end, info, h, last, met, jnp.zeros_like(met.event), no | asked, none, none, none)
 
 
-def go(ways, params, s, tau, last, h):
+def go(context, params, s, tau, last, h):
     """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
-    return ways.reach(params, s, tau, last, h)
+    return context.reach(params, s, tau, last, h)
 
 
 def reaching(flat, stepper, no_info):
@@ -340,12 +342,12 @@ class Found(NamedTuple):
     size: Any
 
 
-def look(ways, part, params, h):
+def look(context, part, params, h):
     """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
     part, params = lax.stop_gradient((part, params))
-    now = ways.params(params, part.met.modes)
-    events, over = ways.events.still, part.met.over
-    (g0, d0), (g1, d1) = events.both(ways.flat, part.start, part.end, now, over, part.rest)
+    now = context.params(params, part.met.modes)
+    events, over = context.events.still, part.met.over
+    (g0, d0), (g1, d1) = events.both(context.flat, part.start, part.end, now, over, part.rest)
     rounding = shaken(events, part.end, now, over) + ROUNDINGS * eps(h) * h * jnp.maximum(jnp.abs(d0), jnp.abs(d1))
     rounding = jnp.where(jnp.isfinite(rounding), rounding, 0)
     g1 = g1 - lateness(events, part.end.t)
@@ -411,7 +413,7 @@ def lateness(events, t):
     return jnp.where(jnp.asarray(events.timed), SLOP * eps(t) * jnp.abs(t), 0)
 
 
-def first_time(ways, params, part, found, h):
+def first_time(context, params, part, found, h):
     """When the first of the events happens, and which are at that time: by Newton on all of them, kept between where
     none is beyond its guard and where one is, from where the first cubic has its zero."""
 
@@ -421,8 +423,8 @@ def first_time(ways, params, part, found, h):
 
     def improve(now):
         low, high, tau, *_, k = now
-        s, _ = reached(ways, params, part, tau, h)
-        g, d = events.rates(ways.flat, s, params, part.met.over, Ldot)
+        s, _ = reached(context, params, part, tau, h)
+        g, d = events.rates(context.flat, s, params, part.met.over, Ldot)
         above = jnp.all((g > 0) | ~found.hit)
         low, high = jnp.where(above, tau, low), jnp.where(above, high, tau)
         times = jnp.where(d < 0, tau - g / jnp.where(d < 0, d, 1), jnp.inf)
@@ -433,7 +435,7 @@ def first_time(ways, params, part, found, h):
         near = jnp.abs(times - new) <= nearness(h) * h
         return low, high, new, near, jnp.abs(new - tau), k + 1
 
-    events = ways.events.still
+    events = context.events.still
     Ldot = events.slope(part.start, part.end, part.rest)
     tau = jnp.clip(jnp.min(found.place), 0, 1) * part.rest
     high = jnp.min(jnp.where(found.hit, found.limit, 1)) * part.rest
@@ -455,24 +457,24 @@ def first_of(events, part, found, near):
     return jnp.min(jnp.where(this, numbers, numbers.size)), this.astype(found.place.dtype)
 
 
-def reached(ways, params, part, tau, h):
+def reached(context, params, part, tau, h):
     """`go` from the start of a part. Where a guard sees multipliers they go over from a line to those of the step:
     these are of order 2, but in a very short one they are not those of the start, and a guard must not jump."""
-    s, info = go(ways, params, part.start, tau, part.last, h)
-    if any(ways.events.forced):
-        line = part.start.L + tau * ways.events.slope(part.start, part.end, part.rest)
+    s, info = go(context, params, part.start, tau, part.last, h)
+    if any(context.events.forced):
+        line = part.start.L + tau * context.events.slope(part.start, part.end, part.rest)
         s = s._replace(L=line + tau / jnp.where(part.rest > 0, part.rest, 1) * (s.L - line))
     return s, info
 
 
-def located(ways, params, part, this, found, tau, h):
+def located(context, params, part, this, found, tau, h):
     """The time of an event, with its derivative; of multipliers that have jumped below zero that of the start."""
     jumped = pick(this, found.jumped.astype(h.dtype)) > 0
 
     def guard(tau):
-        s, _ = reached(ways, params, part, tau, h)
-        g = pick(this, ways.events.guards(s, params, part.met.over))
-        return jnp.where(jumped, -tau, g) if any(ways.events.forced) else g
+        s, _ = reached(context, params, part, tau, h)
+        g = pick(this, context.events.guards(s, params, part.met.over))
+        return jnp.where(jumped, -tau, g) if any(context.events.forced) else g
 
     return lax.custom_root(guard, tau, lambda _, tau: tau, lambda g, y: y / g(jnp.ones_like(y)))
 

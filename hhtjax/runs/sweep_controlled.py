@@ -11,7 +11,7 @@ from jax import lax
 from hhtjax.jaxpr import on_scalars
 from hhtjax.primitives import one_kernel, or_plain
 from hhtjax.runs.controlled_run import Grid, accepted_run, compared, follow, scaled, tighten, verified
-from hhtjax.runs.error_control import Bounds, as_steps, attempt, begin, is_walking, trial_of, trimmed
+from hhtjax.runs.error_control import Bounds, as_steps, begin, is_walking, trial_of, trial_step, trimmed
 from hhtjax.runs.frozen_steps import frozen, is_pair, run_and_choice
 from hhtjax.runs.inputs import Problem
 from hhtjax.runs.output import beside_path, without_path
@@ -211,8 +211,8 @@ class Search(NamedTuple):
         one = members.of(0)
         search = cls(members, members.times[-1], members.control(one).max_steps, None)
         bounds, walk = search.start(one)
-        plain = search.trial(one, bounds)._replace(ways=None)
-        search = search._replace(form=on_scalars(partial(attempt, plain), walk))
+        plain = search.trial(one, bounds)._replace(context=None)
+        search = search._replace(form=on_scalars(partial(trial_step, plain), walk))
         bounds, walks = jax.vmap(search.start, (members.axes,))(members.arrays)
         return search, bounds, jax.vmap(search.form.like)(walks)
 
@@ -230,7 +230,7 @@ class Search(NamedTuple):
 
     def next(self, arrays, bounds, walk):
         """The walk after one try, the same if it is over, and the end of the step; NaN where none was accepted."""
-        new, begun = self.form.of(partial(attempt, self.trial(arrays, bounds)))(walk)
+        new, begun = self.form.of(partial(trial_step, self.trial(arrays, bounds)))(walk)
         new = jax.tree.map(partial(jnp.where, is_walking(walk, self.end)), new, walk)
         return new, jnp.where(new.accepted > walk.accepted, begun.end, jnp.nan)
 
