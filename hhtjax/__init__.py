@@ -47,6 +47,7 @@ import importlib
 
 from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
+from hhtjax.description.presentation import CHARTS as _CHARTS
 from hhtjax.export.export_c import ExportedC, export_c
 from hhtjax.export.export_fmu import ExportedFMU, export_fmu
 from hhtjax.identification.arguments import Gaussian
@@ -104,6 +105,14 @@ __all__ = [  # noqa: RUF022
     "FitResult", "Gaussian", "accelerometer", "bounded", "compare", "equation_error", "fit", "fit_progressively",
     "fixed", "measure", "multistart", "positive", "refine", "step_size_bias", "windows",
 ]  # fmt: skip
+
+
+def _overview(result, sampling_rate):
+    """The chart of a fit, for `FitResult.plot`: matplotlib is imported when it is asked for."""
+    return importlib.import_module("hhtjax.plot").fit_overview(result, sampling_rate)[0].figure
+
+
+_CHARTS["FitResult"] = _overview
 
 
 def __dir__():

@@ -15,6 +15,7 @@ from hhtjax.description import is_array, is_concrete, is_real
 Kind = TypeVar("Kind", bound=type)
 MOST = 16  # rows of a table, or entries of a container
 LINE = "text-align: left; border-bottom: 1px solid rgba(128, 128, 128, 0.35)"  # seen on light and on dark
+CHARTS = {}  # how results draw themselves, by class: entered by `hhtjax`, as charts lie above what they show
 
 
 class Table(NamedTuple):

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number
 from hhtjax.description import freeze, is_concrete, thaw
-from hhtjax.description.presentation import shown
+from hhtjax.description.presentation import CHARTS, shown
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.least_squares import COST, GRADIENT, REASONS, STEP, History
@@ -155,9 +155,7 @@ class FitResult(NamedTuple):
 
     def plot(self, sampling_rate: float = 1.0) -> Any:
         """The figure of `hhtjax.plot.fit_overview`."""
-        from hhtjax.plot import fit_overview  # upstairs: needs matplotlib, as nothing else here does
-
-        return fit_overview(self, sampling_rate)[0].figure
+        return CHARTS["FitResult"](self, sampling_rate)
 
     def to_json(self) -> str:
         """The whole result as JSON, for `FitResult.from_json`; inf and NaN as Python writes them."""
