@@ -44,6 +44,7 @@ what was not computed by the same code, and has been seen to fail.
 """
 
 import importlib
+import warnings
 
 from hhtjax import analysis, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
@@ -68,7 +69,7 @@ from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import Events, FailedRunWarning, Failure, SimulationError, Solution
 from hhtjax.runs.sweep import sweep
 from hhtjax.runs.sweep_to_disk import load_sweep, sweep_to_disk
-from hhtjax.steppers.collocation import collocation, wilson
+from hhtjax.steppers.collocation import wilson
 from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, implicit_euler, newmark
 from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_euler
 from hhtjax.steppers.multistep import houbolt, park
@@ -93,7 +94,7 @@ __all__ = [  # noqa: RUF022
     "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
-    "bossak", "collocation", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
+    "bossak", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
     "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
     # runs
     "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
@@ -120,7 +121,13 @@ def __dir__():
 
 
 def __getattr__(name):
-    """`hhtjax.plot`, imported when it is first asked for: it needs matplotlib, and nothing else does."""
+    """`hhtjax.plot`, imported when it is first asked for, as it needs matplotlib; and what has moved, with a warning."""
     if name == "plot":
         return importlib.import_module("hhtjax.plot")
+    if name == "collocation":
+        warnings.warn(
+            "hhtjax.collocation is hhtjax.steppers.collocation.collocation from the next version on; `wilson` stays.",
+            DeprecationWarning, stacklevel=2,
+        )  # fmt: skip
+        return importlib.import_module("hhtjax.steppers.collocation").collocation
     raise AttributeError(f"module 'hhtjax' has no attribute {name!r}")

@@ -7,6 +7,7 @@ import pytest
 from helpers import slope
 
 import hhtjax
+from hhtjax.steppers.collocation import collocation
 
 M, C, K, H = 2.0, 0.6, 50.0, 0.3
 
@@ -29,7 +30,7 @@ def collocation_matrix(beta, theta, m, c, k, h):
     return np.vstack([positions(h, 1.0) @ np.vstack([np.eye(3), w1]), w1])
 
 
-COLLOCATION = {"wilson": hhtjax.wilson(), "collocation": hhtjax.collocation(0.18, 1.287301)}
+COLLOCATION = {"wilson": hhtjax.wilson(), "collocation": collocation(0.18, 1.287301)}
 
 
 def collocation_step(method, system, h):
@@ -129,7 +130,7 @@ def test_order_with_a_mass_that_changes():
     ("call", "message"),
     [
         (lambda: hhtjax.wilson(0.9), "wilson: `theta` must be 1 or more; received 0.9."),
-        (lambda: hhtjax.collocation(0.3, 1.0), "collocation: `beta` must lie in"),
+        (lambda: collocation(0.3, 1.0), "collocation: `beta` must lie in"),
         (lambda: hhtjax.houbolt(tolerance=0), "houbolt: `tolerance` must be positive"),
         (lambda: hhtjax.park(max_iterations=0), "park: `max_iterations` must be a positive integer"),
     ],

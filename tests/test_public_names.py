@@ -81,3 +81,10 @@ def test_every_name_in_the_readme_exists():
         x = hhtjax
         for part in name.split("."):
             x = getattr(x, part)
+
+
+def test_what_has_moved_is_there_for_a_version_with_a_warning():
+    from hhtjax.steppers.collocation import collocation
+
+    with pytest.warns(DeprecationWarning, match="hhtjax.collocation is hhtjax.steppers.collocation.collocation"):
+        assert hhtjax.collocation is collocation

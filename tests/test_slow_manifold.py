@@ -16,6 +16,7 @@ from zoo import as_data
 
 import hhtjax
 from hhtjax.scenes import double_pendulum
+from hhtjax.steppers.collocation import collocation
 
 K, C, H = 50.0, 5.0, 1e-3
 MASSES = np.array([1, 1e-1, 1e-2, 3e-3, 1e-3, 1e-4, 1e-6, 1e-9, 1e-12])
@@ -100,7 +101,7 @@ def test_no_mass_is_thrown_by_any_of_the_family():
         (lambda: hhtjax.hht(linearize="predictor", solve=hhtjax.banded(1)), 2e-3),
         (lambda: hhtjax.operator_splitting(), 2e-3),
         (hhtjax.wilson, 1e-3),
-        (lambda: hhtjax.collocation(0.18, 1.287301), 1e-3),
+        (lambda: collocation(0.18, 1.287301), 1e-3),
         (hhtjax.houbolt, 4e-3),
         (hhtjax.park, 2e-3),
         (hhtjax.rosenbrock, 2e-3),

@@ -20,38 +20,40 @@ from hhtjax.analysis.amplification import (
     constraint_matrix,
     damping_ratio,
     oscillator_matrix,
-    overshoot,
     period_elongation,
     spectral_radius,
-    stability_region,
 )
-from hhtjax.analysis.convergence import ObservedOrder, observed_order
-from hhtjax.analysis.energy import EnergyBalance, energy_balance
-from hhtjax.analysis.jordan import Eigenvalue, jordan_structure, transient_growth
-from hhtjax.analysis.modal import ModalReduction, NormalModes, modal_reduction, modes
-from hhtjax.analysis.step_size import Mode, StepSize, suggest_step_size
+from hhtjax.analysis.amplification import (
+    overshoot as overshoot,
+)
+from hhtjax.analysis.amplification import (
+    stability_region as stability_region,
+)
+from hhtjax.analysis.convergence import ObservedOrder as ObservedOrder
+from hhtjax.analysis.convergence import observed_order
+from hhtjax.analysis.energy import EnergyBalance as EnergyBalance
+from hhtjax.analysis.energy import energy_balance
+from hhtjax.analysis.jordan import Eigenvalue as Eigenvalue
+from hhtjax.analysis.jordan import jordan_structure, transient_growth
+from hhtjax.analysis.modal import ModalReduction as ModalReduction
+from hhtjax.analysis.modal import NormalModes as NormalModes
+from hhtjax.analysis.modal import modal_reduction as modal_reduction
+from hhtjax.analysis.modal import modes
+from hhtjax.analysis.step_size import Mode as Mode
+from hhtjax.analysis.step_size import StepSize as StepSize
+from hhtjax.analysis.step_size import suggest_step_size
 
 __all__ = [
-    "Eigenvalue",
-    "EnergyBalance",
-    "ModalReduction",
-    "Mode",
-    "NormalModes",
-    "ObservedOrder",
-    "StepSize",
     "amplification_matrix",
     "constraint_matrix",
     "damping_ratio",
     "energy_balance",
     "jordan_structure",
-    "modal_reduction",
     "modes",
     "observed_order",
     "oscillator_matrix",
-    "overshoot",
     "period_elongation",
     "spectral_radius",
-    "stability_region",
     "suggest_step_size",
     "transient_growth",
 ]

@@ -95,11 +95,18 @@ principle, in stiff joints, a vehicle and a mechanism with six constraints, is o
 """
 
 from hhtjax.identification.arguments import Gaussian
-from hhtjax.identification.bias import ModeBias, step_size_bias
-from hhtjax.identification.comparison import Comparison, NestedTest, compare
+from hhtjax.identification.bias import ModeBias as ModeBias
+from hhtjax.identification.bias import step_size_bias
+from hhtjax.identification.comparison import Comparison as Comparison
+from hhtjax.identification.comparison import NestedTest as NestedTest
+from hhtjax.identification.comparison import compare
 from hhtjax.identification.identifiability import IdentifiabilityWarning
-from hhtjax.identification.identify import Multistart, fit, multistart
-from hhtjax.identification.inference import Profile, Score, prediction_errors, profile, score_test
+from hhtjax.identification.identify import Multistart as Multistart
+from hhtjax.identification.identify import fit, multistart
+from hhtjax.identification.inference import Profile as Profile
+from hhtjax.identification.inference import Score as Score
+from hhtjax.identification.inference import prediction_errors as prediction_errors
+from hhtjax.identification.inference import profile, score_test
 from hhtjax.identification.initial_guesses import equation_error, fit_progressively
 from hhtjax.identification.least_squares import History
 from hhtjax.identification.refinement import Refined, StepSizeWarning, refine
@@ -109,17 +116,11 @@ from hhtjax.identification.sensors import Windows, accelerometer, measure, windo
 from hhtjax.identification.transforms import bounded, fixed, positive
 
 __all__ = [
-    "Comparison",
     "FitResult",
     "Gaussian",
     "History",
     "IdentifiabilityWarning",
-    "ModeBias",
-    "Multistart",
-    "NestedTest",
-    "Profile",
     "Refined",
-    "Score",
     "StepSizeWarning",
     "Uncertainty",
     "Windows",
@@ -133,7 +134,6 @@ __all__ = [
     "measure",
     "multistart",
     "positive",
-    "prediction_errors",
     "profile",
     "refine",
     "score_test",

@@ -19,12 +19,15 @@ except ModuleNotFoundError as error:
     raise ImportError("hhtjax.plot needs matplotlib: pip install 'hhtjax[plot]'") from error
 
 from hhtjax.plot.convergence import error_against_h, work_precision
-from hhtjax.plot.fits import correlations, estimates, fit_overview, held_out, profile
+from hhtjax.plot.fits import correlations as correlations
+from hhtjax.plot.fits import estimates, fit_overview, held_out, profile
 from hhtjax.plot.mechanisms import animation, configuration
 from hhtjax.plot.records import fit_against_data
 from hhtjax.plot.steps import damping_ratio, period_elongation, spectral_radius, stability_region
 from hhtjax.plot.styles import COLOURS, LINES, MARKERS, PARAMETERS, legend, save, style, subplots
-from hhtjax.plot.trajectories import constraint_drift, energy_balance, phase_plane, trajectory
+from hhtjax.plot.trajectories import constraint_drift as constraint_drift
+from hhtjax.plot.trajectories import energy_balance, trajectory
+from hhtjax.plot.trajectories import phase_plane as phase_plane
 
 __all__ = [
     "COLOURS",
@@ -33,8 +36,6 @@ __all__ = [
     "PARAMETERS",
     "animation",
     "configuration",
-    "constraint_drift",
-    "correlations",
     "damping_ratio",
     "energy_balance",
     "error_against_h",
@@ -44,7 +45,6 @@ __all__ = [
     "held_out",
     "legend",
     "period_elongation",
-    "phase_plane",
     "profile",
     "save",
     "spectral_radius",
