@@ -121,7 +121,7 @@ def __dir__():
 
 
 def __getattr__(name):
-    """`hhtjax.plot`, imported when it is first asked for, as it needs matplotlib; and what has moved, with a warning."""
+    """`hhtjax.plot`, imported when it is first asked for, as it needs matplotlib; and what moved, with a warning."""
     if name == "plot":
         return importlib.import_module("hhtjax.plot")
     if name == "collocation":
