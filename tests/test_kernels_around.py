@@ -77,7 +77,7 @@ SHARDED = """
 import jax, jax.numpy as jnp
 from jax.sharding import NamedSharding, PartitionSpec
 from hhtjax import explain
-from hhtjax.xla import gate, kernels
+from hhtjax.primitives import kernels
 mesh = jax.make_mesh((2,), ("b",))
 x = jnp.arange(8.0)
 def f(c):

@@ -65,7 +65,7 @@ def or_plain(run: Callable, again: Callable | None = None):
         jax.errors.JaxRuntimeError: XLA refuses the plain program too, or the machinery is off. And whatever run raises.
 
     >>> import jax.numpy as jnp, hhtjax
-    >>> float(hhtjax.xla.or_plain(lambda: jnp.sum(jnp.ones(3))))
+    >>> float(hhtjax.primitives.or_plain(lambda: jnp.sum(jnp.ones(3))))
     3.0
     """
     try:
