@@ -1,14 +1,13 @@
 """For every test and doctest: double precision, no silent promotion of ranks or dtypes, programs compiled quickly."""
 
-import atexit
 import ctypes
 import gc
+import hashlib
 import importlib.util
 import mmap
 import os
-import shutil
+import platform
 import sys
-import tempfile
 import threading
 from pathlib import Path
 
@@ -24,7 +23,7 @@ QUICK = {
     "xla_llvm_enable_noalias_metadata": "false",
     "xla_llvm_enable_invariant_load_metadata": "false",
 }
-SMALL = 0.1  # seconds to compile a program that others load
+KEPT = 1_000_000_000  # bytes of compiled programs, kept from one run to the next
 LARGE = 1_700_000_000  # bytes of a test process, above which it forgets its compiled programs
 
 
@@ -45,29 +44,48 @@ def set_flags():
     os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
 
-def share_programs():
-    """What one process of this run has compiled, the small programs of array operations above all, the others load."""
+def machine():
+    """A name for what programs are compiled for: they do not run where instructions are missing."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    except OSError:
+        flags = platform.processor()
+    return hashlib.sha256(f"{platform.machine()} {flags}".encode()).hexdigest()[:12]
+
+
+def forget_oldest(folder, limit=KEPT):
+    """Programs that have not been read for longest, until the rest takes no more than so many bytes."""
+    found = [(max(x.st_atime, x.st_mtime), x.st_size, path) for path in folder.iterdir() for x in [path.stat()]]
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= limit:
+            break
+        path.unlink(missing_ok=True)
+        total -= size
+
+
+def keep_programs():
+    """What one process has compiled the others load, and those of the next run, from a folder that git ignores. Of the
+    key are the program and the flags, so that changed code is compiled. One's own folder comes first."""
     if not {"PYTEST_XDIST_WORKER", "JAX_COMPILATION_CACHE_DIR"}.isdisjoint(os.environ):
         return  # workers inherit what is set here
     if jax.__version_info__ < (0, 10):
         return  # this has not been tried with old ones
-    folder = tempfile.mkdtemp(prefix="hhtjax-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
-
-
-def share_small_programs_only():
-    """What takes longer to compile is the program of one test; to write it took a twentieth of the time."""
-    if jax.__version_info__[:2] == (0, 10):
-        from jax._src import compiler
-
-        def write(key, seconds, *program, write=compiler._cache_write):
-            if seconds < SMALL:
-                write(key, seconds, *program)
-
-        compiler._cache_write = write
+    folder = Path(__file__).parents[1] / ".pytest_cache" / f"programs-{machine()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        forget_oldest(folder)
+    except OSError:  # nothing can be written there
+        return
+    options = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    for name, value in options.items():
+        jax.config.update(name, value)  # this process has read the environment already
+        os.environ[name.upper()] = str(value)
 
 
 class Contexts(threading.local):
@@ -99,8 +117,7 @@ def share_contexts():
 
 
 set_flags()
-share_programs()
-share_small_programs_only()
+keep_programs()
 share_contexts()
 os.environ.setdefault("MPLBACKEND", "Agg")  # charts of doctests need no display
 jax.config.update("jax_enable_x64", True)
