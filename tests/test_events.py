@@ -106,7 +106,7 @@ def test_derivatives_of_an_impact_are_those_of_the_formula_at_any_dt():
     def by_sweep(x):
         dts = 1.0 / np.array([2, 6, 30, 100])
         params = {"g": x[2], "e": x[3], "floor": x[4]}
-        runs = sweep(ball, hht(), x[:1], x[1:2], params, dts=dts, duration=1.0, num_samples=1, events=[floor])
+        runs = sweep(ball, STEPPER, x[:1], x[1:2], params, dts=dts, duration=1.0, num_samples=1, events=[floor])
         return jnp.stack([runs.q[:, -1, 0], runs.v[:, -1, 0], runs.events.t[:, 0]], axis=1)
 
     exact = jax.jacfwd(bounced)(x)

@@ -71,7 +71,7 @@ def test_same_three_ways(name, stepper):
 
 
 EVENTS = {
-    "impact": (event_problems.dragged_ball, hhtjax.hht(-0.3)),
+    "impact": (event_problems.dragged_ball, hhtjax.hht(-0.3, linearize="predictor")),
     "switch": (event_problems.bump_stop, hhtjax.rk4()),
 }
 
