@@ -1,5 +1,7 @@
 """Masses that depend on the time: a load on a rope that is hoisted, and what leaks."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from compiled_c import Library, needs_compiler
 from helpers import check_forward, check_gradient
 from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
-from zoo import each
+from zoo import Problem, as_data, each, ends_of_two
 
 import hhtjax
 from hhtjax import System
@@ -80,9 +82,10 @@ def rate_by_hand(t, y, params):
     return jnp.concatenate([v, jnp.linalg.solve(mass(q, t, params), force(q, v, t, params))])
 
 
-def by_scipy(params=PARAMS, duration=DURATION):
+@cache
+def by_scipy():
     y0 = np.concatenate([Q0, V0])
-    path = solve_ivp(rate_by_hand, (0, duration), y0, "DOP853", args=(params,), rtol=1e-12, atol=1e-13)
+    path = solve_ivp(rate_by_hand, (0, DURATION), y0, "DOP853", args=(PARAMS,), rtol=1e-12, atol=1e-13)
     return path.y[:, -1]
 
 
@@ -94,10 +97,10 @@ def run(stepper, params=PARAMS, system=CRANE, num_steps=400, **options):
 def test_order(name):
     """That of the stepper for masses which do not depend on the time."""
     stepper, order = STEPPERS[name]
-    exact, steps = by_scipy(), (100, 200) if order > 3 else (400, 800)
-    runs = [run(stepper, num_steps=n) for n in steps]
-    errors = [np.abs(np.concatenate([x.q[-1], x.v[-1]]) - exact).max() for x in runs]
-    runs[-1].check()
+    exact, problem = by_scipy(), Problem(CRANE, PARAMS, Q0, V0, DURATION)
+    runs = ends_of_two(problem, as_data(stepper), 100 if order > 3 else 400)
+    errors = [np.abs(np.concatenate([x.q[k], x.v[k]]) - exact).max() for x, k in runs]
+    runs[-1][0].check()
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
     assert errors[1] < {1: 5e-2, 2: 1e-3, 3: 1e-5, 4: 1e-6, 5: 1e-8}[order]
 
