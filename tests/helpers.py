@@ -102,23 +102,6 @@ def check_gradient(loss, arguments, rtol=1e-10, step=1e-4):
     return reverse
 
 
-def check_forward(f, x0, rtol=1e-6, step=1e-4):
-    """Compares two derivatives of f(x0), a vector of numbers, along each of its entries: forward mode, and differences,
-    by one program. For scenes whose operations some other test takes in reverse."""
-    value_and_forward = jax.jit(lambda x, direction: jax.jvp(f, (x,), (direction,)))
-    slopes = []
-    for value, e in zip(x0, np.eye(x0.size), strict=True):
-        h = step * (abs(value) or 1.0)
-        low, high, *more = (float(value_and_forward(x0 + k * h * e, e)[0]) for k in (-1, 1, -2, 2))
-        # fourth order, so that truncation and rounding both stay below 1e-7
-        slopes.append(((8 * (high - low) - (more[1] - more[0])) / (12 * h), float(value_and_forward(x0, e)[1])))
-    central, forward = np.array(slopes).T
-    size = np.maximum(np.abs(forward), 1e-3 * np.max(np.abs(forward)))
-    assert np.all(np.isfinite(forward))
-    assert np.all(np.abs(central - forward) < rtol * size), (central, forward)
-    return forward
-
-
 def path_loss(problem, stepper, num_steps, save_every):
     """A loss of the whole path, of positions, velocities and accelerations."""
 

@@ -171,9 +171,9 @@ def test_contact_ends_and_begins_in_one_run():
 
 @pytest.mark.slow
 def test_the_derivatives_of_contact():
-    """Of the times, and of a height in flight, in the amplitude: forward, differences, and the formula of the first
-    time, sin(W t) = g/(A W^2), which is met to the first order of dt: the error of the time, of dt^2, changes with its
-    place in a step. In reverse the same operations are tested below, where a body is lifted."""
+    """Of the times, and of a height in flight, in the amplitude: forward, reverse, differences, and the formula of the
+    first time, sin(W t) = g/(A W^2), which is met to the first order of dt: the error of the time, of dt^2, changes
+    with its place in a step."""
 
     def told(A):
         run = shaken({"dt": 0.0025, "num_steps": 360}, A=A)
@@ -181,8 +181,9 @@ def test_the_derivatives_of_contact():
 
     A = float(SCENE.params["A"])
     along = jax.jit(lambda A: jax.jvp(told, (A,), (jnp.ones_like(A),)))
-    by_column = along(A)[1]
+    by_column, by_row = along(A)[1], jax.jit(jax.jacrev(told))(A)
     central = (along(A + 1e-6)[0] - along(A - 1e-6)[0]) / 2e-6
+    assert abs(by_column - by_row).max() < 1e-12
     assert abs(by_column - central).max() < 1e-6
     np.testing.assert_allclose(by_column[0], -np.tan(10 * flights(2.0)[0]) / (10 * A), rtol=4 * 0.0025)
 

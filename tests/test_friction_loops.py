@@ -10,14 +10,13 @@ import pytest
 from compiled_c import Library, needs_compiler, numbers
 from four_bar import CRANK, FREE, LIMITS, PARAMS, angles, motion, ratios, reduced
 from friction_problems import free_vibration_exact
-from helpers import check_forward, check_gradient
+from helpers import check_gradient
 from scipy.integrate import solve_ivp
 
 import hhtjax
 from hhtjax.systems.friction_rows import slides_in_box
 
 ONE, TWO, ZERO = jnp.ones(1), jnp.ones(2), jnp.zeros(2)
-LIGHT = hhtjax.hht(linearize="predictor")  # half the program of "auto"
 
 
 def all_choices(K, load, f):
@@ -73,10 +72,10 @@ GEAR = hhtjax.System(
 GEARED = {"k": 100.0, "F": jnp.array([1.5, 5.0])}  # 1.5 + 5/2 at the first, which feels a mass of 1
 
 
-def turned(F=GEARED["F"], num_steps=400, dtype=float, stepper=LIGHT):
+def turned(F=GEARED["F"], num_steps=400, dtype=float):
     q0 = jnp.array([0.5, 0.25], dtype)
     params = {"k": jnp.asarray(100.0, dtype), "F": jnp.asarray(F, dtype)}
-    return hhtjax.simulate(GEAR, stepper, q0, 0 * q0, params, dt=2.2 / num_steps, num_steps=num_steps)
+    return hhtjax.simulate(GEAR, hhtjax.hht(), q0, 0 * q0, params, dt=2.2 / num_steps, num_steps=num_steps)
 
 
 @pytest.fixture(scope="module")
@@ -203,7 +202,7 @@ def test_a_driven_crank_bears_all_four_joints():
     @jax.jit
     @jax.vmap
     def run(F):
-        return hhtjax.simulate(CRANK, LIGHT, q0, v0, {**PARAMS, "F": F}, dt=2 / 800, num_steps=800)
+        return hhtjax.simulate(CRANK, hhtjax.hht(), q0, v0, {**PARAMS, "F": F}, dt=2 / 800, num_steps=800)
 
     found = run(jnp.stack([LIMITS, 0 * LIMITS]))
     found.check()
@@ -230,7 +229,7 @@ def test_four_joints_of_a_four_bar_rub():
     exact, switches = reduced(LOADED, np.linspace(0, T, samples + 1))
     assert len(switches) == 6
     q0 = angles(np.array([0.7]))[:, 0]
-    found = hhtjax.sweep(FREE, LIGHT, q0, 0 * q0, LOADED, dts=T / sizes, duration=T, num_samples=samples)
+    found = hhtjax.sweep(FREE, hhtjax.hht(), q0, 0 * q0, LOADED, dts=T / sizes, duration=T, num_samples=samples)
     found.check()
     error = np.stack(
         [np.max(np.abs(x[:, :, 0] - y[None]), axis=1) for x, y in zip((found.q, found.v), exact, strict=True)]
@@ -239,21 +238,20 @@ def test_four_joints_of_a_four_bar_rub():
     assert np.all(order > 1.85), order
     assert np.all(error[:, 1] < [1e-3, 4e-3]), error
     assert 0.02 < np.mean(found.sticking[1]) < 0.2
-    one = hhtjax.simulate(FREE, LIGHT, q0, 0 * q0, LOADED, dt=T / 1920, num_steps=1920)
+    one = hhtjax.simulate(FREE, hhtjax.hht(), q0, 0 * q0, LOADED, dt=T / 1920, num_steps=1920)
     balance = hhtjax.analysis.energy_balance(FREE, one, LOADED)
     assert np.max(np.abs(balance.error)) < 1e-3 * np.max(np.abs(balance.kinetic))
 
 
 @pytest.mark.slow
 def test_derivatives_in_all_four_limits():
-    """Forward; a gear has the same operations in reverse, and constraints have tests of their own."""
     q0 = angles(np.array([0.7]))[:, 0]
 
     def end(F):
-        run = hhtjax.simulate(FREE, LIGHT, q0, 0 * q0, {**LOADED, "F": F}, dt=1 / 32, num_steps=32)
+        run = hhtjax.simulate(FREE, hhtjax.hht(), q0, 0 * q0, {**LOADED, "F": F}, dt=1 / 32, num_steps=32)
         return run.q[-1, 0] + 0.1 * run.v[-1, 0] + 0.01 * run.multipliers[-1, 0]
 
-    check_forward(end, np.asarray(LOADED["F"]), step=1e-6)
+    check_gradient(end, np.asarray(LOADED["F"]), step=1e-6)
 
 
 def twins(limit=lambda q, v, t, p: p * TWO):
@@ -322,28 +320,21 @@ def test_joints_break_away_within_a_step():
     assert np.max(errors[1]) < 5e-5
 
 
-PADS = hhtjax.System(
-    ONE,
-    lambda q, v, t, u: u + 0 * q,
-    friction=lambda q, v, t, u: jnp.array([1.5, 2.5]),
-    sliding=lambda q, v, t, u: v * TWO,
-)
-
-
 @pytest.mark.slow
-def test_a_load_at_a_known_time_breaks_a_gear_away():
-    """(u - 4) t^2/2 from then on: exact, since all is constant between. A gear, in steps of one size; and two pads on
-    one disc, whose directions depend on each other too, under error control."""
+@pytest.mark.parametrize(
+    "steps",
+    [{"dt": 0.1, "num_steps": 30}, {"dt": hhtjax.adaptive(1e-4, 1e-7), "times": [2.5, 3.0]}],
+    ids=["fixed", "adaptive"],
+)
+def test_a_load_at_a_known_time_breaks_a_gear_away(steps):
+    """(u - 4) t^2/2 from then on: exact, since all is constant between."""
     load, T = hhtjax.Event(at=2.013, switch=lambda u: u + 2.1), 3.0 - 2.013
     system = hhtjax.System(
         GEAR.mass, lambda q, v, t, u: jnp.stack([u, 0.0 * t]), gear, friction=lambda q, v, L, t, u: GEARED["F"]
     )
-    steps = {"dt": 0.1, "num_steps": 30}, {"dt": hhtjax.adaptive(1e-4, 1e-7), "times": [2.5, 3.0]}
-    stepper = hhtjax.hht(0.0, linearize="predictor")
-    for made, q0, options in zip((system, PADS), (ZERO, 0 * ONE), steps, strict=True):
-        run = hhtjax.simulate(made, stepper, q0, q0, jnp.asarray(3.9), events=[load], **options)
-        run.check()
-        np.testing.assert_allclose([run.q[-1, 0], run.v[-1, 0]], [T**2, 2 * T], rtol=1e-12)
+    run = hhtjax.simulate(system, hhtjax.hht(0.0), ZERO, ZERO, jnp.asarray(3.9), events=[load], **steps)
+    run.check()
+    np.testing.assert_allclose([run.q[-1, 0], run.v[-1, 0]], [T**2, 2 * T], rtol=1e-12)
 
 
 @needs_compiler
