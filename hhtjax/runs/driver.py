@@ -273,9 +273,9 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     met = met._replace(log=Log.empty(unnoted(start)[0], keep, context.slots))
     if in_pieces:
         met = met._replace(pieces=Pieces.none(start, max_events + 1, met.modes if with_modes else ()))
-    step = step_with_events(context, params, loop.bound, loop.sizes)
-    more = {"past": partial(step_with_events, context, params), "now": lambda met: flat_events.with_modes(params, met.modes)}
-    return loop._replace(carry=(*loop.carry, met), advance=step, **more)
+    past = partial(step_with_events, context, params)
+    more = {"past": past, "now": lambda met: flat_events.with_modes(params, met.modes)}
+    return loop._replace(carry=(*loop.carry, met), advance=past(loop.bound, loop.sizes), **more)
 
 
 def step_with_events(context, params, bound, sizes):
