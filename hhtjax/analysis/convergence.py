@@ -1,5 +1,7 @@
 """The order a stepper shows."""
 
+from __future__ import annotations
+
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -8,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import thaw
+from hhtjax.description import PyTree, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.steppers.stepper import begun, require_stepper
 from hhtjax.systems.initial_conditions import initial_values
@@ -31,7 +33,17 @@ class ObservedOrder(NamedTuple):
 
 
 def observed_order(
-    system, stepper, q0, v0=None, params=None, *, z0=None, duration, num_steps, reference=None, t0=0.0
+    system,
+    stepper,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
+    *,
+    z0: PyTree = None,
+    duration,
+    num_steps,
+    reference=None,
+    t0=0.0,
 ) -> ObservedOrder:
     """Order of convergence of q at t0 + duration, from runs with each of `num_steps` steps.
 
@@ -94,7 +106,7 @@ def observed_order(
 
 
 @Programs
-def _end(system, stepper, q0, v0, params, z0, t0, dt, num_steps):
+def _end(system, stepper, q0: PyTree, v0: PyTree, params: PyTree, z0: PyTree, t0, dt, num_steps):
     """q at the end as a vector; one compilation for all numbers of steps."""
     params = thaw(params)
     state = begun("observed_order", system, stepper, q0, v0, z0, params, dt, t0)

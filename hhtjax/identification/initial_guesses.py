@@ -1,5 +1,7 @@
 """Where a fit starts: parameters from the equation of motion itself, and longer and longer parts of a record."""
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Callable
 from functools import partial
@@ -11,6 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import evaluate, require_function
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.flat_system import flatten
@@ -81,8 +84,8 @@ def equation_error(
     t = t0 + jnp.linspace(0, dt * (samples - 1), samples)
     inside = jax.tree.map(lambda y: y[left_out : samples - left_out], (q, v, a, t))
 
-    def residuals(params):
-        def one(q, v, a, t):
+    def residuals(params: PyTree) -> Array:
+        def one(q: PyTree, v: PyTree, a: PyTree, t: Array) -> Array:
             _require_no_rotations(system, q, t, params)
             flat, x, rate = flatten("equation_error", system, q, v, t, params)
             t = t.astype(rate.dtype)
@@ -94,7 +97,7 @@ def equation_error(
     return residuals
 
 
-def _require_no_rotations(system, q, t, params):
+def _require_no_rotations(system, q: PyTree, t: Array, params: PyTree):
     """An error for positions (3, 3) whose mass is that of angular velocities (3,)."""
     turning = sum(x.size for x in jax.tree.leaves(q) if x.shape[-2:] == (3, 3))
     if turning and isinstance(system, System):
@@ -107,7 +110,7 @@ def _require_no_rotations(system, q, t, params):
             )
 
 
-def _at_equal_distances(values, dt, t0, times):
+def _at_equal_distances(values: np.ndarray, dt: Real, t0: Real, times: np.ndarray):
     """The values at as many times at equal distances, their sampling period, and the time of the first."""
     splines = jax.tree.map(lambda y: sampled(y, dt, t0, times=times), values)
     t0, end, count = float(times[0]), float(times[-1]), len(times)
@@ -115,7 +118,7 @@ def _at_equal_distances(values, dt, t0, times):
     return jax.tree.map(lambda u: u(t0 + dt * np.arange(count)), splines, is_leaf=_is_spline), dt, t0
 
 
-def _is_spline(x):
+def _is_spline(x: Sampled) -> bool:
     return isinstance(x, Sampled)
 
 
@@ -165,7 +168,7 @@ def fit_progressively(
     return result
 
 
-def _problem(found, horizon):
+def _problem(found: PyTree, horizon: int):
     """What problem_at returned, if `fit` can take it."""
     where = f"fit_progressively: `problem_at` must return a dict of arguments of `fit`; received at horizon {horizon!r}"
     if not isinstance(found, dict):

@@ -1,8 +1,10 @@
 """Sensors: what they show of a motion, at times of their own, with gain, offset, drift and delay."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe, require_function, require_number, require_params
-from hhtjax.description import Description, is_array, is_real, thaw
+from hhtjax.description import Array, Description, PyTree, Real, is_array, is_real, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.runs.interpolate import interpolate, on_axes
@@ -18,6 +20,10 @@ from hhtjax.runs.output import output_at, require_output
 from hhtjax.runs.solution import Solution
 from hhtjax.systems import kinematics
 from hhtjax.xla import Programs
+
+if TYPE_CHECKING:
+    from hhtjax.runs.interpolate import Interpolant
+    from hhtjax.runs.output import Output
 
 
 def measure(
@@ -98,13 +104,13 @@ def measure(
     ])  # fmt: skip
 
 
-def _clock(times, delay, t0):
+def _clock(times, delay, t0) -> Array:
     """The times at which is measured what is shown at these."""
     require_number("measure", "delay", delay, np.isfinite, "be finite")
     return jnp.maximum(jnp.asarray(times) - delay, t0)
 
 
-def _sensed(solution, output, params, times):
+def _sensed(solution: Solution, output: Output | None, params: PyTree, times: Array) -> PyTree:
     """What ideal sensors show, with the times as leading axes."""
     found = interpolate(solution, times)
     if output is None:
@@ -113,7 +119,7 @@ def _sensed(solution, output, params, times):
 
 
 @Programs
-def _outputs(output, found, times, params):
+def _outputs(output: Output, found: Interpolant, times: Array, params: PyTree) -> PyTree:
     """The output at each of the times, what is known there being `found`."""
     params = thaw(params)
     one = partial(output_at, output)
@@ -122,16 +128,16 @@ def _outputs(output, found, times, params):
     return one(found, times, params)
 
 
-def _one_or_tree(x):
+def _one_or_tree(x: PyTree):
     """Numbers in a list as an array."""
     return np.asarray(x) if isinstance(x, (list, tuple)) and all(is_real(y) and np.ndim(y) == 0 for y in x) else x
 
 
-def _is_tree(x):
+def _is_tree(x: PyTree) -> bool:
     return not (is_array(x) or is_real(x))
 
 
-def _each(name, x, like):
+def _each(name: str, x: PyTree, like: PyTree):
     """One for each leaf of what is measured, from one for all or for whole parts of it."""
     try:
         return jax.tree.leaves(jax.tree.map(lambda x, part: [x] * len(jax.tree.leaves(part)), x, like))
@@ -142,12 +148,12 @@ def _each(name, x, like):
         ) from None
 
 
-def _with_flaws(y, since, gain, offset, drift):
+def _with_flaws(y: Array, since: Array, gain: Real, offset: Real, drift: Real) -> Array:
     """gain y + offset + drift t, each a number or of the shape of a reading; flags and counts as they are."""
     if not jnp.issubdtype(y.dtype, jnp.floating):
         return y
 
-    def like_y(x):
+    def like_y(x: Real) -> Real:
         return x if jnp.ndim(x) == 0 else jnp.broadcast_to(x, y.shape)
 
     shown = like_y(gain) * y + like_y(offset)
@@ -163,13 +169,13 @@ class Accelerometer(Description):
     gravity: Any
     frame: Any
 
-    def __call__(self, q, v, w, t, params):
+    def __call__(self, q: Array, v: Array, w: Array, t: Array, params: PyTree) -> Array:
         """f = R^T (a - g)."""
         x, unravel = ravel_pytree(q)
         rates = ravel_pytree(v)[0]
         blocks, one = kinematics.layout(q, v), jnp.ones_like(t)
 
-        def velocity(x, rates, t):
+        def velocity(x: Array, rates: Array, t: Array) -> Array:
             motion = kinematics.rate(blocks, x, rates), one
             return jax.jvp(lambda x, t: jnp.asarray(self.position(unravel(x), t, params)), (x, t), motion)[1]
 

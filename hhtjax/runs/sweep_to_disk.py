@@ -1,5 +1,7 @@
 """Sweeps that are written to disk as they go, and taken up again where they stopped."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import os
@@ -13,7 +15,7 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_integer
-from hhtjax.description import VERSION, all_concrete
+from hhtjax.description import VERSION, PyTree, all_concrete
 from hhtjax.primitives import or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.output import require_output
@@ -25,11 +27,11 @@ def sweep_to_disk(
     folder,
     system,
     stepper,
-    q0,
-    v0=None,
-    params=None,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
     *,
-    z0=None,
+    z0: PyTree = None,
     dts,
     duration=None,
     num_samples=None,

@@ -1,11 +1,13 @@
 """A scene: a system with everything that a run needs besides a stepper and a step size."""
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import all_concrete
+from hhtjax.description import Array, PyTree, all_concrete
 from hhtjax.description.presentation import shown
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import LinearSystem, System
@@ -65,7 +67,7 @@ class InternalScene(NamedTuple):
     z0: Any
 
 
-def array(values):
+def array(values: PyTree) -> Array:
     """An array of floats; of numbers by NumPy, which has nothing to compile."""
     dtype = jnp.result_type(float)
     known = all_concrete(values)

@@ -8,9 +8,11 @@ that is, of index 1: solutions leave Phi = 0 by what the solver's errors add up 
 and stays orthogonal to the accuracy of the solver. With internal states, y = (q, v, z).
 """
 
+from __future__ import annotations
+
 import importlib
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +20,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import Description, as_float, current, thaw
+from hhtjax.description import Description, PyTree, Real, as_float, current, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.systems.constraints import acceleration_and_multipliers
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, require_consistent
 from hhtjax.systems.system import FirstOrderSystem, require_smooth, require_system
+
+if TYPE_CHECKING:
+    from hhtjax.systems.system import System
 
 __all__ = ["FlatODE", "ScipyRHS", "diffrax_term", "flat_ode", "ode", "scipy_rhs"]
 
@@ -69,7 +74,7 @@ class FlatODE(NamedTuple):
     unravel: Any
 
 
-def flat_ode(system, q0, v0=None, z0=None) -> FlatODE:
+def flat_ode(system: System, q0: PyTree, v0: PyTree = None, z0: PyTree = None) -> FlatODE:
     """The same on vectors: y holds the numbers of q, then those of v, then z, each in the order of `ravel_pytree`.
 
     Args:
@@ -143,7 +148,9 @@ class ScipyRHS(NamedTuple):
     jac: Any
 
 
-def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
+def scipy_rhs(
+    system: System, q0: PyTree, v0: PyTree = None, params: PyTree = None, t0: Real = 0.0, z0: PyTree = None
+) -> ScipyRHS:
     """The system as SciPy takes it: right-hand side, start and Jacobian, for Radau, BDF and LSODA too.
 
     Compiled once for each system and structure; new params, and a new start, cost no compilation. A call takes some
@@ -198,7 +205,7 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
     return ScipyRHS(partial(call, 0), np.asarray(flat.y0), unravel, partial(call, 1))
 
 
-def _ode(system, t, y, params):
+def _ode(system, t, y, params: PyTree):
     """y' of a pytree y."""
     y = jax.tree.map(as_float, y)
     if isinstance(system, FirstOrderSystem):
@@ -220,7 +227,7 @@ def _ode(system, t, y, params):
 class _FlatRate(Description):
     """`ode` on vectors; frozen and hashable, so that equal ones share a program."""
 
-    def __init__(self, system, sizes, unravels):
+    def __init__(self, system: System, sizes: tuple, unravels: tuple):
         self.system, self.sizes, self.unravels = system, sizes, unravels
 
     def unravel(self, y):
@@ -229,11 +236,11 @@ class _FlatRate(Description):
         found = [unravel(part) for unravel, part in zip(self.unravels, parts, strict=True)]
         return tuple(found) if len(found) > 1 else found[0]
 
-    def __call__(self, t, y, params):
+    def __call__(self, t, y, params: PyTree):
         return ravel_pytree(_ode(self.system, t, self.unravel(y), params))[0]
 
 
-def _packed(params):
+def _packed(params: PyTree):
     """The params as one vector, if that is what they are, because fewer arguments make a call quicker; the way back."""
     leaves = jax.tree.leaves(params)
     if leaves and all(jnp.result_type(x) == np.float64 for x in leaves):
@@ -257,7 +264,7 @@ def _compiled(rate, structure, unpack):
     return jax.jit(program), jax.jit(jax.jacfwd(program, argnums=1))
 
 
-def _required(caller, package):
+def _required(caller: str, package):
     """A package that not everybody has."""
     try:
         return importlib.import_module(package)
