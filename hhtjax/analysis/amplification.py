@@ -25,7 +25,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import is_array, is_concrete, is_real, thaw
+from hhtjax.description import is_array, is_concrete, is_real
 from hhtjax.steppers.stepper import State, begun, require_stepper, require_system
 from hhtjax.systems import kinematics
 from hhtjax.systems.system import FirstOrderSystem, System
@@ -99,7 +99,6 @@ def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Arra
 
 @jax.jit
 def _amplification_matrix(system, stepper, state, params, dt):
-    params = thaw(params)
     q, unravel_q = ravel_pytree(state.q)
     blocks = kinematics.layout(state.q, state.v)
     x, unravel = _floats(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))
