@@ -18,8 +18,10 @@ test says so (`tests/test_floors.py` holds the floors as data).
     identification    fits, and how far to trust them
     analysis          what a step does to a motion
     export            out of Python: a step as C, or as an FMU
-    runs              simulate, sweep, interpolate; `driver.py` has the way that every run takes
-    steppers          one step; `residual.py` has the method in thirty lines, one file for each family
+    runs              simulate, sweep, interpolate; `driver.py` has the way that every run takes,
+                      `event_step.py` divides a step at an event
+    steppers          one step, one file for each family. HHT: the formulas in `residual.py`, the step in
+                      `generalized_alpha.py`, its one solve in `implicit_solve.py`
     systems           what moves: pytrees outside, one flat vector inside; constraints, rotations, inputs
     numerics          solves, scans, loops, extrapolation: mathematics that knows no mechanics; rotation, trigonometry
     xla               how a run becomes one kernel on the CPU

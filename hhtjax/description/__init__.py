@@ -1,6 +1,7 @@
 """Frozen descriptions: hashable under jit, and pytrees whose arrays are data."""
 
 from contextlib import nullcontext
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,11 @@ from jax.core import Tracer
 from hhtjax.description.current import Kind, current, programs, with_data  # noqa: F401
 
 VERSION = "0.1.0"  # of the library
+
+# words of signatures
+Array = jax.Array  # of JAX, a tracer too
+Real = Any  # a number, or an array of numbers of JAX or NumPy, on which arithmetic is not checked
+PyTree = Any  # whatever structure of arrays a user has
 
 
 def is_array(x):

@@ -273,17 +273,17 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     met = met._replace(log=Log.empty(unnoted(start)[0], keep, context.slots))
     if in_pieces:
         met = met._replace(pieces=Pieces.none(start, max_events + 1, met.modes if with_modes else ()))
-    step = past_events(context, params, loop.bound, loop.sizes)
-    more = {"past": partial(past_events, context, params), "now": lambda met: flat_events.with_modes(params, met.modes)}
-    return loop._replace(carry=(*loop.carry, met), advance=step, **more)
+    past = partial(step_with_events, context, params)
+    more = {"past": past, "now": lambda met: flat_events.with_modes(params, met.modes)}
+    return loop._replace(carry=(*loop.carry, met), advance=past(loop.bound, loop.sizes), **more)
 
 
-def past_events(context, params, bound, sizes):
+def step_with_events(context, params, bound, sizes):
     """The step of a run with events, which rests where not `here`.
 
     bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
     """
-    events, pass_them = context.events, passing(context)
+    events, pass_them = context.events, passage(context)
     fixed = None if events.switches else bound(params)
 
     def step(carry, here=None):
@@ -316,7 +316,7 @@ def may_meet(context, part, h, params):
     return asked & ~part.met.ended if any(context.events.ends) else asked
 
 
-def passing(context):
+def passage(context):
     """The function of a step and the log, with the counts of steps before and after it, that passes its events."""
 
     @checkpoint  # reverse mode would keep all that is in there for each step

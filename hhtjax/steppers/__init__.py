@@ -99,7 +99,7 @@ numbers and the order, with the error and dense output where it has them.
 
 A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
 `implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
-refusals are tested on all problems there; what is its own gets a test with a closed form.
+refusals are tested on the problems there; what is its own gets a test with a closed form.
 
 For error control, `simulate(..., dt=adaptive(...))`, a method also has an `estimate_order` k, a `begin_estimates`, and
 a `bind_estimated`, whose step returns the errors, of size h^k, too (`variable_step.py`).

@@ -28,8 +28,8 @@ class ExplicitTableau(NamedTuple):
         name: of the method.
         A: the rows of the stages 2 to s, those entries that are below the diagonal.
         b: (s,), the end of the step.
-        error: (s + 1,), b less the weights of the embedded method, and behind them what that takes of the rate at the
-            end of the step, with a minus; None without an estimate.
+        error: (s + 1,), the weights (*b, 0) of the s stages and of the rate at the end of the step, less those of the
+            embedded method; many sources print the negative. None without an estimate.
         embedded_order: of that method.
         dense: (s + 1,), the weights d of dense output: s^2 (1 - s)^2 h sum_i d_i k_i beside the cubic Hermite
             polynomial, s in [0, 1] from the start to the end of the step; None for cubics alone.
