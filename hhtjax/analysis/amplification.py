@@ -29,7 +29,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real, thaw
+from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real
 from hhtjax.steppers.stepper import State, begun, require_stepper, require_system
 from hhtjax.systems import kinematics
 from hhtjax.systems.system import FirstOrderSystem, System
@@ -111,7 +111,6 @@ def amplification_matrix(
 def _amplification_matrix(
     system: LinearSystem | FirstOrderSystem | System, stepper: Stepper, state: State, params: PyTree, dt: Array
 ) -> Array:
-    params = thaw(params)
     q, unravel_q = ravel_pytree(state.q)
     blocks = kinematics.layout(state.q, state.v)
     x, unravel = _floats(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))

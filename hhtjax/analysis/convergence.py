@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import PyTree, thaw
+from hhtjax.description import PyTree
 from hhtjax.description.presentation import shown
 from hhtjax.steppers.stepper import begun, require_stepper
 from hhtjax.systems.initial_conditions import initial_values
@@ -108,7 +108,6 @@ def observed_order(
 @Programs
 def _end(system, stepper, q0: PyTree, v0: PyTree, params: PyTree, z0: PyTree, t0, dt, num_steps):
     """q at the end as a vector; one compilation for all numbers of steps."""
-    params = thaw(params)
     state = begun("observed_order", system, stepper, q0, v0, z0, params, dt, t0)
     state = jax.lax.fori_loop(0, num_steps, lambda _, s: stepper.step(system, s, params, dt)[0], state)
     return ravel_pytree(state.q)[0]

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis.amplification import damping_ratio, eigenvalues, period_elongation
 from hhtjax.checks import require_number
-from hhtjax.description import Array, PyTree, Real, freeze, thaw
+from hhtjax.description import Array, PyTree, Real, freeze
 from hhtjax.steppers.stepper import begun, require_capable, require_stepper
 from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.systems.flat_system import flatten
@@ -210,7 +210,6 @@ def _modal_step(rates, resolved: np.ndarray, stable: np.ndarray, tolerance: Real
 @jax.jit
 def _linearize(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array, z0: PyTree):
     """Derivatives of w in displacement and velocity, (N, N), and B, (m, N), internal states among the velocities."""
-    params = thaw(params)
     flat, q, v = flatten("suggest_step_size", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
 
@@ -331,7 +330,7 @@ def _samples(
     num_steps: Array,
 ) -> Array:
     """q at SAMPLES times, or, of fewer steps, after each; compiled once for all numbers of steps."""
-    params, dt = thaw(params), duration / num_steps
+    dt = duration / num_steps
     between = jnp.maximum(1, num_steps // SAMPLES)
 
     def step(i: Array, carry: tuple):

@@ -315,7 +315,7 @@ class Layout(NamedTuple):
             if name in names and len(path) == 1:
                 leaves.append([field for prefix, tree in names[name] for field in fields(tree, prefix, prefix)])
             else:
-                leaves.append(fields(leaf, "_".join([name, *map(_index, path[1:])]), name))
+                leaves.append(fields(leaf, "_".join([name, *map(_word, path[1:])]), name))
         found = distinct([field for leaf in leaves for field in leaf])
         own = iter(found)
         return cls(found, [[next(own) for _ in leaf] for leaf in leaves])
@@ -323,10 +323,6 @@ class Layout(NamedTuple):
     def places(self, struct: str):
         """C for every number of the state, leaf by leaf."""
         return [[place for field in leaf for place in field.places(struct)] for leaf in self.leaves]
-
-
-def _index(key):
-    return str(next(getattr(key, name) for name in ("key", "idx", "name") if hasattr(key, name)))
 
 
 def derivative_field(field: Field, name: str) -> Field:

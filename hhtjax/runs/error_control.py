@@ -16,7 +16,6 @@ from hhtjax.description.presentation import overwrite, shown
 from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.approximate_math import rough_exp, rough_log, without_rounding
 from hhtjax.numerics.batched_cond import choose, seldom_alone
-from hhtjax.numerics.batched_cond import choose as either
 from hhtjax.primitives import largest_in_batch, one_kernel, or_alone, row_written, staged
 from hhtjax.runs.driver import before_any, flaw_at_start, neutral_info, no_failure, saved, with_flaw
 from hhtjax.runs.event_step import SHORT, EventContext, SubStep, asks, pass_events, reaching
@@ -534,7 +533,7 @@ class Recorder(NamedTuple):
 
     def add(self, since: Since, begun: Begun, accepted: Array) -> Since:
         """Since, with a try; of one that is rejected the beginning too: it is that of the next."""
-        return Since(self.begin(begun.state), either(accepted, join_info(since.info, begun.info), since.info))
+        return Since(self.begin(begun.state), choose(accepted, join_info(since.info, begun.info), since.info))
 
     def sample(self, since: Since, state: State, time: Array):
         """Since a sample before this state, and what lies around it: in a step, whose end this is."""

@@ -131,8 +131,8 @@ def collocation(beta: Any, theta: Any, tolerance: Real = 1e-10, max_iterations: 
     References:
         Hilber, Hughes (1978).
 
-    >>> import hhtjax
-    >>> hhtjax.collocation(beta=0.18, theta=1.287301).order
+    >>> from hhtjax.steppers.collocation import collocation
+    >>> collocation(beta=0.18, theta=1.287301).order
     2
     """
     return _collocation("collocation", beta, theta, tolerance, max_iterations)

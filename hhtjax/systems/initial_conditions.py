@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.checks import describe, require_number, require_params
-from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, is_real, known_now, thaw
+from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, is_real, known_now
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.dense_lu import diagonal
 from hhtjax.numerics.differentiable_while import implicit_root
@@ -122,7 +122,6 @@ def consistent_initial(
 @partial(Programs, static_argnames="redundant")
 def _consistent_initial(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array, z0: PyTree, redundant):
     """The result, B at q0 and which rows are clear, and max|Phi| at the end."""
-    params = thaw(params)
     flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params, z0)
     factorize = factorize_constrained(flat.size, redundant)
     t = jnp.asarray(t0).astype(q.dtype)
@@ -144,7 +143,6 @@ def correction(system: FlatSystem, q: Array, t: Array, params: PyTree, rows: Arr
 @Programs
 def examine(system: System, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z0: PyTree):
     """M and B, Phi and dPhi/dt, the sizes of the coordinates and of their rates, and which rows of B are clear."""
-    params = thaw(params)
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     M, (B, clear) = flat.mass(q, t, params), gradient(flat, q, t, params)
@@ -232,7 +230,6 @@ def _is_far(B, away, start):
 @Programs
 def _turns(system, q0: PyTree, v0: PyTree, t0, params: PyTree, z0: PyTree):
     """By how much a displacement of size 1 turns the gradient of each constraint, in the norm of diag(M), and that."""
-    params = thaw(params)
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     d = diagonal(flat.mass(q, t, params))
@@ -358,7 +355,6 @@ DEPENDENT = 1e-6  # relative size of what is left of a row, below which it is ro
 @jax.jit
 def _rows(system: System, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z0: PyTree):
     """B and H at the start, and how much H changes elsewhere."""
-    params = thaw(params)
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     B = jacobian(flat, q, t, params) if flat.num_constraints else jnp.zeros((0, flat.size), q.dtype)
