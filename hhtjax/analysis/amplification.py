@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -30,13 +29,9 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real
-from hhtjax.steppers.stepper import State, begun, require_stepper, require_system
+from hhtjax.steppers.stepper import State, Stepper, begun, require_stepper, require_system
 from hhtjax.systems import kinematics
-from hhtjax.systems.system import FirstOrderSystem, System
-
-if TYPE_CHECKING:
-    from hhtjax.steppers.stepper import Stepper
-    from hhtjax.systems.linear_system import LinearSystem
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, System
 
 INFINITE = 1e17  # a frequency whose inverse is lost in rounding, and whose square fits into float32
 
@@ -65,7 +60,7 @@ TEST_EQUATION = FirstOrderSystem(_complex_product)
 
 
 def amplification_matrix(
-    system: LinearSystem | FirstOrderSystem | System, stepper: Stepper, state: State, params: PyTree = None, *, dt: Real
+    system: AnySystem, stepper: Stepper, state: State, params: PyTree = None, *, dt: Real
 ) -> jax.Array:
     """A, the derivative of one step at a state, with respect to x: (k, k).
 
@@ -108,9 +103,7 @@ def amplification_matrix(
 
 
 @jax.jit
-def _amplification_matrix(
-    system: LinearSystem | FirstOrderSystem | System, stepper: Stepper, state: State, params: PyTree, dt: Array
-) -> Array:
+def _amplification_matrix(system: AnySystem, stepper: Stepper, state: State, params: PyTree, dt: Array) -> Array:
     q, unravel_q = ravel_pytree(state.q)
     blocks = kinematics.layout(state.q, state.v)
     x, unravel = _floats(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))
@@ -167,7 +160,7 @@ def _carried(step: Callable, state: State, increments: State) -> np.ndarray:
     return np.concatenate([np.full(x.size, c) for x, c in fields if jnp.issubdtype(x.dtype, jnp.floating)])
 
 
-def oscillator_matrix(stepper: Stepper, frequency: float, damping: float = 0.0) -> jax.Array:
+def oscillator_matrix(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
     """A of the test oscillator, on (q, h v, h^2 w, h^2 a, memory) as far as the stepper carries them: (k, k).
 
     Args:
@@ -197,9 +190,7 @@ def oscillator_matrix(stepper: Stepper, frequency: float, damping: float = 0.0) 
     return oscillator_tangent(stepper, *oscillator_params("oscillator_matrix", frequency, damping))
 
 
-def at_rest(
-    system: LinearSystem | FirstOrderSystem | System, stepper: Stepper, zero: Array, params: PyTree, dt: Real
-) -> State:
+def at_rest(system: AnySystem, stepper: Stepper, zero: Array, params: PyTree, dt: Real) -> State:
     """The state of rest, behind the first steps of a stepper that begins with those of another method."""
     v = None if isinstance(system, FirstOrderSystem) else zero
     state = begun("at_rest", system, stepper, zero, v, None, params, dt)
@@ -316,7 +307,7 @@ def _principal_rate(caller: str, stepper: Stepper, frequency: Real, damping: Rea
     return jnp.log(jnp.where(principal.imag > 0, principal, jnp.nan))
 
 
-def spectral_radius(stepper: Stepper, frequency: Real, damping: float = 0.0) -> jax.Array:
+def spectral_radius(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
     """Largest modulus of the eigenvalues of `oscillator_matrix`: of the shape of frequency and damping, broadcast.
 
     To 1e-10, up to W = 1e6. But at W > 1e4 three roots of `generalized_alpha` and of `kim_hht(0.0)` come close to each

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import PyTree
+from hhtjax.description import PyTree, Real
 from hhtjax.description.presentation import shown
-from hhtjax.steppers.stepper import begun, require_stepper
+from hhtjax.steppers.stepper import Stepper, begun, require_stepper
 from hhtjax.systems.initial_conditions import initial_values
+from hhtjax.systems.system import AnySystem
 from hhtjax.xla import Programs
 
 
@@ -27,23 +28,23 @@ class ObservedOrder(NamedTuple):
         slope: between neighbours.
     """
 
-    dt: Any
-    error: Any
-    slope: Any
+    dt: np.ndarray
+    error: np.ndarray
+    slope: np.ndarray
 
 
 def observed_order(
-    system,
-    stepper,
+    system: AnySystem,
+    stepper: Stepper,
     q0: PyTree,
     v0: PyTree = None,
     params: PyTree = None,
     *,
     z0: PyTree = None,
-    duration,
+    duration: Real,
     num_steps,
     reference=None,
-    t0=0.0,
+    t0: Real = 0.0,
 ) -> ObservedOrder:
     """Order of convergence of q at t0 + duration, from runs with each of `num_steps` steps.
 

@@ -20,7 +20,7 @@ from hhtjax.systems.constraints import answers
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.friction import directions, responses
 from hhtjax.systems.friction_rows import rows_of
-from hhtjax.systems.system import LinearSystem, System
+from hhtjax.systems.system import AnySystem, LinearSystem, System
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
@@ -38,14 +38,14 @@ class EnergyBalance(NamedTuple):
         error: kinetic + potential - their sum at the start - work, which the motion itself leaves at 0.
     """
 
-    t: Any
-    kinetic: Any
-    potential: Any
-    work: Any
+    t: Array
+    kinetic: Array
+    potential: Array
+    work: Array
     error: Any
 
 
-def energy_balance(system, solution: Solution, params: PyTree = None, potential=None) -> EnergyBalance:
+def energy_balance(system: AnySystem, solution: Solution, params: PyTree = None, potential=None) -> EnergyBalance:
     """The energy balance along a run: a diagnostic, whose `error` is the energy that the method itself made or lost.
 
         d/dt (T + V) = v' Q + v' Mdot v/2 + L' B v - tau' H v + dV/dt = P,    T = v' M(q) v/2

@@ -33,8 +33,8 @@ class NormalModes(NamedTuple):
         shapes: T, (n, count), a mode in each column, with T^T M T = 1 and the largest entry of a column positive.
     """
 
-    frequencies: Any
-    shapes: Any
+    frequencies: np.ndarray
+    shapes: np.ndarray
 
 
 @shown
@@ -51,7 +51,7 @@ class ModalReduction(NamedTuple):
     system: LinearSystem
     frequencies: Any
     shapes: Any
-    inverse: Any
+    inverse: Array
 
     def expand(self, q: Array) -> Array:
         """Coordinates (..., n) of modal ones (..., count), T q: positions, velocities, accelerations."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,12 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.analysis.amplification import damping_ratio, eigenvalues, period_elongation
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real, freeze
-from hhtjax.steppers.stepper import begun, require_capable, require_stepper
+from hhtjax.steppers.stepper import Stepper, begun, require_capable, require_stepper
 from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.linear_system import require_dense
-from hhtjax.systems.system import LinearSystem, System, require_masses
-
-if TYPE_CHECKING:
-    from hhtjax.steppers.stepper import Stepper
+from hhtjax.systems.system import AnySystem, LinearSystem, System, require_masses
 
 # of suggest_step_size
 GRID = np.geomspace(1e-5, 1e6, 600)  # |lambda| h
@@ -83,7 +80,7 @@ class StepSize(NamedTuple):
 
 
 def suggest_step_size(
-    system: System,
+    system: AnySystem,
     stepper: Stepper,
     q0: PyTree,
     v0: PyTree,
@@ -259,7 +256,7 @@ FEWEST, ENOUGH, MOST = 8, 1024, 2**20  # steps of the first run, and at least an
 
 
 def step_size_by_runs(
-    system: System,
+    system: AnySystem,
     stepper: Stepper,
     q0: PyTree,
     v0: PyTree,

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -28,12 +28,12 @@ from hhtjax.export.model import (
 )
 from hhtjax.export.statements import NotWritten, Statements
 from hhtjax.jaxpr import Listing, NotListed, listed
+from hhtjax.steppers.stepper import Stepper
+from hhtjax.systems.system import AnySystem
 
 if TYPE_CHECKING:
     from hhtjax.export.files import Body
     from hhtjax.steppers.stepper import State, Stepper
-    from hhtjax.systems.linear_system import LinearSystem
-    from hhtjax.systems.system import System
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class ExportedC:
 
 
 def export_c(
-    system: Any, stepper: Any, q0: Any, v0: Any = None, params: Any = None, *,
-    z0: Any = None, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
+    system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree = None, params: PyTree = None, *,
+    z0: PyTree = None, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
 ) -> ExportedC:  # fmt: skip
     """The step of a system as C99 without dependencies: for hard real time, where Python cannot go.
 
@@ -132,7 +132,7 @@ def export_c(
 
 def exported(
     caller: str,
-    system: LinearSystem | System,
+    system: AnySystem,
     stepper: Stepper,
     q0: PyTree,
     v0: PyTree,

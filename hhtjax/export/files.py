@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -138,7 +138,7 @@ class Parts(NamedTuple):
 
     name: str
     made: Given
-    stepper: Any
+    stepper: Stepper
     fields: list[Field]
     numbers: Numbers
     units: dict

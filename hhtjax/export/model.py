@@ -20,13 +20,11 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, with_known_rows
 from hhtjax.systems.linear_system import require_dense
 from hhtjax.systems.sampled import Sampled
-from hhtjax.systems.system import FirstOrderSystem
+from hhtjax.systems.system import AnySystem, FirstOrderSystem
 
 if TYPE_CHECKING:
     from hhtjax.steppers.stepper import Info, State, Stepper
     from hhtjax.systems.flat_system import FlatSystem
-    from hhtjax.systems.linear_system import LinearSystem
-    from hhtjax.systems.system import System
 
 # ----------------------------------------------------------------------------
 # Names in C for the leaves of a pytree: q["arm"]["angle"] is q_arm_angle, an array of numbers if it has a shape.
@@ -138,10 +136,10 @@ class Given(NamedTuple):
 
     caller: str
     system: Any
-    stepper: Any
+    stepper: Stepper
     starts: dict
-    params: Any  # without functions that JAX would not take
-    dtype: Any
+    params: PyTree  # without functions that JAX would not take
+    dtype: np.dtype
 
     def flat(self, t0: Array, params: PyTree) -> FlatSystem:
         """The system on vectors."""
@@ -150,7 +148,7 @@ class Given(NamedTuple):
 
 
 def given(
-    caller: str, system: LinearSystem | System, stepper: Stepper, q0: PyTree, v0: PyTree, params: PyTree, z0: PyTree
+    caller: str, system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree, params: PyTree, z0: PyTree
 ) -> Given:
     """The arguments of an export, checked."""
     require_system(caller, system)

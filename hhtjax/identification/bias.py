@@ -55,12 +55,12 @@ class ModeBias(NamedTuple):
         params: the fitted ones without the bias; None if not asked for.
     """
 
-    frequency: Any
-    damping: Any
-    wh: Any
-    stiffness_bias: Any
-    damping_bias: Any
-    params: Any = None
+    frequency: np.ndarray
+    damping: np.ndarray
+    wh: np.ndarray
+    stiffness_bias: np.ndarray
+    damping_bias: np.ndarray
+    params: PyTree = None
 
     def _verdict(self):
         """The frequencies, and the largest biases, in words."""
@@ -76,11 +76,11 @@ class ModeBias(NamedTuple):
 def step_size_bias(
     system: System | LinearSystem,
     stepper: Stepper,
-    params: Any,
-    dt: float,
-    q: Any,
-    v: Any = None,
-    t0: float = 0.0,
+    params: PyTree,
+    dt: Real,
+    q: PyTree,
+    v: PyTree = None,
+    t0: Real = 0.0,
     correct: Any = False,
 ) -> ModeBias:
     """By how much stiffness and damping are off that were fitted through steps of dt.
@@ -292,7 +292,7 @@ LEAST = 0.02  # influence of a parameter on a frequency, below which it is no st
 class Motion(NamedTuple):
     """Of each mode: rates (modes,) and their changes (parts, modes) with the stiffness of a part of the coordinates."""
 
-    rates: Any
+    rates: Array
     response: Any
 
 

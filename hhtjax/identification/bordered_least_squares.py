@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import Array, Real
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.gauss_newton import Seen, bending, bent, blank, largest_cosine, or_one, with_jacobian
 from hhtjax.identification.losses import LEAST_BEND, Objective
 from hhtjax.numerics.array_namespace import choose, eigh, namespace_of, solve_upper, solve_upper_transposed
@@ -26,7 +26,7 @@ class ArrowTrial(NamedTuple):
     column: Any  # like x
     R: Any  # (records, k + p + 1, p)
     R_own: Any
-    z: Any  # (records, k + p + 1)
+    z: PyTree  # (records, k + p + 1)
 
     @property
     def r(self):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hhtjax.checks import require_function, require_integer, require_number
-from hhtjax.description import PyTree, Real, is_concrete
+from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.description.presentation import Table, as_text, shown
 from hhtjax.identification.evidence import (
     count,
@@ -65,15 +65,15 @@ class Comparison(NamedTuple):
     """
 
     names: tuple
-    parameters: Any
+    parameters: np.ndarray
     observations: int
     effective: float
-    rms: Any
-    aic: Any
-    bic: Any
+    rms: np.ndarray
+    aic: np.ndarray
+    bic: Array
     tests: tuple
-    held_out: Any = None
-    converged: Any = None
+    held_out: Array | None = None
+    converged: Array | None = None
 
     @property
     def cross_validated(self) -> Any:
@@ -133,7 +133,7 @@ def compare(
     *,
     folds: int = 8,
     absent: float | dict[str, float] = 0.0,
-    always: Any = None,
+    always: PyTree = None,
     progress: bool = False,
     **options: Any,
 ) -> Comparison:

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import Array, Real
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.losses import Objective
 from hhtjax.numerics.array_namespace import choose, namespace_of, svd
 
@@ -101,7 +101,7 @@ def bending(before, after, J, row):
 class Seen(NamedTuple):
     """What an evaluation at a point tells."""
 
-    r: Any  # of the least-squares problem, (m,)
+    r: Array  # of the least-squares problem, (m,)
     J: Any  # (m, p)
     cost: Any
     bend: Any  # p''/p' of each unknown; None for 0
@@ -119,7 +119,7 @@ class DenseTrial(NamedTuple):
     column: Any  # norms of the columns of J, at most D
     s: Any  # singular values of J/D, here and below with the rows of `bent`
     V: Any
-    z: Any  # residual in the basis of the left singular vectors
+    z: PyTree  # residual in the basis of the left singular vectors
 
     @property
     def r(self) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, require_integer, require_number
-from hhtjax.description import PyTree, freeze, thaw
+from hhtjax.description import PyTree, Real, freeze, thaw
 from hhtjax.description.presentation import overwrite, shown
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.evidence import count, residuals_of
@@ -42,12 +42,14 @@ class Score(NamedTuple):
     """
 
     names: list
-    statistic: Any
-    cost_drop: Any
-    estimate: Any
+    statistic: np.ndarray
+    cost_drop: np.ndarray
+    estimate: np.ndarray
 
 
-def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: Any, segments: int = SEGMENTS) -> Score:
+def score_test(
+    residuals: Callable[[Any, Any], Any], params: PyTree, candidates: Any, segments: int = SEGMENTS
+) -> Score:
     """Which further terms a model needs, from one Jacobian and without fitting any of them.
 
     With x a candidate's column of the Jacobian, less its projection on the columns of the fitted parameters,
@@ -118,12 +120,12 @@ class Profile(NamedTuple):
             error; 3.84 bounds the 95 % interval. NaN for a parameter without one.
     """
 
-    values: Any
-    cost: Any
-    deviance: Any
+    values: PyTree
+    cost: np.ndarray
+    deviance: np.ndarray
 
 
-def profile(residuals: Callable[..., Any], result: FitResult, name: str, values: Any, **options: Any) -> Profile:
+def profile(residuals: Callable[..., Any], result: FitResult, name: str, values: Real, **options: Any) -> Profile:
     """The profile likelihood of one parameter: the cost with it held at each value, and all others refitted.
 
     Args:

@@ -18,20 +18,26 @@ from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.sampled import Sampled, band_limited_motion, sampled
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, mass_at, require_smooth, require_system
+from hhtjax.systems.system import (
+    AnySystem,
+    System,
+    mass_at,
+    require_smooth,
+    require_system,
+)
 
 ARGUMENTS = set(inspect.signature(fit).parameters) - {"params0"}
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
 
 def equation_error(
-    system: System | LinearSystem | FirstOrderSystem,
-    values: Any,
-    dt: Any = None,
-    cutoff: Any = None,
-    t0: float = 0.0,
+    system: AnySystem,
+    values: Real,
+    dt: Real = None,
+    cutoff: Real | None = None,
+    t0: Real = 0.0,
     *,
-    times: Any = None,
+    times: Real | None = None,
 ) -> Callable[[Any], Any]:
     """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
 
@@ -123,7 +129,7 @@ def _is_spline(x: Sampled) -> bool:
 
 
 def fit_progressively(
-    problem_at: Callable[[Any, FitResult | None], dict[str, Any]], params0: Any, horizons: Any, **options: Any
+    problem_at: Callable[[Any, FitResult | None], dict[str, Any]], params0: PyTree, horizons: Any, **options: Any
 ) -> FitResult:
     """One `fit` after the other, each to a longer part of the data, and each from where the one before ended.
 

@@ -31,10 +31,10 @@ LESS, AGAIN, FASTER = 2.0, 4.0, 6  # lam is divided by 2 after a good step, by 4
 class Course(NamedTuple):
     """What is known from the steps so far."""
 
-    lam: Any
-    radius: Any  # |D dx| of the next step at most; inf after a success
-    good: Any  # how many good steps, one after the other; 0, 1, ..
-    failures: Any  # how many trials have not lowered the cost, one after the other
+    lam: Array
+    radius: Array  # |D dx| of the next step at most; inf after a success
+    good: Array  # how many good steps, one after the other; 0, 1, ..
+    failures: Array  # how many trials have not lowered the cost, one after the other
     along: Any  # the last step, taken or not
     slope: Any  # J^T r'' with r'' the second derivative of the residual along it
 

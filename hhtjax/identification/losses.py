@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description import Array
+from hhtjax.description import Array, PyTree
 
 
 def huber(z: Array) -> Array:
@@ -28,7 +28,7 @@ LEAST_BEND = 0.1  # share of rho' that rho' + 2 rho'' z is taken to have at leas
 class Objective(NamedTuple):
     """1/2 sum rho(z) with z = (w r)^2 for the first `data` residuals, and rho(z) = z for the others, the priors."""
 
-    weights: Any  # (m,); 0: missing, whatever the residual
+    weights: PyTree  # (m,); 0: missing, whatever the residual
     loss: Callable | None
     data: int
 

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 class Data(NamedTuple):
     """The traced arguments of a fit besides params0: pytrees, or None where there is nothing."""
 
-    scale: Any
-    weights: Any
+    scale: Array
+    weights: PyTree
     prior: Any
-    tolerance: Any
+    tolerance: Array
     records: Any
-    starts: Any
+    starts: PyTree
     read: Any = None  # arrays that the residuals read, where these are a `Kind`
 
     def function(self, residuals: Callable | Reading) -> Callable | Reading:
@@ -90,8 +90,8 @@ class DenseParts(NamedTuple):
     """Of a fit without records: residuals and priors f(x) (m + k,), their weights w, and the first m as a pytree."""
 
     f: Any
-    w: Any
-    unravel: Any
+    w: PyTree
+    unravel: Callable
     shapes: tuple  # of the leaves of the residuals
 
     @property
@@ -127,10 +127,10 @@ class RecordParts(NamedTuple):
     both as pytrees."""
 
     f: Any
-    w: Any
-    own0: Any
-    unravel: Any
-    unravel_start: Any
+    w: PyTree
+    own0: Array
+    unravel: Callable
+    unravel_start: Callable
     shapes: tuple  # of the leaves of the residuals, all records together
 
 

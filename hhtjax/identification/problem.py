@@ -40,18 +40,18 @@ class _Solved(NamedTuple):
 
     x: Any
     cost: Any
-    history: Any
-    iterations: Any
-    code: Any
-    choices: Any
-    residual: Any
-    starts: Any
+    history: Array
+    iterations: Array
+    code: Array
+    choices: Array
+    residual: Array
+    starts: PyTree
     J: Any
     pull: Any
     bend: Any
     leaves: Any
     sizes: list
-    present: Any
+    present: Array
     block: int = 1
 
 
@@ -210,10 +210,10 @@ class Kept(NamedTuple):
     """Of a point, for the result."""
 
     estimates: Any  # of `Objective.estimating`; None where they are J, r, None
-    residual: Any
-    params: Any
+    residual: Array
+    params: PyTree
     slope: Any
-    starts: Any
+    starts: PyTree
     stretch: Any  # of `Objective.stretch`
 
 

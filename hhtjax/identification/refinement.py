@@ -13,7 +13,7 @@ import numpy as np
 
 from hhtjax.analysis import damping_ratio
 from hhtjax.checks import require_function, require_integer, require_number
-from hhtjax.description import PyTree, freeze, thaw
+from hhtjax.description import Array, PyTree, Real, freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
@@ -44,11 +44,11 @@ class Refined(NamedTuple):
         shift: of the first fit from there, in its standard errors, a pytree like params.
     """
 
-    stepper: Any
+    stepper: Stepper
     dt: float
     fits: tuple[FitResult, ...]
-    params: Any
-    shift: Any
+    params: PyTree
+    shift: Array
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """The interval of the last fit about `params`: two pytrees like them."""
@@ -77,9 +77,9 @@ def _subclasses(base: type):
 
 def refine(
     residuals_at: Callable[[Stepper, float], Callable[..., Any]],
-    params0: Any,
+    params0: PyTree,
     stepper: Stepper,
-    dt: float,
+    dt: Real,
     levels: int | None = None,
     **options: Any,
 ) -> Refined:

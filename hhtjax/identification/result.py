@@ -48,18 +48,18 @@ class FitResult(NamedTuple):
     has variance 0; one that the residuals do not determine has inf, and covariances 0.
     """
 
-    params: Any
-    residual: Any
+    params: PyTree
+    residual: Array
     cost: Any
     history: History
-    iterations: Any
-    code: Any
+    iterations: Array
+    code: Array
     transforms: tuple
     uncertainty: Uncertainty | None
     segments: int
-    starts: Any = None
-    weights: Any = True
-    choices: Any = None
+    starts: PyTree = None
+    weights: PyTree = True
+    choices: Array | None = None
 
     @property
     def converged(self) -> Any:
@@ -101,7 +101,7 @@ class FitResult(NamedTuple):
         """Of the estimates, (p, p), or None."""
         return None if self.uncertainty is None else correlation(self.covariance)
 
-    def embed(self, covariance: Array) -> Array:
+    def embed(self, covariance: PyTree) -> Array:
         """A covariance of the free entries with rows of zeros for the fixed ones, (p, p)."""
         at = np.flatnonzero(self.free)
         p = len(self.free)
@@ -185,7 +185,7 @@ def _ends(T, p: Array, reach: Array):
     return tuple(jnp.where(near, *ends) for ends in zip(cut, by_x, strict=True))
 
 
-def student(level: Real, degrees: Array) -> Real:
+def student(level: Real, degrees: Array | None) -> Real:
     """Two-sided quantile of Student's t, by Cornish and Fisher's expansion about the normal one (None: normal); of few
     degrees of freedom, where the expansion is far off, by bisection, and between integers by interpolation of log t
     over 1/degrees: to 4 %, between 1 and 2."""

@@ -57,14 +57,14 @@ class Uncertainty(NamedTuple):
             a parameter, and less where a few say most of it (Satterthwaite, for white residuals); None without.
     """
 
-    cluster: Any
-    naive: Any
-    autocorrelated: Any
+    cluster: Array
+    naive: Array
+    autocorrelated: Array
     singular_values: Any
-    directions: Any
-    undetermined: Any
-    inverse: Any = None
-    degrees: Any = None
+    directions: Array
+    undetermined: Array
+    inverse: Array | None = None
+    degrees: Array | None = None
 
     @property
     def covariance(self) -> Array:

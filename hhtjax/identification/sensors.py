@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,14 +29,14 @@ if TYPE_CHECKING:
 
 def measure(
     solution: Solution,
-    times: Any,
-    gain: Any = 1.0,
-    offset: Any = 0.0,
-    delay: Any = 0.0,
+    times: Real | None,
+    gain: PyTree = 1.0,
+    offset: PyTree = 0.0,
+    delay: PyTree = 0.0,
     *,
-    drift: Any = 0.0,
-    output: Any = None,
-    params: Any = None,
+    drift: PyTree = 0.0,
+    output: Callable | None = None,
+    params: PyTree = None,
 ) -> Any:
     """What sensors show at `times`, on their clocks:
 
@@ -196,7 +197,7 @@ class Accelerometer(Description):
         return matvec(R.T, f)
 
 
-def accelerometer(position: Any, gravity: Any, frame: Any = None) -> Accelerometer:
+def accelerometer(position: Real, gravity: Real, frame: str | None = None) -> Accelerometer:
     """What an accelerometer shows, for the `output` of `measure`, `simulate` and `sweep`:
 
         f = R^T (a - g),    a = d^2/dt^2 position(q(t), t)
@@ -265,13 +266,13 @@ class Windows(NamedTuple):
         begin: (windows,), time of the first samples on the clock of the record.
     """
 
-    t: Any
-    y: Any
-    present: Any
-    begin: Any
+    t: Array
+    y: PyTree
+    present: Array
+    begin: Array
 
 
-def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
+def windows(t: Real, y: PyTree, duration: Real, present: Real | None = None) -> Windows:
     """A record cut into windows of `duration`, one after the other; what is left at the end is dropped.
 
     Args:
@@ -321,7 +322,7 @@ def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
     return Windows(t[index] - begin[:, None], y[index], present[index] & real, begin)
 
 
-def wrap_angle(angle: Any) -> Any:
+def wrap_angle(angle: Real) -> Any:
     """The same angle in [-pi, pi): for the difference of two angles of which one has lost its whole turns.
 
     Args:

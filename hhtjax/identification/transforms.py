@@ -188,7 +188,7 @@ positive = Positive()
 fixed = Fixed()
 
 
-def bounded(lower: Any = None, upper: Any = None) -> Bounded:
+def bounded(lower: Real = None, upper: Real = None) -> Bounded:
     """A transform that keeps a parameter strictly between two bounds, or on one side of one.
 
     Args:

@@ -16,7 +16,7 @@ from jax import lax
 from jax.scipy.sparse.linalg import cg
 
 from hhtjax.checks import require_integer, require_number
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.linear_solve import Structured, solve
 
 
@@ -47,7 +47,7 @@ class ConjugateGradients(Structured):
         return lambda b, trans=0: cg(f, b, tol=0.0, atol=0.0, maxiter=self.iterations)[0]
 
 
-def banded(half_bandwidth: int = 1, tolerance=None) -> Banded:
+def banded(half_bandwidth: int = 1, tolerance: Real = None) -> Banded:
     """For the `solve` of a stepper: M and the Jacobians of the force couple unknowns up to `half_bandwidth` apart.
 
     One step costs 2 half_bandwidth + 1 tangents of the residual and an elimination, all in proportion to the number of
@@ -79,7 +79,7 @@ def banded(half_bandwidth: int = 1, tolerance=None) -> Banded:
     return Banded(half_bandwidth, _tolerance("banded", tolerance))
 
 
-def conjugate_gradients(iterations: int, tolerance=None) -> ConjugateGradients:
+def conjugate_gradients(iterations: int, tolerance: Real = None) -> ConjugateGradients:
     """For the `solve` of a stepper: that many iterations at every step, so that each costs the same.
 
     Matrix-free: a tangent of the residual for each iteration. What they leave unsolved is an error of the step. The

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -210,8 +210,8 @@ def _evaluated(closed: ClosedJaxpr, *args: Array):
 class _Own(NamedTuple):
     """What a member has of an array of the whole batch."""
 
-    array: Any
-    member: Any
+    array: Array
+    member: Array
     number: int  # of the argument
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 from jax.core import eval_jaxpr
@@ -13,10 +13,10 @@ from jax.extend.core import Literal
 from jax.extend.source_info_util import user_context
 from jax.interpreters import partial_eval as pe
 
-from hhtjax.description import PyTree, Real
+from hhtjax.description import Array, PyTree, Real
 
 if TYPE_CHECKING:
-    from jax.extend.core import JaxprEqn, Var
+    from jax.extend.core import Jaxpr, JaxprEqn, Var
 
 
 def evaluate(jaxpr, values: Sequence, apply: Callable, of_literal: Callable = lambda x: x):
@@ -72,9 +72,9 @@ class Traced(NamedTuple):
         result: shapes and dtypes of its results.
     """
 
-    jaxpr: Any
-    constants: Any
-    result: Any
+    jaxpr: Jaxpr
+    constants: Array
+    result: Array
 
     def __call__(self, *args):
         found = eval_jaxpr(self.jaxpr, self.constants, *jax.tree.leaves(args))

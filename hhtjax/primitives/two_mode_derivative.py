@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,11 +36,11 @@ class TwoWays(NamedTuple):
     """
 
     number: int
-    values: Any
-    forward: Any
-    reverse: Any
-    slow: Any
-    slow_reverse: Any
+    values: PyTree
+    forward: Callable
+    reverse: Callable
+    slow: Callable
+    slow_reverse: Callable
 
     def batched(self, axes: list) -> TwoWays:
         """Those of a batch; axes: of x."""

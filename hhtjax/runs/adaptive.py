@@ -32,14 +32,14 @@ class Adaptive(Description):
 
 
 def adaptive(
-    rtol: Any,
-    atol: Any,
+    rtol: Real,
+    atol: Real,
     *,
-    atol_v: Any = None,
-    dt_min: Any = 0.0,
-    dt_max: Any = np.inf,
+    atol_v: Real | None = None,
+    dt_min: Real = 0.0,
+    dt_max: Real = np.inf,
     max_steps: int = 10_000,
-    verify: Any = False,
+    verify: bool | str = False,
 ) -> Adaptive:
     """Steps chosen by the error of each, for `simulate(..., dt=adaptive(...), times=...)`.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -30,7 +30,8 @@ from hhtjax.runs.interpolate import kept, output_between, solution_at, with_outp
 from hhtjax.runs.output import beside_path, output_at_start, without_path
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, step_start
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_masses
+from hhtjax.systems.events import Event
+from hhtjax.systems.system import AnySystem, require_masses
 from hhtjax.xla import Programs
 
 if TYPE_CHECKING:
@@ -214,10 +215,10 @@ class Grid(NamedTuple):
     """Frozen steps from t0 on. ends: (N,), inf behind the last; counts: (K,), how many there are from one of the times
     to the next, the last of them ending at it or beyond; reached: the end of the last."""
 
-    t0: Any
-    ends: Any
-    counts: Any
-    reached: Any
+    t0: Array
+    ends: Array
+    counts: Array
+    reached: Array
 
     @classmethod
     def of(cls, t0: Array, times: Array, ends: Array, accepted: Real, halved: bool = False) -> Grid:
@@ -366,17 +367,17 @@ def begun_with(flat: FlatSystem, stepper: Stepper, params: PyTree, loop: Loop, r
 
 
 def choose_steps(
-    system: System | LinearSystem | FirstOrderSystem,
+    system: AnySystem,
     stepper: Stepper,
-    q0: Any,
-    v0: Any = None,
-    params: Any = None,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
     *,
-    times: Any,
-    z0: Any = None,
-    t0: Any = 0.0,
+    times: Real,
+    z0: PyTree = None,
+    t0: Real = 0.0,
     progress: bool = False,
-    events: Any = None,
+    events: Sequence[Event] | None = None,
     max_events: int = 2,
     **tolerances: Any,
 ) -> Steps:
@@ -448,15 +449,15 @@ class Round(NamedTuple):
     """run, steps, ends: what was found; share: of the tolerance that the steps were chosen for, and following: that of
     the next round; error, allowed: those of the `Solution`; is_open: whether more is to be done; number: of rounds."""
 
-    run: Any
-    steps: Any
-    ends: Any
-    share: Any
-    following: Any
+    run: Array
+    steps: Steps | None
+    ends: Array
+    share: Array
+    following: Array
     error: Any
     allowed: Any
-    is_open: Any
-    number: Any
+    is_open: Array
+    number: Array
 
     def told(self):
         """What the `Solution` tells of it."""

@@ -68,9 +68,9 @@ class Run(NamedTuple):
     """A run before its first step. form: how what the loop carries is stepped, as arrays or number by number."""
 
     problem: Any
-    flat: Any
-    params: Any
-    loop: Any
+    flat: FlatSystem
+    params: PyTree
+    loop: Loop
     form: Any
 
 
@@ -80,15 +80,15 @@ class Loop(NamedTuple):
     number of steps taken -> the size of the next, and of the last; start: the state at t0, as it is saved; past: bound,
     sizes -> advance past events; now: what events carry along -> the params after them."""
 
-    carry: Any
-    advance: Any
-    keep: Any
+    carry: PyTree
+    advance: Callable
+    keep: Callable
     no_info: Info
-    bound: Any
+    bound: Callable
     sizes: Any
     start: Any
-    past: Any = None
-    now: Any = None
+    past: Callable | None = None
+    now: Callable | None = None
 
 
 def equal_steps(flat: FlatSystem, stepper: Stepper, q: Array, v: Array, t0: Array, params: PyTree, dt: Array) -> Loop:

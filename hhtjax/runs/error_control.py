@@ -45,11 +45,11 @@ class Controller(NamedTuple):
     """Of the factors by which steps change: the PI controller's exponents, divided by the order of the estimate, and
     bounds behind a step that was accepted. Growth by more than 2 is unstable for some methods."""
 
-    safety: Any = 0.9
-    proportional: Any = 0.7
-    integral: Any = 0.4
-    least: Any = 0.2
-    most: Any = 2.0
+    safety: float = 0.9
+    proportional: float = 0.7
+    integral: float = 0.4
+    least: float = 0.2
+    most: float = 2.0
 
 
 PI = Controller()
@@ -58,28 +58,28 @@ PI = Controller()
 class Walk(NamedTuple):
     """What the loop carries."""
 
-    state: Any
-    h: Any
-    last: Any
-    past: Any
-    before: Any  # logarithm of the error of the last accepted step
+    state: PyTree
+    h: Array
+    last: Array
+    past: Array
+    before: PyTree  # logarithm of the error of the last accepted step
     error: Any
-    q_size: Any
-    v_size: Any
-    accepted: Any
-    rejected: Any
-    stop: Any
+    q_size: Array
+    v_size: Array
+    accepted: Array
+    rejected: Array
+    stop: Array
     met: Any = None  # of events
 
 
 class StepTrial(NamedTuple):
     """How steps are tried, to the time `end`. context, past_events: how to pass events, and what a trial becomes so."""
 
-    flat: Any
-    stepper: Any
-    params: Any
+    flat: FlatSystem
+    stepper: Any  # a `Stepper` that estimates the error of its steps
+    params: PyTree
     end: Any
-    bounds: Any
+    bounds: Bounds
     max_steps: int
     context: Any = None
     past_events: Any = None
@@ -96,28 +96,28 @@ class TrialStep(NamedTuple):
 
     walk: Walk
     error: Any
-    h: Any
-    shortest: Any
-    why: Any
+    h: Array
+    shortest: Array
+    why: Array
 
 
 class Begun(NamedTuple):
     """What else is known of a try: the state it began with, when it was to end, and its `Info`."""
 
-    state: Any
+    state: PyTree
     end: Any
-    info: Any
+    info: Info
 
 
 class Bounds(NamedTuple):
     """Tolerances and bounds in the dtype of the state. scale: the tolerance of the run, relative to that of a step."""
 
-    rtol: Any
-    atol: Any  # of positions
-    atol_v: Any  # (N,), of velocities and of internal states
-    scale: Any
-    least: Any
-    most: Any
+    rtol: Array
+    atol: Array  # of positions
+    atol_v: Array  # (N,), of velocities and of internal states
+    scale: Array
+    least: Array
+    most: Array
 
     @classmethod
     def of(cls, flat: FlatSystem, stepper, control: Adaptive, t0: Array, end: Array) -> Bounds:
@@ -358,15 +358,15 @@ class Steps(NamedTuple):
     """
 
     dt: Any
-    accepted: Any
-    rejected: Any
-    reached: Any
-    stop: Any
+    accepted: Array
+    rejected: Array
+    reached: Array
+    stop: Array
     estimate: Any
-    dt_min: Any
-    event: Any = None
-    guard: Any = None
-    tightened: Any = None
+    dt_min: Array
+    event: Array | None = None
+    guard: Array | None = None
+    tightened: Array | None = None
 
     def check(self):
         """Raises `SimulationError` naming why, and at which time, steps ended too early; for a batch the first."""
@@ -454,7 +454,7 @@ def select_steps(
         since, around = recorder.sample(since, walk.state, time)
         return (walk, ends, since), around
 
-    def run(walk: Walk):
+    def run(walk):
         carry = walk, jnp.full(control.max_steps, jnp.inf, t0.dtype), recorder and recorder.none
         return (walked(carry, unfinished), None) if times is None else lax.scan(to_sample, carry, times)
 
@@ -503,15 +503,15 @@ def trimmed(steps: Steps) -> Steps:
 class Since(NamedTuple):
     """Of the steps since the last sample. first: what was saved at the beginning of the last; info: theirs, joined."""
 
-    first: Any
-    info: Any
+    first: Array
+    info: Info
 
 
 class Recorder(NamedTuple):
     """How walks in one form are recorded. none: `Since` before the first try; begin, end: what is kept of a state."""
 
     none: Since
-    begin: Any
+    begin: Callable
     end: Any
     read: Any = None
     alone: bool = False  # whether that is all that is kept

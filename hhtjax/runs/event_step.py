@@ -9,6 +9,7 @@ A rest of a millionth of the step is a Taylor polynomial: skipping it would lose
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -199,14 +200,14 @@ SHORT = 1e-6  # part of a step: a rest that needs no step
 class EventContext(NamedTuple):
     """How to step, and what to look for."""
 
-    flat: Any
-    stepper: Any
-    events: Any
+    flat: FlatSystem
+    stepper: Stepper
+    events: FlatEvents
     max_events: int
-    no_info: Any
-    reach: Any  # of `reaching`
+    no_info: Info
+    reach: Callable  # of `reaching`
     keep: int = 0  # how many events are noted
-    middle: Any = None  # of the step, where inputs are held
+    middle: Array | None = None  # of the step, where inputs are held
 
     def during(self, params: PyTree, t: Array, h: Array) -> EventContext:
         """The same in a step h from t on."""
@@ -230,12 +231,12 @@ class EventState(NamedTuple):
     times how many of them are over."""
 
     modes: list
-    ended: Any
-    code: Any
-    event: Any
+    ended: Array
+    code: Array
+    event: Array
     log: Any = None
     pieces: Any = None
-    over: Any = ()
+    over: PyTree = ()
 
 
 class SubStep(NamedTuple):
@@ -245,16 +246,16 @@ class SubStep(NamedTuple):
     beside others; whether it is still to happen there."""
 
     start: Any
-    end: Any
-    info: Any
-    rest: Any
-    last: Any
+    end: State
+    info: Info
+    rest: Array
+    last: Array
     met: EventState
-    divided: Any  # number of events that came before and divided the step
-    asked: Any  # whether there may be one
-    passed: Any
-    beside: Any
-    due: Any
+    divided: Array  # number of events that came before and divided the step
+    asked: Array  # whether there may be one
+    passed: Array
+    beside: Array
+    due: Array
 
     @classmethod
     def whole(
@@ -306,7 +307,7 @@ class Pieces(NamedTuple):
 
     start: Any
     end: Any
-    modes: Any = ()
+    modes: PyTree = ()
 
     @classmethod
     def none(cls, state: State, number: int, modes=()) -> Pieces:
@@ -359,15 +360,15 @@ class Found(NamedTuple):
     before where, whether it only touches there, whether the motion stays beyond it, and was made to by the event
     before, whether it is no number, and how large the guard is."""
 
-    hit: Any
-    jumped: Any
-    place: Any
-    limit: Any
-    touches: Any
-    stays: Any
-    negative: Any
-    unknown: Any
-    size: Any
+    hit: Array
+    jumped: Array
+    place: Array
+    limit: Array
+    touches: Array
+    stays: Array
+    negative: Array
+    unknown: Array
+    size: Array
 
 
 def look(context: EventContext, part: SubStep, params: PyTree, h: Array) -> Found:

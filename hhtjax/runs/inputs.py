@@ -34,15 +34,13 @@ from hhtjax.systems import zero_order_hold
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, require_consistent, with_known_rows
-from hhtjax.systems.system import FirstOrderSystem, require_masses
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses
 from hhtjax.xla import Programs
 
 if TYPE_CHECKING:
     from hhtjax.runs.driver import Loop
     from hhtjax.steppers.stepper import State, Stepper
     from hhtjax.systems.flat_system import FlatSystem
-    from hhtjax.systems.linear_system import LinearSystem
-    from hhtjax.systems.system import System
 
 
 class Problem(NamedTuple):
@@ -50,19 +48,19 @@ class Problem(NamedTuple):
     where a run saves that in place of its path."""
 
     system: Any
-    stepper: Any
-    q0: Any
-    v0: Any
-    params: Any
-    t0: Any
-    z0: Any
-    output: Any = None
+    stepper: Any  # the `Stepper`
+    q0: PyTree
+    v0: PyTree
+    params: PyTree
+    t0: Array
+    z0: PyTree
+    output: PyTree = None
 
     @classmethod
     def checked(
         cls,
         caller: str,
-        system: LinearSystem | FirstOrderSystem | System,
+        system: AnySystem,
         stepper: Stepper,
         q0: PyTree,
         v0: PyTree,
@@ -118,7 +116,7 @@ def _refuse_checked_axes(caller: str, *args: PyTree):
 # Steps of sizes that are given, one by one: the checks of what a user hands over.
 
 
-def require_steps(caller: str, stepper: Stepper, dt: Real, num_steps, parts: int = 1):
+def require_steps(caller: str, stepper: Stepper, dt: Real, num_steps: int | None, parts: int = 1) -> tuple[Real, int]:
     """dt, a number or (N,), and the number of steps, each of which may be divided into so many parts."""
     dt = np.asarray(dt) if isinstance(dt, (list, tuple)) else dt
     if not (is_array(dt) and dt.ndim):
@@ -221,8 +219,8 @@ class EqualSteps(NamedTuple):
     them ending at it or beyond; reached: how far they can be read off."""
 
     dt: Any
-    counts: Any
-    reached: Any
+    counts: Array
+    reached: Array
 
     @classmethod
     def to(cls, t0: Array, times: Array, dt: Array) -> EqualSteps:
@@ -417,10 +415,10 @@ class Start(NamedTuple):
 
     g: Any
     rate: Any
-    terms: Any
-    on_velocity: Any
-    e: Any
-    second: Any = 0.0
+    terms: Array
+    on_velocity: Array
+    e: Array
+    second: Real = 0.0
 
     def is_at_guard(self, events: tuple) -> np.ndarray:
         """Of each event, whether its guard is zero but for rounding: (..., E)."""

@@ -39,18 +39,18 @@ class Interpolant(NamedTuple):
         output: what the run has in the place of all these, None without.
     """
 
-    q: Any
-    v: Any
-    acceleration: Any = None
+    q: PyTree
+    v: PyTree
+    acceleration: PyTree = None
     multipliers: Any = None
-    z: Any = None
-    zdot: Any = None
+    z: PyTree = None
+    zdot: PyTree = None
     friction: Any = None
-    sticking: Any = None
-    output: Any = None
+    sticking: Array | None = None
+    output: PyTree = None
 
 
-def interpolate(solution: Solution, times: Real) -> Interpolant:
+def interpolate(solution: Solution, times: Real | None) -> Interpolant:
     """Dense output: what a run has saved, at arbitrary times inside the run, differentiable in all.
 
     Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
@@ -224,10 +224,10 @@ def between(a: Solution, b: Solution, H: Array, x: Array) -> Solution:
     def linear(y0: PyTree, y1: Array) -> Array:
         return y0 + on_axes(x, y0) * (y1 - y0)
 
-    def nearer(y0: PyTree, y1: Array) -> Array:
+    def nearer(y0: PyTree, y1: PyTree) -> Array:
         return jnp.where(on_axes(x, y0) < 0.5, y0, y1)
 
-    def rubbing(tau0: Array, tau1: Array, sticks0: Array, sticks1: Array) -> Array:
+    def rubbing(tau0: PyTree, tau1: PyTree, sticks0: PyTree, sticks1: PyTree) -> Array:
         alike = (sticks0 == sticks1) & (sticks0 | (tau0 * tau1 >= 0))
         return jnp.where(alike, linear(tau0, tau1), nearer(tau0, tau1) + 0 * on_axes(x, tau0))
 

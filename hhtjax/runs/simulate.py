@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.checks import require_integer
-from hhtjax.description import Array, Real, all_concrete, is_array, is_concrete, known_now
+from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, known_now
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.numerics.dense_lu import LARGEST, UNROLLED
 from hhtjax.primitives import is_in_batch, is_traced, one_kernel, or_plain
@@ -41,8 +41,9 @@ from hhtjax.runs.solution import Solution, told
 from hhtjax.steppers.implicit_solve import callbacks_named
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.steppers.variable_step import GROWTH
+from hhtjax.systems.events import Event
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.systems.system import AnySystem, LinearSystem
 from hhtjax.xla import Programs
 
 if TYPE_CHECKING:
@@ -50,27 +51,27 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    system: System | LinearSystem | FirstOrderSystem,
+    system: AnySystem,
     stepper: Stepper,
-    q0: Any,
-    v0: Any = None,
-    params: Any = None,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
     *,
-    z0: Any = None,
-    dt: Any,
+    z0: PyTree = None,
+    dt: Real,
     num_steps: int | None = None,
-    duration: Any = None,
+    duration: Real = None,
     num_samples: int | None = None,
-    times: Any = None,
-    t0: Any = 0.0,
+    times: Real | None = None,
+    t0: Real = 0.0,
     save_every: int = 1,
     progress: bool = False,
     extrapolate: int = 1,
-    events: Any = None,
+    events: Sequence[Event] | None = None,
     max_events: int = 2,
     keep_events: int = 100,
     throw: bool = False,
-    output: Any = None,
+    output: Callable | None = None,
 ) -> Solution:
     """Steps `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), num_steps times by dt.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,9 @@ from hhtjax.steppers.friction_switching import DEPENDENT
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
 from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY
+
+if TYPE_CHECKING:
+    from hhtjax.runs.error_control import Steps
 
 
 class FailedRunWarning(RuntimeWarning):
@@ -46,14 +49,14 @@ class Failure(NamedTuple):
     """
 
     step: Any
-    newton: Any
-    quantity: Any
-    row: Any = None
-    solve: Any = None
+    newton: Array
+    quantity: Array
+    row: Real = None
+    solve: Real = None
     friction: Any = None
     mass: Any = None
-    event: Any = None
-    guard: Any = None
+    event: Real = None
+    guard: Real = None
 
     def _verdict(self) -> str:
         """How many failed, or what did."""
@@ -115,23 +118,23 @@ class Solution(NamedTuple):
             multipliers, z, zdot, friction and sticking, which are None then; None without.
     """
 
-    t: Any
-    q: Any
-    v: Any
-    acceleration: Any
-    multipliers: Any
+    t: Array
+    q: PyTree
+    v: PyTree
+    acceleration: PyTree
+    multipliers: Array | None
     dt: Any
     info: Info
     failure: Failure
-    z: Any = None
-    zdot: Any = None
+    z: PyTree = None
+    zdot: PyTree = None
     friction: Any = None
-    sticking: Any = None
-    steps: Any = None
+    sticking: Array | None = None
+    steps: Steps | None = None
     error: Any = None
     allowed: Any = None
-    events: Any = None
-    output: Any = None
+    events: Events | None = None
+    output: PyTree = None
 
     @property
     def failed(self) -> Array:
@@ -410,13 +413,13 @@ class Events(NamedTuple):
             beside the velocities the motion grazes the guard, and derivatives are huge, at last infinite.
     """
 
-    count: Any
-    t: Any
-    which: Any
-    q: Any
-    before: Any
-    after: Any
-    z: Any
+    count: Array
+    t: Array
+    which: Array
+    q: PyTree
+    before: PyTree
+    after: PyTree
+    z: PyTree
     rate: Any
 
     def _verdict(self):
@@ -432,8 +435,8 @@ class Log(NamedTuple):
     """The events met so far, on vectors: how many, and a column of numbers for each that is kept, NaN beyond, and for
     those of one step more, of which nothing is told."""
 
-    count: Any
-    columns: Any
+    count: Array
+    columns: Array
 
     @classmethod
     def empty(cls, like: PyTree, keep: int, at_once: int) -> Log:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -25,36 +25,37 @@ from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_controlled import sweep_chosen
 from hhtjax.runs.sweep_inputs import VECTORS, Inputs
-from hhtjax.steppers.stepper import bound
+from hhtjax.steppers.stepper import Stepper, bound
 from hhtjax.steppers.variable_step import resized_step
+from hhtjax.systems.events import Event
+from hhtjax.systems.system import AnySystem
 from hhtjax.xla import Programs
 
 if TYPE_CHECKING:
     from hhtjax.runs.driver import Run
     from hhtjax.runs.output import Output
-    from hhtjax.steppers.stepper import Stepper
     from hhtjax.systems.flat_system import FlatSystem
     from hhtjax.systems.linear_system import LinearSystem
     from hhtjax.systems.system import System
 
 
 def sweep(
-    system: LinearSystem | System,
+    system: AnySystem,
     stepper: Stepper,
     q0: PyTree,
     v0: PyTree = None,
     params: PyTree = None,
     *,
     z0: PyTree = None,
-    dts: PyTree,
+    dts: Real,
     duration: Real = None,
     num_samples: int | None = None,
-    times: PyTree = None,
+    times: Real | None = None,
     t0: Real = 0.0,
-    in_axes: tuple | None = None,
+    in_axes: PyTree = None,
     mesh=None,
     progress: bool = False,
-    events: list | None = None,
+    events: Sequence[Event] | None = None,
     max_events: int = 2,
     keep_events: int = 100,
     throw: bool = False,

@@ -153,15 +153,15 @@ class Members(NamedTuple):
 
     system: Any
     arrays: list
-    structure: Any  # of (stepper, q0, v0, params, z0), tolerances
+    structure: Array  # of (stepper, q0, v0, params, z0), tolerances
     axes: list
-    t0: Any
+    t0: Array
     times: Any
     size: int
     lanes: int  # members in a block
     events: Any = None
     room: tuple = ()
-    output: Any = None
+    output: PyTree = None
 
     def problem(self, arrays: list) -> Problem:
         """One member's."""

@@ -12,7 +12,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hhtjax.checks import notes_on_lists, require_integer, require_number, require_params
-from hhtjax.description import PyTree, Real, all_concrete, is_array, is_concrete, known_now
+from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, known_now
 from hhtjax.runs.adaptive import Adaptive, lengths, require_controlled
 from hhtjax.runs.inputs import (
     Problem,
@@ -47,17 +47,17 @@ class Inputs(NamedTuple):
     an `Adaptive` for dts, times are given."""
 
     system: Any
-    data: Any
+    data: PyTree
     dts: Any
-    duration: Any
-    t0: Any
+    duration: Array
+    t0: Array
     mapped: tuple
     num_samples: int
     times: Any
     size: int
     events: Any = None
     room: tuple = ()
-    output: Any = None
+    output: PyTree = None
 
     @classmethod
     def checked(

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import zipfile
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,35 +16,37 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_integer
-from hhtjax.description import VERSION, PyTree, all_concrete
+from hhtjax.description import VERSION, PyTree, Real, all_concrete
 from hhtjax.primitives import or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.output import require_output
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
+from hhtjax.steppers.stepper import Stepper
+from hhtjax.systems.system import AnySystem
 
 
 def sweep_to_disk(
     folder,
-    system,
-    stepper,
+    system: AnySystem,
+    stepper: Stepper,
     q0: PyTree,
     v0: PyTree = None,
     params: PyTree = None,
     *,
     z0: PyTree = None,
     dts,
-    duration=None,
-    num_samples=None,
-    times=None,
-    t0=0.0,
+    duration: Real = None,
+    num_samples: int | None = None,
+    times: Real | None = None,
+    t0: Real = 0.0,
     in_axes=None,
     chunk=4096,
-    progress=False,
+    progress: bool = False,
     events=None,
     max_events=2,
     keep_events=100,
-    output=None,
+    output: Callable | None = None,
 ) -> Path:
     """The same as `sweep`, `chunk` members at a time, each chunk written to a file of its own in `folder`.
 

@@ -28,7 +28,7 @@ def weight_and_drag(q, v, t, params: PyTree):
     return -params["m"] * params["g"] - params["c"] * jnp.abs(v) * v
 
 
-def no_force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def no_force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q of balls on a level line."""
     return jnp.zeros(q.size, q.dtype)
 
@@ -38,7 +38,7 @@ def height(q, v, t, params: PyTree):
     return q[0] - params["floor"]
 
 
-def distance(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def distance(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Between two balls, m."""
     return q[1] - q[0] - params["diameter"]
 

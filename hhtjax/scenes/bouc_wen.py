@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
@@ -26,12 +26,12 @@ def restoring(q: Array, v: Array, z: Array, params: PyTree) -> Array:
     return -(params["c"] * v + params["k"] * q + z)
 
 
-def force(q: Array, v: Array, z: Array, t: Array, params: PyTree) -> Array:
+def force(q: Array, v: Array, z: Array, t: Real, params: PyTree) -> Array:
     """Q with a harmonic input, u = amplitude sin(frequency t)."""
     return restoring(q, v, z, params) + params["amplitude"] * jnp.sin(params["frequency"] * t)
 
 
-def internal(q: Array, v: Array, z: Array, t: Array, params: PyTree) -> Array:
+def internal(q: Array, v: Array, z: Array, t: Real, params: PyTree) -> Array:
     """zdot, for nu = 1."""
     return params["alpha"] * v - params["beta_gamma"] * jnp.abs(v) * z - params["beta_delta"] * v * jnp.abs(z)
 

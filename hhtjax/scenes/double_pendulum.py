@@ -45,7 +45,7 @@ def joint_torques(q: Array, v: Array, params: PyTree):
     return -k1 * q[0] - c1 * v[0], -k2 * (q[1] - q[0]) - c2 * (v[1] - v[0])
 
 
-def force_as_printed(q: Array, v: Array, t: Array, params: PyTree, trigonometry=jnp) -> Array:
+def force_as_printed(q: Array, v: Array, t: Real, params: PyTree, trigonometry=jnp) -> Array:
     """Q as Kim et al. computed it: joint 2 acts on link 2 without a reaction on link 1."""
     return weight_and_inertia(q, v, params, trigonometry) + jnp.array(joint_torques(q, v, params))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -19,12 +19,12 @@ def mass(q: Array, params: PyTree) -> Array:
     return params["m"] * jnp.ones(1, q.dtype)
 
 
-def force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q, without the friction."""
     return params["A"] * jnp.sin(params["W"] * t) - params["k"] * q - params["c"] * v
 
 
-def limit(q: Array, v: Array, t: Array, params: PyTree):
+def limit(q: Array, v: Array, t: Real, params: PyTree):
     """F, with a Stribeck curve."""
     return params["F"] * (1 + params["stiction"] * jnp.exp(-jnp.abs(v) / params["vs"]))
 

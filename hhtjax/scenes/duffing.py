@@ -19,7 +19,7 @@ def restoring(q: Array, v: Array, params: PyTree) -> Array:
     return -(params["c"] * v + q * (params["k"] + q * (params["k2"] + q * params["k3"])))
 
 
-def force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q with a harmonic input, u = amplitude cos(frequency t)."""
     return restoring(q, v, params) + params["amplitude"] * jnp.cos(params["frequency"] * t)
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_integer
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -42,14 +42,14 @@ def mass(q: Array, params: PyTree) -> Array:
     return jnp.kron(params["m"] / 6 * (joined + 2 * jnp.diag(bars)), jnp.eye(2, dtype=q.dtype))
 
 
-def force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q: half of each bar's weight at each of its ends."""
     bars = jnp.sum(couplers(q), axis=0) + 1
     weight = params["m"] * params["g"] / 2 * bars
     return jnp.stack([jnp.zeros_like(weight), -weight], axis=1)
 
 
-def constraint(q: Array, t: Array, params: PyTree) -> Array:
+def constraint(q: Array, t: Real, params: PyTree) -> Array:
     """Phi: cranks, then couplers."""
     pivots = params["l"] * jnp.arange(len(q), dtype=q.dtype)
     cranks = q - jnp.stack([pivots, jnp.zeros_like(pivots)], axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
@@ -16,13 +16,13 @@ def mass(q: Array, params: PyTree) -> Array:
     return (params["link_inertia"] + params["gear"] ** 2 * params["rotor_inertia"]) * jnp.ones(1, q.dtype)
 
 
-def force(q: Array, v: Array, z: dict, t: Array, params: PyTree) -> Array:
+def force(q: Array, v: Array, z: dict, t: Real, params: PyTree) -> Array:
     """Q: torque of the motor, friction of the bearing, and weight; q = 0 hangs down."""
     torque = params["gear"] * params["torque_constant"] * z["current"]
     return torque - params["friction"] * v - params["weight"] * jnp.sin(q)
 
 
-def internal(q: Array, v: Array, z: dict, t: Array, params: PyTree):
+def internal(q: Array, v: Array, z: dict, t: Real, params: PyTree):
     """L di/dt = U - R i - (back EMF), and the rate of the integral: the error of the angle."""
     error = params["amplitude"] * jnp.sin(params["frequency"] * t) - q
     voltage = params["kp"] * error + params["ki"] * z["integral"] - params["kd"] * v

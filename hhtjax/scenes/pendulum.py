@@ -28,17 +28,17 @@ def point_mass(q: Array, params: PyTree) -> Array:
     return jnp.full(2, params["m"], q.dtype)
 
 
-def weight(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def weight(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q = (0, -m g)."""
     return jnp.array([0.0, -params["m"] * params["g"]], q.dtype)
 
 
-def rod(q: Array, t: Array, params: PyTree) -> Array:
+def rod(q: Array, t: Real, params: PyTree) -> Array:
     """Phi = (x^2 + y^2 - l^2)/2."""
     return (jnp.sum(q**2, keepdims=True) - params["l"] ** 2) / 2
 
 
-def weight_and_spring(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def weight_and_spring(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q with a spring of stiffness k (N/m) and rest length l between the origin and the mass."""
     r = jnp.sqrt(jnp.sum(q**2))
     return weight(q, v, t, params) - params["k"] * (r - params["l"]) / r * q

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,9 +24,9 @@ class Scene(NamedTuple):
     """
 
     system: System | LinearSystem
-    params: Any
-    q0: Any
-    v0: Any
+    params: PyTree
+    q0: PyTree
+    v0: PyTree
     duration: float
 
 
@@ -42,9 +42,9 @@ class EventScene(NamedTuple):
     """
 
     system: System | LinearSystem
-    params: Any
-    q0: Any
-    v0: Any
+    params: PyTree
+    q0: PyTree
+    v0: PyTree
     duration: float
     events: tuple[Event, ...]
 
@@ -60,11 +60,11 @@ class InternalScene(NamedTuple):
     """
 
     system: System
-    params: Any
-    q0: Any
-    v0: Any
+    params: PyTree
+    q0: PyTree
+    v0: PyTree
     duration: float
-    z0: Any
+    z0: PyTree
 
 
 def array(values: PyTree) -> Array:

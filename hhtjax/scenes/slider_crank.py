@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -25,7 +25,7 @@ def mass(q: Array, params: PyTree) -> Array:
     return jnp.array([[(m1 / 3 + m2) * l1**2, coupling, 0.0], [coupling, m2 * l2**2 / 3, 0.0], [0.0, 0.0, m3]], q.dtype)
 
 
-def force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q: weight, inertia forces, the moment, the spring and the damper."""
     (m1, m2, _), (l1, l2), g = params["m"], params["l"], params["g"]
     coupling = m2 * l1 * l2 / 2 * jnp.sin(q[0] - q[1])
@@ -38,7 +38,7 @@ def force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
     )
 
 
-def constraint(q: Array, t: Array, params: PyTree) -> Array:
+def constraint(q: Array, t: Real, params: PyTree) -> Array:
     """Phi = (l1 cos q1 + l2 cos q2 - x, l1 sin q1 + l2 sin q2)."""
     l1, l2 = params["l"]
     return jnp.array(

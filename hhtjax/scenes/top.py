@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.rotation import cross
 from hhtjax.scenes.scene import Scene, array
@@ -43,7 +43,7 @@ def weight(params: PyTree) -> Array:
     return jnp.array([0.0, 0.0, -params["m"] * params["g"]])
 
 
-def moment(R: Array, Om: Array, t: Array, params: PyTree) -> Array:
+def moment(R: Array, Om: Array, t: Real, params: PyTree) -> Array:
     """l e2 x R^T (-m g e3) - Om x J Om."""
     arm = jnp.array([0.0, params["l"], 0.0])
     return cross(arm, matvec(R.T, weight(params))) - cross(Om, inertia(R, params) * Om)
@@ -54,13 +54,13 @@ def mass(q: dict, params: PyTree) -> Array:
     return jnp.concatenate([disk_inertia(params), jnp.full(3, params["m"], q["x"].dtype)])
 
 
-def force(q: dict, v: dict, t: Array, params: PyTree):
+def force(q: dict, v: dict, t: Real, params: PyTree):
     """Gyroscopic moment and weight."""
     Om = v["R"]
     return {"R": -cross(Om, disk_inertia(params) * Om), "x": weight(params)}
 
 
-def rod(q: dict, t: Array, params: PyTree) -> Array:
+def rod(q: dict, t: Real, params: PyTree) -> Array:
     """Phi = x - l R e2, in m."""
     return q["x"] - params["l"] * q["R"][:, 1]
 

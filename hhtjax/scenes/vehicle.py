@@ -54,12 +54,12 @@ def damper(rate: Real, params: PyTree) -> Array:
     return params["c"] * v0 * s * (1 - params["r"] * s)
 
 
-def tyre(u: Array, t: Array, params: PyTree) -> Array:
+def tyre(u: Array, t: Real, params: PyTree) -> Array:
     """k_tyre (road - u): the wheel loads less the static ones."""
     return params["k_tyre"] * (params["road"](t) - u)
 
 
-def force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q: on the body in heave, pitch and roll, and on the four wheels."""
     u = q[3:]
     S = spring(u - corner_heights(q, params), params) + damper(v[3:] - corner_heights(v, params), params)

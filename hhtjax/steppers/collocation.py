@@ -138,7 +138,7 @@ def collocation(beta: Any, theta: Any, tolerance: Real = 1e-10, max_iterations: 
     return _collocation("collocation", beta, theta, tolerance, max_iterations)
 
 
-def wilson(theta: Any = 1.4, tolerance: Real = 1e-10, max_iterations: int = 20) -> Collocation:
+def wilson(theta: Real = 1.4, tolerance: Real = 1e-10, max_iterations: int = 20) -> Collocation:
     """Wilson's theta method: acceleration linear in time up to t + theta h, where the equation of motion holds.
 
     `collocation` with beta = 1/6. Order 2. Unconditionally stable for theta >= 1.366, where 2 theta^2 - 2 theta >= 1.

@@ -32,21 +32,21 @@ PIECES = 4, 2  # and per joint, of a step that is differentiated; of 100 000 vio
 class Moment(NamedTuple):
     """Within a step: time since its start over h, sliding velocities, directions, distances over h, who kept on."""
 
-    theta: Any
+    theta: Array
     s: Any
-    sig: Any
-    slid: Any
-    kept: Any
+    sig: Array
+    slid: Array
+    kept: Array
 
 
 class Steady(NamedTuple):
     """A step in which nobody switches: its ds/dtheta, and its friction, base = start + theta rise; limits; and Wh."""
 
-    c: Any
+    c: Array
     start: Any
-    rise: Any
+    rise: Array
     f: Any
-    Wh: Any
+    Wh: Array
 
 
 def run_events(sf: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, Wh: Array):
@@ -189,10 +189,10 @@ class Switch(NamedTuple):
     and whether they kept their friction."""
 
     s: Any
-    sig: Any
-    tau: Any
-    slid: Any
-    kept: Any
+    sig: Array
+    tau: Array
+    slid: Array
+    kept: Array
 
 
 def switch(b: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, Wh: Array) -> Switch:
@@ -246,14 +246,14 @@ class Course(NamedTuple):
     """A step in which nobody switches: its ds/dtheta, and its friction, base = start + theta rise; limits; the rows,
     what a unit of force does to velocities in the step, what is rounding of that, and how large the terms of c are."""
 
-    c: Any
+    c: Array
     start: Any
-    rise: Any
+    rise: Array
     f: Any
     rows: Any
-    Wh: Any
-    least: Any
-    size: Any
+    Wh: Array
+    least: Array
+    size: Array
 
 
 def run_pieces(sf: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, rows, h: Array, driven: Array):

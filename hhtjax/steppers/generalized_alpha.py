@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real, is_concrete
@@ -200,7 +200,7 @@ class GeneralizedAlpha(Controlled, Stepper):
 
 
 @takes_options
-def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def hht(alpha: Real = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """HHT-alpha, by default non-iterative: one Jacobian, one factorisation, one solve per step.
 
         alpha_m = 0,  alpha_f = -alpha,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -275,7 +275,7 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
 
 
 @takes_options
-def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def newmark(beta: Real = 0.25, gamma: Real = 0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Newmark(beta, gamma): alpha_m = alpha_f = 0. The default is the trapezoidal rule.
 
     Order 2 for gamma = 1/2, else 1 (and gamma > 1/2 damps). A-stable for 2 beta >= gamma >= 1/2.
@@ -301,7 +301,7 @@ def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> 
 
 
 @takes_options
-def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def bossak(alpha: Real = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Bossak (Wood, Bossak, Zienkiewicz): HHT's weighting put on the inertia instead of the forces.
 
         alpha_m = alpha,  alpha_f = 0,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -327,7 +327,7 @@ def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
 
 
 @takes_options
-def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def generalized_alpha(rho_inf: Real = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Chung and Hulbert's generalised-alpha: least low-frequency damping for a given one at infinity.
 
         alpha_m = (2 rho - 1)/(rho + 1),  alpha_f = rho/(rho + 1),

@@ -96,11 +96,11 @@ def linearize_rows(r: Callable, s: State, linearize: Callable = jax.linearize):
 class Expansion(NamedTuple):
     """Of r about a state. value: of r at path(w), by its tangent there; here: r there; along: the tangent of path."""
 
-    value: Any
+    value: Array
     at: Any
-    tangent: Any
+    tangent: Callable
     along: Any
-    here: Any
+    here: Array
 
 
 class Expand:

@@ -148,7 +148,7 @@ class KimImplicitEuler(Stepper):
         return step
 
 
-def kim_hht(alpha: Any = 0.0) -> KimHHT:
+def kim_hht(alpha: Real = 0.0) -> KimHHT:
     """The non-iterative HHT-alpha step of Kim et al. (2019), Eq. 8-14, as printed.
 
         Jq = (1 + alpha) Q_q - (M a)_q,   Jv = (1 + alpha) Q_v                 at (q, v, t)
@@ -178,7 +178,7 @@ def kim_hht(alpha: Any = 0.0) -> KimHHT:
 
 
 def conventional_hht(
-    alpha: Any = 0.0, fictive_time: bool = True, tolerance: Real = 1e-10, max_iterations: int = 20
+    alpha: Real = 0.0, fictive_time: bool = True, tolerance: Real = 1e-10, max_iterations: int = 20
 ) -> ConventionalHHT:
     """The conventional, iterative HHT-alpha of Kim et al. (2019), Eq. 1-7, as printed.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -29,9 +29,9 @@ STARTER = rosenbrock(rho_inf=0.0)  # of the first two steps: order 2 and damped 
 class Memory(NamedTuple):
     """q, v: (2, n), by how much they changed in the last step and in the one before; count: of the steps taken."""
 
-    q: Any
-    v: Any
-    count: Any
+    q: PyTree
+    v: PyTree
+    count: Array
 
 
 @dataclass(frozen=True, eq=False)

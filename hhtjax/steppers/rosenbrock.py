@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_number
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import factorize_map
 from hhtjax.numerics.low_rank import around
@@ -156,7 +156,7 @@ def stages(
     return moved(dt, b, rates), Errors(e_q, e_v)
 
 
-def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:
+def rosenbrock(rho_inf: Real = 0.0) -> Rosenbrock:
     """The two-stage Rosenbrock method of order 2: one Jacobian, one factorisation, two solves per step.
 
         g = (1/2)/(1 + sqrt((1 + rho)/2)),  A21 = g,  G21 = -2 g^2,  b = (1 - 1/(2 g), 1/(2 g))

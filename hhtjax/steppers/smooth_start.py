@@ -90,14 +90,14 @@ class Layer(NamedTuple):
     None where it is not formed."""
 
     system: Any
-    params: Any
+    params: PyTree
     base: State
     offset: Any
-    X: Any
+    X: Array
     V: Any
     B: Any
     bend: Any
-    M: Any = None
+    M: Array | None = None
 
     @classmethod
     def of(cls, method, system: FlatSystem, params: PyTree, h: Array, base: State, offset: float = 0.0) -> Layer:
@@ -336,19 +336,19 @@ class Drag(NamedTuple):
     that P leads to, as of large systems."""
 
     of: Any
-    dissipates: Any = None
+    dissipates: Array | None = None
 
 
 class Found(NamedTuple):
     """Behind a layer: v+, the changes z = (dw, dL), dw/dt where it is asked for, whether anything damps at all, dry
     friction where there is some, and a - w where it is kept."""
 
-    v: Any
-    z: Any
-    wdot: Any = None
+    v: PyTree
+    z: PyTree
+    wdot: Array | None = None
     damps: Any = None
     friction: Any = None
-    lag: Any = None
+    lag: Array | None = None
 
 
 def finished(

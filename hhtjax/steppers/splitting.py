@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description import Array, PyTree, is_concrete
+from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.numerics.batched_cond import choose
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.numerics.linear_solve import solve
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 class Memory(NamedTuple):
     """K, C: initial stiffness and damping, (n, n); P: the weighted force that the last step ended with, (n,)."""
 
-    K: Any
-    C: Any
-    P: Any
+    K: Array
+    C: Array
+    P: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ class OperatorSplitting(Stepper):
         return step
 
 
-def operator_splitting(alpha: Any = -0.05, modified: bool = False) -> OperatorSplitting:
+def operator_splitting(alpha: Real = -0.05, modified: bool = False) -> OperatorSplitting:
     """The alpha-operator-splitting method: one solve in a step, no Jacobian but the one at the start.
 
         q~ = q + h v + h^2 (1/2 - beta) a,   v~ = v + h (1 - gamma) a,   beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha

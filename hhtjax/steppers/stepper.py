@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +16,11 @@ from hhtjax.description.presentation import known, shown
 from hhtjax.numerics.batched_cond import seldom
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.systems.constraints import answers
-from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.flat_system import FlatSystem, flatten
 from hhtjax.systems.friction_rows import depends, held_back
 from hhtjax.systems.initial_conditions import initial_values
-from hhtjax.systems.system import require_masses
+from hhtjax.systems.system import AnySystem, require_masses
 from hhtjax.systems.system import require_system as require_system
-
-if TYPE_CHECKING:
-    from hhtjax.systems.flat_system import FlatSystem
-    from hhtjax.systems.linear_system import LinearSystem
-    from hhtjax.systems.system import FirstOrderSystem, System
 
 
 @shown
@@ -44,17 +39,17 @@ class State(NamedTuple):
         memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
 
-    t: Any
-    q: Any
-    v: Any
-    w: Any
-    a: Any = None
+    t: Array
+    q: PyTree
+    v: PyTree
+    w: PyTree
+    a: PyTree = None
     L: Any = None
-    memory: Any = None
-    z: Any = None
-    zdot: Any = None
-    za: Any = None
-    friction: Any = None
+    memory: PyTree = None
+    z: PyTree = None
+    zdot: PyTree = None
+    za: PyTree = None
+    friction: PyTree = None
 
 
 @shown
@@ -66,8 +61,8 @@ class Rubbing(NamedTuple):
         tau: (m,), the friction, positive against positive sliding.
     """
 
-    sig: Any
-    tau: Any
+    sig: Array
+    tau: Array
 
 
 INTERNAL = {"v": "z", "w": "zdot", "a": "za"}  # where a state has what is no rate of a position
@@ -95,17 +90,17 @@ class Info(NamedTuple):
         switched: by how much dry friction that switched has changed the accelerations (alike).
     """
 
-    residual: Any = None
-    iterations: Any = None
-    converged: Any = None
+    residual: Array | None = None
+    iterations: Array | None = None
+    converged: Array | None = None
     constraint: Any = None
-    constraint_rate: Any = None
-    dependent_row: Any = None
-    solve_residual: Any = None
-    solved: Any = None
+    constraint_rate: Array | None = None
+    dependent_row: Array | None = None
+    solve_residual: Real = None
+    solved: Array | None = None
     friction: Any = None
-    defect: Any = None
-    switched: Any = None
+    defect: Array | None = None
+    switched: Array | None = None
 
     def _verdict(self):
         """Of several steps."""
@@ -229,9 +224,7 @@ class Stepper(Description):
         """State at t0, from position q0, velocity v0 (None for a `FirstOrderSystem`) and internal states z0."""
         return begun("init", system, self, *initial_values("init", system, q0, v0, z0), params, dt, t0)
 
-    def step(
-        self, system: LinearSystem | FirstOrderSystem | System, state: State, params: PyTree, dt: Real
-    ) -> tuple[State, Info]:
+    def step(self, system: AnySystem, state: State, params: PyTree, dt: Real) -> tuple[State, Info]:
         """State one step dt after `state`, and what the step tells about itself."""
         params = freeze(params)
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params, state.z)
@@ -244,7 +237,7 @@ class Stepper(Description):
 
 def begun(
     caller: str,
-    system: LinearSystem | FirstOrderSystem | System,
+    system: AnySystem,
     stepper: Stepper,
     q0: PyTree,
     v0: PyTree,
@@ -334,9 +327,7 @@ def require_stepper(caller: str, stepper: Stepper):
         raise TypeError(f"{caller}: `stepper` must be a stepper such as hht(); received {stepper!r}.")
 
 
-def require_capable(
-    caller: str, system: LinearSystem | FirstOrderSystem | System, stepper: Stepper, q0: PyTree, v0: PyTree
-):
+def require_capable(caller: str, system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree):
     """An error for a constraint, a rotation, internal states or friction that the stepper does not know."""
     name = stepper.name
     if not stepper.starts_massless:

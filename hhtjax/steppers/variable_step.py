@@ -127,15 +127,15 @@ def resized_step(flat: FlatSystem, stepper: Stepper, params: PyTree, dt: Array, 
 class Errors(NamedTuple):
     """Of a step, (N,): of the displacement, whose entries beyond the positions mean nothing, and of the rates."""
 
-    q: Any
-    v: Any
+    q: PyTree
+    v: PyTree
 
 
 class Past(NamedTuple):
     """What the estimate of the family remembers of the step before: (w1 - w)/h, and h, which is 0 before the first."""
 
     slope: Any
-    h: Any
+    h: Array
 
 
 class Controlled(Resizing):

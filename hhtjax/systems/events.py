@@ -20,7 +20,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import in_words, require_function, require_number
-from hhtjax.description import Array, Description, PyTree, as_float, freeze, is_array, is_concrete, is_real, thaw
+from hhtjax.description import Array, Description, PyTree, Real, as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.numerics.batched_cond import seldom
 from hhtjax.primitives import consistent
 from hhtjax.systems.constraints import answers, pull_back
@@ -200,7 +200,7 @@ class Impact(Description):
         return e(params) if callable(e) else e
 
 
-def impact(restitution: Any = 1.0) -> Impact:
+def impact(restitution: Real | str = 1.0) -> Impact:
     """Newton's law of impact, for `Event(reset=)`: an impulse along the guard g(q, t), without friction.
 
         v+ = v - (1 + e) M^-1 n (n.v + g_t)/(n.M^-1 n),    n = dg/dq
@@ -267,7 +267,7 @@ class FlatEvents(NamedTuple):
 
         return jax.jvp(guards, at, along)
 
-    def slope(self, s, s1, h: Array):
+    def slope(self, s, s1, h: Array) -> Any:
         """The rate of the multipliers between two states, where a guard sees them."""
         return (s1.L - s.L) / jnp.where(h > 0, h, 1) if any(self.forced) else None
 

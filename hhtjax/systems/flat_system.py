@@ -55,8 +55,8 @@ class FlatSystem(NamedTuple):
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
     settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
     diagonals: Callable | None = None  # params -> M, C, K (None where absent), where all of them are diagonals (n,)
-    massless: Any = None  # G with M G M = M, where M is singular
-    factors: Any = None  # `Factors` for the steps of a run, where they are known before it
+    massless: Array | None = None  # G with M G M = M, where M is singular
+    factors: Factors | None = None  # `Factors` for the steps of a run, where they are known before it
 
     def settled(self, params: PyTree) -> FlatSystem:
         """What `settle` gives, where there is something to settle."""

@@ -15,7 +15,7 @@ dynamics, 1988.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,7 +41,7 @@ HALVINGS = 16  # of a Newton step
 class Independent(NamedTuple):
     """Rows that do not depend on each other: every choice of them is solved as it is."""
 
-    K: Any
+    K: Array
 
     def solve(self, A: Array, some: Array, b: Array):
         """y with A y = b on those rows and columns, 0 elsewhere."""
@@ -72,10 +72,10 @@ class Dependent(NamedTuple):
     the rank that it should have. least: what is rounding in its diagonal.
     """
 
-    K: Any
-    C: Any
-    basis: Any
-    least: Any
+    K: Array
+    C: Array
+    basis: Array
+    least: Array
 
     def spanning(self, some: Array, first: bool = False) -> Array:
         """As many of those rows as do not depend on each other; from `first`, while there are such."""

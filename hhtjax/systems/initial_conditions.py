@@ -33,7 +33,7 @@ from hhtjax.systems.constraints import (
 )
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.friction import directions
-from hhtjax.systems.system import FirstOrderSystem
+from hhtjax.systems.system import AnySystem, FirstOrderSystem
 from hhtjax.xla import Programs
 
 if TYPE_CHECKING:
@@ -59,16 +59,22 @@ class ConsistentInitial(NamedTuple):
             with how well q0 was meant: a start far away may be of another assembly than that which was thought of.
     """
 
-    q: Any
-    v: Any
-    acceleration: Any
+    q: PyTree
+    v: PyTree
+    acceleration: PyTree
     multipliers: Any
-    converged: Any
-    moved: Any = None
+    converged: Array
+    moved: Array | None = None
 
 
 def consistent_initial(
-    system: System, q0: PyTree, v0: PyTree, params: PyTree = None, t0: Real = 0.0, redundant=None, z0: PyTree = None
+    system: AnySystem,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree = None,
+    t0: Real = 0.0,
+    redundant=None,
+    z0: PyTree = None,
 ) -> ConsistentInitial:
     """The values nearest to q0 and v0 that satisfy the constraints, with the acceleration and multipliers there.
 
@@ -437,13 +443,13 @@ class Problem(NamedTuple):
 
     conditions: Any  # z -> (M x - B^T mu, Phi)
     constraint: Any  # x -> Phi
-    M: Any
-    d: Any  # the diagonal of M, ones in the place of zeros
-    unit: Any  # (m,), makes distances of Phi
-    Phi: Any  # at the guess
+    M: Array
+    d: Array  # the diagonal of M, ones in the place of zeros
+    unit: Array  # (m,), makes distances of Phi
+    Phi: Array  # at the guess
     B: Any
-    size: Any  # of the largest coordinate
-    reach: Any  # of all of them, in the norm of M
+    size: Array  # of the largest coordinate
+    reach: Array  # of all of them, in the norm of M
     factorize: Any
 
 

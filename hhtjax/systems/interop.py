@@ -11,6 +11,7 @@ and stays orthogonal to the accuracy of the solver. With internal states, y = (q
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,20 +21,20 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import Description, PyTree, Real, as_float, current, thaw
+from hhtjax.description import Array, Description, PyTree, Real, as_float, current, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.systems.constraints import acceleration_and_multipliers
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, require_consistent
-from hhtjax.systems.system import FirstOrderSystem, require_smooth, require_system
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_smooth, require_system
 
 if TYPE_CHECKING:
-    from hhtjax.systems.system import System
+    pass
 
 __all__ = ["FlatODE", "ScipyRHS", "diffrax_term", "flat_ode", "ode", "scipy_rhs"]
 
 
-def ode(system):
+def ode(system: AnySystem):
     """The system as an ODE on pytrees: the function (t, y, params) -> y' of y = (q, v); of y itself for y' = f(y, t).
 
     With internal states y = (q, v, z). Traceable and differentiable; of equal systems equal, also as a pytree.
@@ -70,11 +71,11 @@ class FlatODE(NamedTuple):
     """
 
     rate: Any
-    y0: Any
-    unravel: Any
+    y0: Array
+    unravel: Callable
 
 
-def flat_ode(system: System, q0: PyTree, v0: PyTree = None, z0: PyTree = None) -> FlatODE:
+def flat_ode(system: AnySystem, q0: PyTree, v0: PyTree = None, z0: PyTree = None) -> FlatODE:
     """The same on vectors: y holds the numbers of q, then those of v, then z, each in the order of `ravel_pytree`.
 
     Args:
@@ -100,7 +101,7 @@ def flat_ode(system: System, q0: PyTree, v0: PyTree = None, z0: PyTree = None) -
     return FlatODE(rate, jnp.concatenate([x for x, _ in parts]), rate.unravel)
 
 
-def diffrax_term(system):
+def diffrax_term(system: AnySystem):
     """The system as a `diffrax.ODETerm`, for `diffeqsolve(term, solver, t0, t1, dt0, y0=(q0, v0), args=params)`.
 
     y0 is (q0, v0), pytrees, or (q0, v0, z0), or y0 of a `FirstOrderSystem`; args are the params, modules of equinox
@@ -142,14 +143,19 @@ class ScipyRHS(NamedTuple):
         jac: (t, y) -> the derivative of fun with respect to y, (N, N), compiled.
     """
 
-    fun: Any
+    fun: Callable
     y0: np.ndarray
-    unravel: Any
-    jac: Any
+    unravel: Callable
+    jac: Callable
 
 
 def scipy_rhs(
-    system: System, q0: PyTree, v0: PyTree = None, params: PyTree = None, t0: Real = 0.0, z0: PyTree = None
+    system: AnySystem,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
+    t0: Real = 0.0,
+    z0: PyTree = None,
 ) -> ScipyRHS:
     """The system as SciPy takes it: right-hand side, start and Jacobian, for Radau, BDF and LSODA too.
 
@@ -227,7 +233,7 @@ def _ode(system, t, y, params: PyTree):
 class _FlatRate(Description):
     """`ode` on vectors; frozen and hashable, so that equal ones share a program."""
 
-    def __init__(self, system: System, sizes: tuple, unravels: tuple):
+    def __init__(self, system: AnySystem, sizes: tuple, unravels: tuple):
         self.system, self.sizes, self.unravels = system, sizes, unravels
 
     def unravel(self, y):

@@ -19,7 +19,7 @@ from hhtjax.systems.matrices import UNDAMPED, as_matrix, constant_matrix, massle
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
-    from hhtjax.systems.system import System
+    from hhtjax.systems.system import FirstOrderSystem, System
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -215,7 +215,7 @@ def shapes_of_matrices(caller: str, system: LinearSystem, params: PyTree):
     return {name: evaluate(caller, name, A, params) if callable(A) else A for name, A in given.items()}
 
 
-def require_dense(caller: str, system: LinearSystem | System, params: PyTree):
+def require_dense(caller: str, system: LinearSystem | System | FirstOrderSystem, params: PyTree):
     """An error for a linear system with sparse matrices."""
     if isinstance(system, LinearSystem):
         for name, A in shapes_of_matrices(caller, system, params).items():

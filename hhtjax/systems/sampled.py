@@ -111,7 +111,7 @@ def _inside(x: Array):
     return jnp.where(x < 0, 0, jnp.where(x > 1, 1, x))  # at the ends the slope is the one inside
 
 
-def sampled(values: Real, dt: Real = None, t0: Real = 0.0, order: int = 3, *, times: Real = None) -> Sampled:
+def sampled(values: Real, dt: Real = None, t0: Real = 0.0, order: int = 3, *, times: Real | None = None) -> Sampled:
     """The function of time through `values[k]` at t0 + k dt, or at times[k]: a pytree for params, called with t.
 
     Args:
@@ -248,7 +248,7 @@ def _uneven_spline_slopes(rise: Array, widths: Array) -> Array:
 # Reconstruction of a band-limited input between its samples, and what simpler reconstructions lose.
 
 
-def band_limited(values: Array, dt: Real, *, factor: int = 8, t0: Real = 0.0) -> Sampled:
+def band_limited(values: Real, dt: Real, *, factor: int = 8, t0: Real = 0.0) -> Sampled:
     """The function of time through `values[k]` at t0 + k dt that holds no frequency above 1/(2 dt).
 
     The samples less the line through the first and the last one, continued as an odd function, are a Fourier series.
@@ -282,7 +282,7 @@ def band_limited(values: Array, dt: Real, *, factor: int = 8, t0: Real = 0.0) ->
     return sampled(fine + line(n * factor), dt / factor, t0)
 
 
-def band_limited_motion(values: Real, dt: Real, cutoff) -> tuple[jax.Array, jax.Array, jax.Array]:
+def band_limited_motion(values: Real, dt: Real, cutoff: Real | None) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Position, velocity and acceleration at the samples of a measured motion, without frequencies above `cutoff`.
 
     The series is that of `band_limited`, cut off and differentiated. At both ends its second derivative is zero, so
@@ -337,7 +337,7 @@ def _odd_series(values: Array):
     return line, jnp.fft.rfft(jnp.concatenate([rest, -rest[-2:0:-1]]), axis=0)
 
 
-def spline_gain_error(frequency: float, dt: Real, order: int = 3) -> float:
+def spline_gain_error(frequency: Real, dt: Real, order: int = 3) -> float:
     """Relative error of the amplitude of a harmonic of `frequency` that `sampled(..., order)` reconstructs.
 
         order 0: 1 - sinc(f dt), late by dt/2 besides,    order 1: 1 - sinc^2(f dt),

@@ -19,7 +19,7 @@ from hhtjax.systems.friction import require_friction
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass
 
-__all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_smooth", "require_system"]
+__all__ = ["AnySystem", "FirstOrderSystem", "LinearSystem", "System", "require_smooth", "require_system"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +266,10 @@ def _require_constraint(constraint: Callable):
         ) from None
 
 
-def require_system(caller: str, system: LinearSystem | FirstOrderSystem | System, massless: bool = False):
+AnySystem = System | LinearSystem | FirstOrderSystem  # what a run takes
+
+
+def require_system(caller: str, system: AnySystem, massless: bool = False):
     """An error for what is no system, or has coordinates without mass where these are not possible."""
     if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
         raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
@@ -274,7 +277,7 @@ def require_system(caller: str, system: LinearSystem | FirstOrderSystem | System
         require_masses(caller, system, "give them some")
 
 
-def require_masses(caller: str, system: LinearSystem | FirstOrderSystem | System, without: str):
+def require_masses(caller: str, system: AnySystem, without: str):
     """An error for coordinates without mass, with which something is not possible."""
     if system.massless is not None:
         raise NotImplementedError(
@@ -402,7 +405,7 @@ def timed(function: Callable, before: int, t: Real) -> tuple:
     return (t,) if takes_time(function, before) else ()
 
 
-def mass_at(system: System, q: Array, t: Array, params: PyTree):
+def mass_at(system: System, q: PyTree, t: Real, params: PyTree):
     """M of a system with pytrees, as its user gave it: a function's value, or the constant array."""
     return system.mass(q, *timed(system.mass, 1, t), params) if callable(system.mass) else system.mass
 
