@@ -42,8 +42,8 @@ def observed_order(
     *,
     z0: PyTree = None,
     duration: Real,
-    num_steps,
-    reference=None,
+    num_steps: Real,
+    reference: PyTree = None,
     t0: Real = 0.0,
 ) -> ObservedOrder:
     """Order of convergence of q at t0 + duration, from runs with each of `num_steps` steps.

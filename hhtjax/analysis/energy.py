@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -45,7 +46,9 @@ class EnergyBalance(NamedTuple):
     error: Any
 
 
-def energy_balance(system: AnySystem, solution: Solution, params: PyTree = None, potential=None) -> EnergyBalance:
+def energy_balance(
+    system: AnySystem, solution: Solution, params: PyTree = None, potential: Callable | None = None
+) -> EnergyBalance:
     """The energy balance along a run: a diagnostic, whose `error` is the energy that the method itself made or lost.
 
         d/dt (T + V) = v' Q + v' Mdot v/2 + L' B v - tau' H v + dV/dt = P,    T = v' M(q) v/2

@@ -23,7 +23,7 @@ class Eigenvalue(NamedTuple):
     blocks: tuple[int, ...]
 
 
-def jordan_structure(matrix, tolerance: Real = 1e-3) -> tuple[Eigenvalue, ...]:
+def jordan_structure(matrix: Real, tolerance: Real = 1e-3) -> tuple[Eigenvalue, ...]:
     """The distinct eigenvalues with their Jordan blocks, the largest modulus first; NumPy, on concrete values.
 
     Rounding scatters an eigenvalue with a block of size k by a k-th root of itself, but not the mean of what it
@@ -75,7 +75,7 @@ def _blocks(A: np.ndarray, members: list, tolerance: Real):
     return tuple(int(np.sum(at_least > i)) for i in range(at_least[0]))
 
 
-def transient_growth(matrix, num_steps, near=None) -> np.ndarray:
+def transient_growth(matrix: Real, num_steps: int, near: Real = None) -> np.ndarray:
     """|D23| of Cardona, Geradin (1989), Fig. 1, from the powers of A, for n = 0 .. num_steps: (num_steps + 1,).
 
     What A^n does in the invariant subspace of an eigenvalue mu beyond multiplying by mu^n, relative to the first step:

@@ -62,7 +62,7 @@ class ModalReduction(NamedTuple):
         return jnp.asarray(q) @ jnp.asarray(self.inverse).T
 
 
-def modes(M, K: Real, count: int | None = None) -> NormalModes:
+def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
     """The lowest modes of free vibration: K T = M T diag(frequencies^2).
 
     Args:

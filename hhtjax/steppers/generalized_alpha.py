@@ -368,7 +368,9 @@ class ImplicitEuler(GeneralizedAlpha):
         return dt * v, v, w, w
 
 
-def implicit_euler(iterations=None, tolerance: Real = 1e-10, max_iterations: int = 20, solve=None) -> ImplicitEuler:
+def implicit_euler(
+    iterations: int | None = None, tolerance: Real = 1e-10, max_iterations: int = 20, solve: Callable | None = None
+) -> ImplicitEuler:
     """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), solved by Newton.
 
     Order 1, L-stable, strongly damping: the reference for robustness, not for accuracy. Constraints (GGL), rotations

@@ -73,7 +73,7 @@ def consistent_initial(
     v0: PyTree,
     params: PyTree = None,
     t0: Real = 0.0,
-    redundant=None,
+    redundant: str | None = None,
     z0: PyTree = None,
 ) -> ConsistentInitial:
     """The values nearest to q0 and v0 that satisfy the constraints, with the acceleration and multipliers there.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -27,7 +29,7 @@ def as_matrix(value, dtype: np.dtype):
     return jnp.atleast_1d(jnp.asarray(value)).astype(dtype)
 
 
-def sparse(matrix) -> Sparse:
+def sparse(matrix: Any) -> Sparse:
     """A sparse matrix whose numbers are data, for functions of params in a `LinearSystem`.
 
     Its multiples, sums and differences are sparse, too: `lambda params: params["k"] * K + params["shift"] * M`. What is
