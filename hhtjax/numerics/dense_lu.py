@@ -99,6 +99,14 @@ def inverse(A: Array) -> Array:
     return lax.fori_loop(0, n, eliminate, both)[:, n:]
 
 
+def differentiable_inverse(A: Array) -> Array:
+    """A^-1 with derivatives, of two steps of Newton and Schulz: X <- 2 X - X A X."""
+    S = X = inverse(A)
+    for _ in range(2):
+        X = 2 * X - X @ A @ X
+    return S + (X - lax.stop_gradient(X))
+
+
 def _lu(A: Array):
     """L below the diagonal and U on and above it, and the order of the rows: A[order] = L U."""
     n = A.shape[0]

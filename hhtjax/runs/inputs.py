@@ -29,7 +29,6 @@ from hhtjax.description import (
 from hhtjax.runs.driver import equal_steps
 from hhtjax.runs.event_step import nearness
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
-from hhtjax.steppers.variable_step import GROWTH
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.flat_system import flatten
@@ -505,26 +504,7 @@ def _require_start(caller: str, events: tuple, start: Start, step):
 
 
 # ----------------------------------------------------------------------------
-# The times at which a sweep is sampled: the checks of what a user hands over, and the steps that land on them.
-
-
-def require_one_grid(stepper: Stepper, duration: Real, num_samples: int | None, times: PyTree):
-    """An error unless the samples are given in one of the two ways, and in one that the stepper can step on."""
-    given = [x is not None for x in (duration, num_samples, times)]
-    if given not in ([True, True, False], [False, False, True]):
-        raise TypeError(
-            "sweep: give `duration` and `num_samples`, or `times` alone; "
-            f"received duration={duration!r}, num_samples={num_samples!r}, times={times!r}."
-        )
-    if times is not None:
-        if stepper.needs_equal_steps:
-            raise NotImplementedError(
-                f"sweep: {stepper.name} needs steps of one size, which differ between `times`: give "
-                "`duration` and `num_samples`, or another stepper."
-            )
-        return
-    require_integer("sweep", "num_samples", num_samples)
-    require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+# The times at which a run is sampled.
 
 
 def equal_times(t0, duration, num_samples):
@@ -556,62 +536,3 @@ def require_sample_times(times: PyTree, t0: Real, dtype: np.dtype, caller: str =
             f"received times[{bad}] = {times[bad]} after {last}.{at_start}"
         )
     return times
-
-
-def require_step_sizes(dts: PyTree) -> Real:
-    """dts as an array (B,)."""
-    dts = dts if is_array(dts) else np.asarray(dts)
-    if not is_real(dts):
-        raise TypeError(f"sweep: `dts` must be real numbers; received {dts!r}.")
-    if dts.ndim != 1 or not dts.size:
-        raise ValueError(f"sweep: `dts` must have shape (B,), one step size for each member; received {dts.shape}.")
-    return dts
-
-
-def require_steps_within(dts: Real, start: float, end: Real, num_samples: int | None = None):
-    """An error for step sizes that are not positive, take too many steps, or exceed the distance of equal samples."""
-    if not all_concrete((dts, start, end)):
-        return
-    h, span = np.asarray(dts, float), float(end) - float(start)
-    limit, at_most = np.inf, ""
-    if num_samples is not None:
-        limit = span / num_samples
-        at_most = (
-            f", and at most {limit:.6g}, the distance of the samples (duration={span:.6g}, num_samples={num_samples})"
-        )
-    fine = (h > 0) & (h <= limit * (1 + 1e-6))
-    if not fine.all():
-        bad = int(np.argmin(fine))
-        raise ValueError(f"sweep: `dts` must be positive{at_most}; received dts[{bad}] = {h[bad]:.6g}.")
-    if span / h.min() >= 2**31:
-        raise ValueError(f"sweep: `dts` must take fewer than 2^31 steps; received dts[{h.argmin()}] = {h.min():.6g}.")
-
-
-def fit_to_samples(dts: Array, H: Array):
-    """The numbers of steps between two samples, and the step sizes; NaN where a traced dt is not in (0, H]."""
-    slack = 64 * float(jnp.finfo(dts.dtype).eps)
-    return _fit(dts, H, (dts > 0) & (dts <= H * (1 + 1e-6)), slack)
-
-
-def fit_to_times(dts: Array, times: Array):
-    """The same for each interval, (B, K); NaN where a traced dt is not positive, or a time not after the last."""
-    H, eps = jnp.diff(times), float(jnp.finfo(dts.dtype).eps)
-    increasing = (H > 0) & jnp.isfinite(H)
-    H = jnp.where(increasing, H, 1)
-    size = jnp.where(increasing, jnp.maximum(jnp.abs(times[1:]), jnp.abs(times[:-1])), 0)
-    slack = eps * (64 + 4 * size / H)  # H is a difference of rounded times
-    return jax.vmap(lambda dt: _fit(dt, H, (dt > 0) & increasing, slack))(dts)
-
-
-def may_grow(dts: np.ndarray, t0: Real, times: np.ndarray) -> bool:
-    """Whether steps may be too long behind the one before, as far as all is known: one after a short interval."""
-    if not all_concrete((dts, t0, times)):
-        return True
-    H = np.diff(np.asarray(times, float), prepend=float(t0))
-    return bool(np.any(np.minimum(H[1:], np.max(dts)) > GROWTH * H[:-1]))
-
-
-def _fit(dts: Array, H: Array, fine: Array, slack: Real):
-    """The least numbers of steps in H that are no longer than dts, but for the slack, and their sizes."""
-    substeps = jnp.maximum(jnp.ceil(H / jnp.where(fine, dts, H) * (1 - slack)), 1).astype(jnp.int32)
-    return substeps, jnp.where(fine, H / substeps.astype(dts.dtype), jnp.nan)

@@ -19,12 +19,12 @@ from hhtjax.numerics.differentiable_while import repeat
 from hhtjax.primitives import one_kernel, or_alone, or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.driver import counted, drive, equal_steps, resting
-from hhtjax.runs.inputs import Problem, fit_to_samples, fit_to_times
+from hhtjax.runs.inputs import Problem
 from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_controlled import sweep_chosen
-from hhtjax.runs.sweep_inputs import VECTORS, Inputs
+from hhtjax.runs.sweep_inputs import VECTORS, Inputs, fit_to_samples, fit_to_times
 from hhtjax.steppers.stepper import Stepper, bound
 from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems.events import Event

@@ -40,7 +40,7 @@ from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.batched_cond import choose, derivative_at_need, seldom
 from hhtjax.numerics.closures import hoisted
-from hhtjax.numerics.dense_lu import UNROLLED, diagonal, inverse, matvec
+from hhtjax.numerics.dense_lu import UNROLLED, diagonal, differentiable_inverse, inverse, matvec
 from hhtjax.numerics.differentiable_while import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
@@ -425,14 +425,6 @@ def differentiable(layer: Layer):
 
     moved = lax.fori_loop(0, STEPS, again, found)
     return jax.tree.map(lambda value, x: value + (x - lax.stop_gradient(x)), found, moved)
-
-
-def differentiable_inverse(A: Array) -> Array:
-    """A^-1 with derivatives, of two steps of Newton and Schulz: X <- 2 X - X A X."""
-    S = X = inverse(A)
-    for _ in range(2):
-        X = 2 * X - X @ A @ X
-    return S + (X - lax.stop_gradient(X))
 
 
 def improved(around, z, *more):
