@@ -1,16 +1,19 @@
 """Checks of arguments that every floor makes: they name the caller, the argument, and what was received."""
 
+from __future__ import annotations
+
 import inspect
+from collections.abc import Callable
 from contextlib import contextmanager
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import freeze, is_array, is_concrete, is_real, thaw
+from hhtjax.description import Array, PyTree, freeze, is_array, is_concrete, is_real, thaw
 
 
-def require_number(caller, name, value, valid, expectation):
+def require_number(caller: str, name: str, value, valid: Callable, expectation: str):
     """The value as it is, if it is a real scalar within its range; a tracer passes unchecked."""
     if not is_real(value) or jnp.ndim(value) != 0:
         large = is_array(value) and jnp.ndim(value) and (jnp.size(value) > 4 or not is_concrete(value))
@@ -22,7 +25,7 @@ def require_number(caller, name, value, valid, expectation):
     return value
 
 
-def require_integer(caller, name, value, least=1):
+def require_integer(caller: str, name: str, value, least: int = 1) -> int:
     """The value as a Python integer, if it is one and not less than `least`."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
         kind = {0: "an integer, 0 or more", 1: "a positive integer"}.get(least, f"an integer, {least} or more")
@@ -30,7 +33,7 @@ def require_integer(caller, name, value, least=1):
     return int(value)
 
 
-def require_function(caller, name, value, signature):
+def require_function(caller: str, name: str, value, signature: str):
     """An error unless `value` can be called so, and is hashable, as a static argument of jit has to be."""
     if not callable(value):
         raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
@@ -60,7 +63,7 @@ def positional_names(function):
     return [] if known is None else [name for name, x in known.parameters.items() if x.kind in kinds]
 
 
-def takes(function, count):
+def takes(function, count: int) -> bool:
     """Whether a function can be called with so many arguments, as far as it tells."""
     called = _signature(function, follow_wrapped=False)
     return called is None or _takes(called, count)
@@ -74,7 +77,7 @@ def _signature(function, **options):
         return None
 
 
-def _takes(called, count):
+def _takes(called, count: int) -> bool:
     """Whether a function of this signature can be called with so many arguments."""
     try:
         called.bind(*range(count))
@@ -83,7 +86,7 @@ def _takes(called, count):
     return True
 
 
-def in_words(called):
+def in_words(called) -> str:
     """The arguments of a signature in words; those that have to be given by name are not positional."""
     named = [name for name, x in called.parameters.items() if x.kind is x.KEYWORD_ONLY]
     first = [name for name in called.parameters if name not in named]
@@ -91,7 +94,7 @@ def in_words(called):
     return words + f" and the keyword{'s' * (len(named) != 1)} {', '.join(named)}" * bool(named)
 
 
-def _in_other_order(names, expected):
+def _in_other_order(names: list, expected: list) -> bool:
     """Whether a time, by its name, is in the place of something else, or q and v change places."""
     names = ["t" if name == "time" else name for name in names[: len(expected)]]
     places = {name: i for i, name in enumerate(names) if name in expected}
@@ -100,7 +103,7 @@ def _in_other_order(names, expected):
     return "q" in places and "v" in places and places["q"] > places["v"]
 
 
-def require_params(caller, params):
+def require_params(caller: str, params: PyTree):
     """The params as data, functions among them hidden; an error that names what is neither: text, objects."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         data = is_array(leaf) or hasattr(leaf, "__jax_array__") or isinstance(leaf, (bool, int, float, complex))
@@ -116,7 +119,7 @@ def require_params(caller, params):
     return freeze(params)
 
 
-def _require_hashable(where, function):
+def _require_hashable(where: str, function: Callable):
     try:
         hash(function)
     except TypeError:
@@ -140,7 +143,7 @@ def describe(x):
 # What the functions of a system return: the checks of shapes, structures and dtypes, made while tracing.
 
 
-def check_matrix(caller, name, matrix, n, dtype, *args):
+def check_matrix(caller: str, name: str, matrix, n: int, dtype: np.dtype, *args: PyTree):
     """A constant matrix, or the result of a function, of a shape that fits n and a dtype that fits the state."""
     value = evaluate(caller, name, matrix, *args) if callable(matrix) else matrix
     shapes = [(n, n), (n,)] + [()] * (n == 1)
@@ -153,7 +156,7 @@ def check_matrix(caller, name, matrix, n, dtype, *args):
         check_dtype(caller, name, value, dtype)
 
 
-def count(caller, name, function, most, dtype, *args):
+def count(caller: str, name: str, function: Callable, most: int, dtype: np.dtype, *args: PyTree) -> int:
     """m, for a function that returns (m,) with m <= most."""
     value = evaluate(caller, name, function, *args)
     if not hasattr(value, "shape") or len(value.shape) != 1 or not 1 <= value.shape[0] <= most:
@@ -164,7 +167,7 @@ def count(caller, name, function, most, dtype, *args):
     return value.shape[0]
 
 
-def check_like(caller, name, value, like, reference, dtype):
+def check_like(caller: str, name: str, value, like: PyTree, reference: Array, dtype: np.dtype):
     """What a function returned, of the structure, the shapes and a dtype that fit the state."""
     if jax.tree.structure(value) != jax.tree.structure(reference) or (
         jax.tree.map(jnp.shape, value) != jax.tree.map(jnp.shape, reference)
@@ -175,7 +178,7 @@ def check_like(caller, name, value, like, reference, dtype):
     check_dtype(caller, name, value, dtype)
 
 
-def check_dtype(caller, name, value, dtype):
+def check_dtype(caller: str, name: str, value, dtype: np.dtype):
     """An error for leaves of another dtype than that of the state; integers and Python numbers pass."""
     for leaf in jax.tree.leaves(value):
         found = jnp.result_type(leaf)
@@ -187,7 +190,7 @@ def check_dtype(caller, name, value, dtype):
             )
 
 
-def evaluate(caller, name, function, *args):
+def evaluate(caller: str, name: str, function, *args: PyTree):
     """Shape of function(*args); `name` is added to what the function raises."""
     try:
         return jax.eval_shape(lambda *args: function(*thaw(args)), *freeze(args))
@@ -198,7 +201,7 @@ def evaluate(caller, name, function, *args):
 
 
 @contextmanager
-def telling_of_arguments(caller, q0, v0, params):
+def telling_of_arguments(caller: str, q0: PyTree, v0: PyTree, params: PyTree):
     """Adds to an error of the user's functions, or of what they return, what may be wrong with the arguments."""
     try:
         yield
@@ -214,7 +217,7 @@ def telling_of_arguments(caller, q0, v0, params):
         raise
 
 
-def notes_on_lists(caller, name, tree):
+def notes_on_lists(caller: str, name, tree: PyTree):
     """A note on each list or tuple of numbers, which is no array to JAX."""
 
     def is_list(x):

@@ -15,6 +15,8 @@ jax.scipy.spatial.transform.Rotation.
 Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """
 
+from __future__ import annotations
+
 from functools import partial, reduce
 from math import factorial
 
@@ -23,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.description import is_array, is_real
+from hhtjax.description import Array, Real, is_array, is_real
 from hhtjax.primitives import Bilinear, Family, structural
 
 __all__ = [
@@ -51,7 +53,7 @@ GENERATORS = np.array(  # hat(x) = x_1 G_1 + x_2 G_2 + x_3 G_3
 ARCTANGENT = tuple(1 / (2 * k + 1) for k in range(16))  # arctan(z) / z in powers of -z^2: to rounding for z < 1/4
 
 
-def hat(x) -> jax.Array:
+def hat(x: Array) -> jax.Array:
     """The matrix (3, 3) of the cross product with x (3,): hat(x) y = x cross y.
 
     Args: x: (3,).
@@ -67,7 +69,7 @@ def hat(x) -> jax.Array:
     return jnp.sum(x[:, None, None] * structural(GENERATORS.astype(x.dtype)), axis=0)
 
 
-def vee(X) -> jax.Array:
+def vee(X: Array) -> jax.Array:
     """The inverse of `hat`: x (3,) with hat(x) = X; if X (3, 3) is not skew, that of (X - X^T)/2.
 
     Args: X: (3, 3).
@@ -81,7 +83,7 @@ def vee(X) -> jax.Array:
     return jnp.sum(X[None, :, :] * structural(GENERATORS.astype(X.dtype)), axis=(1, 2)) / 2
 
 
-def exp(psi) -> jax.Array:
+def exp(psi: Real) -> jax.Array:
     """R (3, 3) = I + c1 P + c2 P^2, the rotation by psi (3,), in rad (Rodrigues); orthogonal to rounding.
 
     Args: psi: (3,), in rad.
@@ -96,7 +98,7 @@ def exp(psi) -> jax.Array:
     return _polynomial(psi, c1, c2)
 
 
-def log(R) -> jax.Array:
+def log(R: Array) -> jax.Array:
     """psi (3,), in rad, with exp(psi) = R and |psi| <= pi, for a rotation R (3, 3). Accurate to rounding at all angles.
 
     At |psi| = pi, where psi and -psi are the same rotation, the largest component of the result is positive if R is
@@ -127,7 +129,7 @@ def log(R) -> jax.Array:
     return 2 * jnp.where(small, series, jnp.arctan2(far, q0) / far) * q
 
 
-def tangent(psi) -> jax.Array:
+def tangent(psi: Array) -> jax.Array:
     """T (3, 3) = I - c2 P + c3 P^2 for psi (3,), in rad: Om = T psidot is the rate of R0 exp(psi), for any constant R0.
 
     T^T takes moments from material components to those that work on psi. det T = 2 c2, so T is singular at 2 pi.
@@ -145,7 +147,7 @@ def tangent(psi) -> jax.Array:
     return _polynomial(psi, -c2, c3)
 
 
-def inverse_tangent(psi) -> jax.Array:
+def inverse_tangent(psi: Array) -> jax.Array:
     """T^-1 (3, 3) = I + P/2 + d P^2 for psi (3,), in rad: psidot = T^-1 Om.
 
     It grows without bound towards |psi| = 2 pi, where T is singular: there the result is inf, NaN or only rounding.
@@ -164,7 +166,7 @@ def inverse_tangent(psi) -> jax.Array:
     return _polynomial(psi, 0.5, inverse_coefficient(jnp.sum(psi**2)))
 
 
-def tangent_rate(psi, psidot) -> jax.Array:
+def tangent_rate(psi: Array, psidot: Array) -> jax.Array:
     """Tdot psidot (3,), in rad/s^2, while psi (3,) changes by psidot (3,), in rad/s: Omdot = T psiddot + Tdot psidot.
 
         Tdot psidot = xdot (-dc2/dx P + dc3/dx P^2) psidot + c3 psidot x (psi x psidot),    xdot = 2 psi.psidot
@@ -183,7 +185,7 @@ def tangent_rate(psi, psidot) -> jax.Array:
     return jnp.sum(psi * psidot) * stretch + c3 * cross(psidot, first)
 
 
-def orthonormalize(R) -> jax.Array:
+def orthonormalize(R: Array) -> jax.Array:
     """R (3, 3) with its distance from the nearest rotation squared: one step R (3 I - R^T R)/2 of Newton and Schulz.
 
     For products of many rotations, whose rounding errors add up. At a rotation, its derivative takes dR to the part
@@ -216,7 +218,7 @@ def is_rotation(R, tolerance):
     return (error <= tolerance) & (jnp.linalg.det(R) > 0)
 
 
-def product(A, B) -> jax.Array:
+def product(A: Array, B: Array) -> jax.Array:
     """A B (3, 3) elementwise: XLA fuses it, and keeps float32 at full precision on every device.
 
     Args: A, B: (3, 3).
@@ -230,11 +232,11 @@ def product(A, B) -> jax.Array:
 
 
 @jax.jit  # and so traced once, however often it is called: rotations are most of what a step of theirs takes to trace
-def _product(A, B):
+def _product(A: Array, B: Array) -> Array:
     return jnp.sum(A[:, :, None] * B[None], axis=1)
 
 
-def cross(x, y) -> jax.Array:
+def cross(x: Array, y: Array) -> jax.Array:
     """x cross y, for (3,) each; of scalars, which XLA fuses better than the gathers of jnp.cross.
 
     Args: x, y: (3,).
@@ -247,7 +249,7 @@ def cross(x, y) -> jax.Array:
     return _cross(_real("cross", "x", x, (3,)), _real("cross", "y", y, (3,)))
 
 
-def _of_scalars(x, y):
+def _of_scalars(x: Array, y: Array) -> Array:
     (a, b, c), (d, e, f) = ([z[..., i] for i in range(3)] for z in (x, y))
     return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=-1)
 
@@ -255,7 +257,7 @@ def _of_scalars(x, y):
 _cross = Bilinear(_of_scalars, lambda z, y: _cross(y, z), lambda x, z: _cross(z, x))
 
 
-def inverse_coefficient(x):
+def inverse_coefficient(x: Array) -> Array:
     """d = (c3 - 2 c4)/(2 c2) = (2 c2 - c1)/(2 c2 x): the one without cancellation at 0, the other at 2 pi."""
     c1, c2, c3, c4, _ = coefficients(x)
     small = x < 1
@@ -263,25 +265,25 @@ def inverse_coefficient(x):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _power_series(coefficients, x):
+def _power_series(coefficients: tuple, x: Array) -> Array:
     """Its derivatives are series too: through the recursion, each would be three times as long as the one before."""
     return reduce(lambda value, c: value * x + c, coefficients[-2::-1], jnp.full_like(x, coefficients[-1]))
 
 
 @_power_series.defjvp
-def _(coefficients, primals, tangents):
+def _(coefficients: tuple, primals: tuple, tangents: tuple):
     slope = tuple(k * c for k, c in enumerate(coefficients))[1:] or (0.0,)
     return _power_series(coefficients, *primals), _power_series(slope, *primals) * tangents[0]
 
 
 @jax.jit
-def _polynomial(psi, f, g):
+def _polynomial(psi: Array, f: Array, g: Array) -> Array:
     """I + f P + g P^2."""
     eye = structural(np.eye(3, dtype=psi.dtype))
     return eye + f * hat(psi) + g * (psi[:, None] * psi[None, :] - jnp.sum(psi**2) * eye)
 
 
-def _real(caller, name, x, shape):
+def _real(caller: str, name: str, x: Array, shape: tuple) -> Array:
     """x as an array of floats, if it is real and has this shape; checked while tracing."""
     if not is_array(x) or not is_real(x):
         raise TypeError(f"{caller}: `{name}` must be an array of real numbers; received {x!r}.")
@@ -302,7 +304,7 @@ def _real(caller, name, x, shape):
 NEAR, TERMS = 4, 11  # x below which two neighbours are series, of so many terms; the recursion up cancels towards 0
 
 
-def coefficients(x):
+def coefficients(x: Array):
     """c1, ..., c5 at a scalar x >= 0.
 
     >>> [round(1 / float(c)) for c in coefficients(jnp.array(0.0))]
@@ -311,7 +313,7 @@ def coefficients(x):
     return stumpff(5, x)
 
 
-def members(n, x):
+def members(n: int, x: Array):
     """c1, ..., cn: power series and recursion down for x < NEAR, definitions and recursion up beyond.
 
     >>> len(members(7, jnp.array(1.0)))
@@ -330,14 +332,14 @@ def members(n, x):
     return tuple(jnp.where(small, a, b) for a, b in zip(reversed(near), far, strict=True))
 
 
-def rule(stumpff, n, x, dx):
+def rule(stumpff, n: int, x: Array, dx: Array):
     """Values and tangents."""
     c1, *c = stumpff(n + 2, x)
     half = dx / 2
     return (c1, *c[: n - 1]), tuple((k * c[k] - c[k - 1]) * half for k in range(1, n + 1))
 
 
-def series(k, y):
+def series(k: int, y: Array) -> Array:
     """ck, to rounding for 0 <= y < NEAR.
 
     >>> float(series(1, jnp.array(0.0)))

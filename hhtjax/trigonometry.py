@@ -11,11 +11,14 @@ is too large for one, put these in their place in `mass` and `force`; the module
 [0.5, 0.866025]
 """
 
+from __future__ import annotations
+
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
+from hhtjax.description import Array
 from hhtjax.primitives import staged
 from hhtjax.xla import RANGE, polynomial_sines
 
@@ -27,7 +30,7 @@ def __dir__():
 
 
 @jax.custom_jvp
-def sincos(x) -> tuple[jax.Array, jax.Array]:
+def sincos(x: Array) -> tuple[jax.Array, jax.Array]:
     """(sin x, cos x) for x in rad, elementwise.
 
         x = k pi/2 + r,  |r| <= pi/4,    sin r = r + r^3 S(r^2),    cos r = 1 - r^2/2 + r^4 C(r^2)
@@ -54,12 +57,12 @@ def sincos(x) -> tuple[jax.Array, jax.Array]:
 
 
 @sincos.defjvp
-def _sincos_jvp(primals, tangents):
+def _sincos_jvp(primals: tuple, tangents: tuple):
     (sine, cosine), (dx,) = sincos(*primals), tangents
     return (sine, cosine), (cosine * dx, -sine * dx)
 
 
-def sin(x) -> jax.Array:
+def sin(x: Array) -> jax.Array:
     """The sine of `sincos`.
 
     Args: x: rad, an array of any shape.
@@ -72,7 +75,7 @@ def sin(x) -> jax.Array:
     return sincos(x)[0]
 
 
-def cos(x) -> jax.Array:
+def cos(x: Array) -> jax.Array:
     """The cosine of `sincos`.
 
     Args: x: rad, an array of any shape.

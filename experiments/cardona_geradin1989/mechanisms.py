@@ -41,8 +41,8 @@ def assess(scene, formulation, solve, h):
         "solve": solve,
         "h_s": h,
         "largest_energy_error_J": float(np.abs(energy - energy[0]).max()),
-        "largest_violation_m2": float(np.max(path.info.constraint)),
-        "largest_multiplier_N_m": float(np.abs(path.multipliers).max()),
+        "largest_violation_m2": float(path.info.constraint.max()),
+        "largest_multiplier_N_m": float(abs(np.asarray(path.multipliers)).max()),
         "folded": bool(np.abs(cranks - cranks[:, :1]).max() > FOLDED),
         "passages": int(np.sum(np.diff(np.sign(q[:, 0, 1])) != 0)),
     }

@@ -60,7 +60,7 @@ def fitted(seed=0):
     return {
         "noise_m": noise, "samples": len(times), "truth": float(scene.params["e"]),
         "estimate": float(found.params["e"]), "low": low, "high": high,
-        "choices": int(found.choices), "converged": bool(found.converged),
+        "choices": int(np.asarray(found.choices)), "converged": bool(found.converged),
     }  # fmt: skip
 
 

@@ -187,7 +187,8 @@ def step_size_study(report: Report, sets, fast: bool, known):
         for substeps, (result, seconds, _), ratio in zip(counts, fits, ratios, strict=True):
             params = result.params[0]
             test = score(params, sets.tests["multisine"], substeps, alpha)[1]
-            linear = hhtjax.LinearSystem(*(jnp.reshape(params[name], (1,)) for name in ("m", "c", "k")))
+            m, c, k = (jnp.reshape(params[name], (1,)) for name in ("m", "c", "k"))
+            linear = hhtjax.LinearSystem(m, c, k)
             dt = 1 / SAMPLING_RATE / substeps
             bias = hhtjax.step_size_bias(linear, hhtjax.hht(alpha), None, dt, q=jnp.zeros(1))
             rows.append(

@@ -17,6 +17,9 @@ H. Hilber, T. Hughes, R. Taylor, Earthquake Eng. Struct. Dyn. 5, 1977; A. Cardon
 33, 1989, Sec. 2; T. Hughes, The Finite Element Method, 1987, Ch. 9.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -25,28 +28,28 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import is_array, is_concrete, is_real
-from hhtjax.steppers.stepper import State, begun, require_stepper, require_system
+from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real
+from hhtjax.steppers.stepper import State, Stepper, begun, require_stepper, require_system
 from hhtjax.systems import kinematics
-from hhtjax.systems.system import FirstOrderSystem, System
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, System
 
 INFINITE = 1e17  # a frequency whose inverse is lost in rounding, and whose square fits into float32
 
 
-def _oscillator_force(q, v, t, params):
+def _oscillator_force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
     c, k = params
     return -c * v - k * q
 
 
-def _nothing(q, v, t, params):
+def _nothing(q: Array, v: Array, t: Array, params: PyTree) -> Array:
     return jnp.zeros_like(v)
 
 
-def _itself(q, t, params):
+def _itself(q: Array, t: Array, params: PyTree) -> Array:
     return q
 
 
-def _complex_product(y, t, z):
+def _complex_product(y: Array, t: Array, z: Array) -> Array:
     """z y, with y = (Re, Im)."""
     return jnp.stack([z.real * y[0] - z.imag * y[1], z.imag * y[0] + z.real * y[1]])
 
@@ -56,7 +59,9 @@ CONSTRAINT = System(np.ones(1), _nothing, _itself)
 TEST_EQUATION = FirstOrderSystem(_complex_product)
 
 
-def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Array:
+def amplification_matrix(
+    system: AnySystem, stepper: Stepper, state: State, params: PyTree = None, *, dt: Real
+) -> jax.Array:
     """A, the derivative of one step at a state, with respect to x: (k, k).
 
         x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za),    of a first-order system (q, h v, h a, memory)
@@ -98,15 +103,15 @@ def amplification_matrix(system, stepper, state, params=None, *, dt) -> jax.Arra
 
 
 @jax.jit
-def _amplification_matrix(system, stepper, state, params, dt):
+def _amplification_matrix(system: AnySystem, stepper: Stepper, state: State, params: PyTree, dt: Array) -> Array:
     q, unravel_q = ravel_pytree(state.q)
     blocks = kinematics.layout(state.q, state.v)
     x, unravel = _floats(state._replace(t=None, q=jax.tree.map(jnp.zeros_like, state.v)))
 
-    def step(state):
+    def step(state: State) -> State:
         return stepper.step(system, state, params, dt)[0]
 
-    def increments(x):
+    def increments(x: Array) -> Array:
         s = unravel(x)
         dq, _ = ravel_pytree(s.q)
         s1 = step(s._replace(t=state.t, q=unravel_q(kinematics.move(blocks, q, dq))))
@@ -125,20 +130,20 @@ def _amplification_matrix(system, stepper, state, params, dt):
     return A[kept][:, kept]
 
 
-def _floats(tree):
+def _floats(tree: PyTree):
     """All but counters as a vector, and the function that puts such a vector beside these."""
     leaves, structure = jax.tree.flatten(tree)
     at = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
     x, unravel = ravel_pytree([leaves[i] for i in at])
 
-    def beside(x):
+    def beside(x: Array) -> State:
         changed = dict(zip(at, unravel(x), strict=True))
         return structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(leaves)])
 
     return x, beside
 
 
-def _tangent_part(blocks, q1, like):
+def _tangent_part(blocks: tuple, q1: Array, like: PyTree) -> Array:
     """A linear function of q1 whose derivative is the displacement of q1, through the transpose of `rate`."""
     at = jax.lax.stop_gradient(q1)
     rate = partial(kinematics.rate, blocks, at)
@@ -147,7 +152,7 @@ def _tangent_part(blocks, q1, like):
     return transpose(q1)[0] / norms
 
 
-def _carried(step, state, increments):
+def _carried(step: Callable, state: State, increments: State) -> np.ndarray:
     """Which increments belong to fields that a step changes: (k,), bool."""
     jaxpr = jax.make_jaxpr(step)(state).jaxpr
     changed = [after is not before for before, after in zip(jaxpr.invars, jaxpr.outvars, strict=True)]
@@ -155,7 +160,7 @@ def _carried(step, state, increments):
     return np.concatenate([np.full(x.size, c) for x, c in fields if jnp.issubdtype(x.dtype, jnp.floating)])
 
 
-def oscillator_matrix(stepper, frequency, damping=0.0) -> jax.Array:
+def oscillator_matrix(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
     """A of the test oscillator, on (q, h v, h^2 w, h^2 a, memory) as far as the stepper carries them: (k, k).
 
     Args:
@@ -185,7 +190,7 @@ def oscillator_matrix(stepper, frequency, damping=0.0) -> jax.Array:
     return oscillator_tangent(stepper, *oscillator_params("oscillator_matrix", frequency, damping))
 
 
-def at_rest(system, stepper, zero, params, dt):
+def at_rest(system: AnySystem, stepper: Stepper, zero: Array, params: PyTree, dt: Real) -> State:
     """The state of rest, behind the first steps of a stepper that begins with those of another method."""
     v = None if isinstance(system, FirstOrderSystem) else zero
     state = begun("at_rest", system, stepper, zero, v, None, params, dt)
@@ -195,13 +200,13 @@ def at_rest(system, stepper, zero, params, dt):
 
 
 @jax.jit
-def oscillator_tangent(stepper, c, k):
+def oscillator_tangent(stepper: Stepper, c: Array, k: Array) -> Array:
     """A of the oscillator with damping c and stiffness k, at rest; h = 1."""
     state = at_rest(OSCILLATOR, stepper, jnp.zeros(1, c.dtype), (c, k), 1.0)
     return amplification_matrix(OSCILLATOR, stepper, state, (c, k), dt=1.0)
 
 
-def oscillator_params(caller, frequency, damping):
+def oscillator_params(caller: str, frequency: Real, damping: Real):
     """c = 2 zeta W, k = W^2."""
     W = require_real(caller, "frequency", frequency, lambda x: x > 0, "be positive")
     zeta = require_real(caller, "damping", damping, np.isfinite, "be finite").astype(W.dtype)
@@ -209,7 +214,7 @@ def oscillator_params(caller, frequency, damping):
     return 2 * zeta * W, W**2
 
 
-def constraint_matrix(stepper) -> jax.Array:
+def constraint_matrix(stepper: Stepper) -> jax.Array:
     """A of one coordinate that a constraint holds, q = 0, on (q, h v, h^2 w, h^2 a, h^2 L): (5, 5), the same for all h.
 
     On B q, B v, B w, B a any constrained system at an equilibrium has this matrix, once for each constraint. In the
@@ -243,23 +248,23 @@ def constraint_matrix(stepper) -> jax.Array:
 
 
 @jax.jit
-def _constraint(stepper):
+def _constraint(stepper: Stepper) -> Array:
     zero = jnp.zeros(1)
     state = begun("constraint_matrix", CONSTRAINT, stepper, zero, zero, None, None, 1.0)
     return amplification_matrix(CONSTRAINT, stepper, state, dt=1.0)
 
 
 @jax.jit
-def eigenvalues(stepper, c, k):
+def eigenvalues(stepper: Stepper, c: Array, k: Array) -> Array:
     """Eigenvalues for each c and k, broadcast: (..., size)."""
 
-    def single(c, k):
+    def single(c: Array, k: Array) -> Array:
         return jnp.linalg.eigvals(oscillator_tangent(stepper, c, k))
 
     return jnp.vectorize(single, signature="(),()->(n)")(c, k)
 
 
-def oscillator_roots(caller, stepper, frequency, damping):
+def oscillator_roots(caller: str, stepper: Stepper, frequency: Real, damping: Real) -> Array:
     """Eigenvalues of `oscillator_matrix`, after a check of what the user gave."""
     require_stepper(caller, stepper)
     return eigenvalues(stepper, *oscillator_params(caller, frequency, damping))
@@ -269,7 +274,7 @@ def oscillator_roots(caller, stepper, frequency, damping):
 # Checks of what the analyses are given.
 
 
-def require_real(caller, name, value, valid, expectation):
+def require_real(caller: str, name: str, value: Real, valid: Callable, expectation: str) -> Array:
     """A real scalar or array, of a float dtype, its values checked unless it is a tracer."""
     value = value if is_array(value) else np.asarray(value)
     if not is_real(value):
@@ -280,7 +285,7 @@ def require_real(caller, name, value, valid, expectation):
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.result_type(float))
 
 
-def require_matrix(caller, matrix):
+def require_matrix(caller: str, matrix: Array) -> np.ndarray:
     """A square, finite matrix of real numbers, as a NumPy array."""
     A = np.asarray(matrix)
     if not is_real(A):
@@ -294,7 +299,7 @@ def require_matrix(caller, matrix):
 # Numbers and regions from the amplification matrix: radius, damping, period, overshoot, stability.
 
 
-def _principal_rate(caller, stepper, frequency, damping):
+def _principal_rate(caller: str, stepper: Stepper, frequency: Real, damping: Real) -> Array:
     """log of the root that decays slowest, of those that oscillate; NaN where none does."""
     roots = oscillator_roots(caller, stepper, frequency, damping)
     slowest = jnp.argmax(jnp.where(roots.imag > 0, jnp.abs(roots), -1), axis=-1)
@@ -302,7 +307,7 @@ def _principal_rate(caller, stepper, frequency, damping):
     return jnp.log(jnp.where(principal.imag > 0, principal, jnp.nan))
 
 
-def spectral_radius(stepper, frequency, damping=0.0) -> jax.Array:
+def spectral_radius(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
     """Largest modulus of the eigenvalues of `oscillator_matrix`: of the shape of frequency and damping, broadcast.
 
     To 1e-10, up to W = 1e6. But at W > 1e4 three roots of `generalized_alpha` and of `kim_hht(0.0)` come close to each
@@ -325,7 +330,7 @@ def spectral_radius(stepper, frequency, damping=0.0) -> jax.Array:
     return jnp.max(jnp.abs(oscillator_roots("spectral_radius", stepper, frequency, damping)), axis=-1)
 
 
-def damping_ratio(stepper, frequency, damping=0.0) -> jax.Array:
+def damping_ratio(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
     """The damping ratio that the discrete oscillator has, -Re(r)/|r| with r = log(principal eigenvalue).
 
     For damping = 0 all of it is the method's. Of the eigenvalues that oscillate the principal one decays slowest; NaN
@@ -351,7 +356,7 @@ def damping_ratio(stepper, frequency, damping=0.0) -> jax.Array:
     return -rate.real / jnp.abs(rate)
 
 
-def period_elongation(stepper, frequency, damping=0.0) -> jax.Array:
+def period_elongation(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
     """Relative error of the natural period, W/|r| - 1 with r = log(principal eigenvalue) as in `damping_ratio`.
 
     Args:
@@ -448,8 +453,8 @@ def stability_region(stepper, z) -> jax.Array:
 
 
 @jax.jit
-def _stability_region(stepper, z):
-    def radius(z):
+def _stability_region(stepper: Stepper, z: Array) -> Array:
+    def radius(z: Array) -> Array:
         state = at_rest(TEST_EQUATION, stepper, jnp.zeros(2, z.real.dtype), z, 1.0)
         A = amplification_matrix(TEST_EQUATION, stepper, state, z, dt=1.0)
         A = jax.lax.complex(A[::2, ::2], A[1::2, ::2])  # the real form of complex numbers, undone

@@ -1,16 +1,20 @@
 """The order a stepper shows."""
 
+from __future__ import annotations
+
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
+from hhtjax.description import PyTree, Real
 from hhtjax.description.presentation import shown
-from hhtjax.steppers.stepper import begun, require_stepper
+from hhtjax.steppers.stepper import Stepper, begun, require_stepper
 from hhtjax.systems.initial_conditions import initial_values
+from hhtjax.systems.system import AnySystem
 from hhtjax.xla import Programs
 
 
@@ -24,13 +28,23 @@ class ObservedOrder(NamedTuple):
         slope: between neighbours.
     """
 
-    dt: Any
-    error: Any
-    slope: Any
+    dt: np.ndarray
+    error: np.ndarray
+    slope: np.ndarray
 
 
 def observed_order(
-    system, stepper, q0, v0=None, params=None, *, z0=None, duration, num_steps, reference=None, t0=0.0
+    system: AnySystem,
+    stepper: Stepper,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
+    *,
+    z0: PyTree = None,
+    duration: Real,
+    num_steps: Real,
+    reference: PyTree = None,
+    t0: Real = 0.0,
 ) -> ObservedOrder:
     """Order of convergence of q at t0 + duration, from runs with each of `num_steps` steps.
 
@@ -93,7 +107,7 @@ def observed_order(
 
 
 @Programs
-def _end(system, stepper, q0, v0, params, z0, t0, dt, num_steps):
+def _end(system, stepper, q0: PyTree, v0: PyTree, params: PyTree, z0: PyTree, t0, dt, num_steps):
     """q at the end as a vector; one compilation for all numbers of steps."""
     state = begun("observed_order", system, stepper, q0, v0, z0, params, dt, t0)
     state = jax.lax.fori_loop(0, num_steps, lambda _, s: stepper.step(system, s, params, dt)[0], state)

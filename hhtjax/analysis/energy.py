@@ -1,13 +1,16 @@
 """The energy of a run: what it holds, what forces put in and took out, and what the method made or lost."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_function
-from hhtjax.description import current, freeze, thaw
+from hhtjax.description import Array, PyTree, current, freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.runs.interpolate import interpolate, on_axes
@@ -18,7 +21,10 @@ from hhtjax.systems.constraints import answers
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.friction import directions, responses
 from hhtjax.systems.friction_rows import rows_of
-from hhtjax.systems.system import LinearSystem, System
+from hhtjax.systems.system import AnySystem, LinearSystem, System
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
 
 @shown
@@ -33,14 +39,16 @@ class EnergyBalance(NamedTuple):
         error: kinetic + potential - their sum at the start - work, which the motion itself leaves at 0.
     """
 
-    t: Any
-    kinetic: Any
-    potential: Any
-    work: Any
+    t: Array
+    kinetic: Array
+    potential: Array
+    work: Array
     error: Any
 
 
-def energy_balance(system, solution, params=None, potential=None) -> EnergyBalance:
+def energy_balance(
+    system: AnySystem, solution: Solution, params: PyTree = None, potential: Callable | None = None
+) -> EnergyBalance:
     """The energy balance along a run: a diagnostic, whose `error` is the energy that the method itself made or lost.
 
         d/dt (T + V) = v' Q + v' Mdot v/2 + L' B v - tau' H v + dV/dt = P,    T = v' M(q) v/2
@@ -89,28 +97,28 @@ def energy_balance(system, solution, params=None, potential=None) -> EnergyBalan
 
 
 @partial(jax.jit, static_argnames="potential")
-def _energy_balance(system, solution, params, potential):
+def _energy_balance(system, solution: Solution, params: PyTree, potential) -> EnergyBalance:
     if solution.events is None:
         return _balance(system, solution, solution, None, params, potential)
     run, across, saved = with_event_rows(solution)
     return jax.tree.map(lambda x: x[saved], _balance(system, solution, run, across, params, potential))
 
 
-def _balance(system, solution, run, across, params, potential):
+def _balance(system, solution: Solution, run: Solution, across, params: PyTree, potential) -> EnergyBalance:
     """At the times of the run, the solution with its events, if it has some; across: whether an interval is one."""
     q0, v0, t0, z0 = (jax.tree.map(lambda x: x[0], y) for y in (solution.q, solution.v, solution.t, solution.z))
     params = thaw(params)
     flat, _, _ = flatten("energy_balance", system, q0, v0, t0, params, z0)
 
-    def along(v, forces):
+    def along(v: Array, forces: Array) -> Array:
         """What forces do with the velocities, internal states left out: v' Q."""
         return jnp.dot(flat.located(v), flat.located(forces))
 
-    def energies(q, v, t):
+    def energies(q: Array, v: Array, t: Array):
         V = jnp.zeros_like(t) if potential is None else potential(flat.unravel(q), t, params)
         return along(v, flat.inertia(q, v, t, params)) / 2, jnp.asarray(V).astype(t.dtype)
 
-    def power(q, v, t, L, params):
+    def power(q: Array, v: Array, t: Array, L, params: PyTree) -> Array:
         """P, without dry friction; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
         motion = flat.rate(q, v), jnp.ones_like(t)
         _, (T_q, V_dot) = jax.jvp(lambda q, t: energies(q, v, t), (q, t), motion)
@@ -122,7 +130,7 @@ def _balance(system, solution, run, across, params, potential):
 
     ends, middles = _points(flat, solution, run, params)
 
-    def over_interval(first, between, last, H):
+    def over_interval(first: tuple, between: tuple, last: tuple, H: Array) -> Array:
         """Simpson's rule; a held input has the value that it has inside."""
         inside = zero_order_hold.held_at(params, between[2])
         P, P_middle, P_end = (power(q, v, t, L, inside) for q, v, t, L in (first, between, last))
@@ -137,7 +145,7 @@ def _balance(system, solution, run, across, params, potential):
     return _summed(t, *jax.vmap(energies)(*ends), work, across)
 
 
-def _summed(t, T, V, work, across):
+def _summed(t: Array, T: Array, V: Array, work: Array, across) -> EnergyBalance:
     """The balance, from the work in each interval; that of an impact is all that T loses."""
     if across is not None:
         work = jnp.where(across, jnp.diff(T), work)
@@ -145,7 +153,7 @@ def _summed(t, T, V, work, across):
     return EnergyBalance(t, T, V, work, T + V - T[0] - V[0] - work)
 
 
-def _points(flat, solution, run, params):
+def _points(flat: FlatSystem, solution: Solution, run: Solution, params: PyTree):
     """q, v and t at the saved times of the run, which is the solution with its events, and q, v, t and L between."""
     t, L = run.t, run.multipliers
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
@@ -156,7 +164,7 @@ def _points(flat, solution, run, params):
     return ends, between
 
 
-def _between(solution, run, H, middle, jumps):
+def _between(solution: Solution, run: Solution, H: Array, middle: Array, jumps):
     """Positions and rates in the middle of each interval, of length H; jumps: whether, or where, accelerations do."""
     found = interpolate(solution, middle)
     rates = _vectors((found.v, found.z))
@@ -168,7 +176,7 @@ def _between(solution, run, H, middle, jumps):
     return _vectors(found.q), rates
 
 
-def _vectors(tree):
+def _vectors(tree: PyTree) -> Array:
     """Leaves joined, a vector for each time."""
     return jnp.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(tree)], axis=1)
 
@@ -230,7 +238,7 @@ def switches(solution):
     return jnp.any(sig[1:] != sig[:-1], axis=1, keepdims=True)
 
 
-def friction_work(flat, solution, ends, middles, w, params):
+def friction_work(flat, solution, ends, middles, w, params: PyTree):
     """What dry friction did to the system in each interval, minus the integral of tau' H v: (K,).
 
     H v = s + c, where c is the speed of what a joint rubs on. Joints that keep on: Simpson's rule, with the limit in
@@ -249,7 +257,7 @@ def friction_work(flat, solution, ends, middles, w, params):
     return -h * jax.vmap(partial(_power, flat, params))(first, middles, last, unseen)
 
 
-def _power(flat, params, first, middle, last, unseen):
+def _power(flat, params: PyTree, first, middle, last, unseen):
     """The mean of tau' H v over an interval; a held input has the value that it has inside."""
     (*_, tau0, sig0), (q, v, t, L), (*_, tau1, sig1) = first, middle, last
     params = zero_order_hold.held_at(params, t)

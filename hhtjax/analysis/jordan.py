@@ -1,11 +1,14 @@
 """Multiple eigenvalues, and what powers of a matrix do before they decay."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np
 
 from hhtjax.analysis.amplification import require_matrix
 from hhtjax.checks import require_integer, require_number
+from hhtjax.description import Real
 
 
 class Eigenvalue(NamedTuple):
@@ -20,7 +23,7 @@ class Eigenvalue(NamedTuple):
     blocks: tuple[int, ...]
 
 
-def jordan_structure(matrix, tolerance=1e-3) -> tuple[Eigenvalue, ...]:
+def jordan_structure(matrix: Real, tolerance: Real = 1e-3) -> tuple[Eigenvalue, ...]:
     """The distinct eigenvalues with their Jordan blocks, the largest modulus first; NumPy, on concrete values.
 
     Rounding scatters an eigenvalue with a block of size k by a k-th root of itself, but not the mean of what it
@@ -56,7 +59,7 @@ def jordan_structure(matrix, tolerance=1e-3) -> tuple[Eigenvalue, ...]:
     return tuple(found)
 
 
-def _blocks(A, members, tolerance):
+def _blocks(A: np.ndarray, members: list, tolerance: Real):
     N = A - np.mean(members) * np.eye(len(A))
     nullities, power = [0], np.eye(len(A))
     while nullities[-1] < len(members) and len(nullities) <= len(members):
@@ -72,7 +75,7 @@ def _blocks(A, members, tolerance):
     return tuple(int(np.sum(at_least > i)) for i in range(at_least[0]))
 
 
-def transient_growth(matrix, num_steps, near=None) -> np.ndarray:
+def transient_growth(matrix: Real, num_steps: int, near: Real = None) -> np.ndarray:
     """|D23| of Cardona, Geradin (1989), Fig. 1, from the powers of A, for n = 0 .. num_steps: (num_steps + 1,).
 
     What A^n does in the invariant subspace of an eigenvalue mu beyond multiplying by mu^n, relative to the first step:

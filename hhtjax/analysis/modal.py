@@ -1,5 +1,7 @@
 """Normal modes of M w + K q = 0, and linear systems reduced to some of them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -10,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_integer
-from hhtjax.description import Description, is_concrete
+from hhtjax.description import Array, Description, PyTree, Real, is_concrete
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.sparse_matrix import Sparse, is_positive_definite
 from hhtjax.systems.linear_system import LinearSystem
@@ -31,8 +33,8 @@ class NormalModes(NamedTuple):
         shapes: T, (n, count), a mode in each column, with T^T M T = 1 and the largest entry of a column positive.
     """
 
-    frequencies: Any
-    shapes: Any
+    frequencies: np.ndarray
+    shapes: np.ndarray
 
 
 @shown
@@ -49,18 +51,18 @@ class ModalReduction(NamedTuple):
     system: LinearSystem
     frequencies: Any
     shapes: Any
-    inverse: Any
+    inverse: Array
 
-    def expand(self, q):
+    def expand(self, q: Array) -> Array:
         """Coordinates (..., n) of modal ones (..., count), T q: positions, velocities, accelerations."""
         return jnp.asarray(q) @ jnp.asarray(self.shapes).T
 
-    def project(self, q):
+    def project(self, q: np.ndarray) -> Array:
         """Modal coordinates (..., count) of given ones (..., n), T^T M q: of what the modes span, exactly."""
         return jnp.asarray(q) @ jnp.asarray(self.inverse).T
 
 
-def modes(M, K, count=None) -> NormalModes:
+def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
     """The lowest modes of free vibration: K T = M T diag(frequencies^2).
 
     Args:
@@ -100,7 +102,7 @@ def modes(M, K, count=None) -> NormalModes:
     return NormalModes(np.sqrt(np.maximum(squares, 0)), np.where(largest < 0, -T, T))
 
 
-def modal_reduction(system, count, params=None) -> ModalReduction:
+def modal_reduction(system: LinearSystem, count, params: PyTree = None) -> ModalReduction:
     """The linear system in its lowest `count` modes, q = T x:
 
         x'' + T^T C T x' + diag(frequencies^2) x = T^T f(t) + T^T g(T x, T v, t)
@@ -168,7 +170,7 @@ class _Projected(Description):
     T: Any
     matrix: Callable
 
-    def __call__(self, params):
+    def __call__(self, params: PyTree) -> Array:
         A = self.matrix(params)
         if isinstance(A, Sparse):
             return self.T.T @ jax.vmap(lambda x: A @ x, 1, 1)(jnp.asarray(self.T))
@@ -182,7 +184,7 @@ class _ProjectedLoad(Description):
     T: Any
     load: Callable
 
-    def __call__(self, t, params):
+    def __call__(self, t: Array, params: PyTree) -> Array:
         f, _ = ravel_pytree(self.load(t, params))
         return jnp.asarray(self.T, f.dtype).T @ f
 
@@ -194,7 +196,7 @@ class _Expanded(Description):
     T: Any
     function: Callable
 
-    def __call__(self, q, v, t, params):
+    def __call__(self, q: Array, v: Array, t: Array, params: PyTree) -> Array:
         T = jnp.asarray(self.T, q.dtype)
         return ravel_pytree(self.function(T @ q, T @ v, t, params))[0]
 
@@ -203,7 +205,7 @@ class _Expanded(Description):
 class _ProjectedForce(_Expanded):
     """T^T g(T x, T v, t), with the rows of T where g acts."""
 
-    def __call__(self, q, v, t, params):
+    def __call__(self, q: Array, v: Array, t: Array, params: PyTree) -> Array:
         return jnp.asarray(self.T, q.dtype).T @ super().__call__(q, v, t, params)
 
 
@@ -211,19 +213,19 @@ def _of_scipy(A):
     return A.tocoo() if isinstance(A, Sparse) and is_concrete(A.values) else A
 
 
-def _velocities(q, v, t, params):
+def _velocities(q, v, t, params: PyTree):
     return v
 
 
-def _times(A, T):
+def _times(A: Real, T: Real) -> Real:
     return A[:, None] * T if np.ndim(A) == 1 and not is_sparse(A) else A @ T
 
 
-def _project(T, A):
+def _project(T: Real, A: Real) -> Real:
     return T.T @ _times(A, T)
 
 
-def _uncoupled(T, C):
+def _uncoupled(T: np.ndarray, C) -> np.ndarray:
     """T^T C T, or its diagonal, if all the rest is rounding."""
     C = C if is_sparse(C) else np.asarray(C)
     D = _project(T, C)
@@ -233,12 +235,12 @@ def _uncoupled(T, C):
     return np.array(d) if np.all(rest <= np.maximum(UNCOUPLED * np.max(np.abs(d), initial=0), rounding)) else D
 
 
-def _eps(*matrices):
+def _eps(*matrices: Real) -> float:
     """The coarsest of their roundings."""
     return max(float(np.finfo(np.result_type(getattr(A, "dtype", float), np.float32)).eps) for A in matrices)
 
 
-def _rows(name, A):
+def _rows(name: str, A: Real) -> int:
     """Number of rows of a matrix that is known, and square."""
     if not is_concrete(A):
         raise TypeError(f"modes: `{name}` must be known: call it outside jit, vmap and grad.")
@@ -249,12 +251,12 @@ def _rows(name, A):
     return A.shape[0]
 
 
-def _require_symmetric(K, difference):
+def _require_symmetric(K, difference: Real):
     if difference > SYMMETRIC * abs(K).max():
         raise ValueError("modes: `K` must be symmetric; received one that differs from its transpose.")
 
 
-def _by_numpy(M, K, count):
+def _by_numpy(M, K: Real, count: int):
     """Squares of the frequencies, shapes, and the size of the largest square, by Cholesky's factor of M."""
     M, K = (np.asarray(constant_matrix("modes", name, A)) for name, A in (("M", M), ("K", K)))
     require_mass("modes", "M", M)

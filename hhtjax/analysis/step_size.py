@@ -1,5 +1,7 @@
 """The step size that a system needs: its modes, and what a stepper makes of them."""
 
+from __future__ import annotations
+
 from functools import partial
 from typing import NamedTuple
 
@@ -10,13 +12,13 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis.amplification import damping_ratio, eigenvalues, period_elongation
 from hhtjax.checks import require_number
-from hhtjax.description import freeze
-from hhtjax.steppers.stepper import begun, require_capable, require_stepper
+from hhtjax.description import Array, PyTree, Real, freeze
+from hhtjax.steppers.stepper import Stepper, begun, require_capable, require_stepper
 from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.linear_system import require_dense
-from hhtjax.systems.system import LinearSystem, System, require_masses
+from hhtjax.systems.system import AnySystem, LinearSystem, System, require_masses
 
 # of suggest_step_size
 GRID = np.geomspace(1e-5, 1e6, 600)  # |lambda| h
@@ -57,7 +59,7 @@ class StepSize(NamedTuple):
     reason: str
     modes: tuple[Mode, ...]
 
-    def __str__(self):
+    def __str__(self) -> str:
         rows = [["rad/s", "damping ratio", "largest dt", "w h", "its damping ratio", "its period", ""]]
         for mode in self.modes:
             swings = mode.period_elongation == mode.period_elongation  # no NaN
@@ -78,7 +80,17 @@ class StepSize(NamedTuple):
 
 
 def suggest_step_size(
-    system, stepper, q0, v0, params=None, *, z0=None, tolerance=1e-2, highest=None, duration=None, t0=0.0
+    system: AnySystem,
+    stepper: Stepper,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree = None,
+    *,
+    z0: PyTree = None,
+    tolerance: Real = 1e-2,
+    highest: Real = None,
+    duration: Real = None,
+    t0: Real = 0.0,
 ) -> StepSize:
     """A step size that resolves the modes of the system linearised at a state, with what each mode then suffers.
 
@@ -170,7 +182,7 @@ def suggest_step_size(
     return StepSize(dt, reason, tuple(modes))
 
 
-def _modal_step(rates, resolved, stable, tolerance, highest, linear):
+def _modal_step(rates, resolved: np.ndarray, stable: np.ndarray, tolerance: Real, highest: Real, linear: bool):
     """The largest step that resolves the chosen modes and keeps all from growing, and why it is no larger."""
     caller, size = "suggest_step_size", abs(rates)
     if not len(rates):
@@ -193,12 +205,12 @@ def _modal_step(rates, resolved, stable, tolerance, highest, linear):
 
 
 @jax.jit
-def _linearize(system, q0, v0, params, t0, z0):
+def _linearize(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array, z0: PyTree):
     """Derivatives of w in displacement and velocity, (N, N), and B, (m, N), internal states among the velocities."""
     flat, q, v = flatten("suggest_step_size", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
 
-    def acceleration(x, v):
+    def acceleration(x: Array, v: Array) -> Array:
         at = flat.move(q, x), v, t, params
         return acceleration_and_multipliers(flat, *at)[0] if flat.num_constraints else flat.acceleration(*at)
 
@@ -206,7 +218,7 @@ def _linearize(system, q0, v0, params, t0, z0):
     return *jax.jacfwd(acceleration, argnums=(0, 1))(jnp.zeros_like(v), v), B
 
 
-def _rates(w_x, w_v, B):
+def _rates(w_x: np.ndarray, w_v: np.ndarray, B: np.ndarray) -> np.ndarray:
     """lambda of the motions that satisfy B x = 0, one of each conjugate pair, slowest first; without rigid motions."""
     N = np.linalg.svd(B)[2][len(B) :].T if len(B) else np.eye(len(w_x))
     zero = np.zeros((N.shape[1], N.shape[1]))
@@ -218,7 +230,7 @@ def _rates(w_x, w_v, B):
     return rates[np.argsort(abs(rates))]
 
 
-def _errors(stepper, direction):
+def _errors(stepper: Stepper, direction: Real):
     """|log(mu)/(lambda h) - 1| and the spectral radius for lambda of unit modulus on GRID: (grid,) each."""
     lambda_h, followed = direction * GRID, GRID <= NYQUIST
     c, k = (-2 * lambda_h.real, GRID**2) if direction.imag else (-lambda_h.real, 0 * GRID)
@@ -229,7 +241,7 @@ def _errors(stepper, direction):
     return np.where(followed, error, np.inf), abs(roots).max(axis=-1)
 
 
-def _reach(bad):
+def _reach(bad: np.ndarray) -> Real:
     """The last of GRID before the first bad one; 0 if that is the first, inf if none is."""
     first = bad.argmax()
     return np.inf if not bad.any() else GRID[first - 1] if first else 0.0
@@ -243,7 +255,17 @@ SAMPLES = 64  # times at which runs are compared; a power of two, so that the co
 FEWEST, ENOUGH, MOST = 8, 1024, 2**20  # steps of the first run, and at least and at most of the last
 
 
-def step_size_by_runs(system, stepper, q0, v0, params, z0, t0, duration, tolerance):
+def step_size_by_runs(
+    system: AnySystem,
+    stepper: Stepper,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree,
+    z0: PyTree,
+    t0: Real,
+    duration: Real,
+    tolerance: Real,
+):
     """The largest step from which on the error of q stays within the tolerance, and the steps of the finest run.
 
     The error is the RMS of q less that of the finest run, relative to the motion about its mean. Halving ends when two
@@ -274,7 +296,7 @@ def step_size_by_runs(system, stepper, q0, v0, params, z0, t0, duration, toleran
     return float(dt), counts[-1]
 
 
-def _errors_of_runs(counts, paths, order):
+def _errors_of_runs(counts: list, paths: list, order: int) -> np.ndarray:
     """Of all runs but the finest, which has an error of its own, by Richardson's extrapolation."""
     finest = paths[-1]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -288,17 +310,27 @@ def _errors_of_runs(counts, paths, order):
     return np.nan_to_num(np.array(errors), nan=np.inf)
 
 
-def _rms(x):
+def _rms(x: np.ndarray) -> Real:
     return np.sqrt(np.mean(x**2))
 
 
 @jax.jit
-def _samples(system, stepper, q0, v0, params, z0, t0, duration, num_steps):
+def _samples(
+    system: System,
+    stepper: Stepper,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree,
+    z0: PyTree,
+    t0: Array,
+    duration: Array,
+    num_steps: Array,
+) -> Array:
     """q at SAMPLES times, or, of fewer steps, after each; compiled once for all numbers of steps."""
     dt = duration / num_steps
     between = jnp.maximum(1, num_steps // SAMPLES)
 
-    def step(i, carry):
+    def step(i: Array, carry: tuple):
         state, path = carry
         state, _ = stepper.step(system, state, params, dt)
         return state, path.at[i // between].set(ravel_pytree(state.q)[0])  # the last to write is the one on time

@@ -3,6 +3,8 @@
 Nothing here computes with JAX: a result may hold tracers, or be shown while something else is being traced.
 """
 
+from __future__ import annotations
+
 import html
 import sys
 from typing import Any, NamedTuple, TypeVar
@@ -10,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import PyTree, is_array, is_concrete, is_real
 
 Kind = TypeVar("Kind", bound=type)
 MOST = 16  # rows of a table, or entries of a container
@@ -46,14 +48,14 @@ def shown(cls: Kind) -> Kind:
     return cls
 
 
-def line(x):
+def line(x) -> str:
     """A named tuple in one line."""
     told = [x._verdict()] if hasattr(x, "_verdict") else []
     told += [f"{name}={brief(y)}" for name, y in zip(x._fields, x, strict=True) if y is not None]
     return f"{type(x).__name__}({_some(filter(None, told))})"
 
 
-def brief(x):
+def brief(x: PyTree) -> str:
     """A few characters: a number as it is, an array as float64[3,2], a container by what it holds."""
     value = known(x)
     if value is not None and not value.ndim:
@@ -72,12 +74,12 @@ def brief(x):
     return repr(x) if x is None or isinstance(x, str | bool) else f"<{getattr(x, '__name__', type(x).__name__)}>"
 
 
-def _some(entries):
+def _some(entries) -> str:
     entries = list(entries)
     return ", ".join([*entries[:MOST], *([f"and {len(entries) - MOST} more"] if len(entries) > MOST else [])])
 
 
-def known(x) -> Any:
+def known(x: PyTree) -> Any:
     """The numbers of an array, or a number, as NumPy's; None where they cannot be had: of a tracer, or elsewhere."""
     if isinstance(x, bool):
         return np.asarray(x)
@@ -88,13 +90,13 @@ def known(x) -> Any:
     return np.asarray(x)
 
 
-def all_known(tree) -> list:
+def all_known(tree: PyTree) -> list:
     """`known` of each leaf; none of them where one is not."""
     numbers = [known(x) for x in jax.tree.leaves(tree)]
     return [] if any(x is None for x in numbers) else numbers
 
 
-def leaf_rows(**trees):
+def leaf_rows(**trees: PyTree):
     """Name, shape and dtype of each array in pytrees, as rows of a table; trees that are None do not occur."""
     rows = []
     for name, tree in trees.items():
@@ -105,19 +107,19 @@ def leaf_rows(**trees):
     return rows
 
 
-def between(x, unit="", digits=6):
+def between(x: np.ndarray, unit: str = "", digits: int = 6) -> str:
     """The range of known numbers, in words."""
     least, most = (f"{end:.{digits}g}" for end in (np.min(x), np.max(x)))
     return (least if least == most else f"{least} ... {most}") + (f" {unit}" if unit else "")
 
 
-def _shortened(table):
+def _shortened(table: Table):
     """At most `MOST` rows, and what is left out."""
     left = len(table.rows) - 1 - MOST
     return table.rows[: MOST + 1], f"and {left} more" if left > 0 else ""
 
 
-def as_text(table):
+def as_text(table: Table) -> str:
     """Title and columns."""
     rows, more = _shortened(table)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -125,17 +127,17 @@ def as_text(table):
     return "\n".join([table.title, *lines, *(["    " + more] if more else [])])
 
 
-def as_html(table):
+def as_html(table: Table) -> str:
     """The same as HTML, in the colours around it."""
     rows, more = _shortened(table)
 
-    def line(kind, cells):
+    def line(kind: str, cells: list) -> str:
         return "<tr>" + "".join(f'<{kind} style="{LINE}">{html.escape(x)}</{kind}>' for x in cells) + "</tr>"
 
     body = "".join([line("th", rows[0]), *(line("td", row) for row in rows[1:])])
     return f"<div>{html.escape(table.title)}</div><table>{body}</table><div>{more}</div>"
 
 
-def overwrite(line, last):
+def overwrite(line: str, last: bool):
     """A line on stderr that takes the place of the one before, in a terminal as in a notebook; the last one stays."""
     print(f"\r{line:<79}", end="\n" if last else "", file=sys.stderr, flush=True)

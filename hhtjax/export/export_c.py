@@ -1,14 +1,18 @@
 """A system, a stepper and parameters as one file of C99, and its header."""
 
+from __future__ import annotations
+
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.description import PyTree
 from hhtjax.export import files
 from hhtjax.export.model import (
     Given,
@@ -24,6 +28,12 @@ from hhtjax.export.model import (
 )
 from hhtjax.export.statements import NotWritten, Statements
 from hhtjax.jaxpr import Listing, NotListed, listed
+from hhtjax.steppers.stepper import Stepper
+from hhtjax.systems.system import AnySystem
+
+if TYPE_CHECKING:
+    from hhtjax.export.files import Body
+    from hhtjax.steppers.stepper import State, Stepper
 
 
 @dataclass(frozen=True)
@@ -64,8 +74,8 @@ class ExportedC:
 
 
 def export_c(
-    system: Any, stepper: Any, q0: Any, v0: Any = None, params: Any = None, *,
-    z0: Any = None, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
+    system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree = None, params: PyTree = None, *,
+    z0: PyTree = None, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
 ) -> ExportedC:  # fmt: skip
     """The step of a system as C99 without dependencies: for hard real time, where Python cannot go.
 
@@ -120,7 +130,18 @@ def export_c(
     return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities, units)
 
 
-def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities, units):
+def exported(
+    caller: str,
+    system: AnySystem,
+    stepper: Stepper,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree,
+    z0: PyTree,
+    name: str,
+    sensitivities: tuple,
+    units: dict | None,
+) -> ExportedC:
     """`export_c`, under the name of its caller."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(f"{caller}: `name` must be one that C allows, such as 'pendulum'; received {name!r}.")
@@ -153,7 +174,7 @@ def exported(caller, system, stepper, q0, v0, params, z0, name, sensitivities, u
     )  # fmt: skip
 
 
-def _rows(caller, numbers, sensitivities):
+def _rows(caller: str, numbers: Numbers, sensitivities: tuple):
     """(leaf, number in it) of each sensitivity, and the names of their numbers."""
     known = {field.name: i for i, field in enumerate(numbers.fields)}
     names = [sensitivities] if isinstance(sensitivities, str) else list(sensitivities)
@@ -170,7 +191,7 @@ def _rows(caller, numbers, sensitivities):
 class _Code:
     """The bodies of both functions."""
 
-    def __init__(self, name, made: Given, numbers: Numbers, layout: Layout, rows, names, state):
+    def __init__(self, name: str, made: Given, numbers: Numbers, layout: Layout, rows: list, names: list, state: State):
         self.name, self.made, self.numbers, self.layout = name, made, numbers, layout
         self.rows, self.names = rows, names
         self.floating = [jnp.issubdtype(x.dtype, jnp.floating) for x in jax.tree.leaves(state)]
@@ -186,14 +207,14 @@ class _Code:
         self.fields = own + [field for rows in self.derivatives for row in rows for field in row]
         self.counts, self.factors = (0, 0), None
 
-    def begin(self, f, args):
+    def begin(self, f: Callable, args: tuple) -> Body:
         """Of NAME_init."""
         starts = [f"{key}[{i}]" for key, x in sorted(self.made.starts.items()) for i in range(_count(x))]
         if self.rows:
             f, args = with_derivatives(f, self.rows), ([], *args)
         return self._text(f, args, [*starts, *self._values(), *self._inputs("u"), "t0", "dt"])
 
-    def step(self, f, args):
+    def step(self, f: Callable, args: tuple) -> Body:
         """Of NAME_step."""
         state = ["s->t"]
         for leaf, floats in list(zip(self.layout.places("s->"), self.floating, strict=True))[1:]:
@@ -209,17 +230,17 @@ class _Code:
     def _values(self):
         return [place for field in self.numbers.fields for place in field.places("p->")]
 
-    def _inputs(self, where):
+    def _inputs(self, where: str):
         return [f"{where}[{i}]" for i in range(sum(field.size for field in self.numbers.inputs))]
 
     def _derivative_places(self):
         return [place for rows in self.derivatives for row in rows for field in row for place in field.places("s->")]
 
-    def _text(self, f, args, names, kept=False):
+    def _text(self, f: Callable, args: tuple, names: list, kept: bool = False) -> Body:
         """Statements that read arguments, compute, and write the state and the flags. kept: what follows from params
         and dt alone, at some cost, is in the state."""
 
-        def numbers_of(*args):
+        def numbers_of(*args: PyTree):
             state, *change, flags = f(*args)
             return [*jax.tree.leaves(state)[1:], *change], flags
 
@@ -240,7 +261,7 @@ class _Code:
             text.line(f"{place} = {text.text(value)};")
         return files.Body(text.lines, text.text(flags.item()), reads, text.helpers)
 
-    def _begun(self, listing, places):
+    def _begun(self, listing, places: dict):
         """All operations, behind constants for what they read; and the places of that."""
         text = Statements({}, self.name, (np.dtype(self.made.dtype), f"{self.name}_real"))
         found = {scalar: place for scalar, place in places.items() if scalar in files.used(listing)}
@@ -251,7 +272,7 @@ class _Code:
         text.write(listing.operations)
         return text, set(found.values())
 
-    def _factors(self, factors, operations, places):
+    def _factors(self, factors: list, operations: list, places: dict):
         """What makes them, or None without."""
         if not factors:
             return None
@@ -261,9 +282,9 @@ class _Code:
         return files.Factors(text.lines, sorted(reads), [(text.type(x.dtype), x.size) for x in factors], text.helpers)
 
 
-def _numbers(values):
+def _numbers(values: list):
     return tuple(float(x) for value in values for x in np.ravel(value))
 
 
-def _count(tree):
+def _count(tree: PyTree) -> int:
     return sum(np.size(x) for x in jax.tree.leaves(tree))

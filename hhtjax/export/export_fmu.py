@@ -13,18 +13,19 @@ from dataclasses import field as entry
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import jax
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.description import VERSION
+from hhtjax.description import VERSION, PyTree, Real
 from hhtjax.export.export_c import ExportedC, exported
 from hhtjax.export.fmi3 import wrapper
 from hhtjax.export.model import distinct, fields
 from hhtjax.export.statements import number
+from hhtjax.steppers.stepper import Stepper
+from hhtjax.systems.system import AnySystem
 
 FLAGS = "-std=c99", "-O3", "-fPIC", "-shared", "-fvisibility=hidden"
 EPOCH = 1980, 1, 1, 0, 0, 0  # of every file in the archive, so that the same model is the same archive
@@ -114,8 +115,8 @@ def _binary(name, files):
 
 
 def export_fmu(
-    system: Any, stepper: Any, q0: Any, v0: Any = None, params: Any = None, *,
-    z0: Any = None, dt: Any, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
+    system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree = None, params: PyTree = None, *,
+    z0: PyTree = None, dt: Real, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
 ) -> ExportedFMU:  # fmt: skip
     """A system as a functional mock-up unit (FMI 3.0, Co-Simulation), for Simulink, OpenModelica, Dymola and others.
 

@@ -1,14 +1,19 @@
 """The text of the two files."""
 
+from __future__ import annotations
+
 import re
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hhtjax.description import VERSION
+from hhtjax.description import VERSION, PyTree
 from hhtjax.export.model import FLAGS, Field, Given, Numbers
 from hhtjax.export.statements import TYPES, helper, number
 from hhtjax.jaxpr import Listing, Scalar
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import Stepper
 
 TAKEN = "fmi3", "math", "stdbool", "stddef", "stdint", "stdlib", "string"  # .h or .c
 
@@ -133,7 +138,7 @@ class Parts(NamedTuple):
 
     name: str
     made: Given
-    stepper: Any
+    stepper: Stepper
     fields: list[Field]
     numbers: Numbers
     units: dict
@@ -156,11 +161,11 @@ def used(listing: Listing):
     return found
 
 
-def _arrays(tree):
+def _arrays(tree: PyTree):
     return [tree] if isinstance(tree, np.ndarray) else [x for y in tree for x in _arrays(y)]
 
 
-def local(place, name):
+def local(place: str, name: str) -> str:
     """The name of a constant for a member of a struct or an element of an array, unlike those of a model `name`.
 
     >>> [local(place, "p") for place in ("p->k", "s->q[3]", "p->k[3]", "u[0]", "(int32_t)s->sign", "dt")]
@@ -171,7 +176,7 @@ def local(place, name):
     return f"{text}_" if text.startswith(f"{name}_") else text
 
 
-def header(parts: Parts):
+def header(parts: Parts) -> str:
     """Of name.h."""
     name, real = parts.name, f"{parts.name}_real"
     operations, functions = parts.counts
@@ -197,11 +202,11 @@ def header(parts: Parts):
     )  # fmt: skip
 
 
-def _input(field, unit):
+def _input(field: Field, unit) -> str:
     return f"{field.name}{f'[{field.size}]' * bool(field.shape)}{f' ({unit})' if unit else ''}"
 
 
-def source(parts: Parts):
+def source(parts: Parts) -> str:
     """Of name.c."""
     begin, body = parts.texts
     num_inputs = sum(field.size for field in parts.numbers.inputs)
@@ -221,7 +226,7 @@ def source(parts: Parts):
     )  # fmt: skip
 
 
-def _factorize(parts):
+def _factorize(parts: Parts):
     """The function, and whether it is to be called again."""
     factors, name = parts.factors, parts.name
     if factors is None:
@@ -233,7 +238,7 @@ def _factorize(parts):
     return text, " || ".join(f"{kept} != {place}" for kept, place in of)
 
 
-def _signatures(parts, restrict):
+def _signatures(parts: Parts, restrict: str):
     name = parts.name
     const = f"const {name}_real *{restrict}"
     both = [f"{name}_state *{restrict}s", f"const {name}_params *{restrict}p"]
@@ -243,13 +248,13 @@ def _signatures(parts, restrict):
     return {"init": ", ".join(init), "step": ", ".join([*both, f"{const}u", f"{name}_real dt"])}
 
 
-def _unused(text, arguments):
+def _unused(text: Body, arguments: list) -> str:
     """Statements that keep compilers quiet."""
     read = {re.split(r"\W", place)[0] for place in text.reads}
     return "".join(f"    (void){name};\n" for name in arguments if name not in read)
 
 
-def _values(parts):
+def _values(parts: Parts) -> str:
     """Of the params."""
     lines = []
     for field, value in zip(parts.numbers.fields, parts.numbers.values, strict=True):
@@ -259,5 +264,5 @@ def _values(parts):
     return "\n".join(lines or ["    0,"])
 
 
-def _comment(x):
+def _comment(x: Stepper) -> str:
     return " ".join(repr(x).replace("*/", "* /").split())

@@ -1,15 +1,18 @@
 """A system and a stepper as two functions of flat lists of numbers: to begin, and to step; with derivatives or not."""
 
+from __future__ import annotations
+
 import itertools
 import re
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_params
-from hhtjax.description import all_concrete, thaw
+from hhtjax.description import Array, PyTree, all_concrete, thaw
 from hhtjax.primitives import structural
 from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import INTERNAL, behind_jump, entered, require_capable, require_stepper, require_system
@@ -17,7 +20,11 @@ from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, with_known_rows
 from hhtjax.systems.linear_system import require_dense
 from hhtjax.systems.sampled import Sampled
-from hhtjax.systems.system import FirstOrderSystem
+from hhtjax.systems.system import AnySystem, FirstOrderSystem
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import Info, State, Stepper
+    from hhtjax.systems.flat_system import FlatSystem
 
 # ----------------------------------------------------------------------------
 # Names in C for the leaves of a pytree: q["arm"]["angle"] is q_arm_angle, an array of numbers if it has a shape.
@@ -47,15 +54,15 @@ class Field(NamedTuple):
     shape: tuple
 
     @property
-    def size(self):
+    def size(self) -> int:
         """How many numbers it holds."""
         return int(np.prod(self.shape, dtype=int))
 
-    def places(self, struct):
+    def places(self, struct: str):
         """C for each of them, given that of the struct with its dot or arrow."""
         return [f"{struct}{self.name}" if self.shape == () else f"{struct}{self.name}[{i}]" for i in range(self.size)]
 
-    def declaration(self, real, unit=None):
+    def declaration(self, real: str, unit=None) -> str:
         """In the struct, with its unit, and its shape where it has more than one axis."""
         size = f"[{self.size}]" if self.shape else ""
         shape = f"{' x '.join(map(str, self.shape))}, row by row" if len(self.shape) > 1 else None
@@ -63,7 +70,7 @@ class Field(NamedTuple):
         return f"    {real} {self.name}{size};{f' /* {told} */' if told else ''}"
 
 
-def fields(tree, prefix, alone):
+def fields(tree: PyTree, prefix: str, alone: str):
     """A field for each leaf of a pytree. alone: the name of one that has no path."""
     return [
         Field(identifier([prefix, *map(_word, path)]) if path or prefix else alone, np.shape(leaf))
@@ -71,14 +78,14 @@ def fields(tree, prefix, alone):
     ]
 
 
-def identifier(words):
+def identifier(words: list) -> str:
     """Words, joined, as a name that C allows."""
     text = re.sub(r"\W", "_", "_".join(filter(None, words)), flags=re.ASCII)
     text = text if re.match(r"[A-Za-z]|_(?![A-Z_])", text) else f"p{text}"  # __LINE__ and _Bool are the compiler's
     return f"{text}_" if text in RESERVED else text
 
 
-def units_of(caller, units, found):
+def units_of(caller: str, units: dict | None, found: list):
     """{name of a field: its unit}, from those of fields, or of all whose names begin with such a word."""
     units = {} if units is None else units
     if not isinstance(units, dict) or not all(isinstance(x, str) for pair in units.items() for x in pair):
@@ -98,7 +105,7 @@ def units_of(caller, units, found):
     return told
 
 
-def distinct(found, taken=()):
+def distinct(found: list, taken: Sequence = ()):
     """The fields, each with a name of its own: one that an earlier field has, or that is taken, gets a number."""
     own, given, result = {field.name for field in found}, set(taken), []
     for field in found:
@@ -109,7 +116,7 @@ def distinct(found, taken=()):
     return result
 
 
-def _word(key):
+def _word(key) -> str:
     return str(next(getattr(key, name) for name in ("key", "idx", "name") if hasattr(key, name)))
 
 
@@ -129,18 +136,20 @@ class Given(NamedTuple):
 
     caller: str
     system: Any
-    stepper: Any
+    stepper: Stepper
     starts: dict
-    params: Any  # without functions that JAX would not take
-    dtype: Any
+    params: PyTree  # without functions that JAX would not take
+    dtype: np.dtype
 
-    def flat(self, t0, params):
+    def flat(self, t0: Array, params: PyTree) -> FlatSystem:
         """The system on vectors."""
         q0, v0, z0 = (self.starts.get(name) for name in ("q0", "v0", "z0"))
         return flatten(self.caller, self.system, q0, v0, t0, params, z0)[0]
 
 
-def given(caller, system, stepper, q0, v0, params, z0):
+def given(
+    caller: str, system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree, params: PyTree, z0: PyTree
+) -> Given:
     """The arguments of an export, checked."""
     require_system(caller, system)
     require_stepper(caller, stepper)
@@ -162,7 +171,7 @@ class Numbers:
     Every `sampled` is an input, held over each step. Integers and booleans stay what they are.
     """
 
-    def __init__(self, params, dtype):
+    def __init__(self, params: PyTree, dtype: np.dtype):
         self.leaves, self.structure = jax.tree.flatten(params, is_leaf=_is_input)
         self.places = [i for i, x in enumerate(self.leaves) if not _is_input(x) and _is_floating(x) and np.size(x)]
         self.input_places = [i for i, x in enumerate(self.leaves) if _is_input(x)]
@@ -174,10 +183,10 @@ class Numbers:
         self.inputs = distinct(fields(self._with(with_shapes | rest), "", "u"))
         self.dtype = dtype
 
-    def _with(self, changes):
+    def _with(self, changes: dict):
         return self.structure.unflatten([changes.get(i, x) for i, x in enumerate(self.leaves)])
 
-    def params(self, values, u):
+    def params(self, values: list, u: list):
         """The params with other numbers, and inputs of the values u, one array for each."""
         constant = [self.leaves[i].constant(x) for i, x in zip(self.input_places, u, strict=True)]
         changes = dict(zip([*self.places, *self.input_places], [*values, *constant], strict=True))
@@ -188,7 +197,7 @@ class Numbers:
         return [self.leaves[i].polynomials[0, 0] for i in self.input_places]
 
 
-def _is_input(x):
+def _is_input(x: PyTree) -> bool:
     return isinstance(x, Sampled)
 
 
@@ -199,7 +208,7 @@ def _is_floating(x):
 def begin(made: Given, numbers: Numbers):
     """The function (starts, values, u, t0, dt) -> (state on vectors, flags); the time of the state is for others."""
 
-    def f(starts, values, u, t0, dt):
+    def f(starts: dict, values: list, u: list, t0: Array, dt: Array):
         params = numbers.params(values, u)
         q0, v0, z0 = (starts.get(name) for name in ("q0", "v0", "z0"))
         flat, q, v = flatten(made.caller, made.system, q0, v0, t0, params, z0)
@@ -212,7 +221,7 @@ def begin(made: Given, numbers: Numbers):
 def step(made: Given, numbers: Numbers):
     """The function (state, values, u of the step before, u, dt) -> (state, flags)."""
 
-    def f(state, values, before, u, dt):
+    def f(state: State, values: list, before: list, u: list, dt: Array):
         old, now = numbers.params(values, before), numbers.params(values, u)
         flat, stepper = made.flat(state.t, now), made.stepper.astype(made.dtype)
         if numbers.inputs:
@@ -223,7 +232,7 @@ def step(made: Given, numbers: Numbers):
     return f
 
 
-def _flags(state, info):
+def _flags(state: State, info: Info | None) -> Array:
     """FLAGS as an integer."""
     found = [~jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in _floats(state)]))]
     converged, row, solved, friction = (None,) * 4
@@ -236,22 +245,22 @@ def _flags(state, info):
     return sum(bits[1:], bits[0])
 
 
-def _floats(tree):
+def _floats(tree: PyTree):
     return [x for x in jax.tree.leaves(tree) if _is_floating(x)]
 
 
-def with_derivatives(f, rows):
+def with_derivatives(f: Callable, rows: list):
     """The same function with derivatives in the numbers of the params that `rows` names: (leaf, number in it).
 
     A first argument before the others: for each floating leaf of a state that is the first of the others, but its time,
     the derivatives (rows, ...); else none. Results: state, derivatives, flags.
     """
 
-    def g(tangents, first, values, *rest):
+    def g(tangents: list, first: PyTree, values: list, *rest: PyTree):
         moves = bool(tangents)
 
-        def along(tangent, units):
-            def moved(leaves, values):
+        def along(tangent: list, units: list):
+            def moved(leaves: list, values: list):
                 state, flags = f(_replaced(first, leaves) if moves else first, values, *rest)
                 return _floats(state)[1:], (state, flags)
 
@@ -268,7 +277,7 @@ def with_derivatives(f, rows):
     return g
 
 
-def _units(value, places):
+def _units(value: Array, places: list) -> Array:
     """For each place the unit vector in the shape of a value, or zeros."""
     found = np.zeros((len(places), np.size(value)), jnp.result_type(value))
     for row, place in zip(found, places, strict=True):
@@ -276,7 +285,7 @@ def _units(value, places):
     return structural(found.reshape(-1, *np.shape(value)))
 
 
-def _replaced(tree, floats):
+def _replaced(tree: PyTree, floats) -> State:
     floats, (leaves, structure) = iter(floats), jax.tree.flatten(tree)
     return structure.unflatten([next(floats) if _is_floating(x) else x for x in leaves])
 
@@ -288,7 +297,7 @@ class Layout(NamedTuple):
     leaves: list
 
     @classmethod
-    def of(cls, made: Given, state):
+    def of(cls, made: Given, state: State) -> Layout:
         """state: on vectors, or its shapes."""
         first_order = isinstance(made.system, FirstOrderSystem)
         trees = dict(made.starts)
@@ -309,11 +318,11 @@ class Layout(NamedTuple):
         own = iter(found)
         return cls(found, [[next(own) for _ in leaf] for leaf in leaves])
 
-    def places(self, struct):
+    def places(self, struct: str):
         """C for every number of the state, leaf by leaf."""
         return [[place for field in leaf for place in field.places(struct)] for leaf in self.leaves]
 
 
-def derivative_field(field: Field, name):
+def derivative_field(field: Field, name: str) -> Field:
     """Of the derivative of a field with respect to a number of the params."""
     return Field(f"d{field.name}_d{name}", field.shape)

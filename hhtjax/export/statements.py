@@ -1,10 +1,13 @@
 """A list of operations as statements of C99: a constant for each result, braces for branches and loops."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 
 import numpy as np
 
+from hhtjax.description import PyTree, Real
 from hhtjax.jaxpr import Scalar
 
 HELPED = {"max": "max", "min": "min", "clamp": ("max", "min"), "sign": "sign"}
@@ -16,32 +19,32 @@ class Statements:
     prefix: of their names; real: (dtype, name) of the type of the state.
     """
 
-    def __init__(self, names, prefix, real):
+    def __init__(self, names: dict, prefix: str, real: tuple):
         self.names, self.prefix, self.real = dict(names), prefix, real
         self.helpers, self.lines, self.depth = set(), [], 1
 
-    def write(self, operations):
+    def write(self, operations: list):
         """All of them, at the end of `lines`."""
         for x in operations:
             getattr(self, f"_{x.name}", self._plain)(x)
 
-    def text(self, operand):
+    def text(self, operand) -> str:
         """The name of a scalar, or a number."""
         return self.names[operand] if isinstance(operand, Scalar) else number(operand)
 
-    def type(self, dtype):
+    def type(self, dtype: np.dtype):
         """Of C."""
         return self.real[1] if dtype == self.real[0] else TYPES[np.dtype(dtype)]
 
-    def line(self, text):
+    def line(self, text: str):
         """One more."""
         self.lines.append("    " * self.depth + text)
 
-    def _name(self, scalar):
+    def _name(self, scalar) -> str:
         self.names[scalar] = f"{'a' if scalar.size else 'x'}{len(self.names)}"
         return self.names[scalar]
 
-    def _helper(self, name, dtype):
+    def _helper(self, name: str, dtype: np.dtype) -> str:
         self.helpers.add((name, np.dtype(dtype)))
         return f"{self.prefix}_{name}{'f' * (np.dtype(dtype) == np.float32)}"
 
@@ -162,7 +165,7 @@ class Statements:
         self._inside(body, x.results)
         self.line("}")
 
-    def _inside(self, block, targets):
+    def _inside(self, block, targets: list):
         """A block, whose results are then given to variables; first read, if they are such variables themselves."""
         self.depth += 1
         self.write(block.operations)
@@ -202,7 +205,7 @@ CALLS = {  # functions of <math.h>
 }
 
 
-def number(x):
+def number(x: Real) -> str:
     """A known number."""
     dtype = np.dtype(x.dtype)
     if dtype.kind == "b":
@@ -218,7 +221,7 @@ def number(x):
     return f"({text})" if text.startswith("-") else text
 
 
-def expression(operation, x, prefix):
+def expression(operation, x: list, prefix: str):
     """One operation. x: its operands as text; prefix: of the names of the helper functions."""
     name, dtype = operation.name, np.dtype(operation.results[0].dtype)
     kind = np.dtype(operation.operands[-1].dtype)
@@ -231,7 +234,7 @@ def expression(operation, x, prefix):
     return None if found is None else found(x, kind, dtype, suffix, prefix, operation.params)
 
 
-def _converted(x, kind, dtype, suffix, prefix, params):
+def _converted(x: list, kind: np.dtype, dtype: np.dtype, suffix: str, prefix: str, params: PyTree) -> str:
     if dtype.kind == "b":
         return f"{x[0]} != 0"
     if kind.kind == "f" and dtype.kind in "iu":
@@ -239,13 +242,13 @@ def _converted(x, kind, dtype, suffix, prefix, params):
     return f"({TYPES[dtype]}){x[0]}"
 
 
-def _bound(dtype, which):
+def _bound(dtype: np.dtype, which: str) -> str:
     """The outermost number of an integer type that a double holds."""
     limit = getattr(np.iinfo(dtype), which)
     return repr(float(limit) if float(limit) <= limit else float(np.nextafter(float(limit), 0)))
 
 
-def _selected(x, kind, dtype, suffix, prefix, params):
+def _selected(x: list, kind: np.dtype, dtype: np.dtype, suffix: str, prefix: str, params: PyTree) -> str:
     which, *cases = x
     if len(cases) == 2:
         return f"{which} ? {cases[1]} : {cases[0]}"
@@ -454,7 +457,7 @@ static void #_svd(const int n, const @ *const a, @ *const s, @ *const u, @ *cons
 }
 
 
-def helper(name, prefix, dtype):
+def helper(name: str, prefix: str, dtype) -> str:
     """The text of a helper function; lower-case f behind the names of those in single precision."""
     suffix = "f" if np.dtype(dtype) == np.float32 else ""
     text = HELPERS[name].replace("~", suffix).replace("@", TYPES[np.dtype(dtype)])

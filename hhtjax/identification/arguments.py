@@ -1,6 +1,9 @@
 """What `fit` is given, checked and brought into one form."""
 
+from __future__ import annotations
+
 import sys
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -9,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_function, require_integer
-from hhtjax.description import as_float, freeze, is_array, is_concrete, is_real
+from hhtjax.description import Array, PyTree, Real, as_float, freeze, is_array, is_concrete, is_real
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
 
@@ -56,13 +59,23 @@ def for_many():
     return optax.lbfgs()
 
 
-def is_of_optax(optimizer):
+def is_of_optax(optimizer) -> bool:
     """Whether it is an optimiser of optax, which is imported then."""
     optax = sys.modules.get("optax")
     return optax is not None and isinstance(optimizer, optax.GradientTransformation)
 
 
-def check_options(caller, params, optimizer, transforms, loss, max_iterations, covariance, segments, progress):
+def check_options(
+    caller: str,
+    params: PyTree,
+    optimizer,
+    transforms: PyTree,
+    loss,
+    max_iterations: int | None,
+    covariance: bool,
+    segments: int,
+    progress: bool,
+) -> Options:
     """`Options` with the defaults filled in, or an error that names what is wrong."""
     if not (optimizer is None or optimizer == LEVENBERG_MARQUARDT or is_of_optax(optimizer)):
         raise TypeError(
@@ -87,7 +100,7 @@ def check_options(caller, params, optimizer, transforms, loss, max_iterations, c
     return Options(optimizer, transforms, rho, max_iterations, covariance, segments, progress)
 
 
-def check_parameters(caller, params0, name="params0"):
+def check_parameters(caller: str, params0: PyTree, name: str = "params0"):
     """params0 as a pytree of float arrays, functions among them hidden."""
     given, params0 = params0, freeze(params0)
     leaves = jax.tree_util.tree_leaves_with_path(params0) or jax.tree_util.tree_leaves_with_path(given)
@@ -98,7 +111,7 @@ def check_parameters(caller, params0, name="params0"):
     return jax.tree.map(as_float, params0)
 
 
-def check_scale(caller, scale, params0):
+def check_scale(caller: str, scale, params0: PyTree):
     """The scale of each entry of params0, by default its size, or 1 where that is 0."""
     if scale is None:
         return jax.tree.map(_size, params0)
@@ -122,7 +135,7 @@ def check_scale(caller, scale, params0):
     return jax.tree.map(lambda s, x: jnp.broadcast_to(jnp.asarray(s, x.dtype), x.shape), scale, params0)
 
 
-def _size(x):
+def _size(x) -> Array:
     """|x|, and 1 where that is 0; by NumPy where it can, which has nothing to compile."""
     if not is_concrete(x):
         return jnp.where(x == 0, 1, jnp.abs(x))
@@ -130,13 +143,13 @@ def _size(x):
     return jnp.asarray(np.where(x == 0, np.ones_like(x), np.abs(x)), x.dtype)
 
 
-def check_prior(caller, prior, params0):
+def check_prior(caller: str, prior: dict, params0: PyTree):
     """Mean and standard deviation of each leaf, pytrees like params0; inf where there is no prior."""
 
-    def is_prior(x):
+    def is_prior(x: PyTree) -> bool:
         return x is None or isinstance(x, Gaussian)
 
-    def fill(entry, branch):
+    def fill(entry: Gaussian | None, branch: Array) -> Gaussian:
         entry = Gaussian(0.0, np.inf) if entry is None else entry
         entry = Gaussian(*(jnp.asarray(y) if isinstance(y, (list, tuple)) else y for y in entry))
         check_real(f"{caller}: the mean in `prior`", entry.mean)
@@ -146,7 +159,7 @@ def check_prior(caller, prior, params0):
             raise ValueError(f"{caller}: `prior` must have a positive deviation; received {entry.deviation}.")
         return jax.tree.map(lambda x: Gaussian(*(spread(y, x) for y in entry)), branch)
 
-    def spread(y, x):
+    def spread(y: Real, x: Array) -> Array:
         if jnp.shape(y) not in ((), x.shape):
             raise ValueError(
                 f"{caller}: `prior` must have the shape of its parameter, {x.shape}; received {jnp.shape(y)}."
@@ -157,7 +170,7 @@ def check_prior(caller, prior, params0):
     return jax.tree.map(fill, prior, params0, is_leaf=is_prior)
 
 
-def require_prefix(caller, name, prefix, tree, of, is_leaf=None):
+def require_prefix(caller: str, name: str, prefix: PyTree, tree: PyTree, of: str, is_leaf: Callable | None = None):
     """An error unless `prefix` has an entry for each leaf of `tree`, which is `of` something, or for whole branches."""
     entries = prefix if is_leaf is None else jax.tree.map(lambda _: 0, prefix, is_leaf=is_leaf)  # None is one, too
     try:
@@ -167,7 +180,7 @@ def require_prefix(caller, name, prefix, tree, of, is_leaf=None):
         raise ValueError(f"{caller}: `{name}` must be a prefix of {of}: {why}") from None
 
 
-def require_entries(caller, name, prefix, tree, of, is_entry, kinds):
+def require_entries(caller: str, name: str, prefix: PyTree, tree: PyTree, of: str, is_entry: Callable, kinds: str):
     """The same, and an error that names the first entry that is none."""
     for path, entry in jax.tree_util.tree_leaves_with_path(prefix, is_leaf=is_entry):
         if not is_entry(entry):
@@ -176,7 +189,7 @@ def require_entries(caller, name, prefix, tree, of, is_entry, kinds):
     require_prefix(caller, name, prefix, tree, of, is_entry)
 
 
-def check_records(caller, records, starts, prior, optimizer):
+def check_records(caller: str, records, starts, prior, optimizer: str):
     """The starts as float arrays; they and the records have one leading axis."""
     if records is None or starts is None:
         raise ValueError(
@@ -190,14 +203,14 @@ def check_records(caller, records, starts, prior, optimizer):
     return starts
 
 
-def require_leading_axis(caller, names, tree):
+def require_leading_axis(caller: str, names: str, tree: PyTree):
     """An error unless the leaves, of the arguments so named, have a leading axis of one length."""
     counts = {jnp.shape(x)[:1] for x in jax.tree.leaves(tree)}
     if len(counts) != 1 or counts == {()}:
         raise ValueError(f"{caller}: {names} must have one leading axis in all leaves; received {sorted(counts)}.")
 
 
-def check_real(where, leaf):
+def check_real(where: str, leaf: Real):
     """An error unless `leaf` is a finite real number or array."""
     text = isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biufcV"  # V: the floats of 8 and 16 bits of JAX
     if not (is_array(leaf) or isinstance(leaf, (int, float))) or isinstance(leaf, bool) or text:
@@ -208,7 +221,7 @@ def check_real(where, leaf):
         raise ValueError(f"{where} must be finite; received {leaf}.")
 
 
-def check_transforms(caller, transforms, params, name="params0"):
+def check_transforms(caller: str, transforms: PyTree, params: PyTree, name: str = "params0"):
     """The transform of each leaf of params, which have to be reachable by it."""
     transforms = _completed(caller, transforms, params, "", name)
     kinds = "hhtjax.positive, bounded(), fixed"
@@ -224,7 +237,7 @@ def check_transforms(caller, transforms, params, name="params0"):
     return transforms
 
 
-def _completed(caller, transforms, params, where, name):
+def _completed(caller: str, transforms: PyTree, params: PyTree, where: str, name: str):
     """Transforms of all keys of a dict, None for those that are not given."""
     if not (isinstance(transforms, dict) and isinstance(params, dict)):
         return transforms

@@ -13,8 +13,11 @@ All of it is for motion at the modes' own frequencies, free or near resonance. A
 W: k fitted beside a known mass is off by m W^2 (W h)^2/6 then, and no eigenvalue knows of W.
 """
 
+from __future__ import annotations
+
 import math
 import warnings
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,7 +28,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.analysis.amplification import amplification_matrix, at_rest, eigenvalues
 from hhtjax.checks import describe, require_number, require_params
-from hhtjax.description import thaw
+from hhtjax.description import Array, PyTree, Real, thaw
 from hhtjax.description.presentation import all_known, between, shown
 from hhtjax.identification.arguments import check_real, require_prefix
 from hhtjax.identification.refinement import StepSizeWarning
@@ -52,12 +55,12 @@ class ModeBias(NamedTuple):
         params: the fitted ones without the bias; None if not asked for.
     """
 
-    frequency: Any
-    damping: Any
-    wh: Any
-    stiffness_bias: Any
-    damping_bias: Any
-    params: Any = None
+    frequency: np.ndarray
+    damping: np.ndarray
+    wh: np.ndarray
+    stiffness_bias: np.ndarray
+    damping_bias: np.ndarray
+    params: PyTree = None
 
     def _verdict(self):
         """The frequencies, and the largest biases, in words."""
@@ -73,11 +76,11 @@ class ModeBias(NamedTuple):
 def step_size_bias(
     system: System | LinearSystem,
     stepper: Stepper,
-    params: Any,
-    dt: float,
-    q: Any,
-    v: Any = None,
-    t0: float = 0.0,
+    params: PyTree,
+    dt: Real,
+    q: PyTree,
+    v: PyTree = None,
+    t0: Real = 0.0,
     correct: Any = False,
 ) -> ModeBias:
     """By how much stiffness and damping are off that were fitted through steps of dt.
@@ -156,7 +159,7 @@ def step_size_bias(
             f"{np.sum(np.isnan(w))} of {len(w)} do not."
         )
 
-    def linear_part(frozen):
+    def linear_part(frozen: dict):
         return _linear_part(system, thaw(frozen), q, v, t0)
 
     target = motion(partial(_rates_of_steps, stepper, dt), *matrices, matrices[2])
@@ -165,14 +168,14 @@ def step_size_bias(
     return bias._replace(params=thaw(corrected))
 
 
-def _require_flags(correct, params):
+def _require_flags(correct: PyTree, params: PyTree):
     require_prefix("step_size_bias", "correct", correct, params, "params")
     for flag in jax.tree.leaves(correct):
         if not isinstance(flag, (bool, np.bool_)):
             raise TypeError(f"step_size_bias: `correct` must be True, False or a pytree of them; received {flag!r}.")
 
 
-def _require_point(q, v):
+def _require_point(q: Array, v):
     for name, values in (("q", q), ("v", v)):
         for path, leaf in jax.tree_util.tree_leaves_with_path(values):
             check_real(f"step_size_bias: `{name}{jax.tree_util.keystr(path)}`", leaf)
@@ -180,18 +183,18 @@ def _require_point(q, v):
         raise ValueError(f"step_size_bias: `q` must hold at least one number; received {q!r}.")
 
 
-def _is_driven(system, params, q, v, t, dt):
+def _is_driven(system, params: PyTree, q: Array, v, t: Real, dt: Real) -> bool:
     """Whether the force at a state, or the mass, depends on the time."""
     v = jax.tree.map(jnp.zeros_like, q) if v is None else v
 
-    def at(t):
+    def at(t: Array) -> Array:
         return ravel_pytree((system.force(q, v, t, params), mass_at(system, q, t, params)))[0]
 
     found = jax.vmap(at)(t + dt * jnp.arange(float(DRIVEN)))
     return bool(jnp.any(found != found[:1]))
 
 
-def _linear_part(system, params, q, v, t):
+def _linear_part(system, params: PyTree, q, v, t: Real):
     """M, C, K about a state, (n, n) each; with a constraint, of the n - m motions that it leaves."""
     given, (q, unravel) = q, ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
     M = jnp.asarray(mass_at(system, unravel(q), t, params))
@@ -199,7 +202,7 @@ def _linear_part(system, params, q, v, t):
     _require_coordinates(len(M), given, v)
     v = jnp.zeros_like(q) if v is None else ravel_pytree(v)[0]
 
-    def force(q, v):
+    def force(q: Array, v: Array) -> Array:
         return ravel_pytree(system.force(unravel(q), unravel(v), t, params))[0]
 
     K, C = (-D for D in jax.jacfwd(force, argnums=(0, 1))(q, v))
@@ -216,7 +219,7 @@ def _linear_part(system, params, q, v, t):
     return N.T @ M @ N, N.T @ C @ N, N.T @ K @ N
 
 
-def _require_coordinates(n, q, v):
+def _require_coordinates(n: int, q, v):
     """An error for rotations, and for a q or v of another size than the mass."""
     shapes = [jnp.shape(x) for x in jax.tree.leaves(q)]
     size = sum(map(math.prod, shapes))
@@ -228,14 +231,14 @@ def _require_coordinates(n, q, v):
         raise ValueError(f"step_size_bias: `v` must have the shapes of q, {describe(q)}; received {describe(v)}.")
 
 
-def _require_on_constraint(system, params, q, t):
+def _require_on_constraint(system, params: PyTree, q: Array, t: Real):
     if system.constraint is not None:
         q = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q)
         rest = jax.tree.map(jnp.zeros_like, q)
         require_consistent("step_size_bias", system, q, rest, t, params, checked=(("q", "Phi"),))
 
 
-def _rates_of_equations(M, C, K):
+def _rates_of_equations(M: Real, C: Real, K: Real) -> np.ndarray:
     """Eigenvalues s with an oscillation, one of each pair, slowest first."""
     n = len(M)
     first_order = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
@@ -244,7 +247,7 @@ def _rates_of_equations(M, C, K):
     return s[np.argsort(np.abs(s))]
 
 
-def _rates_of_steps(stepper, dt, M, C, K):
+def _rates_of_steps(stepper: Stepper, dt: Real, M: Array, C: Array, K: Array) -> np.ndarray:
     """log(mu)/dt of the steps, in the order of the equations' eigenvalues."""
     from scipy.optimize import linear_sum_assignment  # which takes as long to import as hhtjax
 
@@ -260,7 +263,7 @@ def _rates_of_steps(stepper, dt, M, C, K):
     return found
 
 
-def _as_if_alone(stepper, s):
+def _as_if_alone(stepper: Stepper, s) -> np.ndarray:
     """Of an oscillator with the eigenvalue s, and steps of 1, what the steps make of exp(s); NaN without oscillation.
 
     By these the modes of a system are told apart, whose exp(s) may be nearer to what the steps make of another.
@@ -289,11 +292,11 @@ LEAST = 0.02  # influence of a parameter on a frequency, below which it is no st
 class Motion(NamedTuple):
     """Of each mode: rates (modes,) and their changes (parts, modes) with the stiffness of a part of the coordinates."""
 
-    rates: Any
+    rates: Array
     response: Any
 
 
-def motion(rates, M, C, K, stiffness) -> Motion:
+def motion(rates: Callable, M: Real, C: Real, K: Real, stiffness: Array) -> Motion:
     """rates: function of (M, C, K). stiffness: the K that is probed."""
     n = len(stiffness)
     changes = []
@@ -304,7 +307,9 @@ def motion(rates, M, C, K, stiffness) -> Motion:
     return Motion(rates(M, C, K), np.stack(changes))
 
 
-def prewarped(params, flags, linear_part, rates, target, stiffness, free):
+def prewarped(
+    params: PyTree, flags: PyTree, linear_part: Callable, rates: Callable, target: Motion, stiffness: Array, free: bool
+):
     """params with the least relative changes that reproduce `target`, the `Motion` of the steps.
 
     flags: Booleans for leaves or branches of params. linear_part: params -> (M, C, K). rates: of those, in the order
@@ -318,20 +323,20 @@ def prewarped(params, flags, linear_part, rates, target, stiffness, free):
         return params
 
     @jax.jit
-    def moved(x):
+    def moved(x: Array):
         params = unravel(fitted.at[at].multiply(1 + x))
         return params, linear_part(params)
 
-    def matrices(x):
+    def matrices(x: np.ndarray):
         M, C, K = moved(x)[1]
         return np.asarray(M), np.asarray(C), np.asarray(K)
 
-    def unlike(x):
+    def unlike(x: np.ndarray):
         M, C, K = matrices(x)
         now = motion(rates, M, C, K, stiffness)
         return now.rates / target.rates - 1, (now.response - target.response) / np.linalg.norm(target.response, axis=0)
 
-    def apart(x):
+    def apart(x: np.ndarray):
         off = np.concatenate([np.ravel(y) for y in unlike(x)])
         off[len(target.rates) :] *= GAIN_WEIGHT
         return np.concatenate([np.real(off), np.imag(off)])
@@ -353,7 +358,7 @@ def _compromise(left):
     )
 
 
-def _least_change(apart, x, least=0.0):
+def _least_change(apart: Callable, x: np.ndarray, least: float = 0.0) -> np.ndarray:
     """Gauss-Newton steps of least norm towards apart(x) = 0, along directions that change it by more than `least`."""
     for _ in range(4):
         J = np.stack([(apart(x + e) - apart(x - e)) / 2e-5 for e in 1e-5 * np.eye(len(x))], axis=1)

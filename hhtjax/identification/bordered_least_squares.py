@@ -1,11 +1,15 @@
 """The least-squares problem of many records, each with unknowns of its own, inside Levenberg-Marquardt."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.gauss_newton import Seen, bending, bent, blank, largest_cosine, or_one, with_jacobian
 from hhtjax.identification.losses import LEAST_BEND, Objective
 from hhtjax.numerics.array_namespace import choose, eigh, namespace_of, solve_upper, solve_upper_transposed
@@ -22,7 +26,7 @@ class ArrowTrial(NamedTuple):
     column: Any  # like x
     R: Any  # (records, k + p + 1, p)
     R_own: Any
-    z: Any  # (records, k + p + 1)
+    z: PyTree  # (records, k + p + 1)
 
     @property
     def r(self):
@@ -30,12 +34,12 @@ class ArrowTrial(NamedTuple):
         return self.read[0]
 
 
-def split(x, count, p):
+def split(x: Real, count: int, p: int):
     """The p shared unknowns, and those of the `count` records, (count, k)."""
     return x[:p], x[p:].reshape(count, -1)
 
 
-def arrow_trial(x, seen, D, p) -> ArrowTrial:
+def arrow_trial(x: np.ndarray, seen: Seen, D: np.ndarray, p: int) -> ArrowTrial:
     """The trial at x, with D from the trials before; its cost is inf where something is not finite.
 
     seen: of residuals (records, m), and of their derivatives by k own unknowns and then p shared ones.
@@ -59,7 +63,7 @@ def arrow_trial(x, seen, D, p) -> ArrowTrial:
     return ArrowTrial(x, seen.read, cost, length, D, column, R[:, :, k:-1], R[:, :, :k], R[:, :, -1])
 
 
-def _eliminated(trial, lam):
+def _eliminated(trial: ArrowTrial, lam: Real):
     """The damped problem without own unknowns: with T (records, k, k) and S (p, p) upper triangular,
 
     T own + part (shared, 1) = 0,    S shared + seen = 0.
@@ -90,15 +94,15 @@ class Arrow(NamedTuple):
     p: int
     bend: Callable | None  # of the shared unknowns
 
-    def split(self, x):
+    def split(self, x: Array):
         """Shared unknowns (p,) and own ones (records, k)."""
         return split(x, jax.tree.leaves(self.records)[0].shape[0], self.p)
 
-    def read(self, x):
+    def read(self, x: Array):
         """Residuals of each record, and their Jacobians by the shared and by their own unknowns."""
         shared, own = self.split(x)
 
-        def one(own, record):
+        def one(own: Array, record: Array):
             r, J = with_jacobian(lambda y: self.f(y[: self.p], y[self.p :], record), jnp.concatenate([shared, own]))
             return r, J[:, : self.p], J[:, self.p :]
 
@@ -111,7 +115,7 @@ class Arrow(NamedTuple):
         wJ, pull, _ = self.objective.estimating(r.ravel(), J.reshape(r.size, -1))
         return jnp.einsum("bm,bmp->bp", pull.reshape(r.shape), wJ.reshape(J.shape))
 
-    def see(self, x) -> Seen:
+    def see(self, x: Array) -> Seen:
         """What `arrow_trial` has to know of x."""
         r, J, J_own = self.read(x)
         both = jnp.concatenate([J_own, J], axis=2)
@@ -128,7 +132,7 @@ class Arrow(NamedTuple):
         """A trial before the first evaluation."""
         return blank(self, x)
 
-    def step(self, trial, lam):
+    def step(self, trial: ArrowTrial, lam: Real):
         """The damped step, and the decrease of the cost that the linear problem predicts."""
         xp, z, p = namespace_of(trial.x), trial.z, trial.R.shape[-1]
         T, part, S, seen = _eliminated(trial, lam)
@@ -138,7 +142,7 @@ class Arrow(NamedTuple):
         predicted = (xp.sum(z**2) - xp.sum(left**2)) / 2
         return xp.concatenate([shared, own.ravel()]) / or_one(trial.D), predicted
 
-    def damped(self, trial, lam, slope):
+    def damped(self, trial: ArrowTrial, lam: Real, slope: np.ndarray) -> np.ndarray:
         """(J^T J + lam D^2)^-1 slope."""
         xp, (count, _, p) = namespace_of(trial.x), trial.R.shape
         T, part, S = _eliminated(trial, lam)[:3]
@@ -149,7 +153,7 @@ class Arrow(NamedTuple):
         own = solve_upper(T, ahead - xp.einsum("bkp,p->bk", part[:, :, :p], shared))
         return xp.concatenate([shared, own.ravel()]) / or_one(trial.D)
 
-    def bending(self, now, new, at, step):
+    def bending(self, now: ArrowTrial, new: ArrowTrial, at: ArrowTrial, step: np.ndarray):
         """J^T r'' at one of two trials, with r'' = (J_new - J_now) step, of the weighted residuals."""
         if now.read is None:  # before the first evaluation, in NumPy
             return 0 * step
@@ -169,7 +173,7 @@ class Arrow(NamedTuple):
         both = self.objective.scaled(both.reshape(r.size, -1)).reshape(both.shape)
         return both, None if row is None else row.reshape(r.shape)
 
-    def offset(self, trial):
+    def offset(self, trial: ArrowTrial) -> Real:
         """Length of the part of the residual that a step without damping takes away, over that of the residual."""
         xp = namespace_of(trial.x)
         _, predicted = self.step(trial, xp.zeros_like(trial.length))
@@ -182,7 +186,7 @@ class Arrow(NamedTuple):
         Jdx = xp.einsum("bip,p->bi", trial.R, shared) + xp.einsum("bik,bk->bi", trial.R_own, own)
         return xp.linalg.norm(Jdx)
 
-    def cosine(self, trial):
+    def cosine(self, trial) -> Real:
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
         xp = namespace_of(trial.x)
         shared = xp.einsum("bip,bi->p", trial.R, trial.z)
@@ -194,7 +198,7 @@ class Arrow(NamedTuple):
         return self.objective.estimating(r.ravel(), jnp.concatenate([J_own, J], axis=2).reshape(r.size, -1))
 
 
-def free_of_own(both, bend, count, p):
+def free_of_own(both: np.ndarray, bend, count: int, p: int) -> np.ndarray:
     """The part of J, of derivatives by k own unknowns and then p shared ones, that no own unknown can make up for."""
     xp = namespace_of(both)
     both = both.reshape(count, -1, both.shape[-1])

@@ -1,5 +1,7 @@
 """Which of several models does a record support: information criteria, F tests, and errors on what was left out."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hhtjax.checks import require_function, require_integer, require_number
-from hhtjax.description import is_concrete
+from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.description.presentation import Table, as_text, shown
 from hhtjax.identification.evidence import (
     count,
@@ -41,7 +43,7 @@ class NestedTest(NamedTuple):
     naive_p_value: float
 
 
-def _told(test):
+def _told(test: NestedTest) -> str:
     """A test in words, with a doubt where both answers cannot be right, as those of two smaller models."""
     doubt = ", if `absent` is right" if 1e3 * test.p_value < test.naive_p_value > 0.05 else ""
     return f"{test.p_value:.2g} ({test.naive_p_value:.2g}) against {test.smaller}{doubt}"
@@ -63,15 +65,15 @@ class Comparison(NamedTuple):
     """
 
     names: tuple
-    parameters: Any
+    parameters: np.ndarray
     observations: int
     effective: float
-    rms: Any
-    aic: Any
-    bic: Any
+    rms: np.ndarray
+    aic: np.ndarray
+    bic: Array
     tests: tuple
-    held_out: Any = None
-    converged: Any = None
+    held_out: Array | None = None
+    converged: Array | None = None
 
     @property
     def cross_validated(self) -> Any:
@@ -106,7 +108,7 @@ class Comparison(NamedTuple):
         """The table as text; p values have the model they belong to, and in brackets those of the textbook."""
         return as_text(self._table())
 
-    def _table(self):
+    def _table(self) -> Table:
         rows = [["model", "parameters", "rms", "AIC - least", "BIC - least"]]
         for i, name in enumerate(self.names):
             criteria = (f"{x[i] - np.min(x):.4g}" for x in (self.aic, self.bic))
@@ -131,7 +133,7 @@ def compare(
     *,
     folds: int = 8,
     absent: float | dict[str, float] = 0.0,
-    always: Any = None,
+    always: PyTree = None,
     progress: bool = False,
     **options: Any,
 ) -> Comparison:
@@ -218,7 +220,7 @@ def compare(
     return found._replace(held_out=held_out, converged=converged)
 
 
-def _check_fits(fits):
+def _check_fits(fits: dict):
     if not isinstance(fits, dict) or len(fits) < 2 or not all(isinstance(x, FitResult) for x in fits.values()):
         raise TypeError(f"compare: `fits` must be a dict of two or more FitResult; received {type(fits).__name__}.")
     for name, result in fits.items():
@@ -230,7 +232,7 @@ def _check_fits(fits):
             raise ValueError(f"compare: `fits[{name!r}]` must have a covariance; it was made with covariance=False.")
 
 
-def _check_functions(residuals, fits):
+def _check_functions(residuals: PyTree, fits: dict):
     """{name: residual function} of all models."""
     functions = residuals if isinstance(residuals, dict) else dict.fromkeys(fits, residuals)
     if functions.keys() != fits.keys():
@@ -243,7 +245,7 @@ def _check_functions(residuals, fits):
     return functions
 
 
-def _require_known(absent, results):
+def _require_known(absent: PyTree, results: list):
     """An error for a name in `absent` that no model has."""
     known = {name for result in results for name in parameter_names(result.params)}
     if isinstance(absent, dict) and (unknown := [name for name in absent if name not in known]):
@@ -251,7 +253,7 @@ def _require_known(absent, results):
         raise ValueError(f"compare: `absent` must be of parameters, {names}; received one for {unknown[0]!r}.")
 
 
-def _require_equal_weights(names, results):
+def _require_equal_weights(names: tuple, results: list):
     """Their sums of squares are not of one kind, where the weights are not; the order is that of each model's."""
     weights = [np.sort(np.concatenate([np.ravel(w) for w in weights_of(x)])) for x in results]
     for name, w in zip(names, weights, strict=True):
@@ -259,7 +261,7 @@ def _require_equal_weights(names, results):
             raise ValueError(f"compare: `fits` must have the same weights; those of {names[0]!r} and {name!r} differ.")
 
 
-def _nested_tests(fits, costs, n, absent):
+def _nested_tests(fits: dict, costs: dict, n: int, absent):
     """A `NestedTest` of each pair of nested models without a third between them."""
     own = {name: set(np.asarray(parameter_names(x.params))[x.free]) for name, x in fits.items()}
     pairs = [(a, b) for a in fits for b in fits if own[a] < own[b] and _same_constants(fits[a], fits[b], own[b])]
@@ -287,12 +289,12 @@ def _nested_tests(fits, costs, n, absent):
         yield NestedTest(smaller, larger, q, wald, p[0], naive, p[1])
 
 
-def _same_constants(smaller, larger, fitted):
+def _same_constants(smaller: FitResult, larger: FitResult, fitted) -> bool:
     """Whether parameters that both models have, and neither fits, are the same."""
     a, b = (dict(zip(parameter_names(x.params), parameter_values(x.params), strict=True)) for x in (smaller, larger))
     return all(a[name] == b[name] for name in a.keys() & b.keys() - fitted)
 
 
-def _absent(absent, name):
+def _absent(absent: float, name: Real) -> float:
     value = absent.get(name, 0.0) if isinstance(absent, dict) else absent
     return float(require_number("compare", "absent", value, math.isfinite, "be finite"))

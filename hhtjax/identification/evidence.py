@@ -4,16 +4,23 @@ equal.
 Numbers of a finished fit, by NumPy: nothing here is traced.
 """
 
+from __future__ import annotations
+
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc
 
+from hhtjax.description import Real
 from hhtjax.identification.residuals import spread_weights
 from hhtjax.identification.sandwich import time_axis, used_up
+
+if TYPE_CHECKING:
+    from hhtjax.identification.result import FitResult
+    from hhtjax.identification.sandwich import Uncertainty
 
 LAGS = 20  # of the test for white residuals
 LEAST = 5  # samples for each lag
@@ -29,12 +36,12 @@ class Residuals(NamedTuple):
     present: list
 
 
-def weights_of(result) -> list:
+def weights_of(result: FitResult) -> list:
     """The weight of every residual, leaf by leaf."""
     return spread_weights("fit", result.weights, result.residual)
 
 
-def residuals_of(result) -> Residuals:
+def residuals_of(result: FitResult) -> Residuals:
     """Of a fit that is finished."""
     weights = weights_of(result)
     names, plain, weighted, present = [], [], [], []
@@ -55,7 +62,7 @@ def count(residuals: Residuals) -> int:
     return int(sum(np.sum(x) for x in residuals.present))
 
 
-def used_by_starts(result) -> int:
+def used_by_starts(result: FitResult) -> int:
     """Residuals that the starts of records take; 0 without."""
     if result.starts is None:
         return 0
@@ -65,7 +72,7 @@ def used_by_starts(result) -> int:
     return int(used_up(present, sum(map(np.size, starts)) // records))
 
 
-def design_effect(uncertainty) -> float:
+def design_effect(uncertainty: Uncertainty) -> float:
     """tr(naive^-1 C)/p of the p parameters that are determined: the mean factor by which correlated residuals enlarge
     variances (Rao and Scott, J. Am. Stat. Assoc. 76, 1981, 221-230); less than 1 where they make them smaller."""
     known = ~np.asarray(uncertainty.undetermined)
@@ -118,7 +125,7 @@ def fades(residuals: Residuals) -> bool:
     return bool(last < first / 9)
 
 
-def chi_squared_tail(x, degrees) -> float:
+def chi_squared_tail(x: Real, degrees: Real) -> float:
     """Probability of more than x, of an integer number of degrees of freedom: a finite sum."""
     y, odd = float(x) / 2, degrees % 2
     if not 0 < y < math.inf:
@@ -127,7 +134,7 @@ def chi_squared_tail(x, degrees) -> float:
     return min((math.erfc(math.sqrt(y)) if odd else 0.0) + sum(terms), 1.0)
 
 
-def f_tail(x, numerator, denominator) -> float:
+def f_tail(x: Real, numerator: int, denominator: Real) -> float:
     """Probability of more than x in Fisher's F distribution; NaN where there are no degrees of freedom."""
     if denominator <= 0 or not math.isfinite(x):
         return math.nan

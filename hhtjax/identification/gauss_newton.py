@@ -10,25 +10,29 @@ Towards a bound of a parameter, which a transform has put at an infinite x, J^T 
 What makes a good step there is the second derivative of the transform itself: see `bent`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.losses import Objective
 from hhtjax.numerics.array_namespace import choose, namespace_of, svd
 
 PART = 512  # rows
 
 
-def with_jacobian(f, x):
+def with_jacobian(f: Callable, x: Array):
     """f(x) (m,) and its forward-mode Jacobian."""
     if x.size == 1:  # without vmap, over one direction, there is less to trace and to compile
         r, dr = jax.jvp(f, (x,), (jnp.ones_like(x),))
         return r, dr[:, None]
 
-    def twice(x):
+    def twice(x: Array):
         r = f(x)
         return r, r
 
@@ -36,7 +40,7 @@ def with_jacobian(f, x):
     return r, J
 
 
-def triangle(A):
+def triangle(A: np.ndarray) -> np.ndarray:
     """R of A = Q R. Of a tall matrix by QR of parts of its rows, then of what is left of them, and so on: LAPACK's goes
     through the whole of it for every column.
 
@@ -55,13 +59,13 @@ def triangle(A):
     return xp.linalg.qr(A, mode="r")
 
 
-def blank(problem, x):
+def blank(problem, x: Array) -> DenseTrial:
     """Zeros in the form of a trial, without evaluating anything."""
     zeros = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(problem.look, x, x))
     return zeros._replace(x=x, cost=jnp.asarray(jnp.inf, x.dtype))
 
 
-def bent(bend, slope, square):
+def bent(bend: np.ndarray, slope: np.ndarray, square: np.ndarray) -> np.ndarray:
     """Roots of what is added to the diagonal of J^T J (`square`) for transformed unknowns whose bound is ahead.
 
     A transform p(x) gives the second derivative of the cost a part of its own, `slope` p''/p' with slope = J^T r, which
@@ -72,17 +76,17 @@ def bent(bend, slope, square):
     return xp.sqrt(xp.maximum(slope * bend - square, 0))
 
 
-def deviation(trial):
+def deviation(trial: DenseTrial) -> Array:
     """Standard deviation of the residuals."""
     return trial.length / max(trial.r.size - trial.x.size, 1) ** 0.5
 
 
-def or_one(x):
+def or_one(x: Real) -> np.ndarray:
     """x, to divide by."""
     return namespace_of(x).where(x == 0, 1, x)
 
 
-def largest_cosine(slopes, trial):
+def largest_cosine(slopes: np.ndarray, trial) -> Real:
     """|cosine| of the angle between the residual and a column of the Jacobian. slopes: (J/D)^T r."""
     largest = namespace_of(slopes).max(abs(slopes) * trial.D / or_one(trial.column))
     return largest / or_one(trial.length)
@@ -97,7 +101,7 @@ def bending(before, after, J, row):
 class Seen(NamedTuple):
     """What an evaluation at a point tells."""
 
-    r: Any  # of the least-squares problem, (m,)
+    r: Array  # of the least-squares problem, (m,)
     J: Any  # (m, p)
     cost: Any
     bend: Any  # p''/p' of each unknown; None for 0
@@ -115,15 +119,15 @@ class DenseTrial(NamedTuple):
     column: Any  # norms of the columns of J, at most D
     s: Any  # singular values of J/D, here and below with the rows of `bent`
     V: Any
-    z: Any  # residual in the basis of the left singular vectors
+    z: PyTree  # residual in the basis of the left singular vectors
 
     @property
-    def r(self):
+    def r(self) -> Array:
         """Residuals."""
         return self.read[0]
 
 
-def dense_trial(x, seen, D) -> DenseTrial:
+def dense_trial(x, seen: Seen, D) -> DenseTrial:
     """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
     xp, p = namespace_of(x), x.size
     both = xp.concatenate([seen.J, seen.r[:, None]], axis=1)
@@ -146,41 +150,41 @@ class Dense(NamedTuple):
     objective: Objective
     bend: Callable | None
 
-    def read(self, x):
+    def read(self, x: Array):
         """Residuals and their Jacobian."""
         return with_jacobian(self.f, x)
 
-    def slopes(self, x):
+    def slopes(self, x: Array) -> Array:
         """The gradient of the cost, of all that there is: (1, p)."""
         J, pull, _ = self.objective.estimating(*self.read(x))
         return (pull @ J)[None, :]
 
-    def see(self, x) -> Seen:
+    def see(self, x: Array) -> Seen:
         """What `dense_trial` has to know of x."""
         r, J = self.read(x)
         bend = None if self.bend is None else self.bend(x)
         return Seen(*self.objective.least_squares(r, J), self.objective.cost(r), bend, (r, J))
 
-    def estimates(self, r, J):
+    def estimates(self, r: Array, J: Array):
         """What `Objective.estimating` says of the residuals."""
         return self.objective.estimating(r, J)
 
-    def look(self, x, D) -> DenseTrial:
+    def look(self, x: Array, D: Array) -> DenseTrial:
         """The trial at x, with D from the trials before; its cost is inf where something is not finite."""
         return dense_trial(x, self.see(x), D)
 
-    def nothing(self, x):
+    def nothing(self, x: Array) -> DenseTrial:
         """A trial before the first evaluation."""
         return blank(self, x)
 
-    def step(self, trial, lam):
+    def step(self, trial: DenseTrial, lam: Real):
         """The damped step, and the decrease of the cost that the linear problem predicts."""
         xp = namespace_of(trial.x)
         weight = trial.s / xp.maximum(trial.s**2 + lam, float(jnp.finfo(trial.s.dtype).tiny))
         dx = -(trial.V @ (weight * trial.z)) / or_one(trial.D)
         return dx, xp.sum(trial.z**2 * (1 - (1 - trial.s * weight) ** 2)) / 2
 
-    def damped(self, trial, lam, slope):
+    def damped(self, trial: DenseTrial, lam: Real, slope: np.ndarray) -> np.ndarray:
         """(J^T J + lam D^2)^-1 slope."""
         xp, D = namespace_of(trial.x), or_one(trial.D)
         weight = xp.maximum(trial.s**2 + lam, float(jnp.finfo(trial.s.dtype).tiny))
@@ -193,21 +197,21 @@ class Dense(NamedTuple):
         (J0, _), (J1, _), (J, row) = map(self.weighted, (now, new, at))
         return bending(J0 @ step, J1 @ step, J, row)
 
-    def weighted(self, trial):
+    def weighted(self, trial: DenseTrial):
         """w J, and the squares of the factors of its rows in the least-squares problem; None for 1."""
         r, J = trial.read
         return self.objective.scaled(J), self.objective.stretch(r)
 
-    def offset(self, trial):
+    def offset(self, trial: DenseTrial) -> Real:
         """Length of the part of the residual that a step without damping takes away, over that of the residual."""
         xp = namespace_of(trial.x)
         reached = trial.s > 100 * float(jnp.finfo(trial.s.dtype).eps) * trial.s[0]
         return xp.linalg.norm(xp.where(reached, trial.z, 0)) / or_one(trial.length)
 
-    def length(self, trial, dx):
+    def length(self, trial: DenseTrial, dx: Array) -> Array:
         """Of J dx."""
         return namespace_of(trial.x).linalg.norm(trial.s * (trial.V.T @ (trial.D * dx)))
 
-    def cosine(self, trial):
+    def cosine(self, trial) -> Real:
         """Largest |cosine| of the angle between the residual and a column of the Jacobian."""
         return largest_cosine(trial.V @ (trial.s * trial.z), trial)

@@ -1,12 +1,18 @@
 """Words for what residuals do not determine: the combination of parameters, by name."""
 
+from __future__ import annotations
+
 import warnings
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
-from hhtjax.description import freeze
+from hhtjax.description import Array, PyTree, freeze
 from hhtjax.identification.evidence import count, residuals_of, used_by_starts
+
+if TYPE_CHECKING:
+    from hhtjax.identification.result import FitResult
 
 BEYOND = "the loss is flat there, with residuals beyond its bend (`weights` is one over the noise)"
 
@@ -15,7 +21,7 @@ class IdentifiabilityWarning(UserWarning):
     """The residuals do not determine every parameter."""
 
 
-def parameter_names(params):
+def parameter_names(params: PyTree):
     """A name for each entry, in the order of `ravel_pytree(params)`: a, decay[0], decay[1]."""
     names = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(freeze(params)):
@@ -24,12 +30,14 @@ def parameter_names(params):
     return names
 
 
-def parameter_values(params):
+def parameter_values(params: PyTree) -> np.ndarray:
     """The number of each entry, in the same order: (p,)."""
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves(freeze(params))])
 
 
-def undetermined_combinations(names, values, singular_values, directions, num_residuals):
+def undetermined_combinations(
+    names: np.ndarray, values: np.ndarray, singular_values: Array, directions: Array, num_residuals: int
+):
     """A phrase for each combination of parameters that does not matter to the residuals.
 
     Args:
@@ -47,7 +55,7 @@ def undetermined_combinations(names, values, singular_values, directions, num_re
     return [_phrase(names, row, values) for row in basis]
 
 
-def _sparse_basis(rows):
+def _sparse_basis(rows: np.ndarray) -> np.ndarray:
     """The same row space with as many zeros as elimination with pivoting gives; largest entries one."""
     rows = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True, initial=0), 1e-300)
     free = list(range(len(rows)))
@@ -61,7 +69,7 @@ def _sparse_basis(rows):
     return rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True, initial=0), 1e-300)
 
 
-def _phrase(names, direction, values):
+def _phrase(names, direction, values: np.ndarray) -> str:
     """Direction: relative changes that cancel."""
     at = np.flatnonzero(np.abs(direction) > 1e-4)
     names, direction = [names[i] for i in at], direction[at] / direction[at[0]]
@@ -102,7 +110,7 @@ def why_undetermined(result):
     return names[flags].tolist(), why
 
 
-def warn_undetermined(caller, result, stacklevel):
+def warn_undetermined(caller: str, result: FitResult, stacklevel: int):
     """An `IdentifiabilityWarning` that names parameters and combinations; silent where all are determined."""
     names, why = why_undetermined(result)
     if names:

@@ -6,15 +6,17 @@ with exact derivatives: Levenberg-Marquardt on forward-mode Jacobians for few pa
 optimiser on reverse-mode gradients for many.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_function, require_number
-from hhtjax.description import current, is_concrete, is_tracing, thaw, with_data
+from hhtjax.description import PyTree, Real, current, is_concrete, is_tracing, thaw, with_data
 from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
     check_options,
@@ -34,21 +36,24 @@ from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
 from hhtjax.primitives import or_plain
 
+if TYPE_CHECKING:
+    from hhtjax.identification.arguments import Options
+
 
 def fit(
     residuals: Callable[..., Any],
-    params0: Any,
-    optimizer: Any = None,
+    params0: PyTree,
+    optimizer: PyTree = None,
     *,
-    records: Any = None,
-    starts: Any = None,
-    transforms: Any = None,
-    scale: Any = None,
-    weights: Any = True,
+    records: PyTree = None,
+    starts: PyTree = None,
+    transforms: PyTree = None,
+    scale: PyTree = None,
+    weights: PyTree = True,
     loss: str | Callable[[Any], Any] | None = None,
-    prior: Any = None,
+    prior: PyTree = None,
     max_iterations: int | None = None,
-    tolerance: float = 1e-8,
+    tolerance: Real = 1e-8,
     covariance: bool = True,
     segments: int = SEGMENTS,
     progress: bool = False,
@@ -143,7 +148,7 @@ def fit(
     return _finished("fit", result, weights) if is_concrete(result.code) else result
 
 
-def _solved(solver, residuals, options, params0, data):
+def _solved(solver, residuals: Callable, options: Options, params0: PyTree, data: PyTree) -> FitResult:
     """The fit by a solver, with arrays that the residuals read as data, where another fit has read others before."""
     found = None if is_tracing() or data.records is not None else with_data(residuals)
     if found is not None:
@@ -170,16 +175,16 @@ class Multistart(NamedTuple):
 
 def multistart(
     residuals: Callable[..., Any],
-    starts: Any,
-    optimizer: Any = None,
+    starts: PyTree,
+    optimizer: PyTree = None,
     *,
-    transforms: Any = None,
-    scale: Any = None,
-    weights: Any = True,
+    transforms: PyTree = None,
+    scale: PyTree = None,
+    weights: PyTree = True,
     loss: str | Callable[[Any], Any] | None = None,
-    prior: Any = None,
+    prior: PyTree = None,
     max_iterations: int | None = None,
-    tolerance: float = 1e-8,
+    tolerance: Real = 1e-8,
     covariance: bool = True,
     segments: int = SEGMENTS,
 ) -> Multistart:
@@ -221,14 +226,14 @@ def multistart(
     return Multistart(_finished("multistart", best, weights) if is_concrete(best.code) else best, every)
 
 
-def _check_data(caller, params0, scale, weights, prior, tolerance):
+def _check_data(caller: str, params0: PyTree, scale, weights: PyTree, prior: dict | None, tolerance: Real) -> Data:
     require_number(caller, "tolerance", tolerance, lambda x: x > 0, "be positive")
     check_weights(caller, weights)
     prior = None if prior is None else check_prior(caller, prior, params0)
     return Data(check_scale(caller, scale, params0), weights, prior, tolerance, None, None)
 
 
-def _finished(caller, result, weights):
+def _finished(caller: str, result: FitResult, weights: PyTree) -> FitResult:
     """The result of a fit outside of jit: trouble told, and the history cut to what happened."""
     code = int(result.code)
     if code == BAD_START:

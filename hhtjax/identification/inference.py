@@ -1,8 +1,10 @@
 """Questions to a fit: which term is missing, how far one parameter can go, how sure a prediction is."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, require_integer, require_number
-from hhtjax.description import freeze, thaw
+from hhtjax.description import PyTree, Real, freeze, thaw
 from hhtjax.description.presentation import overwrite, shown
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.evidence import count, residuals_of
@@ -20,6 +22,9 @@ from hhtjax.identification.identify import fit
 from hhtjax.identification.residuals import spread_weights
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS, in_segments, in_time
+
+if TYPE_CHECKING:
+    from hhtjax.identification.sandwich import Uncertainty
 
 
 @shown
@@ -37,12 +42,14 @@ class Score(NamedTuple):
     """
 
     names: list
-    statistic: Any
-    cost_drop: Any
-    estimate: Any
+    statistic: np.ndarray
+    cost_drop: np.ndarray
+    estimate: np.ndarray
 
 
-def score_test(residuals: Callable[[Any, Any], Any], params: Any, candidates: Any, segments: int = SEGMENTS) -> Score:
+def score_test(
+    residuals: Callable[[Any, Any], Any], params: PyTree, candidates: Any, segments: int = SEGMENTS
+) -> Score:
     """Which further terms a model needs, from one Jacobian and without fitting any of them.
 
     With x a candidate's column of the Jacobian, less its projection on the columns of the fitted parameters,
@@ -113,12 +120,12 @@ class Profile(NamedTuple):
             error; 3.84 bounds the 95 % interval. NaN for a parameter without one.
     """
 
-    values: Any
-    cost: Any
-    deviance: Any
+    values: PyTree
+    cost: np.ndarray
+    deviance: np.ndarray
 
 
-def profile(residuals: Callable[..., Any], result: FitResult, name: str, values: Any, **options: Any) -> Profile:
+def profile(residuals: Callable[..., Any], result: FitResult, name: str, values: Real, **options: Any) -> Profile:
     """The profile likelihood of one parameter: the cost with it held at each value, and all others refitted.
 
     Args:
@@ -170,7 +177,7 @@ def profile(residuals: Callable[..., Any], result: FitResult, name: str, values:
     return Profile(values, np.asarray(costs), 2 * (np.asarray(costs) - float(result.cost)) / variance)
 
 
-def _uncertainty(caller, result):
+def _uncertainty(caller: str, result: PyTree) -> Uncertainty:
     if not isinstance(result, FitResult):
         raise TypeError(f"{caller}: `result` must be a FitResult; received {type(result).__name__}.")
     if result.uncertainty is None:
@@ -178,7 +185,7 @@ def _uncertainty(caller, result):
     return result.uncertainty
 
 
-def _flags(leaves, at):
+def _flags(leaves: list, at: int) -> np.ndarray:
     return np.concatenate([np.full(np.size(x), i == at) for i, x in enumerate(leaves)])
 
 
@@ -220,7 +227,7 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
 # Fits with one segment of the residuals left out after the other, and their errors there.
 
 
-def _segment(shape, folds, fold):
+def _segment(shape: tuple, folds: int, fold: int) -> np.ndarray:
     """Which entries of a leaf of the residuals are in one of its `folds` segments."""
     order = in_time([shape])
     inside = np.zeros(order.size, bool)
@@ -228,7 +235,7 @@ def _segment(shape, folds, fold):
     return inside.reshape(shape)
 
 
-def require_residuals_of(name, result, function):
+def require_residuals_of(name: str, result: FitResult, function: Callable):
     """An error unless the function gives a fit's residuals again, but for a small part of them, or for what a change
     of the parameters by some 1e-8 does."""
     x, unravel = ravel_pytree(freeze(result.params))
@@ -247,7 +254,7 @@ def require_residuals_of(name, result, function):
         )
 
 
-def leave_out(fits, functions, folds, always, options, progress):
+def leave_out(fits: dict, functions: dict, folds: int, always: np.ndarray, options: dict, progress: bool):
     """For each fit, and each segment, what `_leave_out` says: two arrays."""
     left = [_leave_out(name, fits[name], functions[name], folds, always, options, progress) for name in fits]
     segments = sorted({len(errors) for errors, _ in left})
@@ -260,7 +267,7 @@ def leave_out(fits, functions, folds, always, options, progress):
     return np.array(errors), np.array(converged)
 
 
-def _leave_out(name, result, function, folds, always, options, progress):
+def _leave_out(name: str, result: FitResult, function: Callable, folds: int, always, options: dict, progress: bool):
     """rms of each segment by the parameters fitted to the others, and whether these fits converged.
 
     A segment without a residual to judge by is none: few residuals make fewer segments than `folds`.

@@ -1,5 +1,7 @@
 """Where a fit starts: parameters from the equation of motion itself, and longer and longer parts of a record."""
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Callable
 from functools import partial
@@ -11,24 +13,31 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import evaluate, require_function
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.sampled import Sampled, band_limited_motion, sampled
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, mass_at, require_smooth, require_system
+from hhtjax.systems.system import (
+    AnySystem,
+    System,
+    mass_at,
+    require_smooth,
+    require_system,
+)
 
 ARGUMENTS = set(inspect.signature(fit).parameters) - {"params0"}
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
 
 def equation_error(
-    system: System | LinearSystem | FirstOrderSystem,
-    values: Any,
-    dt: Any = None,
-    cutoff: Any = None,
-    t0: float = 0.0,
+    system: AnySystem,
+    values: Real,
+    dt: Real = None,
+    cutoff: Real | None = None,
+    t0: Real = 0.0,
     *,
-    times: Any = None,
+    times: Real | None = None,
 ) -> Callable[[Any], Any]:
     """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
 
@@ -81,8 +90,8 @@ def equation_error(
     t = t0 + jnp.linspace(0, dt * (samples - 1), samples)
     inside = jax.tree.map(lambda y: y[left_out : samples - left_out], (q, v, a, t))
 
-    def residuals(params):
-        def one(q, v, a, t):
+    def residuals(params: PyTree) -> Array:
+        def one(q: PyTree, v: PyTree, a: PyTree, t: Array) -> Array:
             _require_no_rotations(system, q, t, params)
             flat, x, rate = flatten("equation_error", system, q, v, t, params)
             t = t.astype(rate.dtype)
@@ -94,7 +103,7 @@ def equation_error(
     return residuals
 
 
-def _require_no_rotations(system, q, t, params):
+def _require_no_rotations(system, q: PyTree, t: Array, params: PyTree):
     """An error for positions (3, 3) whose mass is that of angular velocities (3,)."""
     turning = sum(x.size for x in jax.tree.leaves(q) if x.shape[-2:] == (3, 3))
     if turning and isinstance(system, System):
@@ -107,7 +116,7 @@ def _require_no_rotations(system, q, t, params):
             )
 
 
-def _at_equal_distances(values, dt, t0, times):
+def _at_equal_distances(values: np.ndarray, dt: Real, t0: Real, times: np.ndarray):
     """The values at as many times at equal distances, their sampling period, and the time of the first."""
     splines = jax.tree.map(lambda y: sampled(y, dt, t0, times=times), values)
     t0, end, count = float(times[0]), float(times[-1]), len(times)
@@ -115,12 +124,12 @@ def _at_equal_distances(values, dt, t0, times):
     return jax.tree.map(lambda u: u(t0 + dt * np.arange(count)), splines, is_leaf=_is_spline), dt, t0
 
 
-def _is_spline(x):
+def _is_spline(x: Sampled) -> bool:
     return isinstance(x, Sampled)
 
 
 def fit_progressively(
-    problem_at: Callable[[Any, FitResult | None], dict[str, Any]], params0: Any, horizons: Any, **options: Any
+    problem_at: Callable[[Any, FitResult | None], dict[str, Any]], params0: PyTree, horizons: Any, **options: Any
 ) -> FitResult:
     """One `fit` after the other, each to a longer part of the data, and each from where the one before ended.
 
@@ -165,7 +174,7 @@ def fit_progressively(
     return result
 
 
-def _problem(found, horizon):
+def _problem(found: PyTree, horizon: int):
     """What problem_at returned, if `fit` can take it."""
     where = f"fit_progressively: `problem_at` must return a dict of arguments of `fit`; received at horizon {horizon!r}"
     if not isinstance(found, dict):

@@ -3,19 +3,25 @@
 What ended it is a code.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, Real
 from hhtjax.description.presentation import overwrite, shown
 from hhtjax.identification.gauss_newton import deviation, or_one
 from hhtjax.identification.losses import Objective
 from hhtjax.numerics.array_namespace import choose, namespace_of, while_loop, with_entry
+
+if TYPE_CHECKING:
+    from hhtjax.identification.gauss_newton import Dense, DenseTrial
 
 ALIKE = 0.7  # cosine of two steps, from which on one tells how the residual bends along the other
 MOST_BENT = 1.5  # 2 |D a| over |D v|: beyond it v is no straight line any more, and a no correction of it
@@ -25,15 +31,24 @@ LESS, AGAIN, FASTER = 2.0, 4.0, 6  # lam is divided by 2 after a good step, by 4
 class Course(NamedTuple):
     """What is known from the steps so far."""
 
-    lam: Any
-    radius: Any  # |D dx| of the next step at most; inf after a success
-    good: Any  # how many good steps, one after the other; 0, 1, ..
-    failures: Any  # how many trials have not lowered the cost, one after the other
+    lam: Array
+    radius: Array  # |D dx| of the next step at most; inf after a success
+    good: Array  # how many good steps, one after the other; 0, 1, ..
+    failures: Array  # how many trials have not lowered the cost, one after the other
     along: Any  # the last step, taken or not
     slope: Any  # J^T r'' with r'' the second derivative of the residual along it
 
 
-def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress, room=None, enough=None):
+def levenberg_marquardt(
+    problem,
+    x: Real,
+    longest: np.ndarray,
+    tolerance: Real,
+    max_iterations: Real,
+    progress: bool,
+    room: int | None = None,
+    enough: Callable | None = None,
+):
     """Damped Gauss-Newton on a `Dense` or an `Arrow` problem; returns the best trial, the history, and why it ended.
 
     dx = v + a/2,    v = -(J^T J + lam D^2)^-1 J^T r,    a = -(J^T J + lam D^2)^-1 J^T r''
@@ -52,10 +67,10 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
     xp, eps = namespace_of(x), float(jnp.finfo(x.dtype).eps)
     running = xp.asarray(RUNNING, np.int32)
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Real:
         return carry[-1] == RUNNING
 
-    def improve(carry):
+    def improve(carry: tuple):
         now, course, iteration, history, _ = carry
         first = iteration < 0
         lam, v, predicted = _within(problem, now, course, longest)
@@ -91,7 +106,7 @@ def levenberg_marquardt(problem, x, longest, tolerance, max_iterations, progress
     return best, history, iterations, code
 
 
-def _half_acceleration(problem, now, course, attempt, longest):
+def _half_acceleration(problem, now: DenseTrial, course: Course, attempt: tuple, longest: np.ndarray) -> np.ndarray:
     """a/2 of the step v; 0 where v is not along the step that tells of r'', or a not small against v."""
     xp, (lam, v) = namespace_of(now.x), attempt
     own, last = now.D * v, now.D * course.along
@@ -103,7 +118,7 @@ def _half_acceleration(problem, now, course, attempt, longest):
     return xp.where(alike & straight & xp.all(xp.abs(v + half) <= _bounded(longest, v.dtype)), half, 0)
 
 
-def _learn(problem, trials, course, attempt, rho, lower):
+def _learn(problem, trials: tuple, course: Course, attempt: tuple, rho: Real, lower: Real) -> Course:
     """The `Course` behind an attempt."""
     (now, new, best), (lam, v, step) = trials, attempt
     xp, eps = namespace_of(now.x), float(jnp.finfo(now.x.dtype).eps)
@@ -121,7 +136,7 @@ def _learn(problem, trials, course, attempt, rho, lower):
     return Course(*(xp.asarray(x, y.dtype) for x, y in zip(kept, course, strict=True)))
 
 
-def _small(problem, now, new, lower, attempt, start, tolerance):
+def _small(problem, now: DenseTrial, new, lower: Real, attempt: tuple, start: Real, tolerance: Real) -> np.ndarray:
     """COST or STEP where an attempt has changed the cost or the unknowns too little to go on; else RUNNING. GRADIENT
     where the residual is rounding.
 
@@ -144,24 +159,24 @@ def _small(problem, now, new, lower, attempt, start, tolerance):
     return xp.where(nothing, GRADIENT, code)
 
 
-def _within(problem, now, course, longest):
+def _within(problem, now: DenseTrial, course: Course, longest: np.ndarray):
     """The least damping, lam times a power of 2, whose step is within `longest` and the radius; that step, and what it
     predicts."""
     xp = namespace_of(now.x)
     longest = _bounded(longest, now.x.dtype)
 
-    def too_long(carry):
+    def too_long(carry: tuple) -> Real:
         _, v, _ = carry
         return xp.any(xp.abs(v) > longest) | (xp.linalg.norm(now.D * v) > course.radius)
 
-    def damp(carry):
+    def damp(carry: tuple):
         lam = 2 * carry[0]
         return lam, *problem.step(now, lam)
 
     return while_loop(too_long, damp, (course.lam / 2, xp.full_like(now.x, xp.inf), course.lam))
 
 
-def _bounded(longest, dtype):
+def _bounded(longest: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """The longest steps, so that inf is too long."""
     return np.minimum(longest, np.finfo(dtype).max).astype(dtype)
 
@@ -179,22 +194,24 @@ MOST = 5  # rounds with frozen steps
 SMALL = 0.1  # standard errors
 
 
-def in_rounds(problem_for, x, longest, tolerance, max_iterations, progress):
+def in_rounds(
+    problem_for: Callable, x: Array, longest: np.ndarray, tolerance: Array, max_iterations: int, progress: bool
+):
     """`levenberg_marquardt` in rounds; also how many had frozen steps.
 
     problem_for: y, whether steps are chosen at each trial -> the problem, with steps as for y if they are not.
     """
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         return carry[-1]
 
-    def one(carry):
+    def one(carry: tuple):
         best, history, before, _, choices, _ = carry
         fresh = choices < 0
         problem = problem_for(best.x, fresh)
         limits = tolerance, max_iterations - before, progress, max_iterations
 
-        def near(trial, step, problem=problem, fresh=fresh):
+        def near(trial: DenseTrial, step: Array, problem: Dense = problem, fresh: Array = fresh) -> Array:
             return fresh & (problem.length(trial, step) <= SMALL * deviation(trial))
 
         found, new, iterations, code = levenberg_marquardt(problem, best.x, longest, *limits, near)
@@ -216,7 +233,7 @@ def in_rounds(problem_for, x, longest, tolerance, max_iterations, progress):
     return best, history, iterations, code, choices
 
 
-def joined(before, fresh, old, new):
+def joined(before: Array, fresh: Array, old: Array, new: Array) -> Array:
     """The history of a round behind that of those before it, after so many iterations."""
     behind = jnp.arange(old.size, dtype=jnp.int32) > before
     return jnp.where(behind | fresh, jnp.roll(new, before), old)
@@ -232,7 +249,7 @@ class Smooth(NamedTuple):
     f: Callable
     objective: Objective
 
-    def cost(self, x):
+    def cost(self, x: Array) -> Array:
         """Of all residuals."""
         return self.objective.cost(self.f(x))
 
@@ -240,22 +257,24 @@ class Smooth(NamedTuple):
         """Nothing: residuals are evaluated apart."""
         return ()
 
-    def slopes(self, x):
+    def slopes(self, x: Array) -> Array:
         """The gradient of the cost: (1, p)."""
         return jax.grad(self.cost)(x)[None, :]
 
 
-def descend(problem, x, optimizer, tolerance, max_iterations, progress, patience=5):
+def descend(
+    problem: Smooth, x: Array, optimizer, tolerance: Array, max_iterations: int, progress: bool, patience: int = 5
+):
     """An optax optimiser on the cost of a `Smooth` problem; returns the best point it saw."""
     import optax  # where a fit needs it: see `for_many`
 
     optimizer = optax.with_extra_args_support(optimizer)
     running = jnp.asarray(RUNNING, jnp.int32)
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         return carry[-1] == RUNNING
 
-    def improve(carry):
+    def improve(carry: tuple):
         x, state, best, before, step, quiet, iteration, history, _ = carry
         value, gradient = jax.value_and_grad(problem.cost)(x)
         best = jax.tree.map(partial(jnp.where, value < best[1]), (x, value), best)
@@ -320,7 +339,7 @@ class History(NamedTuple):
     damping: Any
 
 
-def record(history, i, *values):
+def record(history: History, i: Real, *values):
     """The history with the values of iteration i; None where there are none."""
     return History(*(None if x is None else with_entry(x, i, y) for x, y in zip(history, values, strict=True)))
 

@@ -1,18 +1,22 @@
 """Robust losses, and the cost that a fit lowers: 1/2 sum rho((w r)^2)."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from hhtjax.description import Array, PyTree
 
-def huber(z):
+
+def huber(z: Array) -> Array:
     """z up to 1, then 2 sqrt(z) - 1: the square of a small residual, the size of a large one."""
     return jnp.where(z <= 1, z, 2 * jnp.sqrt(jnp.maximum(z, 1)) - 1)
 
 
-def soft_l1(z):
+def soft_l1(z: Array) -> Array:
     """2 (sqrt(1 + z) - 1): Huber's loss made smooth."""
     return 2 * z / (jnp.sqrt(1 + z) + 1)
 
@@ -24,16 +28,16 @@ LEAST_BEND = 0.1  # share of rho' that rho' + 2 rho'' z is taken to have at leas
 class Objective(NamedTuple):
     """1/2 sum rho(z) with z = (w r)^2 for the first `data` residuals, and rho(z) = z for the others, the priors."""
 
-    weights: Any  # (m,); 0: missing, whatever the residual
+    weights: PyTree  # (m,); 0: missing, whatever the residual
     loss: Callable | None
     data: int
 
-    def scaled(self, r):
+    def scaled(self, r: Array) -> Array:
         """w r, with 0 in the place of what is missing; r may be a Jacobian."""
         w = self.weights.reshape(-1, *(1,) * (r.ndim - 1))
         return jnp.where(w == 0, 0, w * r)
 
-    def losses(self, r):
+    def losses(self, r: Array):
         """rho of each residual, and its first two derivatives."""
         z = self.scaled(r) ** 2
         ones = jnp.ones_like(z)
@@ -41,17 +45,17 @@ class Objective(NamedTuple):
         if loss is None:
             return z, ones, 0 * z
 
-        def rho(z):
+        def rho(z: Array) -> Array:
             return jnp.concatenate([loss(z[: self.data]), z[self.data :]])
 
         (value, slope), (_, curvature) = jax.jvp(lambda z: jax.jvp(rho, (z,), (ones,)), (z,), (ones,))
         return value, slope, curvature
 
-    def cost(self, r):
+    def cost(self, r: Array) -> Array:
         """1/2 sum rho."""
         return jnp.sum(self.losses(r)[0]) / 2
 
-    def least_squares(self, r, J):
+    def least_squares(self, r: Array, J: Array):
         """(r, J) of an ordinary least-squares problem with the same gradient J^T r.
 
         The rows of J are scaled by sqrt(rho' + 2 rho'' z) (Triggs et al. 2000, Sec. 4.3), but not far below the
@@ -63,17 +67,17 @@ class Objective(NamedTuple):
         r, J = self.scaled(r), self.scaled(J)
         return slope * r / jnp.where(row == 0, 1, row), J * row[:, None]
 
-    def stretch(self, r):
+    def stretch(self, r: Array):
         """rho' + 2 rho'' z of each residual, and not far less than rho': the squares of the factors of the rows of w J.
         None without a loss: 1."""
         return None if self.loss is None else self._stretch(r)
 
-    def _stretch(self, r):
+    def _stretch(self, r: Array) -> Array:
         """Of a cost with a loss."""
         _, slope, curvature = self.losses(r)
         return jnp.maximum(slope + 2 * curvature * self.scaled(r) ** 2, LEAST_BEND * slope)
 
-    def estimating(self, r, J):
+    def estimating(self, r: Array, J: Array):
         """w J, and the first and second derivative of the loss of each weighted residual (None without a loss: 1).
 
         With them J^T pull is the gradient of the cost, and J^T diag(bend) J its second derivative.

@@ -1,31 +1,37 @@
 """What a fit is made of: a vector of coordinates, residuals as functions of it, and their weights."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import Kind, thaw
+from hhtjax.description import Array, Kind, PyTree, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.residuals import check_residuals, require_own_samples, spread_weights
+
+if TYPE_CHECKING:
+    from hhtjax.description.current import Reading
 
 
 class Data(NamedTuple):
     """The traced arguments of a fit besides params0: pytrees, or None where there is nothing."""
 
-    scale: Any
-    weights: Any
+    scale: Array
+    weights: PyTree
     prior: Any
-    tolerance: Any
+    tolerance: Array
     records: Any
-    starts: Any
+    starts: PyTree
     read: Any = None  # arrays that the residuals read, where these are a `Kind`
 
-    def function(self, residuals):
+    def function(self, residuals: Callable | Reading) -> Callable | Reading:
         """The residuals, with what they read."""
         return residuals.of(self.read) if isinstance(residuals, Kind) else residuals
 
@@ -33,7 +39,7 @@ class Data(NamedTuple):
 class Coordinates:
     """params as a function of the vector x that the optimiser moves."""
 
-    def __init__(self, transforms, params0, scale):
+    def __init__(self, transforms: tuple, params0: PyTree, scale: PyTree):
         self.leaves, self.structure = jax.tree.flatten(params0)
         self.scales = jax.tree.leaves(scale)
         self.transforms = transforms
@@ -43,13 +49,13 @@ class Coordinates:
         self.x0 = x0.astype(x0.dtype)  # as x is later: what is traced for a Python number is traced anew
         self.longest = longest_steps(transforms, self.leaves)
 
-    def free_leaves(self, x):
+    def free_leaves(self, x: Array):
         """The fitted leaves."""
         return [
             self.transforms[i].parameter(y, self.scales[i]) for i, y in zip(self.free, self.unravel(x), strict=True)
         ]
 
-    def params(self, x):
+    def params(self, x: Array) -> PyTree:
         """All leaves, as params0 has them."""
         changed = dict(zip(self.free, self.free_leaves(x), strict=True))
         return thaw(self.structure.unflatten([changed.get(i, leaf) for i, leaf in enumerate(self.leaves)]))
@@ -57,23 +63,23 @@ class Coordinates:
     def bend(self):
         """x -> p''/p' of the fitted entries; None where no bound makes it differ from 0."""
 
-        def of(x):
+        def of(x: Array) -> Array:
             leaves = zip(self.free, self.unravel(x), strict=True)
             return ravel_pytree([self.transforms[i].bend(y) for i, y in leaves])[0]
 
         return None if np.all(np.isinf(self.longest)) else of
 
-    def slope(self, x):
+    def slope(self, x: Array) -> Array:
         """dp/dx of the fitted entries."""
         return jax.jvp(lambda x: ravel_pytree(self.free_leaves(x))[0], (x,), (jnp.ones_like(x),))[1]
 
-    def of_prior(self, prior):
+    def of_prior(self, prior: dict):
         """Means and standard deviations for the fitted leaves."""
         pairs = [self.structure.flatten_up_to(prior)[i] for i in self.free]
         return [pair.mean for pair in pairs], [pair.deviation for pair in pairs]
 
 
-def longest_steps(transforms, leaves, own=0):
+def longest_steps(transforms: tuple, leaves: list, own: int = 0) -> np.ndarray:
     """Of the vector x, within which a transform is about straight, (p + own,); own: how many unknowns of records."""
     pairs = [(T, x) for T, x in zip(transforms, leaves, strict=True) if T is not tf.fixed]
     steps = [np.broadcast_to(T.longest_step, np.shape(x)).ravel() for T, x in pairs]
@@ -84,17 +90,17 @@ class DenseParts(NamedTuple):
     """Of a fit without records: residuals and priors f(x) (m + k,), their weights w, and the first m as a pytree."""
 
     f: Any
-    w: Any
-    unravel: Any
+    w: PyTree
+    unravel: Callable
     shapes: tuple  # of the leaves of the residuals
 
     @property
-    def m(self):
+    def m(self) -> int:
         """How many are no priors."""
         return sum(map(math.prod, self.shapes))
 
 
-def dense_parts(residuals, coordinates, data) -> DenseParts:
+def dense_parts(residuals: Callable | Reading, coordinates: Coordinates, data: PyTree) -> DenseParts:
     """One residual function of all parameters, with priors as further rows."""
     residuals = data.function(residuals)
     params0 = coordinates.params(coordinates.x0)
@@ -106,7 +112,7 @@ def dense_parts(residuals, coordinates, data) -> DenseParts:
         means, deviations = coordinates.of_prior(data.prior)
         w = jnp.concatenate([w, 1 / ravel_pytree(deviations)[0]])
 
-    def f(x):
+    def f(x: Array) -> Array:
         r, _ = ravel_pytree(residuals(coordinates.params(x)))
         if data.prior is None:
             return r
@@ -121,19 +127,19 @@ class RecordParts(NamedTuple):
     both as pytrees."""
 
     f: Any
-    w: Any
-    own0: Any
-    unravel: Any
-    unravel_start: Any
+    w: PyTree
+    own0: Array
+    unravel: Callable
+    unravel_start: Callable
     shapes: tuple  # of the leaves of the residuals, all records together
 
 
-def record_parts(residuals, coordinates, data) -> RecordParts:
+def record_parts(residuals: Callable, coordinates: Coordinates, data: PyTree) -> RecordParts:
     """One residual function of each record, with a start of its own."""
     _, unravel_start = ravel_pytree(first(data.starts))
     own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
 
-    def every(params, starts, records):
+    def every(params: PyTree, starts: dict, records: Array) -> Array:
         return jax.vmap(partial(residuals, params))(starts, records)
 
     unknowns, params0 = coordinates.x0.size + own0.size, coordinates.params(coordinates.x0)
@@ -145,12 +151,12 @@ def record_parts(residuals, coordinates, data) -> RecordParts:
     w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)
     _, unravel = ravel_pytree(first(weights))
 
-    def f(x, own, record):
+    def f(x: Array, own: Array, record: Array) -> Array:
         return ravel_pytree(residuals(coordinates.params(x), unravel_start(own), record))[0]
 
     return RecordParts(f, w, own0, jax.vmap(unravel), jax.vmap(unravel_start), tuple(x.shape for x in leaves))
 
 
-def first(tree):
+def first(tree: PyTree) -> PyTree:
     """Of its leading axis."""
     return jax.tree.map(lambda x: x[0], tree)

@@ -1,17 +1,19 @@
 """A fit as one compiled program: from checked arguments to a `FitResult`."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import zero_from_primal
 
-from hhtjax.description import all_concrete, freeze, is_tracing, programs
+from hhtjax.description import Array, PyTree, Real, all_concrete, freeze, is_tracing, programs
 from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options
 from hhtjax.identification.bordered_least_squares import Arrow, ArrowTrial, arrow_trial, free_of_own
 from hhtjax.identification.gauss_newton import Dense, DenseTrial, dense_trial, with_jacobian
@@ -26,6 +28,10 @@ from hhtjax.primitives import is_untouched
 from hhtjax.runs.frozen_steps import chooses_steps, with_steps_for
 from hhtjax.xla import Programs
 
+if TYPE_CHECKING:
+    from hhtjax.description.current import Reading
+    from hhtjax.identification.gauss_newton import Seen
+
 
 class _Solved(NamedTuple):
     """x and what belongs to it. J, pull, bend: of `Objective.estimating` there, J None if not asked for; leaves: pull
@@ -34,23 +40,23 @@ class _Solved(NamedTuple):
 
     x: Any
     cost: Any
-    history: Any
-    iterations: Any
-    code: Any
-    choices: Any
-    residual: Any
-    starts: Any
+    history: Array
+    iterations: Array
+    code: Array
+    choices: Array
+    residual: Array
+    starts: PyTree
     J: Any
     pull: Any
     bend: Any
     leaves: Any
     sizes: list
-    present: Any
+    present: Array
     block: int = 1
 
 
 @partial(Programs, static_argnums=(0, 1))
-def solve(residuals, options: Options, params0, data: Data) -> FitResult:
+def solve(residuals: Callable | Reading, options: Options, params0: PyTree, data: Data) -> FitResult:
     """The fit, with what it says about itself as data."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
     limits = limits_of(options, data, coordinates.x0)
@@ -60,13 +66,13 @@ def solve(residuals, options: Options, params0, data: Data) -> FitResult:
     return result_of(options, data, found, params, slope)
 
 
-def limits_of(options, data, x):
+def limits_of(options: Options, data: PyTree, x: Real):
     """The tolerance, at least 10 roundings of numbers like x; how many iterations at most; whether to show them."""
     xp, least = namespace_of(x), 10 * float(jnp.finfo(x.dtype).eps)
     return xp.maximum(xp.asarray(data.tolerance, x.dtype), least), options.max_iterations, options.progress
 
 
-def result_of(options, data, found, params, slope):
+def result_of(options: Options, data: PyTree, found, params: PyTree, slope: Real) -> FitResult:
     """What is known of a solution. slope: dp/dx of the fitted entries."""
     believed, segments = None, 0
     if options.covariance:
@@ -78,13 +84,15 @@ def result_of(options, data, found, params, slope):
     return FitResult(params, *ended, options.transforms, believed, segments, found.starts, data.weights, found.choices)
 
 
-def _solve_dense(residuals, options, coordinates, data, limits):
+def _solve_dense(
+    residuals: Callable | Reading, options: Options, coordinates: Coordinates, data: PyTree, limits: tuple
+):
     parts = dense_parts(residuals, coordinates, data)
     f, w, m = parts.f, parts.w, parts.m
     call, given = hoisted(f, coordinates.x0)
     by_jacobians = options.optimizer == LEVENBERG_MARQUARDT
 
-    def problem_of(given, w, f=None):
+    def problem_of(given: list, w: Array, f: Callable | None = None) -> Dense | Smooth:
         f, objective = f or partial(call, given), Objective(w, options.loss, m)
         return Dense(f, objective, coordinates.bend()) if by_jacobians else Smooth(f, objective)
 
@@ -112,7 +120,7 @@ def dense_solution(x, cost, ended, residual, estimates, shapes, w) -> _Solved:
     return _Solved(*ended, J, pull, bend, leaves, sizes, xp.sum(w != 0))
 
 
-def _solve_records(residuals, options, coordinates, data, limits):
+def _solve_records(residuals, options, coordinates, data: PyTree, limits):
     parts, p = record_parts(residuals, coordinates, data), coordinates.x0.size
     w, own0 = parts.w, parts.own0
     one = coordinates.x0, own0[0], first(data.records)
@@ -149,7 +157,7 @@ def records_solution(x, cost, ended, residual, starts, estimates, shapes, w, p, 
     return _Solved(*ended, J, pull, bend, leaves, [w.size], present, block)
 
 
-def _minimise(problem, frozen, x0, longest, optimizer, limits):
+def _minimise(problem, frozen: Callable | None, x0: Array, longest: np.ndarray, optimizer, limits: tuple):
     """x, what the problem reads there, and the history, its length, the code, and how often steps were chosen.
 
     frozen: y, fresh -> the problem with steps as for y, unless they are chosen anew; None where runs choose none.
@@ -164,7 +172,7 @@ def _minimise(problem, frozen, x0, longest, optimizer, limits):
     return best.x, best.read, tuple(ended)
 
 
-def _dense_with_frozen_steps(problem, y, fresh):
+def _dense_with_frozen_steps(problem, y: Array, fresh: Array) -> Dense:
     """A `Dense` problem with steps of its runs as for y, unless they are chosen anew."""
     return problem._replace(f=lambda x: with_steps_for(problem.f, x, jnp.where(fresh, x, y)))
 
@@ -202,10 +210,10 @@ class Kept(NamedTuple):
     """Of a point, for the result."""
 
     estimates: Any  # of `Objective.estimating`; None where they are J, r, None
-    residual: Any
-    params: Any
+    residual: Array
+    params: PyTree
     slope: Any
-    starts: Any
+    starts: PyTree
     stretch: Any  # of `Objective.stretch`
 
 
@@ -220,7 +228,7 @@ class Kind:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _begin(residuals, options, params0, data):
+def _begin(residuals: Callable | Reading, options: Options, params0: PyTree, data: PyTree):
     """The vector x to start from, the weights, and the kind of the fit."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
     x0 = coordinates.x0
@@ -238,7 +246,7 @@ programs.add(_begin)
 
 
 @partial(Programs, static_argnums=(0, 1))
-def _see(residuals, options, x, params0, data):
+def _see(residuals: Callable | Reading, options: Options, x: Array, params0: PyTree, data: PyTree) -> Seen:
     """The `Seen` of x, with a `Kept`."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
     p, starts = coordinates.x0.size, None
@@ -264,17 +272,17 @@ class Outside(NamedTuple):
 
     see: Callable
 
-    def look(self, x, D):
+    def look(self, x: np.ndarray, D: np.ndarray) -> DenseTrial:
         """The trial at x, with D from the trials before."""
         return dense_trial(x, _in_numpy(self.see(x)), D)
 
-    def nothing(self, x):
+    def nothing(self, x: np.ndarray) -> DenseTrial:
         """A trial before the first evaluation."""
         zero = np.zeros_like(x)
         square, number = np.zeros((x.size, x.size), x.dtype), np.zeros((), x.dtype)
         return DenseTrial(x, None, number + np.inf, number, zero, zero, zero, square, zero)
 
-    def weighted(self, trial):
+    def weighted(self, trial: DenseTrial):
         """As of `Dense`."""
         _, J, kept = trial.read
         return _weighted(J, kept)
@@ -290,17 +298,17 @@ class OutsideRecords(NamedTuple):
     p: int
     count: int
 
-    def look(self, x, D):
+    def look(self, x: np.ndarray, D: np.ndarray) -> ArrowTrial:
         """The trial at x, with D from the trials before."""
         return arrow_trial(x, _in_numpy(self.see(x)), D, self.p)
 
-    def nothing(self, x):
+    def nothing(self, x: np.ndarray) -> ArrowTrial:
         """A trial before the first evaluation."""
         k, zero, number = (x.size - self.p) // self.count, np.zeros_like(x), np.zeros((), x.dtype)
         R = np.zeros((self.count, 1, k + self.p), x.dtype)
         return ArrowTrial(x, None, number + np.inf, number, zero, zero, R[:, :, k:], R[:, :, :k], R[:, :, 0])
 
-    def weighted(self, trial):
+    def weighted(self, trial: ArrowTrial):
         """As of `Arrow`."""
         _, J, kept = trial.read
         return _weighted(J, kept)
@@ -309,7 +317,7 @@ class OutsideRecords(NamedTuple):
     bending = Arrow.bending
 
 
-def _weighted(J, kept):
+def _weighted(J: np.ndarray, kept: Kept):
     """w J, whose rows in a least-squares problem are others where there is a loss."""
     if kept is None or kept.estimates is None:
         return J, None
@@ -317,19 +325,19 @@ def _weighted(J, kept):
     return np.reshape(wJ, J.shape), np.reshape(kept.stretch, J.shape[:-1])
 
 
-def _in_numpy(seen):
+def _in_numpy(seen: Seen) -> Seen:
     """A `Seen` of NumPy arrays, but for what is kept beside r and J."""
     seen, kept = jax.tree.map(np.asarray, seen._replace(read=None)), seen.read
     return seen._replace(read=(seen.r, seen.J, kept))
 
 
-def is_outside(options, *given):
+def is_outside(options: Options, *given: PyTree) -> bool:
     """Whether a fit with these options, given these pytrees, can be done so."""
     is_free = is_untouched() and not is_tracing() and all_concrete(given)
     return is_free and options.optimizer == LEVENBERG_MARQUARDT and jax.default_backend() == "cpu"
 
 
-def solve_outside(residuals, options, params0, data):
+def solve_outside(residuals: Callable | Reading, options: Options, params0: PyTree, data: PyTree) -> FitResult:
     """`solve`, where nothing is being traced."""
     x0, w, kind = _begin(residuals, options, params0, data)
     columns = x0.size if w.ndim == 1 else kind.p + (x0.size - kind.p) // len(w)
@@ -337,7 +345,7 @@ def solve_outside(residuals, options, params0, data):
         return solve(residuals, options, params0, data)
     x0, w, warned = np.asarray(x0), np.asarray(w), np.geterr()
 
-    def see(x):
+    def see(x: np.ndarray) -> Seen:
         with np.errstate(**warned):  # the user's functions may be traced here
             return _see(residuals, options, x, params0, data)
 
@@ -377,7 +385,7 @@ def _solution(best, ended, kind, w, segments):
 # with the second derivatives of the residuals, which Gauss-Newton leaves out.
 
 
-def at_minimum(solve, problem_of, p, *data):
+def at_minimum(solve: Callable, problem_of: Callable, p: int, *data: PyTree):
     """solve(), with the derivatives of the minimum in `data`.
 
     Args:
@@ -389,11 +397,11 @@ def at_minimum(solve, problem_of, p, *data):
     call, closed_over = hoisted(solve)
 
     @jax.custom_jvp
-    def found(closed_over, data):
+    def found(closed_over: list, data: PyTree):
         return call(closed_over)
 
     @found.defjvp
-    def _(primals, tangents):
+    def _(primals: tuple, tangents: tuple):
         x, values, more = found(*primals)
         data, moved = primals[1], tangents[1]
         dx = _response(problem_of, p, x, data, moved)
@@ -403,12 +411,12 @@ def at_minimum(solve, problem_of, p, *data):
     return found(closed_over, data)
 
 
-def _response(problem_of, p, x, data, moved):
+def _response(problem_of: Callable, p: int, x: Array, data: PyTree, moved: tuple) -> Array:
     """dx where the data move so. Own unknowns are eliminated, and perturbed in all records at once."""
     g, along = jax.jvp(lambda data: problem_of(*data).slopes(x), (data,), (moved,))
     count, size = g.shape
 
-    def near(small):
+    def near(small: Array) -> Array:
         return problem_of(*data).slopes(x + jnp.concatenate([small[:p], jnp.tile(small[p:], count)]))
 
     H = jax.jacfwd(near)(jnp.zeros(size, x.dtype))  # (records, slopes, unknowns)
@@ -423,7 +431,7 @@ def _response(problem_of, p, x, data, moved):
     return jnp.concatenate([shared, own.ravel()])
 
 
-def _inverse(H):
+def _inverse(H: Array) -> Array:
     """Of a symmetric H whose unknowns differ in size; 0 in directions of which it says nothing."""
     D = jnp.sqrt(jnp.abs(jnp.diagonal(H)))
     D = jnp.where(D == 0, 1, D)

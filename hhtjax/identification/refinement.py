@@ -1,5 +1,7 @@
 """Fits with smaller and smaller steps, extrapolated: the estimate without the error of its step size."""
 
+from __future__ import annotations
+
 import json
 import warnings
 from collections.abc import Callable
@@ -11,7 +13,7 @@ import numpy as np
 
 from hhtjax.analysis import damping_ratio
 from hhtjax.checks import require_function, require_integer, require_number
-from hhtjax.description import freeze, thaw
+from hhtjax.description import Array, PyTree, Real, freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
@@ -42,11 +44,11 @@ class Refined(NamedTuple):
         shift: of the first fit from there, in its standard errors, a pytree like params.
     """
 
-    stepper: Any
+    stepper: Stepper
     dt: float
     fits: tuple[FitResult, ...]
-    params: Any
-    shift: Any
+    params: PyTree
+    shift: Array
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """The interval of the last fit about `params`: two pytrees like them."""
@@ -61,13 +63,13 @@ class Refined(NamedTuple):
         return json.dumps(report.encode(self))
 
     @staticmethod
-    def from_json(text: str) -> "Refined":
+    def from_json(text: str) -> Refined:
         """What `to_json` wrote."""
         classes = Refined, Coefficients, Options, ExplicitTableau, RosenbrockTableau, *_subclasses(Stepper)
         return report.read(text, Refined, NAMED | {c.__name__: c for c in classes})
 
 
-def _subclasses(base):
+def _subclasses(base: type):
     for c in base.__subclasses__():
         yield c
         yield from _subclasses(c)
@@ -75,9 +77,9 @@ def _subclasses(base):
 
 def refine(
     residuals_at: Callable[[Stepper, float], Callable[..., Any]],
-    params0: Any,
+    params0: PyTree,
     stepper: Stepper,
-    dt: float,
+    dt: Real,
     levels: int | None = None,
     **options: Any,
 ) -> Refined:
@@ -144,12 +146,12 @@ def refine(
     return Refined(stepper, dt, tuple(fits), thaw(params), thaw(shift))
 
 
-def needed_levels(stepper):
+def needed_levels(stepper: Stepper) -> int:
     """3 where an undamped oscillation with w h = 1 is damped by the stepper itself, else 2."""
     return 2 if float(damping_ratio(stepper, 1.0)) <= UNDAMPED else 3  # it is NaN where none is left
 
 
-def _warn_if_shifted(params, shift, dt):
+def _warn_if_shifted(params: PyTree, shift, dt):
     sizes = np.concatenate([np.ravel(x) for x in jax.tree.leaves(shift)])
     named = [f"{n} ({s:+.1f})" for n, s in zip(parameter_names(params), sizes, strict=True) if abs(s) > 1]
     if named:

@@ -1,15 +1,17 @@
 """A fit for readers: a text table, and JSON."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import fields, is_dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import freeze, thaw
+from hhtjax.description import Array, PyTree, Real, freeze, thaw
 from hhtjax.description.presentation import Table, all_known, brief, known, leaf_rows
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.evidence import (
@@ -24,6 +26,10 @@ from hhtjax.identification.evidence import (
 from hhtjax.identification.identifiability import parameter_names, parameter_values, why_undetermined
 from hhtjax.identification.least_squares import CONVERGED, REASONS
 
+if TYPE_CHECKING:
+    from hhtjax.identification.result import FitResult
+    from hhtjax.identification.sandwich import Uncertainty
+
 CLOSE = 0.95  # correlation of two estimates that is worth a word
 MOST_PAIRS = 3
 AT_BOUND = 0.01  # standard errors
@@ -33,7 +39,7 @@ ADVICE = (
 )
 
 
-def summary(result) -> str:
+def summary(result: FitResult) -> str:
     """The text of `FitResult.summary`."""
     cost = f"cost {float(result.cost):.6g}, {float(result.history.cost[0]):.6g} at the start"
     chosen = "" if result.choices is None else f"; steps chosen {int(result.choices)} times, and frozen"
@@ -56,7 +62,7 @@ def summary(result) -> str:
 
 
 @partial(jax.jit, static_argnames=("kind", "transforms"))
-def _believed(kind, transforms, params, uncertainty, code):
+def _believed(kind: type, transforms: tuple, params: PyTree, uncertainty: Uncertainty, code: Array):
     """Standard errors, interval, naive errors, frozen, and correlations: one program in the place of some fifty."""
     result = kind(thaw(params), None, None, None, None, code, transforms, uncertainty, 0)
     found = result.standard_errors, *result.interval(), result.errors(uncertainty.naive)
@@ -85,7 +91,7 @@ def table(result) -> Table:
     return Table(f"FitResult: {REASONS.get(code.item())}; {iterations} iterations, cost {cost:.6g}", rows)
 
 
-def _columns(free, error, lower, upper, naive):
+def _columns(free: Real, error: Real, lower: Real, upper: Real, naive: Real):
     """Standard error, interval, and the ratio to the naive error, in words."""
     if not free:
         return ["fixed", "", ""]
@@ -94,7 +100,7 @@ def _columns(free, error, lower, upper, naive):
     return [f"{error:.3g}", f"{lower:.6g} .. {upper:.6g}", f"{error / naive:.2f}" if naive else ""]
 
 
-def _about_residuals(result):
+def _about_residuals(result: FitResult):
     """How many there are and what they are worth, how large, whether they are white; starts that were fitted too."""
     residuals = residuals_of(result)
     n = count(residuals)
@@ -123,7 +129,7 @@ def _about_residuals(result):
     return lines
 
 
-def _about_estimates(result, names, errors, R):
+def _about_estimates(result, names, errors: np.ndarray, R: np.ndarray):
     """Where standard errors come from, what is not determined, and what is only together."""
     believed = result.uncertainty
     segments = f"how much {result.segments} segments of the record disagree (cluster sandwich)"
@@ -151,7 +157,7 @@ def _about_estimates(result, names, errors, R):
     return remarks
 
 
-def _at_bound(result, errors):
+def _at_bound(result: FitResult, errors: np.ndarray) -> np.ndarray:
     """Flags of the parameters that are closer to a bound than a hundredth of their standard error, if it is finite."""
     leaves = zip(result.transforms, jax.tree.leaves(freeze(result.params)), strict=True)
     distance = np.concatenate([np.ravel(T.distance(p)) for T, p in leaves])
@@ -184,7 +190,7 @@ def encode(x: Any) -> Any:
     return {"array": np.asarray(x).tolist(), "dtype": str(np.asarray(x).dtype)}
 
 
-def read(text, kind, named) -> Any:
+def read(text: str, kind: type, named: dict) -> Any:
     """What the to_json of a kind wrote; named: as for `decode`."""
     try:
         found = decode(json.loads(text), named)
@@ -197,7 +203,7 @@ def read(text, kind, named) -> Any:
     return found
 
 
-def decode(x, named) -> Any:
+def decode(x: PyTree, named: dict) -> Any:
     """The inverse of `encode`; named: the classes of named tuples and steppers, by name."""
     if not isinstance(x, dict):
         return x

@@ -1,20 +1,27 @@
 """What the residuals of a fit return, checked, and the weights of it."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import freeze, is_array, is_concrete, thaw
+from hhtjax.description import Array, PyTree, Real, freeze, is_array, is_concrete, thaw
 from hhtjax.identification.arguments import check_real, require_prefix
 from hhtjax.identification.least_squares import NO_SLOPE
 
+if TYPE_CHECKING:
+    from hhtjax.description.current import Reading
 
-def check_residuals(caller, residuals, p, *args):
+
+def check_residuals(caller: str, residuals: Callable | Reading, p: int, *args: PyTree) -> PyTree:
     """The shapes and dtypes of residuals(*args), if they are good for p parameters."""
 
-    def real(*args):
+    def real(*args: PyTree) -> PyTree:
         result = residuals(*args)
         for path, leaf in jax.tree_util.tree_leaves_with_path(result):
             if not (is_array(leaf) or isinstance(leaf, (int, float))):
@@ -41,13 +48,13 @@ def check_residuals(caller, residuals, p, *args):
     return shapes
 
 
-def spread_weights(caller, weights, shapes, name="weights"):
+def spread_weights(caller: str, weights: Real, shapes, name: str = "weights"):
     """The weight of every entry of the raveled residuals; name: of the argument."""
 
-    def spread(weight, branch):
+    def spread(weight: Real, branch) -> Array:
         weight = jnp.asarray(weight)
 
-        def one(leaf):
+        def one(leaf) -> Array:
             if weight.shape != leaf.shape[: weight.ndim]:
                 raise ValueError(
                     f"{caller}: `{name}` must have the leading axes of their residuals, {leaf.shape}; "
@@ -61,7 +68,7 @@ def spread_weights(caller, weights, shapes, name="weights"):
     return jax.tree.leaves(jax.tree.map(spread, weights, shapes))
 
 
-def check_weights(caller, weights):
+def check_weights(caller: str, weights: PyTree):
     """Finite numbers, or Booleans: True to keep, False for a missing sample."""
     if weights is None:
         raise TypeError(f"{caller}: `weights` must be a number, an array or a pytree of them; received None.")
@@ -102,7 +109,7 @@ def first_bad(residual, weights, of_records=False):
 # Residuals of every sample less every other: (n, 1) less (n,) is (n, n) to NumPy, which is never meant in a fit.
 
 
-def require_own_samples(caller, residuals, shapes, *args):
+def require_own_samples(caller: str, residuals: Callable | Reading, shapes: PyTree, *args: PyTree):
     """An error where a leaf of residuals(*args) is (n, n), made by promoting a rank, and of no data of that size.
 
     Nothing is traced unless a leaf is (n, n). What is written on purpose is let through: an outer sum whose two ranks

@@ -1,5 +1,7 @@
 """What `fit` returns."""
 
+from __future__ import annotations
+
 import json
 import math
 import statistics
@@ -11,7 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number
-from hhtjax.description import freeze, is_concrete, thaw
+from hhtjax.description import Array, PyTree, Real, freeze, is_concrete, thaw
 from hhtjax.description.presentation import CHARTS, shown
 from hhtjax.identification import report
 from hhtjax.identification import transforms as tf
@@ -46,18 +48,18 @@ class FitResult(NamedTuple):
     has variance 0; one that the residuals do not determine has inf, and covariances 0.
     """
 
-    params: Any
-    residual: Any
+    params: PyTree
+    residual: Array
     cost: Any
     history: History
-    iterations: Any
-    code: Any
+    iterations: Array
+    code: Array
     transforms: tuple
     uncertainty: Uncertainty | None
     segments: int
-    starts: Any = None
-    weights: Any = True
-    choices: Any = None
+    starts: PyTree = None
+    weights: PyTree = True
+    choices: Array | None = None
 
     @property
     def converged(self) -> Any:
@@ -99,13 +101,13 @@ class FitResult(NamedTuple):
         """Of the estimates, (p, p), or None."""
         return None if self.uncertainty is None else correlation(self.covariance)
 
-    def embed(self, covariance):
+    def embed(self, covariance: PyTree) -> Array:
         """A covariance of the free entries with rows of zeros for the fixed ones, (p, p)."""
         at = np.flatnonzero(self.free)
         p = len(self.free)
         return jnp.zeros((p, p), covariance.dtype).at[np.ix_(at, at)].set(covariance)
 
-    def errors(self, covariance):
+    def errors(self, covariance: Array) -> PyTree:
         """Standard errors from a covariance of the free entries, structured like params."""
         _, unravel = ravel_pytree(freeze(self.params))
         return thaw(unravel(jnp.sqrt(jnp.diagonal(self.embed(covariance)))))
@@ -162,7 +164,7 @@ class FitResult(NamedTuple):
         return json.dumps(report.encode(self))
 
     @staticmethod
-    def from_json(text: str) -> "FitResult":
+    def from_json(text: str) -> FitResult:
         """What `to_json` wrote. params of dicts, lists and tuples."""
         return report.read(text, FitResult, NAMED)
 
@@ -170,7 +172,7 @@ class FitResult(NamedTuple):
 NAMED: dict[str, Any] = {c.__name__: c for c in (FitResult, History, Uncertainty)}
 
 
-def _ends(T, p, reach):
+def _ends(T, p: Array, reach: Array):
     if T is tf.fixed:
         return p, p
     one = jnp.ones_like(p)
@@ -183,7 +185,7 @@ def _ends(T, p, reach):
     return tuple(jnp.where(near, *ends) for ends in zip(cut, by_x, strict=True))
 
 
-def student(level, degrees):
+def student(level: Real, degrees: Array | None) -> Real:
     """Two-sided quantile of Student's t, by Cornish and Fisher's expansion about the normal one (None: normal); of few
     degrees of freedom, where the expansion is far off, by bisection, and between integers by interpolation of log t
     over 1/degrees: to 4 %, between 1 and 2."""
@@ -200,7 +202,7 @@ def student(level, degrees):
     return xp.where(degrees > FEW, many, xp.exp(xp.interp(-1 / degrees, -1 / integers, few)))
 
 
-def _student_of_few(level, degrees):
+def _student_of_few(level: Real, degrees: int) -> float:
     """The t with P(|t'| < t) = level, a finite sum of powers of cos(angle) for t = sqrt(degrees) tan(angle)
     (Abramowitz and Stegun 1964, 26.7.3 and 26.7.4)."""
     odd, lower, upper = degrees % 2, 0.0, math.pi / 2

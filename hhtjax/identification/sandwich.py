@@ -18,12 +18,16 @@ With a loss rho (Huber 1981, Ch. 7, an M-estimate) psi(r), half the derivative o
 J^T diag(psi'(r)) J for J^T J outside of it.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.description import Array, Real
 from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import triangle
 from hhtjax.numerics.array_namespace import eigh, namespace_of, svd
@@ -53,22 +57,22 @@ class Uncertainty(NamedTuple):
             a parameter, and less where a few say most of it (Satterthwaite, for white residuals); None without.
     """
 
-    cluster: Any
-    naive: Any
-    autocorrelated: Any
+    cluster: Array
+    naive: Array
+    autocorrelated: Array
     singular_values: Any
-    directions: Any
-    undetermined: Any
-    inverse: Any = None
-    degrees: Any = None
+    directions: Array
+    undetermined: Array
+    inverse: Array | None = None
+    degrees: Array | None = None
 
     @property
-    def covariance(self):
+    def covariance(self) -> Array:
         """The cluster sandwich; the autocorrelated one where there is none."""
         return self.autocorrelated if self.cluster is None else self.cluster
 
 
-def correlation(covariance):
+def correlation(covariance: Array) -> Array:
     """C_ij/sqrt(C_ii C_jj); 0 beside an undetermined parameter."""
     sigma = jnp.sqrt(jnp.diagonal(covariance))
     safe = jnp.where(jnp.isfinite(sigma) & (sigma > 0), sigma, 1)
@@ -76,7 +80,7 @@ def correlation(covariance):
     return jnp.where(eye == 1, eye, covariance / jnp.outer(safe, safe))
 
 
-def used_up(present, entries):
+def used_up(present: np.ndarray, entries: int) -> Real:
     """How many residuals the starts of records take: of each as many as a start has entries, or as there are.
 
     present: (records, m), whether a residual is there; of NumPy or JAX.
@@ -84,17 +88,19 @@ def used_up(present, entries):
     return present.sum(axis=1).clip(max=entries).sum()
 
 
-def _length(n, segments, block):
+def _length(n: int, segments: int, block: int) -> int:
     """Of each of at most `segments` equal parts of n rows, of which `block` after another stay together."""
     return -(-n // (segments * block)) * block
 
 
-def count_segments(sizes, segments, block=1):
+def count_segments(sizes: list, segments: int, block: int = 1) -> int:
     """How many segments leaves of these sizes are cut into, at most `segments`."""
     return max(-(-n // _length(n, segments, block)) for n in sizes if n)
 
 
-def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertainty:
+def uncertainty(
+    J: Real, r: Real, bend: Real, present: Real, sizes: list, segments: int, tau: Real, block: int = 1
+) -> Uncertainty:
     """All of the above.
 
     Args:
@@ -123,13 +129,13 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
     spare = (present - p).astype(J.dtype) - xp.sum(xp.where(told > 0, 1 - told, 0))
     s2 = xp.sum(r**2) / xp.maximum(spare, 1)
 
-    def in_units(C):
+    def in_units(C: Real) -> Real:
         C = T @ C @ T.T / xp.outer(column, column)
         both = undetermined[:, None] & undetermined[None, :]
         C = xp.where(undetermined[:, None] | undetermined[None, :], 0, C)
         return xp.where(both & xp.eye(p, dtype=bool), xp.inf, C)
 
-    def covariance(S):
+    def covariance(S: Real) -> Real:
         return in_units(inverse @ (S + prior) @ inverse)
 
     white = s2 * J.T @ J
@@ -141,7 +147,7 @@ def uncertainty(J, r, bend, present, sizes, segments, tau, block=1) -> Uncertain
     return Uncertainty(cluster, naive, covariance(tau * white), s, directions, undetermined, in_units(inverse), degrees)
 
 
-def _inverse_curvature(J, bend, T, seen):
+def _inverse_curvature(J: Real, bend: Real, T: Real, seen: Real):
     """(J^T diag(bend) J)^-1 for J^T J = 1, and whether a parameter is part of a direction in which it vanishes."""
     xp, p = namespace_of(J), len(seen)
     if bend is None:
@@ -153,7 +159,7 @@ def _inverse_curvature(J, bend, T, seen):
     return (U * inverse[None, :]) @ U.T, xp.any(flat[None, :] & (share > 1e-6), axis=1)
 
 
-def in_segments(x, sizes, segments, block=1):
+def in_segments(x: Real, sizes: list, segments: int, block: int = 1):
     """Of each leaf in the rows of x, raveled, its equal parts: (segments, rows, ...), the last filled up with zeros."""
     xp, parts = namespace_of(x), []
     for leaf in xp.split(x, np.cumsum(sizes)[:-1]):
@@ -164,7 +170,7 @@ def in_segments(x, sizes, segments, block=1):
     return parts
 
 
-def _clusters(J, r, cut, variance, x, prior):
+def _clusters(J: Real, r: Real, cut: tuple, variance: Real, x: Real, prior: Real):
     """sum_g s_g s_g^T, for J^T J = 1: then J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T with A = J_g^T J_g; and
     the `_degrees` of its products with the columns of x."""
     xp, A, score = namespace_of(J), 0.0, 0.0
@@ -181,7 +187,7 @@ def _clusters(J, r, cut, variance, x, prior):
     return S, _degrees(xp.where(alone, 0, share), U, x, known)
 
 
-def _degrees(share, U, x, known):
+def _degrees(share: Real, U: Real, x: Real, known: Real) -> Real:
     """2 mean^2/variance of x^T S x, for each column x and white residuals of unit variance (Bell and McCaffrey 2002).
 
     It is e^T G e, with G_gh = x^T B_g A_g (delta_gh - A_h) B_h x and B = (1 - A)^(-1/2). known: what is in the mean
@@ -199,13 +205,13 @@ def _degrees(share, U, x, known):
     return xp.where(some, xp.maximum(mean**2 / xp.where(some, square, 1), 1), xp.inf)
 
 
-def time_axis(shape, of_records=False):
+def time_axis(shape: tuple, of_records: bool = False) -> int:
     """The longest axis, along which residuals follow one another; records, on the first axis, do not."""
     first = int(of_records and len(shape) > 1)
     return first + int(np.argmax(shape[first:])) if shape else 0
 
 
-def in_time(shapes):
+def in_time(shapes: Sequence) -> np.ndarray:
     """The order of the entries of raveled leaves in which each leaf goes along its `time_axis` first: segments are cut
     from what follows one another, and not from one output after the other."""
     begin, orders = 0, [np.arange(0)]
@@ -216,7 +222,7 @@ def in_time(shapes):
     return np.concatenate(orders)
 
 
-def variance_inflation(leaves, of_records=False):
+def variance_inflation(leaves: list, of_records: bool = False) -> Real:
     """tau >= 1 of weighted residual leaves, each along its `time_axis` of N entries, with L = sqrt(N).
 
     The sum over lags is sum_w (sum of r in w)^2/(L sum r^2) over all windows w of L entries, the ends padded with 0.

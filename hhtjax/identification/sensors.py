@@ -1,8 +1,11 @@
 """Sensors: what they show of a motion, at times of their own, with gain, offset, drift and delay."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import describe, require_function, require_number, require_params
-from hhtjax.description import Description, is_array, is_real, thaw
+from hhtjax.description import Array, Description, PyTree, Real, is_array, is_real, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.runs.interpolate import interpolate, on_axes
@@ -19,17 +22,21 @@ from hhtjax.runs.solution import Solution
 from hhtjax.systems import kinematics
 from hhtjax.xla import Programs
 
+if TYPE_CHECKING:
+    from hhtjax.runs.interpolate import Interpolant
+    from hhtjax.runs.output import Output
+
 
 def measure(
     solution: Solution,
-    times: Any,
-    gain: Any = 1.0,
-    offset: Any = 0.0,
-    delay: Any = 0.0,
+    times: Real | None,
+    gain: PyTree = 1.0,
+    offset: PyTree = 0.0,
+    delay: PyTree = 0.0,
     *,
-    drift: Any = 0.0,
-    output: Any = None,
-    params: Any = None,
+    drift: PyTree = 0.0,
+    output: Callable | None = None,
+    params: PyTree = None,
 ) -> Any:
     """What sensors show at `times`, on their clocks:
 
@@ -98,13 +105,13 @@ def measure(
     ])  # fmt: skip
 
 
-def _clock(times, delay, t0):
+def _clock(times, delay, t0) -> Array:
     """The times at which is measured what is shown at these."""
     require_number("measure", "delay", delay, np.isfinite, "be finite")
     return jnp.maximum(jnp.asarray(times) - delay, t0)
 
 
-def _sensed(solution, output, params, times):
+def _sensed(solution: Solution, output: Output | None, params: PyTree, times: Array) -> PyTree:
     """What ideal sensors show, with the times as leading axes."""
     found = interpolate(solution, times)
     if output is None:
@@ -113,7 +120,7 @@ def _sensed(solution, output, params, times):
 
 
 @Programs
-def _outputs(output, found, times, params):
+def _outputs(output: Output, found: Interpolant, times: Array, params: PyTree) -> PyTree:
     """The output at each of the times, what is known there being `found`."""
     params = thaw(params)
     one = partial(output_at, output)
@@ -122,16 +129,16 @@ def _outputs(output, found, times, params):
     return one(found, times, params)
 
 
-def _one_or_tree(x):
+def _one_or_tree(x: PyTree):
     """Numbers in a list as an array."""
     return np.asarray(x) if isinstance(x, (list, tuple)) and all(is_real(y) and np.ndim(y) == 0 for y in x) else x
 
 
-def _is_tree(x):
+def _is_tree(x: PyTree) -> bool:
     return not (is_array(x) or is_real(x))
 
 
-def _each(name, x, like):
+def _each(name: str, x: PyTree, like: PyTree):
     """One for each leaf of what is measured, from one for all or for whole parts of it."""
     try:
         return jax.tree.leaves(jax.tree.map(lambda x, part: [x] * len(jax.tree.leaves(part)), x, like))
@@ -142,12 +149,12 @@ def _each(name, x, like):
         ) from None
 
 
-def _with_flaws(y, since, gain, offset, drift):
+def _with_flaws(y: Array, since: Array, gain: Real, offset: Real, drift: Real) -> Array:
     """gain y + offset + drift t, each a number or of the shape of a reading; flags and counts as they are."""
     if not jnp.issubdtype(y.dtype, jnp.floating):
         return y
 
-    def like_y(x):
+    def like_y(x: Real) -> Real:
         return x if jnp.ndim(x) == 0 else jnp.broadcast_to(x, y.shape)
 
     shown = like_y(gain) * y + like_y(offset)
@@ -163,13 +170,13 @@ class Accelerometer(Description):
     gravity: Any
     frame: Any
 
-    def __call__(self, q, v, w, t, params):
+    def __call__(self, q: Array, v: Array, w: Array, t: Array, params: PyTree) -> Array:
         """f = R^T (a - g)."""
         x, unravel = ravel_pytree(q)
         rates = ravel_pytree(v)[0]
         blocks, one = kinematics.layout(q, v), jnp.ones_like(t)
 
-        def velocity(x, rates, t):
+        def velocity(x: Array, rates: Array, t: Array) -> Array:
             motion = kinematics.rate(blocks, x, rates), one
             return jax.jvp(lambda x, t: jnp.asarray(self.position(unravel(x), t, params)), (x, t), motion)[1]
 
@@ -190,7 +197,7 @@ class Accelerometer(Description):
         return matvec(R.T, f)
 
 
-def accelerometer(position: Any, gravity: Any, frame: Any = None) -> Accelerometer:
+def accelerometer(position: Real, gravity: Real, frame: str | None = None) -> Accelerometer:
     """What an accelerometer shows, for the `output` of `measure`, `simulate` and `sweep`:
 
         f = R^T (a - g),    a = d^2/dt^2 position(q(t), t)
@@ -259,13 +266,13 @@ class Windows(NamedTuple):
         begin: (windows,), time of the first samples on the clock of the record.
     """
 
-    t: Any
-    y: Any
-    present: Any
-    begin: Any
+    t: Array
+    y: PyTree
+    present: Array
+    begin: Array
 
 
-def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
+def windows(t: Real, y: PyTree, duration: Real, present: Real | None = None) -> Windows:
     """A record cut into windows of `duration`, one after the other; what is left at the end is dropped.
 
     Args:
@@ -315,7 +322,7 @@ def windows(t: Any, y: Any, duration: float, present: Any = None) -> Windows:
     return Windows(t[index] - begin[:, None], y[index], present[index] & real, begin)
 
 
-def wrap_angle(angle: Any) -> Any:
+def wrap_angle(angle: Real) -> Any:
     """The same angle in [-pi, pi): for the difference of two angles of which one has lost its whole turns.
 
     Args:

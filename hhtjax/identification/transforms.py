@@ -11,6 +11,8 @@ A step of Levenberg-Marquardt changes the x of a positive or bounded parameter b
 is no straight line.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+
+from hhtjax.description import Array, PyTree, Real
 
 
 class Transform:
@@ -29,7 +33,7 @@ class Transform:
     def __init_subclass__(cls):
         jax.tree_util.register_static(cls)
 
-    def contains(self, p):
+    def contains(self, p: Real) -> np.ndarray:
         """Whether the values p can be reached."""
         return np.full(np.shape(p), True)
 
@@ -49,11 +53,11 @@ class Transform:
         """The bounds of p."""
         return np.asarray(-np.inf, dtype), np.asarray(np.inf, dtype)
 
-    def fits(self, shape):
+    def fits(self, shape: tuple) -> bool:
         """Whether the transform is one of parameters of this shape."""
         return True
 
-    def distance(self, p):
+    def distance(self, p: Array) -> Array:
         """Of p from the nearer bound."""
         lower, upper = self.ends(p.dtype)
         return jnp.minimum(p - lower, upper - p)
@@ -65,15 +69,15 @@ class Scaled(Transform):
 
     longest_step = np.inf
 
-    def parameter(self, x, scale):
+    def parameter(self, x: Array, scale: Array) -> Array:
         """scale x."""
         return scale * x
 
-    def coordinate(self, p, scale):
+    def coordinate(self, p: Array, scale: Array) -> Array:
         """p/scale."""
         return p / scale
 
-    def bend(self, x):
+    def bend(self, x: Array) -> Array:
         """0."""
         return jnp.zeros_like(x)
 
@@ -88,20 +92,20 @@ class Positive(Transform):
         """0 and none."""
         return np.asarray(0.0, dtype), np.asarray(np.inf, dtype)
 
-    def contains(self, p):
+    def contains(self, p: Array) -> Real:
         """p > 0."""
         return np.asarray(p) > 0
 
-    def parameter(self, x, scale):
+    def parameter(self, x: Array, scale: Array) -> Array:
         """exp(x), which never underflows to 0."""
         p = jnp.exp(x)
         return jnp.maximum(p, jnp.finfo(p.dtype).tiny)
 
-    def coordinate(self, p, scale):
+    def coordinate(self, p: Array, scale: Array) -> Array:
         """log(p)."""
         return jnp.log(p)
 
-    def bend(self, x):
+    def bend(self, x: Array) -> Array:
         """1."""
         return jnp.ones_like(x)
 
@@ -123,22 +127,22 @@ class Bounded(Transform):
         return np.asarray(self.lower, dtype), np.asarray(self.upper, dtype)
 
     @property
-    def longest_step(self):
+    def longest_step(self) -> np.ndarray:
         """1 where there is a bound."""
         lower, upper = self.ends()
         return np.where(np.isfinite(lower) | np.isfinite(upper), 1.0, np.inf)
 
-    def fits(self, shape):
+    def fits(self, shape: tuple) -> bool:
         """Whether the bounds have the shape of a parameter, or are numbers."""
         return all(np.shape(bound) in ((), tuple(shape)) for bound in (self.lower, self.upper))
 
-    def contains(self, p):
+    def contains(self, p) -> Real:
         """lower < p < upper."""
         p = np.asarray(p)
         lower, upper = self.ends(np.result_type(p.dtype, np.float16))
         return (p > lower) & (p < upper)
 
-    def parameter(self, x, scale):
+    def parameter(self, x: Array, scale: Real) -> Array:
         """lower + (upper - lower)/(1 + exp(-x)); of one bound lower + exp(x), or upper - exp(-x); of none scale x."""
         lower, upper = self.ends(x.dtype)
         has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
@@ -153,13 +157,13 @@ class Bounded(Transform):
         return jnp.where(jnp.isfinite(p), p + lax.stop_gradient(inside - p), inside)  # with the derivative of p
 
     @staticmethod
-    def _between(x, lower, upper):
+    def _between(x: Array, lower: np.ndarray, upper: np.ndarray) -> Array:
         """Between two finite bounds."""
         share = jax.nn.sigmoid(jnp.where(x > 0, -x, x))  # from the nearer bound on: so its derivative is never 0
         away = (upper - lower) * share
         return jnp.where(x > 0, upper - away, lower + away)
 
-    def coordinate(self, p, scale):
+    def coordinate(self, p: Array, scale: Real) -> Array:
         """The inverse of `parameter`."""
         lower, upper = self.ends(p.dtype)
         has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
@@ -167,7 +171,7 @@ class Bounded(Transform):
         below = jnp.where(has_upper, np.where(has_upper, upper, 0) - p, 1)
         return jnp.where(has_lower | has_upper, jnp.log(above / below), p / scale)
 
-    def bend(self, x):
+    def bend(self, x: Array) -> Array:
         """-tanh(x/2); of one bound 1 or -1; of none 0."""
         lower, upper = (np.isfinite(bound) for bound in self.ends())
         one_sided = lower.astype(float) - upper.astype(float)
@@ -184,7 +188,7 @@ positive = Positive()
 fixed = Fixed()
 
 
-def bounded(lower: Any = None, upper: Any = None) -> Bounded:
+def bounded(lower: Real = None, upper: Real = None) -> Bounded:
     """A transform that keeps a parameter strictly between two bounds, or on one side of one.
 
     Args:
@@ -212,7 +216,7 @@ def bounded(lower: Any = None, upper: Any = None) -> Bounded:
     return Bounded(*(_hashable(y.tolist()) for y in ends))
 
 
-def _bound(name, given, none):
+def _bound(name: str, given: PyTree, none: float) -> np.ndarray:
     """A bound as an array of floats."""
     if given is None:
         return np.asarray(none)
@@ -227,16 +231,16 @@ def _bound(name, given, none):
     return bound
 
 
-def _hashable(x):
+def _hashable(x: PyTree) -> PyTree:
     return tuple(map(_hashable, x)) if isinstance(x, list) else x
 
 
-def is_transform(x):
+def is_transform(x: PyTree) -> bool:
     """Whether it is one, or None for none."""
     return x is None or isinstance(x, Transform)
 
 
-def per_leaf(prefix, tree):
+def per_leaf(prefix: PyTree, tree: PyTree):
     """The transform of each leaf of `tree`, given for leaves or whole branches; None stands for `scaled`."""
     repeated = jax.tree.map(
         lambda T, branch: [scaled if T is None else T] * len(jax.tree.leaves(branch)),

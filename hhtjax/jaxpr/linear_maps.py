@@ -9,20 +9,27 @@ So every value carries `Terms`: for each axis of it, the parts of its derivative
 along that axis, or else one full array. Operations that have no rule here run on whole columns, as with vmap.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial, reduce
 from operator import add
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.jaxpr.scalar_rules import is_understood
 from hhtjax.primitives.compat import is_on
 from hhtjax.primitives.interpreter import alone, evaluate
 from hhtjax.primitives.kernels import structural
+
+if TYPE_CHECKING:
+    from jax.extend.core import ClosedJaxpr, JaxprEqn
 
 
 def linear_map(f, like):
@@ -49,12 +56,12 @@ def linear_map(f, like):
     return result.whole().T if isinstance(result, Terms) else jnp.zeros((*result.shape, like.size), result.dtype)
 
 
-def _evaluate(closed, *values):
+def _evaluate(closed: ClosedJaxpr, *values):
     """The values of a jaxpr's results; `Terms` for what depends on the unknowns."""
     return evaluate(closed.jaxpr, [*closed.consts, *values], _apply)
 
 
-def _apply(eqn, values):
+def _apply(eqn: JaxprEqn, values: list):
     """The results of one operation."""
     if not any(map(_depends, values)):
         return alone(eqn)(*values)
@@ -63,11 +70,11 @@ def _apply(eqn, values):
     return _by_columns(eqn, values) if results is None else results
 
 
-def _depends(value):
+def _depends(value: Array | Terms):
     return isinstance(value, Terms)
 
 
-def _by_columns(eqn, values):
+def _by_columns(eqn, values: list):
     n = next(x.n for x in values if _depends(x))
     columns = [x.whole() if _depends(x) else x for x in values]
     results = jax.vmap(alone(eqn), [0 if _depends(x) else None for x in values], axis_size=n)(*columns)
@@ -77,12 +84,12 @@ def _by_columns(eqn, values):
 # Rules: (eqn, *values) -> list of results, or None for whole columns.
 
 
-def _each(eqn, x):
+def _each(eqn: JaxprEqn, x: Terms):
     """A linear function of each element."""
     return [x.map(lambda y: alone(eqn)(y)[0], x.shape)]
 
 
-def _spread(x, shape, to):
+def _spread(x: Terms, shape: tuple, to: PyTree) -> Terms:
     """The `Terms` x broadcast: its axis i becomes to[i]. One of length 1 is repeated, and then tells no unknown."""
     return x.map(
         lambda y: lax.broadcast_in_dim(y, shape, to),
@@ -91,7 +98,7 @@ def _spread(x, shape, to):
     )
 
 
-def _fit(x, shape):
+def _fit(x, shape: tuple):
     """The same as operations on elements do it."""
     return x if x.shape == shape else _spread(x, shape, range(len(shape) - len(x.shape), len(shape)))
 
@@ -112,13 +119,13 @@ def _multiply(eqn, x, y):
     return [_fit(x, shape).map(lambda z: lax.mul(z, y), shape)]
 
 
-def _divide(eqn, x, y):
+def _divide(eqn, x, y: Real):
     shape = eqn.outvars[0].aval.shape
     return None if _depends(y) else [_fit(x, shape).map(lambda z: lax.div(z, y), shape)]
 
 
-def _select(eqn, which, *cases):
-    def chosen(y, case):
+def _select(eqn, which: Array, *cases):
+    def chosen(y: Array, case: int):
         return lax.select_n(
             which, *(y if i == case else lax.broadcast(zero_like(y), y.shape) for i in range(len(cases)))
         )
@@ -126,7 +133,7 @@ def _select(eqn, which, *cases):
     return [reduce(add, [x.map(partial(chosen, case=i), x.shape) for i, x in enumerate(cases) if _depends(x)])]
 
 
-def _broadcast(eqn, x, *sizes):
+def _broadcast(eqn: JaxprEqn, x: Terms, *sizes):
     return [_spread(x, eqn.params["shape"], eqn.params["broadcast_dimensions"])]
 
 
@@ -137,7 +144,7 @@ def _reshape(eqn, x, *sizes):
     return [_reshaped(x, eqn.outvars[0].aval.shape)]
 
 
-def _reshaped(x, shape):
+def _reshaped(x: Terms, shape: tuple):
     old, new = ([i for i, length in enumerate(s) if length != 1] for s in (x.shape, shape))
     same = [x.shape[i] for i in old] == [shape[i] for i in new]
     return x.map(
@@ -152,7 +159,7 @@ def _transpose(eqn, x):
     return [x.map(lambda y: lax.transpose(y, to), shape, lambda axis, offset: (to.index(axis), offset))]
 
 
-def _cut(x, start, stop, steps):
+def _cut(x: Terms, start: Sequence, stop: Sequence, steps: tuple):
     shape = tuple(-(-(b - a) // step) for a, b, step in zip(start, stop, steps, strict=True))
     return x.map(
         lambda y: lax.slice(y, start, stop, steps),
@@ -161,7 +168,7 @@ def _cut(x, start, stop, steps):
     )
 
 
-def _slice(eqn, x):
+def _slice(eqn: JaxprEqn, x: Terms):
     start, stop, steps = (eqn.params[name] for name in ("start_indices", "limit_indices", "strides"))
     return [_cut(x, start, stop, steps or (1,) * len(start))]
 
@@ -184,7 +191,7 @@ def _unstack(eqn, x):
     return results
 
 
-def _put(x, shape, config):
+def _put(x, shape: tuple, config: Sequence) -> Terms:
     """Among zeros."""
     return x.map(
         lambda y: lax.pad(y, zero_like(y), config),
@@ -193,7 +200,7 @@ def _put(x, shape, config):
     )
 
 
-def _pad(eqn, x, filling):
+def _pad(eqn, x: Terms, filling: Array):
     return None if _depends(filling) else [_put(x, eqn.outvars[0].aval.shape, eqn.params["padding_config"])]
 
 
@@ -211,7 +218,7 @@ def _concatenate(eqn, *values):
     return [reduce(add, parts)]
 
 
-def _unknown_first(y, axis, offset, n):
+def _unknown_first(y: Array, axis: int, offset: int, n: int):
     """A term along `axis` as an array whose first axis is that of the unknowns, once this axis is summed over."""
     y = jnp.moveaxis(y, axis, 0)
     return lax.pad(y, zero_like(y), [(offset, n - offset - len(y), 0), *[(0, 0, 0)] * (y.ndim - 1)])
@@ -251,7 +258,7 @@ def _dot_general(eqn, x, y):
     return [result]
 
 
-def _call(eqn, *values):
+def _call(eqn: JaxprEqn, *values):
     return _evaluate(eqn.params["jaxpr"], *values)
 
 
@@ -295,7 +302,7 @@ class Terms:
     along: dict = field(default_factory=dict)
     full: Any = None
 
-    def map(self, f, shape, keys=lambda axis, offset: (axis, offset)):
+    def map(self, f: Callable, shape: tuple, keys: Callable = lambda axis, offset: (axis, offset)):
         """The same of f(y), for a linear f that keeps indices along our axes apart, but may move them.
 
         keys: (axis, offset) before -> after, or None where f does not keep them apart.
@@ -305,7 +312,7 @@ class Terms:
         rest = Terms(self.n, self.shape, {key: self.along[key] for key, new in moved.items() if new is None}, self.full)
         return Terms(self.n, shape, along, jax.vmap(f)(rest.whole()) if rest.along or rest.full is not None else None)
 
-    def __add__(self, other):
+    def __add__(self, other: Terms) -> Terms:
         keys = {**self.along, **other.along}
         along = {key: add_if_any(self.along.get(key), other.along.get(key)) for key in keys}
         both = Terms(self.n, self.shape, along, add_if_any(self.full, other.full))
@@ -313,7 +320,7 @@ class Terms:
             return both
         return Terms(self.n, self.shape, full=both.whole())  # to carry both would be twice the work
 
-    def apart(self, axes):
+    def apart(self, axes: tuple):
         """The terms along these axes, and all the rest."""
         found = {key: y for key, y in self.along.items() if key[0] in axes}
         others = {key: y for key, y in self.along.items() if key not in found}
@@ -330,11 +337,11 @@ class Terms:
         return total
 
 
-def zero_like(like):
+def zero_like(like: PyTree) -> Array:
     """Zero, where there is nothing to depend on."""
     return structural(np.zeros((), like.dtype))
 
 
-def add_if_any(x, y):
+def add_if_any(x: Array | None, y: Array | None):
     """x + y, where None is nothing."""
     return y if x is None else x if y is None else lax.add(x, y)

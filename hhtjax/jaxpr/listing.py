@@ -6,8 +6,12 @@ name is a `Scalar` too: `array` of its elements, `element` of an array at an ind
 `taken` has elements of an array in another order, `map` does one operation on all, and `product` multiplies matrices.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 from typing import Any
+
+from hhtjax.description import PyTree
 
 FUNCTIONS = {  # operations of which each takes as long as ten or more sums
     *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "erf", "exp", "exp2"),
@@ -54,7 +58,7 @@ class Listing:
     operations: list
     results: Any
 
-    def apart(self, constant):
+    def apart(self, constant: list):
         """Factors of matrices that follow from the arguments `constant` alone, for who computes them once: the names of
         their arrays, the operations that give them, and the listing that has them as arguments too."""
         known, found = set(constant), []
@@ -74,14 +78,14 @@ class Listing:
         return sum(map(_weight, found)), sum(x.name in FUNCTIONS for x in found)
 
 
-def _weight(x):
+def _weight(x: Operation) -> int:
     """How many operations on numbers it is; of an elimination, which is few times as many as it has numbers, one."""
     if x.name == "product":
         return 2 * x.params["count"] * x.params["rows"] * x.params["columns"]
     return x.results[0].size if x.name == "map" else 1
 
 
-def everywhere(operations):
+def everywhere(operations: list):
     """All operations, those of inner lists included."""
     for x in operations:
         yield x
@@ -89,7 +93,7 @@ def everywhere(operations):
             yield from everywhere(block.operations)
 
 
-def pruned(operations, wanted):
+def pruned(operations: list, wanted):
     """The operations that the scalars `wanted` come from, a set that grows by all that these need."""
     kept = []
     for x in reversed(operations):
@@ -101,28 +105,28 @@ def pruned(operations, wanted):
     return kept[::-1]
 
 
-def _arrays(tree):
+def _arrays(tree: PyTree):
     return [tree] if hasattr(tree, "flat") else [x for y in tree for x in _arrays(y)]
 
 
-def _scalars(operands):
+def _scalars(operands: list):
     return [x for x in operands if isinstance(x, Scalar)]
 
 
-def _shorter(block, places, wanted):
+def _shorter(block: Block, places: list, wanted) -> Block:
     """The block with those of its results alone."""
     results = [block.results[i] for i in places]
     wanted.update(_scalars(results))
     return Block(pruned(block.operations, wanted), results)
 
 
-def _branches(x, wanted):
+def _branches(x: Operation, wanted) -> Operation:
     places = [i for i, result in enumerate(x.results) if result in wanted]
     blocks = [_shorter(block, places, wanted) for block in x.blocks]
     return replace(x, results=[x.results[i] for i in places], blocks=blocks)
 
 
-def _loop(x, wanted):
+def _loop(x: Operation, wanted) -> Operation:
     """A carried variable is needed after the loop, by its condition, or by the next value of one that is."""
     unfinished, body = x.blocks
     unfinished = _shorter(unfinished, [0], wanted)

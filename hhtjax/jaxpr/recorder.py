@@ -1,8 +1,13 @@
 """What writes the list of `listing.py`: each operation once, and none whose result is known."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
 import jax
 import numpy as np
 
+from hhtjax.description import PyTree
 from hhtjax.jaxpr.listing import Block, Operation, Scalar
 from hhtjax.jaxpr.scalar_rules import is_known, unmarked
 
@@ -20,7 +25,7 @@ class Recorder:
         self.orders = {}  # {array of pivots: array of the order of rows}
         self.multiples = {}  # {c x: (c, x)} for known c
 
-    def record(self, name, dtype, *operands, **params):
+    def record(self, name: str, dtype, *operands, **params: PyTree):
         """The result of an operation, found if it was there before."""
         name, dtype, operands = SAME.get(name, name), np.dtype(dtype), [as_operand(x) for x in operands]
         found = _simple(self, name, dtype, operands, params)
@@ -32,7 +37,7 @@ class Recorder:
             self.multiples[result] = operands if is_known(operands[0]) else operands[::-1]
         return result
 
-    def array(self, elements, dtype):
+    def array(self, elements, dtype: np.dtype) -> Scalar:
         """The name of an array of these elements; of all that were read from one array, in their order, its own."""
         elements = [as_operand(x) for x in elements]
         name = self.name_of(elements)
@@ -44,7 +49,7 @@ class Recorder:
             return self._once(("taken", id(found[0][0]), at), "taken", [found[0][0]], {"at": at}, dtype, len(at))
         return self._once(("array", *map(_key, elements)), "array", elements, {}, dtype, len(elements))
 
-    def name_of(self, elements, known=False):
+    def name_of(self, elements, known: bool = False):
         """The name of the array whose elements these are, in their order; of one that is known too; or None."""
         elements = [as_operand(x) for x in elements]
         if known and all(map(is_known, elements)):
@@ -62,13 +67,13 @@ class Recorder:
             self.places[found] = array, int(index)
         return found
 
-    def arrays(self, name, operands, likes, **params):
+    def arrays(self, name: str, operands: list, likes: Sequence, **params: PyTree):
         """The arrays that an operation on arrays gives. likes: (dtype, size) of each."""
         results = [Scalar(np.dtype(dtype), self, size) for dtype, size in likes]
         self.append(Operation(name, operands, results, params))
         return results
 
-    def _once(self, key, name, operands, params, dtype, size=0):
+    def _once(self, key: tuple, name: str, operands: list, params: PyTree, dtype: np.dtype, size: int = 0) -> Scalar:
         for known in reversed(self.known):
             if key in known:
                 return known[key]
@@ -77,11 +82,11 @@ class Recorder:
         self.known[-1][key] = result
         return result
 
-    def append(self, operation):
+    def append(self, operation: Operation):
         """At the end of the innermost list."""
         self.blocks[-1].operations.append(operation)
 
-    def inside(self, f):
+    def inside(self, f: Callable) -> Block:
         """The list of what f records, which returns operands."""
         self.blocks.append(Block())
         self.known.append({})
@@ -104,7 +109,7 @@ def _key(x):
     return (1, id(x), "") if isinstance(x, Scalar) else (0, 0, f"{x.dtype}{x!r}")
 
 
-def _simple(recorder, name, dtype, x, params):
+def _simple(recorder: Recorder, name: str, dtype: np.dtype, x: list, params: PyTree):
     """What takes no operation, or simpler ones."""
     if name == "copy" or (name == "convert_element_type" and x[0].dtype == dtype):
         return x[0]
@@ -125,7 +130,7 @@ def _simple(recorder, name, dtype, x, params):
     return None
 
 
-def _power(recorder, dtype, x, y):
+def _power(recorder: Recorder, dtype: np.dtype, x: Scalar, y: int) -> Scalar:
     """x^y as products, halving y as XLA does."""
     if y < 0:
         return recorder.record("div", dtype, dtype.type(1), _power(recorder, dtype, x, -y))

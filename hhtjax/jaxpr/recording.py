@@ -4,13 +4,18 @@ Rules of `scalar_rules.py` move elements, and tell what is done with them; here 
 reads an array at an index that is not known. No derivative is taken of the list: what it holds is final.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial, reduce
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import PyTree
 from hhtjax.jaxpr.listing import Block, Listing, Operation, Scalar, everywhere, pruned
 from hhtjax.jaxpr.recorder import LARGE, Recorder, as_operand
 from hhtjax.jaxpr.scalar_rules import (
@@ -26,6 +31,9 @@ from hhtjax.jaxpr.scalar_rules import (
 )
 from hhtjax.primitives.interpreter import alone, evaluate, line_of
 
+if TYPE_CHECKING:
+    from jax.extend.core import ClosedJaxpr, JaxprEqn
+
 UNKNOWN = "unknown"
 MOST = 100_000  # operations: of more, a compiler takes minutes
 WRITTEN_OUT = 1000  # operations more than those of a loop
@@ -39,12 +47,12 @@ INLINED = {  # a function called: the parameter that holds it
 class NotListed(Exception):
     """An operation that cannot be in the list. name: its; line: of the user's that asked for it, or None."""
 
-    def __init__(self, name, line=None):
+    def __init__(self, name: str, line=None):
         super().__init__(name if line is None else f"{name} ({line})")
         self.name, self.line = name, line
 
 
-def listed(f, *args) -> Listing:
+def listed(f: Callable, *args: PyTree) -> Listing:
     """f as a list of operations on scalars, with a scalar for each number of its arguments.
 
     Args:
@@ -77,14 +85,14 @@ def listed(f, *args) -> Listing:
     return Listing([x for value in values for x in value.flat], operations, jax.tree.structure(like).unflatten(results))
 
 
-def _fresh(recorder, aval):
+def _fresh(recorder: Recorder, aval) -> np.ndarray:
     """A new scalar for each element."""
     count = int(np.prod(aval.shape, dtype=int))
     dtype = np.dtype(object if jnp.issubdtype(aval.dtype, jax.dtypes.extended) else aval.dtype)
     return arranged([Scalar(dtype, recorder) for _ in range(count)], aval.shape)
 
 
-def known_pieces(x):
+def known_pieces(x) -> np.ndarray:
     """An array of numbers, taken to pieces whatever its size."""
     if jnp.issubdtype(getattr(x, "dtype", float), jax.dtypes.extended):
         raise NotListed("random numbers")
@@ -95,15 +103,15 @@ def known_pieces(x):
 class _Listing:
     """The evaluator of a jaxpr on object arrays."""
 
-    def __init__(self, recorder):
+    def __init__(self, recorder: Recorder):
         self.recorder, self.lines = recorder, []
 
-    def run(self, closed, values):
+    def run(self, closed: ClosedJaxpr, values: list):
         """The values of the results of a closed jaxpr."""
         jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
         return evaluate(jaxpr, [*map(known_pieces, constants), *values], self.apply, known_pieces)
 
-    def apply(self, eqn, values):
+    def apply(self, eqn: JaxprEqn, values: list):
         """The results of one operation; of one that is not known, results that nobody may need."""
         self.lines.append(line_of(eqn))
         results = self._results(eqn, eqn.primitive.name, values)
@@ -117,7 +125,7 @@ class _Listing:
         results = [x if isinstance(x, np.ndarray) else arranged([x], ()) for x in results]
         return [each(as_operand, x) for x in results]
 
-    def _results(self, eqn, name, values):
+    def _results(self, eqn, name: str, values):
         if name in INLINED:
             return self.run(eqn.params[INLINED[name]], values)
         if name in LOOPS:
@@ -145,7 +153,7 @@ class _Listing:
         return ARRAYS[name](self.recorder, eqn, *values) if name in ARRAYS else None
 
 
-def _flat(values):
+def _flat(values: PyTree):
     return [x for value in values for x in value.flat]
 
 
@@ -155,7 +163,7 @@ def _back(elements, avals):
     return [arranged([next(elements) for _ in range(int(np.prod(x.shape, dtype=int)))], x.shape) for x in avals]
 
 
-def _cond(listing, eqn, which, *values):
+def _cond(listing, eqn: JaxprEqn, which: np.ndarray, *values: np.ndarray):
     which, branches, recorder = which.item(), eqn.params["branches"], listing.recorder
     if is_known(which):
         return listing.run(branches[min(max(int(which), 0), len(branches) - 1)], values)
@@ -165,7 +173,7 @@ def _cond(listing, eqn, which, *values):
     return _back(results, [x.aval for x in eqn.outvars])
 
 
-def _while(listing, eqn, *values):
+def _while(listing, eqn: JaxprEqn, *values: np.ndarray):
     params, recorder = eqn.params, listing.recorder
     if params["cond_jaxpr"].out_avals[0].shape:
         return None
@@ -181,7 +189,7 @@ def _while(listing, eqn, *values):
     return carry
 
 
-def _scan(listing, eqn, *values):
+def _scan(listing, eqn: JaxprEqn, *values: np.ndarray):
     """Written out, or a loop, where that is long and reads and makes no rows."""
     params = eqn.params
     first = params["num_consts"]
@@ -201,7 +209,7 @@ def _scan(listing, eqn, *values):
     return [*carry, *_back(_flat(x for column in columns for x in column), [x.aval for x in eqn.outvars[len(carry) :]])]
 
 
-def _counted(listing, params, constants, start, avals):
+def _counted(listing, params: PyTree, constants: tuple, start: tuple, avals: list):
     """The same steps again and again as a `while` that counts them; None where that spares little."""
     recorder, carry = listing.recorder, [_fresh(listing.recorder, x) for x in avals]
     body = recorder.inside(lambda: _flat(listing.run(params["jaxpr"], [*constants, *carry])))
@@ -216,7 +224,7 @@ def _counted(listing, params, constants, start, avals):
     return carry
 
 
-def _custom_linear_solve(listing, eqn, *values):
+def _custom_linear_solve(listing, eqn: JaxprEqn, *values: np.ndarray):
     lengths = eqn.params["const_lengths"]
     start = lengths.matvec + lengths.vecmat
     constants, b = values[start : start + lengths.solve], values[sum(lengths) :]
@@ -249,7 +257,7 @@ def in_loops(recorder, eqn, values):
     return None
 
 
-def _map(recorder, name, out, values):
+def _map(recorder: Recorder, name: str, out, values: list):
     if any(is_structural(y) for x in values for y in x.flat):
         return None
     found = [_operand(recorder, x) for x in values]
@@ -260,7 +268,7 @@ def _map(recorder, name, out, values):
     return [elements_of(recorder, found[0], out.shape)]
 
 
-def _operand(recorder, x):
+def _operand(recorder, x: np.ndarray):
     """The one number that an array holds, or its name; None of what has neither."""
     first = x.flat[0]
     if all(y.tobytes() == first.tobytes() if is_known(y) and is_known(first) else y is first for y in x.flat):
@@ -268,7 +276,7 @@ def _operand(recorder, x):
     return recorder.name_of(x.flat, known=True)
 
 
-def _product(recorder, out, a, b, i, j):
+def _product(recorder: Recorder, out, a, b, i: int, j: int):
     """sum_l a_il b_lj, the axis i of a and j of b summed; the elements of each at strides of its rows and columns."""
     if a.ndim == 1 and b.ndim == 2:
         a, b, i, j = b, a, j, i
@@ -305,7 +313,7 @@ def _read(recorder, x, starts, offsets, strides):
     return x.flat[int(index)] if is_known(index) else recorder.element(array, index)
 
 
-def _times(recorder, start, stride):
+def _times(recorder: Recorder, start, stride: int):
     return np.int32(start * stride) if is_known(start) else recorder.record("mul", np.int32, start, np.int32(stride))
 
 
@@ -322,18 +330,18 @@ def _inside(recorder, start, largest):
     return recorder.record("convert_element_type", np.int32, recorder.record("min", dtype, low, dtype.type(largest)))
 
 
-def _strides(shape):
+def _strides(shape: tuple):
     return [int(np.prod(shape[i + 1 :], dtype=int)) for i in range(len(shape))]
 
 
-def _dynamic_slice(recorder, eqn, x, *starts):
+def _dynamic_slice(recorder, eqn: JaxprEqn, x: np.ndarray, *starts):
     sizes = eqn.params["slice_sizes"]
     starts = [_inside(recorder, s.item(), n - k) for s, n, k in zip(starts, x.shape, sizes, strict=True)]
     strides = _strides(x.shape)
     return [arranged([_read(recorder, x, starts, i, strides) for i in np.ndindex(*sizes)], sizes)]
 
 
-def _gather(recorder, eqn, x, indices):
+def _gather(recorder, eqn, x, indices: np.ndarray):
     numbers, sizes, out = eqn.params["dimension_numbers"], eqn.params["slice_sizes"], eqn.outvars[0].aval
     batched = dict(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
     kept = [i for i in range(x.ndim) if i not in numbers.collapsed_slice_dims and i not in batched]
@@ -356,7 +364,7 @@ def _gather(recorder, eqn, x, indices):
     return [arranged(found, out.shape)]
 
 
-def _filled(recorder, eqn, dtype, outside, value):
+def _filled(recorder, eqn, dtype, outside: list, value):
     """The value, or what stands for an element that is not there."""
     fill = eqn.params["fill_value"]
     if fill is None:
@@ -372,11 +380,11 @@ def _filled(recorder, eqn, dtype, outside, value):
     return value
 
 
-def _largest(comparison, recorder, eqn, x):
+def _largest(comparison: str, recorder, eqn, x: np.ndarray):
     """The index of the first largest (smallest) number, or of the first that is none."""
     (axis,), dtype = eqn.params["axes"], np.dtype(eqn.params["index_dtype"])
 
-    def better(a, b):
+    def better(a: tuple, b: tuple):
         (i, x), (j, y) = a, b
         take = recorder.record(comparison, bool, y, x)
         if y.dtype.kind == "f":
@@ -425,7 +433,7 @@ def elements_of(recorder, array, shape):
     return arranged([recorder.element(array, np.int32(i)) for i in range(array.size)], shape)
 
 
-def _lu(recorder, eqn, A):
+def _lu(recorder, eqn, A: np.ndarray):
     n = A.shape[-1]
     if A.shape != (n, n):
         return None
@@ -451,7 +459,7 @@ def _permutation(recorder, eqn, pivots):
     return None if order is None else [elements_of(recorder, order, pivots.shape)]
 
 
-def _moved(recorder, eqn, *values):
+def _moved(recorder: Recorder, eqn: JaxprEqn, *values: np.ndarray):
     """Of what moves elements, and does nothing else: asked where it takes their numbers."""
     sizes = np.cumsum([0, *(x.size for x in values)])
     numbers = [np.arange(i, i + x.size, dtype=np.int32).reshape(x.shape) for i, x in zip(sizes, values, strict=False)]
@@ -460,7 +468,7 @@ def _moved(recorder, eqn, *values):
         return [arranged(elements[np.ravel(x)], x.shape) for x in alone(eqn)(*numbers)]
 
 
-def _triangular_solve(recorder, eqn, A, b):
+def _triangular_solve(recorder, eqn, A: np.ndarray, b: np.ndarray):
     params, shape, dtype = eqn.params, b.shape, eqn.outvars[0].aval.dtype
     if A.ndim != 2 or b.ndim != 2 or params["conjugate_a"]:
         return None

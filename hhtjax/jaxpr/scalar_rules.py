@@ -4,17 +4,24 @@ What moves numbers about costs nothing. What is done with numbers is what the pr
 zeros, NaN and infinities: only x * 1, x / 1, x - 0 and x + -0 are x. With structural zeros it is less.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
 from functools import reduce
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.jaxpr.listing import Scalar
 from hhtjax.primitives.consistent import held
+
+if TYPE_CHECKING:
+    from jax.extend.core import JaxprEqn
 
 # ----------------------------------------------------------------------------
 # Small arrays taken to pieces: NumPy arrays of objects, which are scalars, traced or known.
@@ -37,32 +44,32 @@ class _Zero32(np.float32):
 ZEROS: dict[Any, Any] = {np.dtype(np.float64): _Zero64(0), np.dtype(np.float32): _Zero32(0)}
 
 
-def is_small(aval):
+def is_small(aval) -> bool:
     """Whether arrays like this are taken to pieces; empty ones, which hold nothing to move, are not."""
     return 0 < math.prod(aval.shape) <= LARGEST and not jnp.issubdtype(aval.dtype, jax.dtypes.extended)
 
 
-def is_in_pieces(value):
+def is_in_pieces(value: np.ndarray) -> bool:
     """Or whole."""
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
-def is_known(x):
+def is_known(x: Real):
     """Whether an element is a number, and no tracer."""
     return isinstance(x, np.generic)
 
 
-def is_structural(x):
+def is_structural(x: Real) -> bool:
     """Whether an element is a structural zero."""
     return isinstance(x, (_Zero64, _Zero32))
 
 
-def unmarked(x):
+def unmarked(x: Real) -> Real:
     """The same element, without the mark of a structural zero."""
     return x.dtype.type(x) if is_structural(x) else x
 
 
-def arranged(elements, shape):
+def arranged(elements, shape: tuple):
     """The pieces of an array of this shape."""
     found = np.empty(len(elements), object)
     for i, x in enumerate(elements):  # one by one: NumPy would ask a tracer for its array
@@ -70,7 +77,7 @@ def arranged(elements, shape):
     return found.reshape(shape)
 
 
-def pieces(x):
+def pieces(x: Real):
     """A small array taken to pieces; a large one as it is."""
     if isinstance(x, (np.ndarray, np.generic, int, float, complex)):
         x = np.asarray(x)
@@ -79,7 +86,7 @@ def pieces(x):
     return arranged([x[i] if x.shape else x[()] for i in np.ndindex(*x.shape)], x.shape)
 
 
-def whole(value, aval):
+def whole(value: Real, aval):
     """The array of a value."""
     if not is_in_pieces(value):
         return value
@@ -87,12 +94,12 @@ def whole(value, aval):
     return jnp.stack(elements).reshape(aval.shape) if aval.shape else elements[0]
 
 
-def as_scalar(x, dtype):
+def as_scalar(x: Array, dtype: np.dtype) -> Array:
     """An element as an array without axes."""
     return jnp.asarray(unmarked(x), dtype)
 
 
-def each(f, value):
+def each(f: Callable, value: np.ndarray) -> np.ndarray:
     """f of every element."""
     return arranged([f(x) for x in value.flat], value.shape) if is_in_pieces(value) else f(value)
 
@@ -107,13 +114,13 @@ LAX = {
 }
 
 
-def compute(name, *x):
+def compute(name: str, *x: Array) -> Array:
     """One operation on scalars of one type, which are to be recorded, or traced, or known."""
     recorder = recorder_of(x)
     return LAX[name](*x) if recorder is None else recorder.record(name, x[0].dtype, *x)
 
 
-def recorder_of(x):
+def recorder_of(x: tuple):
     """Who records what is done with these scalars; None where they are JAX's, or known."""
     return next((y.recorder for y in x if isinstance(y, Scalar)), None)
 
@@ -133,45 +140,45 @@ ELEMENTWISE = {
 }
 
 
-def _any(value):
+def _any(value: PyTree) -> bool:
     return True
 
 
-def _none(value):
+def _none(value) -> bool:
     return value is None
 
 
-def _own(sharding):
+def _own(sharding) -> bool:
     """None, or what shard_map says of arrays that each device has to itself."""
     return sharding is None or (
         getattr(getattr(sharding, "mesh", None), "are_all_axes_manual", False) and not any(sharding.spec)
     )
 
 
-def _empty(value):
+def _empty(value: PyTree) -> bool:
     return not value
 
 
-def _unspecified(values):
+def _unspecified(values: tuple) -> bool:
     return all(type(x).__name__ == "UnspecifiedValue" for x in values)
 
 
-def _no_layout(values):
+def _no_layout(values: tuple) -> bool:
     return all(x is None for x in values)
 
 
-def _usual_precision(value):
+def _usual_precision(value) -> bool:
     """What the CPU computes in any case: full precision."""
     values = value if isinstance(value, tuple) else (value,)
     return all(x is None or isinstance(x, lax.Precision) for x in values)
 
 
-def _mode(value):
+def _mode(value) -> bool:
     modes = lax.GatherScatterMode
     return value in (modes.CLIP, modes.FILL_OR_DROP, modes.PROMISE_IN_BOUNDS)
 
 
-def replaces(jaxpr):
+def replaces(jaxpr) -> bool:
     """Whether an update of a scatter takes the place of what was there; others compute with both."""
     if jaxpr is None:
         return True
@@ -179,7 +186,7 @@ def replaces(jaxpr):
     return not jaxpr.eqns and list(jaxpr.outvars) == [jaxpr.invars[1]]
 
 
-def _of_any(*names):
+def _of_any(*names: str):
     return dict.fromkeys(names, _any)
 
 
@@ -232,7 +239,7 @@ UNDERSTOOD = {
 }
 
 
-def is_understood(eqn):
+def is_understood(eqn: JaxprEqn) -> bool:
     """Whether all parameters of an operation are known, with values for which its rules were written."""
     known = UNDERSTOOD.get(eqn.primitive.name)
     return known is not None and all(name in known and known[name](x) for name, x in eqn.params.items())
@@ -249,7 +256,7 @@ def _elementwise(eqn, *values):
     return [arranged([_scalar(eqn, out.dtype, *x) for x in zip(*columns, strict=True)], out.shape)]
 
 
-def _scalar(eqn, dtype, *x):
+def _scalar(eqn: JaxprEqn, dtype: np.dtype, *x: Real):
     """One operation on scalars, or what is known without it."""
     name = eqn.primitive.name
     found = _without(name, dtype, *x)
@@ -261,7 +268,7 @@ def _scalar(eqn, dtype, *x):
     return found
 
 
-def _without(name, dtype, *x):
+def _without(name: str, dtype: np.dtype, *x: Real):
     """What is known of the result of an operation, or None."""
     found = SHORT[name](dtype, *x) if name in SHORT else None
     if found is None and name in NUMPY and all(map(is_known, x)):
@@ -269,55 +276,55 @@ def _without(name, dtype, *x):
     return found
 
 
-def _is(x, number):
+def _is(x: Real, number: float) -> Real:
     """Whether an element is this number, the sign of a zero included; integers have no such sign."""
     if isinstance(x, np.floating):
         return x == number and np.signbit(x) == np.signbit(number)
     return isinstance(x, np.integer) and x == number
 
 
-def _product(dtype, x, y):
+def _product(dtype: np.dtype, x: Real, y: Array):
     if is_structural(x) or is_structural(y):
         return ZEROS[dtype]
     return y if _is(x, 1) else x if _is(y, 1) else None
 
 
-def _sum(dtype, x, y):
+def _sum(dtype: np.dtype, x: Real, y: Real):
     if is_structural(x) or is_structural(y):
         return y if is_structural(x) else x
     return y if _is(x, -0.0) else x if _is(y, -0.0) else None
 
 
-def _difference(dtype, x, y):
+def _difference(dtype: np.dtype, x: Real, y: Real):
     if is_structural(y) or _is(y, 0.0):
         return x
     return compute("neg", y) if _is(x, -0.0) and not is_known(y) else None
 
 
-def _quotient(dtype, x, y):
+def _quotient(dtype: np.dtype, x: Real, y: Real):
     return ZEROS[dtype] if is_structural(x) else x if _is(y, 1) else None
 
 
-def _negative(dtype, x):
+def _negative(dtype: np.dtype, x: Real):
     return x if is_structural(x) else None
 
 
-def _converted(dtype, x):
+def _converted(dtype: np.dtype, x: Real):
     return ZEROS.get(dtype) if is_structural(x) else None
 
 
-def _selected(dtype, which, *cases):
+def _selected(dtype: np.dtype, which: Real, *cases: Real):
     if not is_known(which) or not 0 <= int(which) < len(cases):
         return None
     return cases[int(which)]
 
 
-def _exactly(f):
+def _exactly(f: Callable):
     """A function of NumPy that gives what XLA does, bit for bit."""
     return lambda dtype, *x: dtype.type(f(*x))
 
 
-def _converted_number(dtype, x):
+def _converted_number(dtype: np.dtype, x: Real) -> Real:
     """A known number in another type, as XLA does it when a program runs: it saturates, and NaN becomes 0. Where XLA or
     MLIR folds constants it would be a cast of C, which is something else on every machine."""
     if any(jnp.issubdtype(d, jnp.complexfloating) for d in (dtype, x.dtype)):
@@ -330,10 +337,10 @@ def _converted_number(dtype, x):
     return x.astype(dtype)
 
 
-def _integers(f):
+def _integers(f: Callable):
     """A function of integers of any size, and of the limits of their type; of other numbers nothing is known."""
 
-    def rule(dtype, *x):
+    def rule(dtype: np.dtype, *x: Real):
         if not jnp.issubdtype(dtype, jnp.integer):
             return None
         limits = jnp.iinfo(dtype)
@@ -342,27 +349,27 @@ def _integers(f):
     return rule
 
 
-def _divided(limits, x, y):
+def _divided(limits, x: int, y: int) -> int:
     """Towards zero; -1, in all its bits, where y is 0. Folding by XLA ends the process there."""
     return -1 if y == 0 else (abs(x) // abs(y)) * (1 if (x < 0) == (y < 0) else -1)
 
 
-def _remainder(limits, x, y):
+def _remainder(limits, x: int, y: int) -> int:
     return x if y == 0 else x - y * _divided(limits, x, y)
 
 
-def _fold(name, dtype, x):
+def _fold(name: str, dtype: np.dtype, x):
     """x[0] o x[1] o ..., o one of the operations of LAX."""
 
-    def combine(x, y):
+    def combine(x: Array, y: Array) -> Array:
         found = _without(name, dtype, x, y)
         return compute(name, x, y) if found is None else found
 
     return reduce(combine, x)
 
 
-def _reduction(name):
-    def rule(eqn, x):
+def _reduction(name: str):
+    def rule(eqn, x: np.ndarray):
         axes, out = eqn.params["axes"], eqn.outvars[0].aval
         rows = _rows(x, [i for i in range(x.ndim) if i not in axes], axes)
         return [arranged([_fold(name, out.dtype, row) for row in rows], out.shape)]
@@ -370,11 +377,11 @@ def _reduction(name):
     return rule
 
 
-def _choice(name):
+def _choice(name: str):
     """The largest or the smallest, with JAX's derivative: equal ones share it, and what is not a number stays so."""
 
     @jax.custom_jvp
-    def chosen(*x):
+    def chosen(*x: Array):
         return reduce(LAX[name], x)
 
     @chosen.defjvp
@@ -386,7 +393,7 @@ def _choice(name):
 
     fold = _reduction(name)
 
-    def rule(eqn, x):
+    def rule(eqn, x: np.ndarray):
         out = eqn.outvars[0].aval
         if not jnp.issubdtype(out.dtype, jnp.floating):
             return fold(eqn, x)
@@ -397,13 +404,13 @@ def _choice(name):
     return rule
 
 
-def _rows(x, first, last):
+def _rows(x: np.ndarray, first: list, last) -> np.ndarray:
     """x as a matrix, the axes `first` along its columns, `last` along its rows."""
     lengths = [math.prod(x.shape[i] for i in axes) for axes in (first, last)]
     return x.transpose(*first, *last).reshape(lengths)
 
 
-def _dot_general(eqn, x, y):
+def _dot_general(eqn, x: np.ndarray, y: np.ndarray):
     out = eqn.outvars[0].aval
     if any(v.aval.dtype != out.dtype for v in eqn.invars) or out.dtype == bool:
         return None
@@ -420,47 +427,47 @@ def _dot_general(eqn, x, y):
     return [arranged([dot(a, b) for left, right in zip(*rows, strict=True) for a in left for b in right], out.shape)]
 
 
-def _reshape(eqn, x):
+def _reshape(eqn, x: np.ndarray):
     order = eqn.params["dimensions"]
     return [(x if order is None else x.transpose(order)).reshape(eqn.outvars[0].aval.shape)]
 
 
-def _squeeze(eqn, x):
+def _squeeze(eqn, x: np.ndarray):
     return [x.reshape(eqn.outvars[0].aval.shape)]
 
 
-def _transpose(eqn, x):
+def _transpose(eqn: JaxprEqn, x: np.ndarray):
     return [x.transpose(eqn.params["permutation"])]
 
 
-def _broadcast_in_dim(eqn, x):
+def _broadcast_in_dim(eqn: JaxprEqn, x: np.ndarray):
     shape = [1] * len(eqn.params["shape"])
     for axis, n in zip(eqn.params["broadcast_dimensions"], x.shape, strict=True):
         shape[axis] = n
     return [np.broadcast_to(x.reshape(shape), eqn.params["shape"])]
 
 
-def _concatenate(eqn, *parts):
+def _concatenate(eqn: JaxprEqn, *parts: np.ndarray):
     return [np.concatenate(parts, eqn.params["dimension"])]
 
 
-def _stack(eqn, *parts):
+def _stack(eqn: JaxprEqn, *parts: np.ndarray):
     return [np.stack(parts, eqn.params["axis"])]
 
 
-def _split(eqn, x):
+def _split(eqn: JaxprEqn, x: np.ndarray):
     return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"])
 
 
-def _unstack(eqn, x):
+def _unstack(eqn, x: np.ndarray):
     return [np.take(x, [i], eqn.params["axis"]).reshape(out.aval.shape) for i, out in enumerate(eqn.outvars)]
 
 
-def _rev(eqn, x):
+def _rev(eqn: JaxprEqn, x: np.ndarray):
     return [np.flip(x, eqn.params["dimensions"])]
 
 
-def _slice(eqn, x):
+def _slice(eqn: JaxprEqn, x: np.ndarray):
     start, stop, step = (eqn.params[key] for key in ("start_indices", "limit_indices", "strides"))
     return [x[tuple(map(slice, start, stop, step or [1] * x.ndim))]]
 
@@ -470,18 +477,18 @@ def _iota(eqn):
     return [pieces(np.indices(out.shape)[axis].astype(out.dtype))]
 
 
-def _structural(eqn, x):
+def _structural(eqn, x: np.ndarray):
     dtype = eqn.outvars[0].aval.dtype
     return [each(lambda x: ZEROS.get(dtype, x) if is_known(x) and x == 0 else x, x)]
 
 
-def _moved(*moves):
+def _moved(*moves: int):
     """Of what moves elements to places that are known: asked where it takes the numbers of the elements.
 
     The numbers start at 1; what comes from outside an array is the fill value, 0.
     """
 
-    def rule(eqn, *values):
+    def rule(eqn, *values: np.ndarray):
         if not all(is_known(x) for i, value in enumerate(values) if i not in moves for x in value.flat):
             return None
         elements = np.concatenate([arranged([_filling(eqn)], (1,)), *(values[i].ravel() for i in moves)])
@@ -499,7 +506,7 @@ def _moved(*moves):
     return rule
 
 
-def _filling(eqn):
+def _filling(eqn) -> Real:
     """What a gather puts in the place of elements that are not there."""
     dtype, value = eqn.invars[0].aval.dtype, eqn.params.get("fill_value")
     if value is not None:

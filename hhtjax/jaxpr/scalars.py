@@ -8,10 +8,13 @@ nothing, products with the zeros and ones of unit vectors vanish, and a batch of
 It comes before vmap and autodiff, which then see scalars. An operation that has no rule here runs on whole arrays.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +22,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import Literal
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.jaxpr.listing import FUNCTIONS
 from hhtjax.jaxpr.scalar_rules import (
     ELEMENTWISE,
@@ -38,6 +42,9 @@ from hhtjax.primitives.compat import is_on
 from hhtjax.primitives.interpreter import alone, evaluate, needed
 from hhtjax.primitives.kernels import STAGED, named
 
+if TYPE_CHECKING:
+    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
+
 MOST_OPERATIONS = 2000  # on scalars: the gradient of more is no kernel any more
 MOST_IN_VALUES = 2500  # where nobody asks for derivatives; of more compiling takes longer than it saves
 
@@ -51,7 +58,7 @@ class Scalars:
     shape: tuple
 
 
-def pays(f, *args, derivatives=True):
+def pays(f: Callable, *args: PyTree, derivatives: bool = True) -> bool:
     """Whether f of these trees is better evaluated on scalars: few operations, all known, of more than one number.
 
     Operations that are not known may keep XLA from making one kernel of a loop; without one, scalars take longer.
@@ -63,10 +70,10 @@ def pays(f, *args, derivatives=True):
     return _work(_traced(f, *args)[0].jaxpr) <= (MOST_OPERATIONS if derivatives else MOST_IN_VALUES)
 
 
-def _traced(f, *args):
+def _traced(f: Callable, *args: PyTree):
     """The closed jaxpr of f of trees, of `Scalars` too, and what it returns, in shapes. JAX traces a function once."""
 
-    def like(x):
+    def like(x: Array | Scalars):
         return jax.ShapeDtypeStruct(x.shape if _is_scalars(x) else jnp.shape(x), _dtype(x))
 
     return jax.make_jaxpr(f, return_shape=True)(*jax.tree.map(like, args, is_leaf=_is_scalars))
@@ -92,7 +99,7 @@ def _work(jaxpr):
     return total
 
 
-def split(tree):
+def split(tree: PyTree):
     """The tree with `Scalars` for its small arrays."""
     return jax.tree.map(lambda x: Scalars(tuple(pieces(x).flat), x.shape) if x.ndim and is_small(x) else x, tree)
 
@@ -101,23 +108,23 @@ class Form(NamedTuple):
     """How functions of a tree are evaluated. tree: with `Scalars` for its small arrays, or as it was; `of` gives the
     form of a function, `like` that of another such tree, and `joined` arrays again."""
 
-    tree: Any
+    tree: Array
     is_split: bool = False
 
-    def of(self, f):
+    def of(self, f: Callable):
         """f of such trees, to such trees."""
         return by_scalars(f)
 
-    def like(self, tree):
+    def like(self, tree: PyTree) -> PyTree:
         """Another tree of the same arrays, in this form."""
         return split(tree) if self.is_split else tree
 
-    def joined(self, tree):
+    def joined(self, tree: PyTree):
         """Any such tree as arrays; what its scalars are stacked along comes first."""
         return join(tree)
 
 
-def on_scalars(f, tree, derivatives=True):
+def on_scalars(f: Callable, tree: PyTree, derivatives: bool = True) -> Form:
     """The form in which f of the tree is better evaluated: on scalars where that pays, else on arrays.
 
     Args:
@@ -139,7 +146,7 @@ def on_scalars(f, tree, derivatives=True):
     return form._replace(tree=form.like(tree))
 
 
-def join(tree):
+def join(tree: PyTree):
     """The tree with arrays for its `Scalars`; what they are stacked along comes first."""
 
     def joined(x):
@@ -151,10 +158,10 @@ def join(tree):
     return jax.tree.map(joined, tree, is_leaf=_is_scalars)
 
 
-def by_scalars(f):
+def by_scalars(f: Callable):
     """f of trees that `split` made, to such trees; f itself of trees it left alone."""
 
-    def g(*args):
+    def g(*args: PyTree) -> PyTree:
         leaves = jax.tree.leaves(args, is_leaf=_is_scalars)
         if not any(map(_is_scalars, leaves)):
             return f(*args)
@@ -168,7 +175,7 @@ def by_scalars(f):
     return g
 
 
-def _is_scalars(x):
+def _is_scalars(x: PyTree) -> bool:
     return isinstance(x, Scalars)
 
 
@@ -176,19 +183,19 @@ def _dtype(x):
     return jnp.result_type(x.elements[0] if _is_scalars(x) else x)
 
 
-def _as_scalars(value, like):
+def _as_scalars(value: np.ndarray, like: PyTree):
     if not is_in_pieces(value):
         return value
     elements = tuple(as_scalar(x, like.dtype) for x in value.flat)
     return Scalars(elements, like.shape) if like.shape else elements[0]
 
 
-def _run(closed, values):
+def _run(closed: ClosedJaxpr, values):
     """The values of the results of a closed jaxpr."""
     return evaluate(closed.jaxpr, [*map(pieces, closed.consts), *values], _apply, lambda x: pieces(np.asarray(x)))
 
 
-def _apply(eqn, values):
+def _apply(eqn: JaxprEqn, values: list):
     """The results of one operation."""
     name = eqn.primitive.name
     results = None
@@ -222,7 +229,7 @@ class _Stage(NamedTuple):
     constvars: Any = ()
 
 
-def in_stages(name, f, *args):
+def in_stages(name: str, f: Callable, *args: Array):
     """f(*args), as calls of functions of this name."""
     closed = jax.make_jaxpr(f)(*args)
     eqns, results = _each_once(closed.jaxpr)
@@ -234,11 +241,11 @@ def in_stages(name, f, *args):
     return [jnp.asarray(x.val) if isinstance(x, Literal) else known[x] for x in results]
 
 
-def _each_once(jaxpr):
+def _each_once(jaxpr: Jaxpr):
     """The operations of a jaxpr without those on numbers that have been done before, and its results."""
     eqns, done, same = [], {}, {}
 
-    def renamed(atoms):
+    def renamed(atoms: list):
         return [x if isinstance(x, Literal) else same.get(x, x) for x in atoms]
 
     for eqn in needed(jaxpr):
@@ -259,7 +266,7 @@ def _variables(atoms):
     return list(dict.fromkeys(x for x in atoms if not isinstance(x, Literal)))
 
 
-def _layers(eqns):
+def _layers(eqns: list):
     """What is to be known one after the other: operands of functions, their results, operands of functions of those."""
     depth, layers = {}, {}
     for eqn in eqns:
@@ -275,7 +282,7 @@ def _layers(eqns):
         yield _variables(x for eqn in layer for x in eqn.outvars)
 
 
-def _stage(eqns, known, wanted):
+def _stage(eqns: list, known, wanted):
     """From what is known to what is wanted."""
     wanted = [x for x in _variables(wanted) if x not in known]
     missing, needed = set(wanted), []
@@ -292,7 +299,7 @@ def _stage(eqns, known, wanted):
 # Each takes `run`, (closed jaxpr, values) -> values of its results, the evaluator that it is a part of.
 
 
-def _call(run, eqn, *values):
+def _call(run: Callable, eqn: JaxprEqn, *values: np.ndarray):
     """A staged function stays a call, of scalars."""
     closed, name = eqn.params["jaxpr"], eqn.params["name"]
     if not name.startswith(STAGED):
@@ -300,7 +307,7 @@ def _call(run, eqn, *values):
     given, fill = _unknowns(values)
     after = []
 
-    def call(*arrays):
+    def call(*arrays: Array):
         results = run(closed, fill(arrays))
         found, refill = _unknowns(results, dict(zip(map(id, arrays), given, strict=True)))
         after.append(refill)
@@ -315,14 +322,14 @@ class _Place:
     index: int
 
 
-def _unknowns(values, passed=()):
+def _unknowns(values: Sequence, passed: PyTree = ()):
     """What is not known in the values, each once, and the function that puts others in its place.
 
     passed: {id of a tracer: what it stands for}, which is put there instead.
     """
     found, places = [], {}
 
-    def place(x):
+    def place(x: Real):
         if is_known(x):
             return x
         if id(x) in passed:
@@ -334,17 +341,17 @@ def _unknowns(values, passed=()):
 
     template = [each(place, value) for value in values]
 
-    def fill(new):
+    def fill(new: Sequence):
         return [each(lambda x: new[x.index] if isinstance(x, _Place) else x, value) for value in template]
 
     return found, fill
 
 
-def _layout(variables):
+def _layout(variables: list):
     """Values of such variables as a list of arrays, and back."""
     avals = [x.aval for x in variables]
 
-    def flat(values):
+    def flat(values: Sequence):
         pairs = zip(values, avals, strict=True)
         return [as_scalar(x, aval.dtype) for v, aval in pairs for x in (v.flat if is_in_pieces(v) else [v])]
 
@@ -360,46 +367,46 @@ def _layout(variables):
     return flat, back
 
 
-def _while_loop(run, eqn, *values):
+def _while_loop(run: Callable, eqn: JaxprEqn, *values: np.ndarray):
     params, flat, back = eqn.params, *_layout(eqn.outvars)
     if params["cond_jaxpr"].out_avals[0].shape:  # vmap: each member has its own end
         return None
     first = params["cond_nconsts"]
     second = first + params["body_nconsts"]
 
-    def unfinished(carry):
+    def unfinished(carry: list) -> Array:
         closed = params["cond_jaxpr"]
         return run(closed, [*values[:first], *back(carry)])[0].item()
 
-    def body(carry):
+    def body(carry: list):
         closed = params["body_jaxpr"]
         return flat(run(closed, [*values[first:second], *back(carry)]))
 
     return back(lax.while_loop(unfinished, body, flat(values[second:])))
 
 
-def _cond(run, eqn, which, *values):
+def _cond(run: Callable, eqn: JaxprEqn, which: np.ndarray, *values: Real):
     (flat, back), (flat_results, back_results) = _layout(eqn.invars[1:]), _layout(eqn.outvars)
 
-    def branch(closed):
+    def branch(closed: ClosedJaxpr):
         return lambda *x: flat_results(run(closed, back(x)))
 
     return back_results(lax.switch(which.item(), [branch(closed) for closed in eqn.params["branches"]], *flat(values)))
 
 
-def _in_turn(run, eqn, asked, *values):
+def _in_turn(run: Callable, eqn: JaxprEqn, asked: np.ndarray, *values: Real):
     number, closed = eqn.params["number"], eqn.params["closed"]
     if closed is not eqn.params["at_once"]:  # of a batch
         return None
     (flat, back), (flat_more, back_more) = _layout(eqn.outvars), _layout(eqn.invars[1 + number :])
 
-    def f(carry, more):
+    def f(carry: list, more: list):
         return flat(run(closed, [*back(carry), *back_more(more)]))
 
     return back(in_turn(f, asked.item(), flat(values[:number]), flat_more(values[number:])))
 
 
-def _custom_linear_solve(run, eqn, *values):
+def _custom_linear_solve(run: Callable, eqn: JaxprEqn, *values: np.ndarray):
     lengths, closed = eqn.params["const_lengths"], eqn.params["jaxprs"]
     flat, back = _layout(eqn.outvars)
     ends = np.cumsum([lengths.matvec, lengths.vecmat, lengths.solve, lengths.transpose_solve])
@@ -410,7 +417,7 @@ def _custom_linear_solve(run, eqn, *values):
     if not scalars or len({x.dtype for x in scalars}) > 1:
         return None
 
-    def vector(name, constants):
+    def vector(name: str, constants: tuple):
         function = getattr(closed, name)
         return lambda x: jnp.stack(flat(run(function, [*constants, *back(list(x))])))
 
@@ -420,7 +427,7 @@ def _custom_linear_solve(run, eqn, *values):
     return back(list(x))
 
 
-def _custom_jvp_call(run, eqn, *values):
+def _custom_jvp_call(run, eqn, *values: np.ndarray):
     """A function with a rule of its own for derivatives, which serves scalars too."""
     if not any(x.aval.shape for x in eqn.invars) or not all(
         jnp.issubdtype(x.aval.dtype, jnp.floating) for x in eqn.invars
@@ -430,11 +437,11 @@ def _custom_jvp_call(run, eqn, *values):
     (flat, back), (flat_results, back_results) = _layout(eqn.invars), _layout(eqn.outvars)
 
     @jax.custom_jvp
-    def call(*x):
+    def call(*x: Array):
         return flat_results(run(closed, back(x)))
 
     @call.defjvp
-    def _(x, dx):
+    def _(x: tuple, dx: tuple):
         shapes = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
         rule = jax.make_jaxpr(lambda x, dx: jax.jvp(alone(eqn), x, dx))(shapes, shapes)
         results = run(rule, [*back(x), *back(dx)])
@@ -444,7 +451,7 @@ def _custom_jvp_call(run, eqn, *values):
     return back_results(call(*flat(values)))
 
 
-def _family(run, eqn, x):
+def _family(run, eqn, x: np.ndarray):
     """Of each element."""
     n, family, dtype = eqn.params["n"], eqn.params["family"], eqn.outvars[0].aval.dtype
     if not is_in_pieces(x) or not x.size:

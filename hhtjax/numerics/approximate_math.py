@@ -3,9 +3,13 @@
 And numbers of few digits, on which programs agree that round differently.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+
+from hhtjax.description import Array
 
 LN2 = float(np.log(2))
 DIGITS = 16  # binary: fewer than rounding, grown along a run, mostly reaches; a step need not be known better
@@ -20,7 +24,7 @@ EXP = (
 )
 
 
-def rough_log(x):
+def rough_log(x: Array) -> Array:
     """ln x of positive normal numbers, to 2e-7, of float32 numbers to 7e-6.
 
     >>> x = np.float32([1e-9, 0.3, 1.0, 7.0, 1e9])
@@ -37,7 +41,7 @@ def rough_log(x):
     return _polynomial((a + LN2, b - LN2, *others), part) + rest
 
 
-def rough_exp(x):
+def rough_exp(x: Array) -> Array:
     """exp(x) to 1e-5 of it for x from -2.4 to 0.9; beyond that less than exp(-2.4), or more than exp(0.9).
 
     >>> x = jnp.linspace(-2.4, 0.9, 99)
@@ -47,7 +51,7 @@ def rough_exp(x):
     return _polynomial(EXP, x)
 
 
-def without_rounding(x, more=0):
+def without_rounding(x: Array, more: int = 0) -> Array:
     """x, positive, to the nearest number of 16 binary digits, and `more` units in its last place.
 
     Numbers that differ by rounding are mostly one behind it.
@@ -63,7 +67,7 @@ def without_rounding(x, more=0):
     return lax.bitcast_convert_type(bits & np.array(-unit, integers), x.dtype)
 
 
-def _polynomial(coefficients, x):
+def _polynomial(coefficients: tuple, x: Array) -> Array:
     """Estrin's scheme for eight of them, which waits less than Horner's."""
     a, b, c, d, e, f, g, h = coefficients
     z = x * x

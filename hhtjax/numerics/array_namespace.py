@@ -5,6 +5,9 @@ times, and nothing is being traced, NumPy is done before. Written against the mo
 the functions below, it takes either.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,8 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Real
 
-def namespace_of(x) -> Any:
+
+def namespace_of(x: Real) -> Any:
     """`numpy` of its arrays and numbers, else `jax.numpy`.
 
     >>> namespace_of(np.ones(2)).__name__, namespace_of(jnp.ones(2)).__name__
@@ -23,7 +28,7 @@ def namespace_of(x) -> Any:
     return np if isinstance(x, (np.ndarray, np.generic)) else jnp
 
 
-def choose(condition, x, y):
+def choose(condition: Real, x, y):
     """x where a condition, a single one, holds, else y: pytrees.
 
     >>> int(choose(np.array(True), 1, 2)), int(choose(jnp.array(False), 1, 2))
@@ -47,7 +52,7 @@ def with_entry(x, i, value):
     return x
 
 
-def svd(A):
+def svd(A: np.ndarray):
     """U, s and V^T of A = U diag(s) V^T, NaN where there are none, as of a matrix with NaN; NumPy would raise.
 
     >>> [x.shape for x in svd(np.full((2, 3), np.nan))]
@@ -57,7 +62,7 @@ def svd(A):
     return _or_nan(namespace_of(A).linalg.svd, A, [(m, m), (min(m, n),), (n, n)])
 
 
-def eigh(A):
+def eigh(A: Real):
     """Eigenvalues and eigenvectors of symmetric matrices (..., n, n), NaN as in `svd`.
 
     >>> [x.shape for x in eigh(np.full((4, 2, 2), np.nan))]
@@ -66,7 +71,7 @@ def eigh(A):
     return _or_nan(namespace_of(A).linalg.eigh, A, [A.shape[-1:], A.shape[-2:]])
 
 
-def _or_nan(f, A, shapes):
+def _or_nan(f: Callable, A: np.ndarray, shapes: list):
     """f(A), or arrays of NaN, behind the leading axes of A, where NumPy raises."""
     try:
         return f(A)
@@ -74,7 +79,7 @@ def _or_nan(f, A, shapes):
         return [np.full((*A.shape[:-2], *shape), np.nan, A.dtype) for shape in shapes]
 
 
-def solve_upper(T, y):
+def solve_upper(T: np.ndarray, y):
     """x of T x = y, T (..., n, n) upper triangular with a diagonal that is not 0, y (..., n).
 
     >>> solve_upper(np.array([[1.0, 2.0], [0.0, 4.0]]), np.array([4.0, 4.0]))
@@ -84,7 +89,7 @@ def solve_upper(T, y):
     return solve(T, y[..., None])[..., 0]
 
 
-def solve_upper_transposed(T, y):
+def solve_upper_transposed(T: np.ndarray, y: np.ndarray):
     """x of T^T x = y, T as in `solve_upper`.
 
     >>> solve_upper_transposed(np.array([[1.0, 2.0], [0.0, 4.0]]), np.array([1.0, 6.0]))
@@ -95,7 +100,7 @@ def solve_upper_transposed(T, y):
     return jax.scipy.linalg.solve_triangular(T, y[..., None], trans="T")[..., 0]
 
 
-def while_loop(unfinished, body, carry):
+def while_loop(unfinished: Callable, body: Callable, carry: tuple):
     """`lax.while_loop`; where `unfinished(carry)` is of NumPy, a loop of Python.
 
     >>> int(while_loop(lambda n: n < 100, lambda n: 3 * n, np.array(2)))

@@ -1,5 +1,8 @@
 """A branch that is seldom taken: a batch takes it where one of its members asks, and pays nothing elsewhere."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -7,17 +10,17 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
-from hhtjax.description import all_concrete
+from hhtjax.description import Array, PyTree, all_concrete
 from hhtjax.numerics.closures import hoisted
 from hhtjax.primitives import in_turn, largest_in_batch
 
 
-def choose(where, x, y):
+def choose(where: Array, x: PyTree, y: PyTree):
     """One of two trees."""
     return jax.tree.map(partial(jnp.where, where), x, y)
 
 
-def seldom(f, asked, carry, *more):
+def seldom(f: Callable, asked: Array, carry: PyTree, *more: PyTree) -> PyTree:
     """f(carry, *more), of the structure of the carry, where `asked`; else the carry.
 
     Of a plain condition vmap makes a choice between both, for every member and in every step. Members that have not
@@ -32,7 +35,7 @@ def seldom(f, asked, carry, *more):
     return if_any(_careful(f, asked), asked, carry, *more)
 
 
-def seldom_alone(f, asked, carry, *more):
+def seldom_alone(f: Callable, asked: Array, carry, *more):
     """The same, one member of a batch after the other, each as it is alone: for what is long, and seldom at one time.
 
     >>> import jax, jax.numpy as jnp
@@ -42,22 +45,22 @@ def seldom_alone(f, asked, carry, *more):
     return if_any(partial(in_turn, _careful(f, asked), asked), asked, carry, *more)
 
 
-def _careful(f, asked):
+def _careful(f: Callable, asked: Array):
     """f, of which only members that have asked see anything."""
 
-    def branch(carry, *more):
+    def branch(carry: PyTree, *more: PyTree):
         known = choose(asked, (carry, more), lax.stop_gradient((carry, more)))
         return choose(asked, f(known[0], *known[1]), carry)
 
     return branch
 
 
-def if_any(f, asked, carry, *more, kept=True):
+def if_any(f: Callable, asked: Array, carry: PyTree, *more: PyTree, kept: bool = True):
     """The same of an f that by itself leaves members alone that have not asked. kept: as of `largest_in_batch`."""
     return lax.cond(largest_in_batch(asked, kept), f, lambda carry, *_: carry, carry, *more)
 
 
-def derivative_of(f, value):
+def derivative_of(f: Callable, value: Callable) -> PyTree:
     """value(), which is what f() is, with the derivatives of f: for a way to the value that is no way to those.
 
     >>> import jax, jax.numpy as jnp
@@ -67,17 +70,17 @@ def derivative_of(f, value):
     (value, in_value), (f, in_f) = map(hoisted, (value, f))
 
     @jax.custom_jvp
-    def call(in_value, in_f):
+    def call(in_value: list, in_f: list) -> PyTree:
         return value(in_value)
 
     @call.defjvp
-    def _(x, dx):
+    def _(x: tuple, dx: tuple):
         return jax.jvp(f, x[1:], dx[1:])
 
     return call(in_value, in_f)
 
 
-def derivative_by(f, value, *args):
+def derivative_by(f: Callable, value: Callable, *args) -> PyTree:
     """value(*args), which is what f(*args) is, with the derivatives of f in those of the arguments that move.
 
     >>> import jax
@@ -87,15 +90,15 @@ def derivative_by(f, value, *args):
     leaves, structure = jax.tree.flatten(args)
 
     @jax.custom_jvp
-    def call(leaves):
+    def call(leaves: list) -> PyTree:
         return value(*structure.unflatten(leaves))
 
     @partial(call.defjvp, symbolic_zeros=True)
-    def _(primals, tangents):
+    def _(primals: tuple, tangents: tuple):
         (x,), (dots,) = primals, tangents
         moving = [i for i, dot in enumerate(dots) if not isinstance(dot, SymbolicZero)]
 
-        def of_moving(moved):
+        def of_moving(moved: list):
             new = dict(zip(moving, moved, strict=True))
             return f(*structure.unflatten([new.get(i, old) for i, old in enumerate(x)]))
 
@@ -104,7 +107,7 @@ def derivative_by(f, value, *args):
     return call(leaves)
 
 
-def derivative_at_need(f, value, *args):
+def derivative_at_need(f: Callable, value: Callable, *args):
     """The same, f traced for a derivative only, unless value closes over numbers that are not known.
 
     >>> import jax

@@ -1,6 +1,9 @@
 """A scan whose reverse mode needs memory in proportion to the square root of its length."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -17,7 +20,7 @@ KEPT_OF_MEMBER = 2**15  # of a batch: 34 MB of 256 double pendulums took 1.6 tim
 checkpoint = partial(jax.checkpoint, prevent_cse=False)  # inside a scan nothing can be merged anyway
 
 
-def checkpointed_scan(body, carry, length, in_batch=False):
+def checkpointed_scan(body: Callable, carry: tuple, length: int, in_batch: bool = False):
     """`lax.scan(body, carry, None, length)` in blocks of about sqrt(length) steps, each in short chunks.
 
     Reverse mode stores the carry before each block, computes a block again when it comes to it, then keeps
@@ -36,10 +39,10 @@ def checkpointed_scan(body, carry, length, in_batch=False):
     size = length * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(carry))
     keeps = size <= (KEPT_OF_MEMBER if in_batch else KEPT)
 
-    def run_chunk(carry, _):
+    def run_chunk(carry: tuple, _):
         return lax.scan(body, carry, None, chunk)
 
-    def run_block(carry, _):
+    def run_block(carry: tuple, _):
         return lax.scan(run_chunk, carry, None, chunks)
 
     carry, ys = lax.scan(run_block if keeps else checkpoint(run_block), carry, None, blocks)
@@ -50,7 +53,7 @@ def checkpointed_scan(body, carry, length, in_batch=False):
     return carry, ys
 
 
-def _sizes(length):
+def _sizes(length: int):
     """Steps in a chunk and chunks in a block: without a rest if possible, then nearest to the aims."""
     root = math.sqrt(length)
     choices = [

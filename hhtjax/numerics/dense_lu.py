@@ -5,6 +5,9 @@ up to `UNROLLED` unknowns the elimination is written out as array operations, an
 `LOOPED` it is a loop in a kernel, and LAPACK's elsewhere. Hundreds are LAPACK's in panels.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.sparse_matrix import Sparse, factorize_sparse
 from hhtjax.primitives import Bilinear, choose, structural
 
@@ -36,7 +40,7 @@ _by_columns = Bilinear(
 )
 
 
-def diagonal(A):
+def diagonal(A: Array) -> Array:
     """Of a full A (n, n), or of a diagonal one (n,), which is its own. jnp.diagonal would ask for the platform."""
     if isinstance(A, Sparse):
         return A.diagonal()
@@ -62,7 +66,7 @@ def factorize(A):
     return by_factors(choose(_lu, lu, A) if A.shape[-1] <= LOOPED else lu(A))
 
 
-def by_factors(factors):
+def by_factors(factors: tuple):
     """The same of a full matrix of more than UNROLLED unknowns, by `panels.lu` of it."""
     if len(factors[0]) > LOOPED:
         return partial(_by_lapack, factors)
@@ -70,7 +74,7 @@ def by_factors(factors):
     return lambda b, trans=0: choose(*(partial(way, trans=trans) for way in ways), factors, b)
 
 
-def inverse(A):
+def inverse(A: Array) -> Array:
     """A^-1 (n, n), constant to autodiff, by Gauss and Jordan in a loop: little to compile, for what is done once.
 
     Rows are measured by the square roots of the diagonal, and those without one by what is left, so that no units
@@ -85,7 +89,7 @@ def inverse(A):
     rows = 1 / jnp.where(d == 0, jnp.where(rest == 0, 1, rest), size)
     i = jnp.arange(n)
 
-    def eliminate(k, both):
+    def eliminate(k: Array, both: Array) -> Array:
         pivot = _pivot(both, k)
         both = both[jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))]
         row = both[k] / both[k, k]
@@ -95,7 +99,15 @@ def inverse(A):
     return lax.fori_loop(0, n, eliminate, both)[:, n:]
 
 
-def _lu(A):
+def differentiable_inverse(A: Array) -> Array:
+    """A^-1 with derivatives, of two steps of Newton and Schulz: X <- 2 X - X A X."""
+    S = X = inverse(A)
+    for _ in range(2):
+        X = 2 * X - X @ A @ X
+    return S + (X - lax.stop_gradient(X))
+
+
+def _lu(A: Array):
     """L below the diagonal and U on and above it, and the order of the rows: A[order] = L U."""
     n = A.shape[0]
     i = jnp.arange(n)
@@ -103,7 +115,7 @@ def _lu(A):
     nothing = structural(np.zeros((), A.dtype))
     loop, find_pivot = (lax.fori_loop, _pivot) if n > UNROLLED else (_written_out, _pivot_by_scalars)
 
-    def eliminate(k, carry):
+    def eliminate(k: Real, carry: tuple):
         A, order = carry
         pivot = find_pivot(A, k)
         exchange = jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))
@@ -115,12 +127,12 @@ def _lu(A):
     return loop(0, n - 1, eliminate, (A, i))
 
 
-def _pivot(A, k):
+def _pivot(A: Array, k: Array) -> Array:
     """Row of the largest element of column k on or below the diagonal."""
     return jnp.argmax(jnp.where(jnp.arange(len(A)) >= k, jnp.abs(A[:, k]), -1))
 
 
-def _pivot_by_scalars(A, k):
+def _pivot_by_scalars(A: Array, k: int) -> Array:
     """The same without argmax: a reduction would end the fusion."""
     largest, pivot = jnp.abs(A[k, k]), jnp.asarray(k, jnp.result_type(int))
     for i in range(k + 1, len(A)):
@@ -130,26 +142,26 @@ def _pivot_by_scalars(A, k):
     return pivot
 
 
-def _substitute(factors, b, trans=0):
+def _substitute(factors: tuple, b: Array, trans: int = 0) -> Array:
     """x with L U x = b[order]; for trans=1, x with x[order] = z and (L U)^T z = b."""
     LU, order = factors
     n = LU.shape[0]
     i = jnp.arange(n)
     loop = lax.fori_loop if n > UNROLLED else _written_out
 
-    def forward(k, x):
+    def forward(k: Real, x: Array) -> Array:
         return x - jnp.where(i > k, LU[:, k] * x[k], 0)
 
-    def backward(j, x):
+    def backward(j: Real, x: Array) -> Array:
         k = n - 1 - j
         pivot = x[k] / LU[k, k]
         return jnp.where(i == k, pivot, x - jnp.where(i < k, LU[:, k] * pivot, 0))
 
-    def forward_transposed(k, x):
+    def forward_transposed(k: Real, x: Array) -> Array:
         pivot = x[k] / LU[k, k]
         return jnp.where(i == k, pivot, x - jnp.where(i > k, LU[k] * pivot, 0))
 
-    def backward_transposed(j, x):
+    def backward_transposed(j: Real, x: Array) -> Array:
         k = n - 1 - j
         return x - jnp.where(i < k, LU[k] * x[k], 0)
 
@@ -159,13 +171,13 @@ def _substitute(factors, b, trans=0):
     return jnp.sum(jnp.where(order[:, None] == i[None, :], x[:, None], 0), axis=0)
 
 
-def _written_out(start, stop, body, x):
+def _written_out(start: int, stop: int, body: Callable, x: PyTree) -> PyTree:
     for k in range(start, stop):
         x = body(k, x)
     return x
 
 
-def _by_lapack(factors, b, trans=0):
+def _by_lapack(factors: tuple, b: Array, trans: int = 0) -> Array:
     """The same as `_substitute`."""
     LU, order = factors
     substitute = partial(lax.linalg.triangular_solve, left_side=True, transpose_a=bool(trans))
@@ -176,7 +188,7 @@ def _by_lapack(factors, b, trans=0):
     return x[jnp.argsort(order), 0] if trans else x[:, 0]
 
 
-def _cramer(A, b, trans=0):
+def _cramer(A: Array, b: Array, trans: int = 0) -> Array:
     """Cramer's rule for two unknowns: forward stable (Higham 2002, Sec. 1.10.1), with one division.
 
     Products of two entries of small mechanisms, as inertias of 1e-20, are less than the least float32.
@@ -192,7 +204,7 @@ def _cramer(A, b, trans=0):
     return jnp.stack([(s * b[0] - q * b[1]) * inverse, (p * b[1] - r * b[0]) * inverse])
 
 
-def _lu_scalars(A):
+def _lu_scalars(A: Array):
     """L and U in the place of A, the pivots as their reciprocals; the exchanges of rows before, [(k, i, whether)]."""
     n = A.shape[0]
     LU = [[A[i, j] for j in range(n)] for i in range(n)]
@@ -211,7 +223,7 @@ def _lu_scalars(A):
     return LU, exchanges
 
 
-def _substitute_scalars(LU, exchanges, b, trans=0):
+def _substitute_scalars(LU: list, exchanges: list, b: Array, trans: int = 0) -> Array:
     """The same as `_substitute`."""
     n = len(LU)
     x = [b[i] for i in range(n)]
@@ -238,7 +250,7 @@ def _substitute_scalars(LU, exchanges, b, trans=0):
     return jnp.stack(x)
 
 
-def _exchange(whether, a, b):
+def _exchange(whether: Array, a: Array, b: Array):
     return jnp.where(whether, b, a), jnp.where(whether, a, b)
 
 
@@ -272,12 +284,12 @@ def lu(A):
     return jnp.concatenate([A[:done], below]), jnp.concatenate([order[:done], order[done:][again]])
 
 
-def _first_columns(A, number, width):
+def _first_columns(A: Array, number: int, width: int):
     """The same after so many panels of this width; the columns behind them updated."""
     n = len(A)
     row, column = jnp.arange(n)[:, None], jnp.arange(n)[None, :]
 
-    def eliminate(i, carry):
+    def eliminate(i: Array, carry: tuple):
         """Rows that are done wait below the others, which begin with that of the panel's diagonal."""
         A, order = carry
         done, behind = i * width, column >= (i + 1) * width
@@ -294,7 +306,7 @@ def _first_columns(A, number, width):
     return jnp.roll(A, number * width, axis=0), jnp.roll(order, number * width)
 
 
-def pivots(A):
+def pivots(A: Array) -> Array:
     """Of the factorisation L D L^T of a symmetric A: the diagonal of D, NaN where one before is not positive."""
     n = len(A)
     if n <= FEW:
@@ -305,7 +317,7 @@ def pivots(A):
     size = number * BLOCK
     column = jnp.arange(size)
 
-    def eliminate(i, carry):
+    def eliminate(i: Array, carry: tuple):
         A, found = carry
         start = i * BLOCK
         rows = lax.dynamic_slice_in_dim(A, start, BLOCK)
@@ -318,11 +330,11 @@ def pivots(A):
     return lax.fori_loop(0, number, eliminate, (A, jnp.zeros_like(A[0])))[1][:n]
 
 
-def _pivots_of_few(A):
+def _pivots_of_few(A: Array) -> Array:
     """The same by elimination: the first call of LAPACK has JAX import SciPy, a tenth of a second."""
     i = jnp.arange(len(A))
 
-    def eliminate(k, carry):
+    def eliminate(k: Real, carry: tuple):
         A, found = carry
         d = A[k, k]
         return A - jnp.outer(A[:, k], A[k] / jnp.where(d > 0, d, jnp.nan)), jnp.where(i == k, d, found)
@@ -335,7 +347,7 @@ def _pivots_of_few(A):
     return carry[1]
 
 
-def _substitute_panels(L, B):
+def _substitute_panels(L: Array, B: Array) -> Array:
     """X with L X = B, L with a unit diagonal, row by row: LAPACK would take threads for this, too."""
     L = jnp.tril(L, -1)
     return lax.fori_loop(1, len(L), lambda i, X: X.at[i].add(-(L[i] @ X)), B)

@@ -1,5 +1,8 @@
 """A loop whose number of iterations is data, with derivatives forward and reverse."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
 from itertools import compress
 from typing import Any
@@ -10,6 +13,7 @@ import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.closures import hoisted, opened
 from hhtjax.primitives import TwoWays, derivative, row_written, staged, together, traced
@@ -18,7 +22,7 @@ SLOTS, LEVELS = 64, 3
 LONGEST = SLOTS**LEVELS  # iterations that reverse mode can go back
 
 
-def repeat(body, carry, count):
+def repeat(body: Callable, carry: PyTree, count: Real) -> PyTree:
     """carry -> body(i, carry) for i = 0, ..., count - 1, count a traced integer.
 
     A while loop, so that another count costs no compilation; its derivatives are such loops too, and cost as many
@@ -31,17 +35,17 @@ def repeat(body, carry, count):
     call, constants = hoisted(body, jnp.zeros_like(count), carry)
     leaves, structure = jax.tree.flatten(carry)
 
-    def on_leaves(i, leaves, constants):
+    def on_leaves(i: Array, leaves: list, constants: list):
         return jax.tree.leaves(call(constants, i, structure.unflatten(leaves)))
 
     return structure.unflatten(_repeat(on_leaves, count, [jnp.asarray(x) for x in leaves], constants))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _repeat(body, count, carry, constants):
+def _repeat(body: Callable, count: Array, carry: list, constants: list):
     number = len(carry)
 
-    def loop(x):
+    def loop(x: list):
         count, carry, constants = split(x, number)
         return lax.fori_loop(0, count, lambda i, carry: body(i, carry, constants), carry)
 
@@ -49,7 +53,7 @@ def _repeat(body, count, carry, constants):
 
 
 @partial(_repeat.defjvp, symbolic_zeros=True)
-def _(body, primals, tangents):
+def _(body: Callable, primals: tuple, tangents: tuple):
     """Constants without a tangent stay so: a long array of them would cost its length in every reverse iteration."""
     count, carry, constants = primals
     floats = tuple(jnp.issubdtype(x.dtype, jnp.inexact) for x in carry)
@@ -62,7 +66,7 @@ def _(body, primals, tangents):
     return out, merged(floats, dots, [_none(x) for x in out])
 
 
-def _none(x):
+def _none(x: Array) -> np.ndarray:
     return np.zeros(x.shape, jax.dtypes.float0)
 
 
@@ -71,7 +75,7 @@ def _instantiate(tangent):
     return tangent if like is None else jnp.zeros(like.shape, like.dtype)
 
 
-def split(x, number):
+def split(x: list, number: int):
     """The count, the carry of so many parts, the constants."""
     return x[0], x[1 : 1 + number], x[1 + number :]
 
@@ -85,7 +89,7 @@ def merged(choices, new, old):
 class Loop:
     """Floats: which parts of the carry are floating numbers; moves: which of the constants have tangents."""
 
-    def __init__(self, body, floats, moves):
+    def __init__(self, body: Callable, floats: tuple, moves: tuple):
         self.body, self.floats, self.moves = body, floats, moves
 
     def ways(self):
@@ -93,28 +97,28 @@ class Loop:
         slow = self.forward_by_scans, self.reverse_by_scans
         return TwoWays(len(self.floats), self.values, self.forward, self.reverse, *slow)
 
-    def parts(self, dx):
+    def parts(self, dx: list):
         """Tangents of the carry, and of the constants."""
         number = sum(self.floats)
         return dx[:number], dx[number:]
 
-    def step(self, i, carry, constants):
+    def step(self, i: Array, carry: list, constants: list):
         """An iteration as a function of what moves, which also gives the whole carry."""
 
-        def step(x, moving):
+        def step(x: list, moving: list):
             after = self.body(i, merged(self.floats, x, carry), merged(self.moves, moving, constants))
             return list(compress(after, self.floats)), after
 
         return step, list(compress(carry, self.floats)), list(compress(constants, self.moves))
 
-    def values(self, x):
+    def values(self, x: list):
         return _repeat(self.body, *split(x, len(self.floats)))
 
-    def forward(self, x, dx):
+    def forward(self, x: list, dx: list):
         count, carry, constants = split(x, len(self.floats))
         dots, moving_dots = self.parts(dx)
 
-        def body(i, now):
+        def body(i: Array, now: tuple):
             carry, dots = now
             step, *at = self.step(i, carry, constants)
             _, dots, carry = jax.jvp(step, tuple(at), (dots, moving_dots), has_aux=True)
@@ -122,16 +126,16 @@ class Loop:
 
         return lax.fori_loop(0, count, body, (carry, dots))
 
-    def reverse(self, x, cotangents):
+    def reverse(self, x: list, cotangents: list):
         count, carry, constants = split(x, len(self.floats))
         sums = [jnp.zeros_like(x) for x in compress(constants, self.moves)]
         pull_back, needed = self.reverse_iteration(jnp.zeros_like(count), carry, constants, cotangents)
         unread = [jnp.zeros_like(x) for x in carry]
 
-        def iterate(i, some):
+        def iterate(i: Array, some: list):
             return list(compress(self.body(i, merged(needed, some, unread), constants), needed))
 
-        def turn(i, some, found):
+        def turn(i: Array, some: list, found: tuple):
             """Cotangents of the carry, and sums of those of constants, before iteration i."""
             cotangents, more = pull_back(i, merged(needed, some, unread), constants, found[0])
             return cotangents, [x + y for x, y in zip(found[1], more, strict=True)]
@@ -139,11 +143,11 @@ class Loop:
         found = backwards(iterate, turn, count, list(compress(carry, needed)), (cotangents, sums))
         return [jnp.where(count <= LONGEST, x, jnp.nan) for x in (*found[0], *found[1])]
 
-    def reverse_iteration(self, i, carry, constants, cotangents):
+    def reverse_iteration(self, i: Array, carry: list, constants: list, cotangents: list):
         """The transpose of an iteration, of the same arguments, and which parts of the carry derivatives are made of:
         those that it reads, in some iteration or the next."""
 
-        def pull_back(i, carry, constants, cotangents):
+        def pull_back(i: Array, carry: list, constants: list, cotangents: list):
             step, *at = self.step(i, carry, constants)
             pull = staged(lambda *at: jax.vjp(step, *at, has_aux=True)[1])(*at)
             return staged(pull)(cotangents)
@@ -192,7 +196,7 @@ class Loop:
         return [*found, *moving]
 
 
-def backwards(iterate, turn, count, carry, found):
+def backwards(iterate: Callable, turn: Callable, count: Array, carry: list, found: tuple):
     """turn(i, carry before iteration i, found) for i = count - 1, ..., 0.
 
     carry: before the first. iterate: i, carry -> the next. A row is kept for the carry before each block of
@@ -200,22 +204,22 @@ def backwards(iterate, turn, count, carry, found):
     """
     sizes = jnp.asarray([SLOTS**level for level in range(LEVELS + 1)], count.dtype)
 
-    def row(level, i):
+    def row(level: Real, i: Array) -> Array:
         return level * SLOTS + i // sizes[level] % SLOTS
 
-    def read(kept, number):
+    def read(kept: list, number: Array):
         return [lax.dynamic_index_in_dim(x, number, 0, keepdims=False) for x in kept]
 
-    def keep(kept, number, carry):
+    def keep(kept: list, number: Array, carry: list):
         return [row_written(k, x, number) for k, x in zip(kept, carry, strict=True)]
 
-    def fill(level, last, kept):
+    def fill(level: Array, last: Array, kept: list):
         """The rows of a level, up to that of iteration `last`, from the one above."""
         size = sizes[level]
         begin = last - last % sizes[level + 1]
         blocks = (last - begin) // size
 
-        def block(j, now):
+        def block(j: Array, now: tuple):
             carry, kept = now
             first = begin + j * size
             kept = keep(kept, row(level, first), carry)
@@ -223,7 +227,7 @@ def backwards(iterate, turn, count, carry, found):
 
         return lax.fori_loop(0, blocks + 1, block, (read(kept, row(level + 1, last)), kept))[1]
 
-    def back(j, now):
+    def back(j: Array, now: tuple):
         kept, found = now
         i = count - 1 - j
         ends = (j == 0) | ((i + 1) % sizes[1:] == 0)  # the last iteration ends blocks of all levels
@@ -240,7 +244,7 @@ def backwards(iterate, turn, count, carry, found):
 # Roots with the derivatives of the implicit function, of every order and in every mode.
 
 
-def implicit_root(f, guess, search, tangent_solve):
+def implicit_root(f: Callable, guess: Array, search: Callable, tangent_solve: Callable):
     """A root w of f(w) = 0, and what else the search tells, which is constant to derivatives.
 
         dw = -A^-1 df,    A = df/dw at the root
@@ -272,12 +276,12 @@ def implicit_root(f, guess, search, tangent_solve):
     told = jax.tree.structure(jax.eval_shape(find, in_search, guess))
 
     @jax.custom_jvp
-    def root(given):
+    def root(given: list):
         _, in_search, _, guess = structure.unflatten(given)
         return jax.tree.leaves(find(in_search, guess))
 
     @partial(root.defjvp, symbolic_zeros=True)
-    def _(primals, tangents):
+    def _(primals: tuple, tangents: tuple):
         (given,), (moved,) = primals, tangents
         found = together(root, given)
         in_residual, _, in_response, _ = structure.unflatten(given)
@@ -285,7 +289,7 @@ def implicit_root(f, guess, search, tangent_solve):
         constants, inside = jax.tree.flatten(in_residual)
         moves = {i: dx for i, dx in enumerate(moved[: len(constants)]) if not isinstance(dx, SymbolicZero)}
 
-        def of_moving(moving):  # what does not move, such as the time, needs no derivative
+        def of_moving(moving: dict) -> Array:  # what does not move, such as the time, needs no derivative
             return residual(inside.unflatten([moving.get(i, x) for i, x in enumerate(constants)]), w)
 
         _, change = jax.jvp(of_moving, ({i: constants[i] for i in moves},), (moves,))

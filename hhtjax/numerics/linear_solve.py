@@ -1,17 +1,25 @@
 """Linear solves that autodiff passes by: of maps and of matrices, by elimination or as a user says."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import diagonal, factorize, matvec
 from hhtjax.numerics.low_rank import AtState
 from hhtjax.primitives import forward_only, part, staged
+
+if TYPE_CHECKING:
+    from hhtjax.numerics.low_rank import Constant, Known
+    from hhtjax.numerics.sparse_matrix import Sparse
+    from hhtjax.numerics.structured_solve import Banded
 
 FORWARD_ONLY = (
     "a force (or mass, or constraint) with a `lax.while_loop`, or a `lax.fori_loop` of unknown length, has forward "
@@ -21,7 +29,7 @@ FORWARD_ONLY = (
 RANK_TOLERANCE = 1e-9  # relative size of a singular value of dependent columns; in float32 100 roundings
 
 
-def solve_map(f, b, factorize):
+def solve_map(f: Callable, b: Array, factorize) -> Array:
     """x with f(x) = b, for a linear map f of (n,) to (n,); `factorize` as below.
 
     The matrix of f only serves to find x. Derivatives pass through f itself, f(dx) = db - df(x): one
@@ -30,20 +38,20 @@ def solve_map(f, b, factorize):
     return factorize_map(f, b, factorize)(b)
 
 
-def factorize_map(f, like, factorize):
+def factorize_map(f: Callable, like: PyTree, factorize: Callable | Constant):
     """The function b -> x with f(x) = b, for vectors like `like`: `solve_map` for many b, factorised once."""
     inverse = invert(f, like, factorize)
     return lambda b: _solve(f, b, inverse)
 
 
-def invert(f, like, factorize):
+def invert(f: Callable, like: PyTree, factorize: Callable | Constant):
     """The function (b, trans=0) -> A^-1 b, or A^-T b, of the matrix A of f; it may be constant to autodiff."""
     if isinstance(factorize, (Structured, AtState)):
         return factorize.of_map(f, like)
     return factorize(staged(partial(linear_map, f), like.size)(like))
 
 
-def invert_and_bound(f, like, factorize):
+def invert_and_bound(f: Callable, like: PyTree, factorize: Callable | Constant | Known):
     """`invert`, and the function x -> |A| |x|, what the rows of A x are sums of; where no A is formed, |A x|."""
     if isinstance(factorize, Structured):
         return factorize.of_map(f, like), lambda x: jnp.abs(f(x))
@@ -53,7 +61,7 @@ def invert_and_bound(f, like, factorize):
     return factorize(A), lambda x: matvec(jnp.abs(A), jnp.abs(x))
 
 
-def _solve(f, b, inverse):
+def _solve(f: Callable, b: Array, inverse: Callable) -> Array:
     f = part(f, b.size)  # for its derivatives
     call = partial(lax.custom_linear_solve, f, b, solve=lambda _, y: inverse(y, trans=0))
     try:
@@ -71,14 +79,14 @@ class Trusted:
 
     tolerance: Any = None
 
-    def leaves(self, f, b, x):
+    def leaves(self, f: Callable, b: Array, x: Array) -> Array:
         """What x leaves of b = f(x), relative to b."""
         largest = jnp.max(jnp.abs(b))  # whose square may be 0 in float32
         unit = jnp.where(largest == 0, 1, largest)
         left, size = (jnp.sqrt(jnp.sum((y / unit) ** 2)) for y in (f(x) - b, b))
         return lax.stop_gradient(jnp.where(left == 0, 0, left / size))
 
-    def accepts(self, left):
+    def accepts(self, left: Array):
         """Whether so much may be left; what is not a number is for others to tell."""
         tolerance = self.tolerance
         return ~(left > (max(1e-6, 1e4 * float(jnp.finfo(left.dtype).eps)) if tolerance is None else tolerance))
@@ -91,7 +99,7 @@ class Given(Trusted):
     function: Callable
     tolerance: Any = None
 
-    def __call__(self, A):
+    def __call__(self, A: Array):
         """(b, trans=0) -> A^-1 b, or A^-T b."""
         return self.function(A)
 
@@ -99,16 +107,16 @@ class Given(Trusted):
 class Structured(Trusted):
     """A `factorize` that is given the linear map f itself: `of_map(f, like)` is what `invert` promises."""
 
-    def of_map(self, f, like):
+    def of_map(self, f, like: PyTree):
         """(b, trans=0) -> A^-1 b, or A^-T b."""
         raise NotImplementedError
 
-    def __call__(self, A):
+    def __call__(self, A: Array | Sparse):
         """The same for a matrix."""
         return self.of_map(partial(matvec, A), jnp.zeros(len(A), A.dtype))
 
 
-def factorize_with(solve):
+def factorize_with(solve: Callable | Banded):
     """The same from a function solve(A, b), which need not be differentiable."""
     if isinstance(solve, Structured):
         return solve
@@ -121,21 +129,21 @@ def factorize_with(solve):
     return Given(factorize)
 
 
-def reuse(factorize, inverse):
+def reuse(factorize: Callable | Banded, inverse: Callable):
     """A `factorize` of the same kind for a matrix that has been factorised: `inverse` is what it gave."""
 
-    def known(A):
+    def known(A: Array):
         return inverse
 
     return Given(known, factorize.tolerance) if isinstance(factorize, Trusted) else known
 
 
-def factorize_saddle_point(n):
+def factorize_saddle_point(n: int):
     """The same for A = [[M, -B^T], [B, .]], the first n unknowns and equations measured by the diagonal of A, and the
     rows below by that: so no units of mass, length or time choose the pivots, with which single precision can fail.
     """
 
-    def factorize_rows(A):
+    def factorize_rows(A: Array):
         A = lax.stop_gradient(A)
         d = jnp.abs(diagonal(A)[:n])
         first = 1 / jnp.sqrt(jnp.where(d == 0, 1, d))
@@ -147,7 +155,7 @@ def factorize_saddle_point(n):
     return factorize_rows
 
 
-def factorize_least_squares(n):
+def factorize_least_squares(n: int):
     """The same where B may have lost rank: the least-squares solution of least norm.
 
     The first n unknowns and equations are measured as above, all others alike.
@@ -164,7 +172,7 @@ def factorize_least_squares(n):
         U, s, Vt = jnp.linalg.svd(scale[:, None] * A * scale[None, :])
         inverse = jnp.where(s > tolerance * s[0], 1 / s, 0)
 
-        def apply(b, trans=0):
+        def apply(b: Array, trans: int = 0) -> Array:
             left, right = (Vt.T, U.T) if trans else (U, Vt)
             return scale * (right.T @ (inverse * (left.T @ (scale * b))))
 
@@ -173,7 +181,7 @@ def factorize_least_squares(n):
     return factorize
 
 
-def solve(A, b, factorize=factorize):
+def solve(A: Array, b: Array, factorize: Callable = factorize):
     """x with A x = b, for A (n, n) and b (n,), differentiable in both.
 
     LU with partial pivoting: unrolled for n <= 8, a loop or LAPACK's above (dense_lu.py); Cramer's rule for n = 2.
@@ -186,7 +194,7 @@ def solve(A, b, factorize=factorize):
     return solver(A, factorize)(b)
 
 
-def solver(A, factorize=factorize):
+def solver(A: Array, factorize: Callable = factorize):
     """The function b -> x of it, for many b: factorised once."""
     inverse = factorize(A)
     return lambda b: _solve(partial(matvec, A), b, inverse)

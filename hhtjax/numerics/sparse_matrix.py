@@ -1,5 +1,7 @@
 """Sparse matrices: numbers that are data in places that are not, so that multiples and sums are sparse, too."""
 
+from __future__ import annotations
+
 import threading
 from collections import OrderedDict
 from functools import cached_property, lru_cache, partial
@@ -10,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.primitives import on_host
 
 PADDING = 2  # slots for each entry, up to which all entries have places in layers
@@ -23,7 +26,7 @@ class Pattern:
     `width` gathers. What a few long rows have beyond is behind. Equal patterns are equal.
     """
 
-    def __init__(self, n, rows, columns):
+    def __init__(self, n: int, rows: np.ndarray, columns: np.ndarray):
         self.n, self.rows, self.columns = n, rows.astype(np.int32), columns.astype(np.int32)
         counts = np.bincount(rows, minlength=n)
         longest, nnz = int(counts.max(initial=1)), len(rows)
@@ -38,17 +41,17 @@ class Pattern:
             digest.update(x.tobytes())
         self.digest = digest.digest()
 
-    def __eq__(self, other):
+    def __eq__(self, other: Pattern) -> bool:
         return isinstance(other, Pattern) and self.digest == other.digest
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return hash(self.digest)
 
     def __repr__(self):
         return f"<{len(self.rows)} entries of ({self.n}, {self.n})>"
 
     @cached_property
-    def layers(self):
+    def layers(self) -> np.ndarray:
         """(width, n): the columns of the first slots."""
         found = np.tile(np.arange(self.n, dtype=np.int32), self.width)
         early = self.slots < self.width * self.n
@@ -56,13 +59,13 @@ class Pattern:
         return found.reshape(self.width, self.n)
 
     @cached_property
-    def filled(self):
+    def filled(self) -> np.ndarray:
         """Which slots hold an entry: what others hold is none, as after a step along a gradient."""
         found = np.zeros(self.size, bool)
         found[self.slots] = True
         return found
 
-    def spread(self, numbers):
+    def spread(self, numbers: np.ndarray) -> np.ndarray:
         """Those of the entries, in their slots."""
         found = np.zeros(self.size, np.result_type(numbers))
         found[self.slots] = numbers
@@ -76,7 +79,7 @@ class Sparse:
     __array_ufunc__ = None  # a number of NumPy leaves products to us
     ndim = 2
 
-    def __init__(self, values, pattern):
+    def __init__(self, values, pattern: Pattern):
         self.values, self.pattern = values, pattern
 
     def tree_flatten(self):
@@ -84,7 +87,7 @@ class Sparse:
         return (self.values,), self.pattern
 
     @classmethod
-    def tree_unflatten(cls, pattern, data):
+    def tree_unflatten(cls, pattern: Pattern, data: PyTree) -> Sparse:
         """Inverse of `tree_flatten`."""
         return cls(data[0], pattern)
 
@@ -97,16 +100,16 @@ class Sparse:
         return self.pattern.n, self.pattern.n
 
     @property
-    def dtype(self):
+    def dtype(self) -> np.dtype:
         """Of the numbers."""
         return self.values.dtype
 
     @property
-    def nnz(self):
+    def nnz(self) -> int:
         """How many entries it has, as matrices of SciPy tell it."""
         return len(self.pattern.rows)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.pattern.n
 
     def tocoo(self):
@@ -116,11 +119,11 @@ class Sparse:
         p = self.pattern
         return coo_array((np.asarray(self.values)[p.slots], (p.rows, p.columns)), shape=self.shape)
 
-    def astype(self, dtype):
+    def astype(self, dtype: np.dtype):
         """The same, with numbers of this dtype."""
         return Sparse(jnp.asarray(self.values).astype(dtype), self.pattern)
 
-    def diagonal(self):
+    def diagonal(self) -> Array:
         """(n,)."""
         p = self.pattern
         here = p.rows == p.columns
@@ -131,30 +134,30 @@ class Sparse:
     def __abs__(self):
         return Sparse(jnp.abs(self.values), self.pattern)
 
-    def __neg__(self):
+    def __neg__(self) -> Sparse:
         return Sparse(-self.values, self.pattern)
 
-    def __mul__(self, factor):
+    def __mul__(self, factor: Real) -> Sparse:
         if jnp.ndim(factor):
             return NotImplemented
         return Sparse(self.values * factor, self.pattern)
 
     __rmul__ = __mul__
 
-    def __truediv__(self, divisor):
+    def __truediv__(self, divisor: int) -> Sparse:
         return Sparse(self.values / divisor, self.pattern) if not jnp.ndim(divisor) else NotImplemented
 
-    def __add__(self, other):
+    def __add__(self, other: Sparse) -> Sparse:
         if not isinstance(other, Sparse):
             return self if isinstance(other, int) and other == 0 else NotImplemented  # sum() begins with 0
         return combined((1, self), (1, other))
 
     __radd__ = __add__
 
-    def __sub__(self, other):
+    def __sub__(self, other: Sparse) -> Sparse:
         return self + -other if isinstance(other, Sparse) else NotImplemented
 
-    def __matmul__(self, x):
+    def __matmul__(self, x: Array) -> Array:
         """A x, for x (n,)."""
         p = self.pattern
         values = jnp.where(p.filled, self.values, 0) if p.size > self.nnz else self.values
@@ -168,13 +171,13 @@ class Sparse:
         return y.at[rows].add(values[p.width * p.n :] * gather(x, columns)) if len(rows) else y
 
 
-def gather(x, i):
+def gather(x: Array, i: np.ndarray) -> Array:
     """x[i], for constant i within its bounds, of which XLA need not be convinced."""
     numbers = lax.GatherDimensionNumbers(offset_dims=(), collapsed_slice_dims=(0,), start_index_map=(0,))
     return lax.gather(x, jnp.asarray(i)[..., None], numbers, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
-def of_scipy(matrix):
+def of_scipy(matrix) -> Sparse:
     """The `Sparse` of a square matrix of scipy.sparse."""
     entries = matrix.tocsr()
     entries.sum_duplicates()
@@ -183,7 +186,7 @@ def of_scipy(matrix):
     return Sparse(pattern.spread(entries.data), pattern)
 
 
-def of_dense(A):
+def of_dense(A: Sparse) -> Sparse:
     """The same of a known full matrix; diagonals (n,) and what is `Sparse` stay so."""
     if isinstance(A, Sparse) or A.ndim == 1:
         return A
@@ -210,7 +213,7 @@ def diagonal_pattern(n):
 
 
 @lru_cache(maxsize=64)
-def union(*patterns):
+def union(*patterns: Pattern):
     """The pattern of a sum, and for each term the slot of every slot of the sum; its size, where it has none."""
     n = patterns[0].n
     keys = [p.rows.astype(np.int64) * n + p.columns for p in patterns]
@@ -239,7 +242,7 @@ _factors: OrderedDict = OrderedDict()
 _lock = threading.Lock()
 
 
-def factorize_sparse(A):
+def factorize_sparse(A: Sparse):
     """The function (b, trans=0) -> A^-1 b, or A^-T b, with a `Sparse` A factorised once and constant to autodiff.
 
     A singular A gives NaN.
@@ -247,13 +250,13 @@ def factorize_sparse(A):
     values = lax.stop_gradient(A.values)
     digest = on_host(partial(_factorize, A.pattern), jax.ShapeDtypeStruct((WORDS,), jnp.uint32), values)
 
-    def apply(b, trans=0):
+    def apply(b: Array, trans: int = 0) -> Array:
         return on_host(partial(_solve, A.pattern, trans), jax.ShapeDtypeStruct(b.shape, b.dtype), digest, values, b)
 
     return apply
 
 
-def _factorize(pattern, values):
+def _factorize(pattern: Pattern, values: np.ndarray) -> np.ndarray:
     """(..., WORDS): the digests of values (..., slots), whose factors are kept."""
     values = np.asarray(values)
     flat = values.reshape(-1, values.shape[-1])
@@ -262,7 +265,7 @@ def _factorize(pattern, values):
     return np.frombuffer(b"".join(digests), np.uint32).reshape(*values.shape[:-1], WORDS)
 
 
-def _solve(pattern, trans, digests, values, b):
+def _solve(pattern: Pattern, trans: int, digests: np.ndarray, values: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(..., n): of a batch as `on_host` hands it over."""
     digests, values, b = map(np.asarray, (digests, values, b))
     number = digests.size // WORDS
@@ -277,12 +280,12 @@ def _solve(pattern, trans, digests, values, b):
     return np.stack([_substitute(factors[i], x, trans) for i, x in zip(which, b, strict=True)]).reshape(*shape, -1)
 
 
-def _substitute(factors, b, trans):
+def _substitute(factors, b: np.ndarray, trans: int) -> np.ndarray:
     """NaN where there are no factors."""
     return np.full_like(b, np.nan) if factors is None else factors.solve(b, "T" if trans else "N")
 
 
-def _obtain(pattern, digests, values):
+def _obtain(pattern: Pattern, digests: list, values: np.ndarray):
     """The factors of these matrices, as those used last."""
     found = []
     for digest, x in zip(digests, values, strict=True):
@@ -303,7 +306,7 @@ def _obtain(pattern, digests, values):
 _MISSING = object()
 
 
-def superlu(pattern, values):
+def superlu(pattern: Pattern, values: np.ndarray):
     """SuperLU's factors; None of a matrix that is singular, or not finite.
 
     In the mode for matrices with large diagonals and symmetric patterns, which finite elements have: half the fill of

@@ -4,6 +4,9 @@ They are given the linear map dw -> A dw of a step and never its matrix: a band 
 vectors of ones and zeros, and conjugate gradients only apply it.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +16,7 @@ from jax import lax
 from jax.scipy.sparse.linalg import cg
 
 from hhtjax.checks import require_integer, require_number
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.linear_solve import Structured, solve
 
 
@@ -23,7 +27,7 @@ class Banded(Structured):
     half_bandwidth: int
     tolerance: Any = None
 
-    def of_map(self, f, like):
+    def of_map(self, f: Callable, like: PyTree):
         """(b, trans=0) -> A^-1 b, or A^-T b."""
         bands = lax.stop_gradient(find_bands(f, like, self.half_bandwidth))
         transposed = jnp.stack([jnp.roll(band, i - self.half_bandwidth) for i, band in enumerate(bands)])[::-1]
@@ -38,12 +42,12 @@ class ConjugateGradients(Structured):
     iterations: int
     tolerance: Any = None
 
-    def of_map(self, f, like):
+    def of_map(self, f, like: PyTree):
         """(b, trans=0) -> A^-1 b, A being symmetric."""
         return lambda b, trans=0: cg(f, b, tol=0.0, atol=0.0, maxiter=self.iterations)[0]
 
 
-def banded(half_bandwidth=1, tolerance=None) -> Banded:
+def banded(half_bandwidth: int = 1, tolerance: Real = None) -> Banded:
     """For the `solve` of a stepper: M and the Jacobians of the force couple unknowns up to `half_bandwidth` apart.
 
     One step costs 2 half_bandwidth + 1 tangents of the residual and an elimination, all in proportion to the number of
@@ -75,7 +79,7 @@ def banded(half_bandwidth=1, tolerance=None) -> Banded:
     return Banded(half_bandwidth, _tolerance("banded", tolerance))
 
 
-def conjugate_gradients(iterations, tolerance=None) -> ConjugateGradients:
+def conjugate_gradients(iterations: int, tolerance: Real = None) -> ConjugateGradients:
     """For the `solve` of a stepper: that many iterations at every step, so that each costs the same.
 
     Matrix-free: a tangent of the residual for each iteration. What they leave unsolved is an error of the step. The
@@ -105,12 +109,12 @@ def conjugate_gradients(iterations, tolerance=None) -> ConjugateGradients:
     return ConjugateGradients(iterations, _tolerance("conjugate_gradients", tolerance))
 
 
-def _tolerance(caller, value):
+def _tolerance(caller: str, value):
     """As a number, which is part of the program."""
     return None if value is None else float(require_number(caller, "tolerance", value, lambda x: x > 0, "be positive"))
 
 
-def find_bands(f, like, p):
+def find_bands(f: Callable, like: PyTree, p: int) -> Array:
     """bands[p + d, i] = A[i, i + d] for |d| <= p, 0 outside of A; from A times 2 p + 1 vectors."""
     n, width = like.size, 2 * p + 1
     i = jnp.arange(n)
@@ -121,13 +125,13 @@ def find_bands(f, like, p):
     return jnp.where((column >= 0) & (column < n), bands, 0)
 
 
-def solve_tridiagonal(bands, b):
+def solve_tridiagonal(bands: Array, b: Array) -> Array:
     """x with A x = b."""
     lower, diagonal, upper = bands
     return lax.linalg.tridiagonal_solve(lower, diagonal, upper, b[:, None])[:, 0]
 
 
-def solve_blocks(bands, b):
+def solve_blocks(bands: Array, b: Array) -> Array:
     """x with A x = b, by elimination on the blocks (p, p) of a block tridiagonal A."""
     p, n = len(bands) // 2, b.size
     num_blocks = -(-n // p)
@@ -138,20 +142,20 @@ def solve_blocks(bands, b):
     row, column = jnp.arange(p)[:, None], jnp.arange(p)[None, :]
     rows = bands.reshape(2 * p + 1, num_blocks, p)
 
-    def blocks(shift):
+    def blocks(shift: int) -> Array:
         """(num_blocks, p, p): the columns `shift` blocks to the right of the diagonal."""
         d = column - row + shift * p
         found = rows[jnp.clip(d + p, 0, 2 * p), :, row]
         return jnp.moveaxis(jnp.where((abs(d) <= p)[:, :, None], found, 0), -1, 0)
 
-    def eliminate(carry, block):
+    def eliminate(carry: tuple, block: tuple):
         upper, y = carry  # of the block above: x = y - upper x_next
         L, D, U, b = block
         both = solve_columns(D - L @ upper, jnp.concatenate([U, (b - L @ y)[:, None]], axis=1))
         carry = both[:, :p], both[:, p]
         return carry, carry
 
-    def substitute(x, block):
+    def substitute(x: Array, block: tuple):
         upper, y = block
         x = y - upper @ x
         return x, x
@@ -162,6 +166,6 @@ def solve_blocks(bands, b):
     return x.reshape(-1)[:n]
 
 
-def solve_columns(A, B):
+def solve_columns(A: Array, B: Array) -> Array:
     """X with A X = B."""
     return jax.vmap(lambda b: solve(A, b), 1, 1)(B)

@@ -1,5 +1,7 @@
 """Charts of error: against the step size, with observed orders, and against the time that it takes."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import jax
@@ -84,7 +86,7 @@ def error_against_h(
     return panel
 
 
-def _lines(caller, lines, curves):
+def _lines(caller: str, lines, curves):
     """{label: options} of the user's, which must be of curves that there are."""
     lines = lines or {}
     if unknown := [label for label in lines if label not in curves]:

@@ -1,5 +1,7 @@
 """Charts of an identification: estimates with their intervals, correlations, a profile."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import jax
@@ -72,7 +74,7 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
     return panel
 
 
-def _kept(names, result, entries):
+def _kept(names: list, result: FitResult, entries) -> np.ndarray:
     """Which numbers of params are drawn."""
     if entries is None:
         return np.flatnonzero(result.free)
@@ -190,7 +192,7 @@ def _estimate_of(result, name):
     return parameter_values(result.params)[at], parameter_values(result.standard_errors)[at]
 
 
-def _require_fit(caller, name, result):
+def _require_fit(caller: str, name: str, result: FitResult):
     if not isinstance(result, FitResult):
         raise TypeError(f"{caller}: `{name}` must be a FitResult, as of fit; received {type(result).__name__}.")
     if result.uncertainty is None:
@@ -253,7 +255,7 @@ def fit_overview(
     return axes
 
 
-def _first_channel(result):
+def _first_channel(result: FitResult) -> np.ndarray:
     """The residual over time, (N,)."""
     leaf = np.asarray(jax.tree.leaves(result.residual)[0], float)
     leaf = leaf if result.starts is None else leaf[0]

@@ -1,7 +1,10 @@
 """Pictures of mechanisms, moving and still, from the points of their bars."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -9,8 +12,12 @@ from matplotlib.animation import FuncAnimation
 from matplotlib.ticker import MaxNLocator
 
 from hhtjax.checks import require_function, require_number
+from hhtjax.description import Real
 from hhtjax.plot.styles import COLOURS, canvas, legend, look, require_run, with_unit
 from hhtjax.runs.interpolate import interpolate
+
+if TYPE_CHECKING:
+    from hhtjax.runs.solution import Solution
 
 
 def animation(
@@ -72,7 +79,7 @@ def animation(
         paths = [panel.plot(*frames[0][0][[i]].T, color=COLOURS[1], lw=0.8)[0] for i in traced]
         title = panel.set_title(f"t = {times[0]:.2f}")
 
-    def draw(k):
+    def draw(k: int):
         for line, x in zip(bars, frames[k], strict=True):
             _move(line, x)
         for line, i in zip(paths, traced, strict=True):
@@ -116,7 +123,7 @@ def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = 
     return panel
 
 
-def _frames(caller, solution, points, times):
+def _frames(caller: str, solution: Solution, points: Callable, times: np.ndarray):
     """For each time a list of polylines, all of one dimension."""
     require_function(caller, "points", points, "points(q)")
     q = interpolate(solution, times).q
@@ -131,7 +138,7 @@ def _frames(caller, solution, points, times):
 
 
 @contextmanager
-def _scene(caller, ax, frames, unit):
+def _scene(caller: str, ax, frames: list, unit: str | None):
     """Axes of the right dimension, with limits that hold all frames and the same scale in every direction."""
     spatial = frames[0][0].shape[1] == 3
     if ax is not None and spatial != hasattr(ax, "get_zlim"):
@@ -154,16 +161,16 @@ def _scene(caller, ax, frames, unit):
         yield panel
 
 
-def _height(width, height):
+def _height(width: Real, height: Real) -> Real:
     """Of a figure, in mm, 85 wide, for a scene of this width and height; 25 for title and labels."""
     return min(max(25 + 65 * height / width, 40), 150)
 
 
-def _bar(i):
+def _bar(i: int):
     return look(i, marker=True) | {"ls": "-", "lw": 1.6, "ms": 3.5}
 
 
-def _move(line, x):
+def _move(line, x: np.ndarray):
     """A line through other points."""
     if x.shape[1] == 3:
         line.set_data_3d(*x.T)

@@ -1,5 +1,7 @@
 """A chart of a record: measured and simulated, what is left over, and spectra."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np
@@ -82,7 +84,7 @@ def fit_against_data(
     return axes
 
 
-def densities(ax, records, rate, unit, frequency_unit):
+def densities(ax, records: dict, rate: float, unit: str | None, frequency_unit: str):
     """Spectra of records by name: the residual blue, what was measured grey."""
     for name, values in records.items():
         frequency, density = _spectrum(values, rate)
@@ -111,7 +113,7 @@ def _record(times, measured, simulated):
     return times, measured, simulated
 
 
-def _spectrum(values, rate):
+def _spectrum(values: np.ndarray, rate: float):
     """Frequencies, and roots of the power spectral density, by Welch's method."""
     there = np.isfinite(values)
     values = np.where(there, values, np.mean(values[there]) if there.any() else 0.0)

@@ -1,5 +1,7 @@
 """Charts of what a step does to a linear motion, over w h or in the complex plane."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np
@@ -91,7 +93,9 @@ def period_elongation(steppers: Any, *, frequency: Any = None, damping: float = 
     return _over_frequency("period_elongation", "relative period error", steppers, frequency, damping, ax, NEAR)
 
 
-def _over_frequency(caller, ylabel, steppers, frequency, damping, ax, default):
+def _over_frequency(
+    caller: str, ylabel: str, steppers: dict, frequency: np.ndarray, damping: float, ax, default: np.ndarray
+):
     """One of the functions of `hhtjax.analysis` with this name, for each stepper."""
     named = _named(caller, steppers)
     frequency = default if frequency is None else np.asarray(frequency)
@@ -108,7 +112,7 @@ def _over_frequency(caller, ylabel, steppers, frequency, damping, ax, default):
     return panel
 
 
-def _named(caller, steppers):
+def _named(caller: str, steppers: dict):
     """{label: stepper}; one alone has no label."""
     if isinstance(steppers, Stepper):
         return {None: steppers}

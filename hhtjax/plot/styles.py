@@ -1,5 +1,7 @@
 """How charts look: colours that colour-blind readers tell apart, 8 pt text at the width of a column, vector text."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +17,7 @@ from matplotlib.textpath import TextPath
 from matplotlib.ticker import Formatter, LogFormatterSciNotation
 
 from hhtjax.checks import require_integer, require_number
-from hhtjax.description import all_concrete
+from hhtjax.description import PyTree, Real, all_concrete
 from hhtjax.runs.output import require_path
 from hhtjax.runs.solution import Solution
 
@@ -136,7 +138,7 @@ def thin_ticks(ax):
 
 
 @contextmanager
-def canvas(caller, ax, rows=1, width=COLUMN, height=None, **options):
+def canvas(caller: str, ax, rows: int = 1, width: int = COLUMN, height: Real = None, **options: PyTree):
     """The axes given, checked, or those of a new figure, and its style while they are drawn into: an array (rows,)."""
     if ax is None:
         with style():
@@ -158,7 +160,7 @@ def look(i: int, marker: bool = False) -> dict[str, Any]:
     return chosen | ({"marker": MARKERS[i % len(MARKERS)]} if marker else {})
 
 
-def legend(ax, handles=None, labels=None, **options: Any):
+def legend(ax, handles=None, labels: list | None = None, **options: Any):
     """A legend above the axes, where it covers no curve, in as many columns as fit; None where nothing has a label.
 
     Args:
@@ -190,7 +192,7 @@ def legend(ax, handles=None, labels=None, **options: Any):
     return ax.legend(handles, labels, **(place | shape | options))
 
 
-def _share(ax):
+def _share(ax) -> Real:
     """Of the width of its figure, that axes have with their labels."""
     cell = ax.get_subplotspec()
     if cell is None:
@@ -200,7 +202,7 @@ def _share(ax):
     return widths[list(cell.colspan)].sum() / widths.sum()
 
 
-def _columns(labels, room):
+def _columns(labels: list, room: Real) -> int:
     """The most columns of a legend that fit into `room` points, by the width of the widest label of each."""
     size = [TextPath((0, 0), label, size=TEXT).get_extents().width if label.strip() else 0 for label in labels]
     for columns in range(len(labels), 1, -1):
@@ -258,7 +260,7 @@ def with_unit(name: str, unit: str | None) -> str:
 SYMBOLS = {"q": "q", "v": "v", "acceleration": "w", "multipliers": "L", "z": "z"}
 
 
-def require_run(caller, solution):
+def require_run(caller: str, solution: Solution):
     """An error unless it is the solution of one run, with numbers."""
     if not isinstance(solution, Solution):
         raise TypeError(f"{caller}: `solution` must be a Solution, as of simulate; received {type(solution).__name__}.")
@@ -272,7 +274,7 @@ def require_run(caller, solution):
         )
 
 
-def named_entries(tree):
+def named_entries(tree: PyTree):
     """{name: (leaf name, values (K + 1,))} of each number: "[0]" of an array, "x[0]" and "phi" of a dict."""
     found = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
@@ -283,7 +285,7 @@ def named_entries(tree):
     return found
 
 
-def chosen_entries(caller, solution, quantity, entries):
+def chosen_entries(caller: str, solution, quantity, entries):
     """{name: (leaf name, values)} of one of a solution's quantities, all or those asked for, by entry or leaf."""
     tree = getattr(solution, quantity)
     if tree is None:

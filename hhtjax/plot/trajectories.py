@@ -1,5 +1,8 @@
 """Charts of one run: over time, in the phase plane, and how far its constraints drift."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +13,7 @@ import numpy as np
 from hhtjax import analysis
 from hhtjax.analysis.energy import EnergyBalance
 from hhtjax.checks import require_function
+from hhtjax.description import Array, PyTree
 from hhtjax.plot.styles import (
     SYMBOLS,
     canvas,
@@ -223,7 +227,7 @@ class LagrangianPotential:
 
     lagrangian: Any
 
-    def __call__(self, q, t, params):
+    def __call__(self, q: Array, t: Array, params: PyTree) -> Array:
         return -self.lagrangian(q, jax.tree.map(jnp.zeros_like, q), t, params)
 
 
@@ -286,7 +290,7 @@ def energy_balance(
     return axes
 
 
-def _balance(system, solution, params, potential):
+def _balance(system, solution, params: PyTree, potential):
     """Times, curves, error and its name, by `hhtjax.analysis`."""
     found = system
     if not isinstance(system, EnergyBalance):
@@ -307,7 +311,7 @@ def _balance(system, solution, params, potential):
     return t, curves, error, "made by the\nmethod"
 
 
-def _given_energy(solution, params, energy):
+def _given_energy(solution: Solution, params: PyTree, energy: Callable):
     """The same of an energy function of the user's."""
     require_run("energy_balance", solution)
     require_function("energy_balance", "energy", energy, "energy(q, v, t, params)")

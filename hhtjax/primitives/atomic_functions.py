@@ -5,9 +5,12 @@ again. Of an operation they ask for nothing but its rule, and what it computes i
 that JAX traced for the gradient of a chain of bodies, a quarter had been finite rotations and cross products.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +18,12 @@ from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.sharding import AxisType
 
+from hhtjax.description import Array
 from hhtjax.primitives.compat import is_on
 from hhtjax.primitives.two_mode_derivative import batch_size, in_front
+
+if TYPE_CHECKING:
+    from jax.extend.core import ClosedJaxpr
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +44,7 @@ class Family:
     members: Callable
     rule: Callable
 
-    def __call__(self, n, x):
+    def __call__(self, n: int, x: Array):
         x = jnp.asarray(x)
         if not _is_one(x):
             return self.plain(n, x)
@@ -70,7 +77,7 @@ class Bilinear:
     first: Callable
     second: Callable
 
-    def __call__(self, x, y):
+    def __call__(self, x: Array, y: Array) -> Array:
         dtype = jnp.result_type(x, y)
         x, y = (jnp.asarray(z, dtype) for z in (x, y))
         if not _is_one(x, y):
@@ -83,25 +90,25 @@ class Bilinear:
         return jax.jit(self.f)
 
 
-def _is_one(*arrays):
+def _is_one(*arrays: Array) -> bool:
     """Not where types say how arrays are spread over devices: each operation of JAX has a rule for that."""
     return is_on() and not any(map(_is_spread, map(jax.typeof, arrays)))
 
 
-def _is_spread(kind):
+def _is_spread(kind) -> bool:
     manual, mesh = getattr(kind, "manual_axis_type", None), kind.sharding.mesh  # older ones do not know of it
     return (manual is not None and not manual.empty) or AxisType.Explicit in getattr(mesh, "axis_types", ())
 
 
-def _jvp_of_family(x, dx, n, family, jaxpr):
+def _jvp_of_family(x: tuple, dx: tuple, n: int, family: Family, jaxpr: ClosedJaxpr):
     return tuple(map(list, family.rule(family, n, *x, *map(ad.instantiate_zeros, dx))))
 
 
-def _batch_of_families(x, axes, n, family, jaxpr):
+def _batch_of_families(x: tuple, axes: tuple, n: int, family: Family, jaxpr: ClosedJaxpr):
     return list(family(n, *x)), [*axes] * n
 
 
-def _batch_of_products(values, axes, product, jaxpr):
+def _batch_of_products(values: tuple, axes: tuple, product: Bilinear, jaxpr: ClosedJaxpr):
     size = batch_size(values, axes)
     return product(*(in_front(x, axis, size) for x, axis in zip(values, axes, strict=True))), 0
 

@@ -1,8 +1,11 @@
 """A row written into an array, each member of a batch its own: part of a kernel, where a scatter would be none."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +15,16 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.primitives.compat import is_on
 from hhtjax.primitives.interpreter import alone, evaluate
 from hhtjax.primitives.two_mode_derivative import batch_size, in_front, no_tangent
 
+if TYPE_CHECKING:
+    from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-def row_written(array, row, number):
+
+def row_written(array: Array, row: Array, number: Array) -> Array:
     """The array (K, ...) with the row (...) in the place of that of a number, 0 to K - 1.
 
     In place, if nothing else needs the old array. Of `lax.dynamic_update_index_in_dim` vmap makes a scatter, even for
@@ -43,7 +50,7 @@ def row_written(array, row, number):
     return write_p.bind(array, row[None], number, members=0, axis=0)
 
 
-def block_written(array, block, number, axis=0):
+def block_written(array: Array, block: Array, number: Array, axis: int = 0) -> Array:
     """The array with a block in the place of what stands there along an axis from a number on; as `row_written`.
 
     Args:
@@ -71,14 +78,14 @@ def block_written(array, block, number, axis=0):
     return write_p.bind(array, block, number, members=0, axis=axis)
 
 
-def written(array, block, number, *, members, axis):
+def written(array: Array, block: Array, number: Array, *, members: int, axis: int) -> Array:
     """Along an axis of a member's; so many axes before are of members, with one number for all or one for each."""
     if not number.ndim:
         return lax.dynamic_update_slice_in_dim(array, block, number, members + axis)
     count, shape = math.prod(number.shape), array.shape[members:]
     block, number = block.reshape(count, *block.shape[members:]), number.reshape(count)
 
-    def write(i, array):
+    def write(i: Array, array: Array) -> Array:
         one = lax.dynamic_index_in_dim(block, i)
         here = lax.dynamic_index_in_dim(number, i, keepdims=False)
         return lax.dynamic_update_slice(array, one, place(i, here, len(shape), axis))
@@ -86,14 +93,14 @@ def written(array, block, number, *, members, axis):
     return lax.fori_loop(0, count, write, array.reshape(count, *shape)).reshape(array.shape)
 
 
-def place(member, number, axes, axis):
+def place(member: Array, number: Array, axes: int, axis: int):
     """Where a member's block starts, that has so many axes."""
     start = [jnp.zeros_like(number)] * axes
     start[axis] = number
     return [member.astype(number.dtype), *start]
 
 
-def _of_members(f, array, *others):
+def _of_members(f: Callable, array: Array, *others: Array) -> Array:
     """f(array, *others) of each member; the last of the others are numbers, one for each."""
     for _ in others[-1].shape:
         f = jax.vmap(f)
@@ -106,17 +113,17 @@ def _scattered(array, block, number, *, members, axis):
     return _of_members(one, array, block, number)
 
 
-def _shape(array, block, number, *, members, axis):
+def _shape(array, block, number, *, members: int, axis: int):
     return ShapedArray(array.shape, array.dtype)
 
 
-def _jvp(args, dots, **params):
+def _jvp(args: tuple, dots: tuple, **params: PyTree):
     """Linear in the array and the block."""
     moves = map(ad.instantiate_zeros, dots[:2])
     return write_p.bind(*args, **params), write_p.bind(*moves, args[2], **params)
 
 
-def _transpose(cotangent, array, block, number, *, members, axis):
+def _transpose(cotangent: Array, array, block, number: Array, *, members: int, axis: int):
     like = block.aval if ad.is_undefined_primal(block) else block
     if type(cotangent) is ad.Zero:
         return [ad.Zero(x.aval) if ad.is_undefined_primal(x) else None for x in (array, block, number)]
@@ -126,7 +133,7 @@ def _transpose(cotangent, array, block, number, *, members, axis):
     return [x if ad.is_undefined_primal(y) else None for x, y in ((to_array, array), (to_block, block))] + [None]
 
 
-def _batch(args, axes, *, members, axis):
+def _batch(args: tuple, axes: tuple, *, members: int, axis: int):
     size = batch_size(args, axes)
     array, block, number = (in_front(x, a, size) for x, a in zip(args, axes, strict=True))
     if axes[2] is None and not jnp.ndim(args[2]):
@@ -150,7 +157,7 @@ mlir.register_lowering(write_p, mlir.lower_fun(written, multiple_results=False),
 # What few members of a batch ask for, done for each of them by itself, one after the other.
 
 
-def in_turn(f, asked, carry, *more):
+def in_turn(f: Callable, asked: Array, carry: PyTree, *more: PyTree):
     """f(carry, *more), which leaves the carry as it is where not `asked`: a batch visits only members that ask.
 
     One after the other, so that a member takes what it takes alone: for what few of them need at a time, with long
@@ -178,7 +185,7 @@ def in_turn(f, asked, carry, *more):
     leaves = [jnp.asarray(x) for x in leaves]
     like, count = jax.tree.structure(carry), len(leaves)
 
-    def on_leaves(*leaves):
+    def on_leaves(*leaves: Array):
         after, found = jax.tree.flatten(f(*structure.unflatten(leaves)))
         types = [[(x.shape, x.dtype) for x in map(jnp.asarray, xs)] for xs in (after, leaves[: like.num_leaves])]
         if found != like or types[0] != types[1]:
@@ -191,20 +198,20 @@ def in_turn(f, asked, carry, *more):
     return like.unflatten(turn_p.bind(asked, *leaves, closed=closed, at_once=closed, number=like.num_leaves))
 
 
-def _closed(f, *like):
+def _closed(f: Callable, *like: PyTree) -> ClosedJaxpr:
     """The jaxpr of f, which closes over no tracer."""
     return jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in like))
 
 
-def _evaluated(closed, *args):
+def _evaluated(closed: ClosedJaxpr, *args: Array):
     return eval_jaxpr(closed.jaxpr, closed.consts, *args)
 
 
 class _Own(NamedTuple):
     """What a member has of an array of the whole batch."""
 
-    array: Any
-    member: Any
+    array: Array
+    member: Array
     number: int  # of the argument
 
 
@@ -213,14 +220,14 @@ def _taken(x):
     return lax.dynamic_index_in_dim(x.array, x.member, keepdims=False) if isinstance(x, _Own) else x
 
 
-def _put(x, own):
+def _put(x, own) -> Array:
     """The array of the batch, with what a member has now."""
     if isinstance(x, _Own) and x.number == own.number:
         return x.array
     return lax.dynamic_update_index_in_dim(own.array, _taken(x), own.member, 0)
 
 
-def _apply(eqn, values):
+def _apply(eqn: JaxprEqn, values: list):
     """The results of one operation; what is written into a member's own stays in its place."""
     if eqn.primitive is write_p and isinstance(values[0], _Own) and eqn.params["members"] == 0:
         own, block, number = values[0], *map(_taken, values[1:])
@@ -229,15 +236,15 @@ def _apply(eqn, values):
     return alone(eqn)(*map(_taken, values))
 
 
-def _one_by_one(closed, mapped, number, *args):
+def _one_by_one(closed: ClosedJaxpr, mapped: list, number: int, *args):
     """For each member that asks, as the last argument says; mapped: which of the others differ between members."""
     *args, asked = args
     numbers = jnp.arange(asked.size, dtype=jnp.int32)
 
-    def next_from(i):
+    def next_from(i: Real) -> Array:
         return jnp.min(jnp.where(asked & (numbers >= i), numbers, asked.size)).astype(numbers.dtype)
 
-    def visit(now):
+    def visit(now: tuple):
         i, carry = now
         pairs = zip((*carry, *args[number:]), mapped, strict=True)
         mine = [_Own(x, i, k) if own else x for k, (x, own) in enumerate(pairs)]
@@ -247,7 +254,7 @@ def _one_by_one(closed, mapped, number, *args):
     return lax.while_loop(lambda now: now[0] < asked.size, visit, (next_from(0), args[:number]))[1]
 
 
-def _batch_turns(args, axes, *, closed, at_once, number):
+def _batch_turns(args, axes: tuple, *, closed, at_once, number: int):
     """The carry differs between members, whatever else does."""
     size = batch_size(args, axes)
     mapped = [i < number or axis is not None for i, axis in enumerate(axes[1:])]
@@ -257,7 +264,7 @@ def _batch_turns(args, axes, *, closed, at_once, number):
         for x, own, axis in zip(args, mapped, axes[1:], strict=True)
     ]
 
-    def together(closed, *args):
+    def together(closed: ClosedJaxpr, *args: Array):
         return jax.vmap(partial(_evaluated, closed), [0 if own else None for own in mapped])(*args[: len(mapped)])
 
     values = partial(together, closed)
@@ -268,11 +275,11 @@ def _batch_turns(args, axes, *, closed, at_once, number):
     return turn_p.bind(asked, *args, **forms, number=number), [0] * number
 
 
-def _jvp_turns(args, dots, *, at_once, **params):
+def _jvp_turns(args: tuple, dots: tuple, *, at_once: ClosedJaxpr, **params: PyTree):
     """Of those that move."""
     moving = [i for i, dot in enumerate(dots) if type(dot) is not ad.Zero and dot.dtype != jax.dtypes.float0]
 
-    def f(*moved):
+    def f(*moved: Array):
         now = list(args)
         for i, x in zip(moving, moved, strict=True):
             now[i] = x
@@ -282,7 +289,7 @@ def _jvp_turns(args, dots, *, at_once, **params):
     return after, [no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found]
 
 
-def _needed(used, *more):
+def _needed(used: list, *more: JaxprEqn):
     """Without what nobody uses of the carry, and what only that is made from."""
     eqn = more[-1]  # a newer JAX tells more
     if eqn.effects:
@@ -295,10 +302,10 @@ def _needed(used, *more):
     places = carry + [i for i, x in enumerate(map(max, *inputs)) if x and i not in carry]
     kept = [eqn.invars[1 + i] for i in places]
 
-    def of(closed):
+    def of(closed: ClosedJaxpr) -> ClosedJaxpr:
         pruned, _ = pe.dce_jaxpr(closed.jaxpr, used, instantiate=True)
 
-        def f(*args):
+        def f(*args: Array):
             given = dict(zip(places, args, strict=True))
             nobody = (jnp.zeros(x.shape, x.dtype) for x in closed.in_avals)
             return eval_jaxpr(pruned, closed.consts, *(given.get(i, x) for i, x in enumerate(nobody)))
@@ -313,7 +320,7 @@ def _needed(used, *more):
     return [True, *(i in places for i in range(len(eqn.invars) - 1))], new
 
 
-def values(asked, *args, closed, **params):
+def values(asked: Array, *args: Array, closed: ClosedJaxpr, **params: PyTree):
     return _evaluated(closed, *args)
 
 

@@ -1,5 +1,7 @@
 """Whether the machinery is on: with the versions of JAX that it is tested with, and unless a user says no."""
 
+from __future__ import annotations
+
 import os
 import warnings
 from collections.abc import Callable
@@ -106,6 +108,6 @@ def _words(version):
     return ".".join(map(str, version))
 
 
-def is_on():
+def is_on() -> bool:
     """Whether the machinery may change how a program runs."""
     return why_off() is None

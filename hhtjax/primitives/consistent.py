@@ -10,7 +10,11 @@ Comparisons by order, x < y, are left alone: where two roundings of x differ in 
 rounding.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import wraps
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +23,12 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.primitives.compat import is_on
 from hhtjax.primitives.interpreter import alone, evaluate
+
+if TYPE_CHECKING:
+    from jax.extend.core import Jaxpr, JaxprEqn
 
 SHORT = 512  # numbers; XLA divides no work on so few among threads, which in a kernel takes a second result
 EQUALITIES = {"eq", "ne"}
@@ -46,7 +54,7 @@ INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}  # the 
 REBUILT = {"cond", "scan", "while"}
 
 
-def held(x):
+def held(x: Real) -> Array:
     """The array x, computed once for all that use it; its tangent is left alone.
 
     >>> print(held(jnp.arange(2.0)))
@@ -55,7 +63,7 @@ def held(x):
     return held_p.bind(jnp.asarray(x))
 
 
-def consistent(f):
+def consistent(f: Callable):
     """f, of which values and derivatives do not depend on how often XLA evaluates what is compared in it.
 
     Args:
@@ -76,14 +84,14 @@ def consistent(f):
     compares = True
 
     @wraps(f)
-    def g(*args, **keywords):
+    def g(*args: PyTree, **keywords: PyTree) -> Array:
         nonlocal compares
         if not compares:
             return f(*args, **keywords)
         leaves, structure = jax.tree.flatten((args, keywords))
         places = [i for i, x in enumerate(leaves) if hasattr(x, "dtype")]  # numbers of Python, and functions, stay
 
-        def on_arrays(*arrays):
+        def on_arrays(*arrays: Array) -> Array:
             new = dict(zip(places, arrays, strict=True))
             args, keywords = structure.unflatten([new.get(i, x) for i, x in enumerate(leaves)])
             return f(*args, **keywords)
@@ -96,7 +104,7 @@ def consistent(f):
     return g
 
 
-def _run(jaxpr, constants, values, inside=False):
+def _run(jaxpr: Jaxpr, constants: list, values, inside: bool = False):
     """The values of a jaxpr's results. inside: of one within, of which arguments are held where it stands."""
     hold = _to_hold(jaxpr)
     given = [*constants, *values]
@@ -105,11 +113,11 @@ def _run(jaxpr, constants, values, inside=False):
     return evaluate(jaxpr, given, lambda eqn, values: _held_where(hold, eqn.outvars, _apply(eqn, values)))
 
 
-def _held_where(hold, variables, values):
+def _held_where(hold, variables: list, values: list):
     return [held(x) if v in hold else x for v, x in zip(variables, values, strict=True)]
 
 
-def _to_hold(jaxpr):
+def _to_hold(jaxpr: Jaxpr):
     """Variables from which come, by exact operations, the numbers that are asked for equality."""
     hold = set()
     for eqn in reversed(jaxpr.eqns):
@@ -127,24 +135,24 @@ def _is_floating(x):
     return not isinstance(x, Literal) and jnp.issubdtype(x.aval.dtype, np.floating)
 
 
-def _inner(eqn):
+def _inner(eqn: JaxprEqn):
     """The jaxprs within an operation that are evaluated anew here."""
     if eqn.primitive.name not in REBUILT and eqn.primitive.name not in INLINED:
         return []
     return [getattr(x, "jaxpr", x) for x in jax.tree.leaves(list(eqn.params.values())) if hasattr(x, "eqns")]
 
 
-def _asks(jaxpr):
+def _asks(jaxpr: Jaxpr) -> bool:
     """Whether it asks floating numbers for equality."""
     return _has(EQUALITIES, jaxpr)
 
 
-def _compares(jaxpr):
+def _compares(jaxpr: Jaxpr) -> bool:
     """The same, its derivatives included."""
     return _has(EQUALITIES | CHOICES, jaxpr)
 
 
-def _has(names, jaxpr):
+def _has(names, jaxpr) -> bool:
     for eqn in jaxpr.eqns:
         if eqn.primitive.name in names and any(map(_is_floating, eqn.invars)):
             return True
@@ -153,7 +161,7 @@ def _has(names, jaxpr):
     return False
 
 
-def _apply(eqn, values):
+def _apply(eqn, values: list):
     """The results of one operation."""
     name = eqn.primitive.name
     if name in CHOICES and any(map(_is_floating, eqn.invars)):
@@ -167,16 +175,16 @@ def _apply(eqn, values):
     return alone(eqn.replace(params=params))(*values)
 
 
-def _rebuilt(closed):
+def _rebuilt(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The body of a loop, or a branch."""
     like = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in closed.in_avals]
     return jax.make_jaxpr(lambda *x: _run(closed.jaxpr, closed.consts, x, inside=True))(*like)
 
 
-def _choice(eqn):
+def _choice(eqn: JaxprEqn):
     """A maximum or minimum as a function whose derivative compares it with the numbers that it was taken of."""
 
-    def plain(*x):
+    def plain(*x: Array) -> Array:
         return alone(eqn)(*x)[0]
 
     choose = jax.custom_jvp(plain)
@@ -184,7 +192,7 @@ def _choice(eqn):
     return choose
 
 
-def _jvp(primals, tangents):
+def _jvp(primals: tuple, tangents: tuple):
     return held_p.bind(*primals), tangents[0]
 
 

@@ -1,9 +1,11 @@
 """A traced function, evaluated anew with other values than arrays."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 from jax.core import eval_jaxpr
@@ -11,8 +13,13 @@ from jax.extend.core import Literal
 from jax.extend.source_info_util import user_context
 from jax.interpreters import partial_eval as pe
 
+from hhtjax.description import Array, PyTree, Real
 
-def evaluate(jaxpr, values, apply, of_literal=lambda x: x):
+if TYPE_CHECKING:
+    from jax.extend.core import Jaxpr, JaxprEqn, Var
+
+
+def evaluate(jaxpr, values: Sequence, apply: Callable, of_literal: Callable = lambda x: x):
     """The values of a jaxpr's results.
 
     values: of its constants and arguments; apply: (operation, values) -> values of its results; of_literal: number in
@@ -20,7 +27,7 @@ def evaluate(jaxpr, values, apply, of_literal=lambda x: x):
     """
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], values, strict=True))
 
-    def read(atom):
+    def read(atom: Literal | Var) -> Real:
         return of_literal(atom.val) if isinstance(atom, Literal) else known[atom]
 
     for eqn in needed(jaxpr):
@@ -38,13 +45,13 @@ def needed(jaxpr):
     return found[::-1]
 
 
-def alone(eqn) -> Callable:
+def alone(eqn: JaxprEqn) -> Callable:
     """One operation of a jaxpr as a function of its arrays, to a list."""
 
     found = eqn.primitive.get_bind_params(eqn.params)
     functions, params = found if isinstance(found, tuple) else ((), found)  # an older JAX gives functions apart
 
-    def f(*arrays):
+    def f(*arrays: Real):
         with eqn.ctx.manager, user_context(eqn.source_info.traceback):  # `explain` names the line that it comes from
             results = eqn.primitive.bind(*functions, *arrays, **params)
         return results if eqn.primitive.multiple_results else [results]
@@ -65,15 +72,15 @@ class Traced(NamedTuple):
         result: shapes and dtypes of its results.
     """
 
-    jaxpr: Any
-    constants: Any
-    result: Any
+    jaxpr: Jaxpr
+    constants: Array
+    result: Array
 
     def __call__(self, *args):
         found = eval_jaxpr(self.jaxpr, self.constants, *jax.tree.leaves(args))
         return jax.tree.unflatten(jax.tree.structure(self.result), found)
 
-    def reads(self, needed):
+    def reads(self, needed: list | None):
         """Which of the arrays in its arguments it makes those of its results from that are needed: lists of booleans.
 
         Args:
@@ -89,7 +96,7 @@ class Traced(NamedTuple):
         return pe.dce_jaxpr(self.jaxpr, needed)[1]
 
 
-def traced(f, *like):
+def traced(f: Callable, *like: PyTree) -> Traced:
     """f, traced once, of arguments like these, without operations that no result is made of.
 
     XLA would drop these too, but not from what it computes once, such as a stage, nor from the tracing and lowering
@@ -125,7 +132,7 @@ THEIRS = str(Path(str(jax.__file__)).parent)
 asked: ContextVar = ContextVar("hhtjax_paths", default=None)
 
 
-def line_of(eqn):
+def line_of(eqn: JaxprEqn):
     """ "file.py, line 12, in force" of the innermost function that is neither JAX's nor ours; None where none is."""
     traceback = getattr(eqn.source_info, "traceback", None)
     for frame in getattr(traceback, "frames", ()):

@@ -5,7 +5,11 @@ the program is lowered the whole function is there to be looked at, with all tha
 what is then done with it is in lowering.py.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from functools import partial, wraps
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import jax
@@ -18,16 +22,21 @@ from jax.extend.linear_util import wrap_init
 from jax.interpreters import ad, batching
 from jax.interpreters import partial_eval as pe
 
+from hhtjax.description import Array, PyTree
+
+if TYPE_CHECKING:
+    from jax.extend.core import JaxprEqn
+
 kernel_p = Primitive("hhtjax_kernel")
 kernel_p.multiple_results = True
 
 
-def of_jaxpr(f):
+def of_jaxpr(f: Callable):
     """f(closed jaxpr, *args), computed once for each jaxpr that is alive, and hashable args."""
     known = WeakKeyDictionary()
 
     @wraps(f)
-    def remembered(closed, *args):
+    def remembered(closed: ClosedJaxpr, *args: PyTree) -> PyTree:
         found = known.setdefault(closed, {})
         if args not in found:
             found[args] = f(closed, *args)
@@ -36,7 +45,7 @@ def of_jaxpr(f):
     return remembered
 
 
-def _seen_moving(x, marks):
+def _seen_moving(x: list, marks: list):
     """The list x; of a derivative that is being made, `marks` gets which of it move."""
 
     @jax.custom_jvp
@@ -44,7 +53,7 @@ def _seen_moving(x, marks):
         return x
 
     @partial(seen.defjvp, symbolic_zeros=True)
-    def _(x, dx):
+    def _(x: tuple, dx: tuple):
         marks[:] = [not isinstance(dot, SymbolicZero) for dot in dx]
         return x, dx
 
@@ -52,15 +61,15 @@ def _seen_moving(x, marks):
     return x
 
 
-def _seen_in_batch(x, marks):
+def _seen_in_batch(x: list, marks: list):
     """The list x; of a batch that is being made, `marks` gets which of it differ from member to member."""
 
     @custom_vmap
-    def seen(*x):
+    def seen(*x: Array):
         return x
 
     @seen.def_vmap
-    def _(size, differ, *x):
+    def _(size: int, differ: list, *x: Array):
         marks[:] = differ
         return x, tuple(differ)
 
@@ -68,13 +77,13 @@ def _seen_in_batch(x, marks):
     return x
 
 
-def _pruned(closed):
+def _pruned(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The closed jaxpr without what no result is made of."""
     jaxpr, _ = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), instantiate=True)
     return ClosedJaxpr(jaxpr, closed.consts)
 
 
-def _abstract(*avals, closed, name):
+def _abstract(*avals, closed: ClosedJaxpr, name: str):
     return closed.out_avals
 
 
@@ -86,14 +95,14 @@ def _run(*args, closed, name):
 
 
 @of_jaxpr
-def _forward(closed, moves):
+def _forward(closed: ClosedJaxpr, moves: tuple):
     """closed and its tangents: arguments, tangents of those that move -> results, tangents of those that then do."""
     moved = [False] * len(closed.out_avals)
 
-    def both(*args):
+    def both(*args: Array):
         static, moving = _parted(args[: len(moves)], moves)
 
-        def f(*moving):
+        def f(*moving: Array):
             return _seen_moving(jaxpr_as_fun(closed)(*_merged(static, moving, moves)), moved)
 
         out, changes = jax.jvp(f, tuple(moving), tuple(args[len(moves) :]))
@@ -103,18 +112,18 @@ def _forward(closed, moves):
     return _pruned(jax.make_jaxpr(both)(*closed.in_avals, *given)), tuple(moved)
 
 
-def _parted(values, marks):
+def _parted(values: Sequence, marks: Sequence):
     """Those that are not marked, and those that are."""
     return tuple([x for x, mark in zip(values, marks, strict=True) if mark == which] for which in (False, True))
 
 
-def _merged(unmarked, marked, marks):
+def _merged(unmarked: Sequence, marked: Sequence, marks: tuple):
     """The inverse of `_parted`."""
     sources = iter(unmarked), iter(marked)
     return [next(sources[bool(mark)]) for mark in marks]
 
 
-def _jvp(args, dots, closed, name):
+def _jvp(args: tuple, dots: tuple, closed: ClosedJaxpr, name: str):
     moves = tuple(type(dot) is not ad.Zero for dot in dots)
     forward, moved_out = _forward(closed, moves)
     found = kernel_p.bind(*args, *_parted(dots, moves)[1], closed=forward, name=name)
@@ -130,7 +139,7 @@ def _no_tangent(aval):
 
 
 @of_jaxpr
-def _divided(closed, unknown):
+def _divided(closed: ClosedJaxpr, unknown: tuple):
     """Into what is known before the arguments that `unknown` marks, and the rest.
 
     The first gives the known results, and what the rest needs; the rest takes that, and the unknown arguments, and
@@ -138,7 +147,7 @@ def _divided(closed, unknown):
     """
     rest = {}
 
-    def first(*known):
+    def first(*known: Array):
         values = iter(known)
         pvals = [
             pe.PartialVal.unknown(aval) if mark else pe.PartialVal.known(next(values))
@@ -173,7 +182,7 @@ def _divide(trace, *args, closed, name):
 
 
 @of_jaxpr
-def _without(closed, wanted):
+def _without(closed: ClosedJaxpr, wanted: tuple):
     """closed with the wanted results only, of the arguments that these need: and which these are."""
     jaxpr, used = pe.dce_jaxpr(closed.jaxpr, list(wanted))
     return ClosedJaxpr(jaxpr, closed.consts), tuple(used)
@@ -190,7 +199,7 @@ def _divide_equation(saveable, unknown, instantiated, eqn):
     return known, rest, list(told), list(told), needed
 
 
-def _eliminated(used, eqn):
+def _eliminated(used: list, eqn: JaxprEqn):
     """Of an equation whose results are not all used: which arguments it still needs, and what is left of it."""
     if not any(used):
         return [False] * len(eqn.invars), None
@@ -206,15 +215,15 @@ def _eliminated(used, eqn):
 
 
 @of_jaxpr
-def _transposed(closed, linear, given):
+def _transposed(closed: ClosedJaxpr, linear: tuple, given: tuple) -> ClosedJaxpr:
     """Arguments that are not linear, cotangents of the results that have one -> cotangents of the linear ones."""
     out_avals = closed.out_avals
 
-    def transpose(*args):
+    def transpose(*args: Array):
         number = len(linear) - sum(linear)
         known, cotangents = args[:number], iter(args[number:])
 
-        def f(*moving):
+        def f(*moving: Array):
             return jaxpr_as_fun(closed)(*_merged(known, moving, linear))
 
         full = [next(cotangents) if g else jnp.zeros(x.shape, x.dtype) for g, x in zip(given, out_avals, strict=True)]
@@ -225,7 +234,7 @@ def _transposed(closed, linear, given):
     return jax.make_jaxpr(transpose)(*parts[0], *parts[1])
 
 
-def _transpose(cotangents, *args, closed, name):
+def _transpose(cotangents: list, *args, closed: ClosedJaxpr, name: str):
     linear = tuple(map(ad.is_undefined_primal, args))
     given = tuple(type(ct) is not ad.Zero for ct in cotangents)
     back = _transposed(closed, linear, given)
@@ -237,14 +246,14 @@ def _transpose(cotangents, *args, closed, name):
 
 
 @of_jaxpr
-def _batched(closed, axes, size, axis_name):
+def _batched(closed: ClosedJaxpr, axes: tuple, size: int, axis_name: str):
     """Of a batch whose members stand along these axes: the jaxpr, and which results have one, in front."""
     marks = [False] * len(closed.out_avals)
 
-    def member(*x):
+    def member(*x: Array):
         return _seen_in_batch(jaxpr_as_fun(closed)(*x), marks)
 
-    def batch(*x):
+    def batch(*x: Array):
         found = jax.vmap(member, in_axes=axes, axis_size=size, axis_name=axis_name)(*x)
         marks[:] = [mark or not size for mark in marks]  # nobody has what members would share
         return [x if mark else x[0] for x, mark in zip(found, marks, strict=True)]
@@ -256,7 +265,7 @@ def _batched(closed, axes, size, axis_name):
     return _pruned(jax.make_jaxpr(batch)(*avals)), [0 if mark else None for mark in marks]
 
 
-def _batch(data, args, axes, closed, name):
+def _batch(data: PyTree, args: tuple, axes: tuple, closed: ClosedJaxpr, name: str):
     axes = tuple(None if axis is None else int(axis) for axis in axes)
     batched, out = _batched(closed, axes, data.size, data.name)
     return kernel_p.bind(*args, closed=batched, name=name), out

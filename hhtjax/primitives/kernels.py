@@ -6,6 +6,11 @@ system once for every column of its Jacobian. So a loop becomes one operation he
 and vmap keep, and functions get names. When the program is lowered, with vmap and autodiff done, lowering.py decides.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +19,12 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import ad, batching
 
+from hhtjax.description import Array, PyTree
 from hhtjax.primitives.compat import is_on, why_off
 from hhtjax.primitives.kernel_primitive import kernel_p
+
+if TYPE_CHECKING:
+    from hhtjax.primitives.interpreter import Traced
 
 # names of functions; autodiff and vmap keep them
 KERNEL, STAGED, PART = "hhtjax_one_kernel", "hhtjax_staged", "hhtjax_part"
@@ -23,7 +32,7 @@ AROUND = "hhtjax_around"
 WRITTEN_OUT = 32  # numbers of a sum in a loop, one after the other
 
 
-def one_kernel(f, *args, around=False):
+def one_kernel(f: Callable, *args: PyTree, around: bool = False):
     """f(*args) of pytrees of arrays, as one kernel where XLA can; the same values otherwise.
 
     Args:
@@ -45,7 +54,7 @@ def one_kernel(f, *args, around=False):
     leaves, structure = jax.tree.flatten(args)
     leaves = [jnp.asarray(x) for x in leaves]
 
-    def on_leaves(*leaves):
+    def on_leaves(*leaves: Array):
         return f(*structure.unflatten(leaves))
 
     trace, like = jax.make_jaxpr(on_leaves, return_shape=True)(*leaves)
@@ -56,7 +65,7 @@ def one_kernel(f, *args, around=False):
     return jax.tree.structure(like).unflatten(found)
 
 
-def _with_arguments(closed):
+def _with_arguments(closed: ClosedJaxpr):
     """The closed jaxpr with those of its constants that are being traced as arguments, and these: they may have
     derivatives."""
     moves = [isinstance(x, Tracer) for x in closed.consts]
@@ -65,7 +74,7 @@ def _with_arguments(closed):
     return ClosedJaxpr(closed.jaxpr.replace(constvars=constvars, invars=[*closed.jaxpr.invars, *more]), consts), values
 
 
-def staged(f, size=None):
+def staged(f: Callable | Traced, size: int | None = None) -> Callable | Traced:
     """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have.
 
     Args:
@@ -84,7 +93,7 @@ def staged(f, size=None):
     return f if size == 1 or not is_on() else named(STAGED, f)
 
 
-def part(f, size=None):
+def part(f: Callable, size: int | None = None):
     """f of pytrees of arrays; a kernel of its own where it is in none, and XLA would take long for its fusions.
 
     Args:
@@ -103,7 +112,7 @@ def part(f, size=None):
     return f if size == 1 or not is_on() else named(PART, f)
 
 
-def choose(inside, outside, *args):
+def choose(inside: Callable, outside: Callable, *args: PyTree) -> PyTree:
     """inside(*args) in one kernel, outside(*args) elsewhere: two ways to the same values.
 
     Args:
@@ -124,7 +133,7 @@ def choose(inside, outside, *args):
     return lax.cond(inside_p.bind(jax.tree.leaves(args)[0]), inside, outside, *args)
 
 
-def structural(x):
+def structural(x: np.ndarray) -> Array:
     """The array x, whose zeros are such by structure, as in a unit vector: their products may be left out of sums.
 
     So the sum of 0 y and z is z, also where y is infinite or not a number.
@@ -144,7 +153,7 @@ def structural(x):
     return structural_p.bind(x) if is_on() else jnp.asarray(x)
 
 
-def largest_in_batch(x, kept=True):
+def largest_in_batch(x: Array, kept: bool = True) -> Array:
     """The scalar x; under vmap the largest over the members, the same for all of them.
 
     A bound of a loop that is the same for all, or a condition: of a condition of their own vmap makes a choice, and
@@ -168,7 +177,7 @@ def largest_in_batch(x, kept=True):
     return largest_p.bind(x, kept=kept)
 
 
-def or_alone(x):
+def or_alone(x: Array) -> Array:
     """Whether a member of a batch goes on while others do; what is no member always does, and never chooses.
 
     Args:
@@ -186,23 +195,23 @@ def or_alone(x):
     return alone_p.bind(x)
 
 
-def named(name, f):
+def named(name: str, f: Callable | Traced):
     """f as a function of this name in the program."""
 
-    def call(*args):
+    def call(*args: PyTree):
         return f(*args)
 
     call.__name__ = name
     return jax.jit(call)
 
 
-def _told(why, tree):
+def _told(why: str, tree: PyTree) -> PyTree:
     """The results of a loop that is no kernel, for `explain` to find."""
     loop = object()
     return jax.tree.map(lambda x: told_p.bind(x, why=why, loop=loop), tree)
 
 
-def _largest(values, axes, kept):
+def _largest(values: tuple, axes: tuple, kept: bool):
     """By halves and a sum where the booleans of a batch are in no array, which has instructions of its own."""
     x = jnp.moveaxis(values[0], axes[0], 0)
     if kept:

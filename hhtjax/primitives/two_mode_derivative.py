@@ -6,8 +6,11 @@ with the values, in one loop; where reverse mode takes the values apart from wha
 of its own, and the linear one brings its transpose.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +19,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive, Var
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
+
+from hhtjax.description import Array, PyTree
 
 
 class TwoWays(NamedTuple):
@@ -31,13 +36,13 @@ class TwoWays(NamedTuple):
     """
 
     number: int
-    values: Any
-    forward: Any
-    reverse: Any
-    slow: Any
-    slow_reverse: Any
+    values: PyTree
+    forward: Callable
+    reverse: Callable
+    slow: Callable
+    slow_reverse: Callable
 
-    def batched(self, axes):
+    def batched(self, axes: list) -> TwoWays:
         """Those of a batch; axes: of x."""
         out = None if all(axis is None for axis in axes) else 0  # of values
         values = self.values if out is None else jax.vmap(self.values, (axes,))
@@ -46,7 +51,7 @@ class TwoWays(NamedTuple):
         return TwoWays(self.number, values, forward, reverse, slow, slow_reverse)
 
 
-def derivative(ways, x, dx):
+def derivative(ways: TwoWays, x: list, dx: list):
     """The values of a function and their tangents, in either mode of autodiff.
 
     Args:
@@ -69,7 +74,7 @@ def derivative(ways, x, dx):
     return found[: ways.number], found[ways.number :]
 
 
-def together(f, x):
+def together(f: Callable, x: list):
     """f(x), lists of arrays; all of the values have a batch if part of x has it, as those of `derivative` do.
 
     Args:
@@ -89,21 +94,21 @@ def together(f, x):
     return values_p.bind(*x, f=f)
 
 
-def _divided(args, count):
+def _divided(args: tuple, count: int):
     return list(args[:count]), list(args[count:])
 
 
-def both(*args, ways, count):
+def both(*args, ways: TwoWays, count: int):
     values, dots = ways.forward(*_divided(args, count))
     return [*values, *dots]
 
 
-def linear(*args, ways, count, backwards):
+def linear(*args, ways: TwoWays, count: int, backwards: bool):
     x, given = _divided(args, count)
     return ways.reverse(x, given) if backwards else ways.forward(x, given)[1]
 
 
-def values(*x, f):
+def values(*x: Array, f: Callable):
     return f(list(x))
 
 
@@ -113,7 +118,7 @@ def _jvp_by(function, args, dots, **params):
     return found[0], [no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found[1]]
 
 
-def no_tangent(x):
+def no_tangent(x: Array):
     """Zero, of a value or of a tangent."""
     dtype = x.dtype if jnp.issubdtype(x.dtype, jnp.inexact) else jax.dtypes.float0
     return ad.Zero(ShapedArray(x.shape, dtype))
@@ -151,13 +156,13 @@ def _instantiated(x, dot):
     return ad.instantiate_zeros(dot)
 
 
-def _transpose(cotangents, *args, ways, count, backwards):
+def _transpose(cotangents: list, *args, ways: TwoWays, count: int, backwards: bool):
     given = map(ad.instantiate_zeros, cotangents)
     found = linear_p.bind(*args[:count], *given, ways=ways, count=count, backwards=not backwards)
     return [None] * count + found
 
 
-def _batch(primitive, args, axes, ways, count, **params):
+def _batch(primitive, args: tuple, axes: tuple, ways: TwoWays, count: int, **params: PyTree):
     """Every tangent gets the batch, and all values, if part of x has it."""
     size = batch_size(args, axes)
     given = [in_front(x, axis, size) for x, axis in zip(args[count:], axes[count:], strict=True)]
@@ -167,12 +172,12 @@ def _batch(primitive, args, axes, ways, count, **params):
     return found, [None] * alone + [0] * (len(found) - alone)
 
 
-def _batch_values(x, axes, f):
+def _batch_values(x: tuple, axes: tuple, f: Callable):
     found = values_p.bind(*x, f=jax.vmap(f, (list(axes),)))
     return found, [0] * len(found)
 
 
-def _divide(trace, *args, ways, count):
+def _divide(trace, *args, ways: TwoWays, count: int):
     """Into the values, which are known, and what is linear in tangents that are not."""
     known = [arg.pval.get_known() for arg in args]
     if all(x is not None for x in known) or any(x is None for x in known[:count]):
@@ -198,7 +203,7 @@ def _divide_equation(saveable, unknown, instantiated, eqn):
     return first, second, told, told, needed
 
 
-def _primitive(name, run, batch):
+def _primitive(name: str, run: Callable, batch: Callable):
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(run)
@@ -208,7 +213,7 @@ def _primitive(name, run, batch):
     return primitive
 
 
-def _shapes(run, *args, **params):
+def _shapes(run: Callable, *args, **params: PyTree):
     return [ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(partial(run, **params), *args)]
 
 
@@ -230,7 +235,7 @@ pe.partial_eval_jaxpr_custom_rules[both_p] = _divide_equation
 KNOWN = "EvalTrace", "DynamicJaxprTrace"  # without any, and inside a jit
 
 
-def is_untouched():
+def is_untouched() -> bool:
     """Whether neither a derivative nor a batch is being made here; of a jit one may be made when it has been traced.
 
     Args:
@@ -252,7 +257,7 @@ def is_untouched():
     return type(_here.bind()).__name__ in KNOWN
 
 
-def is_traced():
+def is_traced() -> bool:
     """Whether what runs here becomes part of a program, or of a derivative or a batch, in less than a microsecond.
 
     Args:
@@ -274,17 +279,17 @@ def is_traced():
     return type(_here.bind()).__name__ != KNOWN[0]
 
 
-def batch_size(args, axes):
+def batch_size(args: tuple, axes: tuple) -> int:
     """Number of the members of a batch. axes: of the arguments, None where all members share one."""
     return next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
 
 
-def in_front(x, axis, size):
+def in_front(x: Array, axis: int | None, size: int) -> Array:
     """An argument with the axis of the members in front, repeated where they share it."""
     return jnp.broadcast_to(x, (size, *jnp.shape(x))) if axis is None else jnp.moveaxis(x, axis, 0)
 
 
-def is_in_batch():
+def is_in_batch() -> bool:
     """Whether a batch is being made here, as far as a JAX says so: not of a jit of which one is made when it is traced.
 
     Args:
@@ -309,7 +314,7 @@ def is_in_batch():
     return trace is not None
 
 
-def forward_only(x, words):
+def forward_only(x: Array, words: str) -> Array:
     """The array x, of which a reverse derivative is refused in these words, and not in JAX's.
 
     Args:
@@ -335,7 +340,7 @@ def forward_only(x, words):
     return forward_only_p.bind(x, words=words)
 
 
-def _refuse(cotangent, x, words):
+def _refuse(cotangent: Array, x, words: str):
     raise TypeError(words)
 
 

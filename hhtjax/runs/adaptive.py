@@ -1,13 +1,19 @@
 """A tolerance in the place of a step size: what a user asks for, and its checks."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from hhtjax.checks import require_integer, require_number
-from hhtjax.description import Description, is_array, is_concrete, is_real
+from hhtjax.description import Description, Real, is_array, is_concrete, is_real
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import Stepper
 
 WITH_ESTIMATES = "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda or dopri5"
 
@@ -26,14 +32,14 @@ class Adaptive(Description):
 
 
 def adaptive(
-    rtol: Any,
-    atol: Any,
+    rtol: Real,
+    atol: Real,
     *,
-    atol_v: Any = None,
-    dt_min: Any = 0.0,
-    dt_max: Any = np.inf,
+    atol_v: Real | None = None,
+    dt_min: Real = 0.0,
+    dt_max: Real = np.inf,
     max_steps: int = 10_000,
-    verify: Any = False,
+    verify: bool | str = False,
 ) -> Adaptive:
     """Steps chosen by the error of each, for `simulate(..., dt=adaptive(...), times=...)`.
 
@@ -97,7 +103,7 @@ def adaptive(
     return Adaptive(rtol, atol, atol_v, dt_min, dt_max, max_steps, verify)
 
 
-def _require(name, value, valid, expectation):
+def _require(name: str, value: Real, valid: Callable, expectation: str):
     """An error unless a number, or each of several, (B,), is what is expected; it names the first that is not."""
     value = np.asarray(value) if isinstance(value, (list, tuple)) else value
     if not (is_real(value) and np.ndim(value) == 1 and np.size(value)):
@@ -107,22 +113,22 @@ def _require(name, value, valid, expectation):
         raise ValueError(f"adaptive: `{name}` must {expectation}; received {name}[{bad}] = {value[bad]}.")
 
 
-def _as_data(x):
+def _as_data(x: Real) -> np.ndarray:
     return x if is_array(x) else np.asarray(x, float)
 
 
-def lengths(values):
+def lengths(values: Sequence):
     """Those of the arrays among numbers, each once."""
     return sorted({np.size(x) for x in values if np.ndim(x)})
 
 
-def require_single(caller, control):
+def require_single(caller: str, control: Adaptive):
     """An error for the tolerances of several members."""
     if lengths(jax.tree.leaves(control)):
         raise ValueError(f"{caller}: tolerances must be numbers; arrays (B,), one for each member, are for `sweep`.")
 
 
-def require_controlled(caller, stepper):
+def require_controlled(caller: str, stepper: Stepper):
     """An error for a stepper without an estimate."""
     if stepper.estimate_order is None:
         raise NotImplementedError(

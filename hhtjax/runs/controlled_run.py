@@ -1,16 +1,20 @@
 """A run under error control: its steps chosen and its samples kept in one pass, or chosen and run; and its error."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 
 from hhtjax.checks import require_integer
-from hhtjax.description import all_concrete, is_tracing
+from hhtjax.description import Array, PyTree, Real, all_concrete, is_tracing
 from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.closures import hoisted
@@ -26,11 +30,21 @@ from hhtjax.runs.interpolate import kept, output_between, solution_at, with_outp
 from hhtjax.runs.output import beside_path, output_at_start, without_path
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import Stepper, step_start
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System, require_masses
+from hhtjax.systems.events import Event
+from hhtjax.systems.system import AnySystem, require_masses
 from hhtjax.xla import Programs
 
+if TYPE_CHECKING:
+    from hhtjax.runs.adaptive import Adaptive
+    from hhtjax.runs.driver import Loop, Run
+    from hhtjax.runs.inputs import EqualSteps
+    from hhtjax.runs.output import Output
+    from hhtjax.runs.solution import Failure
+    from hhtjax.steppers.stepper import State
+    from hhtjax.systems.flat_system import FlatSystem
 
-def run_controlled(problem, times, control, progress, events=None, room=()) -> Solution:
+
+def run_controlled(problem, times: Real, control: Adaptive, progress: bool, events=None, room: tuple = ()) -> Solution:
     """The run that `simulate` returns for an `Adaptive` in the place of dt."""
     times = checked_times("simulate", problem, times, control)
     if events is not None:
@@ -55,17 +69,17 @@ def run_controlled(problem, times, control, progress, events=None, room=()) -> S
     return run if problem.output is None else without_path(run)
 
 
-def passes_alone(problem, events):
+def passes_alone(problem: Problem, events) -> bool:
     """Whether the steps and the samples are found in one pass, where nothing is made of the run."""
     return events is None and problem.system.friction is None
 
 
-def unverified(control):
+def unverified(control: Adaptive) -> Adaptive:
     """The same steps."""
     return replace(control, verify=False)
 
 
-def finer(start, choice, steps, ends, room, in_one):
+def finer(start: tuple, choice: tuple, steps: Steps, ends: Array, room: tuple, in_one: bool) -> Solution:
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
     if start[2].verify != "tolerance":
         return over(start, steps, ends, room, halved=True)
@@ -75,21 +89,21 @@ def finer(start, choice, steps, ends, room, in_one):
     return run_in_two(start, (*begin, scaled(looser, 1 / 4), theirs), room=room)[0]
 
 
-def run_in_two(start, choice, progress=False, room=()):
+def run_in_two(start: tuple, choice: tuple, progress: bool = False, room: tuple = ()):
     """The `Solution` of a start, (problem, times, control, events), over the steps for a choice, another; its `Steps`,
     and the times at which they end."""
     steps, ends = steps_for(choice, progress, room)
     return over(start, steps, ends, room), steps, ends
 
 
-def over(start, steps, ends, room=(), halved=False):
+def over(start: tuple, steps: Steps, ends: Array, room: tuple = (), halved: bool = False) -> Solution:
     """The `Solution` over these steps, each halved or not."""
     problem, times, _, events = start
     keywords = {"halved": halved, "room": room, "rates": problem.rates()}
     return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
 
 
-def run_tightened(start, alone, progress, room):
+def run_tightened(start: tuple, alone: bool, progress: bool, room: tuple) -> Solution:
     """The run with steps for as much of the tolerance as makes its error what was asked for."""
     start, choice = (start, lax.stop_gradient(start)) if alone else run_and_choice(start)
     problem, times, control, events = choice
@@ -107,11 +121,11 @@ def run_tightened(start, alone, progress, room):
 
 
 @partial(Programs, static_argnames=("progress", "room"))
-def rounds(choice, progress, room):
+def rounds(choice: tuple, progress: bool, room: tuple) -> Round:
     """The last `Round`; no tracer of autodiff may come in."""
     problem, times, control, events = choice
 
-    def once(share):
+    def once(share: Array):
         tighter = scaled(control, share)
         if passes_alone(problem, events):
             return run_in_one(problem, times, tighter, progress)
@@ -122,17 +136,17 @@ def rounds(choice, progress, room):
 
 
 @partial(Programs, static_argnames=("progress",))
-def run_recorded(problem, times, control, progress=False):
+def run_recorded(problem: Problem, times: Array, control: Adaptive, progress: bool = False):
     """The same in one pass, but for what vmap makes of it; without derivatives."""
 
-    def record(problem, times, control):
+    def record(problem: Problem, times: Array, control: Adaptive):
         steps, ends, run = select_steps(
             problem, problem.times(times[-1]), control, progress, times=problem.times(times)
         )
         return run, steps, ends
 
     @custom_vmap
-    def in_one(problem, times, control):
+    def in_one(problem: Problem, times: Array, control: Adaptive):
         return one_kernel(record, problem, times, control, around=True)
 
     @in_one.def_vmap
@@ -144,13 +158,13 @@ def run_recorded(problem, times, control, progress=False):
     return in_one(problem, times, control)
 
 
-def in_two_passes(problem, times, control, progress=False):
+def in_two_passes(problem: Problem, times: np.ndarray, control: Adaptive, progress: bool = False):
     """The same."""
     start = problem, times, control, None
     return run_in_two(start, lax.stop_gradient(start), progress)
 
 
-def run_in_one(problem, times, control, progress=False):
+def run_in_one(problem: Problem, times: Real, control: Adaptive, progress: bool = False):
     """The same, with the derivatives of two passes, in a jit that may be one of a derivative or a batch."""
     data = problem, times, control
     in_one, in_two = (
@@ -170,19 +184,26 @@ def run_in_one(problem, times, control, progress=False):
 
 
 @partial(Programs, static_argnames=("progress", "room"))
-def chosen_steps(problem, end, control, events=None, progress=False, room=()):
+def chosen_steps(
+    problem: Problem,
+    end: Array,
+    control: Adaptive,
+    events: tuple | None = None,
+    progress: bool = False,
+    room: tuple = (),
+):
     """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in.
 
     One kernel, what comes before and behind the loop too: each part that stands alone costs about a microsecond.
     """
 
-    def found(problem, end, control, events):
+    def found(problem: Problem, end: Array, control: Adaptive, events: tuple | None):
         return select_steps(problem, problem.times(end), control, progress, events, room)[:2]
 
     return frozen(partial(one_kernel, found, around=True), problem, end, control, events)
 
 
-def steps_for(choice, progress, room):
+def steps_for(choice: tuple, progress: bool, room: tuple):
     """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
     problem, times, control, events = choice
     control, problem = replace(control, verify=False), problem._replace(output=None)
@@ -194,13 +215,13 @@ class Grid(NamedTuple):
     """Frozen steps from t0 on. ends: (N,), inf behind the last; counts: (K,), how many there are from one of the times
     to the next, the last of them ending at it or beyond; reached: the end of the last."""
 
-    t0: Any
-    ends: Any
-    counts: Any
-    reached: Any
+    t0: Array
+    ends: Array
+    counts: Array
+    reached: Array
 
     @classmethod
-    def of(cls, t0, times, ends, accepted, halved=False):
+    def of(cls, t0: Array, times: Array, ends: Array, accepted: Real, halved: bool = False) -> Grid:
         """Those with these ends, of which so many were accepted; each halved or not."""
         reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
         wanted = jnp.minimum(times, reached)
@@ -212,14 +233,14 @@ class Grid(NamedTuple):
             needed = 2 * needed - ((needed > 0) & (ends[2 * needed - 2] >= times)).astype(needed.dtype)
         return cls(t0, ends, jnp.diff(needed, prepend=0).astype(jnp.int32), reached)
 
-    def loop(self, flat, stepper, q, v, t0, params):
+    def loop(self, flat: FlatSystem, stepper: Stepper, q: Array, v: Array, t0: Array, params: PyTree) -> Loop:
         """The `Loop` over its steps."""
         return steps_of(flat, stepper, q, v, t0, params, self.sizes, resolves=True)
 
-    def sizes(self, number):
+    def sizes(self, number: Real):
         """Of a step its size, that of the one before, and where it ends; behind the last 1, and inf."""
 
-        def time(taken):
+        def time(taken: Real) -> Array:
             end = lax.dynamic_index_in_dim(self.ends, jnp.maximum(taken - 1, 0), keepdims=False)
             return jnp.where(taken > 0, end, self.t0)
 
@@ -231,22 +252,32 @@ class Grid(NamedTuple):
 
 
 @partial(Programs, static_argnames=("halved", "room"))
-def run_over(problem, times, ends, accepted, events=None, halved=False, room=()):
+def run_over(
+    problem: Problem,
+    times: Array,
+    ends: Array,
+    accepted: Array,
+    events: tuple | None = None,
+    halved: bool = False,
+    room: tuple = (),
+) -> Solution:
     """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
 
-    def run(problem, times, ends, accepted, events):
+    def run(problem: Problem, times: Array, ends: Array, accepted: Array, events: tuple | None) -> Solution:
         t0, times = problem.times(problem.t0), problem.times(times)
         return follow(problem, times, Grid.of(t0, times, ends, accepted, halved), events, room)
 
     return one_kernel(run, problem, times, ends, accepted, events, around=True)  # as above
 
 
-def follow(problem, times, grid, events=None, room=()):
+def follow(
+    problem: Problem, times: Array, grid: Grid | EqualSteps, events: tuple | None = None, room: tuple = ()
+) -> Solution:
     """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
     return drive(problem, grid.loop, partial(_between, times=times, grid=grid), events, room, between=True)
 
 
-def _between(run, times, grid):
+def _between(run: Run, times: Array, grid: Grid | EqualSteps):
     """Samples at these times, each read off in the step that ends there or beyond."""
     problem, flat, params, loop, form = run
     in_pieces = loop.now is not None
@@ -259,12 +290,12 @@ def _between(run, times, grid):
             keep = None
     interval = to_next_sample(loop, form, begun, keep, in_pieces, read)
 
-    def samples(carry):
+    def samples(carry: tuple):
         return lax.scan(interval, (() if in_pieces else carry[0], carry), (grid.counts, longest, times))
 
     (_, carry), (around, found, info) = one_kernel(samples, form.tree)
 
-    def solution(failure):
+    def solution(failure: Failure) -> Solution:
         state, _, _, *met = carry
         ends = times
         if met:
@@ -279,7 +310,9 @@ def _between(run, times, grid):
     return carry, solution
 
 
-def to_next_sample(loop, form, begun, keep, in_pieces, read=None):
+def to_next_sample(
+    loop: Loop, form, begun: Callable, keep: Callable | None, in_pieces: bool, read: Callable | None = None
+):
     """The body of the scan over the times: steps until one of them ends at the time or beyond, and both ends of that.
 
     in_pieces: of the part of it between events, of which its `Pieces` tell; else the state before is carried along.
@@ -288,10 +321,10 @@ def to_next_sample(loop, form, begun, keep, in_pieces, read=None):
     advance, begun = form.of(loop.advance), form.of(begun)
 
     @checkpoint
-    def interval(carry, now):
+    def interval(carry: tuple, now: tuple):
         count, most, time = now
 
-        def step(i, carry):
+        def step(i: Array, carry: tuple):
             last, run, info = carry
             here = or_alone(i < count)
             last = () if in_pieces else jax.tree.map(partial(jnp.where, here), begun(run), last)
@@ -306,7 +339,17 @@ def to_next_sample(loop, form, begun, keep, in_pieces, read=None):
     return interval
 
 
-def output_in(loop, flat, output, params, keep, long, pair, run, time):
+def output_in(
+    loop: Loop,
+    flat: FlatSystem,
+    output: Output,
+    params: PyTree,
+    keep: Callable,
+    long: Array,
+    pair: tuple,
+    run: tuple,
+    time: Array,
+) -> PyTree:
     """The output of a run at a time between a pair of states, with their modes where there are events."""
     first, second, *modes = pair
     if modes:
@@ -316,7 +359,7 @@ def output_in(loop, flat, output, params, keep, long, pair, run, time):
     return output_between(flat, output, params, (keep(first), keep(second)), time, long)
 
 
-def begun_with(flat, stepper, params, loop, run):
+def begun_with(flat: FlatSystem, stepper: Stepper, params: PyTree, loop: Loop, run: tuple) -> State:
     """The state with which the next step of a run begins: behind a jump of held inputs."""
     state, count, _ = run
     h, last = loop.sizes(count)
@@ -324,17 +367,17 @@ def begun_with(flat, stepper, params, loop, run):
 
 
 def choose_steps(
-    system: System | LinearSystem | FirstOrderSystem,
+    system: AnySystem,
     stepper: Stepper,
-    q0: Any,
-    v0: Any = None,
-    params: Any = None,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
     *,
-    times: Any,
-    z0: Any = None,
-    t0: Any = 0.0,
+    times: Real,
+    z0: PyTree = None,
+    t0: Real = 0.0,
     progress: bool = False,
-    events: Any = None,
+    events: Sequence[Event] | None = None,
     max_events: int = 2,
     **tolerances: Any,
 ) -> Steps:
@@ -377,12 +420,12 @@ def choose_steps(
     return trimmed(steps_for(lax.stop_gradient((problem, times, control, events)), progress, room)[0])
 
 
-def usual_step(t0, times):
+def usual_step(t0: Real, times: np.ndarray) -> Real:
     """How long a step may be before any is chosen: a thousandth of the run."""
     return (times[-1] - t0) / 1000
 
 
-def checked_times(caller, problem, times, control):
+def checked_times(caller: str, problem: Problem, times: PyTree, control: Adaptive) -> Real:
     """times, for a stepper that can be controlled."""
     require_controlled(caller, problem.stepper)
     require_masses(caller, problem.system, "take steps without error control")
@@ -406,22 +449,22 @@ class Round(NamedTuple):
     """run, steps, ends: what was found; share: of the tolerance that the steps were chosen for, and following: that of
     the next round; error, allowed: those of the `Solution`; is_open: whether more is to be done; number: of rounds."""
 
-    run: Any
-    steps: Any
-    ends: Any
-    share: Any
-    following: Any
+    run: Array
+    steps: Steps | None
+    ends: Array
+    share: Array
+    following: Array
     error: Any
     allowed: Any
-    is_open: Any
-    number: Any
+    is_open: Array
+    number: Array
 
     def told(self):
         """What the `Solution` tells of it."""
         return {"error": self.error, "allowed": self.allowed}
 
 
-def tighten(once, judge, one):
+def tighten(once: Callable, judge: Callable, one: Array) -> Round:
     """The last `Round`; none of it is differentiable, and all of it may be a batch, which goes on until all are done.
 
     once: share -> run, `Steps`, their ends; judge: a run, the one before, share of their difference -> error, allowed;
@@ -432,10 +475,10 @@ def tighten(once, judge, one):
     run, steps, ends = found
     begun = Round(run, steps, ends, 2 * one, one, error, allowed, one > 0, jnp.zeros((), jnp.int32))
 
-    def goes_on(last):
+    def goes_on(last: Round) -> Array:
         return jnp.any(last.is_open) & (last.number < ROUNDS)
 
-    def following(last):
+    def following(last: Round) -> Round:
         is_first = last.number == 0
         share = jnp.where(last.is_open, last.following, one)  # what costs least, for those who wait for others
         run, steps, ends = once(share)
@@ -445,7 +488,7 @@ def tighten(once, judge, one):
         is_open = ~(worst <= ENOUGH * allowed) & (steps.stop == 0) & last.is_open
         new = Round(run, steps, ends, share, share * factor, error, allowed, is_open, last.number + 1)
 
-        def kept(old, x):
+        def kept(old: Array, x: Array) -> Array:
             was_open = last.is_open.reshape(last.is_open.shape + (1,) * (x.ndim - last.is_open.ndim))
             return x if x.ndim < last.is_open.ndim else jnp.where(was_open, x, old)
 
@@ -471,22 +514,22 @@ def accepted_run(last, over, start):
 ALARM = 10  # times what was asked for, above which the error of a run is a failure
 
 
-def scaled(control, share):
+def scaled(control: Adaptive, share: Real) -> Adaptive:
     """So much of the tolerance."""
     return replace(control, **{name: share * getattr(control, name) for name in ("rtol", "atol", "atol_v")})
 
 
-def verified(run, finer, control, order):
+def verified(run: Solution, finer: Solution, control: Adaptive, order: int):
     """What a `Solution` tells of its error, by Richardson from a finer run; constant to derivatives."""
     left = 0.25 if control.verify == "tolerance" else 0.5**order  # of the error
     error, tolerance = compared(run, finer, 1 / (1 - left), control)
     return {"error": error, "allowed": ALARM * tolerance}
 
 
-def compared(run, other, share, control):
+def compared(run: Solution, other: Solution, share: Real, control: Adaptive):
     """So much of the difference at each of the times, in its largest coordinate, and what is asked for."""
 
-    def largest(q):
+    def largest(q: Array) -> Array:
         return jnp.max(jnp.stack([jnp.max(jnp.abs(x).reshape(len(x), -1), axis=1) for x in jax.tree.leaves(q)]), axis=0)
 
     q, others, control = lax.stop_gradient((run.q, other.q, control))

@@ -4,14 +4,17 @@
 They differ in how long their steps are, and in where their samples lie; events are there where they are asked for.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.description import thaw
+from hhtjax.description import Array, PyTree, thaw
 from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.batched_cond import choose, if_any
 from hhtjax.numerics.checkpointed_scan import checkpoint
@@ -26,8 +29,22 @@ from hhtjax.systems.events import flatten_events
 from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
 from hhtjax.systems.system import mass_reads_velocity
 
+if TYPE_CHECKING:
+    from hhtjax.runs.inputs import Problem
+    from hhtjax.steppers.stepper import State, Stepper
+    from hhtjax.systems.flat_system import FlatSystem
 
-def drive(problem, steps, sampling, events=None, room=(), between=False, factors=None, caller="simulate"):
+
+def drive(
+    problem: Problem,
+    steps: Callable,
+    sampling: Callable,
+    events: tuple | None = None,
+    room: tuple = (),
+    between: bool = False,
+    factors=None,
+    caller: str = "simulate",
+) -> Solution:
     """The `Solution` of a `Problem`: every run of the library comes through here.
 
     steps: (flat, stepper, q, v, t0, params) -> `Loop`, which knows how long steps are.
@@ -51,9 +68,9 @@ class Run(NamedTuple):
     """A run before its first step. form: how what the loop carries is stepped, as arrays or number by number."""
 
     problem: Any
-    flat: Any
-    params: Any
-    loop: Any
+    flat: FlatSystem
+    params: PyTree
+    loop: Loop
     form: Any
 
 
@@ -63,27 +80,27 @@ class Loop(NamedTuple):
     number of steps taken -> the size of the next, and of the last; start: the state at t0, as it is saved; past: bound,
     sizes -> advance past events; now: what events carry along -> the params after them."""
 
-    carry: Any
-    advance: Any
-    keep: Any
+    carry: PyTree
+    advance: Callable
+    keep: Callable
     no_info: Info
-    bound: Any
+    bound: Callable
     sizes: Any
     start: Any
-    past: Any = None
-    now: Any = None
+    past: Callable | None = None
+    now: Callable | None = None
 
 
-def equal_steps(flat, stepper, q, v, t0, params, dt):
+def equal_steps(flat: FlatSystem, stepper: Stepper, q: Array, v: Array, t0: Array, params: PyTree, dt: Array) -> Loop:
     """The `Loop` over steps of one size."""
     stepper = stepper.astype(q.dtype)
 
-    def take_step(params):
+    def take_step(params: PyTree):
         return jax.jit(bound(stepper, flat, params, dt), inline=True)  # traced once, wherever it is called
 
     step = take_step(params)
 
-    def advance(now):
+    def advance(now: PyTree):
         return counted(step if now is params else take_step(now), flat, t0, dt)
 
     start, first = entered(stepper, flat, q, v, t0, zero_order_hold.before(params, t0, dt), dt, alone=True)
@@ -93,18 +110,30 @@ def equal_steps(flat, stepper, q, v, t0, params, dt):
     return Loop(carry, counted(step, flat, t0, dt), keep, no_info, advance, lambda count: (dt, dt), start)
 
 
-def given_steps(flat, stepper, q, v, t0, params, dt, grows):
+def given_steps(
+    flat: FlatSystem, stepper: Stepper, q: Array, v: Array, t0: Array, params: PyTree, dt: Array, grows: bool
+) -> Loop:
     """The `Loop` over steps dt (N,); NaN from one on that is not positive."""
     dt = jnp.where((dt > 0) & jnp.isfinite(dt), dt, jnp.nan)
     steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt)
 
-    def sizes(number):
+    def sizes(number: Array):
         return [lax.dynamic_index_in_dim(x, number, keepdims=False) for x in steps]
 
     return steps_of(flat, stepper, q, v, t0, params, sizes, grows=grows)
 
 
-def steps_of(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=False):
+def steps_of(
+    flat: FlatSystem,
+    stepper: Stepper,
+    q: Array,
+    v: Array,
+    t0: Array,
+    params: PyTree,
+    sizes: Callable,
+    resolves: bool = False,
+    grows: bool = False,
+) -> Loop:
     """The `Loop` over steps of any sizes: number of steps taken -> the next, the one before, and where it ends.
 
     resolves: whether the first is one of error control. grows: of `resized_step`."""
@@ -112,9 +141,9 @@ def steps_of(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=False
     none = jnp.zeros((), jnp.int32)
     first = sizes(none)[0]
 
-    def take_step(params):
+    def take_step(params: PyTree):
         @partial(jax.jit, inline=True)  # traced once, wherever it is called
-        def step(state, number):
+        def step(state: State, number: Array):
             h, last, end = sizes(number)
             state, info = resized_step(flat, stepper, params, h, last, grows)(state)
             return state._replace(t=end), info
@@ -123,10 +152,10 @@ def steps_of(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=False
 
     step = take_step(params)
 
-    def advance(now):
+    def advance(now: PyTree):
         one = step if now is params else take_step(now)
 
-        def next_step(carry):
+        def next_step(carry: tuple):
             state, count, failure = carry
             state, info = one(state, count)
             return (state, count + 1, first_failure(flat, failure, count + 1, state, info)), info
@@ -140,10 +169,10 @@ def steps_of(flat, stepper, q, v, t0, params, sizes, resolves=False, grows=False
     return Loop(carry, advance(params), keep, no_info, advance, lambda count: tuple(sizes(count)[:2]), start)
 
 
-def counted(take_step, flat, t0, dt, before=None):
+def counted(take_step: Callable, flat: FlatSystem, t0: Array, dt: Array, before: Array | None = None):
     """The step of a run, on (state, number of steps, first failure); also its `Info`. before: steps taken at t0."""
 
-    def step(carry):
+    def step(carry: tuple):
         state, count, failure = carry
         state, info = take_step(state)
         count = count + 1
@@ -154,26 +183,28 @@ def counted(take_step, flat, t0, dt, before=None):
     return step
 
 
-def resting(advance, by_itself, run, info, here):
+def resting(advance: Callable, by_itself: bool, run: tuple, info: Info, here: Array):
     """The run and what is known of it after a step, or, not `here`, without. by_itself: whether `advance` can rest."""
     after, more = advance(run, here) if by_itself else advance(run)
     info = choose(here, join_info(info, more), info)
     return after if by_itself else if_any(partial(choose, here), ~here, after, run, kept=False), info
 
 
-def saved(flat, state):
+def saved(flat: FlatSystem, state: State):
     """What a run saves of a state."""
     state = public(flat, state)
     return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot, state.friction
 
 
-def as_solution(flat, start, path, dt, info, failure):
+def as_solution(
+    flat: FlatSystem, start: State, path: tuple, dt: Array | None, info: Info, failure: Failure
+) -> Solution:
     """The start and the path after it as a `Solution`."""
     path = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), saved(flat, start), path)
     return as_path(flat, path)._replace(dt=dt, info=info, failure=failure)
 
 
-def as_path(flat, path):
+def as_path(flat, path: tuple) -> Solution:
     """What was saved, with a leading axis, as a `Solution` that knows nothing else."""
     t, q, v, w, L, *z, friction = path
     q = jax.vmap(flat.unravel)(q)
@@ -184,12 +215,12 @@ def as_path(flat, path):
     return solution if friction is None else solution._replace(friction=friction.tau, sticking=friction.sig == 0)
 
 
-def with_flaw(failure, flaw):
+def with_flaw(failure: Failure, flaw: Array | None) -> Failure:
     """The failure, or that of a mass that is none at the start."""
     return failure if flaw is None else failure._replace(step=jnp.where(flaw > 0, 1, failure.step), mass=flaw)
 
 
-def flaw_at_start(system, flat, start, params):
+def flaw_at_start(system, flat, start, params: PyTree):
     """What is wrong with the mass there, where it is a function; a constant one has been looked at."""
     if not callable(getattr(system, "mass", None)):
         return None
@@ -200,13 +231,13 @@ def flaw_at_start(system, flat, start, params):
     return jnp.where((flaw == 0) & mass_reads_velocity(system.mass.lagrangian, *at), OF_VELOCITY, flaw)
 
 
-def no_failure(info):
+def no_failure(info: Info) -> Failure:
     """What `Solution.failure` says of a run in which all went well."""
     none = jnp.zeros((), jnp.int32)
     return Failure(none, jnp.array(False), none, info.dependent_row, info.solve_residual, info.friction)
 
 
-def first_failure(flat, failure, count, state, info):
+def first_failure(flat: FlatSystem, failure: Failure, count: Array, state: State, info: Info) -> Failure:
     """The failure so far, or this step's. Of several quantities an internal state is named, then the first."""
     _, *values, _ = saved(flat, state)
     known = [(i, x) for i, x in enumerate(values) if x is not None]
@@ -216,7 +247,7 @@ def first_failure(flat, failure, count, state, info):
     return if_any(partial(failure_of, known, count, info), suspect & (failure.step == 0), failure, kept=False)
 
 
-def told_failure(info):
+def told_failure(info: Info) -> Array:
     """Whether a step says by itself that it failed."""
     failed = jnp.array(False) if info.dependent_row is None else info.dependent_row >= 0
     for well in (info.converged, info.solved):
@@ -224,7 +255,7 @@ def told_failure(info):
     return failed
 
 
-def failure_of(known, count, info, failure):
+def failure_of(known: list, count: Array, info: Info, failure: Failure) -> Failure:
     """The same, from each quantity by itself, [(number, array)]."""
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
     for i, x in reversed(known):
@@ -248,7 +279,7 @@ def failure_of(known, count, info, failure):
     return Failure(step, jnp.where(first, newton, failure.newton), quantity, row, left, friction)
 
 
-def neutral_info(shapes):
+def neutral_info(shapes: Info) -> Info:
     """What `join_info` leaves unchanged."""
     neutral = Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
     return neutral if neutral.dependent_row is None else neutral._replace(dependent_row=-1 - neutral.dependent_row)
@@ -258,7 +289,17 @@ def neutral_info(shapes):
 # Events: what a run carries along for them, and what it tells of them.
 
 
-def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_pieces=False, with_modes=False):
+def loop_with_events(
+    loop: Loop,
+    flat: FlatSystem,
+    stepper: Stepper,
+    events: tuple,
+    params: PyTree,
+    max_events: int,
+    keep: int,
+    in_pieces: bool = False,
+    with_modes: bool = False,
+) -> Loop:
     """The `Loop` with events: its carry has `EventState` behind (state, number of steps, first failure).
 
     in_pieces: whether that has the `Pieces` of the last step; with_modes: whether these have the modes.
@@ -278,7 +319,7 @@ def loop_with_events(loop, flat, stepper, events, params, max_events, keep, in_p
     return loop._replace(carry=(*loop.carry, met), advance=past(loop.bound, loop.sizes), **more)
 
 
-def step_with_events(context, params, bound, sizes):
+def step_with_events(context, params: PyTree, bound, sizes):
     """The step of a run with events, which rests where not `here`.
 
     bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
@@ -286,7 +327,7 @@ def step_with_events(context, params, bound, sizes):
     events, pass_them = context.events, passage(context)
     fixed = None if events.switches else bound(params)
 
-    def step(carry, here=None):
+    def step(carry: tuple, here: Array | None = None):
         *run, met = carry
         now = events.with_modes(params, met.modes)
         (new, count, _), info = (fixed or bound(now))(tuple(run))
@@ -309,7 +350,7 @@ def step_with_events(context, params, bound, sizes):
     return step
 
 
-def may_meet(context, part, h, params):
+def may_meet(context: EventContext, part: SubStep, h: Array, params: PyTree) -> Array:
     """Whether there may be an event in a step."""
     now = context.during(params, part.start.t, h).params(params, part.met.modes)
     asked = asks(context, part.start, part.end, now, part.met.over, h)
@@ -320,12 +361,12 @@ def passage(context):
     """The function of a step and the log, with the counts of steps before and after it, that passes its events."""
 
     @checkpoint  # reverse mode would keep all that is in there for each step
-    def noted(now, h, params):
+    def noted(now: tuple, h: Array, params: PyTree):
         part, log = now
         part, (rows, there) = pass_events(context, params, part, h)
         return part, log.with_more(rows, there, context.keep)
 
-    def pass_them(now, counts, h, params):
+    def pass_them(now: tuple, counts: tuple | None, h: Array, params: PyTree):
         part, log = now
         # who asks, anew: what is needed here alone is nothing that a step without events has to keep
         asked = may_meet(context, part, h, params)
@@ -336,12 +377,12 @@ def passage(context):
     return pass_them
 
 
-def at_rest(here, new, old):
+def at_rest(here: Array | None, new: PyTree, old: PyTree):
     """The new, or, where a member of a sweep rests, the old."""
     return new if here is None else choose(here, new, old)
 
 
-def before_any(context, params, t):
+def before_any(context: EventContext, params: PyTree, t: Array) -> EventState:
     """`EventState` before the first event."""
     none = jnp.zeros((), jnp.int32)
     return EventState(
@@ -349,7 +390,7 @@ def before_any(context, params, t):
     )
 
 
-def with_told_events(flat, solution, met, keep):
+def with_told_events(flat: FlatSystem, solution: Solution, met: EventState, keep: int) -> Solution:
     """The `Solution` with its `Events`, and what was wrong with one of them."""
     failure = solution.failure._replace(event=met.code, guard=met.event)
     return solution._replace(events=met.log.told(flat, keep), failure=failure)

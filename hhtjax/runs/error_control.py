@@ -1,14 +1,17 @@
 """One step under error control: tried, judged by the estimate of its error, taken or not; and how long the next is."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import is_concrete
+from hhtjax.description import Array, PyTree, is_concrete
 from hhtjax.description.presentation import overwrite, shown
 from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.approximate_math import rough_exp, rough_log, without_rounding
@@ -25,6 +28,14 @@ from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.systems.events import flatten_events
 
+if TYPE_CHECKING:
+    from hhtjax.runs.adaptive import Adaptive
+    from hhtjax.runs.inputs import Problem
+    from hhtjax.runs.solution import Solution
+    from hhtjax.steppers.stepper import Info, State, Stepper
+    from hhtjax.steppers.variable_step import Errors
+    from hhtjax.systems.flat_system import FlatSystem
+
 LOWEST = 1e-4  # error of the step before, as the controller sees it
 ROUNDINGS = 16  # of t, of which a step is at least
 DONE, TOO_SHORT, TOO_MANY, BROKEN, AT_EVENT = range(5)
@@ -34,11 +45,11 @@ class Controller(NamedTuple):
     """Of the factors by which steps change: the PI controller's exponents, divided by the order of the estimate, and
     bounds behind a step that was accepted. Growth by more than 2 is unstable for some methods."""
 
-    safety: Any = 0.9
-    proportional: Any = 0.7
-    integral: Any = 0.4
-    least: Any = 0.2
-    most: Any = 2.0
+    safety: float = 0.9
+    proportional: float = 0.7
+    integral: float = 0.4
+    least: float = 0.2
+    most: float = 2.0
 
 
 PI = Controller()
@@ -47,34 +58,34 @@ PI = Controller()
 class Walk(NamedTuple):
     """What the loop carries."""
 
-    state: Any
-    h: Any
-    last: Any
-    past: Any
-    before: Any  # logarithm of the error of the last accepted step
+    state: PyTree
+    h: Array
+    last: Array
+    past: Array
+    before: PyTree  # logarithm of the error of the last accepted step
     error: Any
-    q_size: Any
-    v_size: Any
-    accepted: Any
-    rejected: Any
-    stop: Any
+    q_size: Array
+    v_size: Array
+    accepted: Array
+    rejected: Array
+    stop: Array
     met: Any = None  # of events
 
 
 class StepTrial(NamedTuple):
     """How steps are tried, to the time `end`. context, past_events: how to pass events, and what a trial becomes so."""
 
-    flat: Any
-    stepper: Any
-    params: Any
+    flat: FlatSystem
+    stepper: Any  # a `Stepper` that estimates the error of its steps
+    params: PyTree
     end: Any
-    bounds: Any
+    bounds: Bounds
     max_steps: int
     context: Any = None
     past_events: Any = None
     controller: Controller = PI
 
-    def params_of(self, walk):
+    def params_of(self, walk: Walk):
         """The params of the next step."""
         return self.params if self.context is None else self.context.events.with_modes(self.params, walk.met.modes)
 
@@ -85,31 +96,31 @@ class TrialStep(NamedTuple):
 
     walk: Walk
     error: Any
-    h: Any
-    shortest: Any
-    why: Any
+    h: Array
+    shortest: Array
+    why: Array
 
 
 class Begun(NamedTuple):
     """What else is known of a try: the state it began with, when it was to end, and its `Info`."""
 
-    state: Any
+    state: PyTree
     end: Any
-    info: Any
+    info: Info
 
 
 class Bounds(NamedTuple):
     """Tolerances and bounds in the dtype of the state. scale: the tolerance of the run, relative to that of a step."""
 
-    rtol: Any
-    atol: Any  # of positions
-    atol_v: Any  # (N,), of velocities and of internal states
-    scale: Any
-    least: Any
-    most: Any
+    rtol: Array
+    atol: Array  # of positions
+    atol_v: Array  # (N,), of velocities and of internal states
+    scale: Array
+    least: Array
+    most: Array
 
     @classmethod
-    def of(cls, flat, stepper, control, t0, end):
+    def of(cls, flat: FlatSystem, stepper, control: Adaptive, t0: Array, end: Array) -> Bounds:
         """Those of an `Adaptive`."""
         names = "rtol", "atol", "atol_v", "dt_min", "dt_max"
         rtol, atol, atol_v, least, most = (jnp.asarray(getattr(control, name)).astype(t0.dtype) for name in names)
@@ -119,7 +130,7 @@ class Bounds(NamedTuple):
         power = 1 - stepper.estimate_order / stepper.order
         return cls(rtol, atol, each, rtol**power, jnp.maximum(least, rounding), most)
 
-    def relative(self, flat, errors, q_size, v_size):
+    def relative(self, flat: FlatSystem, errors: Errors, q_size: Array, v_size: Array) -> Array:
         """The largest error, 1 where it is the tolerance."""
         # reciprocals, which are there before the errors are
         error = jnp.max(jnp.abs(errors.v) * (self.scale / (self.atol_v + self.rtol * v_size)))
@@ -128,7 +139,7 @@ class Bounds(NamedTuple):
             error = jnp.maximum(error, jnp.max(e_q))
         return error
 
-    def first(self, state, v_size, span):
+    def first(self, state: State, v_size: Array, span: Array) -> Array:
         """A step that changes v by about its tolerance, and not more than a hundredth of all."""
         tiny = float(jnp.finfo(span.dtype).tiny)
         slow = (self.atol_v + self.rtol * v_size) / self.scale / jnp.maximum(jnp.abs(state.w), tiny)
@@ -136,12 +147,12 @@ class Bounds(NamedTuple):
         return jnp.where(h > self.least, h, jnp.minimum(span / 100, self.most))
 
 
-def sizes(flat, state):
+def sizes(flat: FlatSystem, state: State):
     """Of positions and rates."""
     return kinematics.sizes(flat.blocks, state.q), jnp.abs(state.v)
 
 
-def next_step(h, error, before, accept, order, pi=PI):
+def next_step(h: Array, error: Array, before: Array, accept: Array, order: int, pi: Controller = PI):
     """The PI controller: Gustafsson's, in the form of Hairer and Wanner, Sec. IV.2; before, and what is returned beside
     the step, are logarithms of errors."""
     now = rough_log(jnp.maximum(error, 1e-10))
@@ -152,7 +163,7 @@ def next_step(h, error, before, accept, order, pi=PI):
     return h * factor, jnp.maximum(now, float(np.log(LOWEST)))
 
 
-def judged(state, info, error):
+def judged(state: State, info: Info, error: Array) -> Array:
     """The error of a step, infinite where something that it tells is not fine."""
     for x in (state.q, state.v, state.w, state.L):
         error = error if x is None else error + jnp.sum(0 * x)  # NaN where one is not finite
@@ -163,13 +174,13 @@ def judged(state, info, error):
     return jnp.where(fine, error, jnp.inf)
 
 
-def is_walking(walk, end):
+def is_walking(walk: Walk, end: Array) -> Array:
     """Whether there is more to try."""
     going = (walk.state.t < end) & (walk.stop == DONE)
     return going if walk.met is None else going & ~walk.met.ended
 
 
-def next_end(trial, params, walk):
+def next_end(trial: StepTrial, params: PyTree, walk: Walk):
     """The next step, and the time at which it ends: that of the walk, or one or two halves, to the end, or a jump.
 
     Without rounding: what is left until a jump, less than the steps, and halved, would differ between a run and a batch
@@ -186,7 +197,7 @@ def next_end(trial, params, walk):
     return h, jnp.where(lands, due, t + h)
 
 
-def trial_step(trial, walk):
+def trial_step(trial: StepTrial, walk: Walk):
     """Walk -> Walk after one try, and how that began."""
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
     h, t1 = next_end(trial, params, walk)
@@ -206,7 +217,7 @@ def trial_step(trial, walk):
     return taken(trial, walk, tried), Begun(state, s1.t, info)
 
 
-def taken(trial, walk, tried):
+def taken(trial: StepTrial, walk: Walk, tried: TrialStep) -> Walk:
     """The walk after a try: taken, or to be taken again."""
     accept = tried.error <= 1
     again = walk._replace(rejected=walk.rejected + 1)
@@ -218,12 +229,12 @@ def taken(trial, walk, tried):
     return walk._replace(stop=jnp.where(fine, jnp.where(spent, TOO_MANY, DONE), tried.why).astype(jnp.int32))
 
 
-def why_short(error):
+def why_short(error: Array) -> Array:
     """Why there are no more steps if this one has become too short."""
     return jnp.where(error < jnp.inf, TOO_SHORT, BROKEN)
 
 
-def begin(trial, q, v, t0):
+def begin(trial: StepTrial, q: Array, v: Array, t0: Array):
     """The walk before its first step, and the state at t0 as it is saved. The method starts with the longest of these,
     of which others are parts."""
     flat, stepper, bounds = trial.flat, trial.stepper, trial.bounds
@@ -250,7 +261,9 @@ def begin(trial, q, v, t0):
 # estimate. Where an event cannot be passed, shorter steps are tried too.
 
 
-def trial_of(problem, end, bounds, max_steps, events=None, room=()):
+def trial_of(
+    problem: Problem, end: Array, bounds: Bounds, max_steps: int, events: tuple | None = None, room: tuple = ()
+) -> StepTrial:
     """How the steps of a problem are tried, with events or without."""
     flat, q, v, t0, params = problem.flat()
     stepper = problem.stepper.astype(q.dtype)
@@ -258,7 +271,7 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
     if events is None:
         return trial
 
-    def one(h):
+    def one(h: Array):
         return resized_step(flat, stepper, params, h, h)(stepper.begin(flat, q, v, t0, params, h))
 
     no_info = neutral_info(jax.eval_shape(one, end)[1])
@@ -267,14 +280,14 @@ def trial_of(problem, end, bounds, max_steps, events=None, room=()):
     return trial._replace(context=context, past_events=past_events)
 
 
-def past_events(trial, tried, walk, h):
+def past_events(trial: StepTrial, tried: TrialStep, walk: Walk, h: Array) -> TrialStep:
     """The try, past the events in its step."""
     now = trial.context.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
     asked = (tried.error <= 1) & asks(trial.context, walk.state, tried.walk.state, now, walk.met.over, h)
     return seldom_alone(partial(passed, trial), asked, tried, walk, h)
 
 
-def passed(trial, tried, walk, h):
+def passed(trial: StepTrial, tried: TrialStep, walk: Walk, h: Array) -> TrialStep:
     """The same where there may be one."""
     context = trial.context
     met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE))
@@ -297,7 +310,7 @@ def passed(trial, tried, walk, h):
     return choose(code == FINE, judged, lost)
 
 
-def behind(trial, tried, walk, part, h):
+def behind(trial: StepTrial, tried: TrialStep, walk: Walk, part: SubStep, h: Array) -> TrialStep:
     """The try with the error of the rest behind an event; so long as that is too large, the rest becomes shorter."""
     past, met = trial.stepper.begin_estimates(trial.flat, part.end), part.met
     reached = [(walk.q_size, walk.v_size), *(sizes(trial.flat, s) for s in (part.start, part.end))]  # and no farther
@@ -345,15 +358,15 @@ class Steps(NamedTuple):
     """
 
     dt: Any
-    accepted: Any
-    rejected: Any
-    reached: Any
-    stop: Any
+    accepted: Array
+    rejected: Array
+    reached: Array
+    stop: Array
     estimate: Any
-    dt_min: Any
-    event: Any = None
-    guard: Any = None
-    tightened: Any = None
+    dt_min: Array
+    event: Array | None = None
+    guard: Array | None = None
+    tightened: Array | None = None
 
     def check(self):
         """Raises `SimulationError` naming why, and at which time, steps ended too early; for a batch the first."""
@@ -378,7 +391,16 @@ class Steps(NamedTuple):
         return "" if not is_concrete(self.stop) else self._fault() or "all accepted"
 
 
-def select_steps(problem, end, control, progress=False, events=None, room=(), controller=PI, times=None):
+def select_steps(
+    problem: Problem,
+    end: Array,
+    control: Adaptive,
+    progress: bool = False,
+    events: tuple | None = None,
+    room: tuple = (),
+    controller: Controller = PI,
+    times: Array | None = None,
+):
     """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf behind them; no tracer of autodiff may
     come in. times: where samples are kept on the way, (K,); the third result is the `Solution` there, or None."""
     if progress:
@@ -395,10 +417,12 @@ def select_steps(problem, end, control, progress=False, events=None, room=(), co
         sensed = () if problem.output is None else (problem.output, trial.params, times[-1] - t0)
         recorder = Recorder.of(flat, trial.stepper, form, jax.eval_shape(plain, walk)[1].info, *sensed)
 
-    def unfinished(carry):  # one answer for a batch: else vmap has each try copy the ends of all members
+    def unfinished(
+        carry: tuple,
+    ) -> Array:  # one answer for a batch: else vmap has each try copy the ends of all members
         return largest_in_batch(is_walking(carry[0], end))
 
-    def body(carry):
+    def body(carry: tuple):
         walk, ends, since = carry
         new, begun = one_try(walk)
         here = or_alone(is_walking(walk, end))
@@ -410,7 +434,7 @@ def select_steps(problem, end, control, progress=False, events=None, room=(), co
     def tries(carry):
         return largest_in_batch(carry[0].accepted + carry[0].rejected)
 
-    def walked(carry, ahead):
+    def walked(carry: tuple, ahead: Callable):
         """The walk on, while `ahead`; with a bar in blocks of tries, each a kernel."""
         if not progress:
             return lax.while_loop(ahead, body, carry)
@@ -425,7 +449,7 @@ def select_steps(problem, end, control, progress=False, events=None, room=(), co
 
         return lax.while_loop(ahead, some, carry)
 
-    def to_sample(carry, time):
+    def to_sample(carry: tuple, time: Array):
         walk, ends, since = walked(carry, lambda x: unfinished(x) & (x[0].state.t < time))
         since, around = recorder.sample(since, walk.state, time)
         return (walk, ends, since), around
@@ -441,7 +465,7 @@ def select_steps(problem, end, control, progress=False, events=None, room=(), co
     return steps, ends, solution(problem, start, form.joined(around), times, steps.reached)
 
 
-def as_steps(walk, times, t0, least):
+def as_steps(walk: Walk, times: Array, t0: Array, least: Array) -> Steps:
     """The `Steps` of a walk that is over, which end at these times."""
     numbers = jnp.arange(times.size, dtype=jnp.int32)
     dt = jnp.where(numbers < walk.accepted, jnp.diff(times, prepend=t0), jnp.nan)
@@ -461,7 +485,7 @@ def show(share, over):
     jax.debug.callback(bar, share, over)
 
 
-def trimmed(steps):
+def trimmed(steps: Steps) -> Steps:
     """Without what is behind the accepted ones, of a batch the most, where their numbers are known."""
     if not is_concrete(steps.accepted):
         return steps
@@ -479,21 +503,23 @@ def trimmed(steps):
 class Since(NamedTuple):
     """Of the steps since the last sample. first: what was saved at the beginning of the last; info: theirs, joined."""
 
-    first: Any
-    info: Any
+    first: Array
+    info: Info
 
 
 class Recorder(NamedTuple):
     """How walks in one form are recorded. none: `Since` before the first try; begin, end: what is kept of a state."""
 
     none: Since
-    begin: Any
+    begin: Callable
     end: Any
     read: Any = None
     alone: bool = False  # whether that is all that is kept
 
     @classmethod
-    def of(cls, flat, stepper, form, info, output=None, params=None, long=None):
+    def of(
+        cls, flat: FlatSystem, stepper: Stepper, form, info: Info, output=None, params: PyTree = None, long=None
+    ) -> Recorder:
         """info: that of a try, for its structure. output: what is read off, with params; long: of `read_between`."""
         begin, end = form.of(partial(saved, flat)), form.of(partial(kept, flat, stepper))
         since = Since(begin(form.tree.state), neutral_info(info))
@@ -505,11 +531,11 @@ class Recorder(NamedTuple):
 
         return cls(since, begin, end, form.of(read), not output.beside_path)
 
-    def add(self, since, begun, accepted):
+    def add(self, since: Since, begun: Begun, accepted: Array) -> Since:
         """Since, with a try; of one that is rejected the beginning too: it is that of the next."""
         return Since(self.begin(begun.state), choose(accepted, join_info(since.info, begun.info), since.info))
 
-    def sample(self, since, state, time):
+    def sample(self, since: Since, state: State, time: Array):
         """Since a sample before this state, and what lies around it: in a step, whose end this is."""
         end = self.end(state)
         found = None if self.read is None else self.read(since.first, end, time)
@@ -520,7 +546,7 @@ class Recorder(NamedTuple):
         )
 
 
-def solution(problem, start, around, times, reached):
+def solution(problem: Problem, start: State, around: tuple, times: Array, reached: Array) -> Solution:
     """The `Solution` at the times, from what was kept around them."""
     flat, _, _, _, params = problem.flat()
     around, found, info = around

@@ -7,14 +7,18 @@ at both ends, and made exact by Newton, on steps of size tau; its derivative is 
 A rest of a millionth of the step is a Taylor polynomial: skipping it would lose the derivative of tau.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.batched_cond import choose, if_any, seldom
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import staged
@@ -24,8 +28,13 @@ from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.sampled import SLOP
 
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import Info, State, Stepper
+    from hhtjax.systems.events import FlatEvents
+    from hhtjax.systems.flat_system import FlatSystem
 
-def asks(context, s, s1, params, over, h):
+
+def asks(context: EventContext, s: State, s1: State, params: PyTree, over: list, h: Array) -> Array:
     """Whether an event may fall into the step from s to s1: no more than a look at both ends, in few operations."""
     (g0, d0), (g1, d1) = context.events.still.both(context.flat, *lax.stop_gradient((s, s1)), params, over, h)
     noted = np.asarray(context.events.noted) & ~np.asarray(context.events.timed)
@@ -36,7 +45,7 @@ def asks(context, s, s1, params, over, h):
     return jnp.any(below | ((d0 < 0) & (d1 > 0) & cross_below))
 
 
-def pass_events(context, params, part, h):
+def pass_events(context: EventContext, params: PyTree, part: SubStep, h: Array):
     """The step across all events in it: a `SubStep`, of which end, info and met are to be used, and what to note of
     them, rows and whether each is there. Members that have not asked stay as they are."""
     context = context.during(params, part.start.t, h)
@@ -47,7 +56,7 @@ def pass_events(context, params, part, h):
         part = part._replace(start=behind_jump(context.stepper, context.flat, part.start, old, new, h, here))
 
     @checkpoint  # what all slots keep for reverse mode takes longer to compile than to compute one again
-    def slot(part, _):
+    def slot(part: SubStep, _):
         going = part.asked & (part.met.code == FINE) & ~part.met.ended
         return if_any(partial(meet_or_flag, context), going, (part, unnoted(part.start)), going, h, params)
 
@@ -55,13 +64,13 @@ def pass_events(context, params, part, h):
     part = flag(part, part.asked & ~part.met.ended, MANY, jnp.ones_like(part.passed))
     met = part.met
 
-    def anew(s, params):
+    def anew(s: State, params: PyTree) -> State:
         return begin(context, s.q, s.v, s.t, params, h, moves=False)
 
     now = context.params(params, met.modes)
     end = seldom(anew, (part.divided > 0) & ~met.ended, part.end, now)
 
-    def known(s):
+    def known(s: State) -> State:
         lost = {name: jnp.where(met.code == FINE, getattr(s, name), jnp.nan) for name in ("q", "v", "w")}
         return s._replace(**lost)
 
@@ -70,13 +79,13 @@ def pass_events(context, params, part, h):
     return part._replace(end=known(end), met=met), noted
 
 
-def unnoted(s):
+def unnoted(s: State):
     """The row of no event, and that it is not there."""
     row = row_of(s.t, jnp.zeros((), jnp.int32), s.t, s.q, s.v, s.v)
     return jnp.full_like(row, jnp.nan), jnp.array(False)
 
 
-def meet_or_flag(context, now, going, h, params):
+def meet_or_flag(context: EventContext, now: tuple, going: Array, h: Array, params: PyTree):
     """The part behind its first event, if it has one, and what to note; with what is wrong, if something is."""
     part, noted = now
     found = look(context, part, params, h)
@@ -88,7 +97,7 @@ def meet_or_flag(context, now, going, h, params):
     return seldom(partial(meet, context), here, (part, noted), found, h, params)
 
 
-def flag(part, bad, code, which):
+def flag(part: SubStep, bad: Array, code: int, which: Array) -> SubStep:
     """The part with what went wrong, if it did: at the first of these events."""
     met = part.met
     bad = bad & jnp.any(which) & (met.code == FINE)
@@ -97,14 +106,14 @@ def flag(part, bad, code, which):
     return part._replace(met=met)
 
 
-def begin(context, q, v, t, params, h, moves=True):
+def begin(context: EventContext, q: Array, v: Array, t: Array, params: PyTree, h: Array, moves: bool = True) -> State:
     """The state from which a step of size h goes at a new start; moves: whether its velocity may be another."""
     return staged(lambda q, v, t, h: entered(context.stepper, context.flat, q, v, t, params, h, moves=moves)[1])(
         q, v, t, h
     )
 
 
-def meet(context, now, found, h, params):
+def meet(context: EventContext, now: tuple, found: Found, h: Array, params: PyTree):
     """The part of the step behind its first event, and what to note of that."""
     part, *_ = now
     events, met = context.events, part.met
@@ -135,7 +144,17 @@ def meet(context, now, found, h, params):
     return choose(none, passed, new), (row, ~none & ~many)
 
 
-def behind(context, part, at, outcome, i, this, near, h, params):
+def behind(
+    context: EventContext,
+    part: SubStep,
+    at: tuple,
+    outcome: tuple,
+    i: Array,
+    this: Array,
+    near: Array,
+    h: Array,
+    params: PyTree,
+) -> SubStep:
     """The part of the step behind event i. at: the state and the `Info` before it, when, and g and dg/dt of all."""
     events, (e, info, tau, g, d), (v, modes, over) = context.events, at, outcome
     then = context.params(params, modes)
@@ -181,26 +200,26 @@ SHORT = 1e-6  # part of a step: a rest that needs no step
 class EventContext(NamedTuple):
     """How to step, and what to look for."""
 
-    flat: Any
-    stepper: Any
-    events: Any
+    flat: FlatSystem
+    stepper: Stepper
+    events: FlatEvents
     max_events: int
-    no_info: Any
-    reach: Any  # of `reaching`
+    no_info: Info
+    reach: Callable  # of `reaching`
     keep: int = 0  # how many events are noted
-    middle: Any = None  # of the step, where inputs are held
+    middle: Array | None = None  # of the step, where inputs are held
 
-    def during(self, params, t, h):
+    def during(self, params: PyTree, t: Array, h: Array) -> EventContext:
         """The same in a step h from t on."""
         return self._replace(middle=t + h / 2) if zero_order_hold.holds(params) else self
 
     @property
-    def slots(self):
+    def slots(self) -> int:
         """How often a step is looked at. Between events that divide it, of which there may be max_events, each noted
         one may happen once, and one that only seemed to touch its guard; in the end there is none."""
         return (self.max_events + 1) * (2 + sum(self.events.noted))
 
-    def params(self, params, modes):
+    def params(self, params: PyTree, modes: list):
         """Those with these modes, as they are in this step."""
         params = self.events.with_modes(params, modes)
         return params if self.middle is None else zero_order_hold.held_at(params, self.middle)
@@ -212,12 +231,12 @@ class EventState(NamedTuple):
     times how many of them are over."""
 
     modes: list
-    ended: Any
-    code: Any
-    event: Any
+    ended: Array
+    code: Array
+    event: Array
     log: Any = None
     pieces: Any = None
-    over: Any = ()
+    over: PyTree = ()
 
 
 class SubStep(NamedTuple):
@@ -227,34 +246,44 @@ class SubStep(NamedTuple):
     beside others; whether it is still to happen there."""
 
     start: Any
-    end: Any
-    info: Any
-    rest: Any
-    last: Any
+    end: State
+    info: Info
+    rest: Array
+    last: Array
     met: EventState
-    divided: Any  # number of events that came before and divided the step
-    asked: Any  # whether there may be one
-    passed: Any
-    beside: Any
-    due: Any
+    divided: Array  # number of events that came before and divided the step
+    asked: Array  # whether there may be one
+    passed: Array
+    beside: Array
+    due: Array
 
     @classmethod
-    def whole(cls, context, start, end, info, h, last, met, asked=False):
+    def whole(
+        cls,
+        context: EventContext,
+        start: State,
+        end: State,
+        info: Info,
+        h: Array,
+        last: Array,
+        met: EventState,
+        asked: Real = False,
+    ):
         """A step."""
         none, no = jnp.zeros(len(context.events.noted), bool), jnp.zeros_like(met.ended)
         return cls(start, end, info, h, last, met, jnp.zeros_like(met.event), no | asked, none, none, none)
 
 
-def go(context, params, s, tau, last, h):
+def go(context: EventContext, params: PyTree, s: State, tau: Array, last: Array, h: Array):
     """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
     return context.reach(params, s, tau, last, h)
 
 
-def reaching(flat, stepper, no_info):
+def reaching(flat: FlatSystem, stepper: Stepper, no_info: Info):
     """What `go` calls: one function for all places of a program, so that it is traced once."""
 
     @staged
-    def reach(params, s, tau, last, h):
+    def reach(params: PyTree, s: State, tau: Array, last: Array, h: Array):
         short = tau <= SHORT * h
         s1, info = resized_step(flat, stepper, params, jnp.maximum(tau, SHORT * h), last)(s)
         return choose(short, drifted(flat, s, tau), s1), choose(short, no_info, info)
@@ -262,7 +291,7 @@ def reaching(flat, stepper, no_info):
     return reach
 
 
-def drifted(flat, s, h):
+def drifted(flat: FlatSystem, s: State, h: Array) -> State:
     """The state a very short time h later."""
     s1 = s._replace(t=s.t + h, q=flat.move(s.q, h * (s.v + h / 2 * s.w)), v=s.v + h * s.w)
     return flat.tidy(s1)
@@ -278,10 +307,10 @@ class Pieces(NamedTuple):
 
     start: Any
     end: Any
-    modes: Any = ()
+    modes: PyTree = ()
 
     @classmethod
-    def none(cls, state, number, modes=()):
+    def none(cls, state: State, number: int, modes=()) -> Pieces:
         """Room for so many, like a state, none of them there."""
         like, modes = jax.tree.map(lambda x: jnp.stack([jnp.zeros_like(x)] * number), (state, modes))
         return cls(like._replace(t=jnp.full_like(like.t, jnp.inf)), like, modes)
@@ -289,18 +318,18 @@ class Pieces(NamedTuple):
     def whole(self, start, end, modes=()):
         """A step without events."""
 
-        def first(rows, x):
+        def first(rows: Array, x: Array) -> Array:
             return jnp.concatenate([x[None], rows[1:]])
 
         pieces = jax.tree.map(first, self, Pieces(start, end, modes if self.modes else self.modes))
         later = jnp.full_like(pieces.start.t[1:], jnp.inf)
         return pieces._replace(start=pieces.start._replace(t=jnp.concatenate([pieces.start.t[:1], later])))
 
-    def divided(self, event, start, end, modes=()):
+    def divided(self, event, start, end, modes=()) -> Pieces:
         """The last of them ends at an event; a new one is behind it."""
         new = jnp.sum(jnp.isfinite(self.start.t), dtype=jnp.int32)
 
-        def put(rows, x, here):
+        def put(rows: Array, x: Array, here: Array) -> Array:
             here = jnp.arange(len(rows), dtype=new.dtype) == here
             return jnp.where(here.reshape(-1, *[1] * x.ndim), x[None], rows)
 
@@ -308,7 +337,7 @@ class Pieces(NamedTuple):
         pairs = (self.start, start), (ends, end), (self.modes, modes if self.modes else self.modes)
         return Pieces(*(jax.tree.map(partial(put, here=new), old, x) for old, x in pairs))
 
-    def around(self, t):
+    def around(self, t: Array) -> Pieces:
         """The start and the end of the one in which a time lies, and the modes."""
         i = jnp.maximum(jnp.sum(self.start.t <= t, dtype=jnp.int32) - 1, 0)
         return jax.tree.map(lambda rows: lax.dynamic_index_in_dim(rows, i, keepdims=False), self)
@@ -331,18 +360,18 @@ class Found(NamedTuple):
     before where, whether it only touches there, whether the motion stays beyond it, and was made to by the event
     before, whether it is no number, and how large the guard is."""
 
-    hit: Any
-    jumped: Any
-    place: Any
-    limit: Any
-    touches: Any
-    stays: Any
-    negative: Any
-    unknown: Any
-    size: Any
+    hit: Array
+    jumped: Array
+    place: Array
+    limit: Array
+    touches: Array
+    stays: Array
+    negative: Array
+    unknown: Array
+    size: Array
 
 
-def look(context, part, params, h):
+def look(context: EventContext, part: SubStep, params: PyTree, h: Array) -> Found:
     """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
     part, params = lax.stop_gradient((part, params))
     now = context.params(params, part.met.modes)
@@ -359,7 +388,7 @@ def look(context, part, params, h):
     d0, d1 = d0 * part.rest, d1 * part.rest
     a, b = 3 * (g1 - g0) - 2 * d0 - d1, 2 * (g0 - g1) + d0 + d1
 
-    def cubic(x):
+    def cubic(x: Array) -> Array:
         return g0 + x * (d0 + x * (a + x * b))
 
     turns = (d0 < 0) & (d1 > 0)
@@ -375,14 +404,14 @@ def look(context, part, params, h):
     hit = ~part.passed & (touches | ((g1 <= 0) & ((g0 > 0) | returns) & ~rests) | at_once)
     hit, lowest = jnp.where(jnp.any(part.due), part.due, hit), jnp.where(part.due | at_once, 0, lowest)
 
-    def improve(now):
+    def improve(now: tuple):
         low, high, x, _, k = now
         y, slope = cubic(x), d0 + x * (2 * a + x * 3 * b)
         low, high = jnp.where(y > 0, x, low), jnp.where(y > 0, high, x)
         new = improved(x, y, slope, low, high)
         return low, high, new, jnp.max(jnp.where(hit, jnp.abs(new - x), 0)), k + 1
 
-    def unfinished(now):
+    def unfinished(now: tuple) -> Array:
         *_, change, k = now
         return (change > NEARLY) & (k < ON_CUBIC)
 
@@ -397,10 +426,10 @@ def look(context, part, params, h):
     return lax.stop_gradient(found)
 
 
-def shaken(events, s, params, over):
+def shaken(events: FlatEvents, s: State, params: PyTree, over: list) -> Array:
     """How much each guard changes where q and v do by roundings: of the size of those of its terms."""
 
-    def moved(x):
+    def moved(x: Array) -> Array:
         k = np.arange(x.size)
         uneven = np.where(k % 2, -1, 1) * (0.75 + 0.618034 * k % 0.5)
         return x * (1 + ROUNDINGS * eps(x) * jnp.asarray(uneven, x.dtype))
@@ -408,20 +437,20 @@ def shaken(events, s, params, over):
     return jnp.abs(events.guards(s._replace(q=moved(s.q), v=moved(s.v)), params, over) - events.guards(s, params, over))
 
 
-def lateness(events, t):
+def lateness(events: FlatEvents, t: Array) -> Array:
     """By how much an event may come after the end of a step, by rounding, and still be one of it."""
     return jnp.where(jnp.asarray(events.timed), SLOP * eps(t) * jnp.abs(t), 0)
 
 
-def first_time(context, params, part, found, h):
+def first_time(context: EventContext, params: PyTree, part: SubStep, found: Found, h: Array):
     """When the first of the events happens, and which are at that time: by Newton on all of them, kept between where
     none is beyond its guard and where one is, from where the first cubic has its zero."""
 
-    def unfinished(now):
+    def unfinished(now: tuple) -> Array:
         *_, change, k = now
         return (change > ENOUGH * h) & (k < IMPROVEMENTS)
 
-    def improve(now):
+    def improve(now: tuple):
         low, high, tau, *_, k = now
         s, _ = reached(context, params, part, tau, h)
         g, d = events.rates(context.flat, s, params, part.met.over, Ldot)
@@ -444,7 +473,7 @@ def first_time(context, params, part, found, h):
     return tau, near
 
 
-def first_of(events, part, found, near):
+def first_of(events: FlatEvents, part: SubStep, found: Found, near: Array):
     """The number of the event to be met now, and 1 for it: of those at one time the noted ones are first, for they see
     the motion as it comes, and one that ends the run is last."""
     ranks = np.where(events.noted, 0, np.where(events.ends, 2, 1)) * len(events.noted)
@@ -457,7 +486,7 @@ def first_of(events, part, found, near):
     return jnp.min(jnp.where(this, numbers, numbers.size)), this.astype(found.place.dtype)
 
 
-def reached(context, params, part, tau, h):
+def reached(context: EventContext, params: PyTree, part: SubStep, tau: Array, h: Array):
     """`go` from the start of a part. Where a guard sees multipliers they go over from a line to those of the step:
     these are of order 2, but in a very short one they are not those of the start, and a guard must not jump."""
     s, info = go(context, params, part.start, tau, part.last, h)
@@ -467,11 +496,13 @@ def reached(context, params, part, tau, h):
     return s, info
 
 
-def located(context, params, part, this, found, tau, h):
+def located(
+    context: EventContext, params: PyTree, part: SubStep, this: Array, found: Found, tau: Array, h: Array
+) -> Array:
     """The time of an event, with its derivative; of multipliers that have jumped below zero that of the start."""
     jumped = pick(this, found.jumped.astype(h.dtype)) > 0
 
-    def guard(tau):
+    def guard(tau: Array):
         s, _ = reached(context, params, part, tau, h)
         g = pick(this, context.events.guards(s, params, part.met.over))
         return jnp.where(jumped, -tau, g) if any(context.events.forced) else g
@@ -479,27 +510,27 @@ def located(context, params, part, this, found, tau, h):
     return lax.custom_root(guard, tau, lambda _, tau: tau, lambda g, y: y / g(jnp.ones_like(y)))
 
 
-def improved(x, y, slope, low, high):
+def improved(x: Array, y: Array, slope: Array, low: Array, high: Array) -> Array:
     """A zero by a step of Newton's method from x, where y falls; the middle where it does not, or leaves its bounds."""
     new = x - y / jnp.where(slope < 0, slope, 1)
     return jnp.where((slope < 0) & (new >= low) & (new <= high), new, (low + high) / 2)
 
 
-def beside_zero(rate, h, size):
+def beside_zero(rate: Array, h: Array, size: Array) -> Array:
     """How far from zero a guard may be where its event was found, of numbers of this size."""
     return 1e-3 * jnp.abs(rate) * h + 1e3 * eps(h) * size
 
 
-def nearness(x):
+def nearness(x: Real) -> float:
     """The part of a step within which two times are one."""
     return max(TOGETHER, 1e3 * eps(x))
 
 
-def eps(x):
+def eps(x: Real) -> float:
     """A rounding of 1."""
     return float(jnp.finfo(x.dtype).eps)
 
 
-def pick(this, x):
+def pick(this: Array, x: Array) -> Array:
     """The number of this event; others may be anything."""
     return jnp.sum(jnp.where(this > 0, x, 0))

@@ -1,21 +1,29 @@
 """Richardson's extrapolation of whole runs, at their common saved times."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial, reduce
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 
 from hhtjax import rotation
+from hhtjax.description import Array, PyTree
 from hhtjax.runs.interpolate import on_axes
 from hhtjax.runs.solution import DIFFER
 from hhtjax.systems import kinematics
 from hhtjax.xla import Programs
 
+if TYPE_CHECKING:
+    from hhtjax.runs.solution import Failure, Solution
+
 MOST = 4  # levels; rounding and work grow with each
 
 
-def extrapolated(run, levels, order, join):
+def extrapolated(run: Callable, levels: int, order: int, join: Callable) -> Solution:
     """The `Solution` without the leading errors in dt of several runs, at the saved times of the first.
 
     run: k -> the `Solution` with steps of dt/k at the same saved times. order: of the stepper. join: two `Info` of an
@@ -25,11 +33,11 @@ def extrapolated(run, levels, order, join):
 
 
 @partial(Programs, static_argnames=("order", "join"))
-def _combine(solutions, order, join):
+def _combine(solutions: list, order: int, join: Callable) -> Solution:
     first, finest = solutions[0], solutions[-1]
     together = None if first.events is None else _together(solutions)
 
-    def value(name, combine=None):
+    def value(name: str, combine: Callable | None = None):
         better = richardson([getattr(solution, name) for solution in solutions], order, combine)
         if together is None:
             return better
@@ -50,13 +58,13 @@ def _combine(solutions, order, join):
     return first._replace(q=q, **rest, info=reduce(join, [solution.info for solution in solutions]), failure=failure)
 
 
-def _together(solutions):
+def _together(solutions: list) -> Array:
     """Of each saved time, whether as many events come before it in all runs: else some are behind a jump there."""
     before = [jnp.sum(run.events.t[None, :] <= run.t[:, None], axis=1, dtype=jnp.int32) for run in solutions]
     return reduce(jnp.logical_and, [number == before[-1] for number in before])
 
 
-def _events(runs, order, combine):
+def _events(runs: list, order: int, combine):
     """The `Events` without their leading errors, and whether all runs met each. combine: their positions."""
     finest = runs[-1]
     names = "t", "before", "after", "z", "rate"
@@ -66,7 +74,7 @@ def _events(runs, order, combine):
     return finest._replace(**better), reduce(jnp.logical_and, same)
 
 
-def _told_apart(first, failure, same):
+def _told_apart(first: Solution, failure: Failure, same: Array) -> Failure:
     """The failure, or that of runs that met other events."""
     differ = ~jnp.all(same) & (failure.step == 0)
     here = jnp.argmin(same)
@@ -78,21 +86,21 @@ def _told_apart(first, failure, same):
     return jax.tree.map(partial(jnp.where, differ), new, failure)
 
 
-def _positions(v, gain, coarse, fine):
+def _positions(v: PyTree, gain: float, coarse: PyTree, fine: PyTree) -> PyTree:
     """`take_out` of saved positions."""
 
-    def turn(coarse, fine):
+    def turn(coarse: Array, fine: Array) -> Array:
         shape = fine.shape
         beyond = jax.vmap(lambda A, B: rotation.product(B, rotation.exp(gain * rotation.log(rotation.product(A.T, B)))))
         return beyond(*(R.reshape(-1, 3, 3) for R in (coarse, fine))).reshape(shape)
 
-    def leaf(v, coarse, fine):
+    def leaf(v: Array, coarse: Array, fine: Array) -> Array:
         return turn(coarse, fine) if kinematics.is_rotation(fine.shape, v.shape) else take_out(gain, coarse, fine)
 
     return jax.tree.map(leaf, v, coarse, fine)
 
 
-def _outputs(gain, coarse, fine):
+def _outputs(gain: float, coarse, fine):
     """`take_out` of what a user's function returned; flags and numbers that count are those of the finest run."""
 
     def leaf(coarse, fine):
@@ -101,7 +109,7 @@ def _outputs(gain, coarse, fine):
     return jax.tree.map(leaf, coarse, fine)
 
 
-def _first(failures):
+def _first(failures: list) -> Failure:
     """The one that comes first in time, its step counted in those of the first run."""
     first = failures[0]
     for level, failure in enumerate(failures[1:], 1):
@@ -115,7 +123,7 @@ def _first(failures):
 # Richardson's extrapolation over the step size.
 
 
-def richardson(values, order, combine=None):
+def richardson(values: list, order: int, combine: Callable | None = None):
     """Richardson's value of pytrees that belong to h, h/2, h/4, ..., with errors h^order, h^(order + 1), ...
 
         fine + (fine - coarse)/(2^p - 1),    p = order, order + 1, ...
@@ -133,10 +141,10 @@ def richardson(values, order, combine=None):
     return values[0]
 
 
-def _on_leaves(gain, coarse, fine):
+def _on_leaves(gain: float, coarse: PyTree, fine: PyTree):
     return jax.tree.map(partial(take_out, gain), coarse, fine)
 
 
-def take_out(gain, coarse, fine):
+def take_out(gain: float, coarse: Array, fine: Array) -> Array:
     """The value without the leading error that both have."""
     return fine + gain * (fine - coarse)

@@ -4,11 +4,15 @@ The residuals are evaluated for two points at once, as a batch whose axis has a 
 control, inside whatever of jit, vmap and scan, the run takes the first point, and the choice of its steps the second.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from hhtjax.description import is_array
+from hhtjax.description import Array, PyTree, is_array
 from hhtjax.numerics.closures import hoisted
 from hhtjax.xla import calls
 
@@ -16,7 +20,7 @@ PAIR = "hhtjax: a run, and the choice of its steps"
 CONTROLLED = {"run_over", "run_recorded", "run_chosen"}  # names of what runs over the steps that have been chosen
 
 
-def with_steps_for(f, x, y):
+def with_steps_for(f: Callable, x: Array, y: Array) -> Array:
     """f(x) of an array x, with the steps of all runs under error control as for y.
 
     >>> bool(with_steps_for(jnp.sin, jnp.ones(2), jnp.zeros(2))[0] == jnp.sin(1.0))
@@ -26,7 +30,7 @@ def with_steps_for(f, x, y):
     return jax.tree.map(lambda found: found[0], jax.vmap(f, axis_name=PAIR)(pair))
 
 
-def run_and_choice(data):
+def run_and_choice(data: PyTree):
     """What a run starts from, and what its steps are chosen for, constant to derivatives: the same, but inside
     `with_steps_for`."""
     if not is_pair():
@@ -36,7 +40,7 @@ def run_and_choice(data):
     return run, lax.stop_gradient(choice)
 
 
-def frozen(f, *args):
+def frozen(f: Callable, *args: PyTree) -> PyTree:
     """f(*args), constant to derivatives also in what f closes over, as a force does over what is differentiated.
 
     args: the second of `run_and_choice`. To be called inside a jit: it compiles f anew.
@@ -48,7 +52,7 @@ def frozen(f, *args):
     return call(run_and_choice(closed_over)[1], *args)
 
 
-def chooses_steps(f, *args):
+def chooses_steps(f: Callable, *args: PyTree) -> bool:
     """Whether there are runs under error control in f(*args).
 
     >>> chooses_steps(jnp.sin, jnp.ones(2))
@@ -57,7 +61,7 @@ def chooses_steps(f, *args):
     return calls(CONTROLLED, f, *args)
 
 
-def is_pair():
+def is_pair() -> bool:
     """Whether both points of `with_steps_for` are here."""
     try:
         lax.axis_index(PAIR)

@@ -1,8 +1,11 @@
 """What a run starts from: the checks of what a user hands over, and the same on vectors."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,17 +14,32 @@ from jax.core import Tracer
 
 from hhtjax import checks
 from hhtjax.checks import describe, require_function, require_integer, require_number, require_params
-from hhtjax.description import all_concrete, freeze, is_array, is_concrete, is_real, known_now, thaw
+from hhtjax.description import (
+    Array,
+    PyTree,
+    Real,
+    all_concrete,
+    freeze,
+    is_array,
+    is_concrete,
+    is_real,
+    known_now,
+    thaw,
+)
 from hhtjax.runs.driver import equal_steps
 from hhtjax.runs.event_step import nearness
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
-from hhtjax.steppers.variable_step import GROWTH
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, require_consistent, with_known_rows
-from hhtjax.systems.system import FirstOrderSystem, require_masses
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses
 from hhtjax.xla import Programs
+
+if TYPE_CHECKING:
+    from hhtjax.runs.driver import Loop
+    from hhtjax.steppers.stepper import State, Stepper
+    from hhtjax.systems.flat_system import FlatSystem
 
 
 class Problem(NamedTuple):
@@ -29,16 +47,26 @@ class Problem(NamedTuple):
     where a run saves that in place of its path."""
 
     system: Any
-    stepper: Any
-    q0: Any
-    v0: Any
-    params: Any
-    t0: Any
-    z0: Any
-    output: Any = None
+    stepper: Any  # the `Stepper`
+    q0: PyTree
+    v0: PyTree
+    params: PyTree
+    t0: Array
+    z0: PyTree
+    output: PyTree = None
 
     @classmethod
-    def checked(cls, caller, system, stepper, q0, v0, params, t0, z0):
+    def checked(
+        cls,
+        caller: str,
+        system: AnySystem,
+        stepper: Stepper,
+        q0: PyTree,
+        v0: PyTree,
+        params: PyTree,
+        t0: Real,
+        z0: PyTree,
+    ) -> Problem:
         """The same of what a user hands over, or an error that names what is wrong with it."""
         require_system(caller, system, massless=True)
         require_stepper(caller, stepper)
@@ -56,21 +84,21 @@ class Problem(NamedTuple):
         t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew
         return cls(system, stepper, q0, v0, params, t0, z0)
 
-    def rates(self):
+    def rates(self) -> int:
         """How many there are, of coordinates: a rotation has three, and nine numbers."""
         return sum(map(jnp.size, jax.tree.leaves(self.q0 if self.v0 is None else self.v0)))
 
-    def times(self, t):
+    def times(self, t: Array) -> Array:
         """Times in the dtype of the state."""
         return jnp.asarray(t).astype(jax.tree.leaves(self.q0)[0].dtype)
 
-    def flat(self, caller="simulate"):
+    def flat(self, caller: str = "simulate"):
         """The system on vectors, q, v, t0 and the params."""
         flat, q, v = flatten(caller, self.system, self.q0, self.v0, self.t0, self.params, self.z0)
         return flat, q, v, self.times(self.t0), self.params
 
 
-def _refuse_checked_axes(caller, *args):
+def _refuse_checked_axes(caller: str, *args: PyTree):
     """Under `check_vma` of `jax.shard_map` each array says over which axes it varies. Constants must say so too, and
     those of loops, branches and Jacobians do not here."""
     for x in jax.tree.leaves(args):
@@ -87,7 +115,7 @@ def _refuse_checked_axes(caller, *args):
 # Steps of sizes that are given, one by one: the checks of what a user hands over.
 
 
-def require_steps(caller, stepper, dt, num_steps, parts=1):
+def require_steps(caller: str, stepper: Stepper, dt: Real, num_steps: int | None, parts: int = 1) -> tuple[Real, int]:
     """dt, a number or (N,), and the number of steps, each of which may be divided into so many parts."""
     dt = np.asarray(dt) if isinstance(dt, (list, tuple)) else dt
     if not (is_array(dt) and dt.ndim):
@@ -121,7 +149,7 @@ def require_steps(caller, stepper, dt, num_steps, parts=1):
     return dt, dt.size
 
 
-def require_control_alone(caller, times, num_steps, save_every, extrapolate):
+def require_control_alone(caller: str, times: Real, num_steps, save_every: int, extrapolate: int):
     """An error unless error control comes with times, and with nothing that belongs to steps of given sizes."""
     if times is None:
         raise TypeError(f"{caller}: with dt=adaptive(...), give `times`, (K,), at the last of which the run ends.")
@@ -131,7 +159,7 @@ def require_control_alone(caller, times, num_steps, save_every, extrapolate):
             raise ValueError(f"{caller}: with dt=adaptive(...), leave `{name}` out; received {value!r}.")
 
 
-def require_steps_to(caller, times, dt, num_steps, save_every, t0):
+def require_steps_to(caller: str, times: Real, dt: Real, num_steps, save_every: int, t0: Real) -> Real:
     """dt, of the steps that are read off at `times`."""
     for name, value, default in (("num_steps", num_steps, None), ("save_every", save_every, 1)):
         if value != default:
@@ -142,7 +170,7 @@ def require_steps_to(caller, times, dt, num_steps, save_every, t0):
     return dt
 
 
-def _require_one_size(caller, dt, beside):
+def _require_one_size(caller: str, dt: Real, beside: str) -> Real:
     """dt, a number."""
     if isinstance(dt, (list, tuple)) or (is_array(dt) and dt.ndim):
         raise NotImplementedError(
@@ -153,7 +181,7 @@ def _require_one_size(caller, dt, beside):
     return float(dt) if is_concrete(dt) else dt
 
 
-def require_one_length(caller, duration, num_samples, **others):
+def require_one_length(caller: str, duration: Real, num_samples: int | None, **others: int | None):
     """An error where a run gets its length by `duration`, and by something else too."""
     if duration is None:
         raise TypeError(f"{caller}: `num_samples` goes with `duration`; received {num_samples!r} alone.")
@@ -166,7 +194,7 @@ def require_one_length(caller, duration, num_samples, **others):
         require_integer(caller, "num_samples", num_samples)
 
 
-def steps_within(caller, dtype, dt, duration, num_samples):
+def steps_within(caller: str, dtype: np.dtype, dt: Real, duration: Real, num_samples: int | None):
     """dt, num_steps and save_every, with steps that are made smaller, if need be, to land on equal samples."""
     dt = _require_one_size(caller, dt, "duration")
     if not all_concrete((dt, duration)):
@@ -190,11 +218,11 @@ class EqualSteps(NamedTuple):
     them ending at it or beyond; reached: how far they can be read off."""
 
     dt: Any
-    counts: Any
-    reached: Any
+    counts: Array
+    reached: Array
 
     @classmethod
-    def to(cls, t0, times, dt):
+    def to(cls, t0: Array, times: Array, dt: Array) -> EqualSteps:
         """Those to each of the times; none of a traced size that is not positive."""
         fine, eps = (dt > 0) & jnp.isfinite(dt), 8 * float(jnp.finfo(dt.dtype).eps)
         h = jnp.where(fine, dt, 1)
@@ -204,23 +232,23 @@ class EqualSteps(NamedTuple):
         counts = jnp.maximum(jnp.diff(number, prepend=0), 0)
         return cls(dt, counts, jnp.where(fine, jnp.inf, t0))
 
-    def loop(self, flat, stepper, q, v, t0, params):
+    def loop(self, flat: FlatSystem, stepper: Stepper, q: Array, v: Array, t0: Array, params: PyTree) -> Loop:
         """The `Loop` over them."""
         return equal_steps(flat, stepper, q, v, t0, params, self.dt)
 
 
-def refined(dt, k):
+def refined(dt: Real, k: int) -> Real:
     """k steps in the place of each."""
     return jnp.repeat(dt / k, k) if jnp.ndim(dt) else dt / k
 
 
-def warn_of_jumps_to(problem, dt, times):
+def warn_of_jumps_to(problem: Problem, dt: Real, times: Real):
     """The same of equal steps to the last of these times."""
     if zero_order_hold.holds(problem.params) and all_concrete((dt, times, problem.t0)):
         warn_of_jumps_in(problem, dt, int(np.ceil((float(times[-1]) - float(problem.t0)) / float(dt) - 1e-6)), 5)
 
 
-def warn_of_jumps_in(problem, dt, num_steps, level=4):
+def warn_of_jumps_in(problem: Problem, dt: Real, num_steps, level: int = 4):
     """A warning where a held input jumps within one of these steps, as far as all is known."""
     if zero_order_hold.holds(problem.params) and all_concrete((dt, problem.t0)):
         dt, t0 = np.asarray(dt, float), np.asarray(problem.t0, float)
@@ -237,7 +265,7 @@ def warn_of_jumps_in(problem, dt, num_steps, level=4):
 AT_GUARD = 1e3  # roundings of the terms of a guard that count as zero
 
 
-def require_events(caller, problem, events, step):
+def require_events(caller: str, problem: Problem, events, step: Real):
     """The events as a tuple, or an error for what is none, or does not fit the problem. step: the size of the first,
     of a run under error control what may be; where it is not known, a rate of rounding counts as one."""
     if isinstance(events, Event) or not isinstance(events, (list, tuple)) or not events:
@@ -263,7 +291,7 @@ def require_events(caller, problem, events, step):
     return events
 
 
-def refused_members(problem_of, arrays, axes, events, steps):
+def refused_members(problem_of: Callable, arrays: list, axes: list, events, steps):
     """Numbers of those members of a batch that `require_events` refuses for their values, as far as these are known.
 
     problem_of: arrays -> a member's `Problem`; axes: of the arrays, as for `jax.vmap`; steps: as there, of each member.
@@ -285,12 +313,12 @@ def refused_members(problem_of, arrays, axes, events, steps):
     return np.flatnonzero(bad.any(axis=1))
 
 
-def _known_step(step):
+def _known_step(step: Real):
     """A step, or those of all members, (B, 1); 0 where it is not known."""
     return np.asarray(step)[..., None] if is_concrete(step) else 0.0
 
 
-def _require_shapes(caller, problem, event):
+def _require_shapes(caller: str, problem: Problem, event):
     """An error for a guard that is no number, and for what a reset or a switch returns."""
     params, first_order = thaw(problem.params), isinstance(problem.system, FirstOrderSystem)
     if event.at is not None:
@@ -318,7 +346,7 @@ def _require_shapes(caller, problem, event):
         _require_same(caller, params, checks.evaluate(caller, "switch", lambda *x: freeze(event.switch(*x)), *seen))
 
 
-def _require_known_times(caller, params, event):
+def _require_known_times(caller: str, params: PyTree, event: Event):
     """An error for known times that are none."""
     if not callable(event.at):
         return
@@ -330,7 +358,7 @@ def _require_known_times(caller, params, event):
         require_times(caller, found)
 
 
-def _with_multipliers(caller, problem, event):
+def _with_multipliers(caller: str, problem: Problem, event):
     """The guard as a function without multipliers, which it may see."""
     if not event.sees_multipliers:
         return event.guard
@@ -352,7 +380,7 @@ def _with_multipliers(caller, problem, event):
     return partial(event.guard, multipliers=jnp.zeros(m, dtype))
 
 
-def _require_impact(caller, params, law, first_order):
+def _require_impact(caller: str, params: PyTree, law: Impact, first_order: bool):
     """An error for an impact that has no velocity to change, or no restitution."""
     if first_order:
         raise TypeError(
@@ -365,7 +393,7 @@ def _require_impact(caller, params, law, first_order):
     require_number(caller, "restitution", e, lambda e: 0 <= e <= 1, "lie in [0, 1]")
 
 
-def _require_same(caller, params, after):
+def _require_same(caller: str, params: PyTree, after: dict):
     """An error for params that a switch has given another form."""
     before = freeze(params)
     if jax.tree.structure(before) != jax.tree.structure(after):
@@ -386,18 +414,18 @@ class Start(NamedTuple):
 
     g: Any
     rate: Any
-    terms: Any
-    on_velocity: Any
-    e: Any
-    second: Any = 0.0
+    terms: Array
+    on_velocity: Array
+    e: Array
+    second: Real = 0.0
 
-    def is_at_guard(self, events):
+    def is_at_guard(self, events: tuple) -> np.ndarray:
         """Of each event, whether its guard is zero but for rounding: (..., E)."""
         numbers = np.finfo(self.g.dtype)
         zero = np.abs(self.g) <= AT_GUARD * numbers.eps * np.maximum(self.terms, numbers.tiny)
         return zero & _is_guarded(events)
 
-    def is_beyond(self, events, step):
+    def is_beyond(self, events: tuple, step) -> np.ndarray:
         """Whether the start is beyond its guard, or at it and not leaving: (..., E). Of a motion that is back at its
         guard within a rounding of a step the acceleration tells."""
         soon = nearness(self.g) * step * np.abs(self.second)
@@ -405,13 +433,13 @@ class Start(NamedTuple):
         return _is_guarded(events) & ~(self.g > 0) & ~(self.is_at_guard(events) & leaves)
 
 
-def _is_guarded(events):
+def _is_guarded(events: tuple) -> np.ndarray:
     """Whether an event has a guard that a motion must not be beyond."""
     return np.array([not event.is_noted and event.guard is not None for event in events])
 
 
 @Programs
-def _guards_at_start(problem, events):
+def _guards_at_start(problem: Problem, events: tuple):
     """What `Start` tells, but for d2g/dt2."""
     flat, q, v, t0, params = problem.flat()
     flat_events = flatten_events(flat, events, params, (q, v, t0), problem.stepper.redundant)
@@ -436,32 +464,32 @@ def _guards_at_start(problem, events):
 
 
 @Programs
-def _second_at_start(problem, events):
+def _second_at_start(problem: Problem, events: tuple) -> Array:
     """d2g/dt2 of all events, along the motion from the start."""
     flat, q, v, t0, params = problem.flat()
     flat_events = flatten_events(flat, events, params, (q, v, t0), problem.stepper.redundant)
     over = flat_events.before_any(t0)
 
-    def along(f):
-        def rate(q, v, t):
+    def along(f: Callable):
+        def rate(q: Array, v: Array, t: Array) -> Array:
             s = _begun(problem, flat, q, v, t, params)
             return jax.jvp(f, (q, v, t), (flat.rate(q, v), s.w, jnp.ones_like(t)))[1]
 
         return rate
 
-    def guards(q, v, t):
+    def guards(q: Array, v: Array, t: Array) -> Array:
         return flat_events.guards(_begun(problem, flat, q, v, t, params), params, over)
 
     return along(along(guards))(q, v, t0)
 
 
-def _begun(problem, flat, q, v, t, params):
+def _begun(problem: Problem, flat: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> State:
     """The state at the start."""
     size = jnp.ones_like(t)
     return problem.stepper.astype(v.dtype).begin(flat, q, v, t, zero_order_hold.before(params, t, size), size)
 
 
-def _require_start(caller, events, start, step):
+def _require_start(caller: str, events: tuple, start: Start, step):
     """An error for a start beyond a guard, and an impact along a velocity."""
     beyond, at_guard = start.is_beyond(events, step), start.is_at_guard(events)
     for i, event in enumerate(events):
@@ -476,26 +504,7 @@ def _require_start(caller, events, start, step):
 
 
 # ----------------------------------------------------------------------------
-# The times at which a sweep is sampled: the checks of what a user hands over, and the steps that land on them.
-
-
-def require_one_grid(stepper, duration, num_samples, times):
-    """An error unless the samples are given in one of the two ways, and in one that the stepper can step on."""
-    given = [x is not None for x in (duration, num_samples, times)]
-    if given not in ([True, True, False], [False, False, True]):
-        raise TypeError(
-            "sweep: give `duration` and `num_samples`, or `times` alone; "
-            f"received duration={duration!r}, num_samples={num_samples!r}, times={times!r}."
-        )
-    if times is not None:
-        if stepper.needs_equal_steps:
-            raise NotImplementedError(
-                f"sweep: {stepper.name} needs steps of one size, which differ between `times`: give "
-                "`duration` and `num_samples`, or another stepper."
-            )
-        return
-    require_integer("sweep", "num_samples", num_samples)
-    require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+# The times at which a run is sampled.
 
 
 def equal_times(t0, duration, num_samples):
@@ -503,7 +512,7 @@ def equal_times(t0, duration, num_samples):
     return t0 + duration * np.arange(1, num_samples + 1) / num_samples
 
 
-def require_sample_times(times, t0, dtype, caller="sweep"):
+def require_sample_times(times: PyTree, t0: Real, dtype: np.dtype, caller: str = "sweep") -> Real:
     """times (K,) in the dtype of the state, in which they must increase, checked as far as they are known."""
     times = times if is_array(times) else np.asarray(times)
     if not is_real(times):
@@ -527,62 +536,3 @@ def require_sample_times(times, t0, dtype, caller="sweep"):
             f"received times[{bad}] = {times[bad]} after {last}.{at_start}"
         )
     return times
-
-
-def require_step_sizes(dts):
-    """dts as an array (B,)."""
-    dts = dts if is_array(dts) else np.asarray(dts)
-    if not is_real(dts):
-        raise TypeError(f"sweep: `dts` must be real numbers; received {dts!r}.")
-    if dts.ndim != 1 or not dts.size:
-        raise ValueError(f"sweep: `dts` must have shape (B,), one step size for each member; received {dts.shape}.")
-    return dts
-
-
-def require_steps_within(dts, start, end, num_samples=None):
-    """An error for step sizes that are not positive, take too many steps, or exceed the distance of equal samples."""
-    if not all_concrete((dts, start, end)):
-        return
-    h, span = np.asarray(dts, float), float(end) - float(start)
-    limit, at_most = np.inf, ""
-    if num_samples is not None:
-        limit = span / num_samples
-        at_most = (
-            f", and at most {limit:.6g}, the distance of the samples (duration={span:.6g}, num_samples={num_samples})"
-        )
-    fine = (h > 0) & (h <= limit * (1 + 1e-6))
-    if not fine.all():
-        bad = int(np.argmin(fine))
-        raise ValueError(f"sweep: `dts` must be positive{at_most}; received dts[{bad}] = {h[bad]:.6g}.")
-    if span / h.min() >= 2**31:
-        raise ValueError(f"sweep: `dts` must take fewer than 2^31 steps; received dts[{h.argmin()}] = {h.min():.6g}.")
-
-
-def fit_to_samples(dts, H):
-    """The numbers of steps between two samples, and the step sizes; NaN where a traced dt is not in (0, H]."""
-    slack = 64 * float(jnp.finfo(dts.dtype).eps)
-    return _fit(dts, H, (dts > 0) & (dts <= H * (1 + 1e-6)), slack)
-
-
-def fit_to_times(dts, times):
-    """The same for each interval, (B, K); NaN where a traced dt is not positive, or a time not after the last."""
-    H, eps = jnp.diff(times), float(jnp.finfo(dts.dtype).eps)
-    increasing = (H > 0) & jnp.isfinite(H)
-    H = jnp.where(increasing, H, 1)
-    size = jnp.where(increasing, jnp.maximum(jnp.abs(times[1:]), jnp.abs(times[:-1])), 0)
-    slack = eps * (64 + 4 * size / H)  # H is a difference of rounded times
-    return jax.vmap(lambda dt: _fit(dt, H, (dt > 0) & increasing, slack))(dts)
-
-
-def may_grow(dts, t0, times):
-    """Whether steps may be too long behind the one before, as far as all is known: one after a short interval."""
-    if not all_concrete((dts, t0, times)):
-        return True
-    H = np.diff(np.asarray(times, float), prepend=float(t0))
-    return bool(np.any(np.minimum(H[1:], np.max(dts)) > GROWTH * H[:-1]))
-
-
-def _fit(dts, H, fine, slack):
-    """The least numbers of steps in H that are no longer than dts, but for the slack, and their sizes."""
-    substeps = jnp.maximum(jnp.ceil(H / jnp.where(fine, dts, H) * (1 - slack)), 1).astype(jnp.int32)
-    return substeps, jnp.where(fine, H / substeps.astype(dts.dtype), jnp.nan)

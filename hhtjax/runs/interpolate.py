@@ -1,13 +1,15 @@
 """Dense output: what a run does between its saved times."""
 
+from __future__ import annotations
+
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.batched_cond import choose, if_any
 from hhtjax.runs.driver import as_path, as_solution, saved
@@ -16,6 +18,12 @@ from hhtjax.runs.solution import Solution, told
 from hhtjax.steppers.stepper import State, public
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.xla import Programs
+
+if TYPE_CHECKING:
+    from hhtjax.runs.output import Output
+    from hhtjax.runs.solution import Failure
+    from hhtjax.steppers.stepper import Info, Stepper
+    from hhtjax.systems.flat_system import FlatSystem
 
 
 @shown
@@ -31,18 +39,18 @@ class Interpolant(NamedTuple):
         output: what the run has in the place of all these, None without.
     """
 
-    q: Any
-    v: Any
-    acceleration: Any = None
+    q: PyTree
+    v: PyTree
+    acceleration: PyTree = None
     multipliers: Any = None
-    z: Any = None
-    zdot: Any = None
+    z: PyTree = None
+    zdot: PyTree = None
     friction: Any = None
-    sticking: Any = None
-    output: Any = None
+    sticking: Array | None = None
+    output: PyTree = None
 
 
-def interpolate(solution, times) -> Interpolant:
+def interpolate(solution: Solution, times: Real | None) -> Interpolant:
     """Dense output: what a run has saved, at arbitrary times inside the run, differentiable in all.
 
     Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
@@ -101,7 +109,7 @@ def interpolate(solution, times) -> Interpolant:
     return Interpolant(found.q, v, *(getattr(found, name) for name in Interpolant._fields[2:]))
 
 
-def _are_uneven(t):
+def _are_uneven(t) -> Real:
     """Whether saved times are at other distances than those of a run, beside rounding: of rows picked out."""
     xp = np if is_concrete(t) else jnp
     t = xp.asarray(t)
@@ -110,7 +118,7 @@ def _are_uneven(t):
 
 
 @partial(Programs, static_argnames="equal")
-def _found(known, times, equal):
+def _found(known: Solution, times: Array, equal: bool | None):
     """What is saved of a run, at the times, and which of them lie outside of it; equal: whether its intervals are, None
     where that is known when the program runs."""
     t, times = known.t, times.astype(known.t.dtype)
@@ -139,7 +147,7 @@ def _found(known, times, equal):
     return between(a, b, H, x), outside
 
 
-def on_axes(x, y):
+def on_axes(x, y: Array) -> Array:
     """x with as many axes as y, whose leading ones it has."""
     return x.reshape(x.shape + (1,) * (y.ndim - x.ndim))
 
@@ -165,7 +173,7 @@ def between_events(events, a, b, H, x, times):
     inside, H = behind | ahead, jnp.where(behind | ahead, b.t - a.t, H)
     x = jnp.where(unknown, jnp.nan, jnp.where(inside, (times - a.t) / jnp.where(H > 0, H, 1), x))
 
-    def secant(rate, y0, y1):
+    def secant(rate, y0: PyTree, y1):
         return jnp.where(on_axes(inside, rate), (y1 - y0) / on_axes(jnp.where(H > 0, H, 1), rate), rate)
 
     def on_the_same_side(before, after):
@@ -193,37 +201,37 @@ def between_events(events, a, b, H, x, times):
     return a, b, H, x
 
 
-def between(a, b, H, x):
+def between(a: Solution, b: Solution, H: Array, x: Array) -> Solution:
     """The saved values between those of a and b, which are H apart, at the part x of it, 0 to 1; any leading axes.
 
     Rates are those of the polynomials where nothing else is known; multipliers, friction and outputs are linear.
     """
 
-    def hermite(y0, y1, slope0, slope1):
+    def hermite(y0: PyTree, y1: Array, slope0: Array, slope1: Array) -> Array:
         s, h = on_axes(x, y0), on_axes(H, y0)
         return y0 + kinematics.hermite(y1 - y0, h * slope0, h * slope1, s)
 
-    def rate(y0, y1, slope0, slope1):
+    def rate(y0: PyTree, y1: Array, slope0: Array, slope1: Array) -> Array:
         s, h = on_axes(x, y0), on_axes(H, y0)
         return kinematics.hermite_rate(y1 - y0, h * slope0, h * slope1, s) / h
 
-    def position(q0, q1, v0, v1):
+    def position(q0: PyTree, q1: Array, v0: PyTree, v1: Array) -> Array:
         if not kinematics.is_rotation(q0.shape, v0.shape):
             return hermite(q0, q1, v0, v1)
         s, h = on_axes(x, v0), on_axes(H, v0)
         return kinematics.interpolate_rotation(q0, q1, h * v0, h * v1, s)
 
-    def linear(y0, y1):
+    def linear(y0: PyTree, y1: Array) -> Array:
         return y0 + on_axes(x, y0) * (y1 - y0)
 
-    def nearer(y0, y1):
+    def nearer(y0: PyTree, y1: PyTree) -> Array:
         return jnp.where(on_axes(x, y0) < 0.5, y0, y1)
 
-    def rubbing(tau0, tau1, sticks0, sticks1):
+    def rubbing(tau0: PyTree, tau1: PyTree, sticks0: PyTree, sticks1: PyTree) -> Array:
         alike = (sticks0 == sticks1) & (sticks0 | (tau0 * tau1 >= 0))
         return jnp.where(alike, linear(tau0, tau1), nearer(tau0, tau1) + 0 * on_axes(x, tau0))
 
-    def told(y0, y1):
+    def told(y0: PyTree, y1):
         return (linear if jnp.issubdtype(y0.dtype, jnp.floating) else nearer)(y0, y1)
 
     a = a._replace(output=jax.tree.map(told, a.output, b.output))
@@ -247,7 +255,7 @@ def between(a, b, H, x):
 TINY = 1e-9  # part of a run
 
 
-def kept(flat, stepper, state):
+def kept(flat: FlatSystem, stepper: Stepper, state: State):
     """What is saved of a state, and what its dense output adds."""
     extra = None
     if stepper.dense_term:
@@ -257,7 +265,9 @@ def kept(flat, stepper, state):
     return saved(flat, state), extra
 
 
-def solution_at(flat, start, around, times, reached, info, failure):
+def solution_at(
+    flat: FlatSystem, start: State, around: tuple | None, times: Array, reached: Array, info: Info, failure: Failure
+) -> Solution:
     """The `Solution` at the times, each between the two states of which `around` has what `kept` makes of them; NaN
     beyond what was reached, and before them. Without, one that knows the times."""
     if around is None:
@@ -273,7 +283,9 @@ def solution_at(flat, start, around, times, reached, info, failure):
     return path._replace(info=pair[1].info, failure=pair[1].failure)
 
 
-def read_between(flat, a, b, extra, times, reached, long):
+def read_between(
+    flat: FlatSystem, a: Solution, b: Solution, extra: tuple | None, times: Array, reached: Array, long: Array
+) -> Solution:
     """The values at each of the times, between those of a and b."""
     # a part of a step that is a rounding, behind an event, is the beginning of a long one
     H = jnp.where(b.t - a.t > TINY * long, b.t - a.t, long)
@@ -282,7 +294,7 @@ def read_between(flat, a, b, extra, times, reached, long):
     return found if extra is None else with_dense_term(flat, found, extra, s, H)
 
 
-def with_dense_term(flat, found, extra, s, H):
+def with_dense_term(flat, found, extra: tuple, s: Array, H: Array) -> Solution:
     """`found`, with s^2 (1 - s)^2 times what the stepper's dense output adds to cubics, and the rate of that."""
     weight, rate = (s * (1 - s)) ** 2, 2 * s * (1 - s) * (1 - 2 * s) / H
     e_q, e_v, e_z = extra
@@ -299,7 +311,7 @@ def with_dense_term(flat, found, extra, s, H):
     return found
 
 
-def output_between(flat, output, params, pair, time, long):
+def output_between(flat: FlatSystem, output: Output, params: PyTree, pair: tuple, time: Array, long) -> PyTree:
     """What `output` gives at a time between a pair of what `kept` has made of states; long: of `read_between`."""
     (a, _), (b, extra) = jax.tree.map(lambda x: x[None], pair)
     a, b, times = as_path(flat, a), as_path(flat, b), time[None]
@@ -309,10 +321,10 @@ def output_between(flat, output, params, pair, time, long):
     return output_at(output, jax.tree.map(lambda x: x[0], found), time, params)
 
 
-def with_output(run, start, found, times, reached):
+def with_output(run: Solution, start: PyTree, found: PyTree, times: Array, reached: Array) -> Solution:
     """The `Solution` with the output at its start and at the times; NaN beyond what was reached."""
 
-    def joined(x, y):
+    def joined(x: Array, y: Array) -> Array:
         if jnp.issubdtype(y.dtype, jnp.floating):
             y = jnp.where(on_axes(times <= reached, y), y, jnp.nan)
         return jnp.concatenate([x[None], y])

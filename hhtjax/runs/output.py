@@ -1,19 +1,30 @@
 """What a run gives in place of its path: a user's function of the motion, such as the readings of sensors."""
 
+from __future__ import annotations
+
 import inspect
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.checks import check_dtype, describe, require_function
-from hhtjax.description import Description, is_array, thaw
+from hhtjax.description import Array, Description, PyTree, is_array, thaw
 from hhtjax.runs.driver import as_solution
 from hhtjax.runs.solution import Solution
 from hhtjax.steppers.stepper import public
 from hhtjax.systems import zero_order_hold
+
+if TYPE_CHECKING:
+    from hhtjax.runs.adaptive import Adaptive
+    from hhtjax.runs.driver import Run
+    from hhtjax.runs.interpolate import Interpolant
+    from hhtjax.runs.solution import Failure
+    from hhtjax.steppers.stepper import Info, State
+    from hhtjax.systems.flat_system import FlatSystem
 
 NAMES = ("q", "v", "w", "L", "z", "zdot", "friction", "sticking", "t", "params")
 SIGNATURE = "of some of q, v, w, L, z, zdot, friction, sticking, t and params, by these names"
@@ -33,7 +44,7 @@ class Output(Description):
     names: tuple
     beside_path: bool = False
 
-    def __call__(self, values, dtype):
+    def __call__(self, values: dict, dtype: np.dtype) -> PyTree:
         """The function of values, by name, checked while it is traced."""
         chosen = {name: values[name] for name in self.names}
         if "params" in chosen:
@@ -49,7 +60,7 @@ class Output(Description):
             raise
 
 
-def require_output(caller, function):
+def require_output(caller: str, function):
     """The `Output` of a user's function; None of None; an error that names what it must be."""
     if function is None or isinstance(function, Output):
         return function
@@ -69,7 +80,7 @@ def require_output(caller, function):
     return Output(function, names)
 
 
-def _checked(found, dtype):
+def _checked(found: PyTree, dtype: np.dtype) -> PyTree:
     leaves = jax.tree.leaves(found)
     if not leaves or not all(is_array(x) or isinstance(x, (bool, int, float)) for x in leaves):
         raise TypeError(f"simulate: `output` must return a pytree of arrays, one or more; received {describe(found)}.")
@@ -77,13 +88,13 @@ def _checked(found, dtype):
     return found
 
 
-def _as_array(x, dtype):
+def _as_array(x: Array, dtype: np.dtype) -> Array:
     """Python numbers in the dtype of the state."""
     x = jnp.asarray(x)
     return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
-def output_of(output, flat, params, state):
+def output_of(output: Output, flat, params: PyTree, state) -> PyTree:
     """What `output` gives at a state on vectors."""
     state = public(flat, state)
     values = {"t": state.t, "params": params, "L": state.L, "w": None, "z": None, "zdot": None}
@@ -98,12 +109,12 @@ def output_of(output, flat, params, state):
     return output(values, state.t.dtype)
 
 
-def output_at_start(flat, output, params, start, h):
+def output_at_start(flat: FlatSystem, output: Output, params: PyTree, start: State, h: Array) -> PyTree:
     """The same where a run starts, with a step h."""
     return output_of(output, flat, zero_order_hold.before(params, start.t, h), start)
 
 
-def output_at(output, found, t, params):
+def output_at(output: Output, found: Interpolant | Solution, t: Array, params: PyTree) -> PyTree:
     """The same of anything with the attributes of a `Solution`, at one time."""
     names = {"w": "acceleration", "L": "multipliers"}
     values = {name: getattr(found, names.get(name, name)) for name in NAMES if name not in ("t", "params")}
@@ -113,7 +124,7 @@ def output_at(output, found, t, params):
 PATH = ("q", "v", "acceleration", "multipliers", "z", "zdot", "friction", "sticking")
 
 
-def beside_path(output, control):
+def beside_path(output, control: Adaptive):
     """The `Output` of a run under error control: whoever states errors compares q, and drops the path in the end."""
     return output if output is None or not control.verify else replace(output, beside_path=True)
 
@@ -123,7 +134,7 @@ def without_path(run):
     return run._replace(**dict.fromkeys(PATH))
 
 
-def savings(run):
+def savings(run: Run):
     """How a `Run` saves: the function carry -> what is kept, and that of all kept, dt, info, failure -> `Solution`.
 
     The first takes the size of the step that has led there, too, where the loop does not know it.
@@ -134,7 +145,7 @@ def savings(run):
         keep = form.of(loop.keep)
         return lambda carry, last=None: keep(carry[0]), partial(as_solution, flat, loop.start)
 
-    def save(carry, last=None):
+    def save(carry: tuple, last: Array | None = None):
         state, count, _, *met = carry
         now = loop.now(*met) if met else params
         if zero_order_hold.holds(now):  # as that step has had them
@@ -142,14 +153,14 @@ def savings(run):
             now = zero_order_hold.before(now, state.t, last)
         return state.t, output_of(output, flat, now, state)
 
-    def solution(path, dt, info, failure):
+    def solution(path: tuple, dt: Array, info: Info, failure: Failure) -> Solution:
         t, found = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), save((loop.start, *loop.carry[1:])), path)
         return Solution(t, None, None, None, None, dt, info, failure, output=found)
 
     return form.of(save), solution
 
 
-def require_path(caller, run):
+def require_path(caller: str, run: Solution):
     """An error for a run that has kept outputs alone."""
     if getattr(run, "q", None) is None and getattr(run, "output", None) is not None:
         raise ValueError(

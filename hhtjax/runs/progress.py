@@ -1,9 +1,14 @@
 """The bar on stderr: drawn between blocks of steps, so that the steps of a block stay one kernel."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.description import Array
 from hhtjax.description.presentation import overwrite
 
 MOST = 100  # times that a bar is drawn in a run
@@ -15,28 +20,28 @@ def announce():
     overwrite("compiling ...", last=False)
 
 
-def show_progress(count, total, what):
+def show_progress(count: Array, total: int, what: str):
     """A bar on stderr, about a hundred times in a run."""
     every = max(1, total // MOST)
     lax.cond((count % every == 0) | (count == total), lambda: draw(count, total, what), lambda: None)
 
 
-def draw(count, total, what):
+def draw(count: Array, total: int, what: str):
     """The bar itself."""
 
-    def show(count):
+    def show(count: Array):
         done = int(count) * 40 // total
         overwrite(f"[{'#' * done:<40}] {what} {int(count)} of {total}", last=int(count) == total)
 
     jax.debug.callback(show, count)
 
 
-def steps_between(total, unknowns):
+def steps_between(total: int, unknowns: int) -> int:
     """How many steps lie between two drawings, so that these take little: a step of n takes n^2 at least."""
     return min(total, max(total // MOST, LEAST // unknowns**2, 1))
 
 
-def in_blocks(scan, carry, length, least, show):
+def in_blocks(scan: Callable, carry: tuple, length: int, least: int, show: Callable):
     """scan(carry, length), in blocks of `least` iterations or some more, with show(number of iterations) after each.
 
     scan: carry, number of iterations -> carry, what they return, stacked.
@@ -44,7 +49,7 @@ def in_blocks(scan, carry, length, least, show):
     size = next((n for n in range(least, min(4 * least, length) + 1) if length % n == 0), least)
     blocks, rest = divmod(length, size)
 
-    def block(carry, number):
+    def block(carry: tuple, number: Array):
         carry, ys = scan(carry, size)
         show((number + 1) * size)
         return carry, ys

@@ -1,7 +1,10 @@
 """A run: one scan over the steps."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.checks import require_integer
-from hhtjax.description import all_concrete, is_array, is_concrete, known_now
+from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, known_now
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.numerics.dense_lu import LARGEST, UNROLLED
 from hhtjax.primitives import is_in_batch, is_traced, one_kernel, or_plain
@@ -38,33 +41,37 @@ from hhtjax.runs.solution import Solution, told
 from hhtjax.steppers.implicit_solve import callbacks_named
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.steppers.variable_step import GROWTH
+from hhtjax.systems.events import Event
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
+from hhtjax.systems.system import AnySystem, LinearSystem
 from hhtjax.xla import Programs
+
+if TYPE_CHECKING:
+    from hhtjax.runs.driver import Loop, Run
 
 
 def simulate(
-    system: System | LinearSystem | FirstOrderSystem,
+    system: AnySystem,
     stepper: Stepper,
-    q0: Any,
-    v0: Any = None,
-    params: Any = None,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
     *,
-    z0: Any = None,
-    dt: Any,
+    z0: PyTree = None,
+    dt: Real,
     num_steps: int | None = None,
-    duration: Any = None,
+    duration: Real = None,
     num_samples: int | None = None,
-    times: Any = None,
-    t0: Any = 0.0,
+    times: Real | None = None,
+    t0: Real = 0.0,
     save_every: int = 1,
     progress: bool = False,
     extrapolate: int = 1,
-    events: Any = None,
+    events: Sequence[Event] | None = None,
     max_events: int = 2,
     keep_events: int = 100,
     throw: bool = False,
-    output: Any = None,
+    output: Callable | None = None,
 ) -> Solution:
     """Steps `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), num_steps times by dt.
 
@@ -189,7 +196,7 @@ def simulate(
             events = require_events("simulate", problem, events, dt)
         warn_of_jumps_to(problem, dt, times)
 
-        def run_to(k):
+        def run_to(k: int) -> Solution:
             with callbacks_named():
                 return or_plain(partial(_read_off, problem, times, dt / k, events, room=room, rates=kind["rates"]))
 
@@ -203,7 +210,7 @@ def simulate(
 
     warn_of_jumps_in(problem, dt, num_steps)
 
-    def run(k):
+    def run(k) -> Solution:
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
         sizes["grows"] = jnp.ndim(dt) > 0 and grows_at_once(dt)
         data = problem, refined(dt, k), events, known_factors(problem, refined(dt, k))
@@ -214,16 +221,16 @@ def simulate(
     return told("simulate", solution, throw)
 
 
-def grows_at_once(dt):
+def grows_at_once(dt: Real) -> bool:
     """Whether some of these steps (N,), as far as they are known, are too long behind the one before."""
     return not is_concrete(dt) or bool(np.any(np.asarray(dt)[1:] > GROWTH * np.asarray(dt)[:-1]))
 
 
 @partial(Programs, static_argnames=("room",))
-def _read_off(problem, times, dt, events, *, room):
+def _read_off(problem: Problem, times: Array, dt: Array, events, *, room: tuple) -> Solution:
     """The run with equal steps, at times between them."""
 
-    def run(problem, times, dt, events):
+    def run(problem: Problem, times: Array, dt: Array, events) -> Solution:
         t0, times, dt = map(problem.times, (problem.t0, times, dt))
         return follow(problem, times, EqualSteps.to(t0, times, dt), events, room)._replace(dt=dt)
 
@@ -231,7 +238,19 @@ def _read_off(problem, times, dt, events, *, room):
 
 
 @partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "grows", "in_batch"))
-def _simulate(problem, dt, events, factors, *, num_steps, save_every, progress, room, grows, in_batch):
+def _simulate(
+    problem: Problem,
+    dt: Array,
+    events: tuple | None,
+    factors,
+    *,
+    num_steps: int,
+    save_every: int,
+    progress: bool,
+    room: tuple,
+    grows: bool,
+    in_batch: bool,
+) -> Solution:
     dt = problem.times(dt)
     steps = partial(given_steps, dt=dt, grows=grows) if dt.ndim else partial(equal_steps, dt=dt)
     size = {"every": save_every, "length": num_steps // save_every}
@@ -239,28 +258,28 @@ def _simulate(problem, dt, events, factors, *, num_steps, save_every, progress, 
     return drive(problem, steps, sampling, events, room, factors=factors)
 
 
-def _at_ends(run, dt, every, length, in_batch, progress):
+def _at_ends(run: Run, dt: Array, every: int, length: int, in_batch: bool, progress: bool):
     """A sample at the end of each of `length` intervals of so many steps."""
     loop, form = run.loop, run.form
     step = form.of(loop.advance)
     save, as_saved = savings(run)
 
-    def interval(carry, _):
+    def interval(carry: tuple, _):
         if every == 1:
             carry, info = step(carry)
         else:
             (carry, info), _ = joined_steps((carry, loop.no_info), every)
         return carry, (save(carry), info)
 
-    def joined_step(carry, _):
+    def joined_step(carry: tuple, _):
         carry, info = carry
         carry, new = step(carry)
         return (carry, join_info(info, new)), None
 
-    def joined_steps(carry, length):
+    def joined_steps(carry: tuple, length: int):
         return checkpointed_scan(joined_step, carry, length, in_batch)
 
-    def intervals(carry, length):
+    def intervals(carry: tuple, length: int):
         return one_kernel(lambda carry: checkpointed_scan(interval, carry, length, in_batch), carry)
 
     if progress:
@@ -270,7 +289,16 @@ def _at_ends(run, dt, every, length, in_batch, progress):
     return carry, partial(as_saved, form.joined(path), dt, info)
 
 
-def _with_bar(intervals, joined_steps, save, loop, carry, length, save_every, unknowns):
+def _with_bar(
+    intervals: Callable,
+    joined_steps: Callable,
+    save: Callable,
+    loop: Loop,
+    carry: tuple,
+    length: int,
+    save_every: int,
+    unknowns: int,
+):
     """The same intervals, with a bar drawn outside of kernels: between several of them, or within long ones."""
     announce()
     total = length * save_every
@@ -278,11 +306,11 @@ def _with_bar(intervals, joined_steps, save, loop, carry, length, save_every, un
     if every >= save_every:
         return in_blocks(intervals, carry, length, every // save_every, lambda n: draw(n * save_every, total, "step"))
 
-    def interval(carry, number):
-        def steps(carry, length):
+    def interval(carry: tuple, number: Array):
+        def steps(carry: tuple, length: int):
             return one_kernel(partial(joined_steps, length=length), carry)
 
-        def show(n):
+        def show(n: Array):
             draw(number * save_every + n, total, "step")
 
         (carry, info), _ = in_blocks(steps, (carry, loop.no_info), save_every, every, show)
@@ -298,7 +326,7 @@ def _with_bar(intervals, joined_steps, save, loop, carry, length, save_every, un
 # factorised its matrices.
 
 
-def known_factors(problem, dt):
+def known_factors(problem: Problem, dt: Real):
     """The `Factors` for the steps dt of a run, while something is traced; None where they are not constant, or large:
     a program would hold them."""
     system, stepper = problem.system, problem.stepper

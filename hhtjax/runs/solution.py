@@ -1,20 +1,25 @@
 """What a run returns, and how it tells of a step that failed."""
 
+from __future__ import annotations
+
 import warnings
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
-from hhtjax.description import all_concrete, is_concrete
+from hhtjax.description import Array, PyTree, Real, all_concrete, is_concrete
 from hhtjax.description.presentation import Table, all_known, between, brief, known, leaf_rows, shown
 from hhtjax.primitives import block_written
 from hhtjax.steppers.friction_switching import DEPENDENT
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
 from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY
+
+if TYPE_CHECKING:
+    from hhtjax.runs.error_control import Steps
 
 
 class FailedRunWarning(RuntimeWarning):
@@ -44,16 +49,16 @@ class Failure(NamedTuple):
     """
 
     step: Any
-    newton: Any
-    quantity: Any
-    row: Any = None
-    solve: Any = None
+    newton: Array
+    quantity: Array
+    row: Real = None
+    solve: Real = None
     friction: Any = None
     mass: Any = None
-    event: Any = None
-    guard: Any = None
+    event: Real = None
+    guard: Real = None
 
-    def _verdict(self):
+    def _verdict(self) -> str:
         """How many failed, or what did."""
         step, quantity = known(self.step), known(self.quantity)
         if step is None or quantity is None:
@@ -113,26 +118,26 @@ class Solution(NamedTuple):
             multipliers, z, zdot, friction and sticking, which are None then; None without.
     """
 
-    t: Any
-    q: Any
-    v: Any
-    acceleration: Any
-    multipliers: Any
+    t: Array
+    q: PyTree
+    v: PyTree
+    acceleration: PyTree
+    multipliers: Array | None
     dt: Any
     info: Info
     failure: Failure
-    z: Any = None
-    zdot: Any = None
+    z: PyTree = None
+    zdot: PyTree = None
     friction: Any = None
-    sticking: Any = None
-    steps: Any = None
+    sticking: Array | None = None
+    steps: Steps | None = None
     error: Any = None
     allowed: Any = None
-    events: Any = None
-    output: Any = None
+    events: Events | None = None
+    output: PyTree = None
 
     @property
-    def failed(self):
+    def failed(self) -> Array:
         """Whether the run failed, or, of a batch, which members did: those that `check` would raise for, but for
         `reach` and times that float32 cannot tell apart. Data, inside jit too."""
         batch = self.t.shape[:-1]
@@ -144,7 +149,7 @@ class Solution(NamedTuple):
             failed |= ~jnp.all(self.error <= self.allowed[..., None], axis=-1)
         return failed
 
-    def _is_known(self):
+    def _is_known(self) -> bool:
         """Whether what `check` looks at are numbers: outside of jit, vmap and grad."""
         return all_concrete((self.failure, self.dt, self.t, self.steps, self.error))
 
@@ -209,14 +214,14 @@ class Solution(NamedTuple):
         share = float(np.asarray(self.steps.tightened)[tuple(member)])
         return f"{known} coarser run, and {asked} although steps were chosen for {share:.2g} of the tolerance."
 
-    def _table(self):
+    def _table(self) -> Table:
         """The run in a line, and its arrays."""
         rows = leaf_rows(q=self.q, v=self.v, acceleration=self.acceleration, multipliers=self.multipliers)
         rows += leaf_rows(z=self.z, zdot=self.zdot, friction=self.friction, sticking=self.sticking)
         rows += leaf_rows(output=self.output)
         return Table(f"Solution: {self._title()}", [["", "shape", "dtype"], *rows, *leaf_rows(info=self.info)])
 
-    def _title(self):
+    def _title(self) -> str:
         """Saved times, steps, and what `check` would say; of tracers, and of parts of a run, the times alone."""
         numbers = all_known((self.t, self.dt, self.failure))
         if len(numbers) < 2 + 3:
@@ -237,7 +242,7 @@ class Solution(NamedTuple):
             verdict += f"; {met}"
         return f"{batch}{t.shape[-1]} saved times, t = {between(t, 's')}, dt = {between(dt, 's')}; {verdict}"
 
-    def _why(self, member):
+    def _why(self, member: tuple) -> str:
         """What `failure` says of one member of a batch."""
         found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
         _, newton, quantity, row, left, friction, mass, event, guard = found
@@ -287,7 +292,7 @@ class Solution(NamedTuple):
         names = ("y", "y'") if is_first_order else QUANTITIES
         return f"{names[quantity]} is not finite. Take a smaller dt, or another linearize=, or a method that damps"
 
-    def _first_beyond(self, reach):
+    def _first_beyond(self, reach: float) -> np.ndarray:
         """Step of the first saved time at which q is farther than `reach` from its start; 0 if none is."""
         t, axis = np.asarray(self.t), self.t.ndim - 1
         far: Any = np.zeros(t.shape, bool)
@@ -296,7 +301,7 @@ class Solution(NamedTuple):
                 far |= (abs(q - np.take(q, [0], axis)) > reach).any(axis=tuple(range(axis + 1, q.ndim)))
         return np.take_along_axis(self._steps_taken(), far.argmax(axis)[..., None], axis)[..., 0]
 
-    def _steps_taken(self):
+    def _steps_taken(self) -> np.ndarray:
         """How many steps come before each saved time."""
         t, dt = np.asarray(self.t), np.asarray(self.dt)
         if self.steps is not None:  # the one that ends at a saved time, or beyond
@@ -315,12 +320,12 @@ class Solution(NamedTuple):
                 taken = np.insert(np.cumsum(counts, axis=-1), 0, 0, axis=-1)
         return np.rint(np.nan_to_num(taken, posinf=0, neginf=0)).astype(int)
 
-    def _is_every_step(self):
+    def _is_every_step(self) -> bool:
         """Whether dt has the size of each step, and more than one of them may come before a saved time."""
         K = self.t.shape[-1] - 1
         return self.steps is not None or (np.ndim(self.dt) == self.t.ndim and self.dt.shape[-1] != K)
 
-    def _time_of(self, step, member):
+    def _time_of(self, step: Real, member: tuple) -> Real:
         """The time at which a step of a member of a batch ends."""
         taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
         if self._is_every_step():
@@ -332,7 +337,7 @@ class Solution(NamedTuple):
         return t[i] + (step - taken[i]) * dt[i]
 
 
-def told(caller, solution, throw):
+def told(caller: str, solution: Solution, throw: bool) -> Solution:
     """The solution; with a `FailedRunWarning`, or for `throw` an error, where the run failed and that is known now."""
     if solution.failure is None or not is_concrete(solution.failure.step):
         return solution
@@ -360,14 +365,14 @@ def first_bad(bad):
     return member, words if member else ""
 
 
-def bad_samples(t, dt):
+def bad_samples(t: np.ndarray, dt: np.ndarray):
     """Of a run under error control, with times (..., K + 1) and the steps that it chose, NaN behind the last."""
     if not np.all(np.diff(t) >= 0):  # behind an event that ends the run they are its end
         return ORDER.format(t)
     return ALIKE.format(t.dtype, t.flat[0]) if np.any(dt == 0) else None
 
 
-def bad_steps(t, dt, has_events):
+def bad_steps(t: np.ndarray, dt: np.ndarray, has_events: bool):
     """Of a run with given steps, and of a sweep, whose dt are NaN where they would be longer than between samples."""
     gaps, unknown = np.diff(t), np.isnan(dt)
     is_over_times = t.ndim > 1 and dt.shape == gaps.shape
@@ -408,13 +413,13 @@ class Events(NamedTuple):
             beside the velocities the motion grazes the guard, and derivatives are huge, at last infinite.
     """
 
-    count: Any
-    t: Any
-    which: Any
-    q: Any
-    before: Any
-    after: Any
-    z: Any
+    count: Array
+    t: Array
+    which: Array
+    q: PyTree
+    before: PyTree
+    after: PyTree
+    z: PyTree
     rate: Any
 
     def _verdict(self):
@@ -430,16 +435,16 @@ class Log(NamedTuple):
     """The events met so far, on vectors: how many, and a column of numbers for each that is kept, NaN beyond, and for
     those of one step more, of which nothing is told."""
 
-    count: Any
-    columns: Any
+    count: Array
+    columns: Array
 
     @classmethod
-    def empty(cls, like, keep, at_once):
+    def empty(cls, like: PyTree, keep: int, at_once: int) -> Log:
         """Room for so many columns like this one, and for so many in a step."""
         number = max(keep + at_once, -(-WHOLE // like.size))
         return cls(jnp.zeros((), jnp.int32), jnp.full((like.size, number), jnp.nan, like.dtype))
 
-    def with_more(self, rows, there, keep):
+    def with_more(self, rows: Array, there: Array, keep: int) -> Log:
         """With the first of these, as many as are there, as long as there is room; the others are NaN."""
         places = jnp.cumsum(there, dtype=self.count.dtype) - 1
         numbers = jnp.arange(len(places), dtype=places.dtype)
@@ -449,7 +454,7 @@ class Log(NamedTuple):
         columns = block_written(self.columns, rows.T, jnp.minimum(self.count, keep), axis=1)
         return Log(self.count + jnp.sum(there, dtype=self.count.dtype), columns)
 
-    def told(self, flat, keep):
+    def told(self, flat, keep: int) -> Events:
         """As `Events`."""
         n, N, columns = flat.positions, flat.size, self.columns[:, :keep]
         end = len(columns) - 2 * N  # of q, in which a rotation has nine numbers
@@ -462,7 +467,7 @@ class Log(NamedTuple):
         return Events(self.count, t[0], which, q, before, after, z, rate[0])
 
 
-def row_of(t, which, rate, q, before, after):
+def row_of(t: Array, which: Array, rate: Array, q: Array, before: Array, after: Array) -> Array:
     """What is noted of an event."""
     return jnp.concatenate([jnp.stack([t, which.astype(t.dtype), rate]), q, before, after])
 

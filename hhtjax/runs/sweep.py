@@ -1,6 +1,10 @@
 """Many runs in one compiled call: step sizes, parameters, initial states and coefficients as data."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -8,44 +12,54 @@ import numpy as np
 from jax import lax
 from jax.sharding import NamedSharding, PartitionSpec
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.differentiable_while import repeat
 from hhtjax.primitives import one_kernel, or_alone, or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.driver import counted, drive, equal_steps, resting
-from hhtjax.runs.inputs import Problem, fit_to_samples, fit_to_times
+from hhtjax.runs.inputs import Problem
 from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.solution import Solution, told
 from hhtjax.runs.sweep_controlled import sweep_chosen
-from hhtjax.runs.sweep_inputs import VECTORS, Inputs
-from hhtjax.steppers.stepper import bound
+from hhtjax.runs.sweep_inputs import VECTORS, Inputs, fit_to_samples, fit_to_times
+from hhtjax.steppers.stepper import Stepper, bound
 from hhtjax.steppers.variable_step import resized_step
+from hhtjax.systems.events import Event
+from hhtjax.systems.system import AnySystem
 from hhtjax.xla import Programs
+
+if TYPE_CHECKING:
+    from hhtjax.runs.driver import Run
+    from hhtjax.runs.output import Output
+    from hhtjax.systems.flat_system import FlatSystem
+    from hhtjax.systems.linear_system import LinearSystem
+    from hhtjax.systems.system import System
 
 
 def sweep(
-    system,
-    stepper,
-    q0,
-    v0=None,
-    params=None,
+    system: AnySystem,
+    stepper: Stepper,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
     *,
-    z0=None,
-    dts,
-    duration=None,
-    num_samples=None,
-    times=None,
-    t0=0.0,
-    in_axes=None,
+    z0: PyTree = None,
+    dts: Real,
+    duration: Real = None,
+    num_samples: int | None = None,
+    times: Real | None = None,
+    t0: Real = 0.0,
+    in_axes: PyTree = None,
     mesh=None,
-    progress=False,
-    events=None,
-    max_events=2,
-    keep_events=100,
-    throw=False,
-    output=None,
+    progress: bool = False,
+    events: Sequence[Event] | None = None,
+    max_events: int = 2,
+    keep_events: int = 100,
+    throw: bool = False,
+    output: Callable | None = None,
 ) -> Solution:
     """Runs `system` once for each of `dts`, all from t0 on, sampled at common times.
 
@@ -140,23 +154,23 @@ def sweep(
 
 @partial(Programs, static_argnames=("mapped", "num_samples", "lanes", "mesh", "progress", "room", "grows"))
 def run_sweep(
-    system,
-    data,
-    dts,
+    system: LinearSystem | System,
+    data: PyTree,
+    dts: Array,
     duration,
-    t0,
+    t0: Array,
     times,
-    events,
-    output=None,
+    events: tuple | None,
+    output: Output | None = None,
     *,
-    mapped,
-    num_samples,
-    lanes,
+    mapped: tuple,
+    num_samples: int,
+    lanes: int,
     mesh,
-    progress,
-    room,
-    grows,
-):
+    progress: bool,
+    room: tuple,
+    grows: bool,
+) -> Solution:
     """The sweep of `Inputs`, compiled."""
     if progress:
         announce()
@@ -177,18 +191,18 @@ def run_sweep(
     leaves, structure = jax.tree.flatten(data)
     axes = [0 if flag else None for flag in mapped]
 
-    def member(leaves, dt, substeps, longest):
+    def member(leaves: list, dt: Array, substeps: Array, longest: Array) -> Solution:
         grid = dt, substeps, longest, t0, num_samples, times
         return run_member(system, jax.tree.unflatten(structure, leaves), *grid, events, room, output, grows)
 
-    def block(leaves, dts, substeps, numbered):
+    def block(leaves: list, dts: Array, substeps: Array, numbered: tuple) -> Solution:
         number, members = numbered
         if progress:
             show_progress(number + 1, rounds, "block")
         mine = [x[members] if flag else x for x, flag in zip(leaves, mapped, strict=True)]
         return _together(member, axes, mine, dts[members], substeps[members])
 
-    def hand(members, *data):
+    def hand(members: Array, *data: PyTree) -> Solution:
         """The blocks of one device, one after the other."""
         return lax.map(partial(block, *data), (jnp.arange(rounds, dtype=jnp.int32), members[0]))
 
@@ -201,7 +215,7 @@ def run_sweep(
     return runs if ends else runs._replace(t=jnp.broadcast_to(times, (len(dts), num_samples + 1)))
 
 
-def _together(member, axes, mine, dts, substeps):
+def _together(member: Callable, axes: list, mine: list, dts: Array, substeps: Array) -> Solution:
     """The members of a block; a batch of one would be slower, and would have to be ready to rest."""
     if len(dts) > 1:
         return jax.vmap(member, (axes, 0, 0, None))(mine, dts, substeps, jnp.max(substeps, axis=0))
@@ -221,7 +235,20 @@ def _by_many(hand, mesh):
 # One member of a sweep: as many steps as it takes, and then at rest, as long as its block works.
 
 
-def run_member(system, data, dt, substeps, longest, t0, num_samples, times, events, room, output=None, grows=False):
+def run_member(
+    system: LinearSystem | System,
+    data: PyTree,
+    dt: Array,
+    substeps: Array,
+    longest: Array,
+    t0: Array,
+    num_samples: int,
+    times: Array | None,
+    events: tuple | None,
+    room: tuple,
+    output: Output | None = None,
+    grows: bool = False,
+) -> Solution:
     """One member; it rests from `substeps` to `longest`, where its block still works.
 
     With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval, and
@@ -234,7 +261,7 @@ def run_member(system, data, dt, substeps, longest, t0, num_samples, times, even
     return drive(problem, steps, partial(_at_ends, intervals=intervals, grows=grows), events, room, caller="sweep")
 
 
-def _at_ends(run, intervals, grows):
+def _at_ends(run: Run, intervals: tuple, grows: bool):
     """A sample at the end of each interval."""
     dt, substeps, longest, num_samples, times = intervals
     stepper, loop, form, past_events = run.problem.stepper, run.loop, run.form, run.loop.past is not None
@@ -243,23 +270,23 @@ def _at_ends(run, intervals, grows):
     save, as_saved = savings(run)
     pace = _paces(run, substeps, longest, grows)
 
-    def part(carry, here):
+    def part(carry: tuple, here: tuple | None):
         advance, substeps, longest = pace(carry[0], here)
 
-        def step(i, carry):
+        def step(i: Array, carry: tuple):
             before, info = carry
             return resting(advance, past_events, before, info, or_alone(i < substeps))
 
         return repeat(step, carry, longest), None
 
     @checkpoint
-    def interval(before, here):
+    def interval(before: tuple, here: tuple | None):
         carry = before, loop.no_info
         (after, info), _ = lax.scan(part, carry, here) if resizes else part(carry, here)
         last = None if here is None or run.problem.output is None else here[1].ravel()[0]
         return after, (save(after, last), info)
 
-    def samples(carry):
+    def samples(carry: tuple):
         if times is None:
             return lax.scan(interval, carry, None, num_samples)
         each = times[:-1], dt, substeps, longest
@@ -269,23 +296,23 @@ def _at_ends(run, intervals, grows):
     return carry, partial(as_saved, form.joined(path), dt, info)
 
 
-def _paces(run, substeps, longest, grows):
+def _paces(run: Run, substeps: Array, longest: Array, grows: bool):
     """The function of what the loop carries and an interval that gives the step, and how many the member takes, and its
     block."""
     stepper, params, loop, form = run.problem.stepper, run.params, run.loop, run.form
 
-    def stepped(step_for, sizes):
+    def stepped(step_for: Callable, sizes: Callable):
         """The step, with events one that rests."""
         return form.of(step_for(params) if loop.past is None else loop.past(step_for, sizes))
 
-    def pace(before, interval):
+    def pace(before: tuple, interval: tuple | None):
         if interval is None:
             return stepped(loop.bound, loop.sizes), substeps, longest
         t, h, mine, most, *part = interval
         taken, last = part or (None, None)
         count = before[1] if taken is None else before[1] - taken
 
-        def from_here(params):
+        def from_here(params: PyTree):
             return advance_from(run.flat, stepper, h.dtype, params, t, h, count, last, grows)
 
         return stepped(from_here, lambda _: (h, h if last is None else last)), mine, most
@@ -293,7 +320,17 @@ def _paces(run, substeps, longest, grows):
     return pace
 
 
-def advance_from(flat, stepper, dtype, params, t, dt, count, last=None, grows=False):
+def advance_from(
+    flat: FlatSystem,
+    stepper: Stepper,
+    dtype: np.dtype,
+    params: PyTree,
+    t: Array,
+    dt: Array,
+    count: Array,
+    last: Array | None = None,
+    grows: bool = False,
+):
     """`Loop.advance` with another dt, from the time t on, where `count` steps have been taken, each of size `last`."""
     stepper = stepper.astype(dtype)
     if last is None:
@@ -303,7 +340,7 @@ def advance_from(flat, stepper, dtype, params, t, dt, count, last=None, grows=Fa
     return counted(take_step, flat, t, dt, count)
 
 
-def in_two_parts(t, dt, substeps, longest):
+def in_two_parts(t: Array, dt: Array, substeps: Array, longest: Array):
     """The intervals (K, 2), the first step of each apart; behind them the steps before it, and the size of the last."""
     last = jnp.concatenate([dt[:1], dt[:-1]])
     firsts = t, dt, jnp.ones_like(substeps), jnp.ones_like(longest), jnp.zeros_like(substeps), last

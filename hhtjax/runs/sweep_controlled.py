@@ -1,13 +1,16 @@
 """Sweeps under error control: the steps of all members first, then their runs over them, the long ones together."""
 
+from __future__ import annotations
+
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.jaxpr import on_scalars
 from hhtjax.primitives import one_kernel, or_plain
 from hhtjax.runs.controlled_run import Grid, accepted_run, compared, follow, scaled, tighten, verified
@@ -19,8 +22,15 @@ from hhtjax.runs.progress import announce, show_progress
 from hhtjax.runs.sweep_inputs import lanes_for
 from hhtjax.xla import Programs
 
+if TYPE_CHECKING:
+    from hhtjax.runs.adaptive import Adaptive
+    from hhtjax.runs.error_control import Steps, StepTrial, Walk
+    from hhtjax.runs.solution import Solution
+    from hhtjax.runs.sweep_inputs import Inputs
+    from hhtjax.systems.system import System
 
-def sweep_chosen(inputs, progress):
+
+def sweep_chosen(inputs: Inputs, progress: bool) -> Solution:
     """The `Solution` of a sweep whose `dts` are an `Adaptive`."""
     static = {"mapped": inputs.mapped, "size": inputs.size, "lanes": lanes_for(inputs.size), "progress": progress}
     static |= {"pair": is_pair(), "room": inputs.room}
@@ -33,13 +43,24 @@ def sweep_chosen(inputs, progress):
 
 
 @partial(Programs, static_argnames=("mapped", "size", "lanes", "progress", "pair", "room"))
-def run_chosen(system, start, choice, *, mapped, size, lanes, progress, pair, room):
+def run_chosen(
+    system: System,
+    start: tuple,
+    choice: tuple,
+    *,
+    mapped: tuple,
+    size: int,
+    lanes: int,
+    progress: bool,
+    pair: bool,
+    room: tuple,
+) -> Solution:
     """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, output, of runs, of
     steps; pair: whether the two differ."""
     if progress:
         announce()
 
-    def members_of(data, control, t0, times, events, output):
+    def members_of(data: PyTree, control: Adaptive, t0: Array, times: Array, events, output) -> Members:
         dtype = jax.tree.leaves(data[1])[0].dtype
         times, t0 = (jnp.asarray(x).astype(dtype) for x in (times, t0))
         arrays, structure = jax.tree.flatten((data, control))
@@ -94,17 +115,17 @@ def rounds(members, progress):
     return tighten(once, judge, jnp.ones(members.size, members.t0.dtype))
 
 
-def run_many(members, steps, ends, progress, halved=False):
+def run_many(members: Members, steps: Steps, ends: Array, progress: bool, halved: bool = False) -> Solution:
     """The runs over these steps, each halved or not, in blocks: of the longest members, the next longest, and so on."""
     t0, times, size, lanes = members.t0, members.times, members.size, members.lanes
 
-    def grid(ends, accepted):
+    def grid(ends: Array, accepted: Array) -> Grid:
         return Grid.of(t0, times, ends, accepted, halved)
 
-    def member(arrays, grid):
+    def member(arrays: list, grid: Grid) -> Solution:
         return follow(members.problem(arrays), times, grid, members.events, members.room)
 
-    def block(numbered):
+    def block(numbered: tuple) -> Solution:
         number, those = numbered
         if progress:
             show_progress(number + 1, len(blocks), "block")
@@ -132,22 +153,22 @@ class Members(NamedTuple):
 
     system: Any
     arrays: list
-    structure: Any  # of (stepper, q0, v0, params, z0), tolerances
+    structure: Array  # of (stepper, q0, v0, params, z0), tolerances
     axes: list
-    t0: Any
+    t0: Array
     times: Any
     size: int
     lanes: int  # members in a block
     events: Any = None
     room: tuple = ()
-    output: Any = None
+    output: PyTree = None
 
-    def problem(self, arrays):
+    def problem(self, arrays: list) -> Problem:
         """One member's."""
         (stepper, q0, v0, params, z0), _ = jax.tree.unflatten(self.structure, arrays)
         return Problem(self.system, stepper, q0, v0, params, self.t0, z0, self.output)
 
-    def control(self, arrays):
+    def control(self, arrays: list) -> Adaptive:
         """Its tolerances."""
         return jax.tree.unflatten(self.structure, arrays)[1]
 
@@ -159,12 +180,12 @@ class Members(NamedTuple):
         axes = self.axes[:of_data] + [0 if jnp.ndim(x) else None for x in tolerances]
         return self._replace(arrays=jax.tree.leaves(data) + tolerances, axes=axes)
 
-    def of(self, numbers):
+    def of(self, numbers: Real):
         """The arrays of the members of these numbers."""
         return [x if axis is None else x[numbers] for x, axis in zip(self.arrays, self.axes, strict=True)]
 
 
-def choose_many(members):
+def choose_many(members: Members):
     """`Steps` of each member to the last of the times, and (size, max_steps) where they end; inf behind them.
 
     No tracer of autodiff may come in.
@@ -172,7 +193,7 @@ def choose_many(members):
     search, bounds, walks = Search.begun(members)
     max_steps, size, lanes = search.max_steps, members.size, members.lanes
 
-    def block(order, number, carry):
+    def block(order: Array, number: Array, carry: tuple):
         walks, ends = carry
         those = order[jnp.minimum(number * lanes + np.arange(lanes, dtype=np.int32), size - 1)]  # the last one fills up
         before, limits = (jax.tree.map(lambda x: x[those], tree) for tree in (walks, bounds))
@@ -182,14 +203,14 @@ def choose_many(members):
         ends = ends.at[jnp.broadcast_to(those, places.shape), places].set(rows, mode="drop")
         return jax.tree.map(lambda x, y: x.at[those].set(y), walks, after), ends
 
-    def rounds(carry):
+    def rounds(carry: tuple):
         walks, _ = carry
         waiting = is_walking(walks, search.end)
         order = jnp.argsort(jnp.where(waiting, -(search.end - walks.state.t) / walks.h, jnp.inf))
         blocks = -(-jnp.sum(waiting, dtype=jnp.int32) // lanes)
         return lax.fori_loop(0, blocks, partial(block, order), carry)
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         return jnp.any(is_walking(carry[0], search.end))
 
     ends = jnp.full((size, max_steps), jnp.inf, search.end.dtype)
@@ -206,7 +227,7 @@ class Search(NamedTuple):
     form: Any  # of a walk
 
     @classmethod
-    def begun(cls, members):
+    def begun(cls, members: Members):
         """The search, and the `Bounds` and walks of all members before their first steps."""
         one = members.of(0)
         search = cls(members, members.times[-1], members.control(one).max_steps, None)
@@ -216,32 +237,32 @@ class Search(NamedTuple):
         bounds, walks = jax.vmap(search.start, (members.axes,))(members.arrays)
         return search, bounds, jax.vmap(search.form.like)(walks)
 
-    def start(self, arrays):
+    def start(self, arrays: list):
         """A member's `Bounds` and walk."""
         problem = self.members.problem(arrays)
         flat, q, v, t0, _ = problem.flat()
         bounds = Bounds.of(flat, problem.stepper, self.members.control(arrays), t0, self.end)
         return bounds, begin(self.trial(arrays, bounds), q, v, t0)[0]
 
-    def trial(self, arrays, bounds):
+    def trial(self, arrays: list, bounds: Bounds) -> StepTrial:
         """How a member's steps are tried."""
         members = self.members
         return trial_of(members.problem(arrays), self.end, bounds, self.max_steps, members.events, members.room)
 
-    def next(self, arrays, bounds, walk):
+    def next(self, arrays: list, bounds: Bounds, walk: Walk):
         """The walk after one try, the same if it is over, and the end of the step; NaN where none was accepted."""
         new, begun = self.form.of(partial(trial_step, self.trial(arrays, bounds)))(walk)
         new = jax.tree.map(partial(jnp.where, is_walking(walk, self.end)), new, walk)
         return new, jnp.where(new.accepted > walk.accepted, begun.end, jnp.nan)
 
-    def tries(self, walks, arrays, bounds):
+    def tries(self, walks: Walk, arrays: list, bounds: Bounds):
         """The walks of a block after a number of tries, and (ROUND, lanes) the ends of steps."""
 
-        def unfinished(carry):
+        def unfinished(carry: tuple) -> Array:
             walks, _, number = carry
             return jnp.any(is_walking(walks, self.end)) & (number < ROUND)
 
-        def body(carry):
+        def body(carry: tuple):
             walks, rows, number = carry
             walks, t = jax.vmap(self.next, (self.members.axes, 0, 0))(arrays, bounds, walks)
             return walks, lax.dynamic_update_index_in_dim(rows, t, number, 0), number + 1

@@ -1,8 +1,10 @@
 """What a sweep is made from: the checks of what a user hands over, and which of it differs between members."""
 
+from __future__ import annotations
+
 import math
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,23 +12,25 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hhtjax.checks import notes_on_lists, require_integer, require_number, require_params
-from hhtjax.description import all_concrete, is_array, is_concrete, known_now
+from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, is_real, known_now
 from hhtjax.runs.adaptive import Adaptive, lengths, require_controlled
 from hhtjax.runs.inputs import (
     Problem,
     equal_times,
-    may_grow,
     refused_members,
     require_events,
-    require_one_grid,
     require_sample_times,
-    require_step_sizes,
-    require_steps_within,
 )
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
+from hhtjax.steppers.variable_step import GROWTH
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.initial_conditions import distances, examine, initial_values, require_consistent, with_known_rows
 from hhtjax.systems.system import require_masses
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import Stepper
+    from hhtjax.systems.linear_system import LinearSystem
+    from hhtjax.systems.system import System
 
 LANES, BLOCKS = 128, 32  # members in a block at most; blocks, where there are fewer members than that takes
 VECTORS = 32  # members, of fewer of which LLVM often writes loops out, one member after the other
@@ -40,20 +44,35 @@ class Inputs(NamedTuple):
     an `Adaptive` for dts, times are given."""
 
     system: Any
-    data: Any
+    data: PyTree
     dts: Any
-    duration: Any
-    t0: Any
+    duration: Array
+    t0: Array
     mapped: tuple
     num_samples: int
     times: Any
     size: int
     events: Any = None
     room: tuple = ()
-    output: Any = None
+    output: PyTree = None
 
     @classmethod
-    def checked(cls, system, stepper, q0, v0, params, *, dts, duration, num_samples, t0, in_axes, times=None, z0=None):
+    def checked(
+        cls,
+        system,
+        stepper: Stepper,
+        q0: PyTree,
+        v0: PyTree,
+        params: PyTree,
+        *,
+        dts: PyTree,
+        duration: Real,
+        num_samples,
+        t0: Real,
+        in_axes: tuple | None,
+        times: PyTree = None,
+        z0: PyTree = None,
+    ) -> Inputs:
         """An error that names what is wrong, or the inputs."""
         require_system("sweep", system, massless=True)
         require_stepper("sweep", stepper)
@@ -92,13 +111,13 @@ class Inputs(NamedTuple):
         duration, t0 = (x if x is None or not is_concrete(x) else float(x) for x in (duration, t0))
         return cls(system, data, dts, duration, t0, mapped, int(num_samples), times, size)
 
-    def with_events(self, events, max_events, keep_events):
+    def with_events(self, events, max_events: int, keep_events: int) -> Inputs:
         """The same with events, looked at for each member."""
         room = require_integer("sweep", "max_events", max_events), require_integer("sweep", "keep_events", keep_events)
         if events is None:
             return self
 
-        def problem_of(data):
+        def problem_of(data: PyTree) -> Problem:
             stepper, q0, v0, params, z0 = data
             return Problem(self.system, stepper, q0, v0, params, self.t0, z0)
 
@@ -108,7 +127,7 @@ class Inputs(NamedTuple):
         else:
             steps = self.dts
 
-        def require(i):
+        def require(i: int):
             where = f"sweep: member {i}" if any(self.mapped) else "sweep"
             return require_events(where, problem_of(_member(self.data, self.mapped, i)), events, steps[i])
 
@@ -153,7 +172,7 @@ class Inputs(NamedTuple):
         numbers, rates = (sum(jax.tree.leaves(x)) for x in structure.unflatten(sizes)[1:3])
         return numbers, rates or numbers
 
-    def call(self, mesh=None, progress=False):
+    def call(self, mesh=None, progress: bool = False):
         """The arguments and keywords of `run_sweep`; with these what its program is chosen by."""
         if mesh is not None and not isinstance(mesh, Mesh):
             raise TypeError(f"sweep: `mesh` must be a jax.sharding.Mesh; received {mesh!r}.")
@@ -172,7 +191,7 @@ class Inputs(NamedTuple):
         return arguments, {**static, **fitting, "mesh": mesh, "progress": progress, "room": self.room}
 
 
-def lanes_for(size, least=1):
+def lanes_for(size: int, least: int = 1) -> int:
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
     Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If all are
@@ -181,7 +200,7 @@ def lanes_for(size, least=1):
     return min(LANES, max(1 << (size // BLOCKS).bit_length(), least))
 
 
-def least_lanes(size, unknowns, hands=1):
+def least_lanes(size: int, unknowns: int, hands: int = 1) -> int:
     """Of members that are alike: as many as vector instructions are fast with, if no hand gets more to do by it."""
     if size < 2 * VECTORS:
         return 1
@@ -190,7 +209,7 @@ def least_lanes(size, unknowns, hands=1):
     return min(choices, key=lambda lanes: -(-size // (lanes * hands)) * lanes)
 
 
-def are_alike(dts):
+def are_alike(dts: Real) -> bool:
     """Whether members are known to take about as many steps."""
     if not is_concrete(dts):
         return False
@@ -198,7 +217,7 @@ def are_alike(dts):
     return float(np.max(dts)) <= ALIKE * float(np.min(dts))
 
 
-def _members(control, trees, in_axes):
+def _members(control: Adaptive, trees: PyTree, in_axes) -> int:
     """How many members a sweep under error control has: as many as there are tolerances, or of what else differs."""
     if sizes := lengths(jax.tree.leaves(control)):
         return sizes[0]
@@ -209,7 +228,16 @@ def _members(control, trees, in_axes):
     raise ValueError("sweep: with dts=adaptive(...), give an array (B,) of tolerances, or `in_axes`, else none differ.")
 
 
-def _initial_values(system, q0, v0, params, z0, stepper, in_axes, size):
+def _initial_values(
+    system: LinearSystem | System,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree,
+    z0: PyTree,
+    stepper: Stepper,
+    in_axes: tuple | None,
+    size: int,
+):
     """q0, v0, z0, checked, and for each leaf of (stepper, q0, v0, params, z0) whether it has the axis of members."""
     if in_axes is None:
         in_axes = (None,) * 4
@@ -233,7 +261,7 @@ def _initial_values(system, q0, v0, params, z0, stepper, in_axes, size):
     return values, tuple(flag for name in NAMES for flag in flags[name])
 
 
-def _flags(name, tree, axes, size=None):
+def _flags(name: str, tree: PyTree, axes: PyTree, size: int | None = None):
     """For each leaf of `tree` whether it has an axis of members, from a prefix of 0 and None as for `jax.vmap`."""
     try:
         flags = jax.tree.map(lambda axis, part: [axis] * len(jax.tree.leaves(part)), axes, tree, is_leaf=_is_none)
@@ -257,23 +285,23 @@ def _flags(name, tree, axes, size=None):
     return [flag == 0 for flag in flags]
 
 
-def _is_none(x):
+def _is_none(x: PyTree) -> bool:
     return x is None
 
 
-def _member(data, mapped, i):
+def _member(data: PyTree, mapped: tuple, i: int):
     """One member's part of the data, or, for an array i, that of several."""
     leaves, structure = jax.tree.flatten(data)
     return jax.tree.unflatten(structure, [x[i] if flag else x for x, flag in zip(leaves, mapped, strict=True)])
 
 
-def _require_consistent(system, data, mapped, t0):
+def _require_consistent(system, data: PyTree, mapped: tuple, t0: Real):
     """An error for the members that are farthest from the constraint, and for the first; tracers pass."""
     leaves, structure = jax.tree.flatten(data)
     worst = {0}
     if any(mapped):
 
-        def examined(leaves):
+        def examined(leaves: list):
             _, q0, v0, params, z0 = jax.tree.unflatten(structure, leaves)
             return examine(system, q0, v0, t0, params, z0)
 
@@ -287,7 +315,7 @@ def _require_consistent(system, data, mapped, t0):
         require_consistent(f"sweep: member {i}", system, q0, v0, t0, params, stepper.redundant, z0)
 
 
-def _warn_of_jumps(params, t0, times, dts):
+def _warn_of_jumps(params: PyTree, t0: Real, times: np.ndarray, dts: np.ndarray):
     """A warning where a held input that the members share jumps within a step of one of them."""
     if all_concrete((t0, times, dts)):
         dts = np.unique(np.asarray(dts, float))
@@ -295,3 +323,85 @@ def _warn_of_jumps(params, t0, times, dts):
         zero_order_hold.warn_of_jumps(
             "sweep", params, times, lambda H: np.maximum(np.ceil(H[:, None] / dts * (1 - 1e-9)), 1), 5
         )
+
+
+# ----------------------------------------------------------------------------
+# The steps of members, which land on the samples.
+
+
+def require_one_grid(stepper: Stepper, duration: Real, num_samples: int | None, times: PyTree):
+    """An error unless the samples are given in one of the two ways, and in one that the stepper can step on."""
+    given = [x is not None for x in (duration, num_samples, times)]
+    if given not in ([True, True, False], [False, False, True]):
+        raise TypeError(
+            "sweep: give `duration` and `num_samples`, or `times` alone; "
+            f"received duration={duration!r}, num_samples={num_samples!r}, times={times!r}."
+        )
+    if times is not None:
+        if stepper.needs_equal_steps:
+            raise NotImplementedError(
+                f"sweep: {stepper.name} needs steps of one size, which differ between `times`: give "
+                "`duration` and `num_samples`, or another stepper."
+            )
+        return
+    require_integer("sweep", "num_samples", num_samples)
+    require_number("sweep", "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+
+
+def require_step_sizes(dts: PyTree) -> Real:
+    """dts as an array (B,)."""
+    dts = dts if is_array(dts) else np.asarray(dts)
+    if not is_real(dts):
+        raise TypeError(f"sweep: `dts` must be real numbers; received {dts!r}.")
+    if dts.ndim != 1 or not dts.size:
+        raise ValueError(f"sweep: `dts` must have shape (B,), one step size for each member; received {dts.shape}.")
+    return dts
+
+
+def require_steps_within(dts: Real, start: float, end: Real, num_samples: int | None = None):
+    """An error for step sizes that are not positive, take too many steps, or exceed the distance of equal samples."""
+    if not all_concrete((dts, start, end)):
+        return
+    h, span = np.asarray(dts, float), float(end) - float(start)
+    limit, at_most = np.inf, ""
+    if num_samples is not None:
+        limit = span / num_samples
+        at_most = (
+            f", and at most {limit:.6g}, the distance of the samples (duration={span:.6g}, num_samples={num_samples})"
+        )
+    fine = (h > 0) & (h <= limit * (1 + 1e-6))
+    if not fine.all():
+        bad = int(np.argmin(fine))
+        raise ValueError(f"sweep: `dts` must be positive{at_most}; received dts[{bad}] = {h[bad]:.6g}.")
+    if span / h.min() >= 2**31:
+        raise ValueError(f"sweep: `dts` must take fewer than 2^31 steps; received dts[{h.argmin()}] = {h.min():.6g}.")
+
+
+def fit_to_samples(dts: Array, H: Array):
+    """The numbers of steps between two samples, and the step sizes; NaN where a traced dt is not in (0, H]."""
+    slack = 64 * float(jnp.finfo(dts.dtype).eps)
+    return _fit(dts, H, (dts > 0) & (dts <= H * (1 + 1e-6)), slack)
+
+
+def fit_to_times(dts: Array, times: Array):
+    """The same for each interval, (B, K); NaN where a traced dt is not positive, or a time not after the last."""
+    H, eps = jnp.diff(times), float(jnp.finfo(dts.dtype).eps)
+    increasing = (H > 0) & jnp.isfinite(H)
+    H = jnp.where(increasing, H, 1)
+    size = jnp.where(increasing, jnp.maximum(jnp.abs(times[1:]), jnp.abs(times[:-1])), 0)
+    slack = eps * (64 + 4 * size / H)  # H is a difference of rounded times
+    return jax.vmap(lambda dt: _fit(dt, H, (dt > 0) & increasing, slack))(dts)
+
+
+def may_grow(dts: np.ndarray, t0: Real, times: np.ndarray) -> bool:
+    """Whether steps may be too long behind the one before, as far as all is known: one after a short interval."""
+    if not all_concrete((dts, t0, times)):
+        return True
+    H = np.diff(np.asarray(times, float), prepend=float(t0))
+    return bool(np.any(np.minimum(H[1:], np.max(dts)) > GROWTH * H[:-1]))
+
+
+def _fit(dts: Array, H: Array, fine: Array, slack: Real):
+    """The least numbers of steps in H that are no longer than dts, but for the slack, and their sizes."""
+    substeps = jnp.maximum(jnp.ceil(H / jnp.where(fine, dts, H) * (1 - slack)), 1).astype(jnp.int32)
+    return substeps, jnp.where(fine, H / substeps.astype(dts.dtype), jnp.nan)

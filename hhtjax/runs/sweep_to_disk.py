@@ -1,10 +1,13 @@
 """Sweeps that are written to disk as they go, and taken up again where they stopped."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import os
 import sys
 import zipfile
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,35 +16,38 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_integer
-from hhtjax.description import VERSION, all_concrete
+from hhtjax.description import VERSION, PyTree, Real, all_concrete
 from hhtjax.primitives import or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.output import require_output
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_inputs import Inputs
+from hhtjax.steppers.stepper import Stepper
+from hhtjax.systems.events import Event
+from hhtjax.systems.system import AnySystem
 
 
 def sweep_to_disk(
-    folder,
-    system,
-    stepper,
-    q0,
-    v0=None,
-    params=None,
+    folder: str | Path,
+    system: AnySystem,
+    stepper: Stepper,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
     *,
-    z0=None,
-    dts,
-    duration=None,
-    num_samples=None,
-    times=None,
-    t0=0.0,
-    in_axes=None,
-    chunk=4096,
-    progress=False,
-    events=None,
-    max_events=2,
-    keep_events=100,
-    output=None,
+    z0: PyTree = None,
+    dts: Real,
+    duration: Real = None,
+    num_samples: int | None = None,
+    times: Real | None = None,
+    t0: Real = 0.0,
+    in_axes: PyTree = None,
+    chunk: int = 4096,
+    progress: bool = False,
+    events: Sequence[Event] | None = None,
+    max_events: int = 2,
+    keep_events: int = 100,
+    output: Callable | None = None,
 ) -> Path:
     """The same as `sweep`, `chunk` members at a time, each chunk written to a file of its own in `folder`.
 
@@ -109,7 +115,7 @@ def sweep_to_disk(
     return folder
 
 
-def load_sweep(folder) -> dict[str, np.ndarray]:
+def load_sweep(folder: str | Path) -> dict[str, np.ndarray]:
     """What `sweep_to_disk` wrote: the leaves of the `Solution` by name, members first.
 
     Args:

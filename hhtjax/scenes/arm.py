@@ -10,12 +10,14 @@ References:
     Luh, Walker, Paul (1980); Walker, Orin (1982); Featherstone, Rigid Body Dynamics Algorithms (2008), Ch. 5-6.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from hhtjax.checks import require_number
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real
 from hhtjax.rotation import GENERATORS
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
@@ -23,38 +25,38 @@ from hhtjax.systems.system import System
 GRAVITY = 9.80665
 
 
-def product(A, B):
+def product(A: Array, B: Array):
     """Matrices times matrices, (..., n, m) by (..., m, k), elementwise: XLA fuses that, and small dots it does not."""
     return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
 
 
-def apply(A, x):
+def apply(A: Array, x: Array) -> Array:
     """Matrices times vectors, (..., n, m) by (..., m)."""
     return jnp.sum(A * x[..., None, :], axis=-1)
 
 
-def skew(a):
+def skew(a: Array) -> Array:
     """The matrices (..., 3, 3) of the cross product: skew(a) b = a x b."""
     generators = jnp.broadcast_to(jnp.asarray(GENERATORS, a.dtype), (*a.shape, 3, 3))
     return jnp.sum(a[..., None, None] * generators, axis=-3)
 
 
-def rotation(axis, angle):
+def rotation(axis: Array, angle: Array) -> Array:
     """R (..., 3, 3) by an angle about a unit vector; takes vectors of a link to the frame of the link before."""
     K, angle = skew(axis), angle[..., None, None]
     eye = jnp.broadcast_to(jnp.eye(3, dtype=K.dtype), K.shape)
     return eye + jnp.sin(angle) * K + (1 - jnp.cos(angle)) * product(K, K)
 
 
-def joint_torques(q, v, t, params):
+def joint_torques(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """-k (q - rest) - c v. Angles are relative, so the reactions on the links before need no terms."""
     return -params["k"] * (q - params["rest"]) - params["c"] * v
 
 
-def lagrangian(q, v, t, params):
+def lagrangian(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """L: over the links, the sum of m u.u/2 + Omega.(I Omega)/2 + m g.x; u and x of the centre of mass."""
 
-    def add_link(before, link):
+    def add_link(before: tuple, link: tuple):
         Omega, u, g, gx, L = before  # in the frame of the link before; u and gx = g.x of its joint
         q, v, axis, offset, mass, com, inertia = link
         R = rotation(axis, q).T
@@ -71,7 +73,7 @@ def lagrangian(q, v, t, params):
     return lax.scan(add_link, base, (q, v, *links))[0][-1]
 
 
-def frames(q, params):
+def frames(q: Array, params: PyTree):
     """R (N, 3, 3) and x (N, 3): the frame of each link and the place of its joint, in the base frame."""
     R, x = jnp.eye(3, dtype=q.dtype), jnp.zeros(3, q.dtype)
     placed = []
@@ -82,7 +84,7 @@ def frames(q, params):
     return jnp.stack(R), jnp.stack(x)
 
 
-def axes_and_inertias(q, params):
+def axes_and_inertias(q: Array, params: PyTree):
     """S (N, 6) of the joints and J (N, 6, 6) of the links, as spatial vectors and matrices at the base.
 
     The velocity of a link is (Omega, u), with u of its point at the origin of the base: S_i for v_i = 1. J_i
@@ -96,7 +98,7 @@ def axes_and_inertias(q, params):
     return jnp.concatenate([axis, apply(skew(x), axis)], axis=1), J
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M_ij = S_i . (sum of J over the links that both joints carry) S_j: composite rigid bodies."""
     S, J = axes_and_inertias(q, params)
     U = _inward(q)
@@ -105,7 +107,7 @@ def mass(q, params):
     return jnp.where(U.T > 0, M, M.T)
 
 
-def force(q, v, t, params):
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q: the joint torques, less those that motion without joint acceleration needs: recursive Newton-Euler."""
     S, J = axes_and_inertias(q, params)
     U, rates = _inward(q), S * v[:, None]
@@ -117,7 +119,7 @@ def force(q, v, t, params):
     return joint_torques(q, v, t, params) - jnp.sum(S * product(U.T, wrench), axis=1)
 
 
-def _inward(q):
+def _inward(q: Array) -> Array:
     """U (N, N): 1 where joint j carries link i. U x sums from the base to each link, U^T x from each to the tip."""
     return jnp.tril(jnp.ones((q.size, q.size), q.dtype))
 
@@ -126,7 +128,17 @@ newton_euler = System(mass, force)
 lagrange = System.from_lagrangian(lagrangian, joint_torques)
 
 
-def chain(axis, offset, mass, com, inertia, k, c, rest, gravity=(0.0, 0.0, -GRAVITY)):
+def chain(
+    axis: PyTree,
+    offset: PyTree,
+    mass: PyTree,
+    com: PyTree,
+    inertia: PyTree,
+    k: PyTree,
+    c: PyTree,
+    rest: PyTree,
+    gravity: PyTree = (0.0, 0.0, -GRAVITY),
+):
     """The params of an open chain of N joints: a dict of arrays.
 
     Args:
@@ -167,7 +179,7 @@ def chain(axis, offset, mass, com, inertia, k, c, rest, gravity=(0.0, 0.0, -GRAV
     return params
 
 
-def _real(name, received):
+def _real(name: str, received: PyTree) -> Array:
     """A float array, checked."""
     try:
         value = received if is_array(received) else np.asarray(received)
@@ -181,7 +193,7 @@ def _real(name, received):
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.result_type(float))
 
 
-def swing(joints=6) -> Scene:
+def swing(joints: int = 6) -> Scene:
     """A six-axis arm of 45 kg and 1.2 m, let go from a bent pose; or its first few joints.
 
     Base yaw, shoulder and elbow pitch on soft springs, wrist roll, wrist pitch and tool roll on stiff

@@ -6,8 +6,11 @@ Without drag (c = 0), from rest at q = h over the floor, impact k = 1, 2, ... is
 T = sqrt(8 h/g), and the ball is at rest from T (1/2 + e/(1 - e)) on: infinitely many impacts in a finite time (Zeno).
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -15,32 +18,32 @@ from hhtjax.systems.system import System
 GRAVITY = 9.81
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M, a diagonal."""
     return params["m"] * jnp.ones(q.size, q.dtype)
 
 
-def weight_and_drag(q, v, t, params):
+def weight_and_drag(q, v, t, params: PyTree):
     """Q of a ball."""
     return -params["m"] * params["g"] - params["c"] * jnp.abs(v) * v
 
 
-def no_force(q, v, t, params):
+def no_force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q of balls on a level line."""
     return jnp.zeros(q.size, q.dtype)
 
 
-def height(q, v, t, params):
+def height(q, v, t, params: PyTree):
     """Over the floor, m."""
     return q[0] - params["floor"]
 
 
-def distance(q, v, t, params):
+def distance(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Between two balls, m."""
     return q[1] - q[0] - params["diameter"]
 
 
-def bouncing(restitution=0.8, drag=0.1) -> EventScene:
+def bouncing(restitution: Real = 0.8, drag: float = 0.1) -> EventScene:
     """Dropped from 1 m: two impacts in 1.5 s (SI units).
 
     Args:
@@ -54,7 +57,7 @@ def bouncing(restitution=0.8, drag=0.1) -> EventScene:
     return EventScene(System(mass, weight_and_drag), params, array([1.0]), array([0.0]), 1.5, events)
 
 
-def two(restitution=1.0) -> EventScene:
+def two(restitution: Real = 1.0) -> EventScene:
     """One runs into another of the same mass, which is at rest; elastic, they change their velocities (SI units).
 
     Args:

@@ -3,29 +3,32 @@
 s = v - u,    |tau_i| <= F_i (1 + stiction exp(-|s_i|/vs))
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import PyTree
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
-def mass(q, params):
+def mass(q, params: PyTree):
     """M, a diagonal."""
     return params["m"]
 
 
-def force(q, v, t, params):
+def force(q, v, t, params: PyTree):
     """Q, without the friction."""
     spring = params["between"] * (q[1] - q[0]) * jnp.array([1.0, -1.0], q.dtype)
     return spring - params["k"] * q - params["c"] * v
 
 
-def sliding(q, v, t, params):
+def sliding(q, v, t, params: PyTree):
     """Velocities relative to the belt."""
     return v - params["u"]
 
 
-def limit(q, v, t, params):
+def limit(q, v, t, params: PyTree):
     """F, with a Stribeck curve."""
     return params["F"] * (1 + params["stiction"] * jnp.exp(-jnp.abs(sliding(q, v, t, params)) / params["vs"]))
 

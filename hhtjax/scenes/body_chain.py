@@ -11,36 +11,39 @@ joint is the origin. Gravity g (m/s^2) is along -z.
     of the joints on the rods below
 """
 
+from __future__ import annotations
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_integer, require_number
+from hhtjax.description import PyTree
 from hhtjax.rotation import cross
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
-def inertia(params):
+def inertia(params: PyTree):
     """The diagonal of I, kg m^2."""
     m, l2, r2 = params["m"], params["l"] ** 2, params["r"] ** 2
     return m * jnp.stack([l2 / 12 + r2 / 2, l2 / 12 + r2 / 2, r2])
 
 
-def mass(q, params):
+def mass(q, params: PyTree):
     """The diagonal of M."""
     N = len(q["x"])
     return jnp.concatenate([jnp.tile(inertia(params), N), jnp.full(3 * N, params["m"])])
 
 
-def force(q, v, t, params):
+def force(q, v, t, params: PyTree):
     """Gyroscopic moments and weights."""
     Om = v["R"]
     weight = jnp.stack([jnp.zeros_like(params["g"]), jnp.zeros_like(params["g"]), -params["m"] * params["g"]])
     return {"R": -jax.vmap(cross)(Om, inertia(params)[None, :] * Om), "x": jnp.tile(weight, (len(Om), 1))}
 
 
-def joints(q, t, params):
+def joints(q, t, params: PyTree):
     """Phi: upper end of each rod, less the lower end of the rod above."""
     half = params["l"] / 2 * q["R"][:, :, 2]
     above = jnp.concatenate([jnp.zeros_like(half[:1]), (q["x"] - half)[:-1]])

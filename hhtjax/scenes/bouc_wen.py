@@ -7,44 +7,47 @@ Workshop on Nonlinear System Identification Benchmarks, Brussels 2016, with nu =
 as beta gamma and beta delta only.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M = [m]."""
     return params["m"] * jnp.ones(1, q.dtype)
 
 
-def restoring(q, v, z, params):
+def restoring(q: Array, v: Array, z: Array, params: PyTree) -> Array:
     """-(c v + k q + z)."""
     return -(params["c"] * v + params["k"] * q + z)
 
 
-def force(q, v, z, t, params):
+def force(q: Array, v: Array, z: Array, t: Real, params: PyTree) -> Array:
     """Q with a harmonic input, u = amplitude sin(frequency t)."""
     return restoring(q, v, z, params) + params["amplitude"] * jnp.sin(params["frequency"] * t)
 
 
-def internal(q, v, z, t, params):
+def internal(q: Array, v: Array, z: Array, t: Real, params: PyTree) -> Array:
     """zdot, for nu = 1."""
     return params["alpha"] * v - params["beta_gamma"] * jnp.abs(v) * z - params["beta_delta"] * v * jnp.abs(z)
 
 
-def sampled_mass(q, params):
+def sampled_mass(q, params: PyTree):
     """M for `sampled_force`."""
     return mass(q, params[0])
 
 
-def sampled_force(q, v, z, t, params):
+def sampled_force(q, v, z, t, params: PyTree):
     """Q with a measured input: params is a pair (parameters, u), u made by `hhtjax.sampled` or the like."""
     params, u = params
     return restoring(q, v, z, params) + u(t)
 
 
-def sampled_internal(q, v, z, t, params):
+def sampled_internal(q, v, z, t, params: PyTree):
     """zdot for `sampled_force`."""
     return internal(q, v, z, t, params[0])
 
@@ -60,7 +63,7 @@ def benchmark() -> InternalScene:
     return InternalScene(System(mass, force, internal=internal), params, zero, zero, 0.1, zero)
 
 
-def measured(params, u, duration) -> InternalScene:
+def measured(params: PyTree, u, duration) -> InternalScene:
     """The oscillator at rest, under a given input u.
 
     Args:

@@ -6,51 +6,54 @@ The damper makes the force jump at the gap, so `on` is a mode in params, which a
 jump. A stop holds on to the mass until it is back at the gap, as one whose own mass and preload are left out does.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import PyTree
 from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import System
 
 
-def mass(q, params):
+def mass(q, params: PyTree):
     """M = [m]."""
     return params["m"] * jnp.ones(1, q.dtype)
 
 
-def spring_and_drive(q, v, t, params):
+def spring_and_drive(q, v, t, params: PyTree):
     """Q without stops."""
     return params["A"] * jnp.cos(params["W"] * t) - params["k"] * q
 
 
-def with_upper(q, v, t, params):
+def with_upper(q, v, t, params: PyTree):
     """Q with a stop at q = gap."""
     push = params["K"] * (q - params["gap"]) + params["C"] * v
     return spring_and_drive(q, v, t, params) - params["upper"] * push
 
 
-def with_both(q, v, t, params):
+def with_both(q, v, t, params: PyTree):
     """Q with stops at q = gap and q = -gap."""
     push = params["K"] * (q + params["gap"]) + params["C"] * v
     return with_upper(q, v, t, params) - params["lower"] * push
 
 
-def before_upper(q, v, t, params):
+def before_upper(q, v, t, params: PyTree):
     """Falls to zero at q = gap, on the way there and on the way back."""
     return (params["gap"] - q[0]) * (1 - 2 * params["upper"])
 
 
-def before_lower(q, v, t, params):
+def before_lower(q, v, t, params: PyTree):
     """The same at q = -gap."""
     return (params["gap"] + q[0]) * (1 - 2 * params["lower"])
 
 
-def turn_upper(params):
+def turn_upper(params: PyTree):
     """The upper stop on or off."""
     return params | {"upper": 1 - params["upper"]}
 
 
-def turn_lower(params):
+def turn_lower(params: PyTree):
     """The lower one."""
     return params | {"lower": 1 - params["lower"]}
 

@@ -5,10 +5,14 @@ masses m (kg) at their ends, joint stiffness k (N m/rad) and damping c (N m s/ra
 trigonometry: a module with `sin` and `cos`, jax.numpy or hhtjax.trigonometry.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import cache, partial
 
 import jax.numpy as jnp
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import EventScene, Scene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -16,14 +20,14 @@ from hhtjax.systems.system import System
 GRAVITY = 9.80665
 
 
-def mass(q, params, trigonometry=jnp):
+def mass(q: Array, params: PyTree, trigonometry=jnp) -> Array:
     """M = [[l1^2 (m1 + m2), l1 l2 m2 cos(q1 - q2)], [., l2^2 m2]]."""
     (m1, m2), (l1, l2) = params["m"], params["l"]
     coupling = l1 * l2 * m2 * trigonometry.cos(q[0] - q[1])
     return jnp.array([[l1**2 * (m1 + m2), coupling], [coupling, l2**2 * m2]])
 
 
-def weight_and_inertia(q, v, params, trigonometry=jnp):
+def weight_and_inertia(q: Array, v: Array, params: PyTree, trigonometry=jnp) -> Array:
     """Q without the joint torques."""
     (m1, m2), (l1, l2), g = params["m"], params["l"], params["g"]
     coupling = l1 * l2 * m2 * trigonometry.sin(q[0] - q[1])
@@ -35,25 +39,25 @@ def weight_and_inertia(q, v, params, trigonometry=jnp):
     )
 
 
-def joint_torques(q, v, params):
+def joint_torques(q: Array, v: Array, params: PyTree):
     """Torque of each joint's spring and damper, both at rest at q = 0."""
     (k1, k2), (c1, c2) = params["k"], params["c"]
     return -k1 * q[0] - c1 * v[0], -k2 * (q[1] - q[0]) - c2 * (v[1] - v[0])
 
 
-def force_as_printed(q, v, t, params, trigonometry=jnp):
+def force_as_printed(q: Array, v: Array, t: Real, params: PyTree, trigonometry=jnp) -> Array:
     """Q as Kim et al. computed it: joint 2 acts on link 2 without a reaction on link 1."""
     return weight_and_inertia(q, v, params, trigonometry) + jnp.array(joint_torques(q, v, params))
 
 
-def force(q, v, t, params, trigonometry=jnp):
+def force(q: Array, v: Array, t: Real, params: PyTree, trigonometry=jnp) -> Array:
     """Q with the reaction of joint 2 on link 1."""
     first, second = joint_torques(q, v, params)
     return weight_and_inertia(q, v, params, trigonometry) + jnp.array([first - second, second])
 
 
 @cache  # equal functions for equal systems
-def _using(trigonometry, function):
+def _using(trigonometry, function: Callable):
     return function if trigonometry is jnp else partial(function, trigonometry=trigonometry)
 
 
@@ -68,7 +72,7 @@ def free(trigonometry=jnp) -> Scene:
     return Scene(system, params, array([0.0, 0.0]), array([0.0, 0.0]), 10.0)
 
 
-def stiff(as_printed=False, trigonometry=jnp) -> Scene:
+def stiff(as_printed: bool = False, trigonometry=jnp) -> Scene:
     """Stiff joints, the second one damped by 10000 N m s/rad.
 
     Args:
@@ -81,12 +85,12 @@ def stiff(as_printed=False, trigonometry=jnp) -> Scene:
     return Scene(system, params, array([0.0, 0.0]), array([0.0, 0.0]), 8.0)
 
 
-def left_of_stop(q, v, t, params):
+def left_of_stop(q, v, t, params: PyTree):
     """The angle of joint 2 that is left before its stop, rad."""
     return params["stop"] - (q[1] - q[0])
 
 
-def stopped(restitution=0.7) -> EventScene:
+def stopped(restitution: Real = 0.7) -> EventScene:
     """Free, with a stop at the angle of joint 2, as an elbow has: the links meet it three times.
 
     Args:

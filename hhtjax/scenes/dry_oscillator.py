@@ -5,23 +5,26 @@
 Free, without damping and stiction, its motion is half cosines about F/k and -F/k in turn, until the spring is too weak.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M = [m]."""
     return params["m"] * jnp.ones(1, q.dtype)
 
 
-def force(q, v, t, params):
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q, without the friction."""
     return params["A"] * jnp.sin(params["W"] * t) - params["k"] * q - params["c"] * v
 
 
-def limit(q, v, t, params):
+def limit(q: Array, v: Array, t: Real, params: PyTree):
     """F, with a Stribeck curve."""
     return params["F"] * (1 + params["stiction"] * jnp.exp(-jnp.abs(v) / params["vs"]))
 
@@ -35,7 +38,7 @@ def free() -> Scene:
     return Scene(SYSTEM, params, array([0.5]), array([0.0]), 2.2)
 
 
-def driven(stiction=0.3) -> Scene:
+def driven(stiction: float = 0.3) -> Scene:
     """Stick and slip: 20 switches (SI units).
 
     Args:

@@ -1,33 +1,36 @@
 """One degree of freedom: m w + c v + k q + k2 q^2 + k3 q^3 = u(t) + offset, Duffing's oscillator."""
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M = [m]."""
     return jnp.asarray(params["m"], q.dtype).reshape(1)
 
 
-def restoring(q, v, params):
+def restoring(q: Array, v: Array, params: PyTree) -> Array:
     """-(c v + k q + k2 q^2 + k3 q^3)."""
     return -(params["c"] * v + q * (params["k"] + q * (params["k2"] + q * params["k3"])))
 
 
-def force(q, v, t, params):
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q with a harmonic input, u = amplitude cos(frequency t)."""
     return restoring(q, v, params) + params["amplitude"] * jnp.cos(params["frequency"] * t)
 
 
-def sampled_force(q, v, t, params):
+def sampled_force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q with a measured input: params is a pair (parameters, u), u made by `hhtjax.sampled`."""
     params, u = params
     return restoring(q, v, params) + u(t) + params["offset"]
 
 
-def sampled_mass(q, params):
+def sampled_mass(q: Array, params: PyTree) -> Array:
     """M for `sampled_force`."""
     return mass(q, params[0])
 
@@ -44,7 +47,7 @@ def hardening_spring() -> Scene:
     return Scene(System(mass, force), params, array([1.0]), array([0.0]), 2.0)
 
 
-def measured(params, u, q0, v0, duration) -> Scene:
+def measured(params: PyTree, u, q0: PyTree, v0: PyTree, duration) -> Scene:
     """An oscillator under a sampled input.
 
     Args:

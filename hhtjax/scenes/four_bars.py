@@ -16,37 +16,40 @@ References:
     (2006), 179-190: benchmark A02, "N four-bar mechanism".
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_integer
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 GRAVITY = 9.81
 
 
-def couplers(q):
+def couplers(q: Array) -> Array:
     """(N + 1, N + 1): 1 where a coupler joins B_i and B_j."""
     upper = jnp.eye(len(q), k=1, dtype=q.dtype)
     return upper + upper.T
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M, constant: a bar contributes m/6 [[2, 1], [1, 2]] to its two ends, in x and in y."""
     joined = couplers(q)
     bars = jnp.sum(joined, axis=0) + 1
     return jnp.kron(params["m"] / 6 * (joined + 2 * jnp.diag(bars)), jnp.eye(2, dtype=q.dtype))
 
 
-def force(q, v, t, params):
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q: half of each bar's weight at each of its ends."""
     bars = jnp.sum(couplers(q), axis=0) + 1
     weight = params["m"] * params["g"] / 2 * bars
     return jnp.stack([jnp.zeros_like(weight), -weight], axis=1)
 
 
-def constraint(q, t, params):
+def constraint(q: Array, t: Real, params: PyTree) -> Array:
     """Phi: cranks, then couplers."""
     pivots = params["l"] * jnp.arange(len(q), dtype=q.dtype)
     cranks = q - jnp.stack([pivots, jnp.zeros_like(pivots)], axis=1)
@@ -54,7 +57,7 @@ def constraint(q, t, params):
     return (jnp.sum(bars**2, axis=1) - params["l"] ** 2) / 2
 
 
-def four_bars(loops=2) -> Scene:
+def four_bars(loops: int = 2) -> Scene:
     """N = loops squares of 1 m bars of 1 kg, whose upper row starts at 1 m/s.
 
     Args:

@@ -7,29 +7,32 @@ J. M. T. Thompson, R. Ghaffari, Chaos after period-doubling bifurcations in the 
 Phys. Lett. A 91 (1982).
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import PyTree, Real
 from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
 
 
-def mass(q, params):
+def mass(q, params: PyTree):
     """M = [m]."""
     return params["m"] * jnp.ones(1, q.dtype)
 
 
-def force(q, v, t, params):
+def force(q, v, t, params: PyTree):
     """Q before the stop."""
     return params["A"] * jnp.cos(params["W"] * t) - params["k"] * q - params["c"] * v
 
 
-def room(q, v, t, params):
+def room(q, v, t, params: PyTree):
     """How far the stop is, m."""
     return params["wall"] - q[0]
 
 
-def driven(restitution=0.8) -> EventScene:
+def driven(restitution: Real = 0.8) -> EventScene:
     """Stop at the middle of the oscillation, driven at 2.6 times the frequency without it (SI units).
 
     Args:

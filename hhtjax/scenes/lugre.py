@@ -5,24 +5,27 @@
 C. Canudas de Wit, H. Olsson, K. Astrom, P. Lischinsky, IEEE Trans. Automatic Control 40, 1995, 419-425.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import PyTree
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
 
-def mass(q, params):
+def mass(q, params: PyTree):
     """M = [m]."""
     return params["m"] * jnp.ones(1, q.dtype)
 
 
-def internal(q, v, z, t, params):
+def internal(q, v, z, t, params: PyTree):
     """zdot."""
     steady = params["coulomb"] + (params["static"] - params["coulomb"]) * jnp.exp(-((v / params["stribeck"]) ** 2))
     return v - params["sigma0"] * jnp.abs(v) * z / steady
 
 
-def force(q, v, z, t, params):
+def force(q, v, z, t, params: PyTree):
     """Q: the spring, whose far end moves at a constant speed, and friction."""
     friction = params["sigma0"] * z + params["sigma1"] * internal(q, v, z, t, params) + params["sigma2"] * v
     return params["k"] * (params["speed"] * t - q) - friction

@@ -1,22 +1,25 @@
 """A mass on a spring with Maxwell branches, spring and damper in series, of time constants far apart."""
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import PyTree
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
 
-def mass(q, params):
+def mass(q, params: PyTree):
     """M = [m]."""
     return params["m"] * jnp.ones(1, q.dtype)
 
 
-def force(q, v, z, t, params):
+def force(q, v, z, t, params: PyTree):
     """Q: spring, the forces z of the branches, and an input."""
     return params["amplitude"] * jnp.cos(params["frequency"] * t) - params["k"] * q - jnp.sum(z)
 
 
-def internal(q, v, z, t, params):
+def internal(q, v, z, t, params: PyTree):
     """zdot = k v - z/tau of each branch."""
     return params["stiffness"] * v - z / params["tau"]
 

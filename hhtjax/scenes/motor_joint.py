@@ -1,25 +1,28 @@
 """A joint on a geared motor, under a PI controller with velocity feedback: its current and the integral are states."""
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M = [inertia of the link, and of the rotor seen through the gear]."""
     return (params["link_inertia"] + params["gear"] ** 2 * params["rotor_inertia"]) * jnp.ones(1, q.dtype)
 
 
-def force(q, v, z, t, params):
+def force(q: Array, v: Array, z: dict, t: Real, params: PyTree) -> Array:
     """Q: torque of the motor, friction of the bearing, and weight; q = 0 hangs down."""
     torque = params["gear"] * params["torque_constant"] * z["current"]
     return torque - params["friction"] * v - params["weight"] * jnp.sin(q)
 
 
-def internal(q, v, z, t, params):
+def internal(q: Array, v: Array, z: dict, t: Real, params: PyTree):
     """L di/dt = U - R i - (back EMF), and the rate of the integral: the error of the angle."""
     error = params["amplitude"] * jnp.sin(params["frequency"] * t) - q
     voltage = params["kp"] * error + params["ki"] * z["integral"] - params["kd"] * v

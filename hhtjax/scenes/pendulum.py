@@ -8,10 +8,13 @@ point with a horizontal velocity, by default as in Cardona, Geradin (1989), Sec.
     minimal     q = (angle from the lowest point,)    m l^2 w = -m g l sin q
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import EventScene, Scene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -20,38 +23,38 @@ GRAVITY = 9.81
 DURATION = 1.0
 
 
-def point_mass(q, params):
+def point_mass(q: Array, params: PyTree) -> Array:
     """M = diag(m, m)."""
     return jnp.full(2, params["m"], q.dtype)
 
 
-def weight(q, v, t, params):
+def weight(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q = (0, -m g)."""
     return jnp.array([0.0, -params["m"] * params["g"]], q.dtype)
 
 
-def rod(q, t, params):
+def rod(q: Array, t: Real, params: PyTree) -> Array:
     """Phi = (x^2 + y^2 - l^2)/2."""
     return (jnp.sum(q**2, keepdims=True) - params["l"] ** 2) / 2
 
 
-def weight_and_spring(q, v, t, params):
+def weight_and_spring(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q with a spring of stiffness k (N/m) and rest length l between the origin and the mass."""
     r = jnp.sqrt(jnp.sum(q**2))
     return weight(q, v, t, params) - params["k"] * (r - params["l"]) / r * q
 
 
-def inertia(q, params):
+def inertia(q, params: PyTree):
     """M = [m l^2]."""
     return jnp.full(1, params["m"] * params["l"] ** 2, q.dtype)
 
 
-def moment_of_weight(q, v, t, params):
+def moment_of_weight(q, v, t, params: PyTree):
     """Q = [-m g l sin q]."""
     return -params["m"] * params["g"] * params["l"] * jnp.sin(q)
 
 
-def cartesian(speed=2.505, length=0.5) -> Scene:
+def cartesian(speed: float = 2.505, length: float = 0.5) -> Scene:
     """The rod as a constraint.
 
     Args:
@@ -64,7 +67,7 @@ def cartesian(speed=2.505, length=0.5) -> Scene:
     return Scene(System(point_mass, weight, rod), params, array([0.0, -length]), array([speed, 0.0]), DURATION)
 
 
-def elastic(k=1e6, speed=2.505, length=0.5) -> Scene:
+def elastic(k: float = 1e6, speed: float = 2.505, length: float = 0.5) -> Scene:
     """A spring of stiffness k (N/m) instead of the rod, whose motion it tends to as 1/k.
 
     It starts stretched by as much as carries the weight and turns the mass, k (r - l) = m (g + speed^2/r), so the
@@ -84,7 +87,7 @@ def elastic(k=1e6, speed=2.505, length=0.5) -> Scene:
     return Scene(System(point_mass, weight_and_spring), params, array([0.0, -r]), array([speed, 0.0]), DURATION)
 
 
-def minimal(speed=2.505, length=0.5) -> Scene:
+def minimal(speed: float = 2.505, length: float = 0.5) -> Scene:
     """The same motion as `cartesian` in one angle: (x, y) = l (sin q, -cos q).
 
     Args:
@@ -97,12 +100,12 @@ def minimal(speed=2.505, length=0.5) -> Scene:
     return Scene(System(inertia, moment_of_weight), params, array([0.0]), array([speed / length]), DURATION)
 
 
-def room_before_wall(q, v, t, params):
+def room_before_wall(q, v, t, params: PyTree):
     """How far the mass is from the wall, m."""
     return params["wall"] - q[0]
 
 
-def walled(wall=0.3, restitution=0.7) -> EventScene:
+def walled(wall: float = 0.3, restitution: Real = 0.7) -> EventScene:
     """`cartesian` with a vertical wall on its way: the impulse keeps the length of the rod.
 
     Args:
@@ -119,7 +122,7 @@ def walled(wall=0.3, restitution=0.7) -> EventScene:
     return EventScene(scene.system, params, scene.q0, scene.v0, DURATION, events)
 
 
-def _params(caller, speed, length):
+def _params(caller: str, speed: float, length: float):
     require_number(caller, "speed", speed, np.isfinite, "be finite")
     require_number(caller, "length", length, lambda x: 0 < x < np.inf, "be positive and finite")
     return {"m": 1.0, "l": length, "g": GRAVITY}

@@ -1,11 +1,13 @@
 """A scene: a system with everything that a run needs besides a stepper and a step size."""
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import all_concrete
+from hhtjax.description import Array, PyTree, all_concrete
 from hhtjax.description.presentation import shown
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import LinearSystem, System
@@ -22,9 +24,9 @@ class Scene(NamedTuple):
     """
 
     system: System | LinearSystem
-    params: Any
-    q0: Any
-    v0: Any
+    params: PyTree
+    q0: PyTree
+    v0: PyTree
     duration: float
 
 
@@ -40,9 +42,9 @@ class EventScene(NamedTuple):
     """
 
     system: System | LinearSystem
-    params: Any
-    q0: Any
-    v0: Any
+    params: PyTree
+    q0: PyTree
+    v0: PyTree
     duration: float
     events: tuple[Event, ...]
 
@@ -58,14 +60,14 @@ class InternalScene(NamedTuple):
     """
 
     system: System
-    params: Any
-    q0: Any
-    v0: Any
+    params: PyTree
+    q0: PyTree
+    v0: PyTree
     duration: float
-    z0: Any
+    z0: PyTree
 
 
-def array(values):
+def array(values: PyTree) -> Array:
     """An array of floats; of numbers by NumPy, which has nothing to compile."""
     dtype = jnp.result_type(float)
     known = all_concrete(values)

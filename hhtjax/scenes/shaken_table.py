@@ -13,8 +13,11 @@ sin(W t) = g/(A W^2), and the rest of the motion is a parabola up to the next co
 J. Guckenheimer, P. Holmes, Nonlinear Oscillations, Dynamical Systems, and Bifurcations of Vector Fields, 1983, Ch. 2.4.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import PyTree
 from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -22,43 +25,43 @@ from hhtjax.systems.system import System
 GRAVITY = 9.81
 
 
-def mass(q, params):
+def mass(q, params: PyTree):
     """M, a diagonal: of the body and of s, for which any will do."""
     return params["m"] * jnp.ones(2, q.dtype)
 
 
-def weight(q, v, t, params):
+def weight(q, v, t, params: PyTree):
     """Q; nothing moves s."""
     return jnp.array([-params["m"] * params["g"], 0.0], q.dtype)
 
 
-def over_table(q, t, params):
+def over_table(q, t, params: PyTree):
     """Of the body, m."""
     return q[0] - params["A"] * jnp.sin(params["W"] * t)
 
 
-def contact(q, t, params):
+def contact(q, t, params: PyTree):
     """Phi: the body on the table, or s at 0."""
     on = params["on"]
     return (on * over_table(q, t, params) + (1 - on) * q[1])[None]
 
 
-def before_landing(q, v, t, params):
+def before_landing(q, v, t, params: PyTree):
     """Falls to zero where the body in flight meets the table."""
     return jnp.where(params["on"] == 1, 1.0, over_table(q, t, params))
 
 
-def before_leaving(q, v, t, params, multipliers):
+def before_leaving(q, v, t, params: PyTree, multipliers):
     """Falls to zero where nothing presses the riding body onto the table any more."""
     return jnp.where(params["on"] == 1, multipliers[0], 1.0)
 
 
-def land(params):
+def land(params: PyTree):
     """The constraint on."""
     return params | {"on": 0 * params["on"] + 1}
 
 
-def leave(params):
+def leave(params: PyTree):
     """The constraint off."""
     return params | {"on": 0 * params["on"]}
 
@@ -66,7 +69,7 @@ def leave(params):
 LANDING, LEAVING = Event(before_landing, reset=impact(0.0), switch=land), Event(before_leaving, switch=leave)
 
 
-def shaken_table(strength=2.0) -> EventScene:
+def shaken_table(strength: float = 2.0) -> EventScene:
     """Two flights in 1.3 s, from a ride at the table's mean height (SI units).
 
     Args:

@@ -7,22 +7,25 @@ Crank and rod are slender and uniform, of lengths l (2,) with l1 < l2; m (3,): m
 g acts along -y. A spring k and a damper c act on the slider, the spring at rest at x = rest; a moment on the crank.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 GRAVITY = 9.80665
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M = [[(m1/3 + m2) l1^2, m2 l1 l2 cos(q1 - q2)/2, 0], [., m2 l2^2/3, 0], [0, 0, m3]]."""
     (m1, m2, m3), (l1, l2) = params["m"], params["l"]
     coupling = m2 * l1 * l2 / 2 * jnp.cos(q[0] - q[1])
     return jnp.array([[(m1 / 3 + m2) * l1**2, coupling, 0.0], [coupling, m2 * l2**2 / 3, 0.0], [0.0, 0.0, m3]], q.dtype)
 
 
-def force(q, v, t, params):
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q: weight, inertia forces, the moment, the spring and the damper."""
     (m1, m2, _), (l1, l2), g = params["m"], params["l"], params["g"]
     coupling = m2 * l1 * l2 / 2 * jnp.sin(q[0] - q[1])
@@ -35,7 +38,7 @@ def force(q, v, t, params):
     )
 
 
-def constraint(q, t, params):
+def constraint(q: Array, t: Real, params: PyTree) -> Array:
     """Phi = (l1 cos q1 + l2 cos q2 - x, l1 sin q1 + l2 sin q2)."""
     l1, l2 = params["l"]
     return jnp.array(
@@ -53,7 +56,7 @@ def driven() -> Scene:
     return _turning(0.0, moment=5.0, k=100.0, c=20.0)
 
 
-def _turning(speed, **loads):
+def _turning(speed: float, **loads: float) -> Scene:
     """Stretched out, q = (0, 0, l1 + l2), with the crank at `speed`, rad/s."""
     l1, l2 = 0.15, 0.45
     params = {"m": (0.5, 1.0, 0.8), "l": (l1, l2), "g": GRAVITY, "rest": l2}

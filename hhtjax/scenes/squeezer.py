@@ -12,6 +12,8 @@ References:
     "Andrews' squeezing mechanism"; Cardona, Geradin (1989), Sec. 4.3. Multipliers here are minus those of the test set.
 """
 
+from __future__ import annotations
+
 from operator import itemgetter
 
 import jax.numpy as jnp
@@ -19,21 +21,22 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import require_number
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
 
-def along(angle):
+def along(angle: Array) -> Array:
     """The unit vector at an angle from the x axis."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
-def across(angle):
+def across(angle: Array):
     """The same, turned by a right angle."""
     return jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M, block diagonal: K1 and K2; K3; K4 and K5; K6 and K7."""
     _, theta, _, phi, _, omega, _ = q
     m1, m2, m3, m4, m5, m6, m7 = params["m"]
@@ -41,7 +44,7 @@ def mass(q, params):
     ra, rr, da, sa, sb, ta, tb = itemgetter("ra", "rr", "da", "sa", "sb", "ta", "tb")(params)
     e, ea, zt, zf, fa, u, ua, ub = itemgetter("e", "ea", "zt", "zf", "fa", "u", "ua", "ub")(params)
 
-    def two_bars(inner, outer, coupling):
+    def two_bars(inner: Array, outer: Array, coupling: Array):
         """M of inner, both and outer bar, from the inertias about pivot and joint; the joint carries the outer mass."""
         return inner + 2 * coupling + outer, outer + coupling, outer
 
@@ -57,7 +60,7 @@ def mass(q, params):
     return block_diag(*map(jnp.array, blocks))
 
 
-def spring_moment(gamma, params):
+def spring_moment(gamma: Array, params: PyTree) -> Array:
     """Moment of the spring on K3 about B."""
     sd, sc, c0, l0, B, C = itemgetter("sd", "sc", "c0", "l0", "B", "C")(params)
     spring = B + sd * along(gamma) - sc * across(gamma) - C
@@ -65,14 +68,14 @@ def spring_moment(gamma, params):
     return -c0 * (1 - l0 / length) * jnp.sum(spring * (sd * across(gamma) + sc * along(gamma)))
 
 
-def force(q, v, t, params):
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q: the moment on the crank, the spring, and the inertia forces within the pairs of bars."""
     _, theta, gamma, phi, _, omega, _ = q
     beta_dot, theta_dot, _, phi_dot, delta_dot, omega_dot, epsilon_dot = v
     m2, m4, m6 = params["m"][1], params["m"][3], params["m"][5]
     rr, da, e, ea, zt, zf, fa, u = itemgetter("rr", "da", "e", "ea", "zt", "zf", "fa", "u")(params)
 
-    def two_bars(slope, inner, outer):
+    def two_bars(slope: Array, inner: Array, outer: Array):
         """On the inner and the outer bar; slope is that of their coupling in M."""
         return -slope * outer * (outer + 2 * inner), slope * inner**2
 
@@ -82,7 +85,7 @@ def force(q, v, t, params):
     return jnp.array([K1 + params["moment"], K2, spring_moment(gamma, params), K4, K5, K6, K7])
 
 
-def constraint(q, t, params):
+def constraint(q: Array, t: Real, params: PyTree) -> Array:
     """Phi: P as the end of K2, less P as the end of K3, of K4 on K5, and of K6 on K7; two components each."""
     beta, theta, gamma, phi, delta, omega, epsilon = q
     rr, d, ss, e, zt, zf, u, A, B = itemgetter("rr", "d", "ss", "e", "zt", "zf", "u", "A", "B")(params)
@@ -96,7 +99,7 @@ def constraint(q, t, params):
     )
 
 
-def squeezer(moment=0.033) -> Scene:
+def squeezer(moment: float = 0.033) -> Scene:
     """From rest, under a constant moment on the crank, N m; two and a half turns in 0.03 s with the default one.
 
     q0 closes the loops for the lengths of the test set, and no others.

@@ -10,11 +10,14 @@ J = I + m l^2 diag(1, 0, 1) that about the origin (kg m^2).
 The first needs 3 unknowns a step and the second 9, or 12 when stabilised. L (N) is the force of the rod on the disk.
 """
 
+from __future__ import annotations
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.rotation import cross
 from hhtjax.scenes.scene import Scene, array
@@ -23,46 +26,46 @@ from hhtjax.systems.system import System
 DURATION = 0.5
 
 
-def disk_inertia(params):
+def disk_inertia(params: PyTree) -> Array:
     """I = m a^2/4 diag(1, 2, 1)."""
     quarter = params["m"] * params["a"] ** 2 / 4
     return jnp.array([quarter, 2 * quarter, quarter])
 
 
-def inertia(q, params):
+def inertia(q: Array, params: PyTree) -> Array:
     """J, a diagonal."""
     offset = params["m"] * params["l"] ** 2
     return disk_inertia(params) + jnp.array([offset, 0.0, offset], q.dtype)
 
 
-def weight(params):
+def weight(params: PyTree) -> Array:
     """-m g e3, in spatial components."""
     return jnp.array([0.0, 0.0, -params["m"] * params["g"]])
 
 
-def moment(R, Om, t, params):
+def moment(R: Array, Om: Array, t: Real, params: PyTree) -> Array:
     """l e2 x R^T (-m g e3) - Om x J Om."""
     arm = jnp.array([0.0, params["l"], 0.0])
     return cross(arm, matvec(R.T, weight(params))) - cross(Om, inertia(R, params) * Om)
 
 
-def mass(q, params):
+def mass(q: dict, params: PyTree) -> Array:
     """The diagonal of M: I and m."""
     return jnp.concatenate([disk_inertia(params), jnp.full(3, params["m"], q["x"].dtype)])
 
 
-def force(q, v, t, params):
+def force(q: dict, v: dict, t: Real, params: PyTree):
     """Gyroscopic moment and weight."""
     Om = v["R"]
     return {"R": -cross(Om, disk_inertia(params) * Om), "x": weight(params)}
 
 
-def rod(q, t, params):
+def rod(q: dict, t: Real, params: PyTree) -> Array:
     """Phi = x - l R e2, in m."""
     return q["x"] - params["l"] * q["R"][:, 1]
 
 
-def minimal(spin=150.0, inclination=0.0) -> Scene:
+def minimal(spin: float = 150.0, inclination: float = 0.0) -> Scene:
     """The top as a rotation alone.
 
     It starts with its rod horizontal, along y, turning about the vertical at just the rate that takes it through its
@@ -78,7 +81,7 @@ def minimal(spin=150.0, inclination=0.0) -> Scene:
     return Scene(System(inertia, moment), params, array(R), array(spin * Om), DURATION)
 
 
-def constrained(spin=150.0, inclination=0.0) -> Scene:
+def constrained(spin: float = 150.0, inclination: float = 0.0) -> Scene:
     """The same as a free disk, its centre held by the rod: 6 coordinates, 3 constraints.
 
     Args:
@@ -94,7 +97,7 @@ def constrained(spin=150.0, inclination=0.0) -> Scene:
     return Scene(System(mass, force, rod), params, q0, v0, DURATION)
 
 
-def _start(caller, spin, inclination):
+def _start(caller: str, spin: float, inclination: float):
     require_number(caller, "spin", spin, np.isfinite, "be finite")
     require_number(caller, "inclination", inclination, np.isfinite, "be finite")
     a, length = 0.25, 1.0

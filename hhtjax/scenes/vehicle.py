@@ -14,10 +14,13 @@ as in bump. The tyre pushes the wheel up by k_tyre (road - u). It is linear and 
 tyre is relieved of all its static load, as on the default one.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.sampled import sampled
 from hhtjax.systems.system import System
@@ -29,34 +32,34 @@ RUN_UP = 5.0  # m
 BUMP_LENGTH = 2.0  # m
 
 
-def mass(q, params):
+def mass(q: Array, params: PyTree) -> Array:
     """M, diagonal: sprung mass, pitch and roll inertia, four unsprung masses."""
     return jnp.concatenate([params["body"], params["wheel"]])
 
 
-def corner_heights(q, params):
+def corner_heights(q: Array, params: PyTree) -> Array:
     """Heights of the body's four corners, (4,); of v in the place of q, their rates."""
     return q[0] - params["x"] * q[1] + params["y"] * q[2]
 
 
-def spring(d, params):
+def spring(d: Array, params: PyTree) -> Array:
     """k d + k3 d^3."""
     return d * (params["k"] + params["k3"] * d**2)
 
 
-def damper(rate, params):
+def damper(rate: Real, params: PyTree) -> Array:
     """c v0 s (1 - r s); rate is positive in bump, negative in rebound."""
     v0 = params["v0"]
     s = rate / jnp.sqrt(v0**2 + rate**2)
     return params["c"] * v0 * s * (1 - params["r"] * s)
 
 
-def tyre(u, t, params):
+def tyre(u: Array, t: Real, params: PyTree) -> Array:
     """k_tyre (road - u): the wheel loads less the static ones."""
     return params["k_tyre"] * (params["road"](t) - u)
 
 
-def force(q, v, t, params):
+def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     """Q: on the body in heave, pitch and roll, and on the four wheels."""
     u = q[3:]
     S = spring(u - corner_heights(q, params), params) + damper(v[3:] - corner_heights(v, params), params)
@@ -64,7 +67,9 @@ def force(q, v, t, params):
     return jnp.concatenate([body, tyre(u, t, params) - S])
 
 
-def road(speed, duration, roughness=64e-6, bump=0.05, seed=0, wheelbase=2.7):
+def road(
+    speed: float, duration: Real, roughness: float = 64e-6, bump: float = 0.05, seed: int = 0, wheelbase: float = 2.7
+) -> np.ndarray:
     """Heights of the road under the four wheels at constant speed, every SAMPLING_PERIOD: (samples, 4), in m.
 
     Each track is a sum of sinusoids with random phases, whose amplitudes follow from the one-sided spectral density
@@ -119,7 +124,9 @@ def road(speed, duration, roughness=64e-6, bump=0.05, seed=0, wheelbase=2.7):
     return heights.reshape(4, samples).T
 
 
-def ride(speed=10.0, duration=4.0, roughness=64e-6, bump=0.05, seed=0) -> Scene:
+def ride(
+    speed: float = 10.0, duration: Real = 4.0, roughness: float = 64e-6, bump: float = 0.05, seed: int = 0
+) -> Scene:
     """A mid-size car from rest over the `road` of these arguments.
 
     params: body (3,), sprung mass and pitch and roll inertia; wheel, x, y, k, c, k_tyre (4,), in the order of the

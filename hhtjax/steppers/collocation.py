@@ -6,11 +6,14 @@ E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1, 1973, 241-25
 Struct. Dyn. 6, 1978, 99-117.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hhtjax.checks import require_number
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
 from hhtjax.steppers.implicit_solve import newton
@@ -19,8 +22,11 @@ from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.smooth_start import Corrections
 from hhtjax.steppers.stepper import State, Stepper
 
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
-def newmark_step(system, s, h, w, beta):
+
+def newmark_step(system: FlatSystem, s: State, h: Array, w: Array, beta: Real) -> State:
     """State at t + h by Newmark's formulas with gamma = 1/2, given the acceleration there."""
     t, q = s.t + h, s.q + system.located(h * s.v) + system.located(h**2 * ((0.5 - beta) * s.w + beta * w))
     return State(t, q, s.v + h / 2 * (s.w + w), w)
@@ -45,16 +51,25 @@ class Collocation(Stepper):
     options: Options
     order: int = 2
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """w0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
 
-    def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
+    def smoothed(
+        self,
+        system: FlatSystem,
+        state: State,
+        params: PyTree,
+        dt: Array,
+        moves: bool = True,
+        resolves: bool = False,
+        alone: bool = False,
+    ) -> State:
         """The state from which the first step goes, as of the `hht` family, but for 2 theta h."""
         dt = 2 * self.theta * dt
         return self.beginning.smoothed(system, state, params, dt, moves, resolves, alone)._replace(a=None)
 
-    def jumped(self, system, before, after, old, new, dt, answer):
+    def jumped(self, system: FlatSystem, before, after, old, new, dt: Array, answer):
         """The same where held inputs jump."""
         return self.beginning.jumped(system, before, after, old, new, 2 * self.theta * dt, answer)
 
@@ -62,23 +77,23 @@ class Collocation(Stepper):
         """Unless there are no positions."""
         return system.positions > 0
 
-    def grown(self, system, state, params, dt):
+    def grown(self, system: FlatSystem, state, params: PyTree, dt: Array):
         """As of the `hht` family."""
         lagging = state._replace(a=state.w)
         return self.beginning.grown(system, lagging, params, 2 * self.theta * dt)._replace(a=None)
 
     @property
-    def beginning(self):
+    def beginning(self) -> Beginning:
         """Of runs, and behind jumps."""
         return Beginning(Coefficients(0.0, 0.0, self.beta, 0.5), 2, self.options)
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """Newton for w_c; the state carries w1, which obeys the equation of motion only within O(h^2)."""
         beta, theta, options = self.beta, self.theta, self.options
         r = partial(residual, system, params)
 
-        def step(s):
-            def path(w):
+        def step(s: State):
+            def path(w: Array):
                 return newmark_step(system, s, theta * dt, w, beta)
 
             w, info = newton(system, r, path, s.w, s, factorize, options.tolerance, options.max_iterations)
@@ -87,7 +102,7 @@ class Collocation(Stepper):
         return step
 
 
-def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Collocation:
+def collocation(beta: Any, theta: Any, tolerance: Real = 1e-10, max_iterations: int = 20) -> Collocation:
     """The collocation method of Hilber and Hughes, with gamma = 1/2.
 
         w_c = (1 - theta) w + theta w1                                              at t_c = t + theta h
@@ -123,7 +138,7 @@ def collocation(beta: Any, theta: Any, tolerance=1e-10, max_iterations=20) -> Co
     return _collocation("collocation", beta, theta, tolerance, max_iterations)
 
 
-def wilson(theta: Any = 1.4, tolerance=1e-10, max_iterations=20) -> Collocation:
+def wilson(theta: Real = 1.4, tolerance: Real = 1e-10, max_iterations: int = 20) -> Collocation:
     """Wilson's theta method: acceleration linear in time up to t + theta h, where the equation of motion holds.
 
     `collocation` with beta = 1/6. Order 2. Unconditionally stable for theta >= 1.366, where 2 theta^2 - 2 theta >= 1.
@@ -149,7 +164,7 @@ def wilson(theta: Any = 1.4, tolerance=1e-10, max_iterations=20) -> Collocation:
     return _collocation("wilson", 1 / 6, theta, tolerance, max_iterations)
 
 
-def _collocation(caller, beta, theta, tolerance, max_iterations):
+def _collocation(caller: str, beta: Real, theta: Real, tolerance: Real, max_iterations: int):
     beta = require_number(caller, "beta", beta, lambda x: 0 < x <= 0.25, "lie in (0, 1/4]")
     theta = require_number(caller, "theta", theta, lambda x: x >= 1, "be 1 or more")
     options = check_options(caller, iterations=None, tolerance=tolerance, max_iterations=max_iterations)

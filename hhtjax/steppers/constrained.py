@@ -13,9 +13,14 @@ C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13, 1985; A. Cardona
 1989; M. Arnold, O. Bruls, Multibody Syst. Dyn. 18, 2007.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.description import Array, PyTree
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.primitives import part
 from hhtjax.steppers.implicit_solve import linearized_solve, newton
@@ -28,8 +33,11 @@ from hhtjax.systems.constraints import (
     violation_and_reaction,
 )
 
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
-def begin_constrained(method, system, q, v, t, params):
+
+def begin_constrained(method, system, q: Array, v: Array, t: Array, params: PyTree) -> State:
     """w0 and L0 of the index-1 system."""
     where = method.options.linearize
     if where in ("held", "state"):
@@ -38,13 +46,13 @@ def begin_constrained(method, system, q, v, t, params):
     return State(t, q, v, w, w, L)
 
 
-def directions(system, M, B):
+def directions(system: FlatSystem, M: Array, B: Array) -> Array:
     """D: (n, m)."""
     d = system.with_ones(diagonal(M))
     return B.T / jnp.where(d == 0, 1, d)[:, None]
 
 
-def equations(method, system, params, dt, s):
+def equations(method, system, params: PyTree, dt, s):
     """The residual of a step from s as a function of the state, the state as one of z = (w, L, eta), and z to start at.
 
     Also what eta takes off the displacement, as a function, and B at the start.
@@ -54,16 +62,16 @@ def equations(method, system, params, dt, s):
     B = jacobian(system, s.q, s.t, params)
     D = part(lambda q, B: directions(system, system.mass(q, s.t, params), B))(s.q, B) if ggl else None
 
-    def r(s):
+    def r(s: State) -> Array:
         force = system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)
         position, rate, pull = violation_and_reaction(system, s.q, s.v, s.t, params, s.L)
         rows = [force - pull, position / (c.beta * dt**2)]
         return jnp.concatenate(rows + [rate / (c.gamma * dt)] * ggl)
 
-    def shift(eta):
+    def shift(eta: Array):
         return None if D is None else c.beta * dt**2 * matvec(D, eta)
 
-    def path(z):
+    def path(z: Array):
         w, L, eta = z[:n], z[n : n + m], z[n + m :]
         return method.arrive(system, s, dt, w, shift(eta))._replace(L=L)
 
@@ -71,7 +79,7 @@ def equations(method, system, params, dt, s):
     return r, path, z, shift, B
 
 
-def bind_constrained(method, system, params, dt):
+def bind_constrained(method, system, params: PyTree, dt: Array):
     """The step: one Newton step from the predictor (w, L, 0), or Newton until done."""
     options, factorize = method.options, method.factorize_for(system)
 
@@ -100,7 +108,7 @@ def report_constraints(method, system, params, dt, s, s1, info, B):
         predicted = method.arrive(system, s, dt, s.w)
         return dependent_row(jacobian(system, predicted.q, predicted.t, params))
 
-    def dependent():
+    def dependent() -> Array:
         return lax.cond(jnp.all(jnp.isfinite(s1.w)), lambda: dependent_row(B), at_end)
 
     constraint, rate = (jnp.max(jnp.abs(x)) for x in violation(system, s1.q, s1.v, s1.t, params))

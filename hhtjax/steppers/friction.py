@@ -15,13 +15,17 @@ it does: all of its friction is dtau. Else a limit far above the load would turn
 directions of all forces, through as much as it could in a whole step.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.numerics.low_rank import Updated
 from hhtjax.steppers.constrained import equations, report_constraints
@@ -34,11 +38,22 @@ from hhtjax.systems.constraints import answers, curvature
 from hhtjax.systems.friction import across, directions, own_rate, reaction, responses
 from hhtjax.systems.friction_rows import depends, is_prescribed, rows_of
 
+if TYPE_CHECKING:
+    from hhtjax.numerics.low_rank import Changing
+    from hhtjax.steppers.friction_switching import Switch
+    from hhtjax.steppers.options import Options
+    from hhtjax.steppers.smooth_start import Drag, Layer
+    from hhtjax.steppers.stepper import Info, State, Stepper
+    from hhtjax.systems.flat_system import FlatSystem
+    from hhtjax.systems.friction_rows import Dependent, Independent
+
 NOISE = 8  # roundings, of what it is the difference of, below which a number is 0
 LAGS = 20  # how often multipliers, and limits that depend on them, are made anew at the start
 
 
-def begin_friction(method, system, q, v, t, params, dt, still: Any = False):
+def begin_friction(
+    method, system, q: Array, v: Array, t: Array, params: PyTree, dt: Array, still: Any = False
+) -> State:
     """The state at the start: who slides, who sticks, and the accelerations of that.
 
     still: (m,), joints that are at rest, whatever rounding their velocities show.
@@ -57,7 +72,7 @@ def begin_friction(method, system, q, v, t, params, dt, still: Any = False):
     size = matvec(jnp.abs(H), jnp.abs(w)) + jnp.abs(own)
     settle = partial(_settle, system, at, H, rows, matvec(H, w) + own, size, still)
 
-    def again(_, L):
+    def again(_, L: Array) -> Array:
         """L with the friction of limits that depend on L."""
         return L0 - matvec(pulls.T, settle(L)[1])
 
@@ -78,7 +93,7 @@ def smooth_system(system, sig, tau, L):
     return system._replace(force=force, friction=None)
 
 
-def _settle(system, at, H, rows, load, size, still, L):
+def _settle(system, at: tuple, H: Array, rows, load: Array, size: Array, still: Real, L):
     """sig and tau at the start, where without friction ds/dt is the load, of terms of that size. What rests is held,
     within the limits; what cannot be held slides. still: who rests in any case."""
     q, v, t, params = at
@@ -89,7 +104,7 @@ def _settle(system, at, H, rows, load, size, still, L):
     return jnp.where(rests, slides, sig), jnp.where(rests, tau, slid)
 
 
-def direction(system, at, H):
+def direction(system, at: tuple, H: Array):
     """In which direction each joint slides: 0 where its velocity is a rounding of the velocities it is made of, which
     would begin with the whole limit, and the accelerations of that."""
     q, v, t, params = at
@@ -98,7 +113,7 @@ def direction(system, at, H):
     return jnp.where(jnp.abs(s) <= noise, 0, jnp.sign(s))
 
 
-def bind_friction(method, system, params, dt, kept=None):
+def bind_friction(method, system, params: PyTree, dt, kept: Changing | None = None):
     """The step: the free one, the switches within it, and what becomes of the state behind them.
 
     kept: a `Changing` that knows the matrix without the slopes of limits, which H^T, then constant, spreads.
@@ -112,7 +127,7 @@ def bind_friction(method, system, params, dt, kept=None):
         sig, tau = s.friction
         smooth = jnp.where(stops, 0, sig)
 
-        def rubbing(s1):
+        def rubbing(s1) -> Array:
             f = law.limit(s1.q, s1.v, s1.L, s1.t, params)
             force = reaction(system, s1.q, s1.t, params, smooth * f)
             return r(s1) + jnp.pad(force, (0, z.size - size))
@@ -154,14 +169,14 @@ def bind_friction(method, system, params, dt, kept=None):
     return step
 
 
-def _equations(method, system, params, dt, s):
+def _equations(method, system, params: PyTree, dt, s):
     """As for constraints, also without."""
     if system.num_constraints:
         return equations(method, system, params, dt, s)
     return lambda s: residual(system, params, s), lambda w: method.arrive(system, s, dt, w), s.w, None, None
 
 
-def _foreseen(system, params, h, s, predicted, driven):
+def _foreseen(system, params: PyTree, h: Array, s, predicted, driven: bool):
     """Which joints come to rest within the step, if nothing changes, and the state to linearise about: the predicted
     one, but when the first of them rests all accelerations end: with them its whole friction would go on to act.
 
@@ -178,17 +193,26 @@ def _foreseen(system, params, h, s, predicted, driven):
     return stops, jax.tree.map(partial(jnp.where, jnp.any(stops)), ended, predicted)
 
 
-def _with_slope(kept, system, sig, at, params):
+def _with_slope(kept, system, sig: Array, at, params: PyTree) -> Updated:
     """`kept`, with the slopes of limits where joints slide."""
     limit = partial(system.friction.limit, params=params)
 
-    def slope(x):
+    def slope(x: State):
         return jax.linearize(lambda x: sig * limit(x.q, x.v, x.L, x.t), x)[1]
 
     return Updated(kept, directions(system, at.q, at.t, params), slope)
 
 
-def _free_step(options, system, r, path, z, s, factorize, at):
+def _free_step(
+    options: Options,
+    system: FlatSystem,
+    r: Callable,
+    path: Callable,
+    z: Array,
+    s: State,
+    factorize: Callable | Updated,
+    at: State,
+):
     """The step in which every joint keeps its friction, and those that stuck have none; its factors are kept."""
     if options.iterations is None:
         z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
@@ -201,7 +225,17 @@ def _free_step(options, system, r, path, z, s, factorize, at):
     return z, info, inverse, along
 
 
-def _switches(sf, s, sig, tau, f, W, rows, h, given):
+def _switches(
+    sf: Array,
+    s: Array,
+    sig: Array,
+    tau: Array,
+    f: Array,
+    W: Array,
+    rows: Dependent | Independent,
+    h: Array,
+    given: Real,
+):
     """How joints come out of the step, and what part of it is left where there were too many events; of rows that may
     depend on each other also what would hold joints that stick."""
     if given is not False:
@@ -212,7 +246,7 @@ def _switches(sf, s, sig, tau, f, W, rows, h, given):
     return *run_events(sf, s, sig, tau, f, W, Wh), None
 
 
-def _behind(system, params, s, s1, x, end, f, G, rows, still):
+def _behind(system, params: PyTree, s, s1, x: Array, end, f, G, rows, still) -> State:
     """The state s1 at the end of the step, displaced by x, moved onto the branches on which its joints end.
 
     still: of rows that may depend on each other, the displacement if nobody switched.
@@ -250,7 +284,7 @@ def _behind(system, params, s, s1, x, end, f, G, rows, still):
     return s1._replace(w=w, a=a, friction=Rubbing(end.sig, tau))
 
 
-def _defect(method, system, params, rubbing, s1, dtau, inverse):
+def _defect(method, system, params: PyTree, rubbing, s1, dtau: Array, inverse):
     """`Info.defect` at the end s1 of the step, with its changes dtau of friction; None of the converged method."""
     if method.options.iterations is None:
         return None
@@ -259,7 +293,7 @@ def _defect(method, system, params, rubbing, s1, dtau, inverse):
     return inverse(left + jnp.pad(force, (0, left.size - force.size)))
 
 
-def _switched(system, s, s1, end, G, dependent):
+def _switched(system: FlatSystem, s: State, s1: State, end: Switch, G, dependent: bool) -> Array:
     """`Info.switched`: by how much friction that switched from s to s1 has changed the accelerations."""
     same = end.kept | ((s.friction.sig == 0) & (end.sig == 0))
     if dependent:  # where one switches, others may hold what it held
@@ -268,27 +302,27 @@ def _switched(system, s, s1, end, G, dependent):
     return matvec(system.widened(G[:, : system.positions]).T, change)
 
 
-def _taken_off(x, y, G):
+def _taken_off(x: Array, y: Array, G: Array) -> Array:
     """x - G^T y, and 0 where that is rounding."""
     left = x - matvec(G.T, y)
     noise = NOISE * float(jnp.finfo(x.dtype).eps) * matvec(jnp.abs(G.T), jnp.abs(y))
     return jnp.where(jnp.abs(left) < noise, 0, left)
 
 
-def _each(f, rows):
+def _each(f: Callable, rows):
     """f of each row; without vmap of a single one, which leaves less to compile."""
     if len(rows) == 1:
         return jax.tree.map(lambda x: x[None], f(rows[0]))
     return jax.vmap(f)(rows)
 
 
-def _is_limit(law, s, params):
+def _is_limit(law, s: State, params: PyTree) -> Array:
     """Whether the limits at a state are finite and >= 0; of a state that is not finite others tell."""
     f = law.limit(s.q, s.v, s.L, s.t, params)
     return jnp.all((f >= 0) & (f < jnp.inf)) | ~(jnp.all(jnp.isfinite(s.q)) & jnp.all(jnp.isfinite(s.v)))
 
 
-def _told(info, left, is_limit):
+def _told(info: Info, left: Array, is_limit: Array) -> Info:
     """The `Info` of a step."""
     left = jnp.where(is_limit, left, jnp.inf)
     found = is_settled(left)
@@ -304,13 +338,25 @@ def _told(info, left, is_limit):
 # step resolves does not change; where damping is stiff a limit turns as the motion does, and v+ tells who slides.
 
 
-def smoothed_friction(method, system, s, params, h, moves=True, resolves=False, alone=False, lags=False):
+def smoothed_friction(
+    method: Stepper,
+    system: FlatSystem,
+    s: State,
+    params: PyTree,
+    h: Array,
+    moves: bool = True,
+    resolves: bool = False,
+    alone: bool = False,
+    lags: bool = False,
+) -> State:
     """As `smoothed`."""
     free = system._replace(friction=None)
     return smoothed(method, free, s, params, h, moves, resolves, alone, partial(finished, system.friction), lags)
 
 
-def finished(law, method, layer, inverse, drag, z, h, corrects):
+def finished(
+    law, method: Stepper, layer: Layer, inverse: Callable, drag: Drag | None, z: Array, h: Array, corrects: bool
+) -> Found:
     """v+, z, dw/dt and the friction there, from the implicit step without friction."""
     system, base, params = layer.system._replace(friction=law), layer.base, layer.params
     q, v, t, n = base.q, base.v, base.t, layer.system.size
@@ -319,7 +365,7 @@ def finished(law, method, layer, inverse, drag, z, h, corrects):
     G, pulls = jnp.stack([layer.located(x) for x in answers[:, :n]]), answers[:, n:]
     rows = rows_of(system, q, t, params, H, G, pulls, False, depends(system, method.redundant))
 
-    def taken_off(x, some, own=0.0):
+    def taken_off(x: Array, some: Array, own: Real = 0.0) -> Array:
         """x without what moves these joints."""
         return x - matvec(G.T, rows.solve(rows.K, some, matvec(H, x) + own))
 

@@ -11,12 +11,15 @@ How many that takes no small number bounds, so values come from a loop that ends
 number, of what moves them only: the pieces between instants, however many switch at one.
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.description import Array, Real
 from hhtjax.numerics.batched_cond import choose, seldom
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.systems.friction import ROUNDING, solve_some, solver_of_some
@@ -29,24 +32,24 @@ PIECES = 4, 2  # and per joint, of a step that is differentiated; of 100 000 vio
 class Moment(NamedTuple):
     """Within a step: time since its start over h, sliding velocities, directions, distances over h, who kept on."""
 
-    theta: Any
+    theta: Array
     s: Any
-    sig: Any
-    slid: Any
-    kept: Any
+    sig: Array
+    slid: Array
+    kept: Array
 
 
 class Steady(NamedTuple):
     """A step in which nobody switches: its ds/dtheta, and its friction, base = start + theta rise; limits; and Wh."""
 
-    c: Any
+    c: Array
     start: Any
-    rise: Any
+    rise: Array
     f: Any
-    Wh: Any
+    Wh: Array
 
 
-def run_events(sf, s, sig, tau, f, W, Wh):
+def run_events(sf: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, Wh: Array):
     """How joints come out of a step that start with s and, unless they stick, would come out with sf; and what part of
     the step is left where the events were too many. W: fall of sf by units of friction; Wh: that of s in a time h."""
     smooth = f == 0  # where nothing rubs, nothing switches
@@ -63,10 +66,10 @@ def run_events(sf, s, sig, tau, f, W, Wh):
 
 
 @jax.custom_jvp
-def _to_the_end(at, steady):
+def _to_the_end(at: Moment, steady: Steady) -> Moment:
     """The end of the step, by as many events as there are."""
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         at, i = carry
         return (at.theta < 1) & (i < EVENTS * len(at.s))
 
@@ -74,36 +77,36 @@ def _to_the_end(at, steady):
 
 
 @_to_the_end.defjvp
-def _(primals, tangents):
+def _(primals: tuple, tangents: tuple):
     return jax.jvp(_by_pieces, primals, tangents)
 
 
-def _by_pieces(at, steady):
+def _by_pieces(at: Moment, steady: Steady) -> Moment:
     """The same in a fixed number of pieces, for reverse mode."""
 
-    def piece(at, steady):
+    def piece(at: Moment, steady: Steady) -> Moment:
         return _event(_settled(at, steady), steady)
 
-    def visit(at, _):  # a `lax.cond` cannot be transposed in a batch, as this is the rule of a derivative
+    def visit(at: Moment, _):  # a `lax.cond` cannot be transposed in a batch, as this is the rule of a derivative
         return seldom(piece, at.theta < 1, at, steady), None
 
     return lax.scan(visit, at, length=PIECES[0] + PIECES[1] * len(at.s))[0]
 
 
-def _settled(at, steady):
+def _settled(at: Moment, steady: Steady) -> Moment:
     """Past the events of this very instant; who switches has s = 0, whatever is differentiated."""
     sig, keeps = _switching(*lax.stop_gradient((at, steady)))
     return at._replace(s=jnp.where(keeps, at.s, 0), sig=sig, kept=at.kept & keeps)
 
 
-def _switching(at, steady):
+def _switching(at: Moment, steady: Steady):
     """Directions behind the events of this very instant, and who keeps on."""
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         _, more, i = carry
         return more & (i < EVENTS * len(at.s))
 
-    def visit(carry):
+    def visit(carry: tuple):
         at, _, i = carry
         wait, *rest = _next(at, steady)
         due = jnp.min(wait) <= 0
@@ -115,12 +118,12 @@ def _switching(at, steady):
     return end.sig, end.kept
 
 
-def _event(at, steady):
+def _event(at: Moment, steady: Steady) -> Moment:
     """On to the next event, and past it; or to the end of the step."""
     return _on(at, *_next(at, steady))
 
 
-def _on(at, wait, to, speed):
+def _on(at: Moment, wait: Array, to: Array, speed: Array) -> Moment:
     first, rest = jnp.argmin(wait), 1 - at.theta
     due = wait[first] < rest
     go = jnp.where(due, wait[first], rest)
@@ -131,7 +134,7 @@ def _on(at, wait, to, speed):
     return Moment(theta, jnp.where(who, 0, s), jnp.where(who, to, at.sig), slid, at.kept & ~who)
 
 
-def _next(at, steady):
+def _next(at: Moment, steady: Steady):
     """How long until each joint switches, to what, and ds/dtheta till then."""
     f, smooth = steady.f, steady.f == 0
     rests = (at.sig == 0) & ~smooth
@@ -152,14 +155,14 @@ def _next(at, steady):
     return wait, jnp.where(rests, d, 0), speed
 
 
-def _motion(sig, rests, steady):
+def _motion(sig: Array, rests: Array, steady: Steady):
     """ds/dtheta and the friction as functions of theta, with these directions; both are linear."""
     c, start, rise, f, Wh = steady
     p = [jnp.where(rests, 0, sig * f - start), jnp.where(rests, 0, -rise)]
     hold = solver_of_some(Wh, rests)
     p = [x + hold(y - matvec(Wh, x)) for x, y in zip(p, (c, jnp.zeros_like(c)), strict=True)]
 
-    def rate(theta):
+    def rate(theta: Array) -> Array:
         return jnp.where(rests, 0, c - matvec(Wh, p[0] + theta * p[1]))
 
     return rate, lambda theta: start + p[0] + theta * (rise + p[1])
@@ -186,13 +189,13 @@ class Switch(NamedTuple):
     and whether they kept their friction."""
 
     s: Any
-    sig: Any
-    tau: Any
-    slid: Any
-    kept: Any
+    sig: Array
+    tau: Array
+    slid: Array
+    kept: Array
 
 
-def switch(b, s, sig, tau, f, W, Wh):
+def switch(b: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, Wh: Array) -> Switch:
     """Each joint by itself, elementwise. W: fall of b by a unit of friction; Wh: that of s in a time h."""
     slides, smooth = sig != 0, f == 0  # where nothing rubs, nothing switches
     keeps = slides & (sig * b >= 0) | smooth
@@ -218,7 +221,7 @@ def switch(b, s, sig, tau, f, W, Wh):
     return Switch(s1, new, jnp.where(keeps, 0, (b - s1) / jnp.where(W == 0, 1, W)), slid, keeps)
 
 
-def is_settled(left):
+def is_settled(left: Array) -> Array:
     """Whether so much may be left."""
     return left <= max(SETTLED, 1e3 * float(jnp.finfo(left.dtype).eps))
 
@@ -243,17 +246,17 @@ class Course(NamedTuple):
     """A step in which nobody switches: its ds/dtheta, and its friction, base = start + theta rise; limits; the rows,
     what a unit of force does to velocities in the step, what is rounding of that, and how large the terms of c are."""
 
-    c: Any
+    c: Array
     start: Any
-    rise: Any
+    rise: Array
     f: Any
     rows: Any
-    Wh: Any
-    least: Any
-    size: Any
+    Wh: Array
+    least: Array
+    size: Array
 
 
-def run_pieces(sf, s, sig, tau, f, W, rows, h, driven):
+def run_pieces(sf: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, rows, h: Array, driven: Array):
     """How joints come out of a step that start with s and, unless they stick, would come out with sf; what part of the
     step is left where the events were too many; and what would hold joints that stick if nobody switched. Distances are
     those beyond the ones of that step. W: fall of sf by units of friction; driven: where a part of s
@@ -263,7 +266,7 @@ def run_pieces(sf, s, sig, tau, f, W, rows, h, driven):
     held = rows.solve(W, stuck, sf)
     still = sf - matvec(W, held)
 
-    def of_basis(x):
+    def of_basis(x: Array) -> Array:
         return matvec(rows.C.T, jnp.where(basis, x, 0))
 
     moving = jnp.where(stuck, 0, s)
@@ -284,10 +287,10 @@ def run_pieces(sf, s, sig, tau, f, W, rows, h, driven):
 
 
 @jax.custom_jvp
-def _dependent_to_the_end(at, course):
+def _dependent_to_the_end(at: Moment, course: Course) -> Moment:
     """The end of the step, by as many events as there are."""
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         at, i = carry
         return (at.theta < BEYOND) & (i < EVENTS * len(at.s))
 
@@ -308,7 +311,7 @@ def _dependent_by_pieces(at, course):
     return lax.scan(visit, at, length=PIECES[0] + PIECES[1] * len(at.s))[0]
 
 
-def _piece(at, course):
+def _piece(at: Moment, course: Course) -> Moment:
     """On to the next joints that come to rest or break away, or to the end of the step."""
     f, smooth, rest = course.f, course.f == 0, 1 - at.theta
     middle = (1 + at.theta) / 2
@@ -329,17 +332,17 @@ def _piece(at, course):
     return Moment(theta, jnp.where(who | rests, 0, s), to, slid, at.kept & ~who)
 
 
-def _change(sig, rests, course, theta):
+def _change(sig: Array, rests: Array, course: Course, theta: Real) -> Array:
     """phi - base where that is known, 0 for friction at rest."""
     return jnp.where(rests, 0, sig * course.f) - (course.start + theta * course.rise)
 
 
-def _load(sig, rests, course, theta):
+def _load(sig: Array, rests: Array, course: Course, theta: Real) -> Array:
     """ds/dtheta where nothing holds joints at rest."""
     return course.c - matvec(course.Wh, _change(sig, rests, course, theta))
 
 
-def _directions(at, course, middle):
+def _directions(at: Moment, course: Course, middle: Array):
     """Who slides, and where to; how long joints at rest are held; and who slides then, and where to.
 
     What the loads of the whole rest of the step leave at rest is held until they have grown beyond the limits. What
@@ -357,7 +360,7 @@ def _directions(at, course, middle):
     return sig, jnp.where(grows, until, jnp.inf), jnp.where(rests & (leave != 0), leave, sig)
 
 
-def _speed(sig, rests, course, theta):
+def _speed(sig: Array, rests: Array, course: Course, theta: Array) -> Array:
     """ds/dtheta with these directions, what rests being held."""
     change = _change(sig, rests, course, theta)
     change = change + course.rows.solve(course.Wh, rests, course.c - matvec(course.Wh, change))

@@ -3,12 +3,15 @@
 The formulas are in residual.py; constraints are in constrained.py, and add rows to the residual.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 from hhtjax.checks import require_number
-from hhtjax.description import is_concrete
+from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
@@ -30,8 +33,11 @@ from hhtjax.steppers.variable_step import Controlled
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
 
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
-def step(method, system, params, factorize, where, dt, s):
+
+def step(method, system, params: PyTree, factorize, where, dt, s):
     """From s to t + dt by one Newton step from the constant-acceleration predictor: one Jacobian, one solve.
 
     Or by as many as `iterations` says; None: by the converged method.
@@ -69,7 +75,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     keeps_sparse = True
     corrections = DEFAULT  # of the smooth start
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """The state at the start, w0 = a0 = M^-1 Q."""
         given = self.options.solve
         if system.matrices is not None and not (given is None or isinstance(given, Structured)):
@@ -81,46 +87,57 @@ class GeneralizedAlpha(Controlled, Stepper):
         w = system.acceleration(q, v, t, params, self.factorize)
         return State(t, q, v, w, w)
 
-    def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
+    def smoothed(
+        self,
+        system: FlatSystem,
+        state: State,
+        params: PyTree,
+        dt: Array,
+        moves: bool = True,
+        resolves: bool = False,
+        alone: bool = False,
+    ) -> State:
         """The state from which the first step goes, by `start`."""
         if self.options.start == "simple" or not system.positions or (resolves and not self.corrects(system)):
             return state
         smooth = smoothed if system.friction is None else smoothed_friction
         return smooth(self, system.settled(params), state, params, dt, moves, resolves, alone)
 
-    def jumped(self, system, before, after, old, new, dt, answer):
+    def jumped(
+        self, system: FlatSystem, before: State, after: State, old: PyTree, new: PyTree, dt: Array, answer: Callable
+    ) -> State:
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
         if self.options.start == "simple" or not system.positions:
             return after
         system = system.settled(new)
 
-        def again(s, params, dt):
+        def again(s, params: PyTree, dt: Array):
             start = begin_friction(self, system, s.q, s.v, s.t, params, dt)
             return smoothed_friction(self, system, start, params, dt)
 
         anew = None if system.friction is None else again
         return jumped(self, system, before, after, (old, new), dt, answer, anew)
 
-    def grown(self, system, state, params, dt):
+    def grown(self, system: FlatSystem, state: State, params: PyTree, dt: Array) -> State:
         """The state, or where what damps is too stiff for dt a smooth start from it."""
         smooth = smoothed if system.friction is None else smoothed_friction
         return grown(self, system.settled(params), state, params, dt, smooth)
 
-    def throws(self, system):
+    def throws(self, system: FlatSystem) -> bool:
         """Unless there are no positions, or the recursion is to be literal."""
         return self.options.start != "simple" and system.positions > 0
 
     @property
-    def starts_massless(self):
+    def starts_massless(self) -> bool:
         """Whether the start is a smooth one."""
         return self.options.start != "simple"
 
-    def corrects(self, system):
+    def corrects(self, system: FlatSystem) -> bool:
         """Whether a0 has the term of second order."""
         start = self.options.start
         return self.resizes and (start == "corrected" or (start is None and system.num_constraints > 0))
 
-    def corrected(self, system, v, w, wdot, dt):
+    def corrected(self, system: FlatSystem, v: Array, w: Array, wdot: Array, dt: Array) -> Array:
         """a0 of second order: w0 + (alpha_m - alpha_f) h times the rate of psiddot, or of v.
 
         Internal states may be far faster than h, and keep their w0.
@@ -139,7 +156,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         """How constraints that depend on each other are solved."""
         return self.options.redundant
 
-    def factorize_for(self, system):
+    def factorize_for(self, system: FlatSystem):
         """The same for constrained systems, whose rows may be redundant."""
         if isinstance(self.options.solve, Structured):
             raise NotImplementedError(f"hht: leave out `solve` with constraints; received {self.options.solve!r}.")
@@ -147,11 +164,11 @@ class GeneralizedAlpha(Controlled, Stepper):
             return self.factorize
         return factorize_constrained(system.size, self.redundant)
 
-    def advance(self, s, dt, w):
+    def advance(self, s: State, dt: Array, w: Array):
         """Displacement, velocity, acceleration and algorithmic acceleration at t + dt."""
         return advance(self.coefficients, s, dt, w)
 
-    def arrive(self, system, s, dt, w, shift=None):
+    def arrive(self, system: FlatSystem, s: State, dt: Array, w: Array, shift: Array | None = None):
         """State at t + dt, given its acceleration, the displacement changed by `shift`."""
         x, *rates = self.advance(s, dt, w)
         x = x if shift is None else x - shift
@@ -159,7 +176,7 @@ class GeneralizedAlpha(Controlled, Stepper):
             rates = system.end_of_chart(x, *rates)
         return State(s.t + dt, system.move(s.q, x), *rates)
 
-    def factorization(self, system, params, dt):
+    def factorization(self, system: FlatSystem, params: PyTree, dt: Array):
         """What the matrix of a step is factorised by; that of a linear system is so here, once."""
         if system.num_constraints:
             return self.factorize_for(system)
@@ -167,11 +184,11 @@ class GeneralizedAlpha(Controlled, Stepper):
             return factorized_once(self, system, params, dt)
         return linear_part(self, system, params, dt) or self.factorize
 
-    def factors_of(self, system, dt):
+    def factors_of(self, system: FlatSystem, dt: Array):
         """The `Factors` of a linear system of constant matrices, for those who make them once for many runs."""
         return factors_of(self, at_start(self), system, dt)
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The step; for a linear system its matrix is factorised here, once."""
         system = system.settled(params)
         if system.friction is not None:
@@ -183,7 +200,7 @@ class GeneralizedAlpha(Controlled, Stepper):
 
 
 @takes_options
-def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def hht(alpha: Real = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """HHT-alpha, by default non-iterative: one Jacobian, one factorisation, one solve per step.
 
         alpha_m = 0,  alpha_f = -alpha,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -258,7 +275,7 @@ def hht(alpha: Any = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
 
 
 @takes_options
-def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def newmark(beta: Real = 0.25, gamma: Real = 0.5, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Newmark(beta, gamma): alpha_m = alpha_f = 0. The default is the trapezoidal rule.
 
     Order 2 for gamma = 1/2, else 1 (and gamma > 1/2 damps). A-stable for 2 beta >= gamma >= 1/2.
@@ -284,7 +301,7 @@ def newmark(beta: Any = 0.25, gamma: Any = 0.5, **options: Unpack[Keywords]) -> 
 
 
 @takes_options
-def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def bossak(alpha: Real = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Bossak (Wood, Bossak, Zienkiewicz): HHT's weighting put on the inertia instead of the forces.
 
         alpha_m = alpha,  alpha_f = 0,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
@@ -310,7 +327,7 @@ def bossak(alpha: Any = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
 
 
 @takes_options
-def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
+def generalized_alpha(rho_inf: Real = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
     """Chung and Hulbert's generalised-alpha: least low-frequency damping for a given one at infinity.
 
         alpha_m = (2 rho - 1)/(rho + 1),  alpha_f = rho/(rho + 1),
@@ -345,13 +362,15 @@ def generalized_alpha(rho_inf: Any = 0.8, **options: Unpack[Keywords]) -> Genera
 class ImplicitEuler(GeneralizedAlpha):
     """Implicit Euler; made by `implicit_euler`."""
 
-    def advance(self, s, dt, w):
+    def advance(self, s: State, dt: Array, w: Array):
         """v1 = v + h w1, x = h v1."""
         v = s.v + dt * w
         return dt * v, v, w, w
 
 
-def implicit_euler(iterations=None, tolerance=1e-10, max_iterations=20, solve=None) -> ImplicitEuler:
+def implicit_euler(
+    iterations: int | None = None, tolerance: Real = 1e-10, max_iterations: int = 20, solve: Callable | None = None
+) -> ImplicitEuler:
     """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), solved by Newton.
 
     Order 1, L-stable, strongly damping: the reference for robustness, not for accuracy. Constraints (GGL), rotations

@@ -1,14 +1,18 @@
 """How a step is solved: by one linearisation, or by Newton's iteration."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics import dense_lu
 from hhtjax.numerics.batched_cond import choose, derivative_of, seldom
 from hhtjax.numerics.closures import hoisted
@@ -23,11 +27,18 @@ from hhtjax.steppers.stepper import Info, State
 from hhtjax.systems import kinematics
 from hhtjax.systems.flat_system import Factors
 
+if TYPE_CHECKING:
+    from hhtjax.numerics.low_rank import Changing, Known, Updated
+    from hhtjax.numerics.sparse_solve import ChangingSparse
+    from hhtjax.systems.flat_system import FlatSystem, Local
+
 RELATIVE = 1e-6  # of the terms of a row, above which its residual is never small; nor above what `tolerance` is of 1
 SHAKE, NOISE, SHAKES = 2, 32, 3  # roundings by which a state is changed; how much more than that passes; how often
 
 
-def linearized_solve(r, path, w, factorize, at=None, again=False):
+def linearized_solve(
+    r: Callable, path: Callable, w: Array, factorize: Callable | Constant, at: State | None = None, again: bool = False
+):
     """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)), and its `Info`.
 
     One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's. again: one solve
@@ -37,13 +48,20 @@ def linearized_solve(r, path, w, factorize, at=None, again=False):
     return w, info
 
 
-def solve_and_keep(r, path, w, factorize, at=None, again=False):
+def solve_and_keep(
+    r: Callable,
+    path: Callable,
+    w: Array,
+    factorize: Callable | Constant | Updated,
+    at: State | None = None,
+    again: bool = False,
+):
     """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
     expansion = Expand(partial(linearize_rows, r), partial(jax.linearize, path), w)(at)
     return *solve_expanded(r, path, w, factorize, again, expansion), expansion.along
 
 
-def linearized(f, x, linearize=jax.linearize):
+def linearized(f: Callable, x: PyTree, linearize: Callable = jax.linearize):
     """f(x) and its tangent there; a word where a callback has no derivative."""
     with callbacks_named():
         return linearize(f, x)
@@ -64,7 +82,7 @@ def callbacks_named():
         ) from error
 
 
-def linearize_rows(r, s, linearize=jax.linearize):
+def linearize_rows(r: Callable, s: State, linearize: Callable = jax.linearize):
     """r and its tangent about a state s, for changes that leave the time as it is.
 
     Where r cannot be differentiated, as with a `jax.pure_callback` of the time, the time is held.
@@ -78,21 +96,21 @@ def linearize_rows(r, s, linearize=jax.linearize):
 class Expansion(NamedTuple):
     """Of r about a state. value: of r at path(w), by its tangent there; here: r there; along: the tangent of path."""
 
-    value: Any
+    value: Array
     at: Any
-    tangent: Any
+    tangent: Callable
     along: Any
-    here: Any
+    here: Array
 
 
 class Expand:
     """State -> the `Expansion` about it, or about path(w) for None. r, path: what `jax.linearize` makes of them."""
 
-    def __init__(self, r, path, w):
+    def __init__(self, r, path, w: Array):
         self.r, self.path, self.w = r, path, w
         self.predicted, self.other = staged(self._predicted, w.size), staged(self._other, w.size)
 
-    def __call__(self, at=None, first=None):
+    def __call__(self, at: State | None = None, first: Expansion | None = None) -> Expansion:
         """The `Expansion`; first: that about path(w) where it is known, and with it the path."""
         if at is None:
             return Expansion(*self.predicted(self.w))
@@ -100,21 +118,23 @@ class Expand:
         value, tangent, here = self.other(start, at)
         return Expansion(value, at, tangent, along, here)
 
-    def _predicted(self, w):
+    def _predicted(self, w: Array):
         start, along = self.path(w)
         here, tangent = self.r(start)
         return here, start, tangent, along, here
 
-    def _other(self, start, at):
+    def _other(self, start: State, at: State):
         here, tangent = self.r(at)
         return here + tangent(jax.tree.map(jnp.subtract, start, at)), tangent, here
 
 
-def solve_expanded(r, path, w, factorize, again, expansion):
+def solve_expanded(
+    r: Callable, path: Callable, w: Array, factorize: Callable | Changing | Constant, again: bool, expansion: Expansion
+):
     """w1 with r(path(w1)) = 0 by the expansion, its `Info`, and the solve."""
     value, at, tangent, along, _ = expansion
 
-    def f(dw):
+    def f(dw: Array) -> Array:
         return tangent(along(dw))
 
     factorize = around(factorize, lambda: (at, along))
@@ -124,17 +144,26 @@ def solve_expanded(r, path, w, factorize, again, expansion):
     return w1, info._replace(defect=inverse(staged(r, w.size)(path(w1)))) if again else info, inverse
 
 
-def left_by(factorize, f, b, x):
+def left_by(factorize: Callable | Constant | Known, f: Callable, b: Array, x: Array):
     """What x leaves of b = f(x), relative to it; None for the library's own solve, which needs no proof."""
     return factorize.leaves(f, b, x) if isinstance(factorize, Trusted) else None
 
 
-def told(factorize, left, info=Info()):  # noqa: B008 (a tuple)
+def told(factorize, left, info=Info()) -> Info:  # noqa: B008 (a tuple)
     """The `Info` of a step with a solve that left so much."""
     return info if left is None else info._replace(solve_residual=left, solved=factorize.accepts(left))
 
 
-def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
+def newton(
+    system: FlatSystem,
+    r: Callable,
+    path: Callable,
+    w: Array,
+    s: State,
+    factorize: Callable | Changing | Constant,
+    tolerance: Real,
+    max_iterations: int,
+):
     """Newton on r(path(w)) from w, s being the state before, until each row of r is small beside its own terms:
 
         |r_i| <= tolerance and |r_i| <= relative (|A| |w|)_i,    or each is no larger than rounding makes it,
@@ -148,15 +177,15 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
 
     relative = jnp.minimum(RELATIVE, jnp.maximum(tolerance, SHAKE * NOISE * float(jnp.finfo(w.dtype).eps)))
 
-    def f(w):
+    def f(w: Array) -> Array:
         return r(path(w))
 
-    def search(w):
-        def unfinished(carry):
+    def search(w: Array):
+        def unfinished(carry: tuple) -> Array:
             _, value, iterations, converged, _ = carry
             return ~converged & (iterations < max_iterations) & jnp.all(jnp.isfinite(value))
 
-        def improve(carry):
+        def improve(carry: tuple):
             w0, _, iterations, _, left = carry
             before, tangent = staged(partial(linearized, f), w.size)(w0)
             here = around(factorize, lambda: jax.linearize(path, w0))
@@ -178,25 +207,25 @@ def newton(system, r, path, w, s, factorize, tolerance, max_iterations):
         # as floats: integers have no tangents, which an evaluation on scalars cannot hand on
         return w, (jnp.max(jnp.abs(value)), iterations.astype(w.dtype), converged.astype(w.dtype), left)
 
-    def tangent_solve(g, y):
+    def tangent_solve(g: Callable, y: Array) -> Array:
         return solve_map(g, y, factorize)
 
     w, (size, iterations, converged, left) = implicit_root(f, w, search, tangent_solve)
     return w, told(factorize, left, Info(size, iterations.astype(jnp.int32), converged > 0))
 
 
-def is_rounding(system, r, s0, s1, value, limit, ask):
+def is_rounding(system: FlatSystem, r: Callable, s0: State, s1: State, value: Array, limit: Array, ask: Array) -> Array:
     """If asked, whether each row of r is below its limit, or changes by as much where s1 is rounded otherwise.
 
     A loop, and no condition: of those that vmap makes it takes the steps that some member needs.
     """
     sizes = term_sizes(system, s0, s1)
 
-    def unsettled(carry):
+    def unsettled(carry: tuple) -> Array:
         i, allowed = carry
         return ask & (i < SHAKES) & ~jnp.all(jnp.abs(value) <= allowed)
 
-    def shake(carry):
+    def shake(carry: tuple):
         i, allowed = carry
         shaken = s1._replace(**{name: getattr(s1, name) + _shake(size, i) for name, size in sizes.items()})
         return i + 1, jnp.maximum(allowed, NOISE * jnp.abs(r(shaken) - value))
@@ -205,7 +234,7 @@ def is_rounding(system, r, s0, s1, value, limit, ask):
     return ask & jnp.all(jnp.abs(value) <= allowed)
 
 
-def term_sizes(system, s0, s1):
+def term_sizes(system: FlatSystem, s0: State, s1: State):
     """Sizes of what the numbers of the state s1, reached from s0, are sums of, and their roundings relative to."""
     h = s1.t - s0.t
     w = jnp.abs(s0.w) + jnp.abs(s1.w)
@@ -214,7 +243,7 @@ def term_sizes(system, s0, s1):
     return sizes if s1.L is None else sizes | {"L": jnp.abs(s0.L) + jnp.abs(s1.L)}
 
 
-def _shake(size, i):
+def _shake(size: Array, i: Array) -> Array:
     """A few roundings, of both signs and uneven, so that equal terms do not cancel; others for each i."""
     k, golden = np.arange(size.size), 0.618034
     first = (0.75 + golden * k % 0.5) * np.where(k % 2, -1, 1)
@@ -227,7 +256,7 @@ def _shake(size, i):
 # The matrix of the step of a linear system, or of the linear part of one, factorised once for a whole run.
 
 
-def factorized_once(method, system, params, dt):
+def factorized_once(method, system, params: PyTree, dt):
     """The factorised matrix of a linear system, in the place of `factorize`."""
     if system.knows_matrices and method.options.solve is None:
         return kept(step_matrix(method, system, params, dt))
@@ -235,12 +264,12 @@ def factorized_once(method, system, params, dt):
     return reuse(method.factorize, known or method.factorize(step_matrix(method, system, params, dt)))
 
 
-def known_inverse(system):
+def known_inverse(system: FlatSystem):
     """The solve with the matrix of the step, where its factors are known."""
     return None if system.factors is None else by_factors(system.factors.step)
 
 
-def factors_of(method, start, system, dt):
+def factors_of(method, start, system: FlatSystem, dt: Array):
     """The `Factors` of a linear system of constant matrices; start: the method with whose matrix a run starts."""
     if method.options.solve is not None:
         return None
@@ -249,7 +278,7 @@ def factors_of(method, start, system, dt):
     return Factors(None if M.ndim == 1 else dense_lu.lu(M), first, step)
 
 
-def linear_part(method, system, params, dt):
+def linear_part(method, system, params: PyTree, dt: Array):
     """A `Changing` that knows the linear part, and adds the Jacobian of a force beside it at each state.
 
     None where there is no such part to be kept; also of a linear system without friction, for which it is all.
@@ -264,10 +293,10 @@ def linear_part(method, system, params, dt):
     return None
 
 
-def with_local(A, local, params, inverse=None):
+def with_local(A, local: Local, params: PyTree, inverse=None) -> Changing | ChangingSparse:
     """The `Changing` of the matrix of the linear part, and the Jacobian of the force beside it."""
 
-    def slope(s):
+    def slope(s: State):
         return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
 
     if A.ndim == 1 and local.size is None:  # the force beside it has a full Jacobian
@@ -275,7 +304,7 @@ def with_local(A, local, params, inverse=None):
     return changing(A, slope, local.spread, local.size, inverse)
 
 
-def step_matrix(method, system, params, dt):
+def step_matrix(method, system, params: PyTree, dt):
     """The matrix of the step of a linear system; a diagonal one (n,)."""
     zero = jnp.zeros(1 if system.knows_matrices else system.size, dt.dtype)
     rest = State(jnp.zeros_like(dt), zero, zero, zero, zero)
@@ -293,7 +322,17 @@ def step_matrix(method, system, params, dt):
 HELD_THRESHOLD = 0.3  # "auto": residual, relative to M w, above which the held point may be preferred
 
 
-def linearized_step(system, params, r, path, s, dt, factorize, where, again=False):
+def linearized_step(
+    system: FlatSystem,
+    params: PyTree,
+    r: Callable,
+    path: Callable,
+    s: State,
+    dt: Array,
+    factorize: Callable | Changing | Constant,
+    where: str,
+    again: bool = False,
+):
     """w at t + dt by one linearisation of r, about the state that `where` says, and its `Info`."""
     if where == "predictor":
         return linearized_solve(r, path, s.w, factorize, None, again)
@@ -309,10 +348,10 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
     expand = Expand(traced(rows, now), traced(partial(linearize, path), s.w), s.w)
 
     @jax.jit
-    def solution(expansion):
+    def solution(expansion: Expansion):
         return solve_expanded(r, path, s.w, factorize, again, expansion)[:2]
 
-    def about(at, first=None):
+    def about(at: State | None, first: Expansion | None = None):
         expansion = expand(at, first)
         return *solution(expansion), expansion
 
@@ -323,14 +362,14 @@ def linearized_step(system, params, r, path, s, dt, factorize, where, again=Fals
     return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better_solve(about, *ways[1:]))
 
 
-def linearize(f, x):
+def linearize(f: Callable, x: Array | State):
     """As JAX does it, with a tangent that can leave a jit, and is traced once, however often it is called."""
     value, tangent = jax.linearize(f, x)
     call, constants = hoisted(tangent, x)
     return value, jax.tree_util.Partial(call, constants)
 
 
-def better_state(r, predicted, held, size, limit):
+def better_state(r: Callable, predicted: State, held: State, size: Callable, limit: Array) -> State:
     """The predicted state; or the held one, where the residual at the predicted is large, and the larger one."""
     size = staged(lambda s, size=size: size(r(s)))
     predicted_size = size(predicted)
@@ -338,7 +377,7 @@ def better_state(r, predicted, held, size, limit):
     return choose(use_predictor, predicted, held)
 
 
-def better_solve(about, held, size, limit):
+def better_solve(about: Callable, held: State, size: Callable, limit: Array):
     """The solution about that state, with a second evaluation of r only where the first residual is large.
 
     A branch around it all, and no choice of a state before it: the processor goes on while it waits for the residual.
@@ -346,14 +385,14 @@ def better_solve(about, held, size, limit):
     w, info, first = about(None)
     predicted_size = size(first.here)
 
-    def better(found):
+    def better(found: tuple):
         w, info, expansion = about(held, first)
         return choose(predicted_size <= size(expansion.here), found, (w, info))
 
     return seldom(better, ~(predicted_size <= limit), (w, info))
 
 
-def refresh(system, params, c, s, factorize):
+def refresh(system: FlatSystem, params: PyTree, c, s, factorize):
     """The state with the acceleration that its q and v ask for, w = M^-1 Q, and what the solve left."""
     Q = system.force(s.q, s.v, s.t, params)
     w = system.acceleration(s.q, s.v, s.t, params, factorize)

@@ -4,13 +4,15 @@ M. Kim et al., J. Mech. Sci. Tech. 33(3), 2019, 1087-1096. For work, use `hht`: 
 where these are not.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description import is_concrete
+from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import solve
@@ -21,11 +23,14 @@ from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import acceleration_and_multipliers, reaction
 
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
-def linearize_at_state(system, params, s):
+
+def linearize_at_state(system: FlatSystem, params: PyTree, s: State):
     """M_n, Q_n, and the columns of Q_q - (M a)_q and of Q_v, all at (q_n, v_n, t_n)."""
 
-    def forces(q, v):
+    def forces(q: Array, v: Array) -> Array:
         return system.force(q, v, s.t, params)
 
     zero = jnp.zeros_like(s.v)
@@ -43,16 +48,16 @@ class KimHHT(Stepper):
     alpha: Any
     order: int
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """a_0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """Eq. 10-14. The field w of the state holds a, which the recursion (12) carries on."""
         alpha = self.alpha
         beta, gamma = hht_coefficients(alpha)[2:]
 
-        def step(s):
+        def step(s: State):
             M, Q, Q_q, Q_v, Ma_q = linearize_at_state(system, params, s)
             Jq, Jv = (1 + alpha) * Q_q - Ma_q, (1 + alpha) * Q_v
             drift = s.v + dt / 2 * (1 - 2 * beta / gamma) * s.w
@@ -76,14 +81,14 @@ class ConventionalHHT(Stepper):
     solves_constraints = True
     solves_rotations = True
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """a_0 = M^-1 Q, with the reactions of constraints in Q."""
         if system.num_constraints:
             a, L = acceleration_and_multipliers(system, q, v, t, params)
             return State(t, q, v, a, L=L)
         return State(t, q, v, system.acceleration(q, v, t, params))
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """Eq. 5-7, with Eq. 1 for q1 and v1. The field w of the state holds a."""
         alpha = self.alpha
         beta, gamma = hht_coefficients(alpha)[2:]
@@ -91,21 +96,21 @@ class ConventionalHHT(Stepper):
 
         n, m = system.size, system.num_constraints
 
-        def force(s, t):
+        def force(s: State, t: Array) -> Array:
             Q = system.force(s.q, s.v, t, params)
             return Q + reaction(system, s.q, s.t, params, s.L) if m else Q
 
-        def step(s):
+        def step(s: State):
             Q0 = force(s, s.t)
 
-            def path(z):
+            def path(z: Array):
                 a = z[:n]
                 x = dt * s.v + dt**2 * ((0.5 - beta) * s.w + beta * a)
                 v = s.v + dt * ((1 - gamma) * s.w + gamma * a)
                 v, a, _ = kinematics.end_of_chart(system.blocks, x, v, a, a)
                 return State(s.t + dt, system.move(s.q, x), v, a, L=z[n:] if m else None, memory=x)
 
-            def r(s1):
+            def r(s1: State) -> Array:
                 now = system.inertia(s1.q, s1.w, s1.t, params) - (1 + alpha) * force(s1, s.t + late)
                 # both terms in components that work on the rate of x; for Q0 that is so already
                 now = kinematics.pull_back(system.blocks, s1.memory, now) + alpha * Q0
@@ -126,14 +131,14 @@ class KimImplicitEuler(Stepper):
 
     order: int = 1
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """w_0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """(M - h Q_v - h^2 Jq) dv = h (Q + h Jq v), Jq = Q_q - (M w)_q, then q1 = q + h v1."""
 
-        def step(s):
+        def step(s: State):
             M, Q, Q_q, Q_v, Ma_q = linearize_at_state(system, params, s)
             Jq = Q_q - Ma_q
             v = s.v + solve(M - dt * Q_v - dt**2 * Jq, dt * (Q + dt * Jq @ s.v))
@@ -143,7 +148,7 @@ class KimImplicitEuler(Stepper):
         return step
 
 
-def kim_hht(alpha: Any = 0.0) -> KimHHT:
+def kim_hht(alpha: Real = 0.0) -> KimHHT:
     """The non-iterative HHT-alpha step of Kim et al. (2019), Eq. 8-14, as printed.
 
         Jq = (1 + alpha) Q_q - (M a)_q,   Jv = (1 + alpha) Q_v                 at (q, v, t)
@@ -172,7 +177,9 @@ def kim_hht(alpha: Any = 0.0) -> KimHHT:
     return KimHHT(alpha, _order(alpha))
 
 
-def conventional_hht(alpha: Any = 0.0, fictive_time=True, tolerance=1e-10, max_iterations=20) -> ConventionalHHT:
+def conventional_hht(
+    alpha: Real = 0.0, fictive_time: bool = True, tolerance: Real = 1e-10, max_iterations: int = 20
+) -> ConventionalHHT:
     """The conventional, iterative HHT-alpha of Kim et al. (2019), Eq. 1-7, as printed.
 
         M(q1) a1 = (1 + alpha) Q(q1, v1, t~) - alpha Q(q, v, t),   t~ = t + (1 + alpha) h,
@@ -228,5 +235,5 @@ def kim_implicit_euler() -> KimImplicitEuler:
     return KimImplicitEuler()
 
 
-def _order(alpha):
+def _order(alpha: Real) -> int:
     return 2 if is_concrete(alpha) and alpha == 0 else 1

@@ -3,13 +3,16 @@
 J. Houbolt, J. Aeronautical Sciences 17, 1950, 540-550; K. Park, J. Applied Mechanics 42, 1975, 464-470.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.steppers.implicit_solve import newton
 from hhtjax.steppers.options import Options, check_options
@@ -17,15 +20,18 @@ from hhtjax.steppers.residual import residual
 from hhtjax.steppers.rosenbrock import rosenbrock
 from hhtjax.steppers.stepper import Info, State, Stepper
 
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
+
 STARTER = rosenbrock(rho_inf=0.0)  # of the first two steps: order 2 and damped at infinity, as what follows
 
 
 class Memory(NamedTuple):
     """q, v: (2, n), by how much they changed in the last step and in the one before; count: of the steps taken."""
 
-    q: Any
-    v: Any
-    count: Any
+    q: PyTree
+    v: PyTree
+    count: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,38 +44,38 @@ class Multistep(Stepper):
     needs_equal_steps = True
     first_steps = 2
 
-    def advance(self, system, s, past, dt, w):
+    def advance(self, system: FlatSystem, s, past, dt: Array, w):
         """q and v at t + dt, given the acceleration there."""
         raise NotImplementedError
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """w0 = M^-1 Q, and no past."""
         unknown = jnp.zeros((2, v.size), v.dtype)
         memory = Memory(unknown[:, : q.size], unknown, jnp.zeros((), jnp.int32))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
-    def jumped(self, system, before, after, old, new, dt, answer):
+    def jumped(self, system: FlatSystem, before, after, old, new, dt: Array, answer):
         """`after`, where held inputs jump, with nothing to remember: what was before has another w."""
         return after._replace(memory=after.memory._replace(count=jnp.zeros_like(after.memory.count)))
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """Newton on M(q1) w1 = Q(q1, v1, t1); the first two steps are the starter's."""
         r = partial(residual, system, params)
         start = STARTER.bind(system, params, dt)
 
-        def first(s):
+        def first(s: State):
             s1, _ = start(s)
             return s1, Info(jnp.max(jnp.abs(r(s1))), jnp.zeros((), jnp.int32), jnp.array(True))
 
-        def later(s, past):
-            def path(w):
+        def later(s: State, past: Memory):
+            def path(w: Array):
                 q, v = self.advance(system, s, past, dt, w)
                 return State(s.t + dt, q, v, w)
 
             w, info = newton(system, r, path, s.w, s, factorize, self.options.tolerance, self.options.max_iterations)
             return path(w), info
 
-        def step(s):
+        def step(s: State):
             past, now = s.memory, s._replace(memory=None)
             s1, info = lax.cond(past.count < self.first_steps, lambda: first(now), lambda: later(now, past))
             q, v = jnp.stack([s1.q - s.q, past.q[0]]), jnp.stack([s1.v - s.v, past.v[0]])
@@ -81,7 +87,7 @@ class Multistep(Stepper):
 class Houbolt(Multistep):
     """Houbolt's method; made by `houbolt`."""
 
-    def advance(self, system, s, past, dt, w):
+    def advance(self, system: FlatSystem, s: State, past: Memory, dt: Array, w: Array):
         """By differences, which lose less to rounding than the q themselves."""
         if not system.positions:
             return s.q, s.v + (6 * dt * w + 7 * past.v[0] - 2 * past.v[1]) / 11
@@ -92,13 +98,13 @@ class Houbolt(Multistep):
 class Park(Multistep):
     """Park's method; made by `park`."""
 
-    def advance(self, system, s, past, dt, w):
+    def advance(self, system: FlatSystem, s: State, past: Memory, dt: Array, w: Array):
         """One formula, for v from w and for q from v."""
         v = s.v + (6 * dt * w + 5 * past.v[0] - past.v[1]) / 10
         return s.q + (system.located(6 * dt * v) + 5 * past.q[0] - past.q[1]) / 10, v
 
 
-def houbolt(tolerance=1e-10, max_iterations=20) -> Houbolt:
+def houbolt(tolerance: Real = 1e-10, max_iterations: int = 20) -> Houbolt:
     """Houbolt's method: velocity and acceleration at t1 are those of the cubic through q1, q, q_-1, q_-2.
 
         w1 = (2 q1 - 5 q + 4 q_-1 - q_-2)/h^2,   v1 = (11 q1 - 18 q + 9 q_-1 - 2 q_-2)/(6 h)
@@ -131,7 +137,7 @@ def houbolt(tolerance=1e-10, max_iterations=20) -> Houbolt:
     return Houbolt(2, check_options("houbolt", iterations=None, tolerance=tolerance, max_iterations=max_iterations))
 
 
-def park(tolerance=1e-10, max_iterations=20) -> Park:
+def park(tolerance: Real = 1e-10, max_iterations: int = 20) -> Park:
     """Park's method: the mean of the backward differentiation formulas of two and of three steps.
 
         v1 = (10 q1 - 15 q + 6 q_-1 - q_-2)/(6 h),   w1 = (10 v1 - 15 v + 6 v_-1 - v_-2)/(6 h)

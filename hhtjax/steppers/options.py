@@ -1,16 +1,22 @@
 """The options of the generalised-alpha family: their names, kinds and defaults, and what is wrong with a value."""
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cache, wraps
-from typing import Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
 
 import jax
 
 from hhtjax.checks import require_function, require_integer, require_number
+from hhtjax.description import Real
 from hhtjax.numerics.linear_solve import Structured
 from hhtjax.systems.constraints import check_redundant
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import Stepper
 
 Constructor = TypeVar("Constructor", bound=Callable)
 
@@ -54,7 +60,7 @@ def takes_options(constructor: Constructor) -> Constructor:
     kinds = get_type_hints(Options)
 
     @wraps(constructor)
-    def checked(*arguments, **keywords):
+    def checked(*arguments: Real, **keywords) -> Stepper:
         for given in keywords:
             if given not in own.parameters and given not in OPTIONS:
                 raise TypeError(f"{name}: unknown option {given!r}; the options are {', '.join(OPTIONS)}.")
@@ -69,7 +75,7 @@ def takes_options(constructor: Constructor) -> Constructor:
     return checked  # pyright: ignore[reportReturnType]
 
 
-def check_options(caller, **keywords: Any) -> Options:
+def check_options(caller: str, **keywords: Any) -> Options:
     """`Options` with the default of `linearize` filled in, or an error that names what is wrong."""
     options = Options(**keywords)
     if options.iterations is not None:
@@ -96,14 +102,14 @@ def check_options(caller, **keywords: Any) -> Options:
 
 
 @cache
-def _words(name):
+def _words(name: str):
     """What an option may be, by its annotation, which takes long to read."""
     kind = get_type_hints(Options)[name]
     optional = type(None) in get_args(kind)
     return (*get_args(get_args(kind)[0] if optional else kind), *((None,) if optional else ()))
 
 
-def _require_one_of(caller, name, options):
+def _require_one_of(caller: str, name: str, options: Options):
     value, allowed = getattr(options, name), _words(name)
     if value not in allowed:
         words = [word for word in allowed if word is not None]
@@ -111,6 +117,6 @@ def _require_one_of(caller, name, options):
         raise ValueError(f"{caller}: `{name}` must be {', '.join(others)} or {last}; received {value!r}.")
 
 
-def require_alpha(caller, alpha):
+def require_alpha(caller: str, alpha: Real) -> Real:
     """HHT's alpha as it is, if it lies in its range."""
     return require_number(caller, "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")

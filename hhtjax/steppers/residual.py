@@ -13,7 +13,15 @@ M(q1) a1 = (1 + alpha) Q1 - alpha Q0, is first order once M depends on q and alp
 On rotations the first two lines give the rotation vector of the increment, from zero, and its rate: see kinematics.py.
 """
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from hhtjax.description import Array, PyTree, Real
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import State
+    from hhtjax.systems.flat_system import FlatSystem
 
 
 class Coefficients(NamedTuple):
@@ -25,23 +33,23 @@ class Coefficients(NamedTuple):
     gamma: Any
 
 
-def coefficients(alpha_m, alpha_f):
+def coefficients(alpha_m: float, alpha_f: Real) -> Coefficients:
     """Second order, with as much damping of high frequencies as the two weights allow: Chung, Hulbert (1993)."""
     shift = alpha_f - alpha_m
     return Coefficients(alpha_m, alpha_f, (1 + shift) ** 2 / 4, 0.5 + shift)
 
 
-def hht_coefficients(alpha):
+def hht_coefficients(alpha: Real) -> Coefficients:
     """Hilber, Hughes, Taylor (1977): alpha in [-1/3, 0]; alpha = 0 is the trapezoidal rule."""
     return coefficients(0.0, -alpha)
 
 
-def weighted(weight, x):
+def weighted(weight: Real, x: Array) -> Real:
     """weight x; nothing at all, not even a product, for a weight that is the number 0."""
     return 0.0 if isinstance(weight, float) and weight == 0 else weight * x
 
 
-def advance(c, s, dt, w):
+def advance(c: Coefficients, s: State, dt: Array, w: Array):
     """Displacement from q, and the rest at t + dt, as an affine function of the new acceleration w."""
     a = (weighted(1 - c.alpha_f, w) + weighted(c.alpha_f, s.w) - weighted(c.alpha_m, s.a)) / (1 - c.alpha_m)
     x = dt * s.v + dt**2 * ((0.5 - c.beta) * s.a + c.beta * a)
@@ -49,6 +57,6 @@ def advance(c, s, dt, w):
     return x, v, w, a
 
 
-def residual(system, params, s):
+def residual(system: FlatSystem, params: PyTree, s: State):
     """M(q) w - Q(q, v, t): zero on the trajectory."""
     return system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)

@@ -12,14 +12,18 @@ The derivatives are taken at (q, v, w, t), once. Then y1 = y + h sum_i b_i k_i.
 E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, Sec. IV.7 and VI.3-4.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from hhtjax.checks import require_number
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import factorize_map
 from hhtjax.numerics.low_rank import around
@@ -29,6 +33,9 @@ from hhtjax.steppers.implicit_solve import linearized, with_local
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.variable_step import Embedded, Errors
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
 EMBEDDED = 0.47990028, 0.51762038, 0.00247934, 0.0  # of order 2, L-stable, from the stages of `rowda`
 
@@ -55,24 +62,24 @@ class Rosenbrock(Embedded, Stepper):
     keeps_sparse = True
 
     @property
-    def estimate_order(self):
+    def estimate_order(self) -> int:
         """One more than the order of the embedded method, which is one less than that of this."""
         return self.order
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """w0 = M^-1 Q."""
         return State(t, q, v, system.acceleration(q, v, t, params))
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The step without its estimate."""
         step = self.bind_pair(system, params, dt, estimating=False)
 
-        def plain(s):
+        def plain(s: State):
             return step(s)[:2]
 
         return plain
 
-    def bind_pair(self, system, params, dt, estimating=True):
+    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array, estimating: bool = True):
         """State -> State, Info, Errors; for a linear system the matrix is factorised here, once."""
         system = system.settled(params)
         g, r = self.tableau.g, partial(residual, system, params)
@@ -83,16 +90,16 @@ class Rosenbrock(Embedded, Stepper):
             A, local = system.step_matrix(params, jnp.ones_like(dt), g * dt, (g * dt) ** 2), system.local
             ways = kept(A) if local is None else with_local(A, local, params)
 
-        def along(x):
+        def along(x: Array) -> State:
             return State(instant, system.located((g * dt) ** 2 * x), g * dt * x, x)
 
-        def factorized(tangent, s=None):
+        def factorized(tangent: Callable, s: State | None = None):
             return factorize_map(lambda x: tangent(along(x)), zero, around(ways, lambda: (s, along)))
 
         if system.linear:
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 
-        def step(s):
+        def step(s: State):
             value, tangent = staged(partial(linearized, r), system.size)(s)
             solve = once if system.linear else factorized(tangent, s)
             end, errors = stages(system, self.tableau, s, dt, r, value, tangent, solve)
@@ -104,26 +111,35 @@ class Rosenbrock(Embedded, Stepper):
         return step
 
 
-def stages(system, tableau, s, dt, r, value, tangent, solve):
+def stages(
+    system: FlatSystem,
+    tableau: RosenbrockTableau,
+    s: State,
+    dt: Array,
+    r: Callable,
+    value: Array,
+    tangent: Callable,
+    solve: Callable,
+):
     """The state at t + dt, by the formulas at the top of this file, and its errors; value, tangent: of r at s."""
     g, A, G, b, embedded = tableau
     zero = jnp.zeros(system.size, s.q.dtype)
 
-    def increment(weights, rates):
+    def increment(weights: Sequence, rates: list):
         """dt times the weighted sum of the rates of q, of v and of w."""
         return [dt * sum((x * k[i] for x, k in zip(weights, rates, strict=False)), zero) for i in range(3)]
 
-    def moved(h, weights, rates):
+    def moved(h: Array, weights: tuple, rates: list) -> State:
         """The state after the rates so weighted, at the time t + h."""
         dq, dv, dw = increment(weights, rates)
         return State(s.t + h, s.q + system.located(dq), s.v + dv, s.w + dw)
 
-    def start(row, rates):
+    def start(row: tuple, rates: list):
         """Where a stage starts, and r there."""
         at = moved(sum(row) * dt, row, rates)
         return at, r(at)
 
-    def stage(coupling, rates, at, value):
+    def stage(coupling: tuple, rates: list, at: State, value: Array):
         """Its rates."""
         zq, zv, zw = increment(coupling, rates)
         kq = at.v + zv
@@ -140,7 +156,7 @@ def stages(system, tableau, s, dt, r, value, tangent, solve):
     return moved(dt, b, rates), Errors(e_q, e_v)
 
 
-def rosenbrock(rho_inf: Any = 0.0) -> Rosenbrock:
+def rosenbrock(rho_inf: Real = 0.0) -> Rosenbrock:
     """The two-stage Rosenbrock method of order 2: one Jacobian, one factorisation, two solves per step.
 
         g = (1/2)/(1 + sqrt((1 + rho)/2)),  A21 = g,  G21 = -2 g^2,  b = (1 - 1/(2 g), 1/(2 g))

@@ -7,18 +7,24 @@ of an error, too, e = h sum_i e_i k_i, and one with dense output the weights of 
 E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, Sec. II.1 to II.6.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import is_concrete
+from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.numerics.dense_lu import SCALAR
 from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.variable_step import Embedded, Errors
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
 
 class ExplicitTableau(NamedTuple):
@@ -66,7 +72,7 @@ class RungeKutta(Embedded, Stepper):
     keeps_sparse = True
 
     @property
-    def name(self):
+    def name(self) -> str:
         """Of the method."""
         return self.tableau.name
 
@@ -76,43 +82,43 @@ class RungeKutta(Embedded, Stepper):
         return None if self.tableau.embedded_order is None else self.tableau.embedded_order + 1
 
     @property
-    def dense_term(self):
+    def dense_term(self) -> bool:
         """Whether dense output is more than cubics."""
         return self.tableau.dense is not None
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name}, order={self.order})"
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """w0 = M^-1 Q, the first stage of the first step."""
         memory = Errors(0 * q, 0 * v) if self.dense_term else None
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The step without its estimate."""
         step = self.bind_pair(system, params, dt)
 
-        def plain(s):
+        def plain(s: State):
             return step(s)[:2]
 
         return plain
 
-    def bind_pair(self, system, params, dt):
+    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array):
         """State -> State, Info, Errors; the first stage is the acceleration that the step before ended with."""
         acceleration = staged(lambda q, v, t: system.acceleration(q, v, t, params), system.size)
         rows = *self.tableau.A, self.tableau.b
         run_through = in_a_loop if system.size > SCALAR else written_out
 
-        def stage(s, node, weights, V, W):
+        def stage(s: State, node: Real, weights: PyTree, V: PyTree, W: PyTree):
             """q, v and w of a stage, from the v and w of those before it."""
             q, v = s.q + system.located(dt * mean(weights, V)), s.v + dt * mean(weights, W)
             return q, v, acceleration(q, v, s.t + node * dt)
 
-        def increments(weights, V, W):
+        def increments(weights: tuple | None, V: list, W: list):
             """What q and v gain by these weights."""
             return None if weights is None else Errors(system.located(dt * mean(weights, V)), dt * mean(weights, W))
 
-        def step(s):
+        def step(s: State):
             q, V, W = run_through(rows, stage, s)
             end = State(s.t + dt, q, V[-1], W[-1], memory=increments(self.tableau.dense, V, W))
             errors = self.tableau.error
@@ -121,7 +127,7 @@ class RungeKutta(Embedded, Stepper):
         return step
 
 
-def written_out(rows, stage, s):
+def written_out(rows: tuple, stage: Callable, s: State):
     """q at the end of a step, and the rates v and w of all stages and of the end."""
     q, V, W = s.q, [s.v], [s.w]
     for row in rows:
@@ -131,13 +137,13 @@ def written_out(rows, stage, s):
     return q, V, W
 
 
-def in_a_loop(rows, stage, s):
+def in_a_loop(rows: tuple, stage: Callable, s: State):
     """The same, with one acceleration to compile in the place of several, which may take minutes."""
     number = len(rows) + 1
     nodes = jnp.asarray(np.array([sum(row) for row in rows]), s.v.dtype)
     weights = jnp.asarray(np.array([(*row, *(number - len(row)) * (0.0,)) for row in rows]), s.v.dtype)
 
-    def body(i, carry):
+    def body(i: Array, carry: tuple):
         _, V, W = carry
         row, node = (lax.dynamic_index_in_dim(x, i, keepdims=False) for x in (weights, nodes))
         q, v, w = stage(s, node, row, V, W)
@@ -149,7 +155,7 @@ def in_a_loop(rows, stage, s):
     return q, list(V), list(W)
 
 
-def mean(weights, rates):
+def mean(weights: tuple, rates: list):
     """Their weighted sum, without those that are known to be 0."""
     known = [(weight, k) for weight, k in zip(weights, rates, strict=True) if not is_concrete(weight) or weight]
     return sum(weight * k for weight, k in known)

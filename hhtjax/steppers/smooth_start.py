@@ -24,19 +24,23 @@ Where an input jumps between two steps, dQ = Q(new) - Q(old) takes the place of 
 Internal states z, which may be far faster than h, keep theirs.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.batched_cond import choose, derivative_at_need, seldom
 from hhtjax.numerics.closures import hoisted
-from hhtjax.numerics.dense_lu import UNROLLED, diagonal, inverse, matvec
+from hhtjax.numerics.dense_lu import UNROLLED, diagonal, differentiable_inverse, inverse, matvec
 from hhtjax.numerics.differentiable_while import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
@@ -45,6 +49,14 @@ from hhtjax.steppers.implicit_solve import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
 from hhtjax.systems.constraints import answers, curvature, jacobian, reaction, violation
+
+if TYPE_CHECKING:
+    from hhtjax.numerics.linear_solve import Given
+    from hhtjax.numerics.low_rank import Constant
+    from hhtjax.steppers.collocation import Beginning
+    from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
+    from hhtjax.steppers.stepper import Stepper
+    from hhtjax.systems.flat_system import FlatSystem
 
 POWERS = 5
 ITERATIONS = 40  # of Newton's method, at most
@@ -78,17 +90,17 @@ class Layer(NamedTuple):
     None where it is not formed."""
 
     system: Any
-    params: Any
+    params: PyTree
     base: State
     offset: Any
-    X: Any
+    X: Array
     V: Any
     B: Any
     bend: Any
-    M: Any = None
+    M: Array | None = None
 
     @classmethod
-    def of(cls, method, system, params, h, base, offset=0.0):
+    def of(cls, method, system: FlatSystem, params: PyTree, h: Array, base: State, offset: float = 0.0) -> Layer:
         """In a step h."""
         c = method.coefficients
         B = bend = None
@@ -97,31 +109,31 @@ class Layer(NamedTuple):
             bend = curvature(system, base.q, base.v, base.t, params)
         return cls(system, params, base, offset, c.beta * h**2, c.gamma * h, B, bend)
 
-    def data(self):
+    def data(self) -> Layer:
         """What may be arguments of a function of JAX: all but the system."""
         return self._replace(system=None)
 
-    def with_data(self, data):
+    def with_data(self, data: PyTree) -> Layer:
         """The layer with these."""
         return data._replace(system=self.system)
 
-    def located(self, x):
+    def located(self, x: Array) -> Array:
         """x (N,) with 0 for internal states."""
         return self.system.with_internal(x, jnp.zeros_like(x))
 
-    def parts(self, z):
+    def parts(self, z: Array):
         """dw and dL."""
         n = self.system.size
         return z[:n], (None if self.B is None else z[n:])
 
-    def path(self, z):
+    def path(self, z: Array):
         """The state behind the implicit step, given the changes of acceleration and multipliers."""
         base, (dw, dL) = self.base, self.parts(z)
         L = None if dL is None else base.L + dL
         q = self.system.move(base.q, self.X * dw)
         return State(base.t, q, base.v + self.located(self.V * dw), base.w + dw, L=L)
 
-    def rows(self, s, bend=None):
+    def rows(self, s: State, bend: Array | None = None) -> Array:
         """What is to be zero: M w - Q - B^T L, and B w + curvature."""
         force = residual(self.system, self.params, s)
         if self.B is None:
@@ -129,17 +141,17 @@ class Layer(NamedTuple):
         bend = self.bend if bend is None else bend
         return jnp.concatenate([force - matvec(self.B.T, s.L), matvec(self.B, s.w) + bend]) - self.offset
 
-    def product(self, z):
+    def product(self, z: Array):
         """The part of the rows that z enters at the start itself: M dw - B^T dL, B dw."""
         dw, dL = self.parts(z)
         force = self.inertia(dw)
         return force if dL is None else jnp.concatenate([force - matvec(self.B.T, dL), matvec(self.B, dw)])
 
-    def full_mass(self):
+    def full_mass(self) -> Array:
         """M at the start, as a matrix."""
         return self.system.full_mass(self.base.q, self.base.t, self.params) if self.M is None else self.M
 
-    def inertia(self, w):
+    def inertia(self, w: Array) -> Array:
         """M w at the start."""
         return (
             matvec(self.M, w) if self.M is not None else self.system.inertia(self.base.q, w, self.base.t, self.params)
@@ -150,7 +162,18 @@ class Layer(NamedTuple):
         return jnp.zeros(self.system.size + self.system.num_constraints, self.base.v.dtype)
 
 
-def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=False, finish=None, lags=False):
+def smoothed(
+    method,
+    system: FlatSystem,
+    s: State,
+    params: PyTree,
+    h: Array,
+    moves: bool = True,
+    resolves: bool = False,
+    alone: bool = False,
+    finish: Callable | None = None,
+    lags: bool = False,
+) -> State:
     """The state from which the first step h goes, behind the layer at the start s.
 
     moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M.
@@ -164,7 +187,7 @@ def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=Fal
     # of a linear system outside of the kernel: a loop of the user's around short runs then does it once
     known = factors(method, system, params, method.coefficients.gamma * size) if by_factors(method, system) else None
 
-    def behind(s):
+    def behind(s: State) -> State:
         lag = s.a - s.w if lags else None
         zero = s._replace(w=jnp.zeros_like(s.w), a=lag, L=None if s.L is None else jnp.zeros_like(s.L), friction=None)
         layer = Layer.of(method, system, params, size, zero)
@@ -180,7 +203,16 @@ def smoothed(method, system, s, params, h, moves=True, resolves=False, alone=Fal
     return one_kernel(behind, s, around=True) if alone else behind(s)
 
 
-def jumped(method, system, s, after, both, h, answer, anew=None):
+def jumped(
+    method: Stepper,
+    system: FlatSystem,
+    s: State,
+    after: State,
+    both: tuple,
+    h: Array,
+    answer: Callable,
+    anew: Callable | None = None,
+) -> State:
     """The state behind a jump of held inputs: `after`, but where what damps is stiff.
 
     anew: the start from s with other params and h, in the place of changes to s: of dry friction, which is not linear.
@@ -190,7 +222,7 @@ def jumped(method, system, s, after, both, h, answer, anew=None):
         return after
     stiff = is_stiff(method, system, s, new, h, after.w - s.w, answer)
 
-    def smooth(_, s, both, h):
+    def smooth(_, s: State, both: tuple, h: Array) -> State:
         old, new = both
         if anew is not None:
             return anew(s, new, h)
@@ -204,7 +236,9 @@ def jumped(method, system, s, after, both, h, answer, anew=None):
     return seldom(smooth, stiff, after, s, both, h)
 
 
-def grown(method, system, s, params, h, smooth=smoothed):
+def grown(
+    method: Stepper, system: FlatSystem, s: State, params: PyTree, h: Array, smooth: Callable = smoothed
+) -> State:
     """The state from which a step h goes that is far longer than those before.
 
     Where accelerations change by LEAVES of them within h, and damping is stiff, it is that of a smooth start: short
@@ -217,36 +251,36 @@ def grown(method, system, s, params, h, smooth=smoothed):
     leaves = is_part(system, s, params, change, s.w, LEAVES)
     leaves = leaves & is_stiff(method, system, s, params, h, s.w, lambda dQ: answer(dQ)[0], LEAVES)
 
-    def begin(s, params, h):
+    def begin(s: State, params: PyTree, h: Array) -> State:
         return smooth(method, system, s, params, h, lags=True)
 
     return seldom(begin, leaves, s, params, h)
 
 
-def is_stiff(method, system, s, params, h, w, answer, part=STIFF):
+def is_stiff(method, system, s, params: PyTree, h, w, answer, part: float = STIFF) -> Array:
     """Whether the velocity of an explicit step, h gamma w, changes the accelerations by more than a part of w."""
     v = s.v + system.with_internal(method.coefficients.gamma * h * w, jnp.zeros_like(w))
     change = answer(system.force(s.q, v, s.t, params) - system.force(s.q, s.v, s.t, params))
     return is_part(system, s, params, change, w, part)
 
 
-def is_part(system, s, params, change, w, part):
+def is_part(system: FlatSystem, s: State, params: PyTree, change: Array, w: Array, part: float) -> Array:
     """Whether a change of accelerations is more than a part of these, in the norm of energy."""
     D = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
     return jnp.sum(D * change**2) > part**2 * jnp.sum(D * w**2)
 
 
-def reads_velocity(system, s, params):
+def reads_velocity(system: FlatSystem, s: State, params: PyTree) -> bool:
     """Whether the force depends on v."""
     return traced(lambda v: system.force(s.q, v, s.t, params), s.v).reads(None)[0]
 
 
-def by_factors(method, system):
+def by_factors(method: Beginning | GeneralizedAlpha, system: FlatSystem) -> bool:
     """Whether the matrix of the implicit step is one of a linear system that is factorised, not inverted."""
     return system.linear and (system.size > UNROLLED or method.options.solve is not None)
 
 
-def factors(method, system, params, V):
+def factors(method, system, params: PyTree, V):
     """What the matrix of the implicit step is factorised by. V: h gamma."""
     if system.factors is not None:
         system = system._replace(factors=system.factors._replace(step=system.factors.start))
@@ -259,14 +293,16 @@ def at_start(method):
     return replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
 
 
-def without_layer(method, layer, h, damped, corrects, finish, factorize=None):
+def without_layer(
+    method, layer: Layer, h: Array, damped: bool, corrects: bool, finish: Callable, factorize: Callable | None = None
+) -> Found:
     """What `finish` makes of the implicit step: a `Found`. factorize: `factors`, where they are known.
 
     Small matrices are formed, once: what is differentiated then is products of these, and the force in one place.
     """
     options = method.options
 
-    def by_maps(method, data, h):
+    def by_maps(method: Stepper, data: PyTree, h: Array) -> Found:
         known = layer.with_data(data)
         how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
         z = known.zeros() if known.system.linear or not damped else root(known, how)
@@ -274,7 +310,9 @@ def without_layer(method, layer, h, damped, corrects, finish, factorize=None):
         drag, damps = damping(known, how, at, tangent)
         return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
 
-    def by_matrices(find, invert, method, data, h):
+    def by_matrices(
+        find: Callable, invert: Callable, method: Beginning | GeneralizedAlpha, data: PyTree, h: Array
+    ) -> Found:
         known = layer.with_data(data)
         if known.system.matrices is None:
             known = known._replace(M=known.system.full_mass(known.base.q, known.base.t, known.params))
@@ -298,22 +336,30 @@ class Drag(NamedTuple):
     that P leads to, as of large systems."""
 
     of: Any
-    dissipates: Any = None
+    dissipates: Array | None = None
 
 
 class Found(NamedTuple):
     """Behind a layer: v+, the changes z = (dw, dL), dw/dt where it is asked for, whether anything damps at all, dry
     friction where there is some, and a - w where it is kept."""
 
-    v: Any
-    z: Any
-    wdot: Any = None
+    v: PyTree
+    z: PyTree
+    wdot: Array | None = None
     damps: Any = None
     friction: Any = None
-    lag: Any = None
+    lag: Array | None = None
 
 
-def finished(method, layer, inverse, drag, z, h, corrects):
+def finished(
+    method: Beginning | GeneralizedAlpha,
+    layer: Layer,
+    inverse: Callable,
+    drag: Drag | None,
+    z: Array,
+    h: Array,
+    corrects: bool,
+) -> Found:
     """The `Found`, from the solve with the matrix of the step, the map C, and z behind the implicit step."""
     v, bend = layer.base.v, layer.bend
     if drag is not None:
@@ -329,19 +375,19 @@ def finished(method, layer, inverse, drag, z, h, corrects):
     return Found(v, z, layer.parts(rate_of(layer, s, inverse, h))[0])
 
 
-def expanded(layer, invert):
+def expanded(layer: Layer, invert: Callable):
     """What Newton's step from 0 leads to, the inverse of the matrix of the step there, and C."""
     z = layer.zeros()
     dz, _, (inverse, C) = expansion(layer, z, invert)
     return z - dz, inverse, C
 
 
-def expansion(layer, z, invert=inverse):
+def expansion(layer: Layer, z: Array, invert: Callable = inverse):
     """Newton's step at z, the energy that it is worth, and the inverse and C, from one loop over columns."""
     system, base, n = layer.system, layer.base, layer.system.size
     dw, dL = layer.parts(z)
 
-    def force(x, dv, dw):
+    def force(x: Array, dv: Array, dw: Array) -> Array:
         at = State(base.t, system.move(base.q, x), base.v + layer.located(dv), base.w + dw)
         return residual(system, layer.params, at)
 
@@ -360,7 +406,7 @@ def expansion(layer, z, invert=inverse):
     return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), (S, (C + C.T) / 2)
 
 
-def searched(layer):
+def searched(layer: Layer):
     """The same as `expanded` where Newton's method ends."""
     n, N = layer.system.size, layer.zeros().size
     empty = jnp.zeros((N, N), layer.base.v.dtype), jnp.zeros((n, n), layer.base.v.dtype)
@@ -368,12 +414,12 @@ def searched(layer):
     return z - dz, inverse, C
 
 
-def differentiable(layer):
+def differentiable(layer: Layer):
     """The same, with derivatives: those of Newton's step where it ends, which are exact of order 2^k - 1 after k."""
     find, constants = hoisted(lambda: searched(layer))
     found = lax.stop_gradient(find(lax.stop_gradient(constants)))
 
-    def again(_, held):
+    def again(_, held: tuple):
         dz, _, more = expansion(layer, held[0], differentiable_inverse)
         return held[0] - dz, *more
 
@@ -381,25 +427,17 @@ def differentiable(layer):
     return jax.tree.map(lambda value, x: value + (x - lax.stop_gradient(x)), found, moved)
 
 
-def differentiable_inverse(A):
-    """A^-1 with derivatives, of two steps of Newton and Schulz: X <- 2 X - X A X."""
-    S = X = inverse(A)
-    for _ in range(2):
-        X = 2 * X - X @ A @ X
-    return S + (X - lax.stop_gradient(X))
-
-
 def improved(around, z, *more):
     """The best z that Newton's method finds, with steps that are shortened until the next would be shorter, the next
     step, and what else `around` tells there."""
     eps = float(jnp.finfo(z.dtype).eps)
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         _, (_, energy, *_), first, part, count = carry
         small = (count > 0) & (energy <= eps**1.1 * first)
         return ~small & (part > SHORTEST) & (count < ITERATIONS)
 
-    def improve(carry):
+    def improve(carry: tuple):
         z, best, first, part, count = carry
         trial = z - part * best[0]
         found = around(trial)
@@ -413,7 +451,7 @@ def improved(around, z, *more):
     return z, dz, *more
 
 
-def newton_step(layer, factorize, z):
+def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):
     """The solve with the matrix at z, the z that it leads to, the state there, and the tangent of the rows."""
     at, along = jax.linearize(layer.path, z)
     value, tangent = linearize_rows(layer.rows, at)
@@ -421,11 +459,11 @@ def newton_step(layer, factorize, z):
     return inverse, z - inverse(value), at, tangent
 
 
-def damping(layer, factorize, at, tangent):
+def damping(layer: Layer, factorize: Callable | Given | Constant, at: State, tangent: Callable):
     """The map (C + C^T)/2 at a state, and whether it is anything but 0."""
     zero, v = jax.tree.map(jnp.zeros_like, at), layer.base.v
 
-    def drag(x):
+    def drag(x: Array) -> Array:
         return tangent(zero._replace(v=layer.located(x)))[: v.size]
 
     if not (isinstance(factorize, Trusted) or layer.system.linear):
@@ -434,13 +472,13 @@ def damping(layer, factorize, at, tangent):
         return Drag(partial(matvec, C), dissipates(layer, C)), jnp.any(C != 0)
     pull = jax.linear_transpose(drag, v)  # large: no matrix is formed
 
-    def both(x):
+    def both(x: Array) -> Array:
         return (drag(x) + pull(x)[0]) / 2
 
     return Drag(both), jnp.any(both(jnp.asarray(1 + 0.618 * np.arange(v.size) % 0.5, v.dtype)) != 0)
 
 
-def dissipates(layer, C):
+def dissipates(layer: Layer, C: Array):
     """Whether h gamma x^T C x > -GAINED x^T M x for all x: else P grows what it should take away.
 
     So it is of every damper, and not of a feedback without reaction, whose C is not symmetric. None where M is sparse.
@@ -454,7 +492,7 @@ def dissipates(layer, C):
     unit = jnp.sqrt(jnp.maximum(jnp.abs(diagonal(A)), float(jnp.finfo(A.dtype).tiny)))
     A, least = A / unit[:, None] / unit[None, :], n * float(jnp.finfo(A.dtype).eps)
 
-    def eliminate(k, carry):
+    def eliminate(k: Array, carry: tuple):
         A, fine = carry
         pivot = A[k, k]
         A = A - A[:, k][:, None] * A[k][None, :] / jnp.where(jnp.abs(pivot) < least, least, pivot)
@@ -463,13 +501,15 @@ def dissipates(layer, C):
     return lax.fori_loop(0, n, eliminate, (A, jnp.array(True)))[1]
 
 
-def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
+def damped_part(
+    layer: Layer, inverse: Callable, drag: Drag, dv: Array, h: Array, project: Callable = lambda x: x
+) -> Array:
     """P^4 [1 + (5 - 2 gamma) (1 - P)] dv, or 0 where C gives energy.
 
     project: what keeps P x among the velocities that may change.
     """
 
-    def power(_, carry):
+    def power(_, carry: tuple):
         x, _, fine = carry
         pull = layer.V * layer.located(drag.of(x))
         if drag.dissipates is None:
@@ -482,30 +522,30 @@ def damped_part(layer, inverse, drag, dv, h, project=lambda x: x):
     return jnp.where(fine, before + (POWERS - 2 * layer.V / h) * (before - x), 0)
 
 
-def response(layer, inverse, force):
+def response(layer: Layer, inverse: Callable, force: Array) -> Array:
     """S^-1 of a force, 0 for internal states."""
     n = force.size
     return layer.located(inverse(jnp.pad(force, (0, layer.zeros().size - n)))[:n])
 
 
-def corrected_by(layer, inverse, left, corrections=DEFAULT):
+def corrected_by(layer: Layer, inverse: Callable, left: Array, corrections: Corrections = DEFAULT) -> Array:
     """z with product(z) = -left, as far as the corrections go."""
 
-    def correct(_, z):
+    def correct(_, z: Array) -> Array:
         return z - inverse(left + layer.product(z))
 
     number, last = corrections
     if last == 1:
         return lax.fori_loop(0, number, correct, layer.zeros())
 
-    def remember(i, both):
+    def remember(i: Array, both: tuple):
         return correct(i, both[0]), both[0]
 
     z, before = lax.fori_loop(0, number, remember, (layer.zeros(), layer.zeros()))
     return before + last * (z - before)
 
 
-def lag_left(layer, inverse):
+def lag_left(layer: Layer, inverse: Callable):
     """Of a - w, which the layer's state holds as its a, what the step resolves."""
     lag = layer.base.a
     if lag is None:
@@ -514,12 +554,12 @@ def lag_left(layer, inverse):
     return layer.parts(corrected_by(layer, inverse, -layer.product(z)))[0]
 
 
-def rate_of(layer, s, inverse, h):
+def rate_of(layer: Layer, s: State, inverse: Callable, h: Array) -> Array:
     """(dw/dt, dL/dt) at the state s, by the same corrections: a difference, over far less than h, for what is to be of
     first order in h. A derivative would be one of third order of the constraints, and long to compile."""
     system, params = layer.system, layer.params
 
-    def rows(later):
+    def rows(later: Array) -> Array:
         q, v, t = system.move(s.q, later * s.v), s.v + layer.located(later * s.w), s.t + later
         force = system.inertia(q, s.w, t, params) - system.force(q, v, t, params)
         if layer.B is None:

@@ -5,13 +5,15 @@ Soil Dyn. Earthquake Eng. 16, 1997, 427-443: the methods that Kim et al. (2019) 
 work, use `hht`, which linearises anew in every step.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description import is_concrete
+from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.numerics.batched_cond import choose
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.numerics.linear_solve import solve
@@ -20,13 +22,16 @@ from hhtjax.steppers.options import check_options, require_alpha
 from hhtjax.steppers.residual import hht_coefficients
 from hhtjax.steppers.stepper import Info, State, Stepper
 
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
+
 
 class Memory(NamedTuple):
     """K, C: initial stiffness and damping, (n, n); P: the weighted force that the last step ended with, (n,)."""
 
-    K: Any
-    C: Any
-    P: Any
+    K: Array
+    C: Array
+    P: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,18 +42,27 @@ class OperatorSplitting(Stepper):
     modified: bool
     order: int
 
-    def begin(self, system, q, v, t, params, dt):
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """a_0 = M^-1 Q, and the tangent that the whole run keeps."""
         K, C = (-jax.jacfwd(system.force, argnums=i)(q, v, t, params) for i in (0, 1))
         memory = Memory(system.widened(K), C, self.weighted_force(system, q, v, t, params))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
-    def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
+    def smoothed(
+        self,
+        system: FlatSystem,
+        state: State,
+        params: PyTree,
+        dt: Array,
+        moves: bool = True,
+        resolves: bool = False,
+        alone: bool = False,
+    ) -> State:
         """The state from which the first step goes, as of the `hht` family."""
         s = self.hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves, alone)
         return self.begun(system, s, params, state.memory)
 
-    def begun(self, system, s, params, memory):
+    def begun(self, system: FlatSystem, s: State, params: PyTree, memory: Memory) -> State:
         """A state of the `hht` family as one of this method."""
         left = system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)  # not 0 of what is stiff
         P = self.weighted_force(system, s.q, s.v, s.t, params) + left
@@ -58,18 +72,18 @@ class OperatorSplitting(Stepper):
         """Unless there are no positions."""
         return system.positions > 0
 
-    def grown(self, system, state, params, dt):
+    def grown(self, system: FlatSystem, state, params: PyTree, dt: Array):
         """As of the `hht` family."""
         s = self.hht.grown(system, state._replace(a=state.w, memory=None), params, dt)
         return choose(jnp.any(s.v != state.v), self.begun(system, s, params, state.memory), state)
 
-    def jumped(self, system, before, after, old, new, dt, answer):
+    def jumped(self, system: FlatSystem, before, after, old, new, dt: Array, answer):
         """The same where held inputs jump, of the changes."""
         K, C, P = before.memory
         both = before._replace(memory=None), after._replace(memory=None)
         s = self.hht.jumped(system, *both, old, new, dt, answer)
 
-        def unweighted(s, params):
+        def unweighted(s, params: PyTree):
             return system.force(s.q, s.v, s.t, params) - self.weighted_force(system, s.q, s.v, s.t, params)
 
         change = system.inertia(s.q, s.w - before.w, s.t, new)
@@ -77,20 +91,20 @@ class OperatorSplitting(Stepper):
         return s._replace(memory=Memory(K, C, P))
 
     @property
-    def hht(self):
+    def hht(self) -> Stepper:
         """The method of which it is, on linear systems."""
         return GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
 
-    def weighted_force(self, system, q, v, t, params):
+    def weighted_force(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Array:
         """P, what alpha weighs: Q, or in the modified form Q at rest."""
         return system.force(q, jnp.zeros_like(v) if self.modified else v, t, params)
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The step. The field w of the state holds a."""
         alpha = self.alpha
         beta, gamma = hht_coefficients(alpha)[2:]
 
-        def step(s):
+        def step(s: State):
             K, C, P0 = s.memory
             stiffness, damping = dt**2 * beta * K, dt * gamma * C  # what a1 takes off the predicted forces
             implicit = stiffness + damping
@@ -109,7 +123,7 @@ class OperatorSplitting(Stepper):
         return step
 
 
-def operator_splitting(alpha: Any = -0.05, modified=False) -> OperatorSplitting:
+def operator_splitting(alpha: Real = -0.05, modified: bool = False) -> OperatorSplitting:
     """The alpha-operator-splitting method: one solve in a step, no Jacobian but the one at the start.
 
         q~ = q + h v + h^2 (1/2 - beta) a,   v~ = v + h (1 - gamma) a,   beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha

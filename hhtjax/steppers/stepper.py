@@ -1,5 +1,8 @@
 """What every stepper shares: the state it carries, what it reports, and how it is called."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import Description, freeze
+from hhtjax.description import Array, Description, PyTree, Real, freeze
 from hhtjax.description.presentation import known, shown
 from hhtjax.numerics.batched_cond import seldom
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.systems.constraints import answers
-from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.flat_system import FlatSystem, flatten
 from hhtjax.systems.friction_rows import depends, held_back
 from hhtjax.systems.initial_conditions import initial_values
-from hhtjax.systems.system import require_masses
+from hhtjax.systems.system import AnySystem, require_masses
 from hhtjax.systems.system import require_system as require_system
 
 
@@ -36,17 +39,17 @@ class State(NamedTuple):
         memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
 
-    t: Any
-    q: Any
-    v: Any
-    w: Any
-    a: Any = None
+    t: Array
+    q: PyTree
+    v: PyTree
+    w: PyTree
+    a: PyTree = None
     L: Any = None
-    memory: Any = None
-    z: Any = None
-    zdot: Any = None
-    za: Any = None
-    friction: Any = None
+    memory: PyTree = None
+    z: PyTree = None
+    zdot: PyTree = None
+    za: PyTree = None
+    friction: PyTree = None
 
 
 @shown
@@ -58,8 +61,8 @@ class Rubbing(NamedTuple):
         tau: (m,), the friction, positive against positive sliding.
     """
 
-    sig: Any
-    tau: Any
+    sig: Array
+    tau: Array
 
 
 INTERNAL = {"v": "z", "w": "zdot", "a": "za"}  # where a state has what is no rate of a position
@@ -87,17 +90,17 @@ class Info(NamedTuple):
         switched: by how much dry friction that switched has changed the accelerations (alike).
     """
 
-    residual: Any = None
-    iterations: Any = None
-    converged: Any = None
+    residual: Array | None = None
+    iterations: Array | None = None
+    converged: Array | None = None
     constraint: Any = None
-    constraint_rate: Any = None
-    dependent_row: Any = None
-    solve_residual: Any = None
-    solved: Any = None
+    constraint_rate: Array | None = None
+    dependent_row: Array | None = None
+    solve_residual: Real = None
+    solved: Array | None = None
     friction: Any = None
-    defect: Any = None
-    switched: Any = None
+    defect: Array | None = None
+    switched: Array | None = None
 
     def _verdict(self):
         """Of several steps."""
@@ -107,7 +110,7 @@ class Info(NamedTuple):
         return f"{np.count_nonzero(~met)} of {met.size} not converged" if not met.all() else "all converged"
 
 
-def join_info(info, new):
+def join_info(info: Info, new: Info) -> Info:
     """Info of several steps as one: largest residuals, number of iterations, all converged."""
     join = {
         "iterations": jnp.add,
@@ -154,39 +157,50 @@ class Stepper(Description):
         """Of the method, as messages give it."""
         return type(self).__name__
 
-    def begin(self, system, q, v, t, params, dt) -> State:
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """State at the initial time, for a `FlatSystem`."""
         raise NotImplementedError
 
-    def smoothed(self, system, state, params, dt, moves=True, resolves=False, alone=False):
+    def smoothed(
+        self,
+        system: FlatSystem,
+        state: State,
+        params: PyTree,
+        dt: Array,
+        moves: bool = True,
+        resolves: bool = False,
+        alone: bool = False,
+    ) -> State:
         """The state from which the first step goes, where that is another than the one at the initial time.
 
         moves: whether its velocity may be another, too. resolves: whether the first step, by error control, is so short
         that it follows what is fastest. alone: whether no kernel is around."""
         return state
 
-    def jumped(self, system, before, after, old, new, dt, answer):
+    def jumped(
+        self, system: FlatSystem, before: State, after: State, old: PyTree, new: PyTree, dt: Array, answer: Callable
+    ) -> State:
         """`after`, the state where held inputs jump, with M dw = Q(new) - Q(old), or what else a step dt asks for;
         `before`: the same without. answer: dQ -> dw."""
         return after
 
-    def throws(self, system):
+    def throws(self, system: FlatSystem) -> bool:
         """Whether it leaves in q what does not fit a step, such as one far longer than those before."""
         return False
 
-    def grown(self, system, state, params, dt):
+    def grown(self, system: FlatSystem, state, params: PyTree, dt: Array):
         """The state from which such a step goes, where `throws` says so: of the method and the state for dt."""
         raise NotImplementedError
 
-    def factors_of(self, system, dt) -> Any:
+    def factors_of(self, system: FlatSystem, dt: Array) -> Any:
         """What is factorised once for many runs of a linear system of constant matrices, as `FlatSystem.factors`."""
         return None
 
-    def bind(self, system, params, dt):
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
         raise NotImplementedError
 
-    def resized(self, state, r):
+    def resized(self, state: State, r: Array):
         """The stepper and the state for a step r times as long as the one before: by default the same.
 
         For those who write their own loop, before a step of another size:
@@ -200,15 +214,17 @@ class Stepper(Description):
         """
         return self, state
 
-    def astype(self, dtype):
+    def astype(self, dtype: np.dtype):
         """The same with its arrays, such as a traced alpha, in the dtype of the state."""
         return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), self)
 
-    def init(self, system, q0, v0, params, dt, t0=0.0, z0=None) -> State:
+    def init(
+        self, system, q0: PyTree, v0: PyTree, params: PyTree, dt: Real, t0: Real = 0.0, z0: PyTree = None
+    ) -> State:
         """State at t0, from position q0, velocity v0 (None for a `FirstOrderSystem`) and internal states z0."""
         return begun("init", system, self, *initial_values("init", system, q0, v0, z0), params, dt, t0)
 
-    def step(self, system, state, params, dt) -> tuple[State, Info]:
+    def step(self, system: AnySystem, state: State, params: PyTree, dt: Real) -> tuple[State, Info]:
         """State one step dt after `state`, and what the step tells about itself."""
         params = freeze(params)
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params, state.z)
@@ -219,7 +235,17 @@ class Stepper(Description):
         return _unravel(flat, state), info
 
 
-def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
+def begun(
+    caller: str,
+    system: AnySystem,
+    stepper: Stepper,
+    q0: PyTree,
+    v0: PyTree,
+    z0: PyTree,
+    params: PyTree,
+    dt: Real,
+    t0: Real = 0.0,
+) -> State:
     """What `Stepper.init` makes of checked initial values."""
     require_capable(caller, system, stepper, q0, v0)
     params = freeze(params)
@@ -231,13 +257,13 @@ def begun(caller, system, stepper, q0, v0, z0, params, dt, t0=0.0) -> State:
     )
 
 
-def entered(stepper, system, q, v, t, params, dt, **how):
+def entered(stepper: Stepper, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array, **how: bool):
     """The state at a start, and that from which the first step dt goes. how: of `Stepper.smoothed`."""
     start = stepper.begin(system, q, v, t, params, dt)
     return start, stepper.smoothed(system, start, params, dt, **how)
 
 
-def bound(stepper, system, params, dt, last=None):
+def bound(stepper: Stepper, system: FlatSystem, params: PyTree, dt: Array, last: Array | None = None):
     """The function State -> (State, Info) of `stepper.bind`, with held inputs constant over each step.
 
     last: the step before, where it is another than dt."""
@@ -249,14 +275,14 @@ def bound(stepper, system, params, dt, last=None):
     if not zero_order_hold.holds(params):
         return stepper.bind(system, params, dt)
 
-    def step(s):
+    def step(s: State):
         now, s = step_start(stepper, system, params, dt, dt if last is None else last, s)
         return stepper.bind(system, now, dt)(s)
 
     return step
 
 
-def step_start(stepper, system, params, dt, last, s):
+def step_start(stepper: Stepper, system: FlatSystem, params: PyTree, dt: Array, last: Array, s: State):
     """The params of a step dt, and the state that it starts from; last: the step before."""
     if not zero_order_hold.holds(params):
         return params, s
@@ -265,7 +291,9 @@ def step_start(stepper, system, params, dt, last, s):
     return now, behind_jump(stepper, system, s, old, now, dt, here)
 
 
-def behind_jump(stepper, system, s, old, new, h, here=None):
+def behind_jump(
+    stepper: Stepper, system: FlatSystem, s: State, old: PyTree, new: PyTree, h: Array, here: Array | None = None
+) -> State:
     """The state with the accelerations and multipliers that belong to the new params, for a step h:
 
         M dw - B^T dL = Q(new) - Q(old),   B dw = 0
@@ -278,7 +306,7 @@ def behind_jump(stepper, system, s, old, new, h, here=None):
     return behind(s, old, new, h) if here is None else seldom(behind, here, s, old, new, h)
 
 
-def _behind_jump(stepper, system, s, old, new, h):
+def _behind_jump(stepper: Stepper, system: FlatSystem, s: State, old: PyTree, new: PyTree, h: Array) -> State:
     """The state behind a jump."""
     dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
     answer = answers(system, s.q, s.t, new, stepper.redundant)
@@ -293,13 +321,13 @@ def _behind_jump(stepper, system, s, old, new, h):
     return stepper.jumped(system, s, s1, old, new, h, lambda dQ: answer(dQ)[0])
 
 
-def require_stepper(caller, stepper):
+def require_stepper(caller: str, stepper: Stepper):
     """An error for what is no stepper."""
     if not isinstance(stepper, Stepper):
         raise TypeError(f"{caller}: `stepper` must be a stepper such as hht(); received {stepper!r}.")
 
 
-def require_capable(caller, system, stepper, q0, v0):
+def require_capable(caller: str, system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree):
     """An error for a constraint, a rotation, internal states or friction that the stepper does not know."""
     name = stepper.name
     if not stepper.starts_massless:
@@ -321,7 +349,7 @@ def require_capable(caller, system, stepper, q0, v0):
         raise NotImplementedError(f"{caller}: {name} cannot solve dry `friction`; use hht() or another of its family.")
 
 
-def public(flat, state):
+def public(flat: FlatSystem, state: State) -> State:
     """The state as its user sees it, internal states by themselves.
 
     A first-order system has nothing else, and they are its q; their rates are its v, and it has no w.
@@ -336,7 +364,7 @@ def public(flat, state):
     return state._replace(**rates, **{INTERNAL[name]: z for name, (_, z) in split.items()})
 
 
-def _unravel(flat, state):
+def _unravel(flat, state: State) -> State:
     state = public(flat, state)
     rates = {name: getattr(state, name) for name in INTERNAL}
     rates = {name: flat.unravel_rates(x) for name, x in rates.items() if x is not None}

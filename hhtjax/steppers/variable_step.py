@@ -22,17 +22,23 @@ form, 100 to 6400 steps) w is of order 1.47 and L of 1.43; q and v are of order 
 both ends of a step (2.01, 2.02). With alpha = -0.05 w and L are of order 1.98 and 1.97: damp, where they matter.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from hhtjax.description import is_concrete
+from hhtjax.description import Array, PyTree, is_concrete
 from hhtjax.numerics.batched_cond import seldom
 from hhtjax.steppers.residual import Coefficients, weighted
 from hhtjax.steppers.stepper import bound
 from hhtjax.systems import zero_order_hold
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import State, Stepper
+    from hhtjax.systems.flat_system import FlatSystem
 
 GROWTH = 2.05  # of a step, up to which the recursion follows
 
@@ -43,23 +49,23 @@ class Resizing:
     coefficients: Coefficients
 
     @property
-    def resizes(self):
+    def resizes(self) -> bool:
         """Whether there is anything to mend, alpha_m != alpha_f; a tracer may be."""
         shift = self.coefficients.alpha_m - self.coefficients.alpha_f
         return not (is_concrete(shift) and shift == 0)
 
-    def resized(self, state, r):
+    def resized(self, state: State, r: Array):
         """The method and the state for a step r times as long as the one before."""
         if not self.resizes:
             return self, state
         return replace(self, coefficients=adapted(self.coefficients, r)), moved(state, r)  # pyright: ignore[reportArgumentType]
 
 
-def moved(state, r):
+def moved(state: State, r: Array) -> State:
     """The state with a where steps r times as long expect it, for r <= 1; of vectors or of pytrees."""
     shrunk = jnp.minimum(r, 1) - 1
 
-    def move(a, w):
+    def move(a: Array, w: Array) -> Array:
         return a + shrunk.astype(jnp.result_type(a)) * (a - w)
 
     w = state.v if state.w is None else state.w  # of a first-order system as its user sees it
@@ -67,7 +73,7 @@ def moved(state, r):
     return state._replace(a=a, za=None if state.za is None else jax.tree.map(move, state.za, state.zdot))
 
 
-def adapted(c, r):
+def adapted(c: Coefficients, r: Array) -> Coefficients:
     """The coefficients of a step r times as long as the one before, for r > 1."""
     s = c.alpha_m - c.alpha_f
     grown = jnp.maximum(r, 1)
@@ -78,14 +84,14 @@ def adapted(c, r):
     })  # fmt: skip
 
 
-def resized_step(flat, stepper, params, dt, last, grows=False):
+def resized_step(flat: FlatSystem, stepper: Stepper, params: PyTree, dt: Array, last: Array, grows: bool = False):
     """State -> (State, Info) for a step dt after one of another size; grows: whether it may be far longer."""
 
-    def step(state):
+    def step(state: State):
         resized, state = stepper.resized(state, dt / last)
         if grows and stepper.throws(flat):
 
-            def begin(state, params, dt):
+            def begin(state: State, params: PyTree, dt: Array) -> State:
                 return resized.grown(flat, state, zero_order_hold.before(params, state.t, last), dt)
 
             state = seldom(begin, dt > GROWTH * last, state, params, dt)
@@ -121,15 +127,15 @@ def resized_step(flat, stepper, params, dt, last, grows=False):
 class Errors(NamedTuple):
     """Of a step, (N,): of the displacement, whose entries beyond the positions mean nothing, and of the rates."""
 
-    q: Any
-    v: Any
+    q: PyTree
+    v: PyTree
 
 
 class Past(NamedTuple):
     """What the estimate of the family remembers of the step before: (w1 - w)/h, and h, which is 0 before the first."""
 
     slope: Any
-    h: Any
+    h: Array
 
 
 class Controlled(Resizing):
@@ -144,17 +150,17 @@ class Controlled(Resizing):
         """3, for methods of order 2."""
         return 3 if self.order == 2 else None
 
-    def begin_estimates(self, system, state):
+    def begin_estimates(self, system: FlatSystem, state: State) -> Past:
         """No step before."""
         return Past(jnp.zeros_like(state.w), jnp.zeros_like(state.t))
 
-    def bind_estimated(self, system, params, dt, past):
+    def bind_estimated(self, system: FlatSystem, params: PyTree, dt: Array, past: Past):
         """State -> State, Info, Errors, Past, by the formulas above."""
         asks = not system.linear and self.options.iterations is not None  # else nothing is left at the end
         asks = asks or system.friction is not None  # what switched
         step = replace(self, estimating=asks).bind(system, params, dt)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
-        def estimated(s):
+        def estimated(s: State):
             s1, info = step(s)
             w1 = s1.w if info.switched is None else s1.w - info.switched
             errors, now = family_errors(self.coefficients, dt, s.w, w1, past, info.defect)
@@ -163,7 +169,7 @@ class Controlled(Resizing):
         return estimated
 
 
-def family_errors(c, h, w, w1, past, d):
+def family_errors(c: Coefficients, h: Array, w: Array, w1: Array, past: Past, d: Array | None):
     """The errors of a step from the accelerations w to w1, and what is to be remembered; d: S^-1 r, or None."""
     s = c.alpha_m - c.alpha_f
     rate = 1 / h
@@ -180,20 +186,20 @@ def family_errors(c, h, w, w1, past, d):
 class Embedded:
     """A method of several stages, among which is one of lower order: their difference is the estimate."""
 
-    def begin_estimates(self, system, state):
+    def begin_estimates(self, system: FlatSystem, state: State):
         """Nothing is remembered."""
         return ()
 
-    def bind_estimated(self, system, params, dt, past):
+    def bind_estimated(self, system: FlatSystem, params: PyTree, dt: Array, past: tuple):
         """State -> State, Info, Errors, ()."""
         step = self.bind_pair(system, params, dt)
 
-        def estimated(s):
+        def estimated(s: State):
             s1, info, errors = step(s)
             return s1, info, errors, ()
 
         return estimated
 
-    def bind_pair(self, system, params, dt) -> Any:
+    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array) -> Any:
         """State -> State, Info, Errors."""
         raise NotImplementedError

@@ -6,19 +6,26 @@ A multiplier L_i is the reaction that constraint i exerts along its own gradient
 units of length. (The IVP test set writes -B^T lambda: its multipliers are the negatives of these.)
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import UNROLLED, matvec
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, factorize_saddle_point, solver
 from hhtjax.primitives import staged
 from hhtjax.systems import kinematics
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
 GRADIENT = 64  # times what roundings of q change a constraint and its gradient, below which it has none
 SWITCHED_OFF = (
@@ -28,54 +35,56 @@ SWITCHED_OFF = (
 SHAKES = 3  # by a rounding
 
 
-def violation(system, q, v, t, params):
+def violation(system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree):
     """Phi, and dPhi/dt = B v + Phi_t: (m,) each."""
     return jax.jvp(lambda q, t: system.constraint(q, t, params), (q, t), (system.rate(q, v), jnp.ones_like(t)))
 
 
-def curvature(system, q, v, t, params):
+def curvature(system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Array:
     """The part of the second time derivative of Phi that w does not enter: (m,)."""
 
-    def rate(q, t):
+    def rate(q: Array, t: Array) -> Array:
         return violation(system, q, v, t, params)[1]
 
     return jax.jvp(rate, (q, t), (system.rate(q, v), jnp.ones_like(t)))[1]
 
 
-def reaction(system, q, t, params, L):
+def reaction(system: FlatSystem, q: Array, t: Array, params: PyTree, L: Array) -> Array:
     """B^T L: (n,)."""
     _, pull = jax.vjp(lambda q: system.constraint(q, t, params), q)
     return pull_back(system, q, pull(L)[0])
 
 
-def violation_and_reaction(system, q, v, t, params, L):
+def violation_and_reaction(system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, L: Array):
     """Phi, dPhi/dt and B^T L, from one linearisation of the constraints."""
     Phi, tangent = jax.linearize(lambda q, t: system.constraint(q, t, params), q, t)
     gradient, _ = jax.linear_transpose(tangent, q, t)(L)
     return Phi, tangent(system.rate(q, v), jnp.ones_like(t)), pull_back(system, q, gradient)
 
 
-def pull_back(system, q, gradient):
+def pull_back(system: FlatSystem, q: Array, gradient: Array) -> Array:
     """The force (n,) of a gradient with respect to q: the same, and the material moment for rotations."""
     zero = jnp.zeros(system.size, q.dtype)
     return jax.linear_transpose(lambda v: system.rate(q, v), zero)(gradient)[0]
 
 
-def saddle_point(system, q, t, params, factorize=None):
+def saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree, factorize: Callable | None = None):
     """The function (force, rows) -> (x, L) with M x - B^T L = force and B x = rows, factorised once: the index-1 system
     for accelerations, and all projections."""
     M, B = system.full_mass(q, t, params), jacobian(system, q, t, params)
     A = jnp.block([[M, -B.T], [B, jnp.zeros((len(B), len(B)), B.dtype)]])
     inverse = solver(A, factorize or factorize_constrained(system.size, None))
 
-    def x_and_multipliers(force, rows):
+    def x_and_multipliers(force: Real, rows: Array):
         z = inverse(jnp.concatenate([force, rows]))
         return z[: system.size], z[system.size :]
 
     return x_and_multipliers
 
 
-def answers(system, q, t, params, redundant=None, factorize=None) -> Any:
+def answers(
+    system: FlatSystem, q: Array, t: Array, params: PyTree, redundant=None, factorize: Callable | None = None
+) -> Any:
     """The function (force, rows=0) -> (dw, dL), factorised once: what more of a force makes of the accelerations and
     the multipliers, which are None without constraints. rows: B dw. redundant, factorize: how it is solved."""
     if not system.num_constraints:
@@ -86,38 +95,40 @@ def answers(system, q, t, params, redundant=None, factorize=None) -> Any:
     return lambda force, rows=zero: x_and_multipliers(force, rows)
 
 
-def acceleration_and_multipliers(system, q, v, t, params, factorize=None):
+def acceleration_and_multipliers(
+    system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, factorize: Callable | None = None
+):
     """w and L at a state that satisfies Phi = 0 and dPhi/dt = 0."""
     Q = system.force(q, v, t, params)
     return saddle_point(system, q, t, params, factorize)(Q, -curvature(system, q, v, t, params))
 
 
-def jacobian(system, q, t, params):
+def jacobian(system: FlatSystem, q: Array, t: Array, params: PyTree) -> Array:
     """B: (m, n)."""
     Phi = partial(system.constraint, t=t, params=params)
     _, tangent = staged(partial(jax.linearize, Phi), system.size)(q)
     return linear_map(lambda x: tangent(system.rate(q, x)), jnp.zeros(system.size, q.dtype))
 
 
-def check_redundant(caller, redundant):
+def check_redundant(caller: str, redundant):
     """An error for what is no value of `redundant`."""
     if redundant not in (None, "least_squares"):
         raise ValueError(f'{caller}: `redundant` must be None or "least_squares"; received {redundant!r}.')
 
 
-def factorize_constrained(n, redundant):
+def factorize_constrained(n: int, redundant):
     """The factorisation for n coordinates and their multipliers."""
     return factorize_saddle_point(n) if redundant is None else factorize_least_squares(n)
 
 
-def gradient(system, q, t, params):
+def gradient(system: FlatSystem, q: Array, t: Array, params: PyTree):
     """B, and which of its rows, (m,), are more than rounding, whatever the units: of those that are not, q changed by a
     rounding changes the row, or the constraint by as much as q would if it changed by all of its size."""
     k, sizes = np.arange(system.positions), kinematics.sizes(system.blocks, q)
     uneven = [np.where(k // 2**i % 2, -1, 1) * (0.75 + 0.618034 * (i + 1) * k % 0.5) for i in range(SHAKES)]
     shakes = float(jnp.finfo(q.dtype).eps) * jnp.asarray(np.stack([0 * k, *uneven]), q.dtype) * sizes[None, :]
 
-    def at(x):
+    def at(x: Array):
         moved = system.move(q, x)
         return system.constraint(moved, t, params), jacobian(system, moved, t, params)
 
@@ -128,7 +139,7 @@ def gradient(system, q, t, params):
     return B[0], jnp.isfinite(size) & (size > 0) & clear
 
 
-def require_independent(caller, B, clear):
+def require_independent(caller: str, B: np.ndarray, clear: np.ndarray):
     """An error that names the rows of B that depend on each other, or are not clear (`gradient`)."""
     size = np.linalg.norm(B, axis=1)
     empty = np.flatnonzero(~np.asarray(clear)).tolist()
@@ -148,7 +159,7 @@ def require_independent(caller, B, clear):
         )
 
 
-def dependent_row(B):
+def dependent_row(B: Array) -> Array:
     """Index of the first row of B (m, n) that depends on those above it, to a part in 1e6; -1 for none.
 
     The pivots of an elimination on the cosines between the rows: sin^2 of the angle to the span of the rows above.
@@ -158,7 +169,7 @@ def dependent_row(B):
     B = B / jnp.where(size == 0, 1, size)
     G = jax.vmap(partial(matvec, B))(B)
 
-    def eliminate(k, G):
+    def eliminate(k: int, G: Array) -> Array:
         return G - jnp.where(jnp.arange(m) > k, G[:, k] / jnp.maximum(G[k, k], limit), 0)[:, None] * G[k][None, :]
 
     if m <= UNROLLED:

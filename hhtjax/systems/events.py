@@ -5,11 +5,13 @@
 How a step finds the time is in hhtjax/runs/event_step.py.
 """
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +20,14 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import in_words, require_function, require_number
-from hhtjax.description import Description, as_float, freeze, is_array, is_concrete, is_real, thaw
+from hhtjax.description import Array, Description, PyTree, Real, as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.numerics.batched_cond import seldom
 from hhtjax.primitives import consistent
 from hhtjax.systems.constraints import answers, pull_back
 from hhtjax.systems.sampled import SLOP
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,21 +123,21 @@ class Event(Description):
             raise TypeError(f"Event: `terminal` must be True or False; received {self.terminal!r}.")
 
     @property
-    def is_noted(self):
+    def is_noted(self) -> bool:
         """Whether it changes nothing."""
         return self.reset is None and self.switch is None and not self.terminal
 
     @property
-    def sees_multipliers(self):
+    def sees_multipliers(self) -> bool:
         """Whether its guard has an argument for them."""
         return self.guard is not None and "multipliers" in _parameters(self.guard)
 
     @property
-    def switch_sees_state(self):
+    def switch_sees_state(self) -> bool:
         """Whether its switch is one of the state too."""
         return self.switch is not None and not _takes(self.switch, 1)
 
-    def times(self, params):
+    def times(self, params: PyTree) -> Array:
         """Those of `at`, (K,); NaN where they do not increase."""
         times = jnp.atleast_1d(as_float(self.at(params) if callable(self.at) else self.at))
         return jnp.where(jnp.all(times[1:] >= times[:-1]), times, jnp.nan)
@@ -141,7 +146,7 @@ class Event(Description):
 SWITCHES = 1, 3, 4, 5  # how many arguments: params, and before it y, t of a first-order system, q, v, t, or q, v, z, t
 
 
-def _required_times(at):
+def _required_times(at: PyTree):
     """What `Event` takes as `at`, times by values as an array."""
     if callable(at) and not is_array(at):
         require_function("Event", "at", at, "at(params)")
@@ -153,7 +158,7 @@ def _required_times(at):
     return at.astype(float) if isinstance(at, (np.ndarray, np.generic)) and at.dtype.kind in "iu" else at
 
 
-def require_times(caller, times):
+def require_times(caller: str, times: np.ndarray):
     """An error for times that are no numbers (K,), or do not increase; tracers pass."""
     if np.ndim(times) > 1 or not np.size(times):
         raise ValueError(f"{caller}: `at` must be a number, or of shape (K,); received the shape {np.shape(times)}.")
@@ -164,7 +169,7 @@ def require_times(caller, times):
             raise ValueError(f"{caller}: `at` must hold numbers in increasing order; received {np.asarray(times)}.")
 
 
-def _parameters(function):
+def _parameters(function: Callable):
     """The names of its arguments; none where it does not tell."""
     try:
         return list(inspect.signature(function).parameters)
@@ -172,7 +177,7 @@ def _parameters(function):
         return []
 
 
-def _takes(function, count):
+def _takes(function: Callable, count: int) -> bool:
     """Whether it can be called with so many arguments; of one that does not tell, whether it is one."""
     try:
         inspect.signature(function).bind(*range(count))
@@ -187,7 +192,7 @@ class Impact(Description):
 
     restitution: Any
 
-    def coefficient(self, params):
+    def coefficient(self, params: PyTree):
         """e."""
         e = self.restitution
         if isinstance(e, str):
@@ -195,7 +200,7 @@ class Impact(Description):
         return e(params) if callable(e) else e
 
 
-def impact(restitution: Any = 1.0) -> Impact:
+def impact(restitution: Real | str = 1.0) -> Impact:
     """Newton's law of impact, for `Event(reset=)`: an impulse along the guard g(q, t), without friction.
 
         v+ = v - (1 + e) M^-1 n (n.v + g_t)/(n.M^-1 n),    n = dg/dq
@@ -242,45 +247,45 @@ class FlatEvents(NamedTuple):
         return tuple(times is not None for times in self.times)
 
     @property
-    def still(self):
+    def still(self) -> FlatEvents:
         """The same with times that are constant to derivatives."""
         return self._replace(times=lax.stop_gradient(self.times))
 
-    def guards(self, s, params, over):
+    def guards(self, s, params: PyTree, over: list) -> Array:
         """g, (E,). over: of each event with known times, how many of them are over."""
         return self.values(s, params, next_times(self.times, over))
 
-    def rates(self, system, s, params, over, Ldot=None):
+    def rates(self, system: FlatSystem, s, params: PyTree, over: list, Ldot=None):
         """g, and dg/dt along the motion: (E,) each. Ldot: the rate of the multipliers."""
         at = s.q, s.v, s.t
         along = system.rate(s.q, s.v), s.w, jnp.ones_like(s.t)
         if any(self.forced):
             at, along = (*at, s.L), (*along, Ldot)
 
-        def guards(q, v, t, L=None):
+        def guards(q: Array, v: Array, t: Array, L=None) -> Array:
             return self.guards(s._replace(q=q, v=v, t=t, L=s.L if L is None else L), params, over)
 
         return jax.jvp(guards, at, along)
 
-    def slope(self, s, s1, h):
+    def slope(self, s, s1, h: Array) -> Any:
         """The rate of the multipliers between two states, where a guard sees them."""
         return (s1.L - s.L) / jnp.where(h > 0, h, 1) if any(self.forced) else None
 
-    def both(self, system, s, s1, params, over, h):
+    def both(self, system: FlatSystem, s, s1, params: PyTree, over: list, h: Array):
         """The same at both ends of a step."""
         Ldot = self.slope(s, s1, h)
         return [self.rates(system, x, params, over, Ldot) for x in (s, s1)]
 
-    def before_any(self, t):
+    def before_any(self, t: Array):
         """Of each event with times, how many of these are over at the start of a run."""
 
-        def passed(times):
+        def passed(times: Array) -> Array:
             slack = SLOP * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + jnp.abs(times))
             return jnp.sum(times < t - slack, dtype=jnp.int32)
 
         return [passed(times) for times in self.times if times is not None]
 
-    def passed(self, i, over):
+    def passed(self, i: Array, over: list):
         """The same behind event i."""
         numbers = [number for number, here in enumerate(self.timed) if here]
         return [x + (i == number).astype(x.dtype) for number, x in zip(numbers, over, strict=True)]
@@ -292,47 +297,47 @@ class FlatEvents(NamedTuple):
         return jnp.min(jnp.stack([jnp.full_like(t, jnp.inf), *due]))
 
 
-def next_times(times, over):
+def next_times(times: tuple, over: list):
     """When each of the events with times happens next; inf where it does not."""
     known = [x for x in times if x is not None]
     return [_first_left(x, passed) for x, passed in zip(known, over, strict=True)]
 
 
-def _first_left(times, over):
+def _first_left(times: Array, over: Array) -> Array:
     """The first of the times (K,) that is not over; inf where all are."""
     last = len(times) - 1
     time = times[0] if last == 0 else lax.dynamic_index_in_dim(times, jnp.minimum(over, last), keepdims=False)
     return jnp.where(over > last, jnp.inf, time)
 
 
-def flatten_events(system, events, params, at, redundant=None):
+def flatten_events(system: FlatSystem, events: tuple, params: PyTree, at: tuple, redundant=None) -> FlatEvents:
     """The events of a `FlatSystem`. at: q, v, t of the start; redundant: how its constraints are solved."""
     changed = sorted({i for event in events if event.switch for i in _changed(system, event, params, at)})
     times = tuple(None if event.at is None else event.times(thaw(params)).astype(at[1].dtype) for event in events)
     guards = [None if event.guard is None else consistent(partial(_guard, system, event)) for event in events]
 
-    def values(s, params, due):
+    def values(s, params: PyTree, due) -> Array:
         due = iter(due)
         values = [next(due) - s.t if guard is None else guard(s.q, s.v, s.t, s.L, params) for guard in guards]
         return jnp.stack([jnp.asarray(g).astype(s.v.dtype).reshape(()) for g in values])
 
-    def modes(params):
+    def modes(params: PyTree):
         leaves = jax.tree.leaves(params)
         return [jnp.asarray(leaves[i]) for i in changed]
 
-    def with_modes(params, modes):
+    def with_modes(params: PyTree, modes: list):
         leaves, structure = jax.tree.flatten(params)
         for i, x in zip(changed, modes, strict=True):
             leaves[i] = x
         return structure.unflatten(leaves)
 
-    def outcome_of(event, before, q, t, now, params):
+    def outcome_of(event: Event, before: tuple, q: Array, t: Array, now: dict | None, params: PyTree):
         v, old = before
         after = switched(system, event, q, v, t, params)
         new = [x.astype(y.dtype) for x, y in zip(modes(after), old, strict=True)]
         return _reset(system, event, redundant, q, v, t, now), new
 
-    def outcome(i, s, now, params):
+    def outcome(i: Array, s, now: dict | None, params: PyTree):
         after = s.v, modes(params)
         for number, event in enumerate(events):
             if not event.is_noted:
@@ -344,7 +349,7 @@ def flatten_events(system, events, params, at, redundant=None):
     return FlatEvents(values, outcome, noted, ends, forced, times, bool(changed), modes, with_modes)
 
 
-def switched(system, event, q, v, t, params):
+def switched(system: FlatSystem, event: Event, q: Array, v: Array, t: Array, params: PyTree):
     """The params behind an event, from the flat state before it."""
     if event.switch is None:
         return params
@@ -352,13 +357,13 @@ def switched(system, event, q, v, t, params):
     return freeze(_on_vectors(system, event.switch, q, v, t, params) if whole else event.switch(thaw(params)))
 
 
-def _guard(system, event, q, v, t, L, params):
+def _guard(system: FlatSystem, event, q: Array, v: Array, t: Array, L, params: PyTree) -> Array:
     """The guard of an event at a state."""
     guard = partial(event.guard, multipliers=L) if event.sees_multipliers else event.guard
     return _on_vectors(system, guard, q, v, t, params)
 
 
-def _on_vectors(system, function, q, v, t, params):
+def _on_vectors(system, function, q: Array, v: Array, t: Array, params: PyTree) -> Array:
     """A user's function at a flat state."""
     params = thaw(params)
     if system.positions == 0:
@@ -367,12 +372,12 @@ def _on_vectors(system, function, q, v, t, params):
     return function(system.unravel(q), system.unravel_rates(system.located(v)), *internal, t, params)
 
 
-def _changed(system, event, params, at):
+def _changed(system: FlatSystem, event: Event, params: PyTree, at: tuple):
     """Numbers of the leaves of params that a switch changes."""
     leaves, structure = jax.tree.flatten(params)
     places = [i for i, x in enumerate(leaves) if is_array(x) or not callable(x)]
 
-    def after(data, q, v, t):
+    def after(data: PyTree, q: Array, v: Array, t: Array):
         filled = list(leaves)
         for i, x in zip(places, data, strict=True):
             filled[i] = x
@@ -384,7 +389,7 @@ def _changed(system, event, params, at):
     return [i for i, before, after in pairs if after is not before]
 
 
-def _reset(system, event, redundant, q, v, t, params):
+def _reset(system: FlatSystem, event, redundant, q: Array, v: Array, t: Array, params: PyTree) -> Array:
     """The velocity (N,) after an event."""
     if event.reset is None:
         return v
@@ -396,7 +401,9 @@ def _reset(system, event, redundant, q, v, t, params):
     return system.with_internal(jnp.pad(new, (0, system.size - new.size)), v)
 
 
-def _bounced(system, guard, law, redundant, q, v, t, params):
+def _bounced(
+    system: FlatSystem, guard: Callable, law: Impact, redundant, q: Array, v: Array, t: Array, params: PyTree
+) -> Array:
     """v behind an impact; NaN where no velocity changes the guard."""
     e = jnp.asarray(law.coefficient(thaw(params))).astype(v.dtype)
     gradient, g_t = jax.grad(lambda q, t: jnp.asarray(guard(q, v, t, params)).reshape(()), argnums=(0, 1))(q, t)

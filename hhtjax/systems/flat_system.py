@@ -1,15 +1,18 @@
 """A system on vectors, as the steppers see it, and the checks of what its functions return."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import check_like, check_matrix, count, describe, evaluate, telling_of_arguments
-from hhtjax.description import thaw
+from hhtjax.description import Array, PyTree, Real, thaw
 from hhtjax.numerics.dense_lu import by_factors, factorize, matvec
 from hhtjax.numerics.linear_solve import reuse, solver
 from hhtjax.numerics.sparse_matrix import combined
@@ -19,6 +22,9 @@ from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.linear_system import with_known_matrices
 from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, mass_at, product_at, timed
+
+if TYPE_CHECKING:
+    from hhtjax.systems.system import System
 
 
 class FlatSystem(NamedTuple):
@@ -49,14 +55,14 @@ class FlatSystem(NamedTuple):
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
     settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
     diagonals: Callable | None = None  # params -> M, C, K (None where absent), where all of them are diagonals (n,)
-    massless: Any = None  # G with M G M = M, where M is singular
-    factors: Any = None  # `Factors` for the steps of a run, where they are known before it
+    massless: Array | None = None  # G with M G M = M, where M is singular
+    factors: Factors | None = None  # `Factors` for the steps of a run, where they are known before it
 
-    def settled(self, params):
+    def settled(self, params: PyTree) -> FlatSystem:
         """What `settle` gives, where there is something to settle."""
         return self if self.settle is None else self.settle(params)
 
-    def step_matrix(self, params, w, v, q):
+    def step_matrix(self, params: PyTree, w: Array, v: Array, q: Array):
         """w M + v C + q K, `Sparse` or a diagonal (n,), of factors that are numbers."""
         known = self.matrices or self.diagonals
         assert known is not None
@@ -64,24 +70,24 @@ class FlatSystem(NamedTuple):
         return combined(*terms) if self.matrices is not None else sum(x * A for x, A in terms)
 
     @property
-    def knows_matrices(self):
+    def knows_matrices(self) -> bool:
         """Whether `step_matrix` gives the matrix of a step, so that none has to be found column by column."""
         return self.matrices is not None or self.diagonals is not None
 
-    def inertia(self, q, w, t, params):
+    def inertia(self, q: Array, w: Array, t: Array, params: PyTree) -> Array:
         """M(q, t) w, and zdot."""
 
-        def product(w):
+        def product(w: Array):
             return matvec(self.mass(q, t, params), w) if self.product is None else self.product(q, w, t, params)
 
         return self._of_positions(product, w)
 
-    def acceleration(self, q, v, t, params, factorize=factorize):
+    def acceleration(self, q: Array, v: Array, t: Array, params: PyTree, factorize: Callable = factorize) -> Array:
         """w = M(q, t)^-1 Q(q, v, t), and zdot."""
         M, Q = self.mass(q, t, params), self.force(q, v, t, params)
         return self.mass_solver(M, factorize)(Q)
 
-    def mass_solver(self, M, factorize=factorize):
+    def mass_solver(self, M: Array, factorize: Callable = factorize):
         """The function Q -> M^-1 Q, and what works on z as it is; factorised once."""
         if self.massless is not None:
             return partial(self._of_positions, partial(matvec, jnp.asarray(self.massless).astype(M.dtype)))
@@ -90,39 +96,39 @@ class FlatSystem(NamedTuple):
         inverse = (lambda Q: Q / M) if M.ndim == 1 else solver(M, factorize)
         return partial(self._of_positions, inverse)
 
-    def with_ones(self, d):
+    def with_ones(self, d: Array) -> Array:
         """d (n,), of M, and ones for z: (N,)."""
         return d if self.positions == self.size else jnp.concatenate([d, jnp.ones(self.size - self.positions, d.dtype)])
 
-    def full_mass(self, q, t, params):
+    def full_mass(self, q: Array, t: Array, params: PyTree) -> Array:
         """M(q, t), and ones for z, as a matrix (N, N)."""
         M = self.mass(q, t, params)
         if M.ndim == 1:
             return jnp.diag(self.with_ones(M))
         return M if self.positions == self.size else block_diag(M, jnp.eye(self.size - self.positions, dtype=M.dtype))
 
-    def located(self, x):
+    def located(self, x: Array) -> Array:
         """Those entries of a vector (N,) of rates that have positions."""
         return x if self.positions == self.size else x[: self.positions]
 
-    def with_internal(self, x, z):
+    def with_internal(self, x: Array, z: Array):
         """x, but beside positions the entries of internal states as in z: (N,)."""
         n = self.positions
         return x if n in (0, self.size) else jnp.concatenate([x[:n], z[n:]])
 
-    def widened(self, D):
+    def widened(self, D: Array) -> Array:
         """A derivative (N, n) in q as one in displacements (N,), of which those of z move nothing."""
         return D if self.positions == self.size else jnp.pad(D, ((0, 0), (0, self.size - self.positions)))
 
-    def move(self, q, x):
+    def move(self, q: Array, x: Array) -> Array:
         """q displaced by x (N,): q + x, and R exp(x) for rotations."""
         return kinematics.move(self.blocks, q, self.located(x))
 
-    def rate(self, q, v):
+    def rate(self, q: Array, v: Array) -> Array:
         """qdot: v, and R hat(v) for rotations."""
         return kinematics.rate(self.blocks, q, self.located(v))
 
-    def end_of_chart(self, x, *rates):
+    def end_of_chart(self, x: Array, *rates: Array):
         """Velocity, acceleration, algorithmic acceleration, from first and second rates of the displacement x."""
         if not self.blocks:
             return rates
@@ -133,7 +139,7 @@ class FlatSystem(NamedTuple):
         """The state at the end of a step, its rotations orthogonal to rounding."""
         return state._replace(q=kinematics.orthonormalize(self.blocks, state.q))
 
-    def _of_positions(self, f, x):
+    def _of_positions(self, f: Callable, x: Array) -> Array:
         """f of the entries that have positions, the others as they are."""
         n = self.positions
         if n == self.size:
@@ -159,7 +165,7 @@ class Local(NamedTuple):
     size: int | None  # k; None where it acts on all coordinates
 
 
-def flatten(caller, system, q0, v0, t0, params, z0=None):
+def flatten(caller: str, system, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree = None):
     """The system on vectors, and q0 and (v0, z0) as vectors: the one place where pytrees are ravelled.
 
     Runs while tracing, so it checks shapes and structures and costs nothing at run time.
@@ -170,7 +176,7 @@ def flatten(caller, system, q0, v0, t0, params, z0=None):
         return _flatten_second_order(caller, system, q0, v0, t0, params, z0)
 
 
-def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
+def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree):
     q, unravel = ravel_pytree(q0)
     dtype = q.dtype
     v, unravel_rates = ravel_pytree(v0)
@@ -188,7 +194,7 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
     linear = isinstance(system, LinearSystem)
     _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0)
 
-    def on_vectors(system):
+    def on_vectors(system) -> FlatSystem:
         mass, force = (partial(f, system, unravel, dtype) for f in (_flat_mass, partial(_flat_force, unravel_rates)))
         mass, force = consistent(mass) if callable(system.mass) else mass, consistent(force)
         flat = FlatSystem(mass, force, n, n, linear, unravel, unravel_rates, None, constraint, m, blocks)
@@ -210,22 +216,31 @@ def _flatten_second_order(caller, system, q0, v0, t0, params, z0):
     return flat, q, v
 
 
-def _flat_mass(system, unravel, dtype, q, t, params):
+def _flat_mass(system: System, unravel: Callable, dtype: np.dtype, q: Array, t: Array, params: PyTree):
     return as_matrix(mass_at(system, unravel(q), t, thaw(params)), dtype)
 
 
-def _flat_force(unravel_rates, system, unravel, dtype, q, v, t, params):
+def _flat_force(
+    unravel_rates: Callable,
+    system: System,
+    unravel: Callable,
+    dtype: np.dtype,
+    q: Array,
+    v: Array,
+    t: Array,
+    params: PyTree,
+) -> Array:
     return ravel_pytree(system.force(unravel(q), unravel_rates(v), t, thaw(params)))[0].astype(dtype)
 
 
-def _with_local(system, flat, dtype):
+def _with_local(system, flat: FlatSystem, dtype: np.dtype) -> FlatSystem:
     """The system with its nonlinear force kept apart, too."""
 
-    def linear_force(q, v, t, params):
+    def linear_force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
         Q = system.linear_force(flat.unravel(q), flat.unravel_rates(v), t, thaw(params))
         return ravel_pytree(Q)[0].astype(dtype)
 
-    def local_force(q, v, t, params):
+    def local_force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
         return system.local_force(flat.unravel(q), flat.unravel_rates(v), t, thaw(params)).astype(dtype)
 
     spread, size = partial(system.spread, n=flat.size), None if system.at is None else len(system.at)
@@ -233,34 +248,45 @@ def _with_local(system, flat, dtype):
     return flat._replace(linear=False, local=local)
 
 
-def _with_internal(system, flat, q, v0, z0):
+def _with_internal(system, flat: FlatSystem, q: Array, v0: PyTree, z0: PyTree):
     """The same with internal states, behind the velocities and their rates."""
     V, unravel = ravel_pytree((v0, z0))
     unravel_internal = ravel_pytree(z0)[1]
 
-    def force(q, V, t, params):
+    def force(q: Array, V, t: Array, params: PyTree) -> Array:
         at = flat.unravel(q), *unravel(V), t, thaw(params)
         return ravel_pytree((system.force(*at), system.internal(*at)))[0].astype(V.dtype)
 
     return flat._replace(force=consistent(force), size=V.size, unravel_internal=unravel_internal), q, V
 
 
-def _flatten_first_order(caller, system, y0, t0, params):
+def _flatten_first_order(caller: str, system: FirstOrderSystem, y0: PyTree, t0: Real, params: PyTree):
     """y' = rate: internal states alone, without a position."""
     y, unravel = ravel_pytree(y0)
     n, dtype = y.size, y.dtype
     check_like(caller, "rate", evaluate(caller, "rate", system.rate, y0, t0, params), "q0", y0, dtype)
 
-    def rate(q, v, t, params):
+    def rate(q: Array, v: Array, t: Array, params: PyTree) -> Array:
         return ravel_pytree(system.rate(unravel(v), t, thaw(params)))[0].astype(dtype)
 
-    def mass(q, t, params):
+    def mass(q: Array, t: Array, params: PyTree) -> Array:
         return jnp.ones(0, dtype)
 
     return FlatSystem(mass, consistent(rate), n, 0, False, unravel, unravel), jnp.zeros(0, dtype), y
 
 
-def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):
+def _check_functions(
+    caller: str,
+    system,
+    linear: bool,
+    n: int,
+    dtype: np.dtype,
+    q0: PyTree,
+    v0: PyTree,
+    t0: Real,
+    params: PyTree,
+    z0: PyTree,
+):
     """Shapes of what the functions of a system return."""
     if linear:
         for name in ("M", "C", "K"):
@@ -288,7 +314,7 @@ def _check_functions(caller, system, linear, n, dtype, q0, v0, t0, params, z0):
         _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params)
 
 
-def _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params):
+def _check_nonlinear(caller: str, system, n: int, dtype: np.dtype, q0: PyTree, v0: PyTree, t0: Array, params: PyTree):
     """The force beside a linear system."""
     if system.at is None:
         like = "v0", v0
@@ -300,9 +326,20 @@ def _check_nonlinear(caller, system, n, dtype, q0, v0, t0, params):
     check_like(caller, "nonlinear", evaluate(caller, "nonlinear", system.nonlinear, q0, v0, t0, params), *like, dtype)
 
 
-def _flat_constraint(constraint, unravel, dtype, q, t, params):
+def _flat_constraint(
+    constraint: Callable, unravel: Callable, dtype: np.dtype, q: Array, t: Array, params: PyTree
+) -> Array:
     return jnp.asarray(constraint(unravel(q), t, thaw(params))).astype(dtype)
 
 
-def _flat_product(system, unravel, unravel_rates, dtype, q, w, t, params):
+def _flat_product(
+    system: System,
+    unravel: Callable,
+    unravel_rates: Callable,
+    dtype: np.dtype,
+    q: Array,
+    w: Array,
+    t: Real,
+    params: PyTree,
+) -> Array:
     return ravel_pytree(product_at(system, unravel(q), unravel_rates(w), t, thaw(params)))[0].astype(dtype)

@@ -6,6 +6,8 @@
 How a step finds tau is in hhtjax/steppers/friction.py.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -17,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax import checks
 from hhtjax.checks import describe, require_function
-from hhtjax.description import thaw
+from hhtjax.description import Array, PyTree, Real, thaw
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
@@ -37,7 +39,7 @@ class FrictionLaw(NamedTuple):
     dependent: bool  # whether rows of `sliding` may depend on each other, or on constraints
 
 
-def require_friction(caller, friction, sliding, *more):
+def require_friction(caller: str, friction: Callable | None, sliding: Callable | None, *more: str):
     """An error for what are no functions of dry friction. more: what `friction` takes between v and t."""
     if friction is None:
         if sliding is not None:
@@ -48,7 +50,9 @@ def require_friction(caller, friction, sliding, *more):
         require_function(caller, "sliding", sliding, "sliding(q, v, t, params)")
 
 
-def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
+def flat_friction(
+    caller: str, system, flat, q0: PyTree, v0: PyTree, z0: PyTree, t0: Real, params: PyTree
+) -> FrictionLaw:
     """The `FrictionLaw` of a system, or an error for what its functions return."""
     dtype, n = ravel_pytree(q0)[0].dtype, flat.positions
     z = () if z0 is None else (z0,)
@@ -71,12 +75,12 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
         checks.check_dtype(caller, "friction", F, dtype)
     unravel_internal = (lambda V: ()) if z0 is None else (lambda V: (flat.unravel_internal(V[n:]),))
 
-    def limit(q, V, L, t, params):
+    def limit(q: Array, V: Array, L: Array | None, t: Array, params: PyTree):
         multipliers = (L,) if flat.num_constraints else ()
         at = flat.unravel(q), flat.unravel_rates(flat.located(V)), *unravel_internal(V), *multipliers
         return ravel_pytree(system.friction(*at, t, thaw(params)))[0].astype(dtype)
 
-    def sliding(q, V, t, params):
+    def sliding(q: Array, V: Array, t: Array, params: PyTree):
         v = flat.located(V)
         if system.sliding is None:
             return v
@@ -86,14 +90,14 @@ def flat_friction(caller, system, flat, q0, v0, z0, t0, params):
     return FrictionLaw(consistent(limit), consistent(sliding), m, dependent)
 
 
-def directions(system, q, t, params):
+def directions(system, q, t, params: PyTree) -> Array:
     """H (m, N), the derivative of the sliding velocities in the rates."""
     zero = jnp.zeros(system.size, q.dtype)
     s = partial(system.friction.sliding, q, t=t, params=params)
     return linear_map(jax.linearize(s, zero)[1], zero)
 
 
-def reaction(system, q, t, params, tau):
+def reaction(system, q, t, params: PyTree, tau) -> Array:
     """H^T tau: (N,)."""
     zero = jnp.zeros(system.size, q.dtype)
     return jax.vjp(lambda v: system.friction.sliding(q, v, t, params), zero)[1](tau)[0]
@@ -108,23 +112,23 @@ def own_rate(system, q, v, t, params):
     return jax.jvp(s, (q, t), (system.rate(q, v), jnp.ones_like(t)))[1]
 
 
-def responses(answer, H):
+def responses(answer: Callable, H: Array):
     """G (m, N), the accelerations that a unit of force in each direction of H makes, M^-1 H^T, with constraints; and
     the multipliers that belong to them. answer: of `answers`."""
     return jax.vmap(answer)(H)
 
 
-def across(H, G):
+def across(H: Array, G: Array):
     """H G^T (m, m): what a unit of force in direction j does in direction i."""
     return jnp.stack([matvec(H, g) for g in G], axis=1)
 
 
-def solve_some(K, some, b):
+def solve_some(K: Array, some: Array, b: Array) -> Array:
     """y with K y = b on those rows and columns, and 0 elsewhere."""
     return solver_of_some(K, some)(b)
 
 
-def solver_of_some(K, some):
+def solver_of_some(K: Array, some: Array):
     """The function b -> y of it, for many b: factorised once."""
     if len(K) == 1:
         return lambda b: jnp.where(some, b, 0) / jnp.where(some, K[0], 1)
@@ -132,12 +136,12 @@ def solver_of_some(K, some):
     return lambda b: solve(jnp.where(some, b, 0))
 
 
-def block_of(A, some):
+def block_of(A: Array, some: Array) -> Array:
     """A on those rows and columns, beside ones."""
     return jnp.where(some[:, None] & some[None, :], A, jnp.eye(len(A), dtype=A.dtype))
 
 
-def at_rest(K, rests, load, f):
+def at_rest(K: Array, rests: Array, load: Array, f: Array):
     """sig and tau of joints at rest: what holds them against their loads, within their limits; the others slide.
 
     From all of them held on, the first joint of which that is wrong changes: it cannot be held, and slides, or its
@@ -148,11 +152,11 @@ def at_rest(K, rests, load, f):
         return jnp.where(jnp.abs(load) > f * K[0], jnp.sign(load), 0), tau
     m, fixed = len(f), lax.stop_gradient((K, load, f))
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         _, _, wrong, i = carry
         return jnp.any(wrong) & (i < 3**m)
 
-    def change(carry):
+    def change(carry: tuple):
         sig, to, wrong, i = carry
         sig = jnp.where(jnp.arange(m) == jnp.argmax(wrong), to, sig)
         return sig, *_wrong(*fixed, rests, sig), i + 1
@@ -162,13 +166,13 @@ def at_rest(K, rests, load, f):
     return sig, _holding(K, load, f, rests, sig)
 
 
-def _holding(K, load, f, rests, sig):
+def _holding(K: Array, load: Array, f: Array, rests: Array, sig: Array) -> Array:
     """tau of joints that slide in the directions sig, and of the others at rest, which it holds."""
     slid = sig * f
     return slid + solve_some(K, rests & (sig == 0), load - matvec(K, slid))
 
 
-def _wrong(K, load, f, rests, sig):
+def _wrong(K: Array, load: Array, f: Array, rests: Array, sig: Array):
     """What joints at rest should do instead, and which of them, but for roundings, must."""
     tau, alone = _holding(K, load, f, rests, sig), diagonal(K)
     over = jnp.where(sig == 0, jnp.abs(tau) - f, sig * (matvec(K, tau) - load) / alone)

@@ -13,16 +13,23 @@ D. Bertsekas, SIAM J. Control Optim. 20, 1982; J. Moreau, Unilateral contact and
 dynamics, 1988.
 """
 
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.batched_cond import choose
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems.constraints import jacobian, violation
 from hhtjax.systems.friction import at_rest, block_of, directions, responses, solver_of_some
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
 
 LIMIT = 1e-10  # relative size, squared, of what is left of a direction, below which it is rounding
 SLIGHT = 1e-9  # relative size of an acceleration, or of a time in a step, below which it is 0
@@ -34,17 +41,17 @@ HALVINGS = 16  # of a Newton step
 class Independent(NamedTuple):
     """Rows that do not depend on each other: every choice of them is solved as it is."""
 
-    K: Any
+    K: Array
 
-    def solve(self, A, some, b):
+    def solve(self, A: Array, some: Array, b: Array):
         """y with A y = b on those rows and columns, 0 elsewhere."""
         return solver_of_some(A, some)(b)
 
-    def at_rest(self, rests, load, f, size=None):
+    def at_rest(self, rests: Array, load: Array, f: Array, size: Array | None = None):
         """sig and tau of joints at rest."""
         return at_rest(self.K, rests, load, f)
 
-    def are_dependent(self):
+    def are_dependent(self) -> Array:
         """Whether they depend on each other after all."""
         left, least, m = lax.stop_gradient(self.K), _rounding(self.K), len(self.K)
         found = jnp.zeros((), bool)
@@ -53,7 +60,7 @@ class Independent(NamedTuple):
             found = found | (jnp.abs(left[i + 1, i + 1]) < least[i + 1])
         return found
 
-    def carriers(self, some):
+    def carriers(self, some: Array) -> Array:
         """The same rows."""
         return some
 
@@ -65,44 +72,54 @@ class Dependent(NamedTuple):
     the rank that it should have. least: what is rounding in its diagonal.
     """
 
-    K: Any
-    C: Any
-    basis: Any
-    least: Any
+    K: Array
+    C: Array
+    basis: Array
+    least: Array
 
-    def spanning(self, some, first=False):
+    def spanning(self, some: Array, first: bool = False) -> Array:
         """As many of those rows as do not depend on each other; from `first`, while there are such."""
         return independent(self.K, self.least, some, first)
 
-    def solve(self, A, some, b):
+    def solve(self, A: Array, some: Array, b: Array):
         """y with A y = b on as many of those rows and columns as are independent, 0 elsewhere."""
         return solver_of_positive(A, self.spanning(some))(b)
 
-    def at_rest(self, rests, load, f, size=0.0):
+    def at_rest(self, rests: Array, load: Array, f: Array, size: Real = 0.0):
         """sig and tau of joints at rest, from their loads, which are made of terms of this size."""
         return at_rest_in_box(self, rests, load, f, size)
 
-    def are_dependent(self):
+    def are_dependent(self) -> bool:
         """That is known of them."""
         return False
 
-    def carriers(self, some):
+    def carriers(self, some: Array) -> Array:
         """The rows of the basis that some rows are made of."""
         return self.basis & jnp.any(some[None, :] & (self.C != 0), axis=1)
 
-    def shared(self, sticks, tau, f):
+    def shared(self, sticks: Array, tau: Array, f: Array) -> Array:
         """tau, where joints stick in other forces that do the same, within the limits."""
         held = jnp.where(sticks, tau, 0)
         _, shared = self.at_rest(sticks, matvec(self.K, held), f, matvec(jnp.abs(self.K), jnp.abs(held)))
         return jnp.where(sticks, shared, tau)
 
 
-def depends(system, redundant):
+def depends(system, redundant) -> bool:
     """Whether directions may depend on each other: as is known of the system, or as `redundant` of the stepper says."""
     return system.friction.dependent or redundant is not None
 
 
-def rows_of(system, q, t, params, H, G, pulls, first, dependent):
+def rows_of(
+    system: FlatSystem,
+    q: Array,
+    t: Array,
+    params: PyTree,
+    H: Array,
+    G: Array,
+    pulls: Array | None,
+    first: Real,
+    dependent: bool,
+):
     """The rows of H, with G = A^-1 H^T and the multipliers that belong to it. first: those that a basis begins with.
 
     dependent: whether they may depend on each other; where not, they cost nothing.
@@ -121,23 +138,23 @@ def rows_of(system, q, t, params, H, G, pulls, first, dependent):
     return Dependent(_through(C, basis, K), C, basis, least)
 
 
-def _rounding(K):
+def _rounding(K: Array) -> Array:
     """What is rounding in the diagonal of K: in single precision more."""
     return max(LIMIT, 1e3 * float(jnp.finfo(K.dtype).eps)) * jnp.abs(diagonal(K))
 
 
-def slight(dtype):
+def slight(dtype: np.dtype) -> float:
     """The same of SLIGHT."""
     return max(SLIGHT, 1e3 * float(jnp.finfo(dtype).eps))
 
 
-def _through(C, basis, K):
+def _through(C: Array, basis: Array, K: Array) -> Array:
     """C^T K C, of the basis alone."""
     inner = jnp.where(basis[:, None] & basis[None, :], K, 0)
     return C.T @ (inner @ C)
 
 
-def _left_by_constraints(H, pulls, B):
+def _left_by_constraints(H: Array, pulls, B: Array) -> Array:
     """Which part of each row constraints leave to move something: at most 1, and more than 0."""
     left, taken = jnp.abs(H + pulls @ B), jnp.abs(H) + jnp.abs(pulls) @ jnp.abs(B)
     unit = jnp.maximum(jnp.max(jnp.abs(H), axis=0), jnp.max(jnp.abs(B), axis=0))  # of each coordinate
@@ -145,7 +162,7 @@ def _left_by_constraints(H, pulls, B):
     return jnp.clip(left / jnp.where(taken == 0, 1, taken), float(jnp.finfo(H.dtype).eps), 1)
 
 
-def solver_of_positive(A, some):
+def solver_of_positive(A: Array, some: Array):
     """b -> y with A y = b on those rows and columns, 0 elsewhere, of an A that is positive there."""
 
     def factorize(A):
@@ -156,11 +173,11 @@ def solver_of_positive(A, some):
     return lambda b: solve(jnp.where(some, b, 0))
 
 
-def _inverse(A):
+def _inverse(A: Array) -> Array:
     """Of a positive A, which needs no other pivots, by as short a program as can be."""
     i = jnp.arange(len(A))
 
-    def exchange(k, X):
+    def exchange(k: Array, X: Array) -> Array:
         row, column, pivot = X[k], X[:, k] / X[k, k], X[k, k]
         there, down = (i == k)[:, None], (i == k)[None, :]
         rest = jnp.where(down, -column[:, None], X - column[:, None] * row[None, :])
@@ -169,7 +186,7 @@ def _inverse(A):
     return lax.fori_loop(0, len(A), exchange, A)
 
 
-def independent(K, least, some, first=False):
+def independent(K: Array, least: Array, some: Array, first: Real = False) -> Array:
     """A largest choice of `some` of the rows of a semi-definite K that do not depend on each other.
 
     By elimination with diagonal pivots, the largest next; those of `first` before others.
@@ -177,7 +194,7 @@ def independent(K, least, some, first=False):
     K, m = lax.stop_gradient(K), len(K)
     before = jnp.where(jnp.broadcast_to(first, (m,)), 1 / float(jnp.finfo(K.dtype).eps), 1).astype(K.dtype)
 
-    def take(_, carry):
+    def take(_, carry: tuple):
         chosen, left = carry
         d = diagonal(left)
         fits = some & ~chosen & (d > least)
@@ -192,7 +209,7 @@ def independent(K, least, some, first=False):
     return lax.fori_loop(0, m, take, (jnp.zeros(m, bool), K))[0]
 
 
-def is_prescribed(system, rows, pulls, states, params):
+def is_prescribed(system, rows, pulls: Array, states: tuple, params: PyTree) -> Array:
     """Whether a sliding velocity has a part that the basis has no say in, at one of two states: (m,).
 
     That is r = own - C^T own + (L - C^T L) dPhi/dt in s_j = sum C_ij s_i + r_j, where H^T - H^T C = -B^T L.
@@ -210,7 +227,7 @@ def is_prescribed(system, rows, pulls, states, params):
     return found & ~rows.basis
 
 
-def at_rest_in_box(rows, rests, load, f, size=0.0):
+def at_rest_in_box(rows: Dependent, rests: Array, load: Array, f: Array, size: Real = 0.0):
     """sig and tau of joints at rest: what holds them, within their limits; those slide that this leaves accelerated.
 
     Derivatives are those of the smallest forces tau that hold what sticks, beside those at their limits.
@@ -231,7 +248,7 @@ def at_rest_in_box(rows, rests, load, f, size=0.0):
     return sig, limited + jnp.where(inside, held + lax.stop_gradient(exact - held), 0)
 
 
-def slides_in_box(K, least, rests, load, f, size=0.0):
+def slides_in_box(K: Array, least: Array, rests: Array, load: Array, f: Array, size: Real = 0.0):
     """The directions of those joints at rest that cannot be held, and the forces; both without derivatives."""
     K, load, f, size = lax.stop_gradient((K, load, f, jnp.asarray(size, K.dtype)))
     rests = jnp.broadcast_to(rests, f.shape)
@@ -244,7 +261,7 @@ def slides_in_box(K, least, rests, load, f, size=0.0):
     return jnp.where(rests & at_limit & (jnp.abs(rate) > nothing), d, 0), tau
 
 
-def leaves_box(K, least, rests, loads, f, size=0.0):
+def leaves_box(K: Array, least: Array, rests: Array, loads: list, f: Array, size: Real = 0.0):
     """When loads that go linearly from one to the other of two, within a unit of time, leave what joints at rest can
     hold for good, and who slides then, and where to; infinity and nobody where they do not.
 
@@ -257,24 +274,24 @@ def leaves_box(K, least, rests, loads, f, size=0.0):
     moved = rests & (diagonal(known[0]) > least)
     inverse = solver_of_positive(known[0], independent(known[0], least, moved))
 
-    def plane_at(x):
+    def plane_at(x: Array):
         K, (first, last), f = known
         load = first + x * (last - first)
         slides, tau = slides_in_box(K, least, moved, load, f, size)
         return slides, tau, inverse(jnp.where(slides != 0, load - matvec(K, tau), 0))
 
-    def crossing(plane, K, loads, f):
+    def crossing(plane: tuple, K: Array, loads: list, f: Array) -> Array:
         slides, tau, u = plane
         most = jnp.where(slides != 0, slides * f, tau)
         first, last = (jnp.sum(u * x) for x in loads)
         rise = last - first
         return jnp.where(rise > 0, (jnp.sum(most * matvec(K, u)) - first) / jnp.where(rise > 0, rise, 1), 0)
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         x, _, change, i = carry
         return (x > 0) & (change > slight(K.dtype)) & (i < ROUNDS)
 
-    def improve(carry):
+    def improve(carry: tuple):
         x, old, _, i = carry
         plane = plane_at(x)
         beyond = jnp.any(plane[0] != 0)
@@ -287,7 +304,7 @@ def leaves_box(K, least, rests, loads, f, size=0.0):
     return jnp.where(leaves, crossing(plane, K, loads, f), jnp.inf), plane[0]
 
 
-def smallest_in_box(K, load, f, moved):
+def smallest_in_box(K: Array, load: Array, f: Array, moved: Array) -> Array:
     """tau with min tau' K tau/2 - load' tau, |tau| <= f, for a semi-definite K: by Newton's iteration on what no bound
     holds, projected (Bertsekas 1982), with a proximal term: from 0, so that of all minima the smallest is found.
 
@@ -301,17 +318,17 @@ def smallest_in_box(K, load, f, moved):
     A, eps = R + PROXIMAL * eye, float(jnp.finfo(K.dtype).eps)
     shorter = 0.5 ** jnp.arange(HALVINGS, dtype=K.dtype)
 
-    def away(u, g):
+    def away(u: Array, g: Array) -> Array:
         return jnp.max(jnp.abs(jnp.clip(u - g, -top, top) - u))
 
-    def enough(u):
+    def enough(u: Array) -> Array:
         return 64 * eps * (jnp.max(jnp.abs(b)) + jnp.max(jnp.abs(R) @ jnp.abs(u)))
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         _, _, done, i = carry
         return ~done & (i < ROUNDS)
 
-    def improve(carry):
+    def improve(carry: tuple):
         u, old, _, i = carry
         pull = b + PROXIMAL * old
         g = A @ u - pull
@@ -335,7 +352,7 @@ def smallest_in_box(K, load, f, moved):
     return u / unit
 
 
-def held_back(system, s, L, old, new, dw, answer, dependent):
+def held_back(system, s, L, old, new, dw: Array, answer, dependent: bool):
     """A jump dw of the accelerations at a state, as params jump and multipliers become L, with what friction does about
     it: of joints at rest, and of those that slide, whose limits may jump too; and the multipliers. answer: of `answers`
     there; dependent: whether directions may depend on each other."""

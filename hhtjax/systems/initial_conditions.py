@@ -1,10 +1,13 @@
 """Initial values that satisfy the constraints, and the check that they do."""
 
+from __future__ import annotations
+
 import math
 import warnings
+from collections.abc import Callable
 from copy import copy
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.checks import describe, require_number, require_params
-from hhtjax.description import all_concrete, is_array, is_concrete, is_real, known_now
+from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, is_real, known_now
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.dense_lu import diagonal
 from hhtjax.numerics.differentiable_while import implicit_root
@@ -30,8 +33,13 @@ from hhtjax.systems.constraints import (
 )
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.friction import directions
-from hhtjax.systems.system import FirstOrderSystem
+from hhtjax.systems.system import AnySystem, FirstOrderSystem
 from hhtjax.xla import Programs
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
+    from hhtjax.systems.linear_system import LinearSystem
+    from hhtjax.systems.system import System
 
 CONSISTENT = 1e-6  # distance of initial values from consistent ones that passes, beside 1 + |q|, each coordinate
 SMALL = 1e-3  # of a mechanism's size, if that is so small that the former does not tell
@@ -51,15 +59,23 @@ class ConsistentInitial(NamedTuple):
             with how well q0 was meant: a start far away may be of another assembly than that which was thought of.
     """
 
-    q: Any
-    v: Any
-    acceleration: Any
+    q: PyTree
+    v: PyTree
+    acceleration: PyTree
     multipliers: Any
-    converged: Any
-    moved: Any = None
+    converged: Array
+    moved: Array | None = None
 
 
-def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=None) -> ConsistentInitial:
+def consistent_initial(
+    system: AnySystem,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree = None,
+    t0: Real = 0.0,
+    redundant: str | None = None,
+    z0: PyTree = None,
+) -> ConsistentInitial:
     """The values nearest to q0 and v0 that satisfy the constraints, with the acceleration and multipliers there.
 
         min |q - q0|_M with Phi(q, t0) = 0,     min |v - v0|_M with B v + Phi_t = 0,     |x|_M^2 = x^T M x
@@ -110,7 +126,7 @@ def consistent_initial(system, q0, v0, params=None, t0=0.0, redundant=None, z0=N
 
 
 @partial(Programs, static_argnames="redundant")
-def _consistent_initial(system, q0, v0, params, t0, z0, redundant):
+def _consistent_initial(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array, z0: PyTree, redundant):
     """The result, B at q0 and which rows are clear, and max|Phi| at the end."""
     flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params, z0)
     factorize = factorize_constrained(flat.size, redundant)
@@ -125,13 +141,13 @@ def _consistent_initial(system, q0, v0, params, t0, z0, redundant):
     return ConsistentInitial(flat.unravel(q), v, w, L, converged, moved), rows, left
 
 
-def correction(system, q, t, params, rows, factorize):
+def correction(system: FlatSystem, q: Array, t: Array, params: PyTree, rows: Array, factorize: Callable) -> Array:
     """The x with B x = rows that is smallest in the norm of M."""
     return saddle_point(system, q, t, params, factorize)(jnp.zeros(system.size, q.dtype), rows)[0]
 
 
 @Programs
-def examine(system, q0, v0, t0, params, z0):
+def examine(system: System, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z0: PyTree):
     """M and B, Phi and dPhi/dt, the sizes of the coordinates and of their rates, and which rows of B are clear."""
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
@@ -141,7 +157,7 @@ def examine(system, q0, v0, t0, params, z0):
     return M, B[:, : flat.positions], violation(flat, q, v, t, params), sizes, clear
 
 
-def distances(examined, redundant):
+def distances(examined: tuple, redundant):
     """For Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not, in the coordinate that
     is farthest, in that which is farthest beside its own size, and in each; by NumPy, which has nothing to compile."""
     M, B, both, sizes, _ = jax.tree.map(np.asarray, examined)
@@ -155,7 +171,7 @@ def distances(examined, redundant):
 
 
 @np.errstate(all="ignore")
-def _solved(A, b, n, redundant):
+def _solved(A: np.ndarray, b: np.ndarray, n: int, redundant) -> np.ndarray:
     """z with A z = b, smallest where constraints may be redundant; NaN where there is none. A batch goes first."""
     try:
         if redundant is None:
@@ -174,7 +190,17 @@ def _solved(A, b, n, redundant):
         return np.stack([_solved(*one, n, redundant) for one in zip(A, b, strict=True)])
 
 
-def require_consistent(caller, system, q0, v0, t0, params, redundant=None, z0=None, checked=CHECKED):
+def require_consistent(
+    caller: str,
+    system,
+    q0: PyTree,
+    v0: PyTree,
+    t0: Real,
+    params: PyTree,
+    redundant=None,
+    z0: PyTree = None,
+    checked: tuple = CHECKED,
+):
     """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass.
 
     checked: what the caller names q0, and v0 if it is to be looked at, and what they violate.
@@ -208,7 +234,7 @@ def _is_far(B, away, start):
 
 
 @Programs
-def _turns(system, q0, v0, t0, params, z0):
+def _turns(system, q0: PyTree, v0: PyTree, t0, params: PyTree, z0: PyTree):
     """By how much a displacement of size 1 turns the gradient of each constraint, in the norm of diag(M), and that."""
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
@@ -234,7 +260,7 @@ class PrecisionWarning(UserWarning):
     """The state is in single precision."""
 
 
-def initial_values(caller, system, q0, v0, z0=None, level=3):
+def initial_values(caller: str, system, q0: PyTree, v0: PyTree, z0: PyTree = None, level: int = 3):
     """q0, v0 and z0 as arrays of one float dtype, checked; those that the system does not have are None."""
     first_order = isinstance(system, FirstOrderSystem)
     if first_order:
@@ -277,7 +303,7 @@ def initial_values(caller, system, q0, v0, z0=None, level=3):
     return q0, None if first_order else v0, z0
 
 
-def _the_one(caller, dtypes, q0, v0, z0):
+def _the_one(caller: str, dtypes, q0: PyTree, v0: PyTree, z0: PyTree) -> np.dtype:
     """The dtype that all share, or an error."""
     if len(dtypes) > 1:
         names = "`q0` and `v0`" if z0 is None else "`q0`, `v0` and `z0`"
@@ -286,7 +312,7 @@ def _the_one(caller, dtypes, q0, v0, z0):
     return dtypes.pop()
 
 
-def _require_internal(caller, system, z0):
+def _require_internal(caller: str, system: LinearSystem | System, z0: PyTree):
     """An error for a z0 that is missing, or that the system has no use for."""
     if system.internal is None:
         if z0 is not None:
@@ -297,7 +323,7 @@ def _require_internal(caller, system, z0):
         raise ValueError(f"{caller}: `z0` must hold at least one number; received {z0!r}.")
 
 
-def _require_finite(where, leaf):
+def _require_finite(where: str, leaf: Real) -> np.dtype:
     """The dtype of a leaf, or an error for what is no array of finite numbers of single or double precision."""
     if not is_array(leaf) and (isinstance(leaf, bool) or not isinstance(leaf, (int, float, complex))):
         raise TypeError(f"{where} must be an array or a number; received {leaf!r}.")
@@ -309,7 +335,7 @@ def _require_finite(where, leaf):
     return dtype
 
 
-def _require_rotations(where, R):
+def _require_rotations(where: str, R):
     """An error for matrices that are not orthogonal, or are reflections; tracers pass."""
     if not is_concrete(R):
         return
@@ -333,7 +359,7 @@ DEPENDENT = 1e-6  # relative size of what is left of a row, below which it is ro
 
 
 @jax.jit
-def _rows(system, q0, v0, t0, params, z0):
+def _rows(system: System, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z0: PyTree):
     """B and H at the start, and how much H changes elsewhere."""
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
@@ -345,7 +371,9 @@ def _rows(system, q0, v0, t0, params, z0):
     return B, H, directions(flat, elsewhere, t, params) - H
 
 
-def with_known_rows(caller, system, q0, v0, t0, params, z0=None):
+def with_known_rows(
+    caller: str, system, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree = None
+) -> LinearSystem | System:
     """The system, marked where directions of friction depend on each other, or on constraints; an error for what are
     none. Of tracers nothing is known."""
     rows = known_now(_rows, system, q0, v0, t0, params, z0)
@@ -367,7 +395,7 @@ def with_known_rows(caller, system, q0, v0, t0, params, z0=None):
     return marked
 
 
-def _depend(B, H):
+def _depend(B: np.ndarray, H: np.ndarray) -> bool:
     """Whether a row of H depends on those before it, or on the rows of B."""
     basis = np.zeros((0, H.shape[1]))
     if B.size:
@@ -415,32 +443,32 @@ class Problem(NamedTuple):
 
     conditions: Any  # z -> (M x - B^T mu, Phi)
     constraint: Any  # x -> Phi
-    M: Any
-    d: Any  # the diagonal of M, ones in the place of zeros
-    unit: Any  # (m,), makes distances of Phi
-    Phi: Any  # at the guess
+    M: Array
+    d: Array  # the diagonal of M, ones in the place of zeros
+    unit: Array  # (m,), makes distances of Phi
+    Phi: Array  # at the guess
     B: Any
-    size: Any  # of the largest coordinate
-    reach: Any  # of all of them, in the norm of M
+    size: Array  # of the largest coordinate
+    reach: Array  # of all of them, in the norm of M
     factorize: Any
 
 
-def nearest_position(system, q0, t, params, factorize):
+def nearest_position(system: FlatSystem, q0: PyTree, t: Array, params: PyTree, factorize: Callable):
     """q on Phi = 0, its displacement x from q0 smallest in the norm of M(q0); x, and whether the search converged.
 
     Derivatives are those of the conditions for a minimum.
     """
     n, eps = system.size, float(jnp.finfo(q0.dtype).eps)
 
-    def constraint(x):
+    def constraint(x: Array) -> Array:
         return system.constraint(system.move(q0, x), t, params)
 
-    def conditions(z):
+    def conditions(z: Array) -> Array:
         x, mu = z[:n], z[n:]
         Phi, pull = jax.vjp(constraint, x)
         return jnp.concatenate([system.inertia(q0, x, t, params) - pull(mu)[0], Phi])
 
-    def search(z):
+    def search(z: Array):
         problem = lax.stop_gradient(_problem(system, q0, t, params))
         return _search(problem._replace(conditions=conditions, constraint=constraint, factorize=factorize), z)
 
@@ -449,7 +477,7 @@ def nearest_position(system, q0, t, params, factorize):
     return system.move(q0, z[:n]), z[:n], found > math.sqrt(eps)
 
 
-def _problem(system, q0, t, params):
+def _problem(system: FlatSystem, q0: PyTree, t: Array, params: PyTree) -> Problem:
     """Sizes and slopes at the guess."""
     M, B = system.full_mass(q0, t, params), jacobian(system, q0, t, params)
     d = jnp.diagonal(M)
@@ -463,7 +491,7 @@ def _problem(system, q0, t, params):
     )
 
 
-def _search(p, z0):
+def _search(p: Problem, z0: PyTree):
     """The nearest of the points that were found, and 1 if there is one, else 0, as a float, for autodiff."""
     n, eps = len(p.d), float(jnp.finfo(z0.dtype).eps)
     ways = np.random.default_rng(0).standard_normal((STARTS, n))
@@ -471,11 +499,11 @@ def _search(p, z0):
     ways = jnp.asarray(ways, z0.dtype).at[0].set(0)  # the first is the guess itself
     apart = jnp.sum(p.unit * jnp.abs(p.Phi))
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         _, _, found, certain, i = carry
         return ~(found & certain) & (i < STARTS)
 
-    def again(carry):
+    def again(carry: tuple):
         best, distance, found, _, i = carry
         radius = jnp.where(found, distance, jnp.maximum(apart, jnp.where(i > 0, jnp.sqrt(jnp.sum(p.d)), 0)))
         z, converged = _descend(p, z0.at[:n].set(radius * ways[i] / jnp.sqrt(p.d)))
@@ -494,19 +522,19 @@ def _search(p, z0):
     return best, found.astype(z0.dtype)
 
 
-def _descend(p, z0):
+def _descend(p: Problem, z0: PyTree):
     """Where steps from z0 end, and whether that is a point on the constraints."""
     n, eps = len(p.d), float(jnp.finfo(z0.dtype).eps)
 
-    def largest(z):
+    def largest(z: Array) -> Array:
         return p.size + jnp.max(jnp.abs(z[:n]))
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         z, _, change, last, i = carry
         ends = change <= 16 * eps * (largest(z) + jnp.where(change > last / 2, 1, 0))
         return ~ends & ~jnp.isnan(change) & (i < MAX_ITERATIONS)
 
-    def improve(carry):
+    def improve(carry: tuple):
         z, rho, last, _, i = carry
         z, rho, change = _step(p, z, rho)
         return z, rho, change, last, i + 1
@@ -519,7 +547,7 @@ def _descend(p, z0):
     return z, (change <= root * (1 + largest(z))) & met
 
 
-def _step(p, z, rho):
+def _step(p: Problem, z: Array, rho: Array):
     """One step from z: the new z, rho, and the largest change of a coordinate."""
     n, eps = len(p.d), float(jnp.finfo(z.dtype).eps)
     x, value, A = z[:n], p.conditions(z), jax.jacfwd(p.conditions)(z)
@@ -528,14 +556,14 @@ def _step(p, z, rho):
     dx, mu = step[:n], z[n:] + step[n:]
     rho = jnp.maximum(rho, 1.5 * jnp.max(jnp.abs(mu) / p.unit))
 
-    def merit(x):
+    def merit(x: Array) -> Array:
         return x @ (p.M @ x) / 2 + rho * jnp.sum(p.unit * jnp.abs(p.constraint(x)))
 
     now = merit(x)
     slope = (p.M @ x) @ dx - rho * jnp.sum(p.unit * jnp.abs(value[n:]))
     rounding = 64 * eps * (now + rho * p.reach)
 
-    def falls(part, dx):
+    def falls(part: Real, dx: Array) -> Array:
         return merit(x + dx) <= now + DECREASE * part * slope + rounding
 
     bend = -inverse(jnp.concatenate([jnp.zeros_like(x), p.constraint(x + dx)]), trans=0)[:n]
@@ -546,7 +574,7 @@ def _step(p, z, rho):
     return jnp.concatenate([x + taken, z[n:] + part * step[n:]]), rho, jnp.max(jnp.abs(taken))
 
 
-def _is_convex(p, A, n):
+def _is_convex(p: Problem, A: Array, n: int) -> Array:
     """Whether the Hessian of the Lagrangian is positive definite along the constraints."""
     rows, unit = p.unit[:, None] * A[n:, :n], 1 / jnp.sqrt(p.d)
     H = (A[:n, :n] + A[:n, :n].T) / 2 + WEIGHT * rows.T @ rows

@@ -8,9 +8,12 @@ that is, of index 1: solutions leave Phi = 0 by what the solver's errors add up 
 and stays orthogonal to the accuracy of the solver. With internal states, y = (q, v, z).
 """
 
+from __future__ import annotations
+
 import importlib
+from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +21,20 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import Description, as_float, current, thaw
+from hhtjax.description import Array, Description, PyTree, Real, as_float, current, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.systems.constraints import acceleration_and_multipliers
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, require_consistent
-from hhtjax.systems.system import FirstOrderSystem, require_smooth, require_system
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_smooth, require_system
+
+if TYPE_CHECKING:
+    pass
 
 __all__ = ["FlatODE", "ScipyRHS", "diffrax_term", "flat_ode", "ode", "scipy_rhs"]
 
 
-def ode(system):
+def ode(system: AnySystem):
     """The system as an ODE on pytrees: the function (t, y, params) -> y' of y = (q, v); of y itself for y' = f(y, t).
 
     With internal states y = (q, v, z). Traceable and differentiable; of equal systems equal, also as a pytree.
@@ -65,11 +71,11 @@ class FlatODE(NamedTuple):
     """
 
     rate: Any
-    y0: Any
-    unravel: Any
+    y0: Array
+    unravel: Callable
 
 
-def flat_ode(system, q0, v0=None, z0=None) -> FlatODE:
+def flat_ode(system: AnySystem, q0: PyTree, v0: PyTree = None, z0: PyTree = None) -> FlatODE:
     """The same on vectors: y holds the numbers of q, then those of v, then z, each in the order of `ravel_pytree`.
 
     Args:
@@ -95,7 +101,7 @@ def flat_ode(system, q0, v0=None, z0=None) -> FlatODE:
     return FlatODE(rate, jnp.concatenate([x for x, _ in parts]), rate.unravel)
 
 
-def diffrax_term(system):
+def diffrax_term(system: AnySystem):
     """The system as a `diffrax.ODETerm`, for `diffeqsolve(term, solver, t0, t1, dt0, y0=(q0, v0), args=params)`.
 
     y0 is (q0, v0), pytrees, or (q0, v0, z0), or y0 of a `FirstOrderSystem`; args are the params, modules of equinox
@@ -137,13 +143,20 @@ class ScipyRHS(NamedTuple):
         jac: (t, y) -> the derivative of fun with respect to y, (N, N), compiled.
     """
 
-    fun: Any
+    fun: Callable
     y0: np.ndarray
-    unravel: Any
-    jac: Any
+    unravel: Callable
+    jac: Callable
 
 
-def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
+def scipy_rhs(
+    system: AnySystem,
+    q0: PyTree,
+    v0: PyTree = None,
+    params: PyTree = None,
+    t0: Real = 0.0,
+    z0: PyTree = None,
+) -> ScipyRHS:
     """The system as SciPy takes it: right-hand side, start and Jacobian, for Radau, BDF and LSODA too.
 
     Compiled once for each system and structure; new params, and a new start, cost no compilation. A call takes some
@@ -198,7 +211,7 @@ def scipy_rhs(system, q0, v0=None, params=None, t0=0.0, z0=None) -> ScipyRHS:
     return ScipyRHS(partial(call, 0), np.asarray(flat.y0), unravel, partial(call, 1))
 
 
-def _ode(system, t, y, params):
+def _ode(system, t, y, params: PyTree):
     """y' of a pytree y."""
     y = jax.tree.map(as_float, y)
     if isinstance(system, FirstOrderSystem):
@@ -220,7 +233,7 @@ def _ode(system, t, y, params):
 class _FlatRate(Description):
     """`ode` on vectors; frozen and hashable, so that equal ones share a program."""
 
-    def __init__(self, system, sizes, unravels):
+    def __init__(self, system: AnySystem, sizes: tuple, unravels: tuple):
         self.system, self.sizes, self.unravels = system, sizes, unravels
 
     def unravel(self, y):
@@ -229,11 +242,11 @@ class _FlatRate(Description):
         found = [unravel(part) for unravel, part in zip(self.unravels, parts, strict=True)]
         return tuple(found) if len(found) > 1 else found[0]
 
-    def __call__(self, t, y, params):
+    def __call__(self, t, y, params: PyTree):
         return ravel_pytree(_ode(self.system, t, self.unravel(y), params))[0]
 
 
-def _packed(params):
+def _packed(params: PyTree):
     """The params as one vector, if that is what they are, because fewer arguments make a call quicker; the way back."""
     leaves = jax.tree.leaves(params)
     if leaves and all(jnp.result_type(x) == np.float64 for x in leaves):
@@ -257,7 +270,7 @@ def _compiled(rate, structure, unpack):
     return jax.jit(program), jax.jit(jax.jacfwd(program, argnums=1))
 
 
-def _required(caller, package):
+def _required(caller: str, package):
     """A package that not everybody has."""
     try:
         return importlib.import_module(package)

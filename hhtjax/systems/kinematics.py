@@ -13,12 +13,16 @@ give the angular velocity and acceleration at its end (Cardona, Geradin 1989, Eq
 place of psidot and psiddot.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from hhtjax import rotation
+from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import matvec
 
 
@@ -30,7 +34,7 @@ class Block(NamedTuple):
     v: slice
 
 
-def layout(q0, v0):
+def layout(q0: PyTree, v0: PyTree):
     """The blocks of the flat vectors of q0 and v0; empty where there is no rotation."""
     blocks, nq, nv = [], 0, 0
     for R, Om in zip(jax.tree.leaves(q0), jax.tree.leaves(v0), strict=True):
@@ -40,52 +44,52 @@ def layout(q0, v0):
     return tuple(blocks) if any(block.is_rotation for block in blocks) else ()
 
 
-def is_rotation(q_shape, v_shape):
+def is_rotation(q_shape: tuple, v_shape: tuple) -> bool:
     """Whether leaves of these shapes are rotations (..., 3, 3) with their angular velocities (..., 3)."""
     return q_shape[-2:] == (3, 3) and v_shape == q_shape[:-1]
 
 
-def move(blocks, q, x):
+def move(blocks: tuple, q: Array, x: Array) -> Array:
     """q (+) x."""
     return _each(blocks, jnp.add, lambda R, psi: rotation.product(R, rotation.exp(psi)), q, x)
 
 
-def rate(blocks, q, v):
+def rate(blocks: tuple, q: Array, v: Array) -> Array:
     """qdot: linear in v."""
     return _each(blocks, lambda q, v: v, lambda R, Om: rotation.product(R, rotation.hat(Om)), q, v)
 
 
-def terms(blocks, q0, q1, x):
+def terms(blocks: tuple, q0: PyTree, q1: Array, x: Array) -> Array:
     """Sizes of what q1 is the sum of, q0 and a displacement up to x: (n,) of positions, 1 for those of rotations."""
     return _each(blocks, lambda q0, q1, x: jnp.abs(q0) + jnp.abs(q1) + x, lambda R, *_: jnp.ones_like(R), q0, q1, x)
 
 
-def sizes(blocks, q):
+def sizes(blocks: tuple, q: Array) -> Array:
     """Of displacements, (n,): |q| of positions, and one radian for rotations."""
     return _each(blocks, jnp.abs, lambda R: jnp.ones(3, R.dtype), q)
 
 
-def orthonormalize(blocks, q):
+def orthonormalize(blocks: tuple, q: Array) -> Array:
     """q with the rounding errors of its rotations squared."""
     return _each(blocks, lambda q: q, rotation.orthonormalize, q)
 
 
-def pull_back(blocks, x, Q):
+def pull_back(blocks: tuple, x: Array, Q: Array) -> Array:
     """The force that works on the rate of the displacement x: Q, and T(x)^T Q for rotations."""
     return _each(blocks, lambda Q, x: Q, lambda Q, psi: matvec(rotation.tangent(psi).T, Q), Q, x)
 
 
-def chart_jerk(blocks, v, w, wdot):
+def chart_jerk(blocks, v, w, wdot) -> Array:
     """Third rate of the displacement at x = 0: that of v, and for rotations wdot + Om x w/2."""
     return _each(blocks, lambda wdot, v, w: wdot, lambda wdot, Om, w: wdot + rotation.cross(Om, w) / 2, wdot, v, w)
 
 
-def end_of_chart(blocks, x, v, w, a):
+def end_of_chart(blocks: tuple, x: Array, v: Array, w: Array, a: Array):
     """Velocity, acceleration and algorithmic acceleration, from first and second rates of the displacement x."""
     if not blocks:
         return v, w, a
 
-    def turn(psi, psidot, w, a):
+    def turn(psi: Array, psidot: Array, w: Array, a: Array):
         T, convective = rotation.tangent(psi), rotation.tangent_rate(psi, psidot)
         return matvec(T, psidot), matvec(T, w) + convective, matvec(T, a) + convective
 
@@ -96,20 +100,20 @@ def end_of_chart(blocks, x, v, w, a):
     return tuple(jnp.concatenate([y.ravel() for y in parts]) for parts in zip(*ends, strict=True))
 
 
-def hermite(rise, d0, d1, s):
+def hermite(rise: Array, d0: Array, d1: Array, s: Array) -> Array:
     """The cubic in s from 0 at 0 to `rise` at 1, with slopes d0 and d1 there."""
     return s * (d0 + s * (3 * rise - 2 * d0 - d1 + s * (d0 + d1 - 2 * rise)))
 
 
-def hermite_rate(rise, d0, d1, s):
+def hermite_rate(rise: Array, d0: Array, d1: Array, s: Array) -> Array:
     """Its slope."""
     return d0 + s * (2 * (3 * rise - 2 * d0 - d1) + s * (3 * (d0 + d1 - 2 * rise)))
 
 
-def interpolate_rotation(R0, R1, d0, d1, s):
+def interpolate_rotation(R0: Array, R1: Array, d0: Array, d1: Array, s: Array) -> Array:
     """R0 exp(psi(s)) with the cubic psi that ends in R1; d0, d1 (..., 3): angular velocities times the interval."""
 
-    def between(R0, R1, d0, d1, s):
+    def between(R0: Array, R1: Array, d0: Array, d1: Array, s: Array) -> Array:
         psi = rotation.log(rotation.product(R0.T, R1))
         slope = matvec(rotation.inverse_tangent(psi), d1)
         return rotation.product(R0, rotation.exp(hermite(psi, d0, slope, s)))
@@ -120,7 +124,7 @@ def interpolate_rotation(R0, R1, d0, d1, s):
     return R.reshape(shape)
 
 
-def _each(blocks, plain, turn, *vectors):
+def _each(blocks: tuple, plain: Callable, turn: Callable, *vectors):
     """`plain` on the plain blocks of vectors like q or like v, `turn` on each rotation, joined again."""
     if not blocks:
         return plain(*vectors)
@@ -136,6 +140,6 @@ def _each(blocks, plain, turn, *vectors):
     return jnp.concatenate(parts)
 
 
-def _turned(turn, *arrays):
+def _turned(turn: Callable, *arrays: Real) -> PyTree:
     """`turn` on each of several rotations; on a single one without vmap, which leaves less to compile."""
     return turn(*(y[0] for y in arrays)) if len(arrays[0]) == 1 else jax.vmap(turn)(*arrays)

@@ -1,19 +1,25 @@
 """Linear systems, and such with a nonlinear force beside: M w + C v + K q = f(t) + g(q, v, t)."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import evaluate, require_function, require_integer
-from hhtjax.description import Description, is_array, thaw
+from hhtjax.description import Array, Description, PyTree, is_array, thaw
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.numerics.sparse_matrix import Sparse, of_dense
 from hhtjax.systems.friction import require_friction
 from hhtjax.systems.matrices import UNDAMPED, as_matrix, constant_matrix, massless_inverse, require_mass
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
+    from hhtjax.systems.system import FirstOrderSystem, System
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -79,7 +85,17 @@ class LinearSystem(Description):
     sliding: Callable | None
     massless: Any  # G with M G M = M of a singular M, else None
 
-    def __init__(self, M, C=None, K=None, force=None, nonlinear=None, at=None, friction=None, sliding=None):
+    def __init__(
+        self,
+        M: PyTree,
+        C: PyTree = None,
+        K: PyTree = None,
+        force=None,
+        nonlinear=None,
+        at: list | None = None,
+        friction: Callable | None = None,
+        sliding: Callable | None = None,
+    ):
         for name, matrix in (("M", M), ("C", C), ("K", K)):
             if matrix is None and name != "M":
                 pass
@@ -121,11 +137,11 @@ class LinearSystem(Description):
     internal = None
     depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
-    def mass(self, q, params):
+    def mass(self, q: Array, params: PyTree):
         """M, whatever q."""
         return self.M(params) if callable(self.M) else self.M
 
-    def force(self, q, v, t, params):
+    def force(self, q: Array, v: Array, t: Array, params: PyTree) -> Array:
         """f(t) - C v - K q + g(q, v, t), a pytree structured like v."""
         Q = self.linear_force(q, v, t, params)
         if self.nonlinear is None:
@@ -133,7 +149,7 @@ class LinearSystem(Description):
         Q, unravel = ravel_pytree(Q)
         return unravel(Q + self.spread(self.local_force(q, v, t, params), Q.size))
 
-    def with_matrices(self, M, C, K):
+    def with_matrices(self, M, C, K) -> LinearSystem:
         """The same with these in the place of functions."""
         new = object.__new__(LinearSystem)
         for name, value in {**vars(self), "M": M, "C": C, "K": K}.items():
@@ -147,7 +163,7 @@ class LinearSystem(Description):
             object.__setattr__(new, name, getattr(self, name) if name in "MCK" else None)
         return new
 
-    def linear_force(self, q, v, t, params):
+    def linear_force(self, q: Array, v: Array, t: Array, params: PyTree) -> Array:
         """f(t) - C v - K q, a pytree structured like v."""
         v, unravel = ravel_pytree(v)
         q, _ = ravel_pytree(q)
@@ -157,14 +173,14 @@ class LinearSystem(Description):
                 Q = Q - matvec(as_matrix(matrix(params) if callable(matrix) else matrix, x.dtype), x)
         return unravel(Q)
 
-    def local_force(self, q, v, t, params):
+    def local_force(self, q: Array, v: Array, t: Array, params: PyTree) -> Array:
         """g, (k,) on the coordinates `at`, or (n,)."""
         if self.at is not None:
             q, v = (ravel_pytree(x)[0][jnp.array(self.at)] for x in (q, v))
         assert self.nonlinear is not None
         return ravel_pytree(self.nonlinear(q, v, t, params))[0]
 
-    def spread(self, x, n):
+    def spread(self, x: Array, n: int) -> Array:
         """Numbers (k,) of the coordinates `at` as a vector (n,)."""
         if self.at is None:
             return x
@@ -173,7 +189,7 @@ class LinearSystem(Description):
         return jnp.append(x, jnp.zeros_like(x[:1]))[jnp.array(place)]  # no scatter, which would keep XLA from fusing
 
 
-def _numbers_of_coordinates(at, nonlinear, size):
+def _numbers_of_coordinates(at: list, nonlinear, size: int | None):
     """`at` as a tuple of integers, or an error."""
     if nonlinear is None:
         raise ValueError(f"LinearSystem: `at` must go with a `nonlinear` force; received {at!r} alone.")
@@ -193,13 +209,13 @@ def _numbers_of_coordinates(at, nonlinear, size):
 # Linear systems whose matrices stay sparse, or diagonal: what that asks for, and where there is none.
 
 
-def shapes_of_matrices(caller, system, params):
+def shapes_of_matrices(caller: str, system: LinearSystem, params: PyTree):
     """Of the matrices that a linear system has, by name: what they are, or what their functions return."""
     given = {name: A for name in "MCK" if (A := getattr(system, name)) is not None}
     return {name: evaluate(caller, name, A, params) if callable(A) else A for name, A in given.items()}
 
 
-def require_dense(caller, system, params):
+def require_dense(caller: str, system: LinearSystem | System | FirstOrderSystem, params: PyTree):
     """An error for a linear system with sparse matrices."""
     if isinstance(system, LinearSystem):
         for name, A in shapes_of_matrices(caller, system, params).items():
@@ -210,14 +226,16 @@ def require_dense(caller, system, params):
                 )
 
 
-def with_known_matrices(caller, system, flat, on_vectors, dtype, params):
+def with_known_matrices(
+    caller: str, system: LinearSystem, flat: FlatSystem, on_vectors: Callable, dtype: np.dtype, params: PyTree
+) -> FlatSystem:
     """The flat system as one that keeps its matrices sparse, or diagonal, where they are.
 
     on_vectors: makes the flat system of a `LinearSystem`.
     """
     shapes = shapes_of_matrices(caller, system, params)
 
-    def matrices(params):
+    def matrices(params: PyTree):
         given = {name: getattr(system, name) for name in shapes}
         found = {name: as_matrix(A(thaw(params)) if callable(A) else A, dtype) for name, A in given.items()}
         return [found.get(name) for name in "MCK"]
@@ -227,14 +245,14 @@ def with_known_matrices(caller, system, flat, on_vectors, dtype, params):
         return _knowing(flat, diagonals=matrices) if are_diagonal else flat
     _require_sparse(caller, system, shapes)
 
-    def settle(params):
+    def settle(params: PyTree) -> FlatSystem:
         known = matrices(params)
         return _knowing(on_vectors(system.with_matrices(*known)), matrices=lambda params: known)
 
     return _knowing(flat, matrices=matrices)._replace(settle=settle)
 
 
-def _require_sparse(caller, system, shapes):
+def _require_sparse(caller: str, system: LinearSystem, shapes: dict):
     """An error for what does not go with sparse matrices."""
     for name, A in shapes.items():
         if not isinstance(A, Sparse) and len(A.shape) > 1:
@@ -248,7 +266,7 @@ def _require_sparse(caller, system, shapes):
         raise NotImplementedError(f"{caller}: name the coordinates of `nonlinear` by `at`: the matrices are sparse.")
 
 
-def _knowing(flat, **matrices):
+def _knowing(flat: FlatSystem, **matrices: Callable) -> FlatSystem:
     """The system, and its linear part, with this function for its matrices."""
     local = None if flat.local is None else flat.local._replace(linear=flat.local.linear._replace(**matrices))
     return flat._replace(**matrices, local=local)

@@ -1,10 +1,14 @@
 """Constant matrices of a system, as arrays (n, n) or diagonals (n,): from arrays, lists and scipy.sparse, checked."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real
 from hhtjax.numerics.dense_lu import pivots
 from hhtjax.numerics.sparse_matrix import Sparse, of_scipy
 
@@ -18,14 +22,14 @@ MASSLESS = (
 )
 
 
-def as_matrix(value, dtype):
+def as_matrix(value, dtype: np.dtype):
     """(n, n) or (n,), of the dtype of the state; a scalar is the matrix of one degree of freedom."""
     if isinstance(value, Sparse):
         return value.astype(dtype)
     return jnp.atleast_1d(jnp.asarray(value)).astype(dtype)
 
 
-def sparse(matrix) -> Sparse:
+def sparse(matrix: Any) -> Sparse:
     """A sparse matrix whose numbers are data, for functions of params in a `LinearSystem`.
 
     Its multiples, sums and differences are sparse, too: `lambda params: params["k"] * K + params["shift"] * M`. What is
@@ -58,7 +62,7 @@ def sparse(matrix) -> Sparse:
     return _sparse("sparse", "matrix", matrix)
 
 
-def _sparse(caller, name, matrix):
+def _sparse(caller: str, name: str, matrix) -> Sparse:
     """The `Sparse` of a matrix of scipy.sparse, or an error."""
     if len(matrix.shape) != 2 or matrix.shape[0] != matrix.shape[1]:
         raise ValueError(
@@ -72,7 +76,7 @@ def _sparse(caller, name, matrix):
     return found
 
 
-def constant_matrix(caller, name, received, keep=False):
+def constant_matrix(caller: str, name: str, received: PyTree, keep: bool = False) -> Real:
     """The array (n, n) or (n,), or an error; of a matrix of scipy.sparse, the diagonal that it is, or a dense one.
 
     keep: more than SMALL rows stay sparse, as does a `Sparse`.
@@ -102,7 +106,7 @@ def constant_matrix(caller, name, received, keep=False):
     return value
 
 
-def is_sparse(x):
+def is_sparse(x: PyTree) -> bool:
     """A matrix, or array, of scipy.sparse, which is not imported for it."""
     return hasattr(x, "tocoo") and hasattr(x, "nnz")
 
@@ -116,7 +120,7 @@ def half_bandwidth(entries):
     return int(np.max(np.abs(entries.row.astype(int) - entries.col), initial=0))
 
 
-def _dense(caller, name, matrix):
+def _dense(caller: str, name, matrix):
     entries = matrix.tocoo()
     p, rows = half_bandwidth(entries), matrix.shape[0]
     if p == 0 and matrix.shape == (rows, rows):
@@ -160,7 +164,7 @@ def massless_inverse(M, C):
     return W / values[~rest] @ W.T
 
 
-def require_mass(caller, name, M, massless=False, way=MASSLESS):
+def require_mass(caller: str, name: str, M, massless: bool = False, way: str = MASSLESS):
     """An error for a constant M that is not symmetric, or not positive definite; with constraints it may be singular.
 
     In units in which its diagonal is 1. Tracers pass, and what is too large for a look at each run. way: what to do
@@ -185,7 +189,7 @@ def require_mass(caller, name, M, massless=False, way=MASSLESS):
         raise ValueError(f"{caller}: `{name}` must be positive definite; received one that is singular. {way}.")
 
 
-def _require_sparse_mass(caller, name, M):
+def _require_sparse_mass(caller: str, name: str, M: Sparse):
     """What of it can be seen without a factorisation."""
     if not is_concrete(M.values):
         return
@@ -199,7 +203,7 @@ def _require_sparse_mass(caller, name, M):
 UNSYMMETRIC, INDEFINITE, OF_VELOCITY = 1, 2, 3  # what may be wrong with a mass
 
 
-def mass_flaw(M, massless):
+def mass_flaw(M: Array | Sparse, massless: bool) -> Array:
     """What `require_mass` would find wrong with a mass that is known when it runs, as a number; 0: nothing.
 
     NaN passes: the acceleration tells of it.

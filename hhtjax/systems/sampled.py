@@ -1,5 +1,7 @@
 """A sampled input as a function of time, and as data: samples at equal distances, or at any increasing times."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -10,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.checks import require_integer, require_number
-from hhtjax.description import is_array, is_concrete, is_real
+from hhtjax.description import Array, Real, is_array, is_concrete, is_real
 
 SLOP = 8  # roundings that a time may lie before a sample, and still be the sample's
 
@@ -25,7 +27,7 @@ class Sampled:
     t0: Any
     times: Any = None  # of the samples, where they are not uniform
 
-    def __call__(self, t):
+    def __call__(self, t: Real) -> Array:
         """Value at time t, a scalar or an array; outside the samples, the nearest end value."""
         intervals, terms = self.polynomials.shape[:2]
         i, x = self._uniform(t, intervals, terms) if self.times is None else self._find(t, intervals, terms)
@@ -36,7 +38,7 @@ class Sampled:
             value = value * x + coefficients[k]
         return value
 
-    def _uniform(self, t, intervals, terms):
+    def _uniform(self, t: Real, intervals: int, terms: int):
         """Number of the interval of t, and the place in it, from 0 to 1."""
         # a division: in some copies XLA makes it a product, and one number rounds to two on both sides of a sample
         x = (jnp.asarray(t).astype(self.dt.dtype) - self.t0) * (1 / self.dt)
@@ -46,7 +48,7 @@ class Sampled:
         x = _inside(x - i)
         return i.astype(jnp.int32), x
 
-    def _find(self, t, intervals, terms):
+    def _find(self, t: Real, intervals: int, terms: int):
         """The same by bisection, as many halvings as the number of samples asks for, whatever t."""
         t = jnp.asarray(t).astype(self.times.dtype)
         if terms == 1:
@@ -55,7 +57,7 @@ class Sampled:
         i = self._last_before(t, intervals)
         return i, _inside((t - self.times[i]) / (self.times[i + 1] - self.times[i]))
 
-    def _last_before(self, t, intervals):
+    def _last_before(self, t: Array, intervals: int) -> Array:
         """Number of the last of the first `intervals` samples that is not after t; 0 where all are."""
         i = jnp.zeros(t.shape, jnp.int32)
         for half in reversed(range((intervals - 1).bit_length())):
@@ -64,18 +66,18 @@ class Sampled:
             i = jnp.where(good, further, i)
         return i
 
-    def _rounding(self, t):
+    def _rounding(self, t: Array) -> Array:
         return SLOP * float(jnp.finfo(self.times.dtype).eps) * (jnp.abs(t) + jnp.abs(self.times[0]))
 
-    def held_before(self, t, dt):
+    def held_before(self, t: Array, dt: Array) -> Array:
         """Of a held input the value that a step dt, or shorter, had which ended at t."""
         return self.polynomials[self.place_before(t, dt), 0]
 
-    def place(self, t):
+    def place(self, t: Array) -> Array:
         """Of a held input which of its values is that at t."""
         return (self._uniform if self.times is None else self._find)(t, len(self.polynomials), 1)[0]
 
-    def place_before(self, t, dt):
+    def place_before(self, t: Array, dt: Array) -> Array:
         """Of a held input which of its values a step dt, or shorter, had that ended at t."""
         if self.times is None:
             return self.place(t - dt / 2)
@@ -83,7 +85,7 @@ class Sampled:
         now, before = (self._last_before(x, len(self.times)) for x in (t + self._rounding(t), t - self._rounding(t)))
         return jnp.where(now > before, before, self.place(t - dt / 2))  # steps may differ at a sample
 
-    def jump_after(self, t):
+    def jump_after(self, t: Array) -> Array:
         """Of a held input the time of its first jump after t; inf where there is none."""
         intervals = len(self.polynomials)
         if self.times is None:
@@ -92,24 +94,24 @@ class Sampled:
         i = 1 + self._find(t, intervals, 1)[0]
         return jnp.where(i < intervals, self.times[jnp.minimum(i, intervals - 1)], jnp.inf)
 
-    def jumps(self):
+    def jumps(self) -> np.ndarray:
         """Of a held input the times at which it may jump, in NumPy: not for tracers."""
         if self.times is not None:
             return np.asarray(self.times)[1:]
         return np.asarray(self.t0) + np.asarray(self.dt) * np.arange(1, len(self.polynomials))
 
-    def constant(self, value):
+    def constant(self, value: Array) -> Sampled:
         """The held input that always has this value."""
         one = jnp.ones((), self.polynomials.dtype)
         scale = {"dt": one, "t0": one - 1, "times": None} if self.times is not None else {}
         return replace(self, polynomials=value[None, None], **scale)
 
 
-def _inside(x):
+def _inside(x: Array):
     return jnp.where(x < 0, 0, jnp.where(x > 1, 1, x))  # at the ends the slope is the one inside
 
 
-def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
+def sampled(values: Real, dt: Real = None, t0: Real = 0.0, order: int = 3, *, times: Real | None = None) -> Sampled:
     """The function of time through `values[k]` at t0 + k dt, or at times[k]: a pytree for params, called with t.
 
     Args:
@@ -177,7 +179,7 @@ def sampled(values, dt=None, t0=0.0, order=3, *, times=None) -> Sampled:
     return Sampled(polynomials, dt, t0, times)
 
 
-def _grid(values, dt, t0, times):
+def _grid(values: Array, dt: Real, t0: Real, times: Real):
     """times, dt and t0, checked, in the dtype of the values: either times, or the other two."""
     if times is None:
         if is_array(dt) and dt.ndim and dt.shape == values.shape[:1]:
@@ -206,7 +208,7 @@ def _grid(values, dt, t0, times):
     return jnp.asarray(times).astype(values.dtype), None, None
 
 
-def _spline_slopes(rise):
+def _spline_slopes(rise: Array) -> Array:
     """Slopes s_k, per sampling period, of the spline: s_(k-1) + 4 s_k + s_(k+1) = 3 (rise_(k-1) + rise_k)."""
     rows = rise.reshape(rise.shape[0], -1)
     rhs = 3 * (rows[1:] + rows[:-1])
@@ -221,7 +223,7 @@ def _spline_slopes(rise):
     return slopes.reshape(-1, *rise.shape[1:])
 
 
-def _uneven_spline_slopes(rise, widths):
+def _uneven_spline_slopes(rise: Array, widths: Array) -> Array:
     """Slopes s_k, per time, of the spline through samples h_k apart, d_k = rise_k/h_k:
 
     h_k s_(k-1) + 2 (h_(k-1) + h_k) s_k + h_(k-1) s_(k+1) = 3 (h_k d_(k-1) + h_(k-1) d_k)
@@ -246,7 +248,7 @@ def _uneven_spline_slopes(rise, widths):
 # Reconstruction of a band-limited input between its samples, and what simpler reconstructions lose.
 
 
-def band_limited(values, dt, *, factor=8, t0=0.0) -> Sampled:
+def band_limited(values: Real, dt: Real, *, factor: int = 8, t0: Real = 0.0) -> Sampled:
     """The function of time through `values[k]` at t0 + k dt that holds no frequency above 1/(2 dt).
 
     The samples less the line through the first and the last one, continued as an odd function, are a Fourier series.
@@ -280,7 +282,7 @@ def band_limited(values, dt, *, factor=8, t0=0.0) -> Sampled:
     return sampled(fine + line(n * factor), dt / factor, t0)
 
 
-def band_limited_motion(values, dt, cutoff) -> tuple[jax.Array, jax.Array, jax.Array]:
+def band_limited_motion(values: Real, dt: Real, cutoff: Real | None) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Position, velocity and acceleration at the samples of a measured motion, without frequencies above `cutoff`.
 
     The series is that of `band_limited`, cut off and differentiated. At both ends its second derivative is zero, so
@@ -307,13 +309,13 @@ def band_limited_motion(values, dt, cutoff) -> tuple[jax.Array, jax.Array, jax.A
 
 
 @jax.jit
-def _motion(values, dt, cutoff):
+def _motion(values: Array, dt: Array, cutoff: Array):
     line, spectrum = _odd_series(values)
     n = spectrum.shape[0] - 1
     frequency = (jnp.linspace(0, 0.5, n + 1) / dt).astype(line(n).dtype).reshape(-1, *(1,) * (spectrum.ndim - 1))
     kept = jnp.where(frequency <= cutoff, spectrum, 0)
 
-    def derivative(order):
+    def derivative(order: int) -> Array:
         turned = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency) ** order
         return jnp.fft.irfft(turned * kept, 2 * n, axis=0)[: n + 1]
 
@@ -321,13 +323,13 @@ def _motion(values, dt, cutoff):
     return derivative(0) + line(n), derivative(1) + slope[None], derivative(2)
 
 
-def _odd_series(values):
+def _odd_series(values: Array):
     """The line from the first sample to the last, as a function of how many equal parts it is evaluated in, and the
     spectrum of the rest, continued as an odd function; of its frequencies the highest is 0."""
     y = jnp.asarray(values)
     y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(jnp.result_type(float))
 
-    def line(parts):
+    def line(parts: int) -> Array:
         ramp = jnp.linspace(0, 1, parts + 1, dtype=y.dtype).reshape(-1, *(1,) * (y.ndim - 1))
         return y[:1] + (y[-1] - y[0])[None] * ramp
 
@@ -335,7 +337,7 @@ def _odd_series(values):
     return line, jnp.fft.rfft(jnp.concatenate([rest, -rest[-2:0:-1]]), axis=0)
 
 
-def spline_gain_error(frequency, dt, order=3) -> float:
+def spline_gain_error(frequency: Real, dt: Real, order: int = 3) -> float:
     """Relative error of the amplitude of a harmonic of `frequency` that `sampled(..., order)` reconstructs.
 
         order 0: 1 - sinc(f dt), late by dt/2 besides,    order 1: 1 - sinc^2(f dt),

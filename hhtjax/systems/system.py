@@ -1,5 +1,7 @@
 """What is simulated: M(q) w = Q(q, v, t), with or without internal states, or y' = f(y, t): functions of pytrees."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,13 +13,13 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import positional_names, require_function, takes
-from hhtjax.description import Description
+from hhtjax.description import Array, Description, PyTree, Real
 from hhtjax.primitives import traced
 from hhtjax.systems.friction import require_friction
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass
 
-__all__ = ["FirstOrderSystem", "LinearSystem", "System", "require_smooth", "require_system"]
+__all__ = ["AnySystem", "FirstOrderSystem", "LinearSystem", "System", "require_smooth", "require_system"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +155,14 @@ class System(Description):
 
     @classmethod
     def from_lagrangian(
-        cls, lagrangian, force=None, internal=None, friction=None, sliding=None, constraint=None
-    ) -> "System":
+        cls,
+        lagrangian: Callable,
+        force: Callable | None = None,
+        internal: Callable | None = None,
+        friction: Callable | None = None,
+        sliding=None,
+        constraint=None,
+    ) -> System:
         """The system of Lagrange's equations  d/dt (dL/dv) - dL/dq = F + B^T L, with M and Q by autodiff.
 
             M(q, t) = d2L/dv2,    Q = F + dL/dq - (d2L/dv dq) v - d2L/dv dt
@@ -245,7 +253,7 @@ class FirstOrderSystem(Description):
         require_function("FirstOrderSystem", "rate", self.rate, "rate(y, t, params)")
 
 
-def _require_constraint(constraint):
+def _require_constraint(constraint: Callable):
     """An error for what is no function constraint(q, t, params); for one of velocities with the way to it."""
     try:
         require_function("System", "constraint", constraint, "constraint(q, t, params)")
@@ -258,7 +266,10 @@ def _require_constraint(constraint):
         ) from None
 
 
-def require_system(caller, system, massless=False):
+AnySystem = System | LinearSystem | FirstOrderSystem  # what a run takes
+
+
+def require_system(caller: str, system: AnySystem, massless: bool = False):
     """An error for what is no system, or has coordinates without mass where these are not possible."""
     if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
         raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
@@ -266,7 +277,7 @@ def require_system(caller, system, massless=False):
         require_masses(caller, system, "give them some")
 
 
-def require_masses(caller, system, without):
+def require_masses(caller: str, system: AnySystem, without: str):
     """An error for coordinates without mass, with which something is not possible."""
     if system.massless is not None:
         raise NotImplementedError(
@@ -275,7 +286,7 @@ def require_masses(caller, system, without):
         )
 
 
-def require_smooth(caller, system):
+def require_smooth(caller: str, system):
     """An error for dry friction, which is no function of the state."""
     if system.friction is not None:
         raise NotImplementedError(
@@ -295,7 +306,7 @@ class LagrangianMass:
     lagrangian: Callable
     is_lagrangian = True  # knows no rotations
 
-    def __call__(self, q, t, params):
+    def __call__(self, q: Array, t: Real, params: PyTree) -> Array:
         zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))
         return jax.hessian(lambda v: self.lagrangian(q, unravel(v), t, params))(zero)
 
@@ -306,19 +317,19 @@ class LagrangianInertia:
 
     lagrangian: Callable
 
-    def __call__(self, q, w, t, params):
+    def __call__(self, q: Array, w: Array, t: Real, params: PyTree) -> Array:
         q, w = (jax.tree.map(jnp.asarray, x) for x in (q, w))
         zero = jax.tree.map(jnp.zeros_like, w)
         return lagrangian_product(self.lagrangian, q, zero, w, t, params)
 
 
-def lagrangian_product(lagrangian, q, v, w, t, params):
+def lagrangian_product(lagrangian: Callable, q: Array, v: Array, w: Array, t: Real, params: PyTree) -> Array:
     """d2L/dv2 w at a velocity."""
     momentum = jax.grad(lambda v: lagrangian(q, v, t, params))
     return jax.jvp(momentum, (v,), (w,))[1]
 
 
-def mass_reads_velocity(lagrangian, q, v, t, params):
+def mass_reads_velocity(lagrangian: Callable, q: Array, v: Array, t: Array, params: PyTree):
     """Whether d2L/dv2 depends on v, so that L is none of a mass matrix; looked at where v enters it at all."""
     flat, unravel = ravel_pytree(v)
     some = jnp.asarray(1 + 0.618 * np.arange(flat.size) % 0.5, flat.dtype)
@@ -341,11 +352,11 @@ class LagrangianForce:
     lagrangian: Callable
     force: Callable | None
 
-    def __call__(self, q, v, t, params):
+    def __call__(self, q: Array, v: Array, t: Real, params: PyTree) -> Array:
         q, v = (jax.tree.map(jnp.asarray, x) for x in (q, v))
         t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(q)))
 
-        def momentum(q, t):
+        def momentum(q: Array, t: Array) -> Array:
             return jax.grad(self.lagrangian, argnums=1)(q, v, t, params)
 
         _, convective = jax.jvp(momentum, (q, t), (v, jnp.ones_like(t)))
@@ -360,7 +371,7 @@ class InternalLagrangianForce:
     lagrangian: Callable
     force: Callable | None
 
-    def __call__(self, q, v, z, t, params):
+    def __call__(self, q: Array, v: Array, z: Array, t: Real, params: PyTree) -> Array:
         Q = LagrangianForce(self.lagrangian, None)(q, v, t, params)
         return Q if self.force is None else jax.tree.map(jnp.add, Q, self.force(q, v, z, t, params))
 
@@ -389,16 +400,16 @@ def require_inertial(caller: str, name: str, function: Callable, before: tuple[s
     require_function(caller, name, function, f"{name}({', '.join((*before, *more, 'params'))})")
 
 
-def timed(function: Callable, before: int, t) -> tuple:
+def timed(function: Callable, before: int, t: Real) -> tuple:
     """(t,) for a function that takes the time behind so many arguments, () for one that does not."""
     return (t,) if takes_time(function, before) else ()
 
 
-def mass_at(system, q, t, params):
+def mass_at(system: System, q: PyTree, t: Real, params: PyTree):
     """M of a system with pytrees, as its user gave it: a function's value, or the constant array."""
     return system.mass(q, *timed(system.mass, 1, t), params) if callable(system.mass) else system.mass
 
 
-def product_at(system, q, w, t, params):
+def product_at(system, q: PyTree, w: PyTree, t: Real, params: PyTree) -> PyTree:
     """M w by the system's own `inertia`, a pytree."""
     return system.inertia(q, w, *timed(system.inertia, 2, t), params)

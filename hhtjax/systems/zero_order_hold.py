@@ -5,13 +5,16 @@ gets the value in its middle. Where a step ends on a sample of uneven times, the
 then. What the state takes along at a jump is in steppers/stepper.py, `behind_jump`.
 """
 
+from __future__ import annotations
+
 import warnings
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.description import all_concrete
+from hhtjax.description import Array, PyTree, all_concrete
 from hhtjax.systems.sampled import SLOP, Sampled
 
 OFF_GRID = 1e-6  # of a step, from which on a jump within it is told: what it costs is as much of a step's error
@@ -21,7 +24,7 @@ class JumpWarning(UserWarning):
     """A held input jumps within a step, where the method has order 1, whatever its order is elsewhere."""
 
 
-def warn_of_jumps(caller, params, times, steps, level):
+def warn_of_jumps(caller: str, params: PyTree, times: np.ndarray, steps: Callable, level: int):
     """A `JumpWarning` where a held input jumps within a step, as far as all is known.
 
     times: (K + 1,), at which steps of any size end. steps: H (J,), lengths between two of these -> how many equal steps
@@ -49,28 +52,28 @@ def warn_of_jumps(caller, params, times, steps, level):
             return
 
 
-def holds(params):
+def holds(params: PyTree) -> bool:
     """Whether there is a held input among the params."""
     return any(map(_is_held, jax.tree.leaves(params, is_leaf=_is_held)))
 
 
-def held_at(params, t):
+def held_at(params: PyTree, t: Array):
     """The params with each held input constant, at its value at t."""
     return _with_held(params, lambda x: x(t))
 
 
-def before(params, t, dt):
+def before(params: PyTree, t: Array, dt):
     """The params of a step that ends at t."""
     return _with_held(params, lambda x: x.held_before(t, dt)) if holds(params) else params
 
 
-def passed(params, t, last, dt):
+def passed(params: PyTree, t: Array, last: Array, dt: Array) -> Array:
     """Whether a step dt from t has another sample of a held input than the one before, last, which ended there."""
     held = filter(_is_held, jax.tree.leaves(params, is_leaf=_is_held))
     return jnp.any(jnp.stack([x.place_before(t, last) != x.place(t + dt / 2) for x in held]))
 
 
-def jump_after(params, t):
+def jump_after(params: PyTree, t: Array) -> Array:
     """The time of the first jump after t; inf where there is none."""
     leaves = jax.tree.leaves(params, is_leaf=_is_held)
     t = t + SLOP * float(jnp.finfo(t.dtype).eps) * jnp.abs(t)  # a jump that t is, in its dtype, is over
@@ -78,9 +81,9 @@ def jump_after(params, t):
     return jnp.min(jnp.stack([*times, jnp.full_like(t, jnp.inf)]))
 
 
-def _is_held(x):
+def _is_held(x: PyTree) -> bool:
     return isinstance(x, Sampled) and jnp.ndim(x.polynomials) > 1 and jnp.shape(x.polynomials)[1] == 1
 
 
-def _with_held(params, value):
+def _with_held(params: PyTree, value: Callable):
     return jax.tree.map(lambda x: x.constant(value(x)) if _is_held(x) else x, params, is_leaf=_is_held)

@@ -1,12 +1,19 @@
 """What became of a run in the compiled program."""
 
+from __future__ import annotations
+
 import time
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 
 import hhtjax.xla.lowering  # noqa: F401
+from hhtjax.description import PyTree, Real
 from hhtjax.primitives.interpreter import asked
+
+if TYPE_CHECKING:
+    from jax.extend.core import Jaxpr
 
 
 class Explanation(NamedTuple):
@@ -28,7 +35,7 @@ class Explanation(NamedTuple):
         return "\n".join([*lines, f"compiled in {self.compile_seconds:.2f} s{memory}"])
 
 
-def explain(f, *args) -> Explanation:
+def explain(f: Callable, *args: Real) -> Explanation:
     """Compiles f(*args), which calls `simulate`, and tells how its loops over steps run.
 
     On the CPU each becomes one kernel if XLA can compile it so, several times faster on a small system, and a list of
@@ -68,7 +75,7 @@ def explain(f, *args) -> Explanation:
     return Explanation(tuple(paths.values()), seconds, None if memory is None else memory.temp_size_in_bytes)
 
 
-def calls(names, f, *args):
+def calls(names, f: Callable, *args: PyTree) -> bool:
     """Whether f(*args), as it is traced, calls a compiled function of one of these names.
 
     Args:
@@ -88,7 +95,7 @@ def calls(names, f, *args):
     return _calls(names, jax.make_jaxpr(f)(*args).jaxpr, set())
 
 
-def _calls(names, jaxpr, seen):
+def _calls(names, jaxpr: Jaxpr, seen) -> bool:
     """seen: ids of what has been looked through; a cached trace may be called often."""
     if id(jaxpr) in seen:
         return False

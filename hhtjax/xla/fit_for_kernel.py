@@ -5,14 +5,19 @@ known to the emitter of such functions. LAPACK, sorting, scattering, large sums 
 those of JAX's operations; one that is not listed is taken for unknown: slower, never wrong.
 """
 
+from __future__ import annotations
+
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.jaxpr.scalar_rules import ELEMENTWISE
+
+if TYPE_CHECKING:
+    from jax.extend.core import Jaxpr, JaxprEqn
 
 LARGEST_SUM = 4095  # numbers of a sum; XLA hands larger ones to another library
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
@@ -61,11 +66,11 @@ class Verdict(NamedTuple):
 class _Objection(Exception):
     """Ends the search: why, and the operations, the innermost first."""
 
-    def __init__(self, why, *eqns):
+    def __init__(self, why: str, *eqns: JaxprEqn):
         self.why, self.eqns = why, eqns
 
 
-def verdict(jaxpr):
+def verdict(jaxpr: Jaxpr) -> Verdict:
     """The `Verdict` on a jaxpr, all that it calls included."""
     try:
         return Verdict(None, operations=sum(_count(jaxpr, MOST_OPERATIONS)))
@@ -73,7 +78,7 @@ def verdict(jaxpr):
         return Verdict(found.why, found.eqns)
 
 
-def inner(eqn):
+def inner(eqn: JaxprEqn):
     """The jaxprs in an operation that are run."""
     name, params = eqn.primitive.name, eqn.params
     if name == "custom_linear_solve":
@@ -83,7 +88,7 @@ def inner(eqn):
     return [getattr(x, "jaxpr", x) for x in found]
 
 
-def _count(jaxpr, most):
+def _count(jaxpr: Jaxpr, most: int):
     """Number of operations, all and those in branches."""
     number = in_branches = 0
     for eqn in jaxpr.eqns:
@@ -108,7 +113,7 @@ def _count(jaxpr, most):
     return number, in_branches
 
 
-def _objection(eqn, name):
+def _objection(eqn, name: str):
     odd = [x.aval for x in (*eqn.invars, *eqn.outvars) if not _is_usual(x.aval)]
     if odd:
         return f"{name} of {odd[0].str_short()}"
@@ -122,7 +127,7 @@ def _objection(eqn, name):
     return name
 
 
-def _is_usual(aval):
+def _is_usual(aval) -> bool:
     """Of numbers that the emitter has been seen with; keys of random numbers are arrays of these."""
     dtype: Any = getattr(aval, "dtype", None)
     return dtype in DTYPES or dtype == jax.dtypes.float0 or jnp.issubdtype(dtype, jax.dtypes.extended)
@@ -139,7 +144,7 @@ def lengths(eqn):
     return math.prod(shapes[0][i] for i in over[0]), *sides
 
 
-def is_of_vector(eqn):
+def is_of_vector(eqn) -> bool:
     """Of a vector, batched or not: with a matrix, or another one, which is a sum. It stays in the kernel as it is."""
     _, rows, columns = lengths(eqn)
     largest = max(x.aval.size for x in eqn.invars)

@@ -4,9 +4,13 @@ Products of small matrices become sums, scatters of few windows updates, sines o
 function in two forms (`choose`) the one for kernels is taken. All else is copied as it is, without being traced again.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import lru_cache, partial, reduce
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +21,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.extend.core.primitives import closed_call_p
 
+from hhtjax.description import Array
 from hhtjax.jaxpr.scalar_rules import replaces
 from hhtjax.primitives import batching, two_mode_derivative
 from hhtjax.primitives.consistent import held_p
@@ -24,6 +29,9 @@ from hhtjax.primitives.kernel_primitive import of_jaxpr
 from hhtjax.primitives.kernels import PART, STAGED
 from hhtjax.xla.fit_for_kernel import DTYPES, lengths, verdict
 from hhtjax.xla.sines import sines
+
+if TYPE_CHECKING:
+    from jax.extend.core import JaxprEqn, Var
 
 MOST_TERMS = 32  # of the sum that a product is written as
 MOST_ROWS = 64  # in one of the factors, of the product that is written out; the other may be a batch
@@ -48,12 +56,12 @@ OURS = {  # operations of this package -> what they do, a function of arrays and
 }
 
 
-def for_kernel(closed):
+def for_kernel(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The closed jaxpr, as a kernel needs it."""
     return with_values_held(_Copier(_in_kernel, sines=True).copied(closed))
 
 
-def for_list(closed, stages_are_kernels):
+def for_list(closed: ClosedJaxpr, stages_are_kernels: bool) -> ClosedJaxpr:
     """The closed jaxpr, as it is run where it is no kernel: stages are computed once, or kernels; kernels stay."""
     return with_values_held(_Copier(partial(_in_list, stages_are_kernels)).copied(closed))
 
@@ -61,24 +69,24 @@ def for_list(closed, stages_are_kernels):
 class _Copier:
     """Copies jaxprs, each once: functions that are called often stay one function."""
 
-    def __init__(self, other, sines=False):
+    def __init__(self, other: Callable, sines: bool = False):
         """other: equation, copier -> the closed jaxpr that takes its place, or None; sines: as polynomials."""
         self.other, self.sines, self.done = other, sines, {}
 
-    def copied(self, closed):
+    def copied(self, closed: ClosedJaxpr) -> ClosedJaxpr:
         if id(closed) not in self.done:
             self.done[id(closed)] = closed, ClosedJaxpr(self.jaxpr(closed.jaxpr), closed.consts)
         return self.done[id(closed)][1]
 
-    def jaxpr(self, jaxpr):
+    def jaxpr(self, jaxpr: Jaxpr) -> Jaxpr:
         if id(jaxpr) not in self.done:
             self.done[id(jaxpr)] = jaxpr, self._jaxpr(jaxpr)
         return self.done[id(jaxpr)][1]
 
-    def _jaxpr(self, jaxpr):
+    def _jaxpr(self, jaxpr: Jaxpr) -> Jaxpr:
         new, eqns = {}, []  # what stands for a variable
 
-        def read(x):
+        def read(x: Literal | Var) -> Literal | Var:
             return x if isinstance(x, Literal) else new.get(x, x)
 
         for eqn in _with_sines_together(jaxpr.eqns) if self.sines else jaxpr.eqns:
@@ -102,7 +110,7 @@ class _Copier:
                 eqns.append(eqn.replace(primitive=closed_call_p, invars=invars, params=params, effects=other.effects))
         return jaxpr.replace(eqns=eqns, outvars=[read(x) for x in jaxpr.outvars])
 
-    def _with_copies(self, eqn):
+    def _with_copies(self, eqn: JaxprEqn) -> JaxprEqn:
         """The equation with copies of the jaxprs in it."""
 
         def copied(x):
@@ -115,7 +123,7 @@ class _Copier:
         return eqn.replace(params={key: jax.tree.map(copied, x) for key, x in eqn.params.items()})
 
 
-def _is_seldom(eqn):
+def _is_seldom(eqn: JaxprEqn) -> bool:
     """A conditional on a boolean that has nothing to do where that is false, and many values to pass on."""
     branches = eqn.params["branches"]
     if len(branches) != 2 or len(eqn.outvars) < MANY:
@@ -123,15 +131,15 @@ def _is_seldom(eqn):
     return {x.primitive.name for x in branches[0].jaxpr.eqns} <= IDLE
 
 
-def _loop_at_most_once(eqn, copier):
+def _loop_at_most_once(eqn: JaxprEqn, copier) -> ClosedJaxpr:
     """A loop in the place of a conditional: XLA copies what that passes on, in either branch; what a loop carries stays
     where it is."""
     idle, taken = (copier.copied(x) for x in eqn.params["branches"])
     passed = {x: i for i, x in enumerate(idle.jaxpr.outvars) if not isinstance(x, Literal)}
     place = [passed.get(x) for x in idle.jaxpr.invars]
 
-    def run(which, *x):
-        def body(carry):
+    def run(which: Array, *x: Array):
+        def body(carry: tuple):
             given = [x if i is None else carry[1 + i] for x, i in zip(x, place, strict=True)]
             return jnp.array(False), *jaxpr_as_fun(taken)(*given)
 
@@ -140,14 +148,14 @@ def _loop_at_most_once(eqn, copier):
     return _traced(run, [x.aval for x in eqn.invars])
 
 
-def _is_named(name, eqn):
+def _is_named(name: str, eqn: JaxprEqn) -> bool:
     return eqn.primitive.name in ("jit", "pjit") and eqn.params["name"].startswith(name)
 
 
 _is_staged = partial(_is_named, STAGED)
 
 
-def _in_list(stages_are_kernels, eqn, copier):
+def _in_list(stages_are_kernels: bool, eqn: JaxprEqn, copier):
     """What takes the place of an equation of a list of kernels."""
     if _is_staged(eqn) or (stages_are_kernels and _is_named(PART, eqn)):
         found = _stage_kernel(eqn.params["jaxpr"], LEAST, LARGEST) if stages_are_kernels else None
@@ -157,7 +165,7 @@ def _in_list(stages_are_kernels, eqn, copier):
 
 
 @of_jaxpr
-def _stage_kernel(closed, least, largest):
+def _stage_kernel(closed: ClosedJaxpr, least: int, largest: int):
     """A stage as a kernel, where it makes one, and is worth one; None of all else.
 
     With sines of XLA's own: polynomials, of which a kernel takes many at a time, take longer to compile."""
@@ -168,7 +176,7 @@ def _stage_kernel(closed, least, largest):
     return jax.make_jaxpr(kernel(form))(*form.in_avals)
 
 
-def _expanded(eqn, copier):
+def _expanded(eqn: JaxprEqn, copier):
     """What an operation of this package does; None of any other."""
     name, params = eqn.primitive.name, eqn.params
     if name in ("hhtjax_family", "hhtjax_bilinear"):
@@ -178,7 +186,7 @@ def _expanded(eqn, copier):
     return None
 
 
-def _in_kernel(eqn, copier):
+def _in_kernel(eqn: JaxprEqn, copier):
     """What takes the place of an equation, a closed jaxpr; None where it stays."""
     name, params = eqn.primitive.name, eqn.params
     if name == "cond":
@@ -199,8 +207,8 @@ def _in_kernel(eqn, copier):
     return _expanded(eqn, copier)
 
 
-def _traced(f, avals):
-    def run(*x):
+def _traced(f: Callable, avals: Sequence) -> ClosedJaxpr:
+    def run(*x: Array) -> Sequence:
         found = f(*x)
         return found if isinstance(found, (list, tuple)) else [found]
 
@@ -210,7 +218,7 @@ def _traced(f, avals):
 # products
 
 
-def _is_to_write_out(eqn):
+def _is_to_write_out(eqn) -> bool:
     """Of two matrices, with few terms."""
     terms, *sides = lengths(eqn)
     types = {x.aval.dtype for x in (*eqn.invars, *eqn.outvars)}
@@ -219,11 +227,11 @@ def _is_to_write_out(eqn):
 
 
 @lru_cache(maxsize=256)
-def _product(avals, dimension_numbers):
+def _product(avals: tuple, dimension_numbers: tuple) -> ClosedJaxpr:
     """A product as a sum over its terms, each a column times a row."""
     (over, batch) = dimension_numbers
 
-    def product(x, y):
+    def product(x: Array, y: Array):
         rest = [[i for i in range(z.ndim) if i not in (*o, *b)] for z, o, b in zip((x, y), over, batch, strict=True)]
         shapes = [x.shape[i] for i in batch[0]], [x.shape[i] for i in rest[0]], [y.shape[i] for i in rest[1]]
         x = lax.transpose(x, (*batch[0], *rest[0], *over[0]))
@@ -252,7 +260,7 @@ def _is_of_few_windows(eqn):
     return usual and not clips and number <= MOST_WINDOWS and x.size <= MOST_PLACES * sizes
 
 
-def _scattered(combine, dims, x, indices, updates):
+def _scattered(combine: Callable, dims, x: Array, indices: Array, updates: Array) -> Array:
     """A slice, an operation and an update for each window."""
     windows = [i for i in range(updates.ndim) if i not in dims.update_window_dims]
     lengths = iter(updates.shape[i] for i in dims.update_window_dims)
@@ -283,7 +291,7 @@ def _scattered(combine, dims, x, indices, updates):
 # sines
 
 
-def _with_sines_together(eqns):
+def _with_sines_together(eqns: list):
     """The equations, with one for all sines and cosines of float64 numbers that can be computed together."""
     made, group, since = [], [], set()
 
@@ -313,7 +321,7 @@ def _with_sines_together(eqns):
     return made
 
 
-def _is_sine(eqn):
+def _is_sine(eqn) -> bool:
     x = eqn.invars[0]
     return not isinstance(x, Literal) and x.aval.dtype == np.float64 and eqn.params.get("accuracy") is None
 
@@ -342,7 +350,7 @@ BROADCAST = "broadcast_in_dim"  # handed on before it is one
 FREE = {BROADCAST, "convert_element_type", "reshape", "slice", "transpose", "squeeze", "expand_dims", "copy", "split"}
 
 
-def with_values_held(closed):
+def with_values_held(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The closed jaxpr, in which such values are handed on by calls."""
     return ClosedJaxpr(_Holder().held(closed.jaxpr)[0], closed.consts)
 
@@ -353,12 +361,12 @@ class _Holder:
     def __init__(self):
         self.done = {}  # id of a jaxpr: (it, what has become of it, costs of its results, uses of its arguments)
 
-    def held(self, jaxpr):
+    def held(self, jaxpr: Jaxpr):
         if id(jaxpr) not in self.done:
             self.done[id(jaxpr)] = jaxpr, *self._held(jaxpr)
         return self.done[id(jaxpr)][1:]
 
-    def _held(self, jaxpr):
+    def _held(self, jaxpr: Jaxpr):
         eqns = [self._inside(eqn) for eqn in jaxpr.eqns]
         uses = {}
         for eqn, _, inner_uses in eqns:
@@ -391,7 +399,7 @@ class _Holder:
             [uses.get(x, 0) for x in jaxpr.invars],
         )
 
-    def _inside(self, eqn):
+    def _inside(self, eqn: JaxprEqn):
         """The equation with what is inside done, costs of its results as a call, uses of its arguments."""
         name = eqn.primitive.name
         if name not in CALLS and name not in LOOPS:
@@ -417,7 +425,7 @@ class _Holder:
         return eqn, *told[0]
 
 
-def _handed_on(eqn, x, new):
+def _handed_on(eqn: JaxprEqn, x: Var, new: dict) -> JaxprEqn:
     """An equation that gives x by another name."""
     other = new[x] = copy(x)  # a variable is known by its identity
     return eqn.replace(primitive=held_p, invars=[x], outvars=[other], params={}, effects=frozenset(), ctx=eqn.ctx)
@@ -427,32 +435,32 @@ def _handed_on(eqn, x, new):
 # Calls that bear attributes for XLA:CPU: what is called is compiled into one kernel, or computed once.
 
 
-def kernel(form):
+def kernel(form: ClosedJaxpr):
     """The function of a closed jaxpr as one kernel.
 
     XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once a constant is put in its place.
     So the kernel returns a number that takes an element of each, and the values are hidden from XLA."""
     number = len(form.out_avals)
 
-    def body(*args):
+    def body(*args: Array):
         return [*eval_jaxpr(form.jaxpr, form.consts, *args), *_of_each(args)]
 
     body = _with_attributes(body, inlineable="false", xla_cpu_small_call="true")
     return lambda *args: body(*lax.optimization_barrier(args))[:number]
 
 
-def _with_attributes(f, **attributes):
+def _with_attributes(f: Callable, **attributes: str):
     """f, which returns a list, as a call that bears these."""
     call = jax.jit(f, keep_unused=True)
 
-    def bearing(*args):
+    def bearing(*args: Array):
         found = call(*args)
         return [set_xla_metadata(found[0], **attributes), *found[1:]]  # it finds what made the value
 
     return bearing
 
 
-def _of_each(values):
+def _of_each(values: tuple):
     """A sum of elements of all, and what no sum takes: to return each by itself would take a buffer each."""
     terms, rest = [], []
     for x in values:
@@ -463,13 +471,13 @@ def _of_each(values):
     return [*([reduce(jnp.add, terms)] if terms else []), *rest]
 
 
-def _first(x):
+def _first(x: Array) -> Array:
     """An element, with as many axes."""
     return lax.slice(x, [0] * x.ndim, [1] * x.ndim)
 
 
 @of_jaxpr
-def computed_once(closed):
+def computed_once(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The closed jaxpr as a call that XLA does not inline, and so computes once, however many users its values have.
 
     What has a single result XLA may divide among threads, and then the kernel does not link: it gets a second one."""
@@ -477,7 +485,7 @@ def computed_once(closed):
     if not number:
         return closed
 
-    def body(*args):
+    def body(*args: Array):
         found = jaxpr_as_fun(closed)(*args)
         if number > 1 or found[0].size <= 1:
             return found

@@ -7,16 +7,19 @@ Where something stands against it, the function runs as a list of kernels, and t
 are asked anew. Platforms other than the CPU never see it.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from contextvars import ContextVar
 from inspect import signature
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
-from hhtjax.description import programs
+from hhtjax.description import PyTree, programs
 from hhtjax.primitives.compat import is_on
 from hhtjax.primitives.interpreter import asked, line_of
 from hhtjax.primitives.kernel_primitive import kernel_p, of_jaxpr
@@ -24,24 +27,27 @@ from hhtjax.primitives.kernels import AROUND, alone_p, inside_p, largest_p, stru
 from hhtjax.xla.fit_for_kernel import inner, verdict
 from hhtjax.xla.for_kernel import for_kernel, for_list, kernel
 
+if TYPE_CHECKING:
+    from jax.extend.core import ClosedJaxpr, Jaxpr
+
 quickly: ContextVar = ContextVar("hhtjax_quickly", default=False)  # compiled by XLA's older way
 DIVIDED = "partitioned over devices; shard_map leaves each its own kernel"
 
 
 @of_jaxpr
-def _as_kernel(closed):
+def _as_kernel(closed: ClosedJaxpr):
     """The jaxpr in the form for a kernel, and the verdict on that."""
     form = for_kernel(closed)
     return form, verdict(form.jaxpr)
 
 
 @of_jaxpr
-def _as_list(closed, stages_are_kernels):
+def _as_list(closed: ClosedJaxpr, stages_are_kernels: bool) -> ClosedJaxpr:
     """The jaxpr in the form for a list of kernels."""
     return for_list(closed, stages_are_kernels)
 
 
-def _lower(ctx, *args, closed, name):
+def _lower(ctx, *args, closed: ClosedJaxpr, name: str):
     if tuple(ctx.module_context.platforms) != ("cpu",) or not closed.jaxpr.eqns:
         return mlir.lower_fun(jaxpr_as_fun(closed), multiple_results=True)(ctx, *args)
     form, (objection, eqns, _) = _as_kernel(closed)
@@ -58,7 +64,7 @@ def _lower(ctx, *args, closed, name):
     return mlir.lower_fun(run, multiple_results=True)(ctx, *args)
 
 
-def _number_of_kernels(jaxpr):
+def _number_of_kernels(jaxpr: Jaxpr) -> int:
     """In a jaxpr."""
     number = 0
     for eqn in jaxpr.eqns:
@@ -67,18 +73,18 @@ def _number_of_kernels(jaxpr):
     return number
 
 
-def _tell(loop, path):
+def _tell(loop, path: str):
     """For `explain`, while it asks."""
     if (paths := asked.get()) is not None:
         paths[loop] = path
 
 
-def _lower_told(ctx, x, why, loop):
+def _lower_told(ctx, x, why: str, loop):
     _tell(loop, f"plain: {why}")
     return [x]
 
 
-def _is_partitioned(axes):
+def _is_partitioned(axes) -> bool:
     """Whether XLA divides the function among devices, and puts communication into it."""
     if hasattr(axes, "manual_axes"):  # inside shard_map
         return set(axes.manual_axes) != set(axes.mesh.axis_names)
@@ -124,21 +130,21 @@ class Programs:
 
     are_refused = False  # the options, by an XLA that does not know one
 
-    def __init__(self, f, **static):
+    def __init__(self, f: Callable, **static: PyTree):
         """static: of `jax.jit`."""
         self.usual: Any = jax.jit(f, **static)
         self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
         programs.update((self.usual, self.quick, self.wide))
 
-    def of(self, rates=0, numbers=None):
+    def of(self, rates: int = 0, numbers: int | None = None):
         """The one for a system of so many rates, 0 where nothing is known of one. numbers: in the position of a member
         of a batch, None where members come one by one."""
         if Programs.are_refused or rates > MOST_QUICK or not is_on() or jax.default_backend() != "cpu":
             return self.usual
         return self.wide if numbers is not None and numbers <= MOST_WIDE else self.quick
 
-    def __call__(self, *args, rates=0, numbers=None, **keywords):
+    def __call__(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
         """The values of the function."""
         program = self.of(rates, numbers)
         token = quickly.set(program is not self.usual)
@@ -155,6 +161,6 @@ class Programs:
             quickly.reset(token)
         return self.usual(*args, **keywords)
 
-    def number(self):
+    def number(self) -> int:
         """Of all that have been compiled."""
         return sum(program._cache_size() for program in (self.usual, self.quick, self.wide))

@@ -4,11 +4,20 @@ Sine and cosine together take 2 ns in the place of 8, and batches are vectorised
 where some number of a batch is larger, infinite or none, a branch takes XLA's own, so that every x has its sine.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import lru_cache, reduce
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+
+from hhtjax.description import Array
+
+if TYPE_CHECKING:
+    from jax.extend.core import ClosedJaxpr
 
 NAME = "hhtjax_sines"
 RANGE = 1e5  # largest |x|, rad
@@ -36,7 +45,7 @@ COSINE = (
 )
 
 
-def polynomial_sines(x, stage=lambda f: f):
+def polynomial_sines(x: Array, stage: Callable = lambda f: f):
     """(sin x, cos x) for float64 numbers |x| <= RANGE, to 2 units in the last place; beyond, what has no meaning.
 
         x = k pi/2 + r,  |r| <= pi/4,    sin r = r + r^3 S(r^2),    cos r = 1 - r^2/2 + r^4 C(r^2)
@@ -63,7 +72,7 @@ def polynomial_sines(x, stage=lambda f: f):
     return lax.select(x == 0, x, sine), cosine  # -0 has a sine of its own
 
 
-def _sines_by_bits(x, stage):
+def _sines_by_bits(x: Array, stage: Callable):
     """The same by the bits of k: half the operations after the polynomials. Where operations are listed, or evaluated
     on scalars, there are no bits."""
     k, sine, cosine = _of_quarter(x, stage)
@@ -73,30 +82,30 @@ def _sines_by_bits(x, stage):
     return lax.select(x == 0, x, _with_sign(sine, bits)), _with_sign(cosine, bits + 1)
 
 
-def _of_quarter(x, stage):
+def _of_quarter(x: Array, stage: Callable):
     """k, sin r and cos r."""
     r, k = stage(_reduced)(x)
     return k, *stage(_near_zero)(r)
 
 
-def _reduced(x):
+def _reduced(x: Array):
     """r and k."""
     k = lax.round(x * (2 / jnp.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
     return reduce(lambda r, part: r - k * part, HALF_PI, x), k
 
 
-def _near_zero(r):
+def _near_zero(r: Array):
     """sin r and cos r."""
     z = r * r
     return r + r * z * _polynomial(SINE, z), 1 + z * (z * _polynomial(COSINE, z) - 0.5)
 
 
-def _is_odd(k):
+def _is_odd(k: Array) -> Array:
     """Of whole numbers; in floating point, because conversion to integers takes longer than all the rest."""
     return lax.floor(k / 2) != k / 2
 
 
-def _polynomial(coefficients, z):
+def _polynomial(coefficients: tuple, z: Array) -> Array:
     """Horner's scheme; of a single number, with nothing to do beside it, Estrin's, which waits less."""
     if z.ndim:
         return reduce(lambda value, c: c + z * value, reversed(coefficients))
@@ -104,29 +113,29 @@ def _polynomial(coefficients, z):
     return (a + b * z) + z * z * ((c + d * z) + z * z * (e + f * z))
 
 
-def _bits(x):
+def _bits(x: Array) -> Array:
     return lax.bitcast_convert_type(x, jnp.int64)
 
 
-def _with_sign(x, bits):
+def _with_sign(x: Array, bits: Array) -> Array:
     """-x where the second bit of `bits` is set, else x."""
     sign = lax.shift_left(bits & 2, jnp.full_like(bits, 62))
     return lax.bitcast_convert_type(_bits(x) ^ sign, jnp.float64)
 
 
 @lru_cache(maxsize=256)
-def sines(avals, wanted):
+def sines(avals: tuple, wanted: tuple) -> ClosedJaxpr:
     """A jaxpr of arrays that gives what is wanted, [("sin" or "cos", number of its operand)]."""
     shape, functions = avals[0].shape, {"sin": lax.sin, "cos": lax.cos}
 
-    def exact(*x):
+    def exact(*x: Array):
         return [functions[name](x[i]) for name, i in wanted]
 
-    def fast(*x):
+    def fast(*x: Array):
         pairs = [dict(zip(functions, _sines_by_bits(y, lambda f: f), strict=True)) for y in x]
         return [pairs[i][name] for name, i in wanted]
 
-    def both(*x):
+    def both(*x: Array):
         inside = reduce(lax.bitwise_and, (lax.abs(y) <= RANGE for y in x))
         return lax.cond(lax.reduce_and(inside, range(len(shape))) if shape else inside, fast, exact, *x)
 
