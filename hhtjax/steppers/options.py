@@ -92,9 +92,10 @@ def check_options(caller: str, **keywords: Any) -> Options:
     options = replace(options, max_iterations=require_integer(caller, "max_iterations", options.max_iterations))
     for name in ("start", "formulation", "kinematics"):
         _require_one_of(caller, name, options)
-    check_redundant(caller, options.redundant)
-    if options.redundant is not None and options.solve is not None:
-        raise ValueError(f"{caller}: `redundant` brings its own solver: leave out `solve`, or `redundant`.")
+    if options.redundant is not None:
+        check_redundant(caller, options.redundant)
+        if options.solve is not None:
+            raise ValueError(f"{caller}: `redundant` brings its own solver: leave out `solve`, or `redundant`.")
     if options.solve is not None:
         structured = isinstance(options.solve, Structured)
         require_function(caller, "solve", options.solve, "solve(...)" if structured else "solve(A, b)")

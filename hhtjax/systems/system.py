@@ -145,7 +145,8 @@ class System(Description):
         if self.constraint is not None:
             _require_constraint(self.constraint)
         more = (self.internal is not None) * ("z",) + (self.constraint is not None) * ("L",)
-        require_friction("System", self.friction, self.sliding, *more)
+        if self.friction is not None or self.sliding is not None:
+            require_friction("System", self.friction, self.sliding, *more)
         if callable(self.mass):
             require_inertial("System", "mass", self.mass, ("q",))
         else:
