@@ -89,22 +89,56 @@ def test_a_wish_that_is_none(monkeypatch):
         end(2.0)
 
 
-@on_cpu
-def test_a_program_that_xla_refuses_runs_on_plain_jax(monkeypatch):
-    """As when a new XLA refuses a kernel of which all operations were known to compile."""
+@pytest.fixture
+def sorting(monkeypatch):
+    """A system whose kernels XLA refuses, as a new one may refuse operations that were known to compile."""
     monkeypatch.setattr(fit_for_kernel, "KNOWN", fit_for_kernel.KNOWN | {"sort"})
-    system = hhtjax.System(mass=jnp.ones(3), force=lambda q, v, t, k: -k * jnp.sort(q) * q)
+    return hhtjax.System(mass=jnp.ones(3), force=lambda q, v, t, k: -k * jnp.sort(q) * q)
 
+
+Q0 = jnp.array([0.3, 0.1, 0.2])
+
+
+@on_cpu
+def test_a_program_that_xla_refuses_runs_on_plain_jax(sorting):
     def final(q0):
-        return hhtjax.simulate(system, hhtjax.rk4(), q0, jnp.zeros(3), 2.0, dt=0.1, num_steps=3).q[-1]
+        return hhtjax.simulate(sorting, hhtjax.rk4(), q0, jnp.zeros(3), 2.0, dt=0.1, num_steps=3).q[-1]
 
-    q0 = jnp.array([0.3, 0.1, 0.2])
-    with pytest.warns(RuntimeWarning, match="XLA refused the fast program"):
-        found = final(q0)
+    with pytest.warns(RuntimeWarning, match="XLA refused the fast program") as warned:
+        found = final(Q0)
+    assert [w.filename for w in warned] == [__file__]  # the line that calls the library
     with hhtjax.plain():
-        assert np.allclose(found, final(q0), rtol=1e-14)
+        assert np.allclose(found, final(Q0), rtol=1e-14)
     with pytest.raises(jax.errors.JaxRuntimeError):  # XLA sees the user's program after he has left it
-        jax.jit(final)(q0)
+        jax.jit(final)(Q0)
+
+
+@on_cpu
+def test_what_xla_has_refused_it_is_not_asked_again(sorting, caplog, tmp_path):
+    """One program of several: the others are as fast as ever."""
+    start = sorting, hhtjax.rk4(), Q0, jnp.zeros(3), 2.0
+    kinds = {
+        "_simulate": lambda: hhtjax.simulate(*start, dt=0.1, num_steps=5),
+        "run_sweep": lambda: hhtjax.sweep(*start, dts=jnp.array([0.1, 0.2]), duration=0.4, num_samples=2),
+    }
+    for name, call in kinds.items():
+        with jax.log_compiles():
+            with pytest.warns(RuntimeWarning, match="XLA refused the fast program"):
+                first = call()
+            assert caplog.text.count(f"Compiling jit({name})") == 2
+            caplog.clear()
+            again = call()  # warnings are errors here
+            assert "Compiling" not in caplog.text
+        assert jax.tree.all(jax.tree.map(np.array_equal, first, again))
+    with pytest.warns(RuntimeWarning, match="XLA refused the fast program"):
+        hhtjax.simulate(*start, dt=0.1, num_steps=4)  # another program
+    chunks = [
+        hhtjax.sweep_to_disk(
+            tmp_path, *start, dts=jnp.array([0.1, 0.2]), duration=0.4, num_samples=2, chunk=2
+        )  # that of the sweep; begun again, it is the same one
+        for _ in range(2)
+    ]
+    assert np.array_equal(hhtjax.load_sweep(chunks[0])["q"], kinds["run_sweep"]().q)
 
 
 def test_an_error_of_the_users_own_stays():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -18,8 +19,10 @@ OLDEST = (
     2,
 )  # the first JAX that compiles kernels with all that they may hold; older ones end the process over some
 NEWEST = 0, 10, 2  # the last one with which the conformance tests have passed
+BETWEEN = {"hhtjax", "jax", "contextlib", "functools"}
 
 _plain: ContextVar = ContextVar("hhtjax_plain", default=False)
+_refused: set = set()  # by what they are known by: XLA would take as long to refuse them again
 # part of the key under which JAX keeps a compiled function, so that both forms of it can be there
 _key = jax.make_user_context(default_value=False) if hasattr(jax, "make_user_context") else None
 
@@ -51,17 +54,19 @@ def plain():
         _plain.reset(token)
 
 
-def or_plain(run: Callable, again: Callable | None = None):
+def or_plain(run: Callable, known_by: Callable | None = None):
     """run(), or the same on plain JAX where XLA refuses what the machinery has made of it; a warning says so.
 
     The last resort of programs that start here: inside a jit of the user's, XLA is not asked before he has left it.
+    `hhtjax.xla.Programs` do so by themselves.
 
     Args:
         run: a function without arguments.
-        again: what is called on plain JAX, where that is not run: of a program that is lowered already, say.
+        known_by: a function without arguments; what it returns, run is known by: refused once, it is not tried again.
+            It is called after a refusal only.
 
     Returns:
-        What run, or again, returns.
+        What run returns.
 
     Raises:
         jax.errors.JaxRuntimeError: XLA refuses the plain program too, or the machinery is off. And whatever run raises.
@@ -70,6 +75,9 @@ def or_plain(run: Callable, again: Callable | None = None):
     >>> float(hhtjax.primitives.or_plain(lambda: jnp.sum(jnp.ones(3))))
     3.0
     """
+    if _refused and known_by is not None and known_by() in _refused:
+        with plain():
+            return run()
     try:
         return run()
     except jax.errors.JaxRuntimeError as error:
@@ -77,14 +85,20 @@ def or_plain(run: Callable, again: Callable | None = None):
             raise
         refusal = error
     with plain():
-        result = (again or run)()  # where this fails too, the cause is another, and its error the one to see
+        result = run()  # where this fails too, the cause is another, and its error the one to see
+    if known_by is not None:
+        _refused.add(known_by())
     words = (str(refusal).splitlines() or [""])[0][:200]
-    warnings.warn(
-        f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the try.",
-        RuntimeWarning,
-        stacklevel=3,
-    )
+    _warn(f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the try.")
     return result
+
+
+def _warn(words: str):
+    """At the line outside this library, and outside what it calls others through, that led here."""
+    frame, level = sys._getframe(), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in BETWEEN:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(words, RuntimeWarning, stacklevel=level)
 
 
 def why_off():

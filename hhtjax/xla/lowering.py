@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextvars import ContextVar
+from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +20,8 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
-from hhtjax.description import PyTree, programs
-from hhtjax.primitives.compat import is_on
+from hhtjax.description import PyTree, is_concrete, programs
+from hhtjax.primitives.compat import is_on, or_plain
 from hhtjax.primitives.interpreter import asked, line_of
 from hhtjax.primitives.kernel_primitive import kernel_p, of_jaxpr
 from hhtjax.primitives.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
@@ -145,11 +146,23 @@ class Programs:
         return self.wide if numbers is not None and numbers <= MOST_WIDE else self.quick
 
     def __call__(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
-        """The values of the function."""
+        """The values of the function; from plain JAX where XLA refuses the program, or has done so before."""
+
+        def known_by():  # what JAX keeps the program by, and what is being made of it
+            made = frozenset(type(x) for x in jax.tree.leaves((args, keywords)) if not is_concrete(x))
+            return self.usual.trace(*args, **keywords).jaxpr, made
+
+        return or_plain(partial(self._chosen, lambda program: program(*args, **keywords), rates, numbers), known_by)
+
+    def lower(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
+        """What a call hands to XLA, as `jax.jit(f).lower`."""
+        return self._chosen(lambda program: program.lower(*args, **keywords), rates, numbers)
+
+    def _chosen(self, use: Callable, rates: int, numbers: int | None):
         program = self.of(rates, numbers)
         token = quickly.set(program is not self.usual)
         try:
-            return program(*args, **keywords)
+            return use(program)
         except ValueError as error:  # there are options inside a jit of the user's
             if "compiler_options" not in str(error):
                 raise
@@ -159,7 +172,7 @@ class Programs:
             Programs.are_refused = True
         finally:
             quickly.reset(token)
-        return self.usual(*args, **keywords)
+        return use(self.usual)
 
     def number(self) -> int:
         """Of all that have been compiled."""
