@@ -11,7 +11,6 @@ from linked_pendulums import N, end, links, loss, on_cpu, paths
 
 import hhtjax
 from hhtjax.primitives import compat, kernels
-from hhtjax.xla import fit_for_kernel
 
 GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged"
 
@@ -90,19 +89,24 @@ def test_a_wish_that_is_none(monkeypatch):
 
 
 @pytest.fixture
-def sorting(monkeypatch):
+def refused(monkeypatch):
     """A system whose kernels XLA refuses, as a new one may refuse operations that were known to compile."""
-    monkeypatch.setattr(fit_for_kernel, "KNOWN", fit_for_kernel.KNOWN | {"sort"})
-    return hhtjax.System(mass=jnp.ones(3), force=lambda q, v, t, k: -k * jnp.sort(q) * q)
+
+    def unknown(form):
+        like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in form.out_avals]
+        return jax.ffi.ffi_call("hhtjax_of_no_library", like)
+
+    monkeypatch.setattr("hhtjax.xla.lowering.kernel", unknown)
+    return hhtjax.System(jnp.ones(3), lambda q, v, t, k: -k * q**3)
 
 
 Q0 = jnp.array([0.3, 0.1, 0.2])
 
 
 @on_cpu
-def test_a_program_that_xla_refuses_runs_on_plain_jax(sorting):
+def test_a_program_that_xla_refuses_runs_on_plain_jax(refused):
     def final(q0):
-        return hhtjax.simulate(sorting, hhtjax.rk4(), q0, jnp.zeros(3), 2.0, dt=0.1, num_steps=3).q[-1]
+        return hhtjax.simulate(refused, hhtjax.rk4(), q0, jnp.zeros(3), 2.0, dt=0.1, num_steps=3).q[-1]
 
     with pytest.warns(RuntimeWarning, match="XLA refused the fast program") as warned:
         found = final(Q0)
@@ -114,9 +118,9 @@ def test_a_program_that_xla_refuses_runs_on_plain_jax(sorting):
 
 
 @on_cpu
-def test_what_xla_has_refused_it_is_not_asked_again(sorting, caplog, tmp_path):
+def test_what_xla_has_refused_it_is_not_asked_again(refused, caplog, tmp_path):
     """One program of several: the others are as fast as ever."""
-    start = sorting, hhtjax.rk4(), Q0, jnp.zeros(3), 2.0
+    start = refused, hhtjax.rk4(), Q0, jnp.zeros(3), 2.0
     kinds = {
         "_simulate": lambda: hhtjax.simulate(*start, dt=0.1, num_steps=5),
         "run_sweep": lambda: hhtjax.sweep(*start, dts=jnp.array([0.1, 0.2]), duration=0.4, num_samples=2),

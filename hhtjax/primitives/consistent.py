@@ -50,7 +50,9 @@ EXACT = CHOICES | {
     *("reshape", "rev", "select_n", "slice", "sort", "split", "squeeze", "stack", "stop_gradient", "transpose"),
     *("unstack",),
 }
-INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}  # the parameter that holds what is called
+INLINED = {  # the parameter that holds what is called
+    **{"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "eval_jaxpr": "call_jaxpr"},
+}
 REBUILT = {"cond", "scan", "while"}
 
 

@@ -47,6 +47,7 @@ INSIDE = {
         "custom_jvp_call",
         "custom_lin",
         "custom_linear_solve",
+        "eval_jaxpr",
         "hhtjax_kernel",
     ),
     *("custom_vjp_call", "custom_vjp_call_jaxpr", "jit", "pjit", "remat", "remat2", "scan", "while"),

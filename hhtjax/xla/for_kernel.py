@@ -25,6 +25,7 @@ from hhtjax.description import Array
 from hhtjax.jaxpr.scalar_rules import replaces
 from hhtjax.primitives import batching, two_mode_derivative
 from hhtjax.primitives.consistent import held_p
+from hhtjax.primitives.interpreter import lowered
 from hhtjax.primitives.kernel_primitive import of_jaxpr
 from hhtjax.primitives.kernels import PART, STAGED
 from hhtjax.xla.fit_for_kernel import DTYPES, lengths, verdict
@@ -212,7 +213,7 @@ def _traced(f: Callable, avals: Sequence) -> ClosedJaxpr:
         found = f(*x)
         return found if isinstance(found, (list, tuple)) else [found]
 
-    return jax.make_jaxpr(run)(*avals)
+    return lowered(jax.make_jaxpr(run)(*avals))
 
 
 # products
@@ -343,7 +344,8 @@ _SINES = _Name()
 
 ONCE = "hhtjax_once"  # name of a function that XLA computes once
 LEAST_HELD = 40  # operations that are evaluated once more without a call; of fewer, nothing is gained
-CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2"}
+CALLS = {"jit", "pjit", "closed_call", "core_call", "eval_jaxpr", "custom_jvp_call", "custom_vjp_call", "checkpoint"}
+CALLS |= {"remat2"}
 LOOPS = {"cond", "while", "scan", "custom_linear_solve"}
 MADE_ONCE = LOOPS | {"dot_general", "hhtjax_held"}  # by XLA in any case
 BROADCAST = "broadcast_in_dim"  # handed on before it is one

@@ -108,14 +108,15 @@ mlir.register_lowering(alone_p, lambda ctx, x: [mlir.ir_constant(np.bool_(True))
 # QUICK: XLA:CPU compiles each fusion that stands outside a kernel by a pipeline of MLIR, some 10 ms for a few sums, and
 # gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. So
 # in programs without QUICK stages become kernels (lowering.py), which in those with it would take longer. What it makes
-# of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without. WIDE: vectors of
+# of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without. Since JAX 0.11.1
+# there is no such option, and QUICK is empty. WIDE: vectors of
 # 512 bits for loops over the members of a batch, where XLA:CPU takes half of that, unless it is asked: a batch of
 # double pendulums then takes half the time.
 #
 # For a jit of one's own: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
 
 
-QUICK = {"xla_cpu_use_fusion_emitters": False}
+QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11, 1) else {}
 MOST_QUICK = 32  # rates; with 40, steps of a beam take 1.2 times as long
 WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits; where a processor has none so long, nothing changes
 MOST_WIDE = 4  # coordinates; loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
@@ -134,7 +135,7 @@ class Programs:
     def __init__(self, f: Callable, **static: PyTree):
         """static: of `jax.jit`."""
         self.usual: Any = jax.jit(f, **static)
-        self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
+        self.quick: Any = jax.jit(f, compiler_options=QUICK, **static) if QUICK else self.usual
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
         programs.update((self.usual, self.quick, self.wide))
 
@@ -160,7 +161,7 @@ class Programs:
 
     def _chosen(self, use: Callable, rates: int, numbers: int | None):
         program = self.of(rates, numbers)
-        token = quickly.set(program is not self.usual)
+        token = quickly.set(bool(QUICK) and program is not self.usual)
         try:
             return use(program)
         except ValueError as error:  # there are options inside a jit of the user's
@@ -176,4 +177,4 @@ class Programs:
 
     def number(self) -> int:
         """Of all that have been compiled."""
-        return sum(program._cache_size() for program in (self.usual, self.quick, self.wide))
+        return sum(program._cache_size() for program in {self.usual, self.quick, self.wide})
