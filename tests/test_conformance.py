@@ -29,7 +29,7 @@ pytestmark = [
 NAMES = re.compile(r"(?<![\w.'])[a-zA-Z](?![\w('])")
 # XLA takes z + 0 for z in a compiled program, and JAX one fill value for the other, since they compare as equal
 SIGNS_OF_XLA = ("z + 0.0", "0.0 + z", "z - -0.0", "fill_value=-0.0")
-UNDEFINED = ("lax.div(m, m)",)  # where m is 0; a newer XLA takes x / x for 1 in a compiled program, and no division for it
+UNDEFINED = ("lax.div(m, m)",)  # where m is 0: the XLA of JAX 0.12 takes x / x for 1 in a compiled program
 
 
 def scope():

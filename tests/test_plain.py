@@ -1,6 +1,7 @@
 """The switch: plain JAX, by a context, by the environment, or for a JAX that is not known."""
 
 import re
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -68,18 +69,37 @@ def test_a_sweep_gives_the_same_without_the_machinery():
 @pytest.mark.parametrize(
     ("version", "wish", "why"),
     [
-        ((99, 0, 0), "", "plain: JAX .* is newer than 0.10.2, the last one tested; HHTJAX_PLAIN=0 tries it"),
+        ((99, 0, 0), "", "plain: JAX .* is newer than 0.12, the last one tested; HHTJAX_PLAIN=0 tries it"),
         ((99, 0, 0), "0", "one kernel"),
-        ((0, 7, 1), "", "plain: JAX .* is older than 0.7.2"),
+        ((*compat.NEWEST, 7), "", "one kernel"),  # a correction of what is known
         (jax.__version_info__, "1", "plain: HHTJAX_PLAIN=1"),
         (jax.__version_info__, "0", "one kernel"),
     ],
 )
 def test_the_environment_and_the_version_of_jax(version, wish, why, monkeypatch):
     monkeypatch.setattr(jax, "__version_info__", version)
+    monkeypatch.setattr(compat, "_told", ["a warning of its own"])
     monkeypatch.setenv(compat.VARIABLE, wish)
     (path,) = paths(lambda params: end(params), 2.0)  # new for JAX
     assert re.match(why, path)
+
+
+def test_a_jax_that_is_not_known_is_told_of_once(monkeypatch):
+    """Where a user's program calls the library first; who says what he wants is not told."""
+    monkeypatch.setattr(jax, "__version_info__", (99, 0, 0))
+    monkeypatch.setattr(compat, "_told", [])
+    for wish in "01":
+        monkeypatch.setenv(compat.VARIABLE, wish)
+        end(2.0)  # warnings are errors here
+    monkeypatch.delenv(compat.VARIABLE)
+    run = hhtjax.System(jnp.ones(1), lambda q, v, t, k: -k * q), hhtjax.rk4(), jnp.ones(1), jnp.zeros(1), 2.0
+    with pytest.warns(RuntimeWarning, match=r"several times slower.* newer than 0.12, .* A newer hhtjax") as warned:
+        hhtjax.simulate(*run, dt=0.1, num_steps=1)
+    assert [w.filename for w in warned] == [__file__]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hhtjax.simulate(*run, dt=0.1, num_steps=2)
+        jax.jit(end)(3.0)
 
 
 def test_a_wish_that_is_none(monkeypatch):

@@ -9,7 +9,6 @@ optimiser on reverse-mode gradients for many.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax

@@ -38,9 +38,8 @@ UNKNOWN = "unknown"
 MOST = 100_000  # operations: of more, a compiler takes minutes
 WRITTEN_OUT = 1000  # operations more than those of a loop
 INLINED = {  # a function called: the parameter that holds it
-    **{"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr"},
-    **{"eval_jaxpr": "call_jaxpr", "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"},
-    **{"custom_vjp_call_jaxpr": "fun_jaxpr", "hhtjax_family": "jaxpr", "hhtjax_bilinear": "jaxpr"},
+    **dict.fromkeys(("jit", "remat2", "hhtjax_family", "hhtjax_bilinear"), "jaxpr"),
+    **dict.fromkeys(("closed_call", "eval_jaxpr", "custom_jvp_call", "custom_vjp_call"), "call_jaxpr"),
 }
 
 

@@ -8,23 +8,19 @@ import warnings
 from collections.abc import Callable
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 import jax
-from jax.experimental.xla_metadata import set_xla_metadata
 
 VARIABLE = "HHTJAX_PLAIN"  # 1: off; 0: on, also with a JAX newer than those tested
-OLDEST = (
-    0,
-    7,
-    2,
-)  # the first JAX that compiles kernels with all that they may hold; older ones end the process over some
-NEWEST = 0, 10, 2  # the last one with which the conformance tests have passed
+NEWEST = 0, 12  # the last JAX with which the conformance tests have passed, its corrections 0.12.x included
 BETWEEN = {"hhtjax", "jax", "contextlib", "functools"}
 
 _plain: ContextVar = ContextVar("hhtjax_plain", default=False)
+_told: list = []  # that this JAX is not known, where a warning has said so
 _refused: set = set()  # by what they are known by: XLA would take as long to refuse them again
 # part of the key under which JAX keeps a compiled function, so that both forms of it can be there
-_key = jax.make_user_context(default_value=False) if hasattr(jax, "make_user_context") else None
+_key: Any = jax.make_user_context(default_value=False)
 
 
 @contextmanager
@@ -33,8 +29,8 @@ def plain():
 
     Functions traced inside are kept apart from those traced outside, so a jitted function gives the plain result inside
     and the fast one outside; of several threads it holds for the one that is inside. The environment variable
-    HHTJAX_PLAIN=1, set before the first run, does the same for a whole process; HHTJAX_PLAIN=0 tries the fast way also
-    with a JAX newer than those tested. `explain` tells which way was taken, and why.
+    HHTJAX_PLAIN=1, set before the first run, does the same for a whole process. So does a JAX newer than those tested,
+    with a warning, unless HHTJAX_PLAIN=0 tries the fast way all the same. `explain` tells which way was taken, and why.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0, 2.0]), force=lambda q, v, t, c: -9.81 - c * v)
@@ -47,8 +43,7 @@ def plain():
     """
     token = _plain.set(True)
     try:
-        # an older JAX has no contexts of users; an attribute that XLA does not know is part of the key too
-        with _key(True) if _key is not None else set_xla_metadata(hhtjax_plain="true"):
+        with _key(True):
             yield
     finally:
         _plain.reset(token)
@@ -103,8 +98,6 @@ def _warn(words: str):
 
 def why_off():
     """Why the machinery is off, in words; None where it is on."""
-    if jax.__version_info__ < OLDEST:
-        return f"JAX {jax.__version__} is older than {_words(OLDEST)}"
     if _plain.get():
         return "inside hhtjax.plain()"
     wish = os.environ.get(VARIABLE, "")
@@ -112,14 +105,23 @@ def why_off():
         raise ValueError(f"hhtjax: the environment variable {VARIABLE} must be 0 or 1; received {wish!r}.")
     if wish == "1":
         return f"{VARIABLE}=1"
-    if jax.__version_info__ > NEWEST and wish != "0":
-        newest = _words(NEWEST)
-        return f"JAX {jax.__version__} is newer than {newest}, the last one tested; {VARIABLE}=0 tries it all the same"
+    if jax.__version_info__[:2] > NEWEST and wish != "0":
+        return _too_new()
     return None
 
 
-def _words(version):
-    return ".".join(map(str, version))
+def _too_new() -> str:
+    """In words, which a warning says as well, once in a process."""
+    newest = ".".join(map(str, NEWEST))
+    why = f"JAX {jax.__version__} is newer than {newest}, the last one tested; {VARIABLE}=0 tries it all the same"
+    if not _told:
+        _told.append(why)
+        _warn(
+            f"hhtjax runs on plain JAX: the same numbers, several times slower. {why} (an environment variable). "
+            f"A newer hhtjax may know this JAX; 'jax<{NEWEST[0]}.{NEWEST[1] + 1}' is one that is known; {VARIABLE}=1 "
+            "takes plain JAX without this warning."
+        )
+    return why
 
 
 def is_on() -> bool:

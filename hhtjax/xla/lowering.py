@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextvars import ContextVar
 from functools import partial
-from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -92,10 +91,8 @@ def _is_partitioned(axes) -> bool:
     return (getattr(axes, "num_devices", None) or 1) > 1
 
 
-# a cached lowering would tell `explain` nothing; an older JAX keeps none
-UNCACHED: Any = {"cacheable": False} if "cacheable" in signature(mlir.register_lowering).parameters else {}
-mlir.register_lowering(kernel_p, _lower, **UNCACHED)
-mlir.register_lowering(told_p, _lower_told, **UNCACHED)
+mlir.register_lowering(kernel_p, _lower, cacheable=False)  # a cached lowering would tell `explain` nothing
+mlir.register_lowering(told_p, _lower_told, cacheable=False)
 mlir.register_lowering(inside_p, lambda ctx, x: [mlir.ir_constant(np.bool_(False))])
 mlir.register_lowering(structural_p, lambda ctx, x: [x])
 mlir.register_lowering(largest_p, lambda ctx, x, kept: [x])
@@ -109,9 +106,8 @@ mlir.register_lowering(alone_p, lambda ctx, x: [mlir.ir_constant(np.bool_(True))
 # gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. So
 # in programs without QUICK stages become kernels (lowering.py), which in those with it would take longer. What it makes
 # of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without. Since JAX 0.11.1
-# there is no such option, and QUICK is empty. WIDE: vectors of
-# 512 bits for loops over the members of a batch, where XLA:CPU takes half of that, unless it is asked: a batch of
-# double pendulums then takes half the time.
+# there is no such option, and QUICK is empty. WIDE: vectors of 512 bits for loops over the members of a batch, where
+# XLA:CPU takes half of that, unless it is asked: a batch of double pendulums then takes half the time.
 #
 # For a jit of one's own: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
 
