@@ -122,7 +122,9 @@ def _while(self, params, *values):
 
 
 def _scan(self, params, *values):
-    first, second = params["num_consts"], params["num_consts"] + params["num_carry"]
+    kept = params["ft_in"].unpack() if "ft_in" in params else ()  # JAX >= 0.12
+    number, carried = map(len, kept[:2]) if kept else (params["num_consts"], params["num_carry"])
+    first, second = number, number + carried
     consts, carry, xs = values[:first], list(values[first:second]), values[second:]
     rows = [None] * params["length"]
     for i in reversed(range(params["length"])) if params["reverse"] else range(params["length"]):
@@ -151,6 +153,7 @@ def _closed(jaxpr):
 CALLS = {
     **{"cond": _cond, "while": _while, "scan": _scan, "custom_linear_solve": _solve},
     **{"jit": _called("jaxpr"), "closed_call": _called("call_jaxpr"), "remat2": _called("jaxpr")},
+    "eval_jaxpr": _called("call_jaxpr"),
     "hhtjax_in_turn": lambda self, params, asked, *values: self(params["closed"], *values),
     **{"custom_jvp_call": _called("call_jaxpr"), "custom_vjp_call": _called("call_jaxpr")},
     **dict.fromkeys(("hhtjax_family", "hhtjax_bilinear"), _called("jaxpr")),

@@ -19,6 +19,7 @@ import numpy as np
 from by_numpy import Numbers
 from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
+from jax.interpreters import partial_eval as pe
 from verdicts import judge
 
 from hhtjax.jaxpr.linear_maps import linear_map
@@ -135,7 +136,9 @@ def member(args, i):
 
 def traced(f, args):
     """The program of f, and its results without values."""
-    return jax.make_jaxpr(f, return_shape=True)(*args)
+    closed, shape = jax.make_jaxpr(f, return_shape=True)(*args)
+    # JAX >= 0.12 has operations of a higher kind, such as a search, which become others
+    return pe.lower_jaxpr2(closed) if getattr(closed, "is_high", False) else closed, shape
 
 
 def everywhere(jaxpr):

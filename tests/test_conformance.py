@@ -29,6 +29,7 @@ pytestmark = [
 NAMES = re.compile(r"(?<![\w.'])[a-zA-Z](?![\w('])")
 # XLA takes z + 0 for z in a compiled program, and JAX one fill value for the other, since they compare as equal
 SIGNS_OF_XLA = ("z + 0.0", "0.0 + z", "z - -0.0", "fill_value=-0.0")
+UNDEFINED = ("lax.div(m, m)",)  # where m is 0: the XLA of JAX 0.12 takes x / x for 1 in a compiled program
 
 
 def scope():
@@ -103,6 +104,8 @@ def test_the_witness_evaluates_as_xla_does(group):
     for text, case, ys in zip(TABLE[group], known, expected, strict=True):
         xs = Numbers()(traced(value(case.f), case.args)[0], *case.args)
         for x, y in zip(xs, map(np.asarray, ys), strict=True):
+            if text in UNDEFINED:
+                x, y = x[case.args[0] != 0], y[case.args[0] != 0]
             assert is_close(x, y, RTOL if case.rtol == RTOL else 1e-5), f"{text}: {x}, not {y}"
             if not any(part in text for part in SIGNS_OF_XLA):
                 np.testing.assert_array_equal(signs(x), signs(y), text)

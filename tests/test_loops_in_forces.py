@@ -82,8 +82,12 @@ def past_events(force):
 
 
 def test_a_callback_whose_rate_is_needed_is_named():
-    with pytest.raises(ValueError, match="this stepper needs the derivatives of the force"):
-        past_events(damped)
+    if jax.__version_info__ < (0, 12):
+        with pytest.raises(ValueError, match="this stepper needs the derivatives of the force"):
+            past_events(damped)
+    else:  # drops what no result is made of before it is differentiated, and needs no rate of the callback
+        expected = past_events(lambda q, v, t, k: -k * q + jnp.sin(t) - 0.5 * v)
+        np.testing.assert_allclose(past_events(damped).q, expected.q, rtol=1e-12)
 
 
 def test_a_callback_of_the_time_beside_a_constraint():

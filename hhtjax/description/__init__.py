@@ -42,7 +42,6 @@ def known_now(f, *args):
     """f(*args) in arrays of NumPy, while something is traced, too; None where it has tracers, closed over or not."""
     if not all_concrete(args):
         return None
-    # not elsewhere: JAX 0.6 would leak a tracer
     with jax.ensure_compile_time_eval() if is_tracing() else nullcontext():
         found = f(*args)
     return jax.tree.map(np.asarray, found) if all_concrete(found) else None

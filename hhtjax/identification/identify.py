@@ -9,7 +9,6 @@ optimiser on reverse-mode gradients for many.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -34,7 +33,6 @@ from hhtjax.identification.problem import is_outside, solve, solve_outside
 from hhtjax.identification.residuals import check_weights, first_bad
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
-from hhtjax.primitives import or_plain
 
 if TYPE_CHECKING:
     from hhtjax.identification.arguments import Options
@@ -154,10 +152,10 @@ def _solved(solver, residuals: Callable, options: Options, params0: PyTree, data
     if found is not None:
         kind, arrays = found
         try:
-            return or_plain(partial(solver, kind, options, params0, data._replace(read=arrays)))
+            return solver(kind, options, params0, data._replace(read=arrays))
         except Exception:  # NumPy cannot take a tracer, say; what is wrong otherwise is told below
             kind.refuse()
-    return or_plain(partial(solver, current(residuals), options, params0, data))
+    return solver(current(residuals), options, params0, data)
 
 
 @shown
@@ -218,7 +216,7 @@ def multistart(
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
     residuals, options = current(residuals), options._replace(loss=options.loss and current(options.loss))
-    every = or_plain(lambda: jax.vmap(lambda start: solve(residuals, options, start, data))(starts))
+    every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
     failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
     cost = jnp.where(failed, jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)

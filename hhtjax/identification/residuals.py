@@ -155,7 +155,7 @@ def _spread(y, makers) -> set:
     if hasattr(y, "val") or min(shape, default=1) == 1:
         return {i for i, size in enumerate(shape) if size > 1}
     maker = makers.get(y)
-    if maker is not None and "jaxpr" in maker.params and maker.primitive.name in ("pjit", "jit"):
+    if maker is not None and maker.primitive.name == "jit":
         inner = maker.params["jaxpr"].jaxpr
         return _spread(inner.outvars[maker.outvars.index(y)], _makers(inner))
     if maker is None or len(maker.outvars) > 1 or not maker.invars:

@@ -29,7 +29,7 @@ from hhtjax.jaxpr.scalar_rules import (
     is_structural,
     is_understood,
 )
-from hhtjax.primitives.interpreter import alone, evaluate, line_of
+from hhtjax.primitives.interpreter import alone, evaluate, line_of, lowered
 
 if TYPE_CHECKING:
     from jax.extend.core import ClosedJaxpr, JaxprEqn
@@ -38,9 +38,8 @@ UNKNOWN = "unknown"
 MOST = 100_000  # operations: of more, a compiler takes minutes
 WRITTEN_OUT = 1000  # operations more than those of a loop
 INLINED = {  # a function called: the parameter that holds it
-    **{"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr"},
-    **{"remat2": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"},
-    **{"custom_vjp_call_jaxpr": "fun_jaxpr", "hhtjax_family": "jaxpr", "hhtjax_bilinear": "jaxpr"},
+    **dict.fromkeys(("jit", "remat2", "hhtjax_family", "hhtjax_bilinear"), "jaxpr"),
+    **dict.fromkeys(("closed_call", "eval_jaxpr", "custom_jvp_call", "custom_vjp_call"), "call_jaxpr"),
 }
 
 
@@ -72,6 +71,7 @@ def listed(f: Callable, *args: PyTree) -> Listing:
     """
     trace, like = jax.make_jaxpr(f, return_shape=True)(*args)
     recorder = Recorder()
+    trace = lowered(trace)
     values = [_fresh(recorder, x.aval) for x in trace.jaxpr.invars]
     with np.errstate(all="ignore"):
         results = [each(as_operand, x) for x in _Listing(recorder).run(trace, values)]
@@ -134,7 +134,7 @@ class _Listing:
             return values
         if name == "hhtjax_values":  # a function that autodiff keeps whole, such as a root
             shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
-            return self.run(jax.make_jaxpr(eqn.params["f"])(shapes), values)
+            return self.run(lowered(jax.make_jaxpr(eqn.params["f"])(shapes)), values)
         if name == "hhtjax_inside":  # functions come in two forms: outside of a kernel LAPACK's
             return [known_pieces(np.bool_(False))]
         known = all(is_known(x) for value in values for x in value.flat)
@@ -192,9 +192,9 @@ def _while(listing, eqn: JaxprEqn, *values: np.ndarray):
 def _scan(listing, eqn: JaxprEqn, *values: np.ndarray):
     """Written out, or a loop, where that is long and reads and makes no rows."""
     params = eqn.params
-    first = params["num_consts"]
-    second = first + params["num_carry"]
-    if second == len(values) and params["num_carry"] == len(eqn.outvars):
+    first, carried = _kept_and_carried(params)
+    second = first + carried
+    if second == len(values) and carried == len(eqn.outvars):
         loop = _counted(listing, params, values[:first], values[first:], [x.aval for x in eqn.outvars])
         if loop is not None:
             return loop
@@ -207,6 +207,13 @@ def _scan(listing, eqn: JaxprEqn, *values: np.ndarray):
         rows.append(row)
     columns = zip(*(rows[::-1] if params["reverse"] else rows), strict=True)
     return [*carry, *_back(_flat(x for column in columns for x in column), [x.aval for x in eqn.outvars[len(carry) :]])]
+
+
+def _kept_and_carried(params: PyTree):
+    """How many of the arguments of a scan stay, and how many go from step to step."""
+    if "num_carry" in params:  # JAX <= 0.11
+        return params["num_consts"], params["num_carry"]
+    return tuple(map(len, params["ft_in"].unpack()[:2]))
 
 
 def _counted(listing, params: PyTree, constants: tuple, start: tuple, avals: list):

@@ -20,6 +20,7 @@ from jax.sharding import AxisType
 
 from hhtjax.description import Array
 from hhtjax.primitives.compat import is_on
+from hhtjax.primitives.interpreter import holds_jaxprs
 from hhtjax.primitives.two_mode_derivative import batch_size, in_front
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def _batch_of_products(values: tuple, axes: tuple, product: Bilinear, jaxpr: Clo
     return product(*(in_front(x, axis, size) for x, axis in zip(values, axes, strict=True))), 0
 
 
-family_p = Primitive("hhtjax_family")
+family_p = holds_jaxprs(Primitive("hhtjax_family"))
 family_p.multiple_results = True
 family_p.def_impl(lambda x, n, family, jaxpr: list(family.plain(n, x)))
 family_p.def_abstract_eval(lambda x, n, family, jaxpr: [x.update(weak_type=False)] * n)
@@ -121,7 +122,7 @@ ad.primitive_jvps[family_p] = _jvp_of_family
 batching.primitive_batchers[family_p] = _batch_of_families
 
 
-bilinear_p = Primitive("hhtjax_bilinear")
+bilinear_p = holds_jaxprs(Primitive("hhtjax_bilinear"))
 bilinear_p.def_impl(lambda x, y, product, jaxpr: product.plain(x, y))
 bilinear_p.def_abstract_eval(lambda x, y, product, jaxpr: jaxpr.out_avals[0])
 ad.defbilinear(

@@ -17,7 +17,7 @@ from jax.interpreters import partial_eval as pe
 
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.primitives.compat import is_on
-from hhtjax.primitives.interpreter import alone, evaluate
+from hhtjax.primitives.interpreter import alone, evaluate, holds_jaxprs
 from hhtjax.primitives.two_mode_derivative import batch_size, in_front, no_tangent
 
 if TYPE_CHECKING:
@@ -325,7 +325,7 @@ def values(asked: Array, *args: Array, closed: ClosedJaxpr, **params: PyTree):
 
 
 # closed: the function; at_once: the same in the form of which derivatives are taken
-turn_p = Primitive("hhtjax_in_turn")
+turn_p = holds_jaxprs(Primitive("hhtjax_in_turn"))
 turn_p.multiple_results = True
 turn_p.def_impl(values)
 turn_p.def_effectful_abstract_eval(lambda *args, closed, **params: (closed.out_avals, closed.effects))

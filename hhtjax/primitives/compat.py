@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 import jax
-from jax.experimental.xla_metadata import set_xla_metadata
 
 VARIABLE = "HHTJAX_PLAIN"  # 1: off; 0: on, also with a JAX newer than those tested
-OLDEST = (
-    0,
-    7,
-    2,
-)  # the first JAX that compiles kernels with all that they may hold; older ones end the process over some
-NEWEST = 0, 10, 2  # the last one with which the conformance tests have passed
+NEWEST = 0, 12  # the last JAX with which the conformance tests have passed, its corrections 0.12.x included
+BETWEEN = {"hhtjax", "jax", "contextlib", "functools"}
 
 _plain: ContextVar = ContextVar("hhtjax_plain", default=False)
+_told: list = []  # that this JAX is not known, where a warning has said so
+_refused: set = set()  # by what they are known by: XLA would take as long to refuse them again
 # part of the key under which JAX keeps a compiled function, so that both forms of it can be there
-_key = jax.make_user_context(default_value=False) if hasattr(jax, "make_user_context") else None
+_key: Any = jax.make_user_context(default_value=False)
 
 
 @contextmanager
@@ -30,8 +29,8 @@ def plain():
 
     Functions traced inside are kept apart from those traced outside, so a jitted function gives the plain result inside
     and the fast one outside; of several threads it holds for the one that is inside. The environment variable
-    HHTJAX_PLAIN=1, set before the first run, does the same for a whole process; HHTJAX_PLAIN=0 tries the fast way also
-    with a JAX newer than those tested. `explain` tells which way was taken, and why.
+    HHTJAX_PLAIN=1, set before the first run, does the same for a whole process. So does a JAX newer than those tested,
+    with a warning, unless HHTJAX_PLAIN=0 tries the fast way all the same. `explain` tells which way was taken, and why.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0, 2.0]), force=lambda q, v, t, c: -9.81 - c * v)
@@ -44,24 +43,25 @@ def plain():
     """
     token = _plain.set(True)
     try:
-        # an older JAX has no contexts of users; an attribute that XLA does not know is part of the key too
-        with _key(True) if _key is not None else set_xla_metadata(hhtjax_plain="true"):
+        with _key(True):
             yield
     finally:
         _plain.reset(token)
 
 
-def or_plain(run: Callable, again: Callable | None = None):
+def or_plain(run: Callable, known_by: Callable | None = None):
     """run(), or the same on plain JAX where XLA refuses what the machinery has made of it; a warning says so.
 
     The last resort of programs that start here: inside a jit of the user's, XLA is not asked before he has left it.
+    `hhtjax.xla.Programs` do so by themselves.
 
     Args:
         run: a function without arguments.
-        again: what is called on plain JAX, where that is not run: of a program that is lowered already, say.
+        known_by: a function without arguments; what it returns, run is known by: refused once, it is not tried again.
+            It is called after a refusal only.
 
     Returns:
-        What run, or again, returns.
+        What run returns.
 
     Raises:
         jax.errors.JaxRuntimeError: XLA refuses the plain program too, or the machinery is off. And whatever run raises.
@@ -70,6 +70,9 @@ def or_plain(run: Callable, again: Callable | None = None):
     >>> float(hhtjax.primitives.or_plain(lambda: jnp.sum(jnp.ones(3))))
     3.0
     """
+    if _refused and known_by is not None and known_by() in _refused:
+        with plain():
+            return run()
     try:
         return run()
     except jax.errors.JaxRuntimeError as error:
@@ -77,20 +80,24 @@ def or_plain(run: Callable, again: Callable | None = None):
             raise
         refusal = error
     with plain():
-        result = (again or run)()  # where this fails too, the cause is another, and its error the one to see
+        result = run()  # where this fails too, the cause is another, and its error the one to see
+    if known_by is not None:
+        _refused.add(known_by())
     words = (str(refusal).splitlines() or [""])[0][:200]
-    warnings.warn(
-        f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the try.",
-        RuntimeWarning,
-        stacklevel=3,
-    )
+    _warn(f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the try.")
     return result
+
+
+def _warn(words: str):
+    """At the line outside this library, and outside what it calls others through, that led here."""
+    frame, level = sys._getframe(), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in BETWEEN:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(words, RuntimeWarning, stacklevel=level)
 
 
 def why_off():
     """Why the machinery is off, in words; None where it is on."""
-    if jax.__version_info__ < OLDEST:
-        return f"JAX {jax.__version__} is older than {_words(OLDEST)}"
     if _plain.get():
         return "inside hhtjax.plain()"
     wish = os.environ.get(VARIABLE, "")
@@ -98,14 +105,23 @@ def why_off():
         raise ValueError(f"hhtjax: the environment variable {VARIABLE} must be 0 or 1; received {wish!r}.")
     if wish == "1":
         return f"{VARIABLE}=1"
-    if jax.__version_info__ > NEWEST and wish != "0":
-        newest = _words(NEWEST)
-        return f"JAX {jax.__version__} is newer than {newest}, the last one tested; {VARIABLE}=0 tries it all the same"
+    if jax.__version_info__[:2] > NEWEST and wish != "0":
+        return _too_new()
     return None
 
 
-def _words(version):
-    return ".".join(map(str, version))
+def _too_new() -> str:
+    """In words, which a warning says as well, once in a process."""
+    newest = ".".join(map(str, NEWEST))
+    why = f"JAX {jax.__version__} is newer than {newest}, the last one tested; {VARIABLE}=0 tries it all the same"
+    if not _told:
+        _told.append(why)
+        _warn(
+            f"hhtjax runs on plain JAX: the same numbers, several times slower. {why} (an environment variable). "
+            f"A newer hhtjax may know this JAX; 'jax<{NEWEST[0]}.{NEWEST[1] + 1}' is one that is known; {VARIABLE}=1 "
+            "takes plain JAX without this warning."
+        )
+    return why
 
 
 def is_on() -> bool:

@@ -50,7 +50,7 @@ EXACT = CHOICES | {
     *("reshape", "rev", "select_n", "slice", "sort", "split", "squeeze", "stack", "stop_gradient", "transpose"),
     *("unstack",),
 }
-INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}  # the parameter that holds what is called
+INLINED = {"jit": "jaxpr", "closed_call": "call_jaxpr", "eval_jaxpr": "call_jaxpr"}  # the parameter: what is called
 REBUILT = {"cond", "scan", "while"}
 
 

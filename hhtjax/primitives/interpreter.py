@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 from jax.core import eval_jaxpr
-from jax.extend.core import Literal
+from jax.extend.core import ClosedJaxpr, Literal, Primitive
 from jax.extend.source_info_util import user_context
 from jax.interpreters import partial_eval as pe
 
@@ -120,6 +120,27 @@ def traced(f: Callable, *like: PyTree) -> Traced:
     trace, result = jax.make_jaxpr(f, return_shape=True)(*like)
     needed, _ = pe.dce_jaxpr(trace.jaxpr, [True] * len(trace.out_avals), instantiate=True)
     return Traced(needed, trace.consts, result)
+
+
+# ----------------------------------------------------------------------------
+# JAX >= 0.12 has operations of a higher kind, such as the search of `jnp.interp`, which become others when derivatives
+# and batches have been made. It does so itself, but for what stands in jaxprs that operations of ours hold.
+
+
+def lowered(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The closed jaxpr without operations of a higher kind: itself where it has none."""
+    return getattr(pe, "lower_jaxpr2")(closed) if getattr(closed, "is_high", False) else closed  # noqa: B009
+
+
+def holds_jaxprs(primitive: Primitive) -> Primitive:
+    """The primitive, which has closed jaxprs for parameters, with a rule by which JAX asks for lower ones."""
+
+    def to_lower(*args: Real, **params: PyTree):
+        params = {name: lowered(x) if isinstance(x, ClosedJaxpr) else x for name, x in params.items()}
+        return primitive.bind(*args, **params)
+
+    primitive.to_lojax = to_lower  # asked of nobody by an older JAX
+    return primitive
 
 
 # ----------------------------------------------------------------------------

@@ -23,11 +23,12 @@ from jax.interpreters import ad, batching
 from jax.interpreters import partial_eval as pe
 
 from hhtjax.description import Array, PyTree
+from hhtjax.primitives.interpreter import holds_jaxprs
 
 if TYPE_CHECKING:
     from jax.extend.core import JaxprEqn
 
-kernel_p = Primitive("hhtjax_kernel")
+kernel_p = holds_jaxprs(Primitive("hhtjax_kernel"))
 kernel_p.multiple_results = True
 
 

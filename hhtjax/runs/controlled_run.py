@@ -19,7 +19,7 @@ from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.closures import hoisted
 from hhtjax.numerics.differentiable_while import repeat
-from hhtjax.primitives import is_untouched, largest_in_batch, one_kernel, or_alone, or_plain
+from hhtjax.primitives import is_untouched, largest_in_batch, one_kernel, or_alone
 from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
 from hhtjax.runs.driver import drive, resting, steps_of
 from hhtjax.runs.error_control import Steps, select_steps, trimmed
@@ -56,7 +56,7 @@ def run_controlled(problem, times: Real, control: Adaptive, progress: bool, even
         return run if problem.output is None else without_path(run)
     in_one = alone and passes_alone(problem, events)
     if in_one:  # else the program that chooses steps for a derivative or a batch is that of `choose_steps`
-        run, steps, ends = or_plain(partial(run_in_one, problem, times, unverified(control), progress=progress))
+        run, steps, ends = run_in_one(problem, times, unverified(control), progress)
         choice = lax.stop_gradient(start)
     else:
         start, choice = run_and_choice(start)
@@ -83,10 +83,10 @@ def finer(start: tuple, choice: tuple, steps: Steps, ends: Array, room: tuple, i
     """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
     if start[2].verify != "tolerance":
         return over(start, steps, ends, room, halved=True)
-    *begin, looser, theirs = choice
+    problem, times, looser, theirs = choice
     if in_one:
-        return or_plain(partial(run_in_one, *begin, scaled(unverified(looser), 1 / 4)))[0]
-    return run_in_two(start, (*begin, scaled(looser, 1 / 4), theirs), room=room)[0]
+        return run_in_one(problem, times, scaled(unverified(looser), 1 / 4))[0]
+    return run_in_two(start, (problem, times, scaled(looser, 1 / 4), theirs), room=room)[0]
 
 
 def run_in_two(start: tuple, choice: tuple, progress: bool = False, room: tuple = ()):
@@ -100,7 +100,7 @@ def over(start: tuple, steps: Steps, ends: Array, room: tuple = (), halved: bool
     """The `Solution` over these steps, each halved or not."""
     problem, times, _, events = start
     keywords = {"halved": halved, "room": room, "rates": problem.rates()}
-    return or_plain(partial(run_over, problem, times, ends, steps.accepted, events, **keywords))
+    return run_over(problem, times, ends, steps.accepted, events, **keywords)
 
 
 def run_tightened(start: tuple, alone: bool, progress: bool, room: tuple) -> Solution:
@@ -108,7 +108,7 @@ def run_tightened(start: tuple, alone: bool, progress: bool, room: tuple) -> Sol
     start, choice = (start, lax.stop_gradient(start)) if alone else run_and_choice(start)
     problem, times, control, events = choice
     choice = problem, times, unverified(control), events
-    last = or_plain(partial(rounds, choice, progress=progress, room=room, rates=problem.rates()))
+    last = rounds(choice, progress=progress, room=room, rates=problem.rates())
     again = partial(over, room=room)
     if alone and not is_tracing():
         run = last.run
@@ -208,7 +208,7 @@ def steps_for(choice: tuple, progress: bool, room: tuple):
     problem, times, control, events = choice
     control, problem = replace(control, verify=False), problem._replace(output=None)
     keywords = {"progress": progress, "room": room[:1], "rates": problem.rates()}
-    return or_plain(partial(chosen_steps, problem, times[-1], control, events, **keywords))
+    return chosen_steps(problem, times[-1], control, events, **keywords)
 
 
 class Grid(NamedTuple):

@@ -15,7 +15,7 @@ from hhtjax.checks import require_integer
 from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, known_now
 from hhtjax.numerics.checkpointed_scan import checkpointed_scan
 from hhtjax.numerics.dense_lu import LARGEST, UNROLLED
-from hhtjax.primitives import is_in_batch, is_traced, one_kernel, or_plain
+from hhtjax.primitives import is_in_batch, is_traced, one_kernel
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.controlled_run import follow, run_controlled
 from hhtjax.runs.driver import drive, equal_steps, given_steps
@@ -198,7 +198,7 @@ def simulate(
 
         def run_to(k: int) -> Solution:
             with callbacks_named():
-                return or_plain(partial(_read_off, problem, times, dt / k, events, room=room, rates=kind["rates"]))
+                return _read_off(problem, times, dt / k, events, room=room, rates=kind["rates"])
 
         solution = run_to(1) if extrapolate == 1 else extrapolated(run_to, extrapolate, stepper.order, join_info)
         return told("simulate", solution, throw)
@@ -215,7 +215,7 @@ def simulate(
         sizes["grows"] = jnp.ndim(dt) > 0 and grows_at_once(dt)
         data = problem, refined(dt, k), events, known_factors(problem, refined(dt, k))
         with callbacks_named():
-            return or_plain(partial(_simulate, *data, in_batch=is_in_batch(), **sizes, **kind))
+            return _simulate(*data, in_batch=is_in_batch(), **sizes, **kind)
 
     solution = run(1) if extrapolate == 1 else extrapolated(run, extrapolate, stepper.order, join_info)
     return told("simulate", solution, throw)

@@ -16,7 +16,7 @@ from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.differentiable_while import repeat
-from hhtjax.primitives import one_kernel, or_alone, or_plain
+from hhtjax.primitives import one_kernel, or_alone
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.driver import counted, drive, equal_steps, resting
 from hhtjax.runs.inputs import Problem
@@ -146,9 +146,9 @@ def sweep(
         arguments, keywords = inputs.call(mesh=mesh, progress=progress)
         runs = partial(run_sweep, **keywords)
         if events is None or keywords["lanes"] <= VECTORS:
-            return told("sweep", or_plain(partial(runs, *arguments)), throw)
+            return told("sweep", runs(*arguments), throw)
         # derivatives keep many states, of so many members more than a cache holds
-        found = or_plain(partial(derivative_by, partial(runs, lanes=VECTORS), runs, *arguments))
+        found = derivative_by(partial(runs, lanes=VECTORS), runs, *arguments)
         return told("sweep", found, throw)
 
 

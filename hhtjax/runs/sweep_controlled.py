@@ -12,7 +12,7 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.jaxpr import on_scalars
-from hhtjax.primitives import one_kernel, or_plain
+from hhtjax.primitives import one_kernel
 from hhtjax.runs.controlled_run import Grid, accepted_run, compared, follow, scaled, tighten, verified
 from hhtjax.runs.error_control import Bounds, as_steps, begin, is_walking, trial_of, trial_step, trimmed
 from hhtjax.runs.frozen_steps import frozen, is_pair, run_and_choice
@@ -36,7 +36,7 @@ def sweep_chosen(inputs: Inputs, progress: bool) -> Solution:
     static |= {"pair": is_pair(), "room": inputs.room}
     output = beside_path(inputs.output, inputs.dts)
     starts = run_and_choice((inputs.data, inputs.dts, inputs.t0, inputs.times, inputs.events, output))
-    runs = or_plain(partial(run_chosen, inputs.system, *starts, **static, rates=inputs.sizes()[1]))
+    runs = run_chosen(inputs.system, *starts, **static, rates=inputs.sizes()[1])
     steps = trimmed(runs.steps)
     runs = runs._replace(dt=steps.dt, steps=steps)
     return runs if output is None else without_path(runs)

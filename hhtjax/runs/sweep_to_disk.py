@@ -17,7 +17,6 @@ import numpy as np
 
 from hhtjax.checks import require_integer
 from hhtjax.description import VERSION, PyTree, Real, all_concrete
-from hhtjax.primitives import or_plain
 from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.output import require_output
 from hhtjax.runs.sweep import run_sweep
@@ -95,19 +94,12 @@ def sweep_to_disk(
     folder, size = Path(folder), inputs.dts.size
     places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
     arguments, keywords = inputs.chunk(places[0]).call()
-    kind = keywords.pop("rates"), keywords.pop("numbers")
-
-    def lower():
-        return run_sweep.of(*kind).lower(*arguments, **keywords)
-
-    lowered = lower()
+    lowered = run_sweep.lower(*arguments, **keywords)
     _claim(folder, _manifest(inputs, lowered, chunk, len(places)))
-    compiled = None
     for number, members in enumerate(places):
         path = folder / f"chunk-{number:05d}.npz"
         if not _is_whole(path):
-            compiled = compiled or or_plain(lowered.compile, lambda: lower().compile())
-            runs = compiled(*inputs.chunk(members).call()[0])
+            runs = run_sweep(*inputs.chunk(members).call()[0], **keywords)
             kept = min(chunk, size - number * chunk)
             _write(path, lambda file, runs=runs, kept=kept: np.savez(file, **_named(runs, kept)))
         if progress:

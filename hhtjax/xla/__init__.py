@@ -15,9 +15,10 @@ A step of the double pendulum, its functions in plain `jnp` and no Jacobian writ
 C with everything written by hand, 40 ns, and in a batch 8 ns for each member, or 4 with vectors of 512 bits, which
 `sweep` and `jax.vmap` of `simulate` take where no jit is around them. Such runs, and fits, are compiled in half the
 time, too; inside a jit of the user's its own options hold: `jax.jit(f, compiler_options=hhtjax.xla.QUICK |
-hhtjax.xla.WIDE)` (QUICK: up to 32 unknowns; WIDE: batches of up to four; both for XLA on the CPU). Sines of float64
-numbers in a kernel are polynomials, to 2 units in the last place, where XLA would call a function for each. The
-gradient of a run takes 2.7 to 3.9 times the run, in memory that grows with the square root of the number of steps.
+hhtjax.xla.WIDE)` (QUICK: up to 32 unknowns, nothing since JAX 0.11.1; WIDE: batches of up to four; both for the CPU).
+Sines of float64 numbers in a kernel are polynomials, to 2 units in the last place, where XLA would call a function for
+each. The gradient of a run takes 2.7 to 3.9 times the run, in memory that grows with the square root of the number of
+steps.
 Systems of few operations are stepped number by number, not array by array, with every sine evaluated once. What is no
 single kernel runs as a list of them, several times slower, with all that the columns of a Jacobian share evaluated
 once; in a jit of the user's each stage of a step is one: the squeezing mechanism with its 19 unknowns then takes 9
@@ -28,8 +29,9 @@ Measured, against C, by structure, batches and gradients, on a page, `experiment
 time beside diffrax, SciPy, MuJoCo and exudyn, losses included, on another, `experiments/work_precision/README.md`.
 
 All this may change rounding, and nothing else. Who doubts a number runs the same on plain JAX, and compares; the
-environment variable `HHTJAX_PLAIN=1` does it for a whole process. With a JAX newer than the last one tested it is so
-from the start, and `explain` says so (`HHTJAX_PLAIN=0` tries it all the same).
+environment variable `HHTJAX_PLAIN=1` does it for a whole process. JAX 0.7.2 to 0.12 make kernels. With a newer one it
+is so from the start: a warning, once in a process, and `explain` say so (`HHTJAX_PLAIN=0` tries it all the same). A
+program that XLA refuses runs on plain JAX too, with a warning, and is not tried again.
 
 >>> with hhtjax.plain():
 ...     expected = fall(0.1)

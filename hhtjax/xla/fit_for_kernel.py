@@ -40,16 +40,8 @@ SUMS = {
     *("cumlogsumexp", "cummax", "cummin", "cumprod", "cumsum", "reduce_xor"),
 }
 INSIDE = {
-    *(
-        "checkpoint",
-        "closed_call",
-        "core_call",
-        "custom_jvp_call",
-        "custom_lin",
-        "custom_linear_solve",
-        "hhtjax_kernel",
-    ),
-    *("custom_vjp_call", "custom_vjp_call_jaxpr", "jit", "pjit", "remat", "remat2", "scan", "while"),
+    *("closed_call", "custom_jvp_call", "custom_lin", "custom_linear_solve", "custom_vjp_call", "eval_jaxpr"),
+    *("hhtjax_kernel", "jit", "remat2", "scan", "while"),
 }
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "bool", "int32", "int64", "uint32", "uint64")}
 

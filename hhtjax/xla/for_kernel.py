@@ -25,6 +25,7 @@ from hhtjax.description import Array
 from hhtjax.jaxpr.scalar_rules import replaces
 from hhtjax.primitives import batching, two_mode_derivative
 from hhtjax.primitives.consistent import held_p
+from hhtjax.primitives.interpreter import lowered
 from hhtjax.primitives.kernel_primitive import of_jaxpr
 from hhtjax.primitives.kernels import PART, STAGED
 from hhtjax.xla.fit_for_kernel import DTYPES, lengths, verdict
@@ -38,8 +39,8 @@ MOST_ROWS = 64  # in one of the factors, of the product that is written out; the
 EXACT = {np.dtype(x) for x in ("float32", "float64", "int32", "int64", "uint32", "uint64")}
 MOST_WINDOWS = 32  # of a scatter; beyond, it takes longer to compile than it is worth
 MOST_PLACES = 4096  # for a window, side by side; each of a step's updates may copy all
-COMBINED = {"scatter": lambda before, given: given} | {  # an older JAX writes some of them otherwise
-    f"scatter{mark}{name}": getattr(lax, name) for mark in "-_" for name in ("add", "sub", "mul", "min", "max")
+COMBINED = {"scatter": lambda before, given: given} | {
+    f"scatter-{name}": getattr(lax, name) for name in ("add", "sub", "mul", "min", "max")
 }
 LEAST = 6  # operations of a stage that is a kernel; fewer are one fusion or two anyway
 LARGEST = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
@@ -149,7 +150,7 @@ def _loop_at_most_once(eqn: JaxprEqn, copier) -> ClosedJaxpr:
 
 
 def _is_named(name: str, eqn: JaxprEqn) -> bool:
-    return eqn.primitive.name in ("jit", "pjit") and eqn.params["name"].startswith(name)
+    return eqn.primitive.name == "jit" and eqn.params["name"].startswith(name)
 
 
 _is_staged = partial(_is_named, STAGED)
@@ -212,7 +213,7 @@ def _traced(f: Callable, avals: Sequence) -> ClosedJaxpr:
         found = f(*x)
         return found if isinstance(found, (list, tuple)) else [found]
 
-    return jax.make_jaxpr(run)(*avals)
+    return lowered(jax.make_jaxpr(run)(*avals))
 
 
 # products
@@ -343,7 +344,7 @@ _SINES = _Name()
 
 ONCE = "hhtjax_once"  # name of a function that XLA computes once
 LEAST_HELD = 40  # operations that are evaluated once more without a call; of fewer, nothing is gained
-CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2"}
+CALLS = {"jit", "closed_call", "eval_jaxpr", "custom_jvp_call", "custom_vjp_call", "remat2"}
 LOOPS = {"cond", "while", "scan", "custom_linear_solve"}
 MADE_ONCE = LOOPS | {"dot_general", "hhtjax_held"}  # by XLA in any case
 BROADCAST = "broadcast_in_dim"  # handed on before it is one

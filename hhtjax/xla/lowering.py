@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextvars import ContextVar
-from inspect import signature
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -19,8 +19,8 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
 
-from hhtjax.description import PyTree, programs
-from hhtjax.primitives.compat import is_on
+from hhtjax.description import PyTree, is_concrete, programs
+from hhtjax.primitives.compat import is_on, or_plain
 from hhtjax.primitives.interpreter import asked, line_of
 from hhtjax.primitives.kernel_primitive import kernel_p, of_jaxpr
 from hhtjax.primitives.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
@@ -91,10 +91,8 @@ def _is_partitioned(axes) -> bool:
     return (getattr(axes, "num_devices", None) or 1) > 1
 
 
-# a cached lowering would tell `explain` nothing; an older JAX keeps none
-UNCACHED: Any = {"cacheable": False} if "cacheable" in signature(mlir.register_lowering).parameters else {}
-mlir.register_lowering(kernel_p, _lower, **UNCACHED)
-mlir.register_lowering(told_p, _lower_told, **UNCACHED)
+mlir.register_lowering(kernel_p, _lower, cacheable=False)  # a cached lowering would tell `explain` nothing
+mlir.register_lowering(told_p, _lower_told, cacheable=False)
 mlir.register_lowering(inside_p, lambda ctx, x: [mlir.ir_constant(np.bool_(False))])
 mlir.register_lowering(structural_p, lambda ctx, x: [x])
 mlir.register_lowering(largest_p, lambda ctx, x, kept: [x])
@@ -107,14 +105,14 @@ mlir.register_lowering(alone_p, lambda ctx, x: [mlir.ir_constant(np.bool_(True))
 # QUICK: XLA:CPU compiles each fusion that stands outside a kernel by a pipeline of MLIR, some 10 ms for a few sums, and
 # gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. So
 # in programs without QUICK stages become kernels (lowering.py), which in those with it would take longer. What it makes
-# of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without. WIDE: vectors of
-# 512 bits for loops over the members of a batch, where XLA:CPU takes half of that, unless it is asked: a batch of
-# double pendulums then takes half the time.
+# of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without. Since JAX 0.11.1
+# there is no such option, and QUICK is empty. WIDE: vectors of 512 bits for loops over the members of a batch, where
+# XLA:CPU takes half of that, unless it is asked: a batch of double pendulums then takes half the time.
 #
 # For a jit of one's own: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
 
 
-QUICK = {"xla_cpu_use_fusion_emitters": False}
+QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11, 1) else {}
 MOST_QUICK = 32  # rates; with 40, steps of a beam take 1.2 times as long
 WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits; where a processor has none so long, nothing changes
 MOST_WIDE = 4  # coordinates; loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
@@ -133,7 +131,7 @@ class Programs:
     def __init__(self, f: Callable, **static: PyTree):
         """static: of `jax.jit`."""
         self.usual: Any = jax.jit(f, **static)
-        self.quick: Any = jax.jit(f, compiler_options=QUICK, **static)
+        self.quick: Any = jax.jit(f, compiler_options=QUICK, **static) if QUICK else self.usual
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)
         programs.update((self.usual, self.quick, self.wide))
 
@@ -145,11 +143,23 @@ class Programs:
         return self.wide if numbers is not None and numbers <= MOST_WIDE else self.quick
 
     def __call__(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
-        """The values of the function."""
+        """The values of the function; from plain JAX where XLA refuses the program, or has done so before."""
+
+        def known_by():  # what JAX keeps the program by, and what is being made of it
+            made = frozenset(type(x) for x in jax.tree.leaves((args, keywords)) if not is_concrete(x))
+            return self.usual.trace(*args, **keywords).jaxpr, made
+
+        return or_plain(partial(self._chosen, lambda program: program(*args, **keywords), rates, numbers), known_by)
+
+    def lower(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
+        """What a call hands to XLA, as `jax.jit(f).lower`."""
+        return self._chosen(lambda program: program.lower(*args, **keywords), rates, numbers)
+
+    def _chosen(self, use: Callable, rates: int, numbers: int | None):
         program = self.of(rates, numbers)
-        token = quickly.set(program is not self.usual)
+        token = quickly.set(bool(QUICK) and program is not self.usual)
         try:
-            return program(*args, **keywords)
+            return use(program)
         except ValueError as error:  # there are options inside a jit of the user's
             if "compiler_options" not in str(error):
                 raise
@@ -159,8 +169,8 @@ class Programs:
             Programs.are_refused = True
         finally:
             quickly.reset(token)
-        return self.usual(*args, **keywords)
+        return use(self.usual)
 
     def number(self) -> int:
         """Of all that have been compiled."""
-        return sum(program._cache_size() for program in (self.usual, self.quick, self.wide))
+        return sum(program._cache_size() for program in {self.usual, self.quick, self.wide})
