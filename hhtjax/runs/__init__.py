@@ -51,6 +51,9 @@ A second process then has only to trace, in a quarter to two thirds of the time.
 
     hhtjax.keep_programs("~/.cache/hhtjax")
 
+While a first call takes longer than two seconds, one line on stderr says so, by the logger `hhtjax` of Python's
+`logging`; `logging.getLogger("hhtjax").setLevel("ERROR")` keeps it quiet.
+
 After the imports, `import gc; gc.freeze()` spares the garbage collector all that they have made, which it else looks
 through again and again while functions are traced: 5 to 20 % of a first call. The library leaves the collector alone.
 
