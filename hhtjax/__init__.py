@@ -86,7 +86,7 @@ from hhtjax.systems.matrices import sparse
 from hhtjax.systems.sampled import Sampled, band_limited, band_limited_motion, sampled, spline_gain_error
 from hhtjax.systems.system import FirstOrderSystem, LinearSystem, System
 from hhtjax.systems.zero_order_hold import JumpWarning
-from hhtjax.xla import Explanation, explain, plain
+from hhtjax.xla import Explanation, explain, keep_programs, plain
 
 __all__ = [  # noqa: RUF022
     "__version__", "analysis", "identification", "interop", "rotation", "scenes", "trigonometry",
@@ -101,7 +101,7 @@ __all__ = [  # noqa: RUF022
     # runs
     "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
     "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep",
-    "Explanation", "explain", "plain",
+    "Explanation", "explain", "keep_programs", "plain",
     # out of Python
     "ExportedC", "ExportedFMU", "export_c", "export_fmu",
     # identification

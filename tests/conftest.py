@@ -2,11 +2,9 @@
 
 import ctypes
 import gc
-import hashlib
 import importlib.util
 import mmap
 import os
-import platform
 import sys
 import threading
 from pathlib import Path
@@ -44,27 +42,6 @@ def set_flags():
     os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
 
-def machine():
-    """A name for what programs are compiled for: they do not run where instructions are missing."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    except OSError:
-        flags = platform.processor()
-    return hashlib.sha256(f"{platform.machine()} {flags}".encode()).hexdigest()[:12]
-
-
-def forget_oldest(folder, limit=KEPT):
-    """Programs that have not been read for longest, until the rest takes no more than so many bytes."""
-    found = [(max(x.st_atime, x.st_mtime), x.st_size, path) for path in folder.iterdir() for x in [path.stat()]]
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
-        if total <= limit:
-            break
-        path.unlink(missing_ok=True)
-        total -= size
-
-
 def keep_programs():
     """What one process has compiled the others load, and those of the next run, from a folder that git ignores. Of the
     key are the program and the flags, so that changed code is compiled. One's own folder comes first."""
@@ -72,20 +49,15 @@ def keep_programs():
         return  # workers inherit what is set here
     if jax.__version_info__ < (0, 10):
         return  # this has not been tried with old ones
-    folder = Path(__file__).parents[1] / ".pytest_cache" / f"programs-{machine()}"
+    import hhtjax
+    from hhtjax.xla.kept_programs import SETTINGS
+
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        forget_oldest(folder)
+        hhtjax.keep_programs(Path(__file__).parents[1] / ".pytest_cache", KEPT)
     except OSError:  # nothing can be written there
         return
-    options = {
-        "jax_compilation_cache_dir": str(folder),
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    for name, value in options.items():
-        jax.config.update(name, value)  # this process has read the environment already
-        os.environ[name.upper()] = str(value)
+    for name in ("jax_compilation_cache_dir", *SETTINGS):  # for processes that are started here
+        os.environ[name.upper()] = str(getattr(jax.config, name))
 
 
 class Contexts(threading.local):

@@ -46,11 +46,13 @@ The first call
 
 takes seconds: the functions are traced, and XLA compiles what becomes of them, where a jit of yours is around it in up
 to twice the time that it takes elsewhere, unless that asks for the same: `jax.jit(f,
-compiler_options=hhtjax.xla.QUICK)`, for systems of up to 32 unknowns on the CPU. JAX can keep that on disk, and then a
-second process has only to trace, in a quarter to two thirds of the time. Before the first call:
+compiler_options=hhtjax.xla.QUICK)`, for systems of up to 32 unknowns on the CPU. Compiled programs can be kept on disk.
+A second process then has only to trace, in a quarter to two thirds of the time. Before the first call:
 
-    jax.config.update("jax_compilation_cache_dir", ".jax_cache")
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)      # keeps small programs too
+    hhtjax.keep_programs("~/.cache/hhtjax")
+
+While a first call takes longer than two seconds, one line on stderr says so, by the logger `hhtjax` of Python's
+`logging`; `logging.getLogger("hhtjax").setLevel("ERROR")` keeps it quiet.
 
 After the imports, `import gc; gc.freeze()` spares the garbage collector all that they have made, which it else looks
 through again and again while functions are traced: 5 to 20 % of a first call. The library leaves the collector alone.

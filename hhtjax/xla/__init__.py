@@ -44,6 +44,7 @@ The door
     explain(f, *args)         what became of the loops of a program
     calls(names, f, *args)    whether a program calls compiled functions of these names
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
+    keep_programs(folder)     compiled programs on disk, for the next process
     Programs(f)               f, compiled QUICKly, with WIDE vectors where that pays
 
 What a program says of itself is in `hhtjax.primitives`; how its functions are evaluated number by number, and what that
@@ -52,10 +53,14 @@ may change, in `hhtjax.jaxpr`. On plain JAX the rest of the library works as wel
 
 from hhtjax.primitives import plain
 from hhtjax.xla.explanation import Explanation, calls, explain
+from hhtjax.xla.kept_programs import keep_programs
 from hhtjax.xla.lowering import QUICK, WIDE, Programs
 from hhtjax.xla.sines import RANGE, polynomial_sines
 
-__all__ = ["QUICK", "RANGE", "WIDE", "Explanation", "Programs", "calls", "explain", "plain", "polynomial_sines"]
+__all__ = [
+    "QUICK", "RANGE", "WIDE", "Explanation", "Programs", "calls", "explain", "keep_programs", "plain",
+    "polynomial_sines",
+]  # fmt: skip
 
 
 def __dir__():

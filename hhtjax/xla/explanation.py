@@ -11,6 +11,7 @@ import jax
 import hhtjax.xla.lowering  # noqa: F401
 from hhtjax.description import PyTree, Real
 from hhtjax.primitives.interpreter import asked
+from hhtjax.xla.waiting import tell_if_long
 
 if TYPE_CHECKING:
     from jax.extend.core import Jaxpr
@@ -69,6 +70,7 @@ def explain(f: Callable, *args: Real) -> Explanation:
         lowered = jax.jit(lambda *args: f(*args)).lower(*args)  # anew: JAX keeps what it has lowered
     finally:
         asked.reset(token)
+    tell_if_long()
     compiled = lowered.compile()
     seconds = time.perf_counter() - start
     memory: Any = compiled.memory_analysis()

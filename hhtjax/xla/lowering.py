@@ -26,6 +26,7 @@ from hhtjax.primitives.kernel_primitive import kernel_p, of_jaxpr
 from hhtjax.primitives.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
 from hhtjax.xla.fit_for_kernel import inner, verdict
 from hhtjax.xla.for_kernel import for_kernel, for_list, kernel
+from hhtjax.xla.waiting import tell_if_long, telling_if_long
 
 if TYPE_CHECKING:
     from jax.extend.core import ClosedJaxpr, Jaxpr
@@ -48,6 +49,7 @@ def _as_list(closed: ClosedJaxpr, stages_are_kernels: bool) -> ClosedJaxpr:
 
 
 def _lower(ctx, *args, closed: ClosedJaxpr, name: str):
+    tell_if_long()  # a jit of the user's, or of reverse mode, does not say when it begins
     if tuple(ctx.module_context.platforms) != ("cpu",) or not closed.jaxpr.eqns:
         return mlir.lower_fun(jaxpr_as_fun(closed), multiple_results=True)(ctx, *args)
     form, (objection, eqns, _) = _as_kernel(closed)
@@ -130,6 +132,7 @@ class Programs:
 
     def __init__(self, f: Callable, **static: PyTree):
         """static: of `jax.jit`."""
+        f = telling_if_long(f)
         self.usual: Any = jax.jit(f, **static)
         self.quick: Any = jax.jit(f, compiler_options=QUICK, **static) if QUICK else self.usual
         self.wide: Any = jax.jit(f, compiler_options=QUICK | WIDE, **static)

@@ -1,0 +1,166 @@
+"""Compiled programs that outlive their process: JAX's cache on disk, with a bound on its size."""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import os
+import platform
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jax.experimental.compilation_cache import compilation_cache
+
+from hhtjax.checks import require_integer
+
+SETTINGS = {  # of JAX, beside the folder
+    "jax_enable_compilation_cache": True,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,  # small programs too: to load one takes a third of compiling it
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+    "jax_compilation_cache_max_size": -1,  # JAX's own bound needs a package that we do not depend on
+}
+WRITTEN = "/jax/compilation_cache/cache_misses"  # the event of JAX before a program is written
+EVERY = 50  # programs that are written, the folder is looked through
+
+
+class _Kept(NamedTuple):
+    """Where programs go to, how many bytes of them, and JAX's settings before."""
+
+    folder: Path
+    max_bytes: int
+    before: dict[str, Any]
+
+
+_kept: _Kept | None = None
+_written: int | None = None  # programs so far; None until JAX has been asked to tell
+
+
+def keep_programs(folder: str | os.PathLike[str] | None, max_bytes: int = 1_000_000_000) -> Path | None:
+    """Keeps compiled programs in a folder, from where other processes load them: their first calls take half as long.
+
+    Call it before the first run. What is kept are machine instructions, found by the program, the versions of JAX and
+    XLA, and the options of the compiler: what has changed in your code is compiled anew. Tracing, in Python, remains.
+
+    This is a setting of JAX for the whole process. All programs are kept, also those of other libraries. It is off
+    until it is called, and other processes have to call it too. JAX's settings with
+    `jax_compilation_cache_dir` are the same thing without a bound.
+
+    Programs that have not been read for longest are deleted when the rest takes more than `max_bytes`: in this call,
+    after every 50 programs that are written, and when the process ends. Other files in the folder are left alone. Each
+    kind of processor has a folder of its own inside, because programs do not run where instructions are missing. Who
+    can write to the folder can run code in your process: do not share it with people whom you do not trust.
+
+    Args:
+        folder: made where it does not exist; "~" is your home. None: JAX's settings from before the first call.
+        max_bytes: of all programs together, on disk.
+
+    Returns:
+        The folder that holds the programs of this kind of processor; None for None.
+
+    Raises:
+        TypeError: `folder` is no path.
+        ValueError: `max_bytes` is no positive integer.
+        OSError: the folder cannot be made, or not be written to.
+
+    References:
+        https://docs.jax.dev/en/latest/persistent_compilation_cache.html
+
+    >>> import tempfile, jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: -9.0 * q)
+    >>> with tempfile.TemporaryDirectory() as folder:            # of your own, say "~/.cache/hhtjax"
+    ...     where = hhtjax.keep_programs(folder, max_bytes=200_000_000)
+    ...     run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.01, num_steps=3)
+    ...     number = len(list(where.iterdir()))
+    ...     hhtjax.keep_programs(None)                           # here alone: the folder is deleted
+    >>> number > 0
+    True
+    """
+    global _kept
+    max_bytes = require_integer("keep_programs", "max_bytes", max_bytes)
+    before = {name: getattr(jax.config, name) for name in ("jax_compilation_cache_dir", *SETTINGS)}
+    if _kept is not None:
+        before = _kept.before
+    if folder is None:
+        if _kept is not None:
+            _set(before)
+        _kept = None
+        return None
+    where = _made(folder)
+    _kept = _Kept(where, max_bytes, before)
+    _set({"jax_compilation_cache_dir": str(where), **SETTINGS})
+    _look_through()
+    _listen()
+    return where
+
+
+def _made(folder) -> Path:
+    """The folder inside for this kind of processor, which exists and can be written to."""
+    if not isinstance(folder, (str, os.PathLike)) or isinstance(os.fspath(folder), bytes) or not os.fspath(folder):
+        raise TypeError(f"keep_programs: `folder` must be the path of a folder, or None; received {folder!r}.")
+    where = Path(folder).expanduser().absolute() / f"programs-{_processor()}"
+    try:
+        where.mkdir(parents=True, exist_ok=True)
+        probe = where / f"probe-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OSError(
+            f"keep_programs: `folder` must be one that can be written to; received {os.fspath(folder)!r} ({error})."
+        ) from error
+    return where
+
+
+def _processor() -> str:
+    """A name of what programs are compiled for: the processor with its sets of instructions."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    except OSError:
+        flags = platform.processor()
+    return hashlib.sha256(f"{platform.machine()} {flags}".encode()).hexdigest()[:12]
+
+
+def _set(settings: dict[str, Any]):
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()  # the folder that it has opened stays in use otherwise
+
+
+def _listen():
+    """Counts the programs that JAX writes, from the first call on."""
+    global _written
+    if _written is None:
+        _written = 0
+        jax.monitoring.register_event_listener(_count)
+        atexit.register(_look_through)
+
+
+def _count(event: str, **_):
+    global _written
+    if event == WRITTEN and _written is not None and _kept is not None:
+        _written += 1
+        if _written % EVERY == 0:
+            _look_through()
+
+
+def _look_through():
+    """Deletes the programs that have not been read for longest, until the rest takes no more than is allowed."""
+    if _kept is None:
+        return
+    found = []
+    for path in _kept.folder.glob("*-cache"):
+        try:  # another process may have deleted it
+            x = path.stat()
+        except OSError:
+            continue
+        found.append((max(x.st_atime, x.st_mtime), x.st_size, path))
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= _kept.max_bytes:
+            break
+        try:
+            path.unlink(missing_ok=True)
+        except OSError:
+            continue
+        total -= size

@@ -1,0 +1,127 @@
+"""One line for who waits: where a first call takes long, and nowhere else."""
+
+import logging
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import hhtjax
+from hhtjax.primitives import one_kernel
+from hhtjax.xla import Programs, waiting
+
+
+@pytest.fixture(autouse=True)
+def _little_patience(monkeypatch):
+    monkeypatch.setattr(waiting, "PATIENCE", 0.15)
+
+
+def told(caplog):
+    time.sleep(0.3)  # for a clock that should have been stopped
+    lines = [x.getMessage() for x in caplog.records if x.name == "hhtjax"]
+    caplog.clear()
+    return lines
+
+
+def slow_to_trace(seconds):
+    """A function of an array that takes long the first time."""
+
+    def f(x):
+        time.sleep(seconds)
+        return 2 * x
+
+    return f
+
+
+@pytest.fixture
+def slow_compiler(monkeypatch):
+    """All that is lowered takes long from there on, in the same call of JAX."""
+    verdict = hhtjax.xla.lowering._as_kernel
+
+    def late(closed):
+        time.sleep(0.4)
+        return verdict(closed)
+
+    monkeypatch.setattr(hhtjax.xla.lowering, "_as_kernel", late)
+
+
+def test_a_first_call_that_takes_long_is_told_of_once_and_a_second_call_starts_no_clock(caplog, monkeypatch):
+    program = Programs(slow_to_trace(0.4))
+    program(jnp.ones(2))
+    (line,) = told(caplog)
+    assert line.startswith("hhtjax: tracing or compiling a program for 0.15 s by now")
+    started = []
+    monkeypatch.setattr(threading.Thread, "start", lambda self: started.append(self))
+    program(jnp.zeros(2))
+    assert not started
+    assert not told(caplog)
+
+
+def test_a_quick_first_call_says_nothing_though_more_is_done_in_the_same_call_of_jax(caplog):
+    program = Programs(lambda x: 2 * x)
+
+    def f(x):
+        y = program(x)
+        time.sleep(0.4)
+        return y
+
+    assert jax.jvp(f, (2.0,), (1.0,)) == (4.0, 2.0)
+    assert not told(caplog)
+
+
+def test_a_jit_of_the_users_and_its_gradient_are_told_of(caplog, slow_compiler):
+    def f(x):
+        return one_kernel(lambda x: jnp.sin(x) * 2, x)
+
+    jax.jit(f)(1.0)
+    assert len(told(caplog)) == 1
+    jax.grad(jax.jit(f))(1.0)
+    assert len(told(caplog)) >= 1
+
+
+def test_what_is_lowered_and_not_compiled_is_not_told_of(caplog):
+    def f(x):
+        return one_kernel(lambda x: jnp.cos(x) * 2, x)
+
+    lowered = jax.jit(f).lower(1.0)
+    assert waiting._clocks
+    assert not told(caplog)
+    lowered.compile()
+    assert not waiting._clocks
+
+
+def test_an_error_ends_the_wait(caplog):
+    def refuse(x):
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        Programs(refuse)(1.0)
+    assert not told(caplog)
+
+
+def test_explain_waits_too(caplog, monkeypatch):
+    stage = type(jax.jit(lambda x: x).lower(1.0))
+    compile_ = stage.compile
+    monkeypatch.setattr(stage, "compile", lambda self: time.sleep(0.4) or compile_(self))
+    hhtjax.explain(lambda x: one_kernel(lambda x: jnp.exp(x) * 2, x), 1.0)
+    assert len(told(caplog)) == 1
+
+
+def test_logging_keeps_quiet(caplog):
+    with caplog.at_level(logging.ERROR, logger="hhtjax"):
+        Programs(slow_to_trace(0.4))(jnp.ones(3))
+        assert not told(caplog)
+
+
+def test_how_to_wait_less_is_said_once_and_where_nothing_is_kept(monkeypatch):
+    monkeypatch.setattr(waiting, "_hinted", [])
+    folder = jax.config.jax_compilation_cache_dir
+    try:
+        jax.config.update("jax_compilation_cache_dir", "somewhere")
+        assert "keep_programs" not in waiting._words()
+        jax.config.update("jax_compilation_cache_dir", None)
+        assert ["keep_programs" in waiting._words() for _ in range(3)] == [True, False, False]
+    finally:
+        jax.config.update("jax_compilation_cache_dir", folder)
