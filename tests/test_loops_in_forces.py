@@ -86,6 +86,7 @@ def test_a_callback_whose_rate_is_needed_is_named():
         past_events(damped)
 
 
+@pytest.mark.slow
 def test_a_callback_of_the_time_beside_a_constraint():
     """Of which the start takes a difference."""
     expected = on_circle(lambda q, v, t, k: -k * q + jnp.sin(t) - 0.5 * v).q
