@@ -1,4 +1,7 @@
-"""The runner, and Silverbox as a user runs it: on the measured record where there is one, else on a generated one."""
+"""The runner, and Silverbox as a user runs it: on the measured record where there is one, else on a generated one.
+
+The two whole runs of Silverbox are for .ci/run: `-m every`.
+"""
 
 import importlib
 import json
@@ -126,6 +129,7 @@ def test_an_unknown_name_gives_the_list_and_fails():
 
 
 @pytest.mark.slow
+@pytest.mark.every
 def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("HHTJAX_DATA", str(tmp_path / "nowhere"))
     runner = importlib.import_module("experiments.__main__")
@@ -149,6 +153,7 @@ def test_silverbox_without_the_data_recovers_the_generated_parameters(tmp_path, 
 
 
 @pytest.mark.slow
+@pytest.mark.every
 def test_silverbox_on_the_measured_record(tmp_path, capsys):
     """As README's first command runs it: the best model on the whole record, one figure; the errors that it reaches."""
     if not (DATA / "silverbox").is_dir():

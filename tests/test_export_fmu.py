@@ -206,6 +206,7 @@ def test_the_sources_compile_without_a_warning(unit, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_same_model_is_the_same_unit(unit):
     again = export_fmu(SYSTEM, STEPPER, Q0, V0, PARAMS, **NAMES)
     assert again == unit

@@ -15,6 +15,7 @@ from hhtjax.export.model import FLAGS
 pytestmark = needs_compiler
 
 
+@pytest.mark.slow
 def test_dry_friction_with_an_input_and_its_flag(tmp_path):
     """Two coupled joints that an input pushes, from sample to sample; a negative limit."""
     case = RUBBING["M(q), two joints"]

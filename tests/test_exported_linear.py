@@ -34,6 +34,7 @@ def library(tmp_path_factory):
     return system, Library(model, tmp_path_factory.mktemp("chain"))
 
 
+@pytest.mark.slow
 def test_factors_are_kept_until_what_they_are_made_of_changes(library):
     """The numbers of the step in Python, while a load, a stiffness and the step size change."""
     system, library = library

@@ -33,7 +33,7 @@ def errors(found, q, v, events):
     return np.array([np.max(np.abs(np.asarray(x) - y)[away]) for x, y in ((found.q, q), (found.v, v))])
 
 
-@pytest.mark.parametrize("name", EVENTS)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x != "ball")) for x in EVENTS])
 def test_the_motion_of_a_scene(name):
     """Order 2 through all events, from one program: steps of h and h/2 over the first half of the time."""
     steps = STEPS[name]

@@ -90,6 +90,7 @@ assert explain(by_hand, sharded).paths == ("one kernel",)
 """
 
 
+@pytest.mark.slow
 @on_cpu
 def test_a_program_divided_among_devices_is_plain():
     """In a process of its own, for there are two devices."""

@@ -104,6 +104,7 @@ def test_singular_values_in_c(tmp_path):
             np.testing.assert_allclose(S, np.linalg.svd(A)[1], atol=1e-13 * n)
 
 
+@pytest.mark.slow
 def test_large_products_in_c_whatever_is_summed(tmp_path):
     """As loops: over either axis of either matrix, of constants and of what a loop has computed, and with vectors."""
     rng = np.random.default_rng(0)

@@ -88,6 +88,7 @@ def test_branches_are_counted_by_themselves(monkeypatch):
     assert "more than 100 operations in branches" in told(seldom)
 
 
+@pytest.mark.slow
 @on_cpu
 def test_a_run_with_dry_friction_and_an_end_stop_is_one_kernel():
     """Ten times as fast as without, and its passage of events has four times the operations of all the rest."""

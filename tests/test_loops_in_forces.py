@@ -90,6 +90,7 @@ def test_a_callback_whose_rate_is_needed_is_named():
         np.testing.assert_allclose(past_events(damped).q, expected.q, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_callback_of_the_time_beside_a_constraint():
     """Of which the start takes a difference."""
     expected = on_circle(lambda q, v, t, k: -k * q + jnp.sin(t) - 0.5 * v).q

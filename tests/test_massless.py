@@ -40,6 +40,7 @@ def test_a_damped_node_without_mass_is_of_order_2(c):
     assert np.all(np.log2(errors[0] / errors[1]) > [1.95, 1.95, 1.8])  # with alpha = 0 the jump swings for ever
 
 
+@pytest.mark.slow
 def test_any_singular_mass_and_its_derivatives():
     """M of rank 2 in 4 general coordinates; forward = reverse = differences, and float32 stays so."""
     rng = np.random.default_rng(0)

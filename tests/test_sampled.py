@@ -252,6 +252,7 @@ def test_a_sampled_input_starts_as_smoothly_as_the_function_it_samples():
     assert np.allclose(state.a - state.w, -0.3 * 0.1 * 1.0, rtol=1e-6)  # but for the fifth power of what h resolves
 
 
+@pytest.mark.slow
 def test_gradients_through_a_simulation_with_respect_to_the_samples():
     values = jnp.asarray(RNG.standard_normal((9, 1)))
 

@@ -156,6 +156,7 @@ def test_pivots_are_free_where_the_diagonal_is_none():
     np.testing.assert_allclose(solve(b), np.linalg.solve(A.tocoo().toarray(), b), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_single_precision():
     made = LinearSystem(*map(hhtjax.sparse, (M, GYRO, 40 * K)))
     with pytest.warns(hhtjax.PrecisionWarning):
