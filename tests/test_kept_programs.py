@@ -14,9 +14,6 @@ import pytest
 import hhtjax
 from hhtjax.xla import kept_programs
 
-IS_KEPT = jax.__version_info__ >= kept_programs.OLDEST
-kept = pytest.mark.skipif(not IS_KEPT, reason="this JAX loads programs that give other numbers")
-
 ROOT = Path(__file__).parents[1]
 NAMES = ("jax_compilation_cache_dir", *kept_programs.SETTINGS)
 PROCESS = """
@@ -68,7 +65,6 @@ def in_a_process(folder, max_bytes):
     return int(read), float.fromhex(end)
 
 
-@kept
 @pytest.mark.slow
 def test_a_second_process_loads_what_the_first_has_compiled(tmp_path):
     once, end = in_a_process(tmp_path, 10**8)
@@ -82,15 +78,6 @@ def test_a_second_process_loads_what_the_first_has_compiled(tmp_path):
     assert not names(folder)
 
 
-def test_a_jax_that_loads_other_numbers_keeps_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(kept_programs, "OLDEST", (99,))
-    before = settings()
-    with pytest.warns(RuntimeWarning, match="keep_programs: needs JAX"):
-        hhtjax.keep_programs(tmp_path)
-    assert settings() == before
-
-
-@kept
 def test_programs_are_written_and_read(tmp_path):
     read = []
     folder = hhtjax.keep_programs(tmp_path)
@@ -105,7 +92,6 @@ def test_programs_are_written_and_read(tmp_path):
     assert names(folder) == written
 
 
-@kept
 def test_what_was_not_read_for_longest_is_deleted_and_other_files_are_not(tmp_path):
     folder = hhtjax.keep_programs(tmp_path)
     fill(folder, [300, 200, 400])
@@ -121,7 +107,6 @@ def test_what_was_not_read_for_longest_is_deleted_and_other_files_are_not(tmp_pa
     assert names(tmp_path) == {folder.name, "mine-cache"}
 
 
-@kept
 def test_the_bound_holds_while_a_process_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(kept_programs, "EVERY", 1)
     folder = hhtjax.keep_programs(tmp_path)
@@ -134,7 +119,6 @@ def test_the_bound_holds_while_a_process_goes_on(tmp_path, monkeypatch):
         assert sum(path.stat().st_size for path in folder.iterdir()) <= 4.1 * size  # with the one just written
 
 
-@kept
 def test_none_gives_the_settings_from_before_the_first_call(tmp_path):
     before = settings()
     hhtjax.keep_programs(tmp_path / "a")
