@@ -9,7 +9,7 @@ import hhtjax
 from hhtjax.identification.arguments import check_options
 from hhtjax.identification.gauss_newton import Seen
 from hhtjax.identification.least_squares import CONVERGED, levenberg_marquardt
-from hhtjax.identification.problem import Outside
+from hhtjax.identification.problem import HostProblem
 
 LIMIT = check_options("fit", 0.0, None, None, None, None, True, 2, False).max_iterations
 
@@ -47,7 +47,7 @@ def by_fit(problem):
 
     x0 = np.array(problem.start, float)
     limits = np.full(x0.size, np.inf), np.float64(1e-8), LIMIT, False
-    best, _, _, code = levenberg_marquardt(Outside(see), x0, *limits)
+    best, _, _, code = levenberg_marquardt(HostProblem(see), x0, *limits)
     return runs, float(best.cost), code
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.gauss_newton import Seen, bending, bent, blank, largest_cosine, or_one, with_jacobian
 from hhtjax.identification.losses import LEAST_BEND, Objective
-from hhtjax.numerics.array_namespace import choose, eigh, namespace_of, solve_upper, solve_upper_transposed
+from hhtjax.numerics.array_namespace import eigh, namespace_of, select, solve_upper, solve_upper_transposed
 
 
 class ArrowTrial(NamedTuple):
@@ -47,7 +47,7 @@ def arrow_trial(x: np.ndarray, seen: Seen, D: np.ndarray, p: int) -> ArrowTrial:
     xp, both, r = namespace_of(x), seen.J, seen.r
     count, k = len(both), both.shape[2] - p
     finite = xp.all(xp.isfinite(r)) & xp.all(xp.isfinite(both))
-    both, r = choose(finite, (both, r), (xp.zeros_like(both), xp.zeros_like(r)))
+    both, r = select(finite, (both, r), (xp.zeros_like(both), xp.zeros_like(r)))
     if seen.bend is not None:
         slopes, squares = xp.einsum("bmp,bm->p", both[:, :, k:], r), xp.sum(both[:, :, k:] ** 2, axis=(0, 1))
         further = xp.diag(bent(seen.bend, slopes, squares) / count**0.5)  # a part in each record

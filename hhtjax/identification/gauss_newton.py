@@ -21,7 +21,7 @@ import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.losses import Objective
-from hhtjax.numerics.array_namespace import choose, namespace_of, svd
+from hhtjax.numerics.array_namespace import namespace_of, select, svd
 
 PART = 512  # rows
 
@@ -132,7 +132,7 @@ def dense_trial(x, seen: Seen, D) -> DenseTrial:
     xp, p = namespace_of(x), x.size
     both = xp.concatenate([seen.J, seen.r[:, None]], axis=1)
     finite = xp.all(xp.isfinite(both))
-    R = triangle(choose(finite, both, xp.zeros_like(both)))
+    R = triangle(select(finite, both, xp.zeros_like(both)))
     if seen.bend is not None:
         further = bent(seen.bend, R[:, :p].T @ R[:, p], xp.sum(R[:, :p] ** 2, axis=0))
         R = triangle(xp.concatenate([R, xp.pad(xp.diag(further), ((0, 0), (0, 1)))]))

@@ -29,7 +29,7 @@ from hhtjax.identification.arguments import (
 from hhtjax.identification.identifiability import warn_undetermined
 from hhtjax.identification.least_squares import BAD_START, NO_INFLUENCE
 from hhtjax.identification.parameter_vector import Data
-from hhtjax.identification.problem import is_outside, solve, solve_outside
+from hhtjax.identification.problem import is_on_host, solve, solve_on_host
 from hhtjax.identification.residuals import check_weights, first_bad
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
@@ -139,9 +139,9 @@ def fit(
     data = _check_data("fit", params0, scale, weights, prior, tolerance)
     if of_records:
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
-    alone = is_outside(options, params0, data)
+    alone = is_on_host(options, params0, data)
     options = options._replace(loss=options.loss and current(options.loss))
-    result = _solved(solve_outside if alone else solve, residuals, options, params0, data)
+    result = _solved(solve_on_host if alone else solve, residuals, options, params0, data)
     result = result._replace(params=thaw(result.params))
     return _finished("fit", result, weights) if is_concrete(result.code) else result
 

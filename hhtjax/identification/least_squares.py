@@ -18,7 +18,7 @@ from hhtjax.description import Array, Real
 from hhtjax.description.presentation import overwrite, shown
 from hhtjax.identification.gauss_newton import deviation, or_one
 from hhtjax.identification.losses import Objective
-from hhtjax.numerics.array_namespace import choose, namespace_of, while_loop, with_entry
+from hhtjax.numerics.array_namespace import namespace_of, select, while_loop, with_entry
 
 if TYPE_CHECKING:
     from hhtjax.identification.gauss_newton import Dense, DenseTrial
@@ -78,9 +78,9 @@ def levenberg_marquardt(
         new = problem.look(now.x + step, now.D)
         lower = new.cost < now.cost
         small = _small(problem, now, new, lower, (step, predicted, lam), history.cost[0], tolerance)
-        best = choose(lower | first, new, now)
+        best = select(lower | first, new, now)
         course = _learn(problem, (now, new, best), course, (lam, v, step), (now.cost - new.cost) / predicted, lower)
-        course = choose(first, carry[1], course)
+        course = select(first, carry[1], course)
         iteration = iteration + 1
         code = xp.where(iteration == max_iterations, LIMIT, running)
         code = xp.where(~lower & (lam > 1 / eps), STUCK, code)
@@ -148,7 +148,7 @@ def _small(problem, now: DenseTrial, new, lower: Real, attempt: tuple, start: Re
     flat = (predicted <= tolerance * now.cost) & (xp.abs(now.cost - new.cost) <= tolerance * now.cost)
     short = xp.all(xp.abs(step) <= tolerance * (xp.abs(now.x) + tolerance))
     damped = lam * xp.max(xp.where(now.column > 0, now.D / or_one(now.column), 1)) ** 2
-    best = choose(lower, new, now)
+    best = select(lower, new, now)
     reach = xp.linalg.norm(best.column * xp.maximum(xp.abs(best.x), 1))  # of parameters changed by themselves
     rounding = 10 * float(jnp.finfo(reach.dtype).eps) * reach
     little = (best.cost <= tolerance * start) | (best.length <= rounding)

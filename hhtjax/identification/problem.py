@@ -267,7 +267,7 @@ def _see(residuals: Callable | Reading, options: Options, x: Array, params0: PyT
     return seen._replace(read=kept)
 
 
-class Outside(NamedTuple):
+class HostProblem(NamedTuple):
     """A `Dense` problem. see: x -> its `Seen`."""
 
     see: Callable
@@ -291,7 +291,7 @@ class Outside(NamedTuple):
     bending = Dense.bending
 
 
-class OutsideRecords(NamedTuple):
+class HostRecords(NamedTuple):
     """An `Arrow` problem. see: x -> its `Seen`."""
 
     see: Callable
@@ -331,13 +331,13 @@ def _in_numpy(seen: Seen) -> Seen:
     return seen._replace(read=(seen.r, seen.J, kept))
 
 
-def is_outside(options: Options, *given: PyTree) -> bool:
+def is_on_host(options: Options, *given: PyTree) -> bool:
     """Whether a fit with these options, given these pytrees, can be done so."""
     is_free = is_untouched() and not is_tracing() and all_concrete(given)
     return is_free and options.optimizer == LEVENBERG_MARQUARDT and jax.default_backend() == "cpu"
 
 
-def solve_outside(residuals: Callable | Reading, options: Options, params0: PyTree, data: PyTree) -> FitResult:
+def solve_on_host(residuals: Callable | Reading, options: Options, params0: PyTree, data: PyTree) -> FitResult:
     """`solve`, where nothing is being traced."""
     x0, w, kind = _begin(residuals, options, params0, data)
     columns = x0.size if w.ndim == 1 else kind.p + (x0.size - kind.p) // len(w)
@@ -349,7 +349,7 @@ def solve_outside(residuals: Callable | Reading, options: Options, params0: PyTr
         with np.errstate(**warned):  # the user's functions may be traced here
             return _see(residuals, options, x, params0, data)
 
-    problem = Outside(see) if w.ndim == 1 else OutsideRecords(see, kind.p, len(w))
+    problem = HostProblem(see) if w.ndim == 1 else HostRecords(see, kind.p, len(w))
     longest = longest_steps(options.transforms, jax.tree.leaves(params0), x0.size - kind.p)
     with np.errstate(all="ignore"):
         limits = limits_of(options, data, x0)

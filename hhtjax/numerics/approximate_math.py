@@ -24,11 +24,11 @@ EXP = (
 )
 
 
-def rough_log(x: Array) -> Array:
+def approximate_log(x: Array) -> Array:
     """ln x of positive normal numbers, to 2e-7, of float32 numbers to 7e-6.
 
     >>> x = np.float32([1e-9, 0.3, 1.0, 7.0, 1e9])
-    >>> bool(jnp.all(abs(rough_log(jnp.asarray(x)) - np.log(x)) < 1e-5))
+    >>> bool(jnp.all(abs(approximate_log(jnp.asarray(x)) - np.log(x)) < 1e-5))
     True
     """
     digits = jnp.finfo(x.dtype).nmant
@@ -41,11 +41,11 @@ def rough_log(x: Array) -> Array:
     return _polynomial((a + LN2, b - LN2, *others), part) + rest
 
 
-def rough_exp(x: Array) -> Array:
+def approximate_exp(x: Array) -> Array:
     """exp(x) to 1e-5 of it for x from -2.4 to 0.9; beyond that less than exp(-2.4), or more than exp(0.9).
 
     >>> x = jnp.linspace(-2.4, 0.9, 99)
-    >>> bool(jnp.all(abs(rough_exp(x) / np.exp(x) - 1) < 2e-5))
+    >>> bool(jnp.all(abs(approximate_exp(x) / np.exp(x) - 1) < 2e-5))
     True
     """
     return _polynomial(EXP, x)

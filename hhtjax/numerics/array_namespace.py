@@ -28,10 +28,10 @@ def namespace_of(x: Real) -> Any:
     return np if isinstance(x, (np.ndarray, np.generic)) else jnp
 
 
-def choose(condition: Real, x, y):
+def select(condition: Real, x, y):
     """x where a condition, a single one, holds, else y: pytrees.
 
-    >>> int(choose(np.array(True), 1, 2)), int(choose(jnp.array(False), 1, 2))
+    >>> int(select(np.array(True), 1, 2)), int(select(jnp.array(False), 1, 2))
     (1, 2)
     """
     if namespace_of(condition) is np:

@@ -15,12 +15,12 @@ from hhtjax.numerics.closures import hoisted
 from hhtjax.primitives import in_turn, largest_in_batch
 
 
-def choose(where: Array, x: PyTree, y: PyTree):
+def tree_where(where: Array, x: PyTree, y: PyTree):
     """One of two trees."""
     return jax.tree.map(partial(jnp.where, where), x, y)
 
 
-def seldom(f: Callable, asked: Array, carry: PyTree, *more: PyTree) -> PyTree:
+def call_where(f: Callable, asked: Array, carry: PyTree, *more: PyTree) -> PyTree:
     """f(carry, *more), of the structure of the carry, where `asked`; else the carry.
 
     Of a plain condition vmap makes a choice between both, for every member and in every step. Members that have not
@@ -28,18 +28,18 @@ def seldom(f: Callable, asked: Array, carry: PyTree, *more: PyTree) -> PyTree:
 
     >>> import jax, jax.numpy as jnp
     >>> def root(x):
-    ...     return seldom(jnp.sqrt, x > 1, x)
+    ...     return call_where(jnp.sqrt, x > 1, x)
     >>> [float(y) for y in jax.vmap(root)(jnp.array([4.0, 0.0]))], [float(jax.grad(root)(x)) for x in (4.0, 0.0)]
     ([2.0, 0.0], [0.25, 1.0])
     """
     return if_any(_careful(f, asked), asked, carry, *more)
 
 
-def seldom_alone(f: Callable, asked: Array, carry, *more):
+def call_where_alone(f: Callable, asked: Array, carry, *more):
     """The same, one member of a batch after the other, each as it is alone: for what is long, and seldom at one time.
 
     >>> import jax, jax.numpy as jnp
-    >>> print(jax.vmap(lambda x: seldom_alone(jnp.sqrt, x > 1, x))(jnp.array([4.0, 0.0])))
+    >>> print(jax.vmap(lambda x: call_where_alone(jnp.sqrt, x > 1, x))(jnp.array([4.0, 0.0])))
     [2. 0.]
     """
     return if_any(partial(in_turn, _careful(f, asked), asked), asked, carry, *more)
@@ -49,8 +49,8 @@ def _careful(f: Callable, asked: Array):
     """f, of which only members that have asked see anything."""
 
     def branch(carry: PyTree, *more: PyTree):
-        known = choose(asked, (carry, more), lax.stop_gradient((carry, more)))
-        return choose(asked, f(known[0], *known[1]), carry)
+        known = tree_where(asked, (carry, more), lax.stop_gradient((carry, more)))
+        return tree_where(asked, f(known[0], *known[1]), carry)
 
     return branch
 

@@ -16,7 +16,7 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree, thaw
 from hhtjax.jaxpr import on_scalars
-from hhtjax.numerics.batched_cond import choose, if_any
+from hhtjax.numerics.batched_cond import if_any, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import in_turn
 from hhtjax.runs.event_step import EventContext, EventState, Pieces, SubStep, asks, pass_events, reaching, unnoted
@@ -186,8 +186,8 @@ def counted(take_step: Callable, flat: FlatSystem, t0: Array, dt: Array, before:
 def resting(advance: Callable, by_itself: bool, run: tuple, info: Info, here: Array):
     """The run and what is known of it after a step, or, not `here`, without. by_itself: whether `advance` can rest."""
     after, more = advance(run, here) if by_itself else advance(run)
-    info = choose(here, join_info(info, more), info)
-    return after if by_itself else if_any(partial(choose, here), ~here, after, run, kept=False), info
+    info = tree_where(here, join_info(info, more), info)
+    return after if by_itself else if_any(partial(tree_where, here), ~here, after, run, kept=False), info
 
 
 def saved(flat: FlatSystem, state: State):
@@ -334,7 +334,7 @@ def step_with_events(context, params: PyTree, bound, sizes):
         state, before, failure = run
         h, last = sizes(before)
         if any(events.ends):
-            new, info = choose(met.ended, state, new), choose(met.ended, context.no_info, info)
+            new, info = tree_where(met.ended, state, new), tree_where(met.ended, context.no_info, info)
         # before the branch: LLVM makes no vector instructions of a choice between what comes out of one
         new, count = at_rest(here, (new, count), (state, before))
         if met.pieces is not None:
@@ -379,7 +379,7 @@ def passage(context):
 
 def at_rest(here: Array | None, new: PyTree, old: PyTree):
     """The new, or, where a member of a sweep rests, the old."""
-    return new if here is None else choose(here, new, old)
+    return new if here is None else tree_where(here, new, old)
 
 
 def before_any(context: EventContext, params: PyTree, t: Array) -> EventState:

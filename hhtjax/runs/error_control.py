@@ -14,8 +14,8 @@ from jax import lax
 from hhtjax.description import Array, PyTree, is_concrete
 from hhtjax.description.presentation import overwrite, shown
 from hhtjax.jaxpr import on_scalars
-from hhtjax.numerics.approximate_math import rough_exp, rough_log, without_rounding
-from hhtjax.numerics.batched_cond import choose, seldom_alone
+from hhtjax.numerics.approximate_math import approximate_exp, approximate_log, without_rounding
+from hhtjax.numerics.batched_cond import call_where_alone, tree_where
 from hhtjax.primitives import largest_in_batch, one_kernel, or_alone, row_written, staged
 from hhtjax.runs.driver import before_any, flaw_at_start, neutral_info, no_failure, saved, with_flaw
 from hhtjax.runs.event_step import SHORT, EventContext, SubStep, asks, pass_events, reaching
@@ -155,11 +155,11 @@ def sizes(flat: FlatSystem, state: State):
 def next_step(h: Array, error: Array, before: Array, accept: Array, order: int, pi: Controller = PI):
     """The PI controller: Gustafsson's, in the form of Hairer and Wanner, Sec. IV.2; before, and what is returned beside
     the step, are logarithms of errors."""
-    now = rough_log(jnp.maximum(error, 1e-10))
+    now = approximate_log(jnp.maximum(error, 1e-10))
     slope = jnp.where(accept, -pi.proportional / order, -1 / order)
     exponent = slope * now + jnp.where(accept, pi.integral / order * before, 0)
     least, most = jnp.where(accept, pi.least, 0.1), jnp.where(accept, pi.most, 0.9)
-    factor = jnp.clip(pi.safety * rough_exp(exponent), least, most)
+    factor = jnp.clip(pi.safety * approximate_exp(exponent), least, most)
     return h * factor, jnp.maximum(now, float(np.log(LOWEST)))
 
 
@@ -284,7 +284,7 @@ def past_events(trial: StepTrial, tried: TrialStep, walk: Walk, h: Array) -> Tri
     """The try, past the events in its step."""
     now = trial.context.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
     asked = (tried.error <= 1) & asks(trial.context, walk.state, tried.walk.state, now, walk.met.over, h)
-    return seldom_alone(partial(passed, trial), asked, tried, walk, h)
+    return call_where_alone(partial(passed, trial), asked, tried, walk, h)
 
 
 def passed(trial: StepTrial, tried: TrialStep, walk: Walk, h: Array) -> TrialStep:
@@ -306,8 +306,8 @@ def passed(trial: StepTrial, tried: TrialStep, walk: Walk, h: Array) -> TrialSte
         walk=tried.walk._replace(met=part.met), error=jnp.full_like(tried.error, jnp.inf), h=middle, shortest=middle,
         why=jnp.full_like(tried.why, AT_EVENT),
     )  # fmt: skip
-    judged = choose(part.divided > 0, behind(trial, tried, walk, part, h), tried)
-    return choose(code == FINE, judged, lost)
+    judged = tree_where(part.divided > 0, behind(trial, tried, walk, part, h), tried)
+    return tree_where(code == FINE, judged, lost)
 
 
 def behind(trial: StepTrial, tried: TrialStep, walk: Walk, part: SubStep, h: Array) -> TrialStep:
@@ -533,7 +533,7 @@ class Recorder(NamedTuple):
 
     def add(self, since: Since, begun: Begun, accepted: Array) -> Since:
         """Since, with a try; of one that is rejected the beginning too: it is that of the next."""
-        return Since(self.begin(begun.state), choose(accepted, join_info(since.info, begun.info), since.info))
+        return Since(self.begin(begun.state), tree_where(accepted, join_info(since.info, begun.info), since.info))
 
     def sample(self, since: Since, state: State, time: Array):
         """Since a sample before this state, and what lies around it: in a step, whose end this is."""

@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree, Real
-from hhtjax.numerics.batched_cond import choose, if_any, seldom
+from hhtjax.numerics.batched_cond import call_where, if_any, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import staged
 from hhtjax.runs.solution import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, SINGULAR, STAYS, THROWN, row_of
@@ -68,7 +68,7 @@ def pass_events(context: EventContext, params: PyTree, part: SubStep, h: Array):
         return begin(context, s.q, s.v, s.t, params, h, moves=False)
 
     now = context.params(params, met.modes)
-    end = seldom(anew, (part.divided > 0) & ~met.ended, part.end, now)
+    end = call_where(anew, (part.divided > 0) & ~met.ended, part.end, now)
 
     def known(s: State) -> State:
         lost = {name: jnp.where(met.code == FINE, getattr(s, name), jnp.nan) for name in ("q", "v", "w")}
@@ -94,7 +94,7 @@ def meet_or_flag(context: EventContext, now: tuple, going: Array, h: Array, para
     part = flag(part, going & ~here, STAYS, found.stays)
     part = flag(part, going & ~here, NO_NUMBER, found.unknown)
     part = part._replace(asked=jnp.where(going, here, part.asked))
-    return seldom(partial(meet, context), here, (part, noted), found, h, params)
+    return call_where(partial(meet, context), here, (part, noted), found, h, params)
 
 
 def flag(part: SubStep, bad: Array, code: int, which: Array) -> SubStep:
@@ -136,12 +136,12 @@ def meet(context: EventContext, now: tuple, found: Found, h: Array, params: PyTr
     passed = part._replace(passed=part.passed | ((this > 0) & ~again), met=met._replace(over=over))
     new = behind(context, part, (e, info, tau, g, d), (v, modes, over), i, this, near, h, params)
     noted, touches = (pick(this, jnp.asarray(x, h.dtype)) > 0 for x in (events.noted, found.touches))
-    new = choose(noted, passed, new)  # what changes nothing divides no step
+    new = tree_where(noted, passed, new)  # what changes nothing divides no step
     stays, many = missed & jnp.all(jnp.isfinite(e.v)), ~noted & (part.divided == context.max_events)
     code = jnp.where(many, MANY, jnp.where(stays, STAYS, new.met.code)).astype(met.code.dtype)
     new = new._replace(met=new.met._replace(code=code, event=jnp.where(stays | many, i, new.met.event)))
     none = missed & touches
-    return choose(none, passed, new), (row, ~none & ~many)
+    return tree_where(none, passed, new), (row, ~none & ~many)
 
 
 def behind(
@@ -179,7 +179,7 @@ def behind(
 
     pieces = None if part.met.pieces is None else part.met.pieces.divided(e, start, end, modes)
     met = EventState(modes, ends, code, i, pieces=pieces, over=over)
-    infos = join_info(join_info(choose(part.divided > 0, part.info, context.no_info), info), more)
+    infos = join_info(join_info(tree_where(part.divided > 0, part.info, context.no_info), info), more)
     asked = asks(context, start, end, then, over, rest) | jnp.any(due)
     passed = part.passed & near & (d1 < 0)
     new = SubStep(start, end, infos, rest, h, met, part.divided + 1, asked, passed, beside, due)
@@ -286,7 +286,7 @@ def reaching(flat: FlatSystem, stepper: Stepper, no_info: Info):
     def reach(params: PyTree, s: State, tau: Array, last: Array, h: Array):
         short = tau <= SHORT * h
         s1, info = resized_step(flat, stepper, params, jnp.maximum(tau, SHORT * h), last)(s)
-        return choose(short, drifted(flat, s, tau), s1), choose(short, no_info, info)
+        return tree_where(short, drifted(flat, s, tau), s1), tree_where(short, no_info, info)
 
     return reach
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real
 from hhtjax.description.presentation import shown
-from hhtjax.numerics.batched_cond import choose, if_any
+from hhtjax.numerics.batched_cond import if_any, tree_where
 from hhtjax.runs.driver import as_path, as_solution, saved
 from hhtjax.runs.output import output_at
 from hhtjax.runs.solution import Solution, told
@@ -137,7 +137,7 @@ def _found(known: Solution, times: Array, equal: bool | None):
 
     if equal is None:
         uneven = _are_uneven(t)
-        i, H = if_any(lambda found: choose(uneven, of_any(), found), uneven, of_equal())
+        i, H = if_any(lambda found: tree_where(uneven, of_any(), found), uneven, of_equal())
     else:
         i, H = of_equal() if equal else of_any()
     x = jnp.where(outside, jnp.nan, (times - t[i]) / H)

@@ -33,7 +33,7 @@ from hhtjax.steppers.friction_switching import DEPENDENT, is_settled, run_events
 from hhtjax.steppers.implicit_solve import newton, solve_and_keep
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.smooth_start import Found, corrected_by, damped_part, lag_left, rate_of, smoothed
-from hhtjax.steppers.stepper import Rubbing, join_info
+from hhtjax.steppers.stepper import FrictionState, join_info
 from hhtjax.systems.constraints import answers, curvature
 from hhtjax.systems.friction import across, directions, own_rate, reaction, responses
 from hhtjax.systems.friction_rows import depends, is_prescribed, rows_of
@@ -80,7 +80,7 @@ def begin_friction(
     sig, tau = settle(L)
     s = method.begin(smooth_system(system, sig, tau, L), *at, dt)
     a = _taken_off(s.a, rows.solve(K, sig == 0, matvec(H, s.a) + own), G)
-    return s._replace(a=a, friction=Rubbing(sig, tau))
+    return s._replace(a=a, friction=FrictionState(sig, tau))
 
 
 def smooth_system(system, sig, tau, L):
@@ -281,7 +281,7 @@ def _behind(system, params: PyTree, s, s1, x: Array, end, f, G, rows, still) -> 
         borne, tau = borne + shared - tau, shared
     if s1.L is not None:
         s1 = s1._replace(L=s1.L - matvec(G[:, size : size + system.num_constraints].T, borne))
-    return s1._replace(w=w, a=a, friction=Rubbing(end.sig, tau))
+    return s1._replace(w=w, a=a, friction=FrictionState(end.sig, tau))
 
 
 def _defect(method, system, params: PyTree, rubbing, s1, dtau: Array, inverse):

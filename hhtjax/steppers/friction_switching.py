@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description import Array, Real
-from hhtjax.numerics.batched_cond import choose, seldom
+from hhtjax.numerics.batched_cond import call_where, tree_where
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.systems.friction import ROUNDING, solve_some, solver_of_some
 from hhtjax.systems.friction_rows import leaves_box, slides_in_box, slight
@@ -88,7 +88,7 @@ def _by_pieces(at: Moment, steady: Steady) -> Moment:
         return _event(_settled(at, steady), steady)
 
     def visit(at: Moment, _):  # a `lax.cond` cannot be transposed in a batch, as this is the rule of a derivative
-        return seldom(piece, at.theta < 1, at, steady), None
+        return call_where(piece, at.theta < 1, at, steady), None
 
     return lax.scan(visit, at, length=PIECES[0] + PIECES[1] * len(at.s))[0]
 
@@ -111,7 +111,7 @@ def _switching(at: Moment, steady: Steady):
         wait, *rest = _next(at, steady)
         due = jnp.min(wait) <= 0
         after = _on(at, wait, *rest)
-        return choose(due, after, at), due & (after.theta < 1), i + 1
+        return tree_where(due, after, at), due & (after.theta < 1), i + 1
 
     begin = at._replace(kept=jnp.ones_like(at.kept))
     end, *_ = lax.while_loop(unfinished, visit, (begin, at.theta < 1, 0))
@@ -306,7 +306,7 @@ def _dependent_by_pieces(at, course):
     """The same in a fixed number of pieces, for reverse mode."""
 
     def visit(at, _):  # a `lax.cond` cannot be transposed in a batch, as this is the rule of a derivative
-        return seldom(_piece, at.theta < BEYOND, at, course), None
+        return call_where(_piece, at.theta < BEYOND, at, course), None
 
     return lax.scan(visit, at, length=PIECES[0] + PIECES[1] * len(at.s))[0]
 

@@ -14,7 +14,7 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics import dense_lu
-from hhtjax.numerics.batched_cond import choose, derivative_of, seldom
+from hhtjax.numerics.batched_cond import call_where, derivative_of, tree_where
 from hhtjax.numerics.closures import hoisted
 from hhtjax.numerics.dense_lu import by_factors, diagonal
 from hhtjax.numerics.differentiable_while import implicit_root
@@ -374,7 +374,7 @@ def better_state(r: Callable, predicted: State, held: State, size: Callable, lim
     size = staged(lambda s, size=size: size(r(s)))
     predicted_size = size(predicted)
     use_predictor = lax.cond(predicted_size <= limit, lambda: jnp.array(True), lambda: predicted_size <= size(held))
-    return choose(use_predictor, predicted, held)
+    return tree_where(use_predictor, predicted, held)
 
 
 def better_solve(about: Callable, held: State, size: Callable, limit: Array):
@@ -387,9 +387,9 @@ def better_solve(about: Callable, held: State, size: Callable, limit: Array):
 
     def better(found: tuple):
         w, info, expansion = about(held, first)
-        return choose(predicted_size <= size(expansion.here), found, (w, info))
+        return tree_where(predicted_size <= size(expansion.here), found, (w, info))
 
-    return seldom(better, ~(predicted_size <= limit), (w, info))
+    return call_where(better, ~(predicted_size <= limit), (w, info))
 
 
 def refresh(system: FlatSystem, params: PyTree, c, s, factorize):

@@ -38,7 +38,7 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
-from hhtjax.numerics.batched_cond import choose, derivative_at_need, seldom
+from hhtjax.numerics.batched_cond import call_where, derivative_at_need, tree_where
 from hhtjax.numerics.closures import hoisted
 from hhtjax.numerics.dense_lu import UNROLLED, diagonal, differentiable_inverse, inverse, matvec
 from hhtjax.numerics.differentiable_while import implicit_root
@@ -194,7 +194,7 @@ def smoothed(
         found = without_layer(method, layer, h, damped and moves and not resolves, corrects, finish or finished, known)
         w, L = layer.parts(found.z)
         if finish is None and not resolves:  # M^-1 Q as it is, where nothing damps
-            w, L = choose(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
+            w, L = tree_where(found.damps, (w, L), (s.w, s.L)) if damped else (s.w, s.L)
         a = w if found.wdot is None else method.corrected(system, found.v, w, found.wdot, h)
         a = a if found.lag is None else a + found.lag
         s1 = s._replace(v=found.v, w=w, a=a, L=L)
@@ -233,7 +233,7 @@ def jumped(
         a, L = (None if x is None else x + change for x, change in ((s.a, dw), (s.L, dL)))
         return s._replace(v=v, w=s.w + dw, a=a, L=L)
 
-    return seldom(smooth, stiff, after, s, both, h)
+    return call_where(smooth, stiff, after, s, both, h)
 
 
 def grown(
@@ -254,7 +254,7 @@ def grown(
     def begin(s: State, params: PyTree, h: Array) -> State:
         return smooth(method, system, s, params, h, lags=True)
 
-    return seldom(begin, leaves, s, params, h)
+    return call_where(begin, leaves, s, params, h)
 
 
 def is_stiff(method, system, s, params: PyTree, h, w, answer, part: float = STIFF) -> Array:
@@ -442,7 +442,7 @@ def improved(around, z, *more):
         trial = z - part * best[0]
         found = around(trial)
         better = found[1] < best[1]
-        z, best = choose(better, (trial, found), (z, best))
+        z, best = tree_where(better, (trial, found), (z, best))
         return z, best, jnp.where(count == 0, best[1], first), jnp.where(better, 1, part / 4), count + 1
 
     one = jnp.ones((), z.dtype)

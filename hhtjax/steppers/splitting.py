@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description import Array, PyTree, Real, is_concrete
-from hhtjax.numerics.batched_cond import choose
+from hhtjax.numerics.batched_cond import tree_where
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.numerics.linear_solve import solve
 from hhtjax.steppers.generalized_alpha import GeneralizedAlpha
@@ -75,7 +75,7 @@ class OperatorSplitting(Stepper):
     def grown(self, system: FlatSystem, state, params: PyTree, dt: Array):
         """As of the `hht` family."""
         s = self.hht.grown(system, state._replace(a=state.w, memory=None), params, dt)
-        return choose(jnp.any(s.v != state.v), self.begun(system, s, params, state.memory), state)
+        return tree_where(jnp.any(s.v != state.v), self.begun(system, s, params, state.memory), state)
 
     def jumped(self, system: FlatSystem, before, after, old, new, dt: Array, answer):
         """The same where held inputs jump, of the changes."""

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.description import Array, Description, PyTree, Real, freeze
 from hhtjax.description.presentation import known, shown
-from hhtjax.numerics.batched_cond import seldom
+from hhtjax.numerics.batched_cond import call_where
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.systems.constraints import answers
 from hhtjax.systems.flat_system import FlatSystem, flatten
@@ -35,7 +35,7 @@ class State(NamedTuple):
             where a method has none.
         z, zdot, za: internal states, their rates and their algorithmic rates, None without.
         L: multipliers (m,) of constraints, None without.
-        friction: `Rubbing`, the directions of sliding and the forces of dry friction, None without.
+        friction: `FrictionState`, the directions of sliding and the forces of dry friction, None without.
         memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
 
@@ -53,7 +53,7 @@ class State(NamedTuple):
 
 
 @shown
-class Rubbing(NamedTuple):
+class FrictionState(NamedTuple):
     """What a step remembers of dry friction.
 
     Attributes:
@@ -303,7 +303,7 @@ def behind_jump(
     """
 
     behind = partial(_behind_jump, stepper, system)
-    return behind(s, old, new, h) if here is None else seldom(behind, here, s, old, new, h)
+    return behind(s, old, new, h) if here is None else call_where(behind, here, s, old, new, h)
 
 
 def _behind_jump(stepper: Stepper, system: FlatSystem, s: State, old: PyTree, new: PyTree, h: Array) -> State:

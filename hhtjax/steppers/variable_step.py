@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 
 from hhtjax.description import Array, PyTree, is_concrete
-from hhtjax.numerics.batched_cond import seldom
+from hhtjax.numerics.batched_cond import call_where
 from hhtjax.steppers.residual import Coefficients, weighted
 from hhtjax.steppers.stepper import bound
 from hhtjax.systems import zero_order_hold
@@ -94,7 +94,7 @@ def resized_step(flat: FlatSystem, stepper: Stepper, params: PyTree, dt: Array, 
             def begin(state: State, params: PyTree, dt: Array) -> State:
                 return resized.grown(flat, state, zero_order_hold.before(params, state.t, last), dt)
 
-            state = seldom(begin, dt > GROWTH * last, state, params, dt)
+            state = call_where(begin, dt > GROWTH * last, state, params, dt)
         return bound(resized, flat, params, dt, last)(state)
 
     return step

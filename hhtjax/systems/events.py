@@ -21,7 +21,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import in_words, require_function, require_number
 from hhtjax.description import Array, Description, PyTree, Real, as_float, freeze, is_array, is_concrete, is_real, thaw
-from hhtjax.numerics.batched_cond import seldom
+from hhtjax.numerics.batched_cond import call_where
 from hhtjax.primitives import consistent
 from hhtjax.systems.constraints import answers, pull_back
 from hhtjax.systems.sampled import SLOP
@@ -341,7 +341,7 @@ def flatten_events(system: FlatSystem, events: tuple, params: PyTree, at: tuple,
         after = s.v, modes(params)
         for number, event in enumerate(events):
             if not event.is_noted:
-                after = seldom(partial(outcome_of, event), i == number, after, s.q, s.t, now, params)
+                after = call_where(partial(outcome_of, event), i == number, after, s.q, s.t, now, params)
         return after
 
     names = "is_noted", "terminal", "sees_multipliers"

@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree, Real
-from hhtjax.numerics.batched_cond import choose
+from hhtjax.numerics.batched_cond import tree_where
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.numerics.linear_solve import solver
 from hhtjax.systems.constraints import jacobian, violation
@@ -296,7 +296,7 @@ def leaves_box(K: Array, least: Array, rests: Array, loads: list, f: Array, size
         plane = plane_at(x)
         beyond = jnp.any(plane[0] != 0)
         new = jnp.where(beyond, jnp.clip(crossing(plane, *known), 0, x), x)
-        return new, choose(beyond, plane, old), x - new, i + 1
+        return new, tree_where(beyond, plane, old), x - new, i + 1
 
     one, none = jnp.ones((), K.dtype), jnp.zeros_like(f)
     _, plane, *_ = lax.while_loop(unfinished, improve, (one, (none, none, none), one, 0))

@@ -9,7 +9,7 @@ import pytest
 
 import hhtjax
 from hhtjax.identification import problem
-from hhtjax.identification.problem import is_outside
+from hhtjax.identification.problem import is_on_host
 from hhtjax.identification.transforms import bounded, fixed, positive
 
 T = jnp.linspace(0.0, 2.0, 40)
@@ -138,7 +138,7 @@ def test_what_is_transformed_is_inside():
     seen = []
 
     def look(x):
-        seen.append(is_outside(options, 1.0, x))
+        seen.append(is_on_host(options, 1.0, x))
         return x
 
     look(1.0)
