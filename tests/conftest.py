@@ -36,10 +36,11 @@ def is_known(flag):
 
 
 def set_flags():
-    """Before JAX starts; processes that tests start inherit them."""
-    given = os.environ.get("XLA_FLAGS", "")
-    added = [f"--{name}={value}" for name, value in QUICK.items() if name not in given and is_known(name)]
-    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+    """Before JAX starts; processes that tests start inherit them. Of these, one that is given has the last word, where
+    this XLA has it."""
+    given = {flag.lstrip("-").partition("=")[0]: flag for flag in os.environ.get("XLA_FLAGS", "").split()}
+    flags = {name: f"--{name}={value}" for name, value in QUICK.items()} | given
+    os.environ["XLA_FLAGS"] = " ".join(flag for name, flag in flags.items() if name not in QUICK or is_known(name))
 
 
 def keep_programs():

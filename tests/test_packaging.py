@@ -11,8 +11,12 @@ from pathlib import Path
 
 import pytest
 
+import hhtjax
+from hhtjax.primitives import compat
+
 ROOT = Path(__file__).parents[1]
-BACKEND = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["build-backend"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+BACKEND = PROJECT["build-system"]["build-backend"]
 
 
 @pytest.fixture
@@ -55,3 +59,10 @@ def test_the_sdist_holds_what_the_tests_read(built):
     ours = {name for name in ours if "experiments/output" not in name}
     assert ours <= names
     assert {"pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE", ".ci/run"} <= names
+
+
+def test_the_range_of_jax_is_told_as_it_is():
+    (lowest,) = [x for x in PROJECT["project"]["dependencies"] if x.startswith("jax>=")]
+    first, last = lowest.removeprefix("jax>="), ".".join(map(str, compat.NEWEST))
+    assert f"JAX {first} to {last} make kernels" in hhtjax.xla.__doc__
+    assert f"JAX from {first} to {last}." in (ROOT / "CONTRIBUTING.md").read_text()
