@@ -178,6 +178,7 @@ def test_a_start_on_the_guard_that_rises():
     assert abs(run.q[-1, 0] - 1.4) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_traced_start_beyond_the_guard_is_named():
     def end(q0):
         return call([Event(lambda q, v, t, p: q[0], impact(0.5))], q0=q0)
@@ -188,6 +189,7 @@ def test_a_traced_start_beyond_the_guard_is_named():
     )
 
 
+@pytest.mark.slow
 def test_a_guard_that_its_switch_makes_negative_is_named():
     """A threshold that moves away by more than the motion, where it should have moved ahead of it."""
     passing = Event(lambda q, v, t, p: p["level"] - q[0], switch=lambda p: {"level": p["level"] - 1.0})

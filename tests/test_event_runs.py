@@ -58,6 +58,7 @@ def test_impacts_at_the_ends_of_steps_are_at_their_times():
     assert np.abs(found - times).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_a_guard_that_is_no_number_fails_by_name():
     root = Event(lambda q, v, t, p: jnp.sqrt(q[0]), terminal=True)
     run = simulate(BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": G}, dt=0.01, num_steps=100, events=[root])
@@ -65,6 +66,7 @@ def test_a_guard_that_is_no_number_fails_by_name():
     check_message(SimulationError, message, run.check)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noted_first", [True, False])
 def test_a_log_of_impacts_has_them_all_and_changes_nothing(noted_first):
     """On the guard of the impact itself, before it in the list or behind; one that it throws back is not met."""
@@ -84,6 +86,7 @@ def test_a_log_of_impacts_has_them_all_and_changes_nothing(noted_first):
     np.testing.assert_allclose(often.events.t[:80:2], np.sqrt(2 / G) * np.arange(1, 80, 2), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_an_impact_that_nothing_can_follow_fails_by_name():
     clock = Event(lambda q, v, t, p: 0.25 - t + 0 * q[0], impact(0.5))
     run = simulate(BALL, LIGHT, jnp.ones(1), jnp.zeros(1), {"g": 0.0}, dt=0.1, num_steps=5, events=[clock])
@@ -142,6 +145,7 @@ def test_the_same_numbers_on_plain_jax():
     assert abs(found - plain).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_float32_stays_float32():
     params = {"g": np.float32(9.81), "floor": np.float32(0), "e": np.float32(0.8)}
     start, grid = (np.ones(1, np.float32), np.zeros(1, np.float32), params), {"dt": 0.01, "num_steps": 100}
@@ -154,6 +158,7 @@ def test_float32_stays_float32():
     assert abs(float(run.events.t[0]) - np.sqrt(2 / 9.81)) < 1e-7  # three roundings of t
 
 
+@pytest.mark.slow
 def test_float32_finds_the_part_of_a_step():
     """To a millionth of it, against the formula; late in a run the rounding of t + tau is larger than that."""
     heights = np.linspace(0.002, 0.009, 8, dtype=np.float32)
@@ -170,6 +175,7 @@ def test_float32_finds_the_part_of_a_step():
     assert np.abs(found - exact).max() < 1e-6 * 0.01
 
 
+@pytest.mark.slow
 def test_a_second_call_compiles_nothing():
     traced = []
 
@@ -189,6 +195,7 @@ def test_a_second_call_compiles_nothing():
     assert len(traced) <= before + 1  # the shapes are looked at anew
 
 
+@pytest.mark.slow
 def test_what_is_between_the_saved_times():
     params = {"g": G, "floor": 0.0, "e": 0.8}
     run = simulate(BALL, LIGHT, jnp.ones(1), jnp.zeros(1), params, dt=0.1, num_steps=12, save_every=3, events=[FLOOR])
@@ -240,6 +247,7 @@ def test_uneven_steps_and_modes_of_a_linear_system():
     assert abs(run.q[-1, 0] + np.sin(2 * (2.0 - quarter - np.pi / 10))) < 1e-3
 
 
+@pytest.mark.slow
 def test_events_of_a_first_order_system():
     """A clock that is set back at 1; and one that is only noted."""
     clock = FirstOrderSystem(lambda y, t, p: 1.0 + 0 * y)

@@ -141,10 +141,17 @@ def test_linear_system_equals_the_general_one(n, form):
 @pytest.mark.slow
 def test_linear_system_has_the_gradient_of_the_general_one():
     linear, general = end_of_linear_and_general(3)
-    theirs = jax.jit(jax.jacfwd(general))(PARAMS)
-    for ours in jax.jit(lambda p: (jax.jacfwd(linear)(p), jax.jacrev(linear)(p)))(PARAMS):
-        for name in PARAMS:
-            np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-7, atol=1e-12)
+    weights = jnp.array([1.0, -0.7, 0.4])
+
+    @jax.jit
+    def derivatives(p):
+        reverse = jax.grad(lambda p: weights @ linear(p))(p)
+        return jax.jacfwd(linear)(p), reverse, jax.jacfwd(general)(p)
+
+    ours, reverse, theirs = derivatives(PARAMS)
+    for name in PARAMS:
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-7, atol=1e-12)
+        np.testing.assert_allclose(reverse[name], weights @ theirs[name], rtol=1e-7, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -234,24 +241,42 @@ def test_diagonal_systems_are_stepped_without_a_matrix():
             assert f"[{n},{n}]" not in str(jax.make_jaxpr(lambda p, run=run: run(params=p).q)(1.0))
 
 
-@pytest.mark.slow
-def test_diagonal_systems_move_as_full_ones():
+def end_of_diagonal(form, stepper, beside, params):
+    """Of a run of the same system, its matrices as vectors or in full."""
     n = 3
     k = jnp.array([4.0, 9.0, 160.0])
+    system = hhtjax.LinearSystem(form(jnp.ones(n)), form(0.01 * k), lambda p: form(p * k), **beside)
+    return hhtjax.simulate(system, stepper, jnp.ones(n), jnp.zeros(n), params, dt=0.05, num_steps=20).q[-1]
 
-    def end(form, stepper, beside, params):
-        system = hhtjax.LinearSystem(form(jnp.ones(n)), form(0.01 * k), lambda p: form(p * k), **beside)
-        return hhtjax.simulate(system, stepper, jnp.ones(n), jnp.zeros(n), params, dt=0.05, num_steps=20).q[-1]
 
-    everywhere = {"nonlinear": lambda q, v, t, params: -params * q**3}
-    rubbing = {"friction": lambda q, v, t, params: 0.1 * jnp.ones(n)}
-    solved = hhtjax.hht(solve=lambda A, b: jnp.linalg.inv(A) @ b)
-    cases = [({}, solved), ({}, hhtjax.rowda()), (everywhere, hhtjax.hht()), (rubbing, hhtjax.hht())]
-    for beside, stepper in cases:
-        ours, theirs = (end(form, stepper, beside, 1.3) for form in (jnp.asarray, jnp.diag))
-        np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
-    ours = partial(end, jnp.asarray, hhtjax.hht(), {})
-    theirs = jax.jvp(partial(end, jnp.diag, hhtjax.hht(), {}), (1.3,), (1.0,))
-    for x, y in zip((ours(1.3), jax.jacrev(ours)(1.3)), theirs, strict=True):
+EVERYWHERE = {"nonlinear": lambda q, v, t, params: -params * q**3}
+RUBBING = {"friction": lambda q, v, t, params: 0.1 * jnp.ones(3)}
+MADE = {
+    "a solve of one's own": ({}, hhtjax.hht(solve=lambda A, b: jnp.linalg.inv(A) @ b)),
+    "rowda": ({}, hhtjax.rowda()),
+    "nonlinear": (EVERYWHERE, hhtjax.hht()),
+    "friction": (RUBBING, hhtjax.hht(linearize="predictor")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", MADE)
+def test_diagonal_systems_move_as_full_ones(case):
+    beside, stepper = MADE[case]
+    ours, theirs = (end_of_diagonal(form, stepper, beside, 1.3) for form in (jnp.asarray, jnp.diag))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_diagonal_systems_have_the_derivatives_of_full_ones():
+    weights = jnp.array([1.0, -0.7, 0.4])
+
+    @jax.jit
+    def derivatives(p):
+        """Forward of both, reverse of ours: of one weighted sum."""
+        ours, theirs = (partial(end_of_diagonal, form, hhtjax.hht(), {}) for form in (jnp.asarray, jnp.diag))
+        return [jax.jvp(f, (p,), (1.0,)) for f in (ours, theirs)], jax.grad(lambda p: weights @ ours(p))(p)
+
+    (ours, theirs), reverse = derivatives(1.3)
+    for x, y in zip((*ours, reverse), (*theirs, weights @ theirs[1]), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(jax.jvp(ours, (1.3,), (1.0,))[1], theirs[1], rtol=1e-10)

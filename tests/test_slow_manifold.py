@@ -60,6 +60,18 @@ def errors(run, h, reference=exact, duration=0.2):
     return np.array([K * np.max(np.abs(x - reference(m, times))) for x, m in zip(q, MASSES, strict=True)])
 
 
+def errors_of_two(run, h, reference=exact, duration=0.2):
+    """The same with steps of h, and of h/2: one program, for the run with long steps goes on."""
+    num_steps = round(2 * duration / h)
+    some = jax.jit(lambda h: jax.vmap(lambda m: run(m, h, num_steps))(jnp.asarray(MASSES)))
+    for k in (1, 2):
+        q, failed = some(jnp.asarray(h / k))
+        assert not np.any(failed)
+        times = h / k * np.arange(k * num_steps // 2 + 1)
+        pairs = zip(np.asarray(q)[:, : times.size], MASSES, strict=True)
+        yield np.array([K * np.max(np.abs(x - reference(m, times))) for x, m in pairs])
+
+
 def of_node(stepper, m, h, num_steps, **more):
     params = {"m": m, **more.pop("params", {})}
     run = hhtjax.simulate(NODE, stepper, jnp.zeros(1), jnp.zeros(1), params, dt=h, num_steps=num_steps, **more)
@@ -71,10 +83,11 @@ def runs_of_family(steppers, h, num_steps):
     return jax.vmap(lambda one: jax.vmap(lambda m: of_node(one, m, h, num_steps)[0])(jnp.asarray(MASSES)))(steppers)
 
 
-def errors_of_family(h):
+def errors_of_family(h, num_steps=200):
+    """Until 0.2 s, of longer runs where h is longer: one program."""
     steppers = jax.tree.map(lambda *x: jnp.stack(x), *(as_data(x) for x in FAMILY.values()))
-    num_steps = round(0.2 / h)
-    q, times = np.asarray(runs_of_family(steppers, h, num_steps)), h * np.arange(num_steps + 1)
+    times = h * np.arange(round(0.2 / h) + 1)
+    q = np.asarray(runs_of_family(steppers, h, num_steps))[..., : times.size]
     reference = np.stack([exact(m, times) for m in MASSES])
     return K * np.max(np.abs(q - reference), axis=-1)
 
@@ -150,7 +163,7 @@ def test_quadratic_damping():
     def without_mass(m, t):
         return (1 - (1 - 25 * t / np.sqrt(5)).clip(0) ** 2) / K
 
-    coarse, fine = (errors(quadratic, h, without_mass, 0.08)[-2:] for h in (2 * H, H))
+    coarse, fine = (x[-2:] for x in errors_of_two(quadratic, 2 * H, without_mass, 0.08))
     assert np.all(fine < 2e-4)
     assert np.all(np.log2(coarse / fine) > 1.9)
 
@@ -219,7 +232,7 @@ def test_where_held_inputs_jump():
     def reference(m, t):
         return sum(x * exact(m, t - 0.01 * i) for i, x in enumerate(np.diff(load, prepend=0.0)))
 
-    coarse, fine = (errors(run, h, reference, 0.05) for h in (H, H / 2))
+    coarse, fine = errors_of_two(run, H, reference, 0.05)
     assert np.all(coarse < 2e-3)
     assert np.all(np.log2(coarse / fine)[STIFF] > 1.9)
 
@@ -242,7 +255,7 @@ def test_where_held_inputs_jump_other_methods_begin_anew(make, limit):
     def reference(m, t):
         return exact(m, t - 0.01)
 
-    coarse, fine = (errors(run, h, reference, 0.2) for h in (2 * H, H))
+    coarse, fine = errors_of_two(run, 2 * H, reference, 0.2)
     assert np.all(fine < limit)
     assert np.log2(coarse / fine)[0] > 1.7
 
@@ -398,13 +411,14 @@ def two_nodes(x, num_steps=4):
 @pytest.mark.slow
 def test_derivatives_pass_through_the_start():
     """Where damping is resolved, half so, and stiff; forward, reverse and differences."""
-    forward, reverse, run = (jax.jit(f(two_nodes)) for f in (jax.jacfwd, jax.grad, lambda f: f))
+    reverse, along = jax.jit(jax.grad(two_nodes)), jax.jit(lambda x, dx: jax.jvp(two_nodes, (x,), (dx,)))
     for m in (1e-1, 1e-3, 1e-5):
         x = jnp.array([m, 50.0, 5.0, -0.1, 0.1, 0.2])
-        found = forward(x)
+        found = np.array([along(x, dx)[1] for dx in np.eye(6)])
         np.testing.assert_allclose(reverse(x), found, rtol=1e-10)
         for i, h in enumerate(1e-5 * np.abs(x)):
-            change = (run(x.at[i].add(h)) - run(x.at[i].add(-h))) / (2 * h)
+            (after, _), (before, _) = (along(x.at[i].add(step), x) for step in (h, -h))
+            change = (after - before) / (2 * h)
             np.testing.assert_allclose(change, found[i], rtol=2e-5)
 
 
