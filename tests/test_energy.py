@@ -95,7 +95,8 @@ def test_a_top_keeps_its_energy():
     def height(R, t, params):
         return params["m"] * params["g"] * params["l"] * R[2, 1]
 
-    path = hhtjax.simulate(scene.system, hhtjax.hht(0.0), scene.q0, scene.v0, scene.params, dt=1e-3, num_steps=200)
+    stepper = hhtjax.hht(0.0, linearize="predictor")
+    path = hhtjax.simulate(scene.system, stepper, scene.q0, scene.v0, scene.params, dt=1e-3, num_steps=200)
     found = energy_balance(scene.system, path, scene.params, height)
     assert np.ptp(found.potential) > 1
     np.testing.assert_allclose(found.work, 0, atol=1e-6)
@@ -103,11 +104,14 @@ def test_a_top_keeps_its_energy():
 
 
 def dry_balances(scene, numbers, potential=None):
-    for n in numbers:
+    """Runs and their balances, of which the last has most steps."""
+    for n in numbers:  # one program: runs with longer steps go on
         path = hhtjax.simulate(
-            scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params, dt=scene.duration / n, num_steps=n
+            scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params, dt=scene.duration / n, num_steps=numbers[-1]
         )
-        yield path, energy_balance(scene.system, path, scene.params, potential)
+        found, kept = energy_balance(scene.system, path, scene.params, potential), slice(n + 1)
+        path = path._replace(**{name: getattr(path, name)[kept] for name in ("t", "q", "v", "sticking")})
+        yield path, jax.tree.map(lambda x, kept=kept: x[kept], found)
 
 
 @pytest.mark.slow
@@ -135,6 +139,7 @@ def test_a_belt_drives_what_sticks_to_it():
     assert np.max(np.abs(coarse.error)) < 1e-4 * np.max(fine.kinetic)
 
 
+@pytest.mark.slow
 def test_an_impact_takes_what_it_leaves_out_of_the_velocity():
     """A ball that drags and rubs, twice on the floor: only what the method makes is error, of its order."""
     ball = hhtjax.System(
@@ -143,7 +148,8 @@ def test_an_impact_takes_what_it_leaves_out_of_the_velocity():
         friction=lambda q, v, t, p: jnp.array([0.5]),
         sliding=lambda q, v, t, p: v,
     )
-    events = [hhtjax.Event(lambda q, v, t, p: q[0], hhtjax.impact(0.8))]
+    # one program: the run with long steps goes on, without a floor
+    events = [hhtjax.Event(lambda q, v, t, p: q[0] + jnp.where(t > 1.501, 1e3, 0.0), hhtjax.impact(0.8))]
     end = bounce(
         lambda t, y: [y[1], -G - 0.3 * y[1] - 0.5 * np.sign(y[1])],
         [1.0, 0.0], 1.5, lambda y: y[0], lambda y: [0, -0.8 * y[1]],
@@ -155,12 +161,13 @@ def test_an_impact_takes_what_it_leaves_out_of_the_velocity():
     errors = []
     for n in (100, 400):
         path = hhtjax.simulate(
-            ball, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=1.5 / n, num_steps=n, save_every=n // 100, events=events
+            ball, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=1.5 / n, num_steps=400, save_every=2, events=events
         )
         found = energy_balance(ball, path, potential=potential)
         np.testing.assert_array_equal(found.t, path.t)
-        errors.append([np.max(np.abs(found.error)), abs(found.work[-1] - (end[1] ** 2 / 2 + G * (end[0] - 1)))])
-    assert int(path.events.count) == 2
+        error, work = found.error[: n // 2 + 1], found.work[n // 2]
+        errors.append([np.max(np.abs(error)), abs(work - (end[1] ** 2 / 2 + G * (end[0] - 1)))])
+        assert int(path.events.count) == 2
     assert np.all(np.array(errors) < [[1e-2], [1e-3]]), errors
     slope = jax.grad(lambda v: energy_balance(ball, path._replace(v=v), potential=potential).work[-1])(path.v)
     assert np.all(np.isfinite(slope))

@@ -1,5 +1,7 @@
 """Events at known times: loads that are switched on, against formulas; their derivatives; and what is refused."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,23 +55,14 @@ def test_times_at_a_start_that_is_not_zero():
         assert int(run.events.count) == 6
 
 
-GRIDS = {
-    "uneven": {"dt": np.diff(np.linspace(0, 1, 12) ** 1.5)},
-    "adaptive": {"dt": adaptive(1e-4, 1e-7), "times": [0.31, 0.5, 1.0]},
-}
+DIVIDING = np.array(MANY["t0, twice in one step, two at one time, the end"])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("grid", GRIDS)
-def test_they_divide_steps_of_other_grids(grid):
-    """Steps under error control end there, and none is rejected."""
-    T = np.array([0.0, 0.05, 0.3, 0.31, 0.31, 0.32, 1.0])
-    run = loaded(T, **GRIDS[grid])
+def test_they_divide_steps_of_an_uneven_grid():
+    run = loaded(DIVIDING, dt=np.diff(np.linspace(0, 1, 12) ** 1.5))
     run.check()
-    np.testing.assert_allclose(run.q[:, 0], pushed(T, run.t), rtol=0, atol=1e-14)
-    if run.steps is not None:
-        assert int(run.steps.rejected) == 0
-        assert np.isclose(np.cumsum(run.steps.dt)[:, None], T[None, 1:], rtol=1e-14).any(axis=0).all()
+    np.testing.assert_allclose(run.q[:, 0], pushed(DIVIDING, run.t), rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow
@@ -85,37 +78,71 @@ def test_the_members_of_a_sweep_have_times_of_their_own(dts):
 
 
 OSCILLATOR = System(jnp.ones(1), lambda q, v, t, p: p["F"] - p["k"] * (3.0 * q + 0.2 * v))
-STEPS = {"fixed": {"dt": 0.1, "num_steps": 10}, "adaptive": {"dt": adaptive(1e-3, 1e-6), "times": np.array([1.0])}}
+STEPS = {
+    "fixed": {"dt": 0.1, "num_steps": 10},
+    "adaptive": {"dt": adaptive(1e-4, 1e-7), "times": np.array([0.31, 0.5, 1.0])},
+}
+
+
+def kicked(T, k, steps):
+    """Seven times of two newtons more each, and one of a kick: the end and the first time; and the run."""
+    load = Event(at=T[:7], switch=lambda p: p | {"F": p["F"] + 2.0})
+    kick = Event(at=T[7], reset=lambda q, v, t, p: v + 1)
+    params, events = {"F": 0.0, "k": k}, [load, kick]
+    run = simulate(OSCILLATOR, LIGHT, ONE, ZERO, params, events=events, max_events=7, **STEPS[steps])
+    return jnp.concatenate([run.q[-1], run.v[-1], run.events.t[:1]]), run
+
+
+@partial(jax.jit, static_argnums=3)
+def along(T, k, dT, steps):
+    """The end, its derivative along dT, and the run."""
+    return jax.jvp(lambda T: kicked(T, k, steps), (T,), (dT,), has_aux=True)
+
+
+@partial(jax.jit, static_argnums=3)
+def back(T, k, weights, steps):
+    return jax.vjp(lambda T: kicked(T, k, steps)[0], T)[1](weights)[0]
+
+
+LATE = 2.0  # behind the end
+
+
+@pytest.mark.slow
+def test_they_divide_steps_under_error_control():
+    """Steps end there, and none is rejected."""
+    T = DIVIDING
+    _, _, run = along(np.append(T, LATE), 0.0, np.zeros(8), "adaptive")
+    run.check()
+    np.testing.assert_allclose(run.q[:, 0], 1 + 2 * pushed(T, run.t), rtol=0, atol=1e-14)
+    assert int(run.steps.rejected) == 0
+    assert np.isclose(np.cumsum(run.steps.dt)[:, None], T[None, 1:], rtol=1e-14).any(axis=0).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", STEPS)
 def test_the_derivative_in_the_times(steps):
     """Of q and v at the end, and of the first time: forward, reverse, and differences of the run; of a free body, with
-    times on the grid, which differences would cross, the formula."""
+    times on the grid, which differences would cross, the formula. Of two loads and the kick; the others come late."""
+    used = np.array([0, 1, 7])
 
-    def end(T, k):
-        load = Event(at=T[:2], switch=lambda p: p | {"F": p["F"] + 2.0})
-        kick = Event(at=T[2], reset=lambda q, v, t, p: v + 1)
-        params, events = {"F": 0.0, "k": k}, [load, kick]
-        run = simulate(OSCILLATOR, LIGHT, ONE, ZERO, params, events=events, **STEPS[steps])
-        return jnp.concatenate([run.q[-1], run.v[-1], run.events.t[:1]])
-
-    along = jax.jit(lambda T, k, dT: jax.jvp(lambda T: end(T, k), (T,), (dT,)))
-    back = jax.jit(lambda T, k, weights: jax.vjp(lambda T: end(T, k), T)[1](weights)[0])
+    def at(first, second, kick):
+        return np.array([first, second, *[LATE] * 5, kick])
 
     def by_column(T, k):
-        return np.stack([along(T, k, dT)[1] for dT in np.eye(3)], axis=1)
+        return np.stack([along(T, k, dT, steps)[1] for dT in np.eye(8)[used]], axis=1)
 
     def by_row(T, k):
-        return np.stack([back(T, k, weights) for weights in np.eye(3)])
+        rows = np.stack([back(T, k, weights, steps) for weights in np.eye(3)])
+        assert not np.any(np.delete(rows, used, axis=1))
+        return rows[:, used]
 
-    T = np.array([0.23, 0.61, 0.74])
+    T = at(0.23, 0.61, 0.74)
     assert abs(by_column(T, 1.0) - by_row(T, 1.0)).max() < 1e-13
     if steps == "fixed":  # chosen steps would change with the times
-        central = [(along(T + d, 1.0, d)[0] - along(T - d, 1.0, d)[0]) / 2e-6 for d in 1e-6 * np.eye(3)]
+        ends = [[along(T + s * d, 1.0, d, steps)[0] for s in (1, -1)] for d in 1e-6 * np.eye(8)[used]]
+        central = [(on - before) / 2e-6 for on, before in ends]
         assert abs(by_column(T, 1.0) - np.stack(central, axis=1)).max() < 1e-8
-    T = np.array([0.2, 0.6, 0.6])
+    T = at(0.2, 0.6, 0.6)
     exact = [[-1.6, -0.8, -1.0], [-2.0, -2.0, 0.0], [1.0, 0.0, 0.0]]
     for found in by_column(T, 0.0), by_row(T, 0.0):
         np.testing.assert_allclose(found, exact, rtol=0, atol=1e-12)
@@ -162,6 +189,7 @@ def test_a_first_order_system():
     np.testing.assert_allclose(run.q[:, 0], t - (t > 0.5) - (t > 1.5 - 1e-9), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_float32_keeps_its_dtype():
     one = np.ones(1, np.float32)
     params = {"F": np.float32(0), "T": np.array([0.1, 0.35], np.float32)}
@@ -190,6 +218,7 @@ def test_other_times_compile_nothing():
     assert len(traced) <= before + 2  # the values are looked at anew
 
 
+@pytest.mark.slow
 def test_times_that_do_not_increase_are_named_under_jit_too():
     def end(T):
         return loaded(T)

@@ -19,13 +19,16 @@ BATCH = jnp.cos(jnp.arange(6.0 * 3 * 3)).reshape(6, 3, 3)
 EIGHTS = jnp.sin(jnp.arange(3.0 * 4 * 5 * 8)).reshape(3, 4, 5, 8)
 
 
+@pytest.mark.slow
 @on_cpu
 @pytest.mark.compiled
 def test_one_kernel_gives_what_the_plain_path_gives(monkeypatch):
-    one = jax.jit(jax.value_and_grad(loss))(2.0)
+    one, verdicts = run(jax.value_and_grad(loss), 2.0)
+    assert verdicts == ("one kernel", "one kernel")
     monkeypatch.setattr(fit_for_kernel, "KNOWN", set())
-    assert paths(jax.grad(loss), 2.0)[0].startswith("plain: ")
-    assert np.allclose(one, jax.jit(jax.value_and_grad(loss))(2.0), rtol=1e-12, atol=0)
+    plain, verdicts = run(jax.value_and_grad(loss), 2.0)
+    assert verdicts[0].startswith("plain: ")
+    assert np.allclose(one, plain, rtol=1e-12, atol=0)
 
 
 @on_cpu
@@ -51,6 +54,7 @@ def test_a_conditional_on_an_argument_stays():
     assert paths(f, 1, 0.5) == ("one kernel",)
 
 
+@pytest.mark.slow
 @on_cpu
 def test_derivatives_and_batches_are_one_kernel_too():
     assert paths(jax.grad(partial(loss, stepper=hhtjax.hht())), 2.0) == ("one kernel", "one kernel")

@@ -1,5 +1,7 @@
 """Initial values nearest to a guess that is far off: chains and loops of links, against SciPy's optimisers."""
 
+from functools import cache, partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +27,7 @@ def is_closed(q, t, params):
     return jnp.stack([across, crank * jnp.sin(q[0]) + coupler * jnp.sin(q[1]) - rocker * jnp.sin(q[2])])
 
 
+@cache
 def system(constraint, size=3):
     return hhtjax.System(jnp.ones(size), lambda q, v, t, params: 0 * v, constraint)
 
@@ -53,9 +56,10 @@ def nearest_by_scipy(constraint, guess, params, rng, starts=5):
     return min(found)
 
 
+@partial(jax.jit, static_argnums=0)
 def starts(made, guesses, params):
-    """All of them, in one program."""
-    return jax.jit(jax.vmap(lambda q: hhtjax.consistent_initial(made, q, 0 * q, params)))(jnp.asarray(guesses))
+    """All of them, in one program; params are those of each."""
+    return jax.vmap(lambda q, params: hhtjax.consistent_initial(made, q, 0 * q, params))(guesses, params)
 
 
 def check_against_scipy(constraint, found, guesses, params, count):
@@ -76,7 +80,7 @@ def test_three_links_that_are_guessed_badly():
     angles = np.cumsum(CHAIN)
     place = jnp.array([np.cos(angles).sum(), np.sin(angles).sum()])
     guesses = CHAIN + np.random.default_rng(0).uniform(-1.2, 1.2, (300, 3))
-    found = starts(system(end_is_held), guesses, place)
+    found = starts(system(end_is_held), guesses, np.tile(place, (300, 1)))
     away = check_against_scipy(end_is_held, found, guesses, place, 12)
     assert np.all(away <= np.linalg.norm(guesses - CHAIN, axis=1) + 1e-9)  # CHAIN is a point on the constraint
 
@@ -86,7 +90,7 @@ def test_four_bars_guessed_to_34_degrees():
     """200 guesses: Newton alone missed the nearest in 11."""
     truth = close(1.0, BARS)
     guesses = truth + np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
-    found = starts(system(is_closed), guesses, jnp.asarray(BARS))
+    found = starts(system(is_closed), guesses, np.tile(BARS, (200, 1)))
     away = check_against_scipy(is_closed, found, guesses, jnp.asarray(BARS), 12)
     assert np.all(away <= np.linalg.norm(guesses - truth, axis=1) + 1e-9)
 
@@ -103,9 +107,9 @@ def test_a_circle_from_inside():
 
 def test_links_that_are_too_short_are_not_converged():
     """Under jit, too: a search that runs away leaves a part of Phi that is small beside q, but not small."""
-    for place in ([4.0, 1.0], [3.1, 0.0], [-2.0, 6.0]):
-        place = jnp.array(place)
-        assert not starts(system(end_is_held), CHAIN[None], place).converged[0]
+    places = np.array([[4.0, 1.0], [3.1, 0.0], [-2.0, 6.0]])
+    assert not np.any(starts(system(end_is_held), np.tile(CHAIN, (3, 1)), places).converged)
+    for place in jnp.asarray(places):
         with pytest.raises(ValueError, match=r"no q with Phi\(q, t\) = 0 found near `q0`: .* is left of it"):
             hhtjax.consistent_initial(system(end_is_held), CHAIN, 0 * CHAIN, place)
 
