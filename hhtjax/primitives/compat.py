@@ -114,7 +114,7 @@ def _too_new() -> str:
     """In words, which a warning says as well, once in a process."""
     newest = ".".join(map(str, NEWEST))
     why = f"JAX {jax.__version__} is newer than {newest}, the last one tested; {VARIABLE}=0 tries it all the same"
-    if not _told:
+    if not _told and jax.default_backend() == "cpu":  # elsewhere plain JAX is what runs in any case
         _told.append(why)
         _warn(
             f"hhtjax runs on plain JAX: the same numbers, several times slower. {why} (an environment variable). "
