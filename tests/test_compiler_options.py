@@ -38,6 +38,15 @@ def test_few_unknowns_take_options_and_no_jit_of_a_user_has_them():
     assert jax.grad(programs)(3.0) == 2
 
 
+@pytest.mark.parametrize("change", [jax.jit, jax.grad, jax.checkpoint, lambda f: jax.vmap(jax.grad(f))])
+def test_no_program_with_options_is_made_where_jax_would_refuse_it(change):
+    """In reverse mode only after the forward part has been compiled, and run, for nothing."""
+    programs = of_twice()
+    programs.quick = programs.wide = None
+    x = 1.0 if change in (jax.jit, jax.grad, jax.checkpoint) else jnp.ones(2)
+    assert jnp.all(change(lambda x: programs(x, rates=2, numbers=2))(x) == 2)
+
+
 @pytest.mark.skipif(not ARE_TAKEN, reason="no options here")
 @pytest.mark.parametrize("numbers", [None, 2])
 def test_an_option_that_xla_does_not_know_is_tried_once(numbers, monkeypatch):

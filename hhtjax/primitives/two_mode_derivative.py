@@ -233,6 +233,11 @@ pe.partial_eval_jaxpr_custom_rules[both_p] = _divide_equation
 
 
 KNOWN = "EvalTrace", "DynamicJaxprTrace"  # without any, and inside a jit
+IN_PROGRAMS = (
+    "DynamicJaxprTrace",
+    "LinearizeTrace",
+    "JaxprTrace",
+)  # of a jit, and of reverse mode, old or new
 
 
 def is_untouched() -> bool:
@@ -310,6 +315,25 @@ def is_in_batch() -> bool:
     """
     trace = _here.bind()
     while trace is not None and type(trace).__name__ != "BatchTrace":
+        trace = getattr(trace, "parent_trace", None)
+    return trace is not None
+
+
+def is_in_program() -> bool:
+    """Whether what is called here becomes part of a program: of a jit that is traced, or of reverse mode.
+
+    A jit called there may have no options for the compiler. JAX says so of reverse mode only after it has compiled, and
+    run, the forward part with them.
+
+    >>> import jax
+    >>> seen, x = [], jax.numpy.ones(1)
+    >>> for change in (jax.vmap, jax.jacfwd, jax.jit, jax.grad, lambda f: jax.vmap(jax.grad(lambda x: f(x[None])))):
+    ...     _ = change(lambda x: seen.append(is_in_program()) or x.sum())(x)
+    >>> seen
+    [False, False, True, True, True]
+    """
+    trace = _here.bind()
+    while trace is not None and type(trace).__name__ not in IN_PROGRAMS:
         trace = getattr(trace, "parent_trace", None)
     return trace is not None
 

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 LARGEST_SUM = 4095  # numbers of a sum; XLA hands larger ones to another library
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
-MOST_OPERATIONS = 15_000  # of more, compiling takes long, or fails: LLVM takes 20 s for a gradient of 12,500
+# of a kernel with more, compiling takes longer than 20 s, or fails: on one core 3 s for 4,700, 7 s for 8,500, 18 s for
+# 13,900; gradients and branches take .2 to 1.2 ms an operation
+MOST_OPERATIONS = 15_000
 MOST_IN_BRANCH = 12_500  # the same in one branch, which is seldom taken
 MOST_IN_BRANCHES = 15_000  # and in all together
 

@@ -24,6 +24,7 @@ from hhtjax.primitives.compat import is_on, or_plain
 from hhtjax.primitives.interpreter import asked, line_of
 from hhtjax.primitives.kernel_primitive import kernel_p, of_jaxpr
 from hhtjax.primitives.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
+from hhtjax.primitives.two_mode_derivative import is_in_program
 from hhtjax.xla.fit_for_kernel import inner, verdict
 from hhtjax.xla.for_kernel import for_kernel, for_list, kernel
 from hhtjax.xla.waiting import tell_if_long, telling_if_long
@@ -142,6 +143,8 @@ class Programs:
         """The one for a system of so many rates, 0 where nothing is known of one. numbers: in the position of a member
         of a batch, None where members come one by one."""
         if Programs.are_refused or rates > MOST_QUICK or not is_on() or jax.default_backend() != "cpu":
+            return self.usual
+        if is_in_program():
             return self.usual
         return self.wide if numbers is not None and numbers <= MOST_WIDE else self.quick
 
