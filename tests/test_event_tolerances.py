@@ -68,6 +68,7 @@ def bounced(times, e):
     return np.where(number == 0, 1.0, 0.0) + up * since - G / 2 * since**2, up - G * since
 
 
+@pytest.mark.slow
 def test_samples_lie_on_the_motion():
     """Steps have no error, and grow until one holds several samples and events; one sample is an impact."""
     times = np.sort(np.append(np.linspace(0.0, 1.8, 61)[1:], np.sqrt(2 / G)))
