@@ -16,10 +16,8 @@ from zoo import each
 
 from hhtjax.jaxpr import linear_maps, scalar_rules, scalars
 from hhtjax.numerics.dense_lu import matvec
-from hhtjax.primitives import compat
-from hhtjax.primitives.batching import in_turn
+from hhtjax.primitives import compat, in_turn, largest_in_batch, staged, structural
 from hhtjax.primitives.consistent import held
-from hhtjax.primitives.kernels import largest_in_batch, staged, structural
 from hhtjax.rotation import cross, stumpff
 
 pytestmark = [

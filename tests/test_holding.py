@@ -9,7 +9,7 @@ import pytest
 from linked_pendulums import on_cpu
 
 import hhtjax
-from hhtjax.primitives import kernels
+from hhtjax import primitives
 from hhtjax.xla import for_kernel
 
 x = jnp.linspace(0.4, 1.1, 3)
@@ -33,25 +33,25 @@ def shared(x):
 
 
 def in_kernel(x):
-    return kernels.one_kernel(shared, x)
+    return primitives.one_kernel(shared, x)
 
 
 def beside_a_sort(x):
     """In what is no kernel, too."""
-    return kernels.one_kernel(lambda x: (*shared(x), jnp.sort(x)), x)
+    return primitives.one_kernel(lambda x: (*shared(x), jnp.sort(x)), x)
 
 
 def in_a_loop(x):
     """In a loop, of what a function gives that XLA inlines."""
     inner = jax.jit(chain)
     start = used(x, x)
-    return kernels.one_kernel(lambda x: jax.lax.fori_loop(0, 2, lambda i, carry: used(inner(carry[1]), x), start), x)
+    return primitives.one_kernel(lambda x: jax.lax.fori_loop(0, 2, lambda i, carry: used(inner(carry[1]), x), start), x)
 
 
 def in_a_function(x):
     """Of a value that a single operation takes, a call of a function that uses it three times."""
     inner = jax.jit(used)
-    return kernels.one_kernel(lambda x: inner(chain(x), x), x)
+    return primitives.one_kernel(lambda x: inner(chain(x), x), x)
 
 
 def products(f):

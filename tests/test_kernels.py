@@ -10,7 +10,7 @@ import pytest
 from linked_pendulums import LIGHT, N, end, loss, on_cpu, paths, run
 
 import hhtjax
-from hhtjax.primitives import kernels
+from hhtjax import primitives
 from hhtjax.xla import fit_for_kernel
 
 x = jnp.linspace(0.1, 1.0, 4)
@@ -38,7 +38,7 @@ def test_a_loop_of_which_only_an_integer_is_used():
         def halved(carry):
             return carry[0] / 2, carry[1] + 1
 
-        return kernels.one_kernel(lambda x: jax.lax.while_loop(lambda carry: carry[0] > 0.1, halved, (x, 0)), x)[1]
+        return primitives.one_kernel(lambda x: jax.lax.while_loop(lambda carry: carry[0] > 0.1, halved, (x, 0)), x)[1]
 
     assert int(jax.jit(count)(1.0)) == 4
     assert paths(count, 1.0) == ("one kernel",)
@@ -48,7 +48,7 @@ def test_a_loop_of_which_only_an_integer_is_used():
 @pytest.mark.compiled
 def test_a_conditional_on_an_argument_stays():
     def f(i, x):
-        return kernels.one_kernel(lambda i, x: jax.lax.switch(i, [jnp.sin, jnp.cos], x), i, x)
+        return primitives.one_kernel(lambda i, x: jax.lax.switch(i, [jnp.sin, jnp.cos], x), i, x)
 
     assert [float(jax.jit(f)(i, 0.5)) for i in (0, 1)] == pytest.approx([np.sin(0.5), np.cos(0.5)], rel=1e-15)
     assert paths(f, 1, 0.5) == ("one kernel",)
@@ -122,7 +122,7 @@ def test_what_xla_cannot_compile_into_one_kernel_runs_plainly(name):
         return jax.lax.scan(lambda c, _: (body(c), None), c, None, 3)[0]
 
     def f(c):
-        return kernels.one_kernel(loop, c)
+        return primitives.one_kernel(loop, c)
 
     def run(f, c):
         return jax.grad(lambda c: jnp.sum(f(c)))(c) if name == "gather, in reverse" else f(c)
@@ -174,7 +174,7 @@ def test_every_product_compiles_in_value_and_reverse():
             found += jax.grad(lambda A, B, f=f: jnp.sum(jnp.sin(f(A, B))), (0, 1))(A, B)
         return found
 
-    one, verdicts = run(all_of, kernels.one_kernel)
+    one, verdicts = run(all_of, primitives.one_kernel)
     for x, y in zip(one, run(all_of, lambda f, *args: f(*args))[0], strict=True):
         assert np.allclose(x, y, rtol=1e-12, atol=1e-12)
     assert sum(verdict == "one kernel" for verdict in verdicts) >= 36, verdicts  # not three that are too large
@@ -223,9 +223,9 @@ def test_a_stage_of_a_large_batch_is_not_divided_among_threads():
 
     def f(c):
         def body(c, _):
-            return kernels.staged(lambda c: jnp.sin(c) * c)(c) + c / 2, None
+            return primitives.staged(lambda c: jnp.sin(c) * c)(c) + c / 2, None
 
-        return kernels.one_kernel(lambda c: jax.lax.scan(body, c, None, 2)[0], c)
+        return primitives.one_kernel(lambda c: jax.lax.scan(body, c, None, 2)[0], c)
 
     assert jnp.all(jnp.isfinite(jax.jit(f)(c)))
 
@@ -239,7 +239,7 @@ def test_a_batch_of_thousands_compiles():
 
 def test_a_program_for_several_platforms_is_plain():
     def f(c):
-        return kernels.one_kernel(lambda c: jax.lax.scan(lambda c, _: (jnp.sin(c), None), c, None, 3)[0], c)
+        return primitives.one_kernel(lambda c: jax.lax.scan(lambda c, _: (jnp.sin(c), None), c, None, 3)[0], c)
 
     exported = jax.export.export(jax.jit(f), platforms=("cpu", "cuda"))(x)
     assert "xla_cpu_small_call" not in exported.mlir_module()
@@ -255,9 +255,9 @@ def test_shared_values_are_computed_once():
             return jnp.cumsum(y * x) + y[::-1] * x, None
 
         def run(x):
-            return kernels.one_kernel(lambda x: jax.lax.scan(body, x, None, 99)[0], x)
+            return primitives.one_kernel(lambda x: jax.lax.scan(body, x, None, 99)[0], x)
 
         return str(jax.jit(run).lower(jnp.ones(N, jnp.float32)).compile().as_text()).count(" sine(")
 
-    assert sines(partial(kernels.staged, size=N)) == 1
-    assert sines(partial(kernels.staged, size=1)) == 2  # fused into both users
+    assert sines(partial(primitives.staged, size=N)) == 1
+    assert sines(partial(primitives.staged, size=1)) == 2  # fused into both users

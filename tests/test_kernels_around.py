@@ -13,7 +13,7 @@ from helpers import SPRING, ZERO
 from linked_pendulums import on_cpu, paths
 
 import hhtjax
-from hhtjax.primitives import kernels
+from hhtjax import primitives
 
 x = jnp.linspace(0.1, 1.0, 4)
 KERNEL = 'xla_cpu_small_call = "true"'
@@ -26,9 +26,9 @@ def test_a_kernel_around_others():
 
     def around(f, x):
         def whole(x):
-            return f(kernels.one_kernel(lambda x: 2 * x, x)) + 1
+            return f(primitives.one_kernel(lambda x: 2 * x, x)) + 1
 
-        return kernels.one_kernel(whole, x, around=True)
+        return primitives.one_kernel(whole, x, around=True)
 
     for f in (jnp.cos, jnp.sort):
         assert jax.jit(partial(around, f)).lower(-x).as_text().count(KERNEL) == 1
@@ -67,21 +67,20 @@ def test_the_users_line_that_stands_against_a_kernel_is_told():
 
 def test_who_is_alone_goes_on():
     some = jnp.array([True, False])
-    assert jax.jit(kernels.or_alone)(False)
-    for batch in (jax.vmap(kernels.or_alone), jax.jit(jax.vmap(kernels.or_alone))):
+    assert jax.jit(primitives.or_alone)(False)
+    for batch in (jax.vmap(primitives.or_alone), jax.jit(jax.vmap(primitives.or_alone))):
         assert batch(some).tolist() == some.tolist()
-    assert jax.vmap(jax.vmap(kernels.or_alone))(some[None]).tolist() == [some.tolist()]
+    assert jax.vmap(jax.vmap(primitives.or_alone))(some[None]).tolist() == [some.tolist()]
 
 
 SHARDED = """
 import jax, jax.numpy as jnp
 from jax.sharding import NamedSharding, PartitionSpec
-from hhtjax import explain
-from hhtjax.primitives import kernels
+from hhtjax import explain, primitives
 mesh = jax.make_mesh((2,), ("b",))
 x = jnp.arange(8.0)
 def f(c):
-    return kernels.one_kernel(lambda c: jax.lax.scan(lambda c, _: (c - jnp.mean(c) / 2, None), c, None, 3)[0], c)
+    return primitives.one_kernel(lambda c: jax.lax.scan(lambda c, _: (c - jnp.mean(c) / 2, None), c, None, 3)[0], c)
 sharded = jax.device_put(x, NamedSharding(mesh, PartitionSpec("b")))
 assert jnp.allclose(jax.jit(f)(sharded), f(x))
 assert explain(f, sharded).paths[0].startswith("plain: partitioned"), explain(f, sharded).paths

@@ -17,10 +17,10 @@ from matrices import (
     zero_diagonal,
 )
 
-from hhtjax import explain
+from hhtjax import explain, primitives
 from hhtjax.numerics.dense_lu import UNROLLED, factorize, matvec
 from hhtjax.numerics.linear_solve import factorize_with, solve, solve_map
-from hhtjax.primitives import compat, kernels
+from hhtjax.primitives import compat
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -190,7 +190,7 @@ def test_elimination_is_a_loop_inside_a_kernel_and_lapack_s_elsewhere(made):
         return inverse(b), inverse(b, trans=1), jax.grad(lambda b: jnp.sum(solve(A, b) ** 3) / 3)(b)
 
     def inside(A, b):
-        return kernels.one_kernel(many, A, b)
+        return primitives.one_kernel(many, A, b)
 
     A, b = made(UNROLLED + 4)
     x = np.linalg.solve(A, b)

@@ -42,20 +42,29 @@ def three(n):
     )
 
 
-def path(system, n, params, **options):
+def path(system, n, params, dt=0.05, **options):
     stepper = hhtjax.hht(alpha=-0.1, **options)
     start = jnp.linspace(0.0, 1.0, n), jnp.ones(n)
-    return hhtjax.simulate(system, stepper, *start, params, dt=0.05, num_steps=30)
+    return hhtjax.simulate(system, stepper, *start, params, dt=dt, num_steps=30)
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """Of the three systems: the program and the run. A step that is known would be factorised before the program."""
+
+    def both(system):
+        program = jax.jit(lambda dt: path(system, 20, 300.0, dt)).lower(0.05).compile()
+        return program.as_text(), program(0.05)
+
+    return [both(system) for system in three(20)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", [{}, {"linearize": "state"}, {"iterations": None, "tolerance": 1e-11}], ids=str)
-def test_the_motion_is_that_of_the_general_system(form):
-    n = 20
-    systems = three(n)
-    if form:  # on all coordinates it is like any other system; the plain form shows it
-        systems = systems[::2]
-    runs = [path(system, n, 300.0, **form) for system in systems]
+def test_the_motion_is_that_of_the_general_system(form, compiled):
+    # on all coordinates it is like any other system; the plain form shows it
+    local_and_general = [path(system, 20, 300.0, **form) for system in three(20)[::2]] if form else []
+    runs = local_and_general or [run for _, run in compiled]
     for run in runs:
         run.check()
         np.testing.assert_allclose(run.q, runs[-1].q, rtol=1e-10, atol=1e-11)
@@ -100,20 +109,15 @@ def test_other_steppers_take_the_force_along():
 
 
 @pytest.mark.slow
-def test_a_force_at_few_coordinates_leaves_one_factorisation_outside_the_loop():
+def test_a_force_at_few_coordinates_leaves_one_factorisation_outside_the_loop(compiled):
     """In the program of the run; of the force on all coordinates it stands inside."""
-    n = 20
 
-    def factorised_in_loops(system):
-        def end(q0, dt):  # a step that is known is factorised before the program
-            return hhtjax.simulate(system, hhtjax.hht(), q0, jnp.ones(n), 300.0, dt=dt, num_steps=50, save_every=50).q
-
-        parts = jax.jit(end).lower(jnp.ones(n), 0.05).compile().as_text().split("\n\n")
-        found = [part for part in parts if "lapack_dgetrf" in part]
+    def factorised_in_loops(text):
+        found = [part for part in text.split("\n\n") if "lapack_dgetrf" in part]
         assert found
         return any("ENTRY" not in part for part in found)
 
-    local, everywhere, _ = three(n)
+    local, everywhere, _ = (text for text, _ in compiled)
     assert not factorised_in_loops(local)
     assert factorised_in_loops(everywhere)
 

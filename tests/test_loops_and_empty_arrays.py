@@ -7,7 +7,7 @@ import pytest
 from linked_pendulums import on_cpu, paths
 
 import hhtjax
-from hhtjax.primitives import kernels
+from hhtjax import primitives
 from hhtjax.xla import fit_for_kernel
 
 
@@ -73,7 +73,7 @@ def test_branches_are_counted_by_themselves(monkeypatch):
         return x
 
     def loop(f):
-        return lambda x: kernels.one_kernel(lambda x: jax.lax.fori_loop(0, 3, lambda i, x: f(x), x), x)
+        return lambda x: primitives.one_kernel(lambda x: jax.lax.fori_loop(0, 3, lambda i, x: f(x), x), x)
 
     def seldom(x):
         return jax.lax.cond(x > 1, waves, lambda x: waves(x * 2), x)

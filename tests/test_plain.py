@@ -11,7 +11,8 @@ import pytest
 from linked_pendulums import N, end, links, loss, on_cpu, paths
 
 import hhtjax
-from hhtjax.primitives import compat, kernels
+from hhtjax import primitives
+from hhtjax.primitives import compat
 
 GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged"
 
@@ -19,7 +20,7 @@ GIVEN_AWAY = "xla_cpu_small_call", "inlineable", "hhtjax_staged"
 def of_all_kinds(params):
     """A run by a function that was jitted outside, with a choice, stages, scalars and a matrix of a linear map."""
     return jax.value_and_grad(
-        jax.jit(lambda p: jax.jit(loss)(p * kernels.choose(jnp.sign, jnp.sign, jax.lax.stop_gradient(p))))
+        jax.jit(lambda p: jax.jit(loss)(p * primitives.choose(jnp.sign, jnp.sign, jax.lax.stop_gradient(p))))
     )(params)
 
 

@@ -10,7 +10,7 @@ from jax import lax
 import hhtjax
 from hhtjax.jaxpr import scalars
 from hhtjax.jaxpr.scalars import Scalars, by_scalars, join, pays, split
-from hhtjax.primitives import compat, kernels, structural
+from hhtjax.primitives import compat, staged, structural
 from hhtjax.scenes import double_pendulum, slider_crank
 
 old = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
@@ -65,7 +65,7 @@ FUNCTIONS = {
     "large array": lambda x: jnp.interp(
         x, jnp.linspace(-3, 3, 100, dtype=x.dtype), jnp.linspace(0, 1, 100, dtype=x.dtype) ** 2
     ),
-    "a stage": lambda x: sum(kernels.staged(lambda x, y: (x, x * y, y))(x, x[::-1] ** 2)),
+    "a stage": lambda x: sum(staged(lambda x, y: (x, x * y, y))(x, x[::-1] ** 2)),
     "integers": lambda x: x * (jnp.arange(3) % 2).astype(x.dtype) + jnp.argmax(x).astype(x.dtype),
 }
 

@@ -8,7 +8,7 @@ from jax import lax
 from linked_pendulums import on_cpu
 
 import hhtjax
-from hhtjax.primitives import kernels
+from hhtjax import primitives
 from hhtjax.xla import for_kernel, lowering
 
 x = jnp.linspace(-0.4, 1.1, 6)
@@ -17,14 +17,14 @@ KERNEL = 'xla_cpu_small_call = "true"'
 
 def smooth(x, y):
     """A stage that is a kernel, with another, a loop and an unused argument in it."""
-    z = kernels.staged(lambda x: jnp.sin(x) * x[0] - jnp.cos(x[::-1]) / 3)(x)
+    z = primitives.staged(lambda x: jnp.sin(x) * x[0] - jnp.cos(x[::-1]) / 3)(x)
     return lax.fori_loop(0, 3, lambda i, z: 0.9 * z + jnp.tanh(z) * x[i], z), x[None] * x[:, None]
 
 
-smooth_part = kernels.part(smooth)
+smooth_part = primitives.part(smooth)
 
 
-@kernels.staged
+@primitives.staged
 def sorted_stage(x, flag):
     """A stage that is none, and holds one."""
     a, b = smooth_part(x, 2 * x)
@@ -34,12 +34,12 @@ def sorted_stage(x, flag):
 def step(x, i):
     """Calls the same stage from two places, and one of few operations."""
     y = sorted_stage(x, i > 1)
-    z = kernels.staged(lambda y: -y)(y)
+    z = primitives.staged(lambda y: -y)(y)
     return sorted_stage(jnp.exp(z - 1), i > 0), jnp.sum(y * z)
 
 
 def run(x):
-    return kernels.one_kernel(lambda x: lax.scan(step, x, jnp.arange(3)), x)
+    return primitives.one_kernel(lambda x: lax.scan(step, x, jnp.arange(3)), x)
 
 
 def loss(x):
