@@ -61,6 +61,7 @@ def structure(matrix):
     return {round(x.value.real, 10) + 0.0: x.blocks for x in analysis.jordan_structure(matrix)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [0.0, -0.05, -0.3])
 def test_hht_has_one_jordan_block_at_infinity_and_ggl_has_none(alpha):
     double, weight = round(-(1 + alpha) / (1 - alpha), 10), round(alpha / (1 + alpha), 10)
@@ -183,6 +184,7 @@ def test_tangent_of_a_step_predicts_what_becomes_of_a_perturbation(system, q0, v
     np.testing.assert_allclose(central_difference(x), A @ x, atol=1e-8 * np.linalg.norm(x))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "v0"),
     [

@@ -73,6 +73,7 @@ def assert_equal_to_rounding(x, y):
     assert np.max(np.abs(x - y)) <= 1e-13 * np.max(np.abs(y))
 
 
+@pytest.mark.slow
 def test_formulations_agree():
     params = random_chain(6, 1)
     q, v = states(6, 20)

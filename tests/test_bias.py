@@ -65,6 +65,7 @@ def test_predicted_bias_is_measured_and_taken_back():
         assert Refined.from_json(refined._replace(stepper=other).to_json()).stepper == other
 
 
+@pytest.mark.slow
 def test_only_numerical_damping_needs_a_third_level():
     undamped = hhtjax.hht(alpha=0.0), hhtjax.generalized_alpha(rho_inf=1.0), hhtjax.kim_hht(alpha=0.0)
     damped = hhtjax.hht(alpha=-0.01), hhtjax.rk4(), hhtjax.kim_implicit_euler()
@@ -215,6 +216,7 @@ def test_a_constraint_leaves_the_bias_of_the_minimal_form():
     assert np.min(np.abs(mu - np.exp(s * dt))) < 1e-9
 
 
+@pytest.mark.slow
 def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
     """alpha = 0 turns a mode of w h into one of 2 arctan(w h/2): exp(2.2i) is nearest to what becomes of 3. Wilson's
     method leaves no oscillation of the last."""

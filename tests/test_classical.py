@@ -105,6 +105,7 @@ def test_backward_differences_have_their_characteristic_roots(name):
     assert 0.99 < radii(1e-3)[-1] < 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHARACTERISTIC)
 def test_the_analyses_are_of_backward_differences_and_not_of_their_starter(name):
     """Oscillators with w h = 0.1, where a spurious root of Park's oscillates faster, and 1; y' = z y by BDF3."""

@@ -19,6 +19,7 @@ def namespace():
     return known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["scipy", "diffrax", "mujoco"])
 @pytest.mark.filterwarnings("ignore")  # theirs
 def test_each_package_agrees(package, namespace):

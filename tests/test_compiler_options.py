@@ -61,6 +61,7 @@ def test_an_option_that_xla_does_not_know_is_tried_once(numbers, monkeypatch):
     assert jax.value_and_grad(lambda x: programs(x, rates=2, numbers=numbers))(3.0) == (6, 2)
 
 
+@pytest.mark.slow
 def test_programs_of_the_library_are_chosen_by_their_unknowns(monkeypatch):
     """A run, a sweep, a fit, and steps that are chosen."""
     chosen = []

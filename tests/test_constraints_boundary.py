@@ -61,6 +61,7 @@ def bead(size, off, origin=0.0):
     return run_from(circle, (origin, -size * (1 + off)), ZERO)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "off"), [(1e-6, 5e-3), (1.0, 1e-5)])
 def test_a_small_mechanism_is_off_by_its_own_measure(size, off):
     bead(size, off / 10)().check()

@@ -82,6 +82,7 @@ def test_any_count_that_is_data(count):
         assert np.isnan(value(0.0, LONGEST + 1)[1])
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_with_counts_of_their_own():
     found = jax.jit(jax.vmap(every(looped), (None, None, 0)))(*AT, jnp.array([0, COUNT]))
     expected = every(unrolled)(*AT)

@@ -51,6 +51,7 @@ def test_resting_contact_fails_by_name():
     assert np.nanmin(run.q) > -1e-9
 
 
+@pytest.mark.slow
 def test_impacts_at_the_ends_of_steps_are_at_their_times():
     """Where rounding puts the zero of the guard before the end, or behind it."""
     times = 0.01 * np.arange(5, 100)

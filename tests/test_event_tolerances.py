@@ -120,6 +120,7 @@ def test_derivatives_are_those_of_the_accepted_steps():
     assert abs(reverse - np.stack(central)).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_failures_keep_their_names_and_one_program():
     """A motion to rest ends at 3 sqrt(2/g) with e = .5; all tolerances, and e, are data."""
     run = drop(0.5)

@@ -20,6 +20,7 @@ def into_the_corner(events):
     return simulate(free, LIGHT, jnp.full(2, 0.35), jnp.full(2, -1.0), **options)
 
 
+@pytest.mark.slow
 def test_impacts_at_one_time_that_do_not_change_each_other_both_act():
     """And one that is noted beside them sees the motion as it comes."""
     run = into_the_corner([*WALLS, Event(OBLIQUE.guard)])
@@ -30,6 +31,7 @@ def test_impacts_at_one_time_that_do_not_change_each_other_both_act():
     np.testing.assert_allclose(run.q[-1], 0.65 / 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("events", [[WALLS[0], OBLIQUE], [OBLIQUE, WALLS[0]]], ids=["oblique last", "oblique first"])
 def test_a_corner_fails_by_name(events):
     run = into_the_corner(events)
@@ -38,6 +40,7 @@ def test_a_corner_fails_by_name(events):
     assert np.isnan(run.q[8:]).all()
 
 
+@pytest.mark.slow
 def test_a_guard_that_an_impact_throws_back_fails_by_name():
     """That of a rebound, though the ball is falling again at the end of the step."""
     ball = System(jnp.ones(1), lambda q, v, t, p: 0 * q - p["g"])

@@ -37,6 +37,7 @@ def pushed(T, t, start=0.0):
     return np.sum(since**2 / 2, axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", MANY)
 def test_loads_at_known_times(case):
     T = np.array(MANY[case])
@@ -180,6 +181,7 @@ def test_a_load_at_the_time_of_an_impact():
         np.testing.assert_allclose(run.q[-1, 0], 0.5 - 0.55 - 0.55**2 / 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_first_order_system():
     clock = FirstOrderSystem(lambda y, t, p: 1.0 + 0 * y)
     back = Event(at=[0.5, 1.5], reset=lambda y, t, p: y - 1.0)
@@ -200,6 +202,7 @@ def test_float32_keeps_its_dtype():
     np.testing.assert_allclose(run.q[-1, 0], pushed([0.1, 0.35], 1.0), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_other_times_compile_nothing():
     traced = []
 

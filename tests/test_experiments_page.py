@@ -42,6 +42,7 @@ def committed():
     return results, text, Reader(text)
 
 
+@pytest.mark.slow
 def test_the_page_is_one_well_formed_file(committed):
     _, text, reader = committed
     assert not reader.open

@@ -136,6 +136,7 @@ def test_variables_have_units(unit):
     assert "u = u[2] (N & more) held over it" in unit.c.header
 
 
+@pytest.mark.slow
 def test_one_long_step_is_many_short_ones(slave):
     """With the input held, to the last bit; and of a step that is no multiple, steps a little shorter."""
     slave.begin()
@@ -149,6 +150,7 @@ def test_one_long_step_is_many_short_ones(slave):
     assert slave.step(0.1, 2.5 * DT) == (OK, pytest.approx(0.125, rel=1e-14))
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_state_can_be_kept_and_parameters_tuned(slave, expected):
     slave.begin()

@@ -58,6 +58,7 @@ def test_factors_are_kept_until_what_they_are_made_of_changes(library):
     assert [a == b for a, b in itertools.pairwise(factors)] == [True, True, False, False]
 
 
+@pytest.mark.slow
 def test_matrices_are_loops(library):
     """So that a hundred unknowns are no million lines; what is small has neither loops nor factors."""
     _, library = library

@@ -109,6 +109,7 @@ def test_states_are_independent_and_params_may_change(pendulum_library):
     assert numbers(other, "q") == pytest.approx(np.asarray(run.q[-1]), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_another_step_size_goes_on_from_the_same_time(pendulum_library):
     problem = PROBLEMS["forced double pendulum"]
     state, _ = pendulum_library.begin(problem.q0, problem.v0, t0=0.5, dt=1e-3)

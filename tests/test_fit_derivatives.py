@@ -93,6 +93,7 @@ def away(leaf):
     return jnp.cos(jnp.arange(1.0, leaf.size + 1)).reshape(leaf.shape) * jnp.where(leaf == 0, 0, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimate", [dense, at_the_start, by_descent, SLOW(records), SLOW(simulated)])
 def test_estimates_have_the_derivatives_of_the_minimum(estimate):
     point = given()

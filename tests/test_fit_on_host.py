@@ -149,6 +149,7 @@ def test_what_is_transformed_is_inside():
     assert seen == [True, False, False, False, False, False]
 
 
+@pytest.mark.slow
 def test_data_that_a_function_closes_over_have_derivatives():
     def estimate(y):
         return hhtjax.fit(lambda p: p * T - y * jnp.ones_like(T), 1.0).params

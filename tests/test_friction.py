@@ -133,6 +133,7 @@ def sledge(speed, dt=1e-2):
     return found, np.abs(forward - U * np.tanh(2 * U * np.asarray(found.t) + np.arctanh(1 / U)))
 
 
+@pytest.mark.slow
 def test_a_start_that_slides_by_a_rounding_sticks():
     """With one of the numbers beside it."""
     for speed in (0.4, np.nextafter(0.4, 1), np.nextafter(0.4, 0)):
@@ -150,6 +151,7 @@ def test_a_joint_that_stops_at_once_is_not_thrown_by_its_limit():
         assert np.log2(error[0] / error[1]) == pytest.approx(2, abs=0.15)
 
 
+@pytest.mark.slow
 def test_without_limit_it_is_the_step_without_friction():
     case = of_scene(dry_oscillator.driven(0.0))
     smooth = replace(case.system, friction=None)

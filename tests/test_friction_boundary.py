@@ -147,6 +147,7 @@ def test_a_held_input_breaks_a_joint_away_at_its_jump():
     np.testing.assert_allclose(found.friction[1:8, 0], [0.5] * 4 + [0.9] * 3, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_limit_that_jumps_brakes_at_once():
     """Two coupled masses that slide, and a brake that is held: exact too."""
     mass, share, brake = np.array([[2.0, 0.7], [0.7, 1.0]]), np.array([1.0, 0.5]), np.array([1.0, 3.0])

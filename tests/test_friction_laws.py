@@ -46,6 +46,7 @@ def test_joints_at_rest_are_balanced():
         assert {-1, 0, 1} == set(np.unique(sig))
 
 
+@pytest.mark.slow
 def test_joints_that_do_not_jerk_each_other_switch_each_by_itself():
     """Also where all of them reverse within a step; with the same derivatives, those of a batch."""
     rng, m = np.random.default_rng(0), 3
@@ -95,6 +96,7 @@ def test_loads_at_their_limits_end_the_step():
     assert not np.any(left)
 
 
+@pytest.mark.slow
 def test_derivatives_reach_the_end_of_violent_steps():
     """In 1 of 100 of these, two joints need more than two pieces each. Against central differences."""
     rng, m, N, short = np.random.default_rng(5), 2, 4000, 1e-7

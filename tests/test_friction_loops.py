@@ -60,6 +60,7 @@ def all_choices(K, load, f):
     return best, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("m", "rank"), [(2, 1), (4, 1), (4, 2), (6, 3)])
 def test_the_box_problem_is_that_of_all_choices(m, rank):
     """Forces of semi-definite matrices, limits of 0 among them: the motion, who slides, and the smallest forces."""

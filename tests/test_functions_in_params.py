@@ -58,6 +58,7 @@ def test_a_run_with_a_module_and_another_of_its_structure_without_tracing_again(
     assert len(TRACES) > count
 
 
+@pytest.mark.slow
 def test_derivatives_in_a_module():
     net = network(0)
     found = eqx.filter_jit(eqx.filter_grad(lambda net: jnp.sum(run(net) ** 2)))(net)

@@ -31,6 +31,7 @@ def test_gradients_on_the_duffing_oscillator(name):
     check_gradient(path_loss(problem, tight(STEPPERS[name]), 30, 1), arguments)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_default_where_it_chooses_the_held_state():
     """Steps so long that both points are chosen; of params that hold integers, too."""
 

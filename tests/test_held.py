@@ -163,6 +163,7 @@ def test_energy_balance_sees_one_value_in_each_interval():
     np.testing.assert_allclose(found.error, 0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_jumps_within_steps_are_told():
     """By `simulate` and `sweep`, for steps of one size and of several; not where steps end on them, nor inside jit."""
     system = hhtjax.System(jnp.ones(1), lambda q, v, t, params: params(t)[None])

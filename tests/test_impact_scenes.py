@@ -58,6 +58,7 @@ def test_a_ball_without_drag_keeps_to_its_formula():
     np.testing.assert_allclose(found.events.before[:2, 0], [-speed, -0.8 * speed], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_two_balls_change_their_velocities():
     scene = balls.two()
     found = run(scene, LIGHT, 7)

@@ -40,6 +40,7 @@ def test_amplification_is_the_trapezoidal_rule():
         assert np.min(np.abs(found - (1 + s * h / 2) / (1 - s * h / 2))) < 1e-9
 
 
+@pytest.mark.slow
 def test_suggested_step_size_sees_the_modes_of_internal_states():
     found = hhtjax.analysis.suggest_step_size(linear_rates(A), hhtjax.hht(), *STATES[:2], z0=STATES[2], highest=10.0)
     expected = sorted(abs(s) for s in np.linalg.eigvals(A) if s.imag >= 0)

@@ -161,6 +161,7 @@ def product(lengths):
     return partial(jnp.einsum, f"{names[0]},{names[1]}->{batch}{rows}{columns}"), factors
 
 
+@pytest.mark.slow
 @on_cpu
 @pytest.mark.compiled
 def test_every_product_compiles_in_value_and_reverse():
@@ -230,6 +231,7 @@ def test_a_stage_of_a_large_batch_is_not_divided_among_threads():
     assert jnp.all(jnp.isfinite(jax.jit(f)(c)))
 
 
+@pytest.mark.slow
 @on_cpu
 @pytest.mark.compiled
 def test_a_batch_of_thousands_compiles():

@@ -36,6 +36,7 @@ def test_a_kernel_around_others():
         np.testing.assert_allclose(jax.jit(partial(around, f))(-x), f(-2 * x) + 1, rtol=1e-15)
 
 
+@pytest.mark.slow
 @on_cpu
 @pytest.mark.parametrize(("derivative", "number"), [(lambda f: f, 1), (jax.grad, 3)])
 def test_kernels_of_a_controlled_run_hold_all_that_is_around_their_loops(derivative, number):

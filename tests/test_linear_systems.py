@@ -227,6 +227,7 @@ def test_factors_made_before_change_no_value_and_no_derivative():
     np.testing.assert_allclose(gradient, jnp.sum(tangent), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_diagonal_systems_are_stepped_without_a_matrix():
     """Also beside a force at few coordinates: no array (n, n) anywhere in the program of a run."""
     n = 37

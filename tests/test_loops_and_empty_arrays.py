@@ -27,6 +27,7 @@ def nothing(q, v, t, params):
     return -params * (q + jnp.sum(jnp.sin(empty)) + jnp.concatenate([empty, q]) + jnp.zeros((3, 0)) @ empty)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [until, *(pytest.param(f, marks=pytest.mark.slow) for f in (counted, nothing))])
 def test_they_give_what_plain_jax_gives(force):
     system = hhtjax.System(jnp.ones(3), force)

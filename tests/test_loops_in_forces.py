@@ -32,12 +32,14 @@ def called(q, v, t, k):
     return -k * q + jax.pure_callback(lambda t: np.sin(np.asarray(t)), jax.ShapeDtypeStruct((), t.dtype), t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STEPPERS)
 def test_a_loop_until_it_is_exact(name):
     expected = end(lambda q, v, t, k: -k * q * jnp.sqrt(1 + q * q), name)
     np.testing.assert_allclose(end(iterated, name), expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_forward_derivatives_through_a_loop():
     expected = jax.jit(jax.jacfwd(lambda k: end(lambda q, v, t, k: -k * q * jnp.sqrt(1 + q * q), "hht", k)))(3.0)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(lambda k: end(iterated, "hht", k)))(3.0), expected, rtol=1e-11)
@@ -64,6 +66,7 @@ def damped(q, v, t, k):
     return called(q, v, t, k) - 0.5 * v
 
 
+@pytest.mark.slow
 def test_a_callback_of_the_time_beside_a_damper():
     """Of which the smooth start takes derivatives; the time stays as it is."""
     expected = end(lambda q, v, t, k: -k * q + jnp.sin(t) - 0.5 * v, "hht")

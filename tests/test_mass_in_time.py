@@ -217,6 +217,7 @@ def test_constraint_friction_and_internal_states_pass_through():
     np.testing.assert_allclose(leaks.multipliers, scale * exact.multipliers, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_momentum_in_closed_form():
     """M = 1 + t; what pushes fades, zdot = -z, and friction takes its limit: p = 1 - exp(-t) + 0.5 - 0.2 t."""
     system = System.from_lagrangian(
@@ -255,6 +256,7 @@ def run_by(lagrangian, q0=1.0, v0=0.0):
     return hhtjax.simulate(system, hhtjax.hht(), jnp.array([q0]), jnp.array([v0]), dt=0.01, num_steps=2)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hhtjax.FailedRunWarning")
 @pytest.mark.parametrize("v0", [0.0, 0.5])
 def test_energies_that_are_not_quadratic_are_named(v0):

@@ -105,6 +105,7 @@ def test_a_circle_from_inside():
         assert found.moved == pytest.approx(np.max(np.abs(found.q - guess)))
 
 
+@pytest.mark.slow
 def test_links_that_are_too_short_are_not_converged():
     """Under jit, too: a search that runs away leaves a part of Phi that is small beside q, but not small."""
     places = np.array([[4.0, 1.0], [3.1, 0.0], [-2.0, 6.0]])

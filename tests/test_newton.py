@@ -48,6 +48,7 @@ def test_each_row_is_solved_in_its_own_units(name):
     assert run.info.iterations.max() < 7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(KINDS)[1:])
 def test_so_do_all_that_iterate(name):
     mass, force, q0, v0, dt, _ = CASES["far and near"]

@@ -235,6 +235,7 @@ def test_all_arguments_may_be_tracers_of_jit():
     assert np.allclose(jax.jit(lambda x: outcome(**x))(TRACED), outcome(**TRACED), rtol=1e-13, atol=0)
 
 
+@pytest.mark.slow
 def test_all_arguments_may_be_tracers_of_vmap():
     batch = {name: np.stack([value, 0.9 * np.asarray(value)]) for name, value in TRACED.items()}
     f = jax.jit(lambda x: outcome(**x))
@@ -244,6 +245,7 @@ def test_all_arguments_may_be_tracers_of_vmap():
     assert results[0] != results[1]
 
 
+@pytest.mark.slow
 def test_all_arguments_may_be_tracers_of_grad():
     f = jax.jit(lambda x: outcome(**x))
     gradient = jax.grad(f)(TRACED)

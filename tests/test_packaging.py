@@ -51,6 +51,7 @@ def test_the_wheel_is_the_package_and_nothing_else(built):
     assert "hhtjax/py.typed" in files
 
 
+@pytest.mark.slow
 def test_the_sdist_holds_what_the_tests_read(built):
     with tarfile.open(built("sdist")) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}

@@ -11,6 +11,7 @@ from hhtjax.numerics import dense_lu
 from hhtjax.numerics.dense_lu import factorize
 
 
+@pytest.mark.slow
 def test_factorisations_in_panels():
     """As LAPACK does it, the order of the rows included; a last panel narrower than its block, too."""
     rng = np.random.default_rng(3)

@@ -85,6 +85,7 @@ def test_the_environment_and_the_version_of_jax(version, wish, why, monkeypatch)
     assert re.match(why, path)
 
 
+@pytest.mark.slow
 def test_a_jax_that_is_not_known_is_told_of_once(monkeypatch):
     """Where a user's program calls the library first; who says what he wants is not told."""
     monkeypatch.setattr(jax, "__version_info__", (99, 0, 0))

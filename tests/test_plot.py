@@ -75,6 +75,7 @@ def test_trajectory_names_entries_and_units(run):
     assert len({style for _, style in looks}) == 2
 
 
+@pytest.mark.slow
 def test_trajectory_marks_events():
     """At their times, those that were met alone, over the whole height, and without a place in the legend."""
     scene = hhtjax.scenes.balls.bouncing(drag=0.0)

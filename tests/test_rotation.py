@@ -225,6 +225,7 @@ def test_bad_rate_and_tolerance_are_named():
         is_rotation(EYE, -1.0)
 
 
+@pytest.mark.slow
 def test_products_inside_shard_map():
     """Where JAX watches which arrays differ among devices."""
     mesh = jax.make_mesh((1,), ("i",), axis_types=(jax.sharding.AxisType.Auto,))

@@ -149,6 +149,7 @@ def nested(x, y, number):
     return lax.fori_loop(0, 17, step, (x, x / 2, x - 0.2, x * x, number))
 
 
+@pytest.mark.slow
 def test_conditionals_in_conditionals_become_loops():
     """With the same values, also of a batch and of tangents."""
     x, y, number = jnp.array([0.7, -0.4, 1.1]), jnp.array(0.3), jnp.array(3, jnp.int32)

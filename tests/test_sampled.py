@@ -234,6 +234,7 @@ def respond(values):
     return hhtjax.simulate(OSCILLATOR, PREDICTOR, np.zeros(1), np.zeros(1), params, dt=0.02, num_steps=30)
 
 
+@pytest.mark.slow
 def test_a_simulation_with_a_sampled_input_is_that_with_the_function():
     """sin(2 t) sampled every 0.1 s: the spline is within 1e-4 of it at the ends, straight lines within 5e-3."""
     signal = np.sin(2 * 0.1 * np.arange(21))[:, None]

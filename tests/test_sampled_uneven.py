@@ -45,6 +45,7 @@ def test_the_spline_of_few_and_of_many_samples(samples):
     np.testing.assert_allclose(evaluate(values, knots, t, 3), CubicSpline(knots, values)(t), rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [0, 1, 3])
 def test_equal_distances_are_the_uniform_case(order):
     uniform = sampled(VALUES, 0.25, 0.7, order)

@@ -53,6 +53,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param(x, marks=[] if x == QUICK else pytest.mark.slow) for x in CASES])
 def test_runs(case):
     """Converged ones to what the tolerance leaves."""
@@ -103,6 +104,7 @@ def circle(q, t, length):
     return (jnp.sum(q**2, keepdims=True) - length**2) / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_consistent_initial(dtype):
     bead = hhtjax.System(jnp.ones(2, dtype), lambda q, v, t, p: -q, circle)

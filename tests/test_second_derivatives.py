@@ -76,6 +76,7 @@ def test_second_derivatives_are_differences_of_the_first(f, mode):
     np.testing.assert_allclose(H, expected, rtol=0, atol=2e-10 * np.max(np.abs(expected)))
 
 
+@pytest.mark.slow
 def test_the_gradient_of_two_unknowns_evaluated_on_scalars():
     """Reverse mode against forward mode; what the search tells besides the root is no integer there."""
     system = hhtjax.System(np.ones(2), lambda q, v, t, p: -p * jnp.sin(q + q[::-1]) - 0.1 * v)

@@ -16,6 +16,7 @@ from hhtjax.systems.system import mass_at
 DUFFING = PROBLEMS["forced Duffing"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("save_every", [1, 2, 7, 70, 210])
 @pytest.mark.parametrize("name", ["hht auto", "hht converged"])
 def test_saving_less_saves_a_part_of_the_same_path(name, save_every):
@@ -68,6 +69,7 @@ def test_nested_scan_equals_a_plain_one(length):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_member_of_a_batch_keeps_fewer_states():
     """And computes more of them again: what many keep takes longer to fill."""
 
@@ -277,6 +279,7 @@ def test_lagrangian_system_equals_the_one_by_hand():
         np.testing.assert_allclose(*forces, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_lagrangian_system_on_a_dict_with_explicit_time():
     """A mass on a spring whose end is moved: L = m x'^2/2 - k (x - u(t))^2/2, and a charged term x' t."""
 

@@ -92,6 +92,7 @@ def errors_of_family(h, num_steps=200):
     return K * np.max(np.abs(q - reference), axis=-1)
 
 
+@pytest.mark.slow
 def test_no_mass_is_thrown_by_any_of_the_family():
     """Below 2e-3 of F/k with every mass, at once and ever after, and of order 2 where damping is stiff."""
     coarse, fine = errors_of_family(2 * H), errors_of_family(H)
@@ -219,6 +220,7 @@ def test_behind_an_event():
         assert K * np.max(np.abs(q - expected)) < 2e-3
 
 
+@pytest.mark.slow
 def test_where_held_inputs_jump():
     load = np.array([0.0, 1.0, 1.0, 0.5, 1.5])
     held = hhtjax.sampled(jnp.asarray(load), dt=0.01, order=0)
@@ -351,6 +353,7 @@ RUBBED = hhtjax.System(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v0", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_with_dry_friction(v0):
     """0.8 of the load is left."""

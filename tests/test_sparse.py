@@ -174,6 +174,7 @@ def test_a_singular_matrix_fails_by_name():
         run(made, hhtjax.newmark(), -1 / (beta * h**2), num_steps=2).check()
 
 
+@pytest.mark.slow
 def test_large_ones_stay_sparse_and_are_traced_once():
     n, counted = 2000, []
     x = np.arange(1, n + 1) * np.pi / (n + 1)

@@ -82,6 +82,7 @@ def test_mass_alone_costs_an_order_with_alpha():
     np.testing.assert_allclose(slopes(varying)[[0, 2]], [2, 1], atol=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("linear", [False, True])
 def test_a_linear_system_moves_as_with_hht(linear):
     def load(t, params):
@@ -213,6 +214,7 @@ def test_jit_equals_eager_through_init_and_step(modified):
     np.testing.assert_allclose(compiled.acceleration[-1], state.w, rtol=1e-9)
 
 
+@pytest.mark.slow
 @every_form
 def test_vmap_equals_loop(modified):
     problem = PROBLEMS["forced Duffing"]

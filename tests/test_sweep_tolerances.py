@@ -130,6 +130,7 @@ def test_what_differs_is_data_and_failures_are_alone():
         np.testing.assert_allclose(again.q[i], alone.q, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_too_far_is_named_with_the_step_that_got_there():
     runs = sweep()
     with pytest.raises(hhtjax.SimulationError, match=r"member 0 \(5 of 5 failed\), step \d+ \(to t = ") as told:

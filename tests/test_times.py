@@ -17,6 +17,7 @@ def run(stepper=None, **options):
     return hhtjax.simulate(SPRING, stepper or hhtjax.rk4(), *START, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", [hhtjax.hht(), hhtjax.dopri5(), hhtjax.houbolt()], ids=["hht", "dopri5", "houbolt"])
 def test_equal_steps_are_read_off_between_their_ends(stepper):
     """Some of the times in one step, some at its end: the cubics of the run, and the term that dopri5 adds to them."""

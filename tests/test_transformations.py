@@ -79,6 +79,7 @@ def test_vmap_over_alpha_equals_loop():
     assert abs(batch[0] - batch[2]) > 1e-6
 
 
+@pytest.mark.slow
 @every_stepper
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_dtype_is_kept(name, dtype):

@@ -100,6 +100,7 @@ def test_energy_is_conserved_and_dampers_take_it_out(damped):
         assert np.max(np.abs(energy / energy[0] - 1)) < 1e-5
 
 
+@pytest.mark.slow
 def test_symmetric_road_gives_no_roll_and_a_rough_one_does():
     bump = vehicle.ride(roughness=0.0, duration=1.0)
     path = drive(bump)

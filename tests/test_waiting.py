@@ -47,6 +47,7 @@ def slow_compiler(monkeypatch):
     monkeypatch.setattr(hhtjax.xla.lowering, "_as_kernel", late)
 
 
+@pytest.mark.slow
 def test_a_first_call_that_takes_long_is_told_of_once_and_a_second_call_starts_no_clock(caplog, monkeypatch):
     program = Programs(slow_to_trace(0.4))
     program(jnp.ones(2))
@@ -59,6 +60,7 @@ def test_a_first_call_that_takes_long_is_told_of_once_and_a_second_call_starts_n
     assert not told(caplog)
 
 
+@pytest.mark.slow
 def test_a_quick_first_call_says_nothing_though_more_is_done_in_the_same_call_of_jax(caplog):
     program = Programs(lambda x: 2 * x)
 
@@ -71,6 +73,7 @@ def test_a_quick_first_call_says_nothing_though_more_is_done_in_the_same_call_of
     assert not told(caplog)
 
 
+@pytest.mark.slow
 def test_a_jit_of_the_users_and_its_gradient_are_told_of(caplog, slow_compiler):
     def f(x):
         return one_kernel(lambda x: jnp.sin(x) * 2, x)
@@ -101,6 +104,7 @@ def test_an_error_ends_the_wait(caplog):
     assert not told(caplog)
 
 
+@pytest.mark.slow
 def test_explain_waits_too(caplog, monkeypatch):
     stage = type(jax.jit(lambda x: x).lower(1.0))
     compile_ = stage.compile
@@ -109,6 +113,7 @@ def test_explain_waits_too(caplog, monkeypatch):
     assert len(told(caplog)) == 1
 
 
+@pytest.mark.slow
 def test_logging_keeps_quiet(caplog):
     with caplog.at_level(logging.ERROR, logger="hhtjax"):
         Programs(slow_to_trace(0.4))(jnp.ones(3))
