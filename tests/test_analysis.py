@@ -162,6 +162,7 @@ CRANE = hhtjax.System(lambda q, params: jnp.array([2.0 + q["load"] ** 2, 1.0]), 
 TOP = top.minimal()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "q0", "v0", "params"),
     [
@@ -224,6 +225,7 @@ def test_observed_order(stepper, order):
     assert alone.error[0] + alone.error[1] == pytest.approx(against.error[0] - against.error[2], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_overshoot_of_the_first_step():
     """None of the trapezoidal rule. Of HHT in velocity, W (1 - gamma/(2 beta)), and 1.9 % more than that at W = 100."""
     W = np.array([0.1, 10.0, 1e4])

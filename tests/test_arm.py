@@ -115,6 +115,7 @@ def test_one_joint_is_the_physical_pendulum(name):
     assert float(Q[0]) == pytest.approx(m * g * r * np.cos(0.6) - k * 0.4 + c * 1.5, rel=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMULATIONS)
 def test_two_planar_joints_are_the_double_pendulum(name):
     """With relative angles: its own are those from the horizontal, (q1, q1 + q2)."""
@@ -228,6 +229,7 @@ def test_gradients_in_the_joint_stiffness():
     check_gradient(loss, scene.params["k"])
 
 
+@pytest.mark.slow
 def test_single_precision_is_kept():
     scene = swing(2)
     params, q = jax.tree.map(lambda x: x.astype(jnp.float32), (scene.params, scene.q0))

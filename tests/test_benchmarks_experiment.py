@@ -115,6 +115,7 @@ def test_time_to_an_error_is_read_off_the_line_between_runs():
     assert time_to(rows, 1e-6) is None
 
 
+@pytest.mark.slow
 def test_errors_of_controlled_runs_follow_their_tolerances():
     rows = ours.controlled_entries("forced Duffing", (1e-3, 1e-5), ("dopri5, adaptive",))
     assert [row["tolerance"] for row in rows] == [1e-3, 1e-5]

@@ -85,6 +85,7 @@ def test_gradient_with_respect_to_a_mass_in_a_system_made_in_a_traced_function()
     assert abs(found) > 1e-2
 
 
+@pytest.mark.slow
 def test_gradient_with_respect_to_a_whole_system():
     """The gradient is a system whose arrays are derivatives: here of all three matrices, against differences."""
     system = LinearSystem(TWO, C=ONE, K=9 * ONE)
@@ -207,6 +208,7 @@ def test_num_steps_and_save_every_are_part_of_the_program():
     assert 0 < counts[0] < counts[1] < counts[2]
 
 
+@pytest.mark.slow
 def test_both_solves_of_a_step_are_one_traced_function():
     """About the predicted state and about the held one."""
     scene = double_pendulum.free()

@@ -27,6 +27,7 @@ CHOICES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.compiled
 def test_derivatives_behind_products_and_sums():
     """Forward and reverse, against the choice by NumPy, at points where roundings of a product and a sum differ."""

@@ -25,6 +25,7 @@ def pulled(force, rate, stop=0.0, **steps):
     return simulate(PULLED, rk4(), ZERO + stop, ZERO + rate, {"F": force, "stop": stop}, events=[STOP], **steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.0, -0.0, -1e-17, 1e-17])
 @pytest.mark.parametrize("stop", [0.0, -3.7])
 def test_a_body_at_rest_at_its_stop_that_is_pulled_off(rate, stop):
@@ -88,6 +89,7 @@ def test_such_starts_under_error_control_and_in_a_sweep():
     check_message(ValueError, "sweep: member 2: the start is beyond the guard of events[0]", lambda: members(F))
 
 
+@pytest.mark.slow
 def test_a_guard_of_the_velocity_is_judged_by_the_jerk():
     """At rest at the top of its path, thrown up by a force that grows."""
     turns = Event(lambda q, v, t, p: v[0], switch=lambda p: p | {"n": p["n"] + 1})

@@ -171,6 +171,7 @@ def test_what_does_not_fit_is_an_error_at_the_boundary(case):
     check_message(*ERRORS[case])
 
 
+@pytest.mark.slow
 def test_a_start_on_the_guard_that_rises():
     run = call([Event(lambda q, v, t, p: q[0] - 1.0, impact(0.5))], stepper=rk4(), v0=ONE)
     run.check()

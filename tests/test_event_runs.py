@@ -32,6 +32,7 @@ def come_to_rest(e, num_steps, floor=0.0):
         num_steps=num_steps, events=[FLOOR])  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_motion_to_rest_fails_by_name():
     """With e = .5 the bounces pile up at t = 3 sqrt(2/g): the run is right before that step, and NaN after."""
     run = come_to_rest(0.5, 200)

@@ -94,6 +94,7 @@ def test_what_a_number_is_by_its_key():
             assert kind(path) == name, key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_numbers_compare_with_themselves(name):
     """And every one that counts is needed."""

@@ -180,6 +180,7 @@ def test_inputs_are_held_over_the_step(tmp_path):
             assert numbers(state, name) == pytest.approx(np.asarray(x[-1]), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hhtjax.PrecisionWarning")
 def test_single_precision(tmp_path):
     problem = PROBLEMS["forced Duffing"]

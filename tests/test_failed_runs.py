@@ -70,6 +70,7 @@ def test_what_error_control_gave_up_is_told():
         run(1.0, **control)
 
 
+@pytest.mark.slow
 def test_inside_jit_and_vmap_failures_travel_as_data():
     strengths = jnp.array([-1.0, 1.0])
     assert jax.jit(lambda k: run(k, throw=True).failed)(1.0)

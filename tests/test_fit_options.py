@@ -294,6 +294,7 @@ def test_transforms_of_some_keys_leave_the_others_alone():
     assert [type(T).__name__ for T in given.transforms] == ["Positive" if n == "a" else "Scaled" for n in names]
 
 
+@pytest.mark.slow
 def test_bounds_are_arrays_and_one_sided():
     """Each entry has its own: between, below, above, none; found as by SciPy, and kept by JSON."""
     data = np.array([[1.0, 2.0, 3.0, 4.0], [1.2, 2.4, 3.1, 4.0]])

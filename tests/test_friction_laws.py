@@ -5,6 +5,7 @@ from itertools import product
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from hhtjax.steppers.friction_switching import run_events, switch
 from hhtjax.systems.friction import at_rest
@@ -81,6 +82,7 @@ def test_joints_that_do_not_jerk_each_other_switch_each_by_itself():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_loads_at_their_limits_end_the_step():
     """Many instances, as only roundings say whether such a joint breaks away."""
     rng, m, N = np.random.default_rng(7), 4, 4000

@@ -80,6 +80,7 @@ def test_index_3_is_of_order_two_too():
     assert np.all(np.abs(found[3, damped] - 2) < 0.15), found
 
 
+@pytest.mark.slow
 def test_the_start_is_corrected_for_positions_alone():
     """What is faster than the step would start with an acceleration of 1/lag^2 else."""
     case = CASES["a constraint"](LAG)

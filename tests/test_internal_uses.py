@@ -31,6 +31,7 @@ def linear_rates(matrix):
 A = np.array([[0, 1, 0, 0], [-9.0, -0.2, 1.0, 0.0], [0.0, 2.0, -3.0, 0.5], [1.0, 0.3, 0.0, -200.0]])
 
 
+@pytest.mark.slow
 def test_amplification_is_the_trapezoidal_rule():
     """hht(0) takes each eigenvalue s of the equations to (1 + s h/2)/(1 - s h/2)."""
     system, stepper, h = linear_rates(A), hhtjax.newmark(linearize="predictor"), 0.1
@@ -63,6 +64,7 @@ def test_dense_and_extrapolated_output_of_z():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", [hhtjax.hht(-0.05), hhtjax.rosenbrock()], ids=["hht", "rosenbrock"])
 def test_held_inputs_restart_internal_states(stepper):
     values = jnp.array([1.0, -2.0, 0.5])
@@ -129,6 +131,7 @@ def test_energy_that_an_internal_state_takes():
     assert abs(found.error[-1]) < 1e-6 * abs(taken)
 
 
+@pytest.mark.slow
 def test_consistent_initial_values_with_z():
     """The multiplier of a rod holds the force of z too; z0 stays."""
     system = hhtjax.System(

@@ -180,6 +180,7 @@ def test_one_factorisation_serves_many_right_hand_sides_and_the_transpose(factor
     assert np.allclose(transposed, np.linalg.solve(A.T, b), rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not compat.is_on(), reason="this JAX makes no kernels")
 @pytest.mark.parametrize("made", [zero_diagonal, permuted, bad_rows])
 def test_elimination_is_a_loop_inside_a_kernel_and_lapack_s_elsewhere(made):

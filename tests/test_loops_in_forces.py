@@ -45,6 +45,7 @@ def test_forward_derivatives_through_a_loop():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(lambda k: end(iterated, "hht", k)))(3.0), expected, rtol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hht", "hht converged", "hht state"])
 def test_a_callback_of_the_time(name):
     np.testing.assert_allclose(end(called, name), end(lambda q, v, t, k: -k * q + jnp.sin(t), name), rtol=1e-12)

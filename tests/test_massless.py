@@ -28,6 +28,7 @@ def path(system, stepper, dt, num_steps):
     return hhtjax.simulate(system, stepper, *start, {"k": 1.0}, dt=dt, num_steps=num_steps).q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("c", [5.0, 1e-6], ids=str)
 def test_a_damped_node_without_mass_is_of_order_2(c):
     """Largest error of the run, from a velocity that is not the node's own, for all alpha."""

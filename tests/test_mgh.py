@@ -51,6 +51,7 @@ def by_fit(problem):
     return runs, float(best.cost), code
 
 
+@pytest.mark.slow
 def test_minima_are_found_in_fewer_runs_than_minpack_takes():
     """All of them, within the default number of iterations; in all a third fewer runs, and fewer Jacobians."""
     with np.errstate(all="ignore"):

@@ -59,6 +59,7 @@ def test_so_do_all_that_iterate(name):
     np.testing.assert_allclose(run.q[:, 1:], alone.q, rtol=1e-9, atol=0)
 
 
+@pytest.mark.slow
 def test_noise_of_terms_that_cancel_is_no_failure():
     """Loads of 1e9 N that nearly cancel, far beyond what an absolute tolerance can see, and a row of zeros."""
 

@@ -38,6 +38,7 @@ def test_plain_leaves_nothing_of_the_machinery():
     assert "xla_cpu_small_call" in fast.lower(2.0).as_text()
 
 
+@pytest.mark.slow
 @on_cpu
 def test_plain_holds_for_its_own_thread():
     def is_on_in_plain():
@@ -66,6 +67,7 @@ def test_a_sweep_gives_the_same_without_the_machinery():
         assert np.allclose(sweep(), fast, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 @on_cpu
 @pytest.mark.parametrize(
     ("version", "wish", "why"),
@@ -139,6 +141,7 @@ def test_a_program_that_xla_refuses_runs_on_plain_jax(refused):
         jax.jit(final)(Q0)
 
 
+@pytest.mark.slow
 @on_cpu
 def test_what_xla_has_refused_it_is_not_asked_again(refused, caplog, tmp_path):
     """One program of several: the others are as fast as ever."""

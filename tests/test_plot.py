@@ -141,6 +141,7 @@ def test_energy_balance_finds_the_potential_of_a_lagrangian():
     assert labels(plot.energy_balance(balance)[0]) == ["kinetic", "work of all forces"]
 
 
+@pytest.mark.slow
 def test_constraint_drift(swing):
     ax = plot.constraint_drift(swing, unit="m")
     assert labels(ax) == ["|Phi| (m)", "|dPhi/dt| (m/s)"]
@@ -201,6 +202,7 @@ def test_work_precision():
     assert (ax.get_xscale(), ax.get_yscale(), ax.get_xlabel()) == ("log", "log", "time (ms)")
 
 
+@pytest.mark.slow
 def test_curves_over_frequency_are_those_of_analysis():
     frequency = np.array([0.1, 1.0, 3.0])
     stepper = hhtjax.hht(alpha=-0.1)

@@ -202,6 +202,7 @@ def test_what_is_deleted_or_no_number_is_shown_by_its_shape():
     assert repr(Interpolant(gone, jax.random.key(0))) == "Interpolant(q=float64[3], v=key<fry>[])"
 
 
+@pytest.mark.slow
 def test_completion_shows_our_names():
     for result, ours in ((run(), {"t", "q", "check"}), (fitted(), {"params", "summary", "plot", "interval"})):
         names = {name for name in dir(result) if not name.startswith("_")}

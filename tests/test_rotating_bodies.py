@@ -176,6 +176,7 @@ def test_literal_step_is_as_printed_and_of_first_order(constrained):
     np.testing.assert_allclose(np.append(T.T @ now[:3], now[3]), -alpha * Q0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_end_of_chart_is_the_motion_of_the_rotation():
     """Om = vee(R^T dR/dt) and A = dOm/dt of R(t) = R0 exp(x + v t + w t^2/2), beside plain coordinates."""
     x, v, w, a = np.random.default_rng(0).normal(size=(4, 4))  # three of a rotation, and one more

@@ -70,6 +70,7 @@ def random_weights(shape):
     return [rng.uniform(-1, 1, shape), *rng.uniform(-1, 1, (2, 3))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("f", [exp, *(pytest.param(f, marks=pytest.mark.slow) for f in (tangent, inverse_tangent))])
 def test_derivatives(f):
     """Forward mode, reverse mode, and fourth-order central differences of the derivative before."""

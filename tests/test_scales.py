@@ -83,6 +83,7 @@ def linked_run(inertia, dt, **options):
         return hhtjax.simulate(LINKED, hhtjax.hht(**options), q0, 0 * q0, params, dt=jnp.float32(dt), num_steps=12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.02, 0.3])
 def test_inertias_whose_squares_are_no_numbers_in_float32(dt):
     """Of links of micrometres, 8e-28 kg m^2: neither the solve may square them, nor what "auto" compares in long steps.
@@ -116,6 +117,7 @@ def test_consistent_initial(dtype):
             np.testing.assert_allclose(found.q / length, [0.6, -0.8], rtol=4 * np.finfo(dtype).eps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
 def test_gradients_that_are_rounding(size):
     """A bead at rest on a circle, and a crank in the one position in which it cannot push."""
@@ -131,6 +133,7 @@ def test_gradients_that_are_rounding(size):
         start(other, hhtjax.hht(), jnp.array([0.0, np.pi / 2]), jnp.zeros(2), size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "off"), [(1e-6, 5e-3), (1.0, 1e-5)])
 def test_velocities_that_violate_the_constraint(size, off):
     """By so much of the mechanism's size in a second, and of the velocity."""

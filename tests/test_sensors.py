@@ -164,6 +164,7 @@ def test_dense_output_has_accelerations_and_multipliers():
     assert np.all(np.log2(np.array(errors[0]) / np.array(errors[1])) > 1.8)  # the order of the steps themselves
 
 
+@pytest.mark.slow
 def test_dense_output_has_friction():
     """tau = F sign(v) where it slides, the spring's force where it sticks; never a mean of both."""
     scene = dry_oscillator.free()

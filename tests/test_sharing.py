@@ -103,6 +103,7 @@ def test_the_program_has_each_sine_once():
     assert [program.count(f" {name}(") for name in ("sine", "cosine")] == [2, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stepper", "sines", "cosines"),
     [

@@ -244,6 +244,7 @@ def test_float32_is_kept(modified):
     np.testing.assert_allclose(path.q, run(problem, stepper, 100).q, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_trees_are_kept():
     def force(q, v, t, params):
         return {"b": -9.0 * q["b"] - 0.5 * v["b"] - q["a"][0] ** 3, "a": -4.0 * q["a"] - q["b"]}

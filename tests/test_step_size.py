@@ -33,6 +33,7 @@ def relative_error(rate, dt):
     return abs(np.log(max(roots, key=lambda root: root.imag)) / (rate * dt) - 1)
 
 
+@pytest.mark.slow
 def test_suggested_step_is_the_largest_that_resolves_the_modes():
     slow, fast = coupled_rates()
     suggest = partial(

@@ -222,6 +222,7 @@ def test_bad_input_is_named(name):
         hhtjax.sweep(SPRING, STEPPER, **arguments)
 
 
+@pytest.mark.slow
 def test_progress_is_shown(capfd):
     sweep(PARAMS, progress=True)
     jax.effects_barrier()

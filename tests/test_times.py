@@ -111,6 +111,7 @@ def test_a_duration_under_error_control():
     np.testing.assert_allclose(found.t, [0, 0.25, 0.5, 0.75, 1.0])
 
 
+@pytest.mark.slow
 def test_a_failure_is_named_by_the_end_of_its_step():
     """Which is at none of the times."""
     broken = hhtjax.System(jnp.ones(1), lambda q, v, t, p: jnp.where(t > 0.55, jnp.nan, -q))

@@ -27,6 +27,7 @@ def arguments():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="no extended precision to compare with")
 def test_within_two_units_in_the_last_place():
     x = arguments()
