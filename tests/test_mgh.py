@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from mgh import PROBLEMS, jacobian
 from scipy.optimize import least_squares
 
