@@ -51,7 +51,7 @@ def keep_programs():
     if jax.__version_info__ < (0, 10):
         return  # this has not been tried with old ones
     import hhtjax
-    from hhtjax.xla.kept_programs import SETTINGS
+    from hhtjax.xla.first_call import SETTINGS
 
     try:
         hhtjax.keep_programs(Path(__file__).parents[1] / ".pytest_cache", KEPT)

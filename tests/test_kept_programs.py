@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import hhtjax
-from hhtjax.xla import kept_programs
+from hhtjax.xla import first_call
 
 ROOT = Path(__file__).parents[1]
-NAMES = ("jax_compilation_cache_dir", *kept_programs.SETTINGS)
+NAMES = ("jax_compilation_cache_dir", *first_call.SETTINGS)
 PROCESS = """
 import sys, jax, jax.numpy as jnp, hhtjax
 
@@ -108,7 +108,7 @@ def test_what_was_not_read_for_longest_is_deleted_and_other_files_are_not(tmp_pa
 
 
 def test_the_bound_holds_while_a_process_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(kept_programs, "EVERY", 1)
+    monkeypatch.setattr(first_call, "EVERY", 1)
     folder = hhtjax.keep_programs(tmp_path)
     x = jnp.ones(3)
     compiled(2, x)
@@ -123,7 +123,7 @@ def test_none_gives_the_settings_from_before_the_first_call(tmp_path):
     before = settings()
     hhtjax.keep_programs(tmp_path / "a")
     folder = hhtjax.keep_programs(tmp_path / "b", max_bytes=10)
-    assert settings() == kept_programs.SETTINGS | {"jax_compilation_cache_dir": str(folder)}
+    assert settings() == first_call.SETTINGS | {"jax_compilation_cache_dir": str(folder)}
     assert hhtjax.keep_programs(None) is None
     assert settings() == before
     compiled(9, jnp.ones(3))

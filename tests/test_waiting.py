@@ -10,12 +10,12 @@ import pytest
 
 import hhtjax
 from hhtjax.primitives import one_kernel
-from hhtjax.xla import Programs, waiting
+from hhtjax.xla import Programs, first_call
 
 
 @pytest.fixture(autouse=True)
 def _little_patience(monkeypatch):
-    monkeypatch.setattr(waiting, "PATIENCE", 0.15)
+    monkeypatch.setattr(first_call, "PATIENCE", 0.15)
 
 
 def told(caplog):
@@ -89,10 +89,10 @@ def test_what_is_lowered_and_not_compiled_is_not_told_of(caplog):
         return one_kernel(lambda x: jnp.cos(x) * 2, x)
 
     lowered = jax.jit(f).lower(1.0)
-    assert waiting._clocks
+    assert first_call._clocks
     assert not told(caplog)
     lowered.compile()
-    assert not waiting._clocks
+    assert not first_call._clocks
 
 
 def test_an_error_ends_the_wait(caplog):
@@ -121,12 +121,12 @@ def test_logging_keeps_quiet(caplog):
 
 
 def test_how_to_wait_less_is_said_once_and_where_nothing_is_kept(monkeypatch):
-    monkeypatch.setattr(waiting, "_hinted", [])
+    monkeypatch.setattr(first_call, "_hinted", [])
     folder = jax.config.jax_compilation_cache_dir
     try:
         jax.config.update("jax_compilation_cache_dir", "somewhere")
-        assert "keep_programs" not in waiting._words()
+        assert "keep_programs" not in first_call._words()
         jax.config.update("jax_compilation_cache_dir", None)
-        assert ["keep_programs" in waiting._words() for _ in range(3)] == [True, False, False]
+        assert ["keep_programs" in first_call._words() for _ in range(3)] == [True, False, False]
     finally:
         jax.config.update("jax_compilation_cache_dir", folder)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real, is_concrete
@@ -28,7 +28,7 @@ from hhtjax.steppers.implicit_solve import (
 from hhtjax.steppers.options import Keywords, Options, check_options, require_alpha, takes_options
 from hhtjax.steppers.residual import Coefficients, advance, coefficients, hht_coefficients, residual
 from hhtjax.steppers.smooth_start import DEFAULT, at_start, grown, jumped, smoothed
-from hhtjax.steppers.stepper import State, Stepper, join_info
+from hhtjax.steppers.stepper import Info, State, Stepper, join_info
 from hhtjax.steppers.variable_step import Controlled
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
@@ -37,7 +37,9 @@ if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 
-def step(method, system, params: PyTree, factorize, where, dt, s):
+def step(
+    method: GeneralizedAlpha, system: FlatSystem, params: PyTree, factorize: Any, where: str, dt: Real, s: State
+) -> tuple[State, Info]:
     """From s to t + dt by one Newton step from the constant-acceleration predictor: one Jacobian, one solve.
 
     Or by as many as `iterations` says; None: by the converged method.

@@ -53,7 +53,7 @@ may change, in `hhtjax.jaxpr`. On plain JAX the rest of the library works as wel
 
 from hhtjax.primitives import plain
 from hhtjax.xla.explanation import Explanation, calls, explain
-from hhtjax.xla.kept_programs import keep_programs
+from hhtjax.xla.first_call import keep_programs
 from hhtjax.xla.lowering import QUICK, WIDE, Programs
 from hhtjax.xla.sines import RANGE, polynomial_sines
 

@@ -11,7 +11,7 @@ import jax
 import hhtjax.xla.lowering  # noqa: F401
 from hhtjax.description import PyTree, Real
 from hhtjax.primitives.interpreter import asked
-from hhtjax.xla.waiting import tell_if_long
+from hhtjax.xla.first_call import tell_if_long
 
 if TYPE_CHECKING:
     from jax.extend.core import Jaxpr

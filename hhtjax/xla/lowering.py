@@ -25,9 +25,9 @@ from hhtjax.primitives.interpreter import asked, line_of
 from hhtjax.primitives.kernel_primitive import kernel_p, of_jaxpr
 from hhtjax.primitives.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
 from hhtjax.primitives.two_mode_derivative import is_in_program
+from hhtjax.xla.first_call import tell_if_long, telling_if_long
 from hhtjax.xla.fit_for_kernel import inner, verdict
 from hhtjax.xla.for_kernel import for_kernel, for_list, kernel
-from hhtjax.xla.waiting import tell_if_long, telling_if_long
 
 if TYPE_CHECKING:
     from jax.extend.core import ClosedJaxpr, Jaxpr
