@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def step(
-    method: GeneralizedAlpha, system: FlatSystem, params: PyTree, factorize: Any, where: str, dt: Real, s: State
+    method: GeneralizedAlpha, system: FlatSystem, params: PyTree, factorize: Any, where: str | None, dt: Real, s: State
 ) -> tuple[State, Info]:
     """From s to t + dt by one Newton step from the constant-acceleration predictor: one Jacobian, one solve.
 

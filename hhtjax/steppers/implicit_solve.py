@@ -330,7 +330,7 @@ def linearized_step(
     s: State,
     dt: Array,
     factorize: Callable | Changing | Constant,
-    where: str,
+    where: str | None,
     again: bool = False,
 ):
     """w at t + dt by one linearisation of r, about the state that `where` says, and its `Info`."""
