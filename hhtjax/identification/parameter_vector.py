@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.description import Array, Kind, PyTree, thaw
+from hhtjax.description import Array, Kind, PyTree, Real, thaw
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.residuals import check_residuals, require_own_samples, spread_weights
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 class Data(NamedTuple):
     """The traced arguments of a fit besides params0: pytrees, or None where there is nothing."""
 
-    scale: Array
+    scale: PyTree
     weights: PyTree
     prior: Any
-    tolerance: Array
+    tolerance: Real
     records: Any
     starts: PyTree
     read: Any = None  # arrays that the residuals read, where these are a `Kind`

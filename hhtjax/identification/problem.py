@@ -17,7 +17,7 @@ from hhtjax.description import Array, PyTree, Real, all_concrete, freeze, is_tra
 from hhtjax.identification.arguments import LEVENBERG_MARQUARDT, Options
 from hhtjax.identification.bordered_least_squares import Arrow, ArrowTrial, arrow_trial, free_of_own
 from hhtjax.identification.gauss_newton import Dense, DenseTrial, dense_trial, with_jacobian
-from hhtjax.identification.least_squares import BAD_START, Smooth, descend, in_rounds, levenberg_marquardt
+from hhtjax.identification.least_squares import BAD_START, History, Smooth, descend, in_rounds, levenberg_marquardt
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.parameter_vector import Coordinates, Data, dense_parts, first, longest_steps, record_parts
 from hhtjax.identification.result import FitResult
@@ -40,11 +40,11 @@ class _Solved(NamedTuple):
 
     x: Any
     cost: Any
-    history: Array
+    history: History
     iterations: Array
     code: Array
     choices: Array
-    residual: Array
+    residual: PyTree
     starts: PyTree
     J: Any
     pull: Any
@@ -210,7 +210,7 @@ class Kept(NamedTuple):
     """Of a point, for the result."""
 
     estimates: Any  # of `Objective.estimating`; None where they are J, r, None
-    residual: Array
+    residual: PyTree
     params: PyTree
     slope: Any
     starts: PyTree

@@ -13,7 +13,7 @@ import numpy as np
 
 from hhtjax.analysis import damping_ratio
 from hhtjax.checks import require_function, require_integer, require_number
-from hhtjax.description import Array, PyTree, Real, freeze, thaw
+from hhtjax.description import PyTree, Real, freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.identification import report
 from hhtjax.identification.identifiability import parameter_names
@@ -48,7 +48,7 @@ class Refined(NamedTuple):
     dt: float
     fits: tuple[FitResult, ...]
     params: PyTree
-    shift: Array
+    shift: PyTree
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """The interval of the last fit about `params`: two pytrees like them."""

@@ -49,7 +49,7 @@ class FitResult(NamedTuple):
     """
 
     params: PyTree
-    residual: Array
+    residual: PyTree
     cost: Any
     history: History
     iterations: Array

@@ -108,7 +108,7 @@ class Form(NamedTuple):
     """How functions of a tree are evaluated. tree: with `Scalars` for its small arrays, or as it was; `of` gives the
     form of a function, `like` that of another such tree, and `joined` arrays again."""
 
-    tree: Array
+    tree: PyTree
     is_split: bool = False
 
     def of(self, f: Callable):

@@ -13,7 +13,7 @@ from jax.extend.core import ClosedJaxpr, Literal, Primitive
 from jax.extend.source_info_util import user_context
 from jax.interpreters import partial_eval as pe
 
-from hhtjax.description import Array, PyTree, Real
+from hhtjax.description import PyTree, Real
 
 if TYPE_CHECKING:
     from jax.extend.core import Jaxpr, JaxprEqn, Var
@@ -73,8 +73,8 @@ class Traced(NamedTuple):
     """
 
     jaxpr: Jaxpr
-    constants: Array
-    result: Array
+    constants: list
+    result: PyTree
 
     def __call__(self, *args):
         found = eval_jaxpr(self.jaxpr, self.constants, *jax.tree.leaves(args))

@@ -215,7 +215,7 @@ class Grid(NamedTuple):
     """Frozen steps from t0 on. ends: (N,), inf behind the last; counts: (K,), how many there are from one of the times
     to the next, the last of them ending at it or beyond; reached: the end of the last."""
 
-    t0: Array
+    t0: Real
     ends: Array
     counts: Array
     reached: Array
@@ -449,7 +449,7 @@ class Round(NamedTuple):
     """run, steps, ends: what was found; share: of the tolerance that the steps were chosen for, and following: that of
     the next round; error, allowed: those of the `Solution`; is_open: whether more is to be done; number: of rounds."""
 
-    run: Array
+    run: Solution
     steps: Steps | None
     ends: Array
     share: Array

@@ -61,7 +61,7 @@ class Walk(NamedTuple):
     state: PyTree
     h: Array
     last: Array
-    past: Array
+    past: PyTree
     before: PyTree  # logarithm of the error of the last accepted step
     error: Any
     q_size: Array
@@ -503,7 +503,7 @@ def trimmed(steps: Steps) -> Steps:
 class Since(NamedTuple):
     """Of the steps since the last sample. first: what was saved at the beginning of the last; info: theirs, joined."""
 
-    first: Array
+    first: PyTree
     info: Info
 
 

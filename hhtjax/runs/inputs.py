@@ -51,7 +51,7 @@ class Problem(NamedTuple):
     q0: PyTree
     v0: PyTree
     params: PyTree
-    t0: Array
+    t0: Real
     z0: PyTree
     output: PyTree = None
 

@@ -153,9 +153,9 @@ class Members(NamedTuple):
 
     system: Any
     arrays: list
-    structure: Array  # of (stepper, q0, v0, params, z0), tolerances
+    structure: Any  # of (stepper, q0, v0, params, z0), tolerances
     axes: list
-    t0: Array
+    t0: Real
     times: Any
     size: int
     lanes: int  # members in a block

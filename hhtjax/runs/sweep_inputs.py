@@ -46,8 +46,8 @@ class Inputs(NamedTuple):
     system: Any
     data: PyTree
     dts: Any
-    duration: Array
-    t0: Array
+    duration: Real
+    t0: Real
     mapped: tuple
     num_samples: int
     times: Any
