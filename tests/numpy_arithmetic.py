@@ -107,7 +107,8 @@ ARITHMETIC = {
     **{"reduce_or": _over_axes(np.bitwise_or.reduce), "reduce_and": _over_axes(np.bitwise_and.reduce)},
 }
 SUMS = ("reduce_sum", "dot_general", "cumsum", "reduce_prod", "cumprod", "cumlogsumexp", "reduce_window_sum")
-SIGNLESS = ("reduce_sum", "dot_general", "cumsum", "reduce_window_sum")  # where they give zero, its sign is rounding
+# where they give zero, its sign is rounding: compiled, what is known to be zero is not added
+SIGNLESS = ("add", "add_any", "sub", "scatter-add", "reduce_sum", "dot_general", "cumsum", "reduce_window_sum")
 INEXACT = ("div", "rem", "pow", "integer_pow", "round")  # NumPy does otherwise with integers
 QUIET = {
     *("select_n", "copy", "stop_gradient", "neg", "abs", "sign", "floor", "ceil", "gather", "dynamic_slice", "round"),

@@ -53,5 +53,6 @@ def _within(a, b, others, rtol):
         if any((_kinds(x) != _kinds(b)).any() for x in others):
             return True
         finite = np.isfinite(b)
-        reach = max(np.abs(x - b)[finite].max(initial=0.0) for x in others)
-        return is_close(a, b, max(rtol, 30 * reach / max(np.abs(b)[finite].max(initial=0.0), 1e-300)))
+        reach = 30 * max(np.abs(x - b)[finite].max(initial=0.0) for x in others)
+        reach = max(reach, rtol * np.abs(b)[finite].max(initial=0.0))
+        return bool((_kinds(a) == _kinds(b)).all() and (np.abs(a - b)[finite] <= reach).all())

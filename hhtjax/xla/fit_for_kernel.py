@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Literal
 
 from hhtjax.jaxpr.scalar_rules import ELEMENTWISE
 
@@ -45,6 +46,7 @@ INSIDE = {
     *("closed_call", "custom_jvp_call", "custom_lin", "custom_linear_solve", "custom_vjp_call", "eval_jaxpr"),
     *("hhtjax_kernel", "jit", "remat2", "scan", "while"),
 }
+MENDED = "hhtjax_", "scatter", "dot_general"  # how names begin of operations that for_kernel.py may replace
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "bool", "int32", "int64", "uint32", "uint64")}
 
 
@@ -72,6 +74,16 @@ def verdict(jaxpr: Jaxpr) -> Verdict:
         return Verdict(found.why, found.eqns)
 
 
+def verdict_before(jaxpr: Jaxpr) -> Verdict:
+    """The same on a jaxpr that for_kernel.py has not gone through, by what that leaves: what is hopeless is not copied.
+
+    There are more objections after."""
+    try:
+        return Verdict(None, operations=sum(_count(jaxpr, MOST_OPERATIONS, mended=True)))
+    except _Objection as found:
+        return Verdict(found.why, found.eqns)
+
+
 def inner(eqn: JaxprEqn):
     """The jaxprs in an operation that are run."""
     name, params = eqn.primitive.name, eqn.params
@@ -82,23 +94,27 @@ def inner(eqn: JaxprEqn):
     return [getattr(x, "jaxpr", x) for x in found]
 
 
-def _count(jaxpr: Jaxpr, most: int):
-    """Number of operations, all and those in branches."""
+def _count(jaxpr: Jaxpr, most: int, mended: bool = False):
+    """Number of operations, all and those in branches. mended: whether for_kernel.py is still to come."""
     number = in_branches = 0
+    asking = set()  # whether a kernel holds them: in one, that is known
     for eqn in jaxpr.eqns:
         number += 1
         name = eqn.primitive.name
-        if name in INSIDE or name == "cond":
-            for x in inner(eqn):
+        is_asking = not asking.isdisjoint(x for x in eqn.invars[:1] if not isinstance(x, Literal))
+        if mended and (name == "hhtjax_inside" or (is_asking and name != "cond")):
+            asking.add(eqn.outvars[0])
+        elif name in INSIDE or name == "cond":
+            for x in inner(eqn)[1:] if is_asking else inner(eqn):
                 try:
-                    more, branches = _count(x, MOST_IN_BRANCH if name == "cond" else most)
+                    more, branches = _count(x, MOST_IN_BRANCH if name == "cond" else most, mended)
                 except _Objection as found:
                     found.eqns = (*found.eqns, eqn)
                     raise
                 if name == "cond":
                     more, branches = 0, more + branches
                 number, in_branches = number + more, in_branches + branches
-        elif objection := _objection(eqn, name):
+        elif not (mended and name.startswith(MENDED)) and (objection := _objection(eqn, name)):
             raise _Objection(objection, eqn)
         if number > most:
             raise _Objection(f"more than {most} operations")

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import eval_jaxpr
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.extend.core.primitives import closed_call_p
@@ -142,7 +141,7 @@ def _loop_at_most_once(eqn: JaxprEqn, copier) -> ClosedJaxpr:
     def run(which: Array, *x: Array):
         def body(carry: tuple):
             given = [x if i is None else carry[1 + i] for x, i in zip(x, place, strict=True)]
-            return jnp.array(False), *jaxpr_as_fun(taken)(*given)
+            return jnp.array(False), *as_call(taken)(*given)
 
         return lax.while_loop(lambda carry: carry[0], body, (which != 0, *jaxpr_as_fun(idle)(*x)))[1:]
 
@@ -444,10 +443,26 @@ def kernel(form: ClosedJaxpr):
     number = len(form.out_avals)
 
     def body(*args: Array):
-        return [*eval_jaxpr(form.jaxpr, form.consts, *args), *_of_each(args)]
+        return [*as_call(form)(*args), *_of_each(args)]
 
     body = _with_attributes(body, inlineable="false", xla_cpu_small_call="true")
     return lambda *args: body(*lax.optimization_barrier(args))[:number]
+
+
+def as_call(closed: ClosedJaxpr) -> Callable:
+    """The function of a closed jaxpr, as one call of it: `jaxpr_as_fun` would trace every operation in it again.
+
+    The call is traced with zeros for results, and then holds the jaxpr in their place."""
+    if any(x.dtype not in DTYPES for x in closed.out_avals):  # no zeros of keys
+        return jaxpr_as_fun(closed)
+
+    def body(*_: Array):
+        return [lax.full(x.shape, 0, x.dtype) for x in closed.out_avals]
+
+    around = jax.make_jaxpr(jax.jit(body, keep_unused=True))(*closed.in_avals)
+    (call,) = around.jaxpr.eqns
+    call = call.replace(params=call.params | {"jaxpr": closed}, effects=closed.effects)
+    return jaxpr_as_fun(ClosedJaxpr(around.jaxpr.replace(eqns=[call], effects=closed.effects), around.consts))
 
 
 def _with_attributes(f: Callable, **attributes: str):
@@ -487,7 +502,7 @@ def computed_once(closed: ClosedJaxpr) -> ClosedJaxpr:
         return closed
 
     def body(*args: Array):
-        found = jaxpr_as_fun(closed)(*args)
+        found = as_call(closed)(*args)
         if number > 1 or found[0].size <= 1:
             return found
         return [*found, _first(next((x for x in args if x.size), found[0]))]  # of what is known before all else
