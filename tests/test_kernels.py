@@ -1,5 +1,7 @@
 """How a run is cut into kernels changes the compiled program, and nothing else."""
 
+import gc
+import weakref
 from functools import partial
 
 import jax
@@ -7,11 +9,14 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import ClosedJaxpr
 from linked_pendulums import LIGHT, N, end, loss, on_cpu, paths, run
 
 import hhtjax
 from hhtjax import primitives
 from hhtjax.xla import fit_for_kernel
+from hhtjax.xla.for_kernel import computed_once
+from hhtjax.xla.lowering import _as_kernel
 
 x = jnp.linspace(0.1, 1.0, 4)
 order = jnp.array([1, 0, 3, 2])
@@ -263,3 +268,15 @@ def test_shared_values_are_computed_once():
 
     assert sines(partial(primitives.staged, size=N)) == 1
     assert sines(partial(primitives.staged, size=1)) == 2  # fused into both users
+
+
+@pytest.mark.parametrize("f", [lambda x: jnp.sin(x) + x, jnp.sort], ids=["a kernel", "none"])
+def test_what_is_known_of_a_jaxpr_ends_with_it(f):
+    made = jax.make_jaxpr(f)(jnp.ones(3))
+    closed = ClosedJaxpr(made.jaxpr, made.consts)  # JAX keeps its own
+    computed_once(closed)
+    _as_kernel(closed)
+    alive = weakref.ref(closed)
+    del closed
+    gc.collect()
+    assert alive() is None

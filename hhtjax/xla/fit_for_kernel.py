@@ -46,7 +46,7 @@ INSIDE = {
     *("closed_call", "custom_jvp_call", "custom_lin", "custom_linear_solve", "custom_vjp_call", "eval_jaxpr"),
     *("hhtjax_kernel", "jit", "remat2", "scan", "while"),
 }
-MENDED = "hhtjax_", "scatter", "dot_general"  # how names begin of operations that for_kernel.py may replace
+REPLACED = "hhtjax_", "scatter", "dot_general"  # how names begin of operations that for_kernel.py may replace
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "bool", "int32", "int64", "uint32", "uint64")}
 
 
@@ -66,20 +66,13 @@ class _Objection(Exception):
         self.why, self.eqns = why, eqns
 
 
-def verdict(jaxpr: Jaxpr) -> Verdict:
-    """The `Verdict` on a jaxpr, all that it calls included."""
+def verdict(jaxpr: Jaxpr, before: bool = False) -> Verdict:
+    """The `Verdict` on a jaxpr, all that it calls included.
+
+    before: whether for_kernel.py has not gone through it yet. An objection is then one that this leaves, so that what
+    is hopeless need not be copied; there may be more after."""
     try:
-        return Verdict(None, operations=sum(_count(jaxpr, MOST_OPERATIONS)))
-    except _Objection as found:
-        return Verdict(found.why, found.eqns)
-
-
-def verdict_before(jaxpr: Jaxpr) -> Verdict:
-    """The same on a jaxpr that for_kernel.py has not gone through, by what that leaves: what is hopeless is not copied.
-
-    There are more objections after."""
-    try:
-        return Verdict(None, operations=sum(_count(jaxpr, MOST_OPERATIONS, mended=True)))
+        return Verdict(None, operations=sum(_count(jaxpr, MOST_OPERATIONS, before)))
     except _Objection as found:
         return Verdict(found.why, found.eqns)
 
@@ -94,27 +87,27 @@ def inner(eqn: JaxprEqn):
     return [getattr(x, "jaxpr", x) for x in found]
 
 
-def _count(jaxpr: Jaxpr, most: int, mended: bool = False):
-    """Number of operations, all and those in branches. mended: whether for_kernel.py is still to come."""
+def _count(jaxpr: Jaxpr, most: int, before: bool):
+    """Number of operations, all and those in branches."""
     number = in_branches = 0
-    asking = set()  # whether a kernel holds them: in one, that is known
+    asking = set()  # variables that ask whether a kernel holds them: in one that is known, and for_kernel.py drops them
     for eqn in jaxpr.eqns:
         number += 1
         name = eqn.primitive.name
         is_asking = not asking.isdisjoint(x for x in eqn.invars[:1] if not isinstance(x, Literal))
-        if mended and (name == "hhtjax_inside" or (is_asking and name != "cond")):
+        if before and (name == "hhtjax_inside" or (is_asking and name != "cond")):
             asking.add(eqn.outvars[0])
         elif name in INSIDE or name == "cond":
             for x in inner(eqn)[1:] if is_asking else inner(eqn):
                 try:
-                    more, branches = _count(x, MOST_IN_BRANCH if name == "cond" else most, mended)
+                    more, branches = _count(x, MOST_IN_BRANCH if name == "cond" else most, before)
                 except _Objection as found:
                     found.eqns = (*found.eqns, eqn)
                     raise
                 if name == "cond":
                     more, branches = 0, more + branches
                 number, in_branches = number + more, in_branches + branches
-        elif not (mended and name.startswith(MENDED)) and (objection := _objection(eqn, name)):
+        elif not (before and name.startswith(REPLACED)) and (objection := _objection(eqn, name)):
             raise _Objection(objection, eqn)
         if number > most:
             raise _Objection(f"more than {most} operations")

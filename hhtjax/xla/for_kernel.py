@@ -461,7 +461,8 @@ def as_call(closed: ClosedJaxpr) -> Callable:
 
     around = jax.make_jaxpr(jax.jit(body, keep_unused=True))(*closed.in_avals)
     (call,) = around.jaxpr.eqns
-    call = call.replace(params=call.params | {"jaxpr": closed}, effects=closed.effects)
+    held = ClosedJaxpr(closed.jaxpr, closed.consts)  # another one: what `of_jaxpr` knows ends with the jaxpr it is of
+    call = call.replace(params=call.params | {"jaxpr": held}, effects=closed.effects)
     return jaxpr_as_fun(ClosedJaxpr(around.jaxpr.replace(eqns=[call], effects=closed.effects), around.consts))
 
 

@@ -26,7 +26,7 @@ from hhtjax.primitives.kernel_primitive import kernel_p, of_jaxpr
 from hhtjax.primitives.kernels import AROUND, alone_p, inside_p, largest_p, structural_p, told_p
 from hhtjax.primitives.two_mode_derivative import is_in_program
 from hhtjax.xla.first_call import tell_if_long, telling_if_long
-from hhtjax.xla.fit_for_kernel import inner, verdict, verdict_before
+from hhtjax.xla.fit_for_kernel import inner, verdict
 from hhtjax.xla.for_kernel import for_kernel, for_list, kernel
 
 if TYPE_CHECKING:
@@ -38,9 +38,9 @@ DIVIDED = "partitioned over devices; shard_map leaves each its own kernel"
 
 @of_jaxpr
 def _as_kernel(closed: ClosedJaxpr):
-    """The jaxpr in the form for a kernel, and the verdict on that; as it is, where it is none in any form."""
-    if (hopeless := verdict_before(closed.jaxpr)).objection:
-        return closed, hopeless
+    """The jaxpr in the form for a kernel, and the verdict on that; no form, where it is none in any."""
+    if (hopeless := verdict(closed.jaxpr, before=True)).objection:
+        return None, hopeless
     form = for_kernel(closed)
     return form, verdict(form.jaxpr)
 
