@@ -33,6 +33,12 @@ def require_integer(caller: str, name: str, value, least: int = 1) -> int:
     return int(value)
 
 
+def require_one_of(caller: str, name: str, value, known: tuple):
+    """An error for what is none of the known values."""
+    if value not in known:
+        raise ValueError(f"{caller}: `{name}` must be one of {', '.join(map(repr, known))}; received {value!r}.")
+
+
 def require_function(caller: str, name: str, value, signature: str):
     """An error unless `value` can be called so, and is hashable, as a static argument of jit has to be."""
     if not callable(value):
@@ -156,13 +162,12 @@ def check_matrix(caller: str, name: str, matrix, n: int, dtype: np.dtype, *args:
         check_dtype(caller, name, value, dtype)
 
 
-def count(caller: str, name: str, function: Callable, most: int, dtype: np.dtype, *args: PyTree) -> int:
-    """m, for a function that returns (m,) with m <= most."""
+def count(caller: str, name: str, function: Callable, most: int | None, dtype: np.dtype, *args: PyTree) -> int:
+    """m, for a function that returns (m,) with m <= most, if there is a most."""
     value = evaluate(caller, name, function, *args)
-    if not hasattr(value, "shape") or len(value.shape) != 1 or not 1 <= value.shape[0] <= most:
-        raise ValueError(
-            f"{caller}: `{name}` must return an array (m,) with 1 <= m <= {most}; received {describe(value)}."
-        )
+    if not hasattr(value, "shape") or len(value.shape) != 1 or not 1 <= value.shape[0] <= (most or value.shape[0]):
+        sizes = "m >= 1" if most is None else f"1 <= m <= {most}"
+        raise ValueError(f"{caller}: `{name}` must return an array (m,) with {sizes}; received {describe(value)}.")
     check_dtype(caller, name, value, dtype)
     return value.shape[0]
 

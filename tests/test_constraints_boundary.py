@@ -32,10 +32,10 @@ def level(q, t, params):
 
 ONE, ZERO = (1.0, 1.0), (0.0, 0.0)
 AWAY = "1 away from consistent values; hhtjax.consistent_initial gives them."
-SHAPE = "simulate: `constraint` must return an array (m,) with 1 <= m <= 2"
+SHAPE = "simulate: `constraint` must return an array (m,) with m >= 1"
 BAD = [
     (SHAPE, run_from(lambda q, t, params: q[0], ONE, ONE)),
-    (SHAPE, run_from(lambda q, t, params: jnp.tile(q, 2), ONE, ONE)),
+    ("simulate: `constraint` rows [0, 2] depend", run_from(lambda q, t, params: jnp.tile(q - 1, 2)[:3], ONE, ZERO)),
     (f"simulate: `q0` violates the constraint: max|Phi| = 1, {AWAY}", run_from(level, (2.0, 2.0), ZERO)),
     ("simulate: `q0` violates the constraint: max|Phi| = 1, 1 away", run_from(level, (2.0, 1e8), ZERO)),
     (f"simulate: `v0` violates the constraint: max|dPhi/dt| = 1, {AWAY}", run_from(level, ONE, ONE)),

@@ -70,17 +70,49 @@ def test_minimal_top():
     np.testing.assert_allclose(np.log2(coarse / fine), 2, atol=0.15)
 
 
+class Rods:
+    """The chain in R^3 x SO(3), body by body, with the ball joints as constraints: q = {"R", "x"} of the centres."""
+
+    m, length, r, g = body_chain.MASS, body_chain.LENGTH, body_chain.GYRATION, body_chain.GRAVITY
+    inertia = m * np.array([length**2 / 12 + r**2 / 2, length**2 / 12 + r**2 / 2, r**2])
+
+    @classmethod
+    def system(cls, bodies):
+        """I A = -Om x I Om, m xddot = -m g e3; upper end of each rod = lower end of the rod above."""
+        M = np.concatenate([np.tile(cls.inertia, bodies), np.full(3 * bodies, cls.m)])
+
+        def force(q, v, t, params):
+            weight = jnp.tile(jnp.array([0.0, 0.0, -cls.m * cls.g]), (bodies, 1))
+            return {"R": -jnp.cross(v["R"], cls.inertia[None] * v["R"]), "x": weight}
+
+        def joints(q, t, params):
+            half = cls.length / 2 * q["R"][:, :, 2]
+            above = jnp.concatenate([jnp.zeros_like(half[:1]), (q["x"] - half)[:-1]])
+            return (q["x"] + half - above).ravel()
+
+        return hhtjax.System(M, force, joints)
+
+    @classmethod
+    def start(cls, scene):
+        """The start of the scene."""
+        mechanism, N = body_chain.mechanism(len(scene.q0["ball"])), len(scene.q0["ball"])
+        frames = mechanism.frames(scene.q0)
+        R = np.stack([frames[f"rod{i + 1}"].R for i in range(N)])
+        x = np.stack([frames[f"rod{i + 1}"].x for i in range(N)]) - cls.length / 2 * R[:, :, 2]
+        spin = np.tile(np.asarray(scene.v0["ball"][0]), (N, 1))
+        return {"R": R, "x": x}, {"R": spin, "x": np.zeros((N, 3))}
+
+
 @pytest.mark.slow
 def test_body_chain():
-    """Two rods on spherical joints: energy and the vertical momentum kept to second order, joints closed."""
+    """Two rods on ball joints: energy and the vertical momentum kept to second order, joints closed; as the scene."""
     scene = body_chain.body_chain(bodies=2)
+    system, (q0, v0) = Rods.system(2), Rods.start(scene)
     errors = []
     for dt, half in ((1 / 500, 26), (1 / 1000, 51)):  # one program; over half a second
-        run = hhtjax.simulate(
-            scene.system, hhtjax.hht(-0.05), *scene[2:4], scene.params, dt=dt, num_steps=500, save_every=10
-        )
+        run = hhtjax.simulate(system, hhtjax.hht(-0.05), q0, v0, None, dt=dt, num_steps=500, save_every=10)
         run.check()
-        inertia, m, g = np.array(body_chain.inertia(scene.params)), 1.0, 9.81
+        inertia, m, g = Rods.inertia, Rods.m, Rods.g
         R, x, Om, v = (np.array(y) for y in (run.q["R"], run.q["x"], run.v["R"], run.v["x"]))
         energy = np.sum(inertia * Om**2, (1, 2)) / 2 + m * np.sum(v**2, (1, 2)) / 2 + m * g * np.sum(x[..., 2], 1)
         spin = np.sum(np.einsum("tnij,tnj->tni", R, inertia * Om) + m * np.cross(x, v), 1)[:, 2]
@@ -90,3 +122,9 @@ def test_body_chain():
     slopes = np.log2(np.array(errors[0]) / np.array(errors[1]))
     assert np.all(slopes > 1.85)
     assert errors[1][0] < 1e-3 * 2 * m * g
+    minimal = hhtjax.simulate(
+        scene.system, hhtjax.hht(-0.05), scene.q0, scene.v0, scene.params, dt=1 / 1000, num_steps=500, save_every=500
+    )
+    frame = body_chain.mechanism(2).frames(jax.tree.map(lambda y: y[-1], minimal.q))["rod2"]
+    np.testing.assert_allclose(frame.R, R[-1, 1], atol=1e-4)
+    np.testing.assert_allclose(frame.x - Rods.length / 2 * frame.R[:, 2], x[-1, 1], atol=1e-5)

@@ -24,7 +24,7 @@ METHODS = {
     "hht, auto": hht(ALPHA),
 }
 FAST_METHODS = ("hht, predictor",)
-FORMULATIONS = {"Newton-Euler": arm.newton_euler, "Lagrange": arm.lagrange}
+FORMULATIONS = {"Newton-Euler": arm.mechanism().system, "Lagrange": arm.lagrange()}
 SAMPLES = 20  # times at which q is compared; every number of steps is a multiple
 COMPARED_STEPS = 320  # of the run that is made with both formulations
 
@@ -135,7 +135,7 @@ def run(report, fast):
 
     methods = FAST_METHODS if fast else METHODS
     tasks = {method: (scene, METHODS[method]) for method in methods}
-    other = scene._replace(system=arm.lagrange)
+    other = scene._replace(system=arm.lagrange())
     if not fast:
         difference = np.max(np.abs(exact - solve_reference(scene, evaluate["Newton-Euler"])))
         numbers["reference_difference_rad"] = float(difference)

@@ -26,7 +26,7 @@ plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 # %%
 arm = hhtjax.scenes.arm.swing(joints=3)
-true = {name: arm.params[name] for name in ("k", "c")}
+true = {name: arm.params[name] for name in ("stiffness", "damping")}
 NOISE, SAMPLES = 2e-3, 300
 
 
@@ -60,7 +60,7 @@ def residuals(unknown):
 
 
 guess = jax.tree.map(lambda x: jnp.full(3, jnp.mean(x)), true)
-positive = {"k": hhtjax.positive, "c": hhtjax.positive}
+positive = {"stiffness": hhtjax.positive, "damping": hhtjax.positive}
 fits = {
     str(loss or "least squares"): hhtjax.fit(
         residuals, guess, loss=loss, weights=jnp.full(record.shape, 1 / NOISE), transforms=positive

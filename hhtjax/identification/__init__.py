@@ -111,11 +111,21 @@ from hhtjax.identification.initial_guesses import equation_error, fit_progressiv
 from hhtjax.identification.least_squares import History
 from hhtjax.identification.refinement import Refined, StepSizeWarning, refine
 from hhtjax.identification.result import FitResult
+from hhtjax.identification.robots import (
+    BaseParameters,
+    Excitation,
+    base_parameters,
+    excitation,
+    inertia_coordinates,
+    physical_inertia,
+)
 from hhtjax.identification.sandwich import Uncertainty
 from hhtjax.identification.sensors import Windows, accelerometer, measure, windows, wrap_angle
 from hhtjax.identification.transforms import bounded, fixed, positive
 
 __all__ = [
+    "BaseParameters",
+    "Excitation",
     "FitResult",
     "Gaussian",
     "History",
@@ -125,14 +135,18 @@ __all__ = [
     "Uncertainty",
     "Windows",
     "accelerometer",
+    "base_parameters",
     "bounded",
     "compare",
     "equation_error",
+    "excitation",
     "fit",
     "fit_progressively",
     "fixed",
+    "inertia_coordinates",
     "measure",
     "multistart",
+    "physical_inertia",
     "positive",
     "profile",
     "refine",

@@ -22,11 +22,11 @@ from hhtjax.systems.system import (
     AnySystem,
     System,
     mass_at,
-    require_smooth,
     require_system,
 )
 
 ARGUMENTS = set(inspect.signature(fit).parameters) - {"params0"}
+SLOW = 0.02  # part of the largest sliding velocity, below which a place may stick for all that a record tells
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
 
@@ -42,6 +42,9 @@ def equation_error(
     """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
 
     Of a `FirstOrderSystem` y' - f(y, t, params), for a measured y.
+
+    With dry friction it holds H^T F sign(s) too, and rows are 0 where something slides slower than a fiftieth of its
+    largest velocity, as it may stick there.
 
     Nothing is simulated, and most parameters enter linearly: so the fit converges from anywhere, and its estimate is a
     start for the fit through the simulation. It is no more than that, because noise and filter bias it.
@@ -60,7 +63,7 @@ def equation_error(
 
     Raises:
         TypeError, ValueError: what is no system; as `band_limited_motion` and `sampled`; no samples between the ends.
-        NotImplementedError: a system with constraints, internal states or dry friction; when called, with rotations.
+        NotImplementedError: a system with constraints or internal states; when called, with rotations.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -75,7 +78,6 @@ def equation_error(
         raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
     if system.internal is not None:
         raise NotImplementedError("equation_error: `system` has internal states, which are not measured.")
-    require_smooth("equation_error", system)
     if times is not None:
         values, dt, t0 = _at_equal_distances(values, dt, t0, times)
     motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)
@@ -95,12 +97,35 @@ def equation_error(
             _require_no_rotations(system, q, t, params)
             flat, x, rate = flatten("equation_error", system, q, v, t, params)
             t = t.astype(rate.dtype)
-            known = flat.force(x, rate, t, params)
-            return flat.inertia(x, ravel_pytree(a if flat.positions else v)[0], t, params) - known
+            left = flat.residual(x, rate, ravel_pytree(a if flat.positions else v)[0], t, params)
+            return left if flat.friction is None else _with_sliding(flat, left, slowest, x, rate, t, params)
 
+        slowest = None if getattr(system, "friction", None) is None else SLOW * _largest_sliding(system, inside, params)
         return jax.vmap(one)(*inside)
 
     return residuals
+
+
+def _largest_sliding(system, motion: tuple, params: PyTree) -> Array:
+    """Of each place that rubs, the largest sliding velocity of a motion: (m,)."""
+
+    def one(q: PyTree, v: PyTree, t: Array) -> Array:
+        flat, x, rate = flatten("equation_error", system, q, v, t, params)
+        return jnp.abs(flat.friction.sliding(x, rate, t.astype(rate.dtype), params))
+
+    q, v, _, t = motion
+    return jnp.max(jax.vmap(one)(q, v, t), axis=0)
+
+
+def _with_sliding(flat, left: Array, slowest: Array, q: Array, v: Array, t: Array, params: PyTree) -> Array:
+    """The rows with H^T tau, tau = F sign(s); 0 where something enters that is slower than `slowest`, and may stick."""
+    law = flat.friction
+    s, pull = jax.vjp(lambda v: law.sliding(q, v, t, params), v)
+    fast = jnp.abs(s) > slowest
+    tau = law.limit(q, v, None, t, params) * jnp.where(fast, jnp.sign(s), 0)
+    slow = jnp.where(fast, 0.0, 1.0).astype(s.dtype)
+    H = jax.jacfwd(lambda v: law.sliding(q, v, t, params))(v)
+    return jnp.where(jnp.abs(H).T @ slow > 0, 0, left + pull(tau)[0])
 
 
 def _require_no_rotations(system, q: PyTree, t: Array, params: PyTree):

@@ -1,53 +1,30 @@
-"""A chain of rods in space: bodies in R^3 x SO(3), each hung by a spherical joint on the one before. SI units.
+"""A chain of rods in space on ball joints, the first at the origin. SI units.
 
-Rod i has its centre at x_i and its material axis 3 along R_i e3; r is its radius of gyration about that axis. The first
-joint is the origin. Gravity g (m/s^2) is along -z.
-
-    q = {"R": (N, 3, 3), "x": (N, 3)}, v = {"R": Om (N, 3), "x": (N, 3)}
-
-    I A = -Om x I Om,    m xddot = -m g e3,    I = m diag(l^2/12 + r^2/2, l^2/12 + r^2/2, r^2)
-
-    Phi_i = x_i + R_i (l/2) e3 - (x_(i-1) - R_(i-1) (l/2) e3) = 0,  3 N components; the multipliers are the forces (N)
-    of the joints on the rods below
+q = {"ball": (N, 3, 3)}, the rotation of each rod as seen from the rod before, from material components; v = {"ball":
+(N, 3)}, material angular velocities relative to the rod before. A tree, in minimal coordinates: no constraints.
 """
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.bodies import Body, Joint, Mechanism, tree
 from hhtjax.checks import require_integer, require_number
-from hhtjax.description import PyTree
-from hhtjax.rotation import cross
 from hhtjax.scenes.scene import Scene, array
-from hhtjax.systems.system import System
+
+MASS, LENGTH, GYRATION, GRAVITY = 1.0, 0.5, 0.05, 9.81  # kg, m, radius of gyration about the axis in m, m/s^2
+TILT = np.pi / 3  # from the vertical
 
 
-def inertia(params: PyTree):
-    """The diagonal of I, kg m^2."""
-    m, l2, r2 = params["m"], params["l"] ** 2, params["r"] ** 2
-    return m * jnp.stack([l2 / 12 + r2 / 2, l2 / 12 + r2 / 2, r2])
-
-
-def mass(q, params: PyTree):
-    """The diagonal of M."""
-    N = len(q["x"])
-    return jnp.concatenate([jnp.tile(inertia(params), N), jnp.full(3 * N, params["m"])])
-
-
-def force(q, v, t, params: PyTree):
-    """Gyroscopic moments and weights."""
-    Om = v["R"]
-    weight = jnp.stack([jnp.zeros_like(params["g"]), jnp.zeros_like(params["g"]), -params["m"] * params["g"]])
-    return {"R": -jax.vmap(cross)(Om, inertia(params)[None, :] * Om), "x": jnp.tile(weight, (len(Om), 1))}
-
-
-def joints(q, t, params: PyTree):
-    """Phi: upper end of each rod, less the lower end of the rod above."""
-    half = params["l"] / 2 * q["R"][:, :, 2]
-    above = jnp.concatenate([jnp.zeros_like(half[:1]), (q["x"] - half)[:-1]])
-    return (q["x"] + half - above).ravel()
+def mechanism(bodies: int) -> Mechanism:
+    """Rods that hang, each by the upper end of its axis 3 on the lower end of the one before."""
+    across = MASS * (LENGTH**2 / 12 + GYRATION**2 / 2)
+    rod = {"mass": MASS, "com": (0, 0, -LENGTH / 2), "inertia": (across, across, MASS * GYRATION**2)}
+    first = Body("rod1", "world", Joint("ball"), **rod)
+    others = [
+        Body(f"rod{i}", f"rod{i - 1}", Joint("ball"), position=(0, 0, -LENGTH), **rod) for i in range(2, bodies + 1)
+    ]
+    return tree([first, *others], gravity=(0.0, 0.0, -GRAVITY))
 
 
 def body_chain(bodies=3, spin=5.0) -> Scene:
@@ -59,15 +36,14 @@ def body_chain(bodies=3, spin=5.0) -> Scene:
     Raises:
         TypeError, ValueError: bodies is no positive integer, or spin no finite number.
 
-    >>> (body_chain(bodies=2).q0["x"].round(3) + 0.0).tolist()
-    [[0.217, 0.0, -0.125], [0.65, 0.0, -0.375]]
+    >>> (mechanism(2).frames(body_chain(bodies=2).q0)["rod2"].x.round(3) + 0.0).tolist()
+    [0.433, 0.0, -0.25]
     """
     require_number("body_chain", "spin", spin, np.isfinite, "be finite")
-    N = require_integer("body_chain", "bodies", bodies)
-    length, c, s = 0.5, np.cos(np.pi / 3), np.sin(np.pi / 3)
-    R = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
-    x = -length * (np.arange(N) + 0.5)[:, None] * R[:, 2]
-    q0, v0 = {"R": np.tile(R, (N, 1, 1)), "x": x}, {"R": array(N * [[0.0, 0.0, spin]]), "x": np.zeros((N, 3))}
-    params = {"m": 1.0, "l": length, "r": 0.05, "g": 9.81}
-    params, q0, v0 = jax.tree.map(array, (params, q0, v0))
-    return Scene(System(mass, force, joints), params, q0, v0, 2.0)
+    chain = mechanism(require_integer("body_chain", "bodies", bodies))
+    c, s = np.cos(TILT), np.sin(TILT)
+    R = np.tile(np.eye(3), (bodies, 1, 1))
+    R[0] = [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]
+    spins = np.zeros((bodies, 3))
+    spins[0, 2] = spin  # the others turn with it
+    return Scene(chain.system, chain.params, {"ball": array(R)}, {"ball": array(spins)}, 2.0)

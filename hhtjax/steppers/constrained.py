@@ -63,7 +63,7 @@ def equations(method, system, params: PyTree, dt, s):
     D = part(lambda q, B: directions(system, system.mass(q, s.t, params), B))(s.q, B) if ggl else None
 
     def r(s: State) -> Array:
-        force = system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)
+        force = system.residual(s.q, s.v, s.w, s.t, params)
         position, rate, pull = violation_and_reaction(system, s.q, s.v, s.t, params, s.L)
         rows = [force - pull, position / (c.beta * dt**2)]
         return jnp.concatenate(rows + [rate / (c.gamma * dt)] * ggl)

@@ -59,4 +59,4 @@ def advance(c: Coefficients, s: State, dt: Array, w: Array):
 
 def residual(system: FlatSystem, params: PyTree, s: State):
     """M(q) w - Q(q, v, t): zero on the trajectory."""
-    return system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)
+    return system.residual(s.q, s.v, s.w, s.t, params)

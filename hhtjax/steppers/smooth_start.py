@@ -561,7 +561,7 @@ def rate_of(layer: Layer, s: State, inverse: Callable, h: Array) -> Array:
 
     def rows(later: Array) -> Array:
         q, v, t = system.move(s.q, later * s.v), s.v + layer.located(later * s.w), s.t + later
-        force = system.inertia(q, s.w, t, params) - system.force(q, v, t, params)
+        force = system.residual(q, v, s.w, t, params)
         if layer.B is None:
             return force
         along = system.rate(q, v), s.w, jnp.ones_like(t)

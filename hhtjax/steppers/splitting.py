@@ -64,7 +64,7 @@ class OperatorSplitting(Stepper):
 
     def begun(self, system: FlatSystem, s: State, params: PyTree, memory: Memory) -> State:
         """A state of the `hht` family as one of this method."""
-        left = system.inertia(s.q, s.w, s.t, params) - system.force(s.q, s.v, s.t, params)  # not 0 of what is stiff
+        left = system.residual(s.q, s.v, s.w, s.t, params)  # not 0 of what is stiff
         P = self.weighted_force(system, s.q, s.v, s.t, params) + left
         return s._replace(a=None, memory=memory._replace(P=P))
 

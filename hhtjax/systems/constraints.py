@@ -149,6 +149,7 @@ def require_independent(caller: str, B: np.ndarray, clear: np.ndarray):
             f"one. {SWITCHED_OFF}."
         )
     left, values, _ = np.linalg.svd(B / size[:, None])
+    values = np.pad(values, (0, len(B) - len(values)))  # of more rows than coordinates
     dependent = left[:, values < RANK_TOLERANCE]
     if dependent.size:
         rows = np.flatnonzero(np.abs(dependent).max(axis=1) > 1e-6).tolist()

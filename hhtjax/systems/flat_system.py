@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -21,7 +22,7 @@ from hhtjax.systems import kinematics
 from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.linear_system import with_known_matrices
 from hhtjax.systems.matrices import as_matrix
-from hhtjax.systems.system import FirstOrderSystem, LinearSystem, mass_at, product_at, timed
+from hhtjax.systems.system import DynamicsMass, FirstOrderSystem, LinearSystem, mass_at, product_at, timed
 
 if TYPE_CHECKING:
     from hhtjax.systems.system import System
@@ -50,6 +51,7 @@ class FlatSystem(NamedTuple):
     num_constraints: int = 0  # m
     blocks: tuple = ()  # where the rotations are; empty without
     product: Callable | None = None  # q, w, t, params -> M w, where the system has its own
+    balance: Callable | None = None  # q, v, w, t, params -> M w - Q (N,), where the system has it as one function
     local: Any = None  # the `Local` force beside a linear system
     friction: FrictionLaw | None = None  # dry friction, which `force` does not hold
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
@@ -81,6 +83,12 @@ class FlatSystem(NamedTuple):
             return matvec(self.mass(q, t, params), w) if self.product is None else self.product(q, w, t, params)
 
         return self._of_positions(product, w)
+
+    def residual(self, q: Array, v: Array, w: Array, t: Array, params: PyTree) -> Array:
+        """M(q, t) w - Q(q, v, t), and zdot - g: zero on the trajectory, but for the reactions of constraints."""
+        if self.balance is not None:
+            return self.balance(q, v, w, t, params)
+        return self.inertia(q, w, t, params) - self.force(q, v, t, params)
 
     def acceleration(self, q: Array, v: Array, t: Array, params: PyTree, factorize: Callable = factorize) -> Array:
         """w = M(q, t)^-1 Q(q, v, t), and zdot."""
@@ -188,7 +196,7 @@ def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real,
         )
     constraint, m = None, 0
     if system.constraint is not None:
-        m = count(caller, "constraint", system.constraint, n, dtype, q0, t0, params)
+        m = count(caller, "constraint", system.constraint, None, dtype, q0, t0, params)
         constraint = consistent(partial(_flat_constraint, system.constraint, unravel, dtype))
 
     linear = isinstance(system, LinearSystem)
@@ -201,6 +209,8 @@ def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real,
         return _with_local(system, flat, dtype) if linear and system.nonlinear is not None else flat
 
     flat = on_vectors(system)
+    if not linear and system.dynamics is not None:
+        flat = _with_dynamics(caller, system, flat, dtype, q0, v0, t0, params, z0)
     if not linear and system.inertia is not None:
         at = q0, v0, *timed(system.inertia, 2, t0), params
         check_like(caller, "inertia", evaluate(caller, "inertia", system.inertia, *at), "v0", v0, dtype)
@@ -214,6 +224,34 @@ def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real,
     if system.friction is not None:
         flat = flat._replace(friction=flat_friction(caller, system, flat, q0, v0, z0, t0, params))
     return flat, q, v
+
+
+def _with_dynamics(caller: str, system, flat: FlatSystem, dtype, q0: PyTree, v0: PyTree, t0: Real, params, z0: PyTree):
+    """The system with its residual as one function, and M w and M by it."""
+    z = () if system.internal is None else (z0,)
+    r = evaluate(caller, "dynamics", system.dynamics, q0, v0, v0, *z, t0, params)
+    check_like(caller, "dynamics", r, "v0", v0, dtype)
+    unravel, unravel_rates, n = flat.unravel, flat.unravel_rates, flat.size
+
+    def balance(q: Array, v: Array, w: Array, t: Array, params: PyTree) -> Array:
+        r = system.dynamics(unravel(q), unravel_rates(v), unravel_rates(w), t, thaw(params))
+        return ravel_pytree(r)[0].astype(dtype)
+
+    if z:
+        return flat
+    known = flat._replace(balance=consistent(balance))
+    if not isinstance(system.mass, DynamicsMass):
+        return known
+    derived = system.mass
+
+    def mass(q: Array, t: Array, params: PyTree) -> Array:
+        return derived.matrix(unravel(q), jnp.zeros(n, dtype), unravel_rates, t, thaw(params)).astype(dtype)
+
+    def product(q: Array, w: Array, t: Array, params: PyTree) -> Array:
+        v = unravel_rates(jnp.zeros(n, dtype))
+        return ravel_pytree(derived.product(unravel(q), v, unravel_rates(w), t, thaw(params)))[0].astype(dtype)
+
+    return known._replace(mass=consistent(mass), product=consistent(product))
 
 
 def _flat_mass(system: System, unravel: Callable, dtype: np.dtype, q: Array, t: Array, params: PyTree):
@@ -257,7 +295,13 @@ def _with_internal(system, flat: FlatSystem, q: Array, v0: PyTree, z0: PyTree):
         at = flat.unravel(q), *unravel(V), t, thaw(params)
         return ravel_pytree((system.force(*at), system.internal(*at)))[0].astype(V.dtype)
 
-    return flat._replace(force=consistent(force), size=V.size, unravel_internal=unravel_internal), q, V
+    def balance(q: Array, V: Array, W: Array, t: Array, params: PyTree) -> Array:
+        (v, z), (w, rate), q, params = unravel(V), unravel(W), flat.unravel(q), thaw(params)
+        left = jax.tree.map(jnp.subtract, rate, system.internal(q, v, z, t, params))
+        return ravel_pytree((system.dynamics(q, v, w, z, t, params), left))[0].astype(V.dtype)
+
+    flat = flat._replace(force=consistent(force), size=V.size, unravel_internal=unravel_internal)
+    return (flat if system.dynamics is None else flat._replace(balance=consistent(balance))), q, V
 
 
 def _flatten_first_order(caller: str, system: FirstOrderSystem, y0: PyTree, t0: Real, params: PyTree):
@@ -299,7 +343,8 @@ def _check_functions(
             if getattr(L, "shape", None) != ():
                 raise ValueError(f"{caller}: `lagrangian` must give a scalar, of shape (); received {describe(L)}.")
         at = (q0, *timed(system.mass, 1, t0), params) if callable(system.mass) else ()
-        check_matrix(caller, "mass", system.mass, n, dtype, *at)
+        if not isinstance(system.mass, DynamicsMass):
+            check_matrix(caller, "mass", system.mass, n, dtype, *at)
     if linear and system.load is not None:
         Q = evaluate(caller, "force", system.load, t0, params)
     elif system.internal is None:

@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import positional_names, require_function, takes
 from hhtjax.description import Array, Description, PyTree, Real
+from hhtjax.jaxpr import linear_map
 from hhtjax.primitives import traced
 from hhtjax.systems.friction import require_friction
 from hhtjax.systems.linear_system import LinearSystem
@@ -36,12 +37,21 @@ class System(Description):
         force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v. Steps take its slopes,
             derivatives of runs its second derivatives: a contact max(x, 0)**1.5, whose second one is infinite at 0,
             gives NaN there, and max(x, 1e-12)**1.5 does not.
-        constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), m <= n, rows independent. Then
+        constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), rows independent (or see `hht`). Then
             M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.
         inertia: M(q) w without M, `inertia(q, w, params)`, or `inertia(q, w, t, params)`, a pytree structured like v:
             for chains and trees, whose
             inverse dynamics take fewer operations than their matrix. It replaces the product of `mass` and w, in the
             steps and in their Jacobians, and is trusted to be equal to it; `mass` is still asked for M itself.
+        dynamics: r, the whole residual as one function, in the place of `force` and `inertia`: inverse dynamics less
+            the forces that act, `dynamics(q, v, w, t, params)`, a pytree structured like v, with
+
+                r(q, v, w, t) = M(q, t) w - Q(q, v, t)
+
+            It must be affine in w. The implicit steps then call nothing else, and take its slopes by `jax.jacfwd`, or
+            by the rule that it brings (`jax.custom_jvp`). Where M or Q is asked for alone, at a start or by an explicit
+            method, M is its slope in w and Q is -r(q, v, 0, t); `mass` may be given beside it where it is known with
+            fewer operations. With internal states it is `dynamics(q, v, w, z, t, params)`.
         internal: g, the rate of internal states z of first order, such as the current of a motor, the integral of a
             controller, hysteresis, or a Maxwell branch: `internal(q, v, z, t, params)`, a pytree structured like z,
             of any shapes. The force is then `force(q, v, z, t, params)`, and runs take a `z0`:
@@ -85,7 +95,8 @@ class System(Description):
     units do. A System is frozen and hashable; constant arrays in it are leaves of a pytree.
 
     Raises:
-        TypeError: a function is not callable (or an array, for `mass`), not hashable, or has other arguments.
+        TypeError: a function is not callable (or an array, for `mass`), not hashable, or has other arguments;
+            `dynamics` beside `force` or `inertia`.
         ValueError: a constant `mass` of a wrong shape, not finite, not symmetric or not positive definite; `sliding`
             without `friction`.
 
@@ -122,19 +133,28 @@ class System(Description):
     >>> solution = hhtjax.simulate(block, hhtjax.hht(), jnp.array([1.0]), jnp.zeros(1), dt=1e-2, num_steps=500)
     >>> bool(solution.sticking[-1, 0]), round(float(solution.friction[-1, 0]), 4), round(float(solution.q[-1, 0]), 4)
     (True, -1.0, 0.1111)
+
+    Example: the pendulum again, by its inverse dynamics: the moment that the acceleration w needs.
+
+    >>> pendulum = hhtjax.System(dynamics=lambda q, v, w, t, params: params["l"] * w + 9.81 * jnp.sin(q))
+    >>> pendulum.mass(jnp.array([0.5]), 0.0, {"l": 2.0}), pendulum.force(jnp.zeros(1), jnp.zeros(1), 0.0, {"l": 2.0})
+    (Array([[2.]], dtype=float64), Array([-0.], dtype=float64))
     """
 
-    mass: Any
-    force: Callable
+    mass: Any = None
+    force: Callable | None = None
     constraint: Callable | None = None
     inertia: Callable | None = None
     internal: Callable | None = None
     friction: Callable | None = None
     sliding: Callable | None = None
+    dynamics: Callable | None = None
     massless = None  # of a `LinearSystem` alone
     depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
     def __post_init__(self):
+        if self.dynamics is not None:
+            self._take_apart()
         if self.internal is None:
             require_function("System", "force", self.force, "force(q, v, t, params)")
         else:
@@ -153,6 +173,21 @@ class System(Description):
             mass = constant_matrix("System", "mass", self.mass)
             require_mass("System", "mass", mass, self.constraint is not None)
             object.__setattr__(self, "mass", mass)
+
+    def _take_apart(self):
+        """`mass`, `force` and `inertia` by `dynamics`, for those who ask for one of them alone."""
+        z, dynamics = "" if self.internal is None else "z, ", self.dynamics
+        assert dynamics is not None
+        require_function("System", "dynamics", dynamics, f"dynamics(q, v, w, {z}t, params)")
+        for name in ("force", "inertia"):
+            given = getattr(self, name)
+            if given is not None:
+                raise TypeError(f"System: `dynamics` holds what `{name}` says: give one of them; received both.")
+        object.__setattr__(self, "force", DynamicsForce(dynamics))
+        if self.mass is None and self.internal is None:
+            object.__setattr__(self, "mass", DynamicsMass(dynamics))
+        elif self.mass is None:
+            raise TypeError("System: `dynamics` with internal states needs `mass` beside it, which they do not enter.")
 
     @classmethod
     def from_lagrangian(
@@ -375,6 +410,41 @@ class InternalLagrangianForce:
     def __call__(self, q: Array, v: Array, z: Array, t: Real, params: PyTree) -> Array:
         Q = LagrangianForce(self.lagrangian, None)(q, v, t, params)
         return Q if self.force is None else jax.tree.map(jnp.add, Q, self.force(q, v, z, t, params))
+
+
+# ----------------------------------------------------------------------------
+# Mass and force of a residual r(q, v, w, t) = M w - Q. Classes: equal functions give equal systems.
+
+
+@dataclass(frozen=True)
+class DynamicsMass:
+    """M(q, t), the slope of r in w, at v = 0. Of a position without rotations, whose rates are structured like it."""
+
+    dynamics: Callable
+
+    def __call__(self, q: PyTree, t: Real, params: PyTree) -> Array:
+        zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))
+        return self.matrix(q, zero, unravel, t, params)
+
+    def matrix(self, q: PyTree, zero: Array, unravel: Callable, t: Real, params: PyTree) -> Array:
+        """The same of any position. zero: (n,); unravel: of vectors of rates."""
+        v = unravel(zero)
+        return linear_map(lambda x: ravel_pytree(self.product(q, v, unravel(x), t, params))[0], zero)
+
+    def product(self, q: PyTree, v: PyTree, w: PyTree, t: Real, params: PyTree) -> PyTree:
+        """M(q, t) w. v: zeros."""
+        return jax.jvp(lambda w: self.dynamics(q, v, w, t, params), (v,), (w,))[1]
+
+
+@dataclass(frozen=True)
+class DynamicsForce:
+    """Q(q, v, t) = -r(q, v, 0, t); with internal states Q(q, v, z, t)."""
+
+    dynamics: Callable
+
+    def __call__(self, q: PyTree, v: PyTree, *others: PyTree) -> PyTree:
+        r = self.dynamics(q, v, jax.tree.map(jnp.zeros_like, v), *others)
+        return jax.tree.map(jnp.negative, r)
 
 
 # ----------------------------------------------------------------------------

@@ -1,0 +1,373 @@
+"""The equations of motion of a mechanism, as the functions of a `System`: dynamics, mass, friction, loops, stops.
+
+    r(q, v, w, t) = ID(q, v, w) + armature w + damping v + stiffness (q - springref)
+                    - motors - torque - wrenches - stops
+
+Each is a frozen object that holds the model, so that equal mechanisms share compiled programs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax import rotation
+from hhtjax.bodies.model import Model, Row, Stop
+from hhtjax.bodies.newton_euler import (
+    Inertia,
+    Placed,
+    Position,
+    apply,
+    axial,
+    cross,
+    inverse_dynamics,
+    mass_matrix,
+    outer,
+    place,
+    product,
+    total,
+    trace,
+)
+from hhtjax.bodies.tree import Tree
+from hhtjax.description import Array, PyTree, Real
+
+
+class Frame(NamedTuple):
+    """A frame in the world.
+
+    Attributes:
+        R: (3, 3), from its components to those of the world.
+        x: (3,), its origin, m.
+    """
+
+    R: Array
+    x: Array
+
+
+# ----------------------------------------------------------------------------
+# Coordinates: an array of hinges and slides, or a dict of "ball", "free" and "joint". Rates in the order of
+# `jax.flatten_util.ravel_pytree`: balls, rotations of free joints, their places, hinges and slides.
+
+
+def position(tree: Tree, q: PyTree) -> Position:
+    """A tree's coordinates by kind."""
+    if not tree.balls:
+        dtype = q.dtype
+        return Position(q, jnp.zeros((0, 3, 3), dtype), jnp.zeros((0, 3), dtype))
+    some = jax.tree.leaves(q)[0]
+    free = q.get("free", {"R": some[:0].reshape(0, 3, 3), "x": some[:0].reshape(0, 3)})
+    balls = [q["ball"]] if "ball" in q else []
+    R = jnp.concatenate([*balls, free["R"]]) if balls and tree.frees else (balls or [free["R"]])[0]
+    return Position(q.get("joint", jnp.zeros(0, some.dtype)), R, free["x"])
+
+
+def rates(tree: Tree, v: PyTree) -> Array:
+    """v as a vector (nv,)."""
+    if not tree.balls:
+        return v
+    parts = [v[name] for name in ("ball",) if name in v]
+    parts += [v["free"][name] for name in ("R", "x")] if "free" in v else []
+    return jnp.concatenate([x.ravel() for x in [*parts, *([v["joint"]] if "joint" in v else [])]])
+
+
+def as_rates(tree: Tree, x: Array) -> PyTree:
+    """A vector (nv,) as v is structured."""
+    if not tree.balls:
+        return x
+    n, f = tree.balls - tree.frees, tree.frees
+    found, at = {}, 3 * n
+    if n:
+        found["ball"] = x[:at].reshape(n, 3)
+    if f:
+        found["free"] = {"R": x[at : at + 3 * f].reshape(f, 3), "x": x[at + 3 * f : at + 6 * f].reshape(f, 3)}
+    if tree.scalars:
+        found["joint"] = x[at + 6 * f :]
+    return found
+
+
+# ----------------------------------------------------------------------------
+# What params say
+
+
+def inertia_of(model: Model, params: PyTree) -> Inertia:
+    """Mass, first and second moment of each link about its frame, from mass, com and inertia of the bodies on it."""
+    m, c = params["mass"], params["com"]
+    h = m[:, None] * c
+    return of_links(model, Inertia(m, h, second_moment(params["inertia"]) + outer(h, c)), params)
+
+
+def second_moment(inertia: Array) -> Array:
+    """Sigma = tr(I)/2 1 - I, of tensors of inertia I (..., 3, 3)."""
+    return trace(inertia)[..., None] / 2 * np.broadcast_to(np.eye(3, dtype=inertia.dtype), inertia.shape) - inertia
+
+
+def of_links(model: Model, bodies: Inertia, params: PyTree) -> Inertia:
+    """The moments of bodies about their frames, as those of the links that carry them: linear in them."""
+    m, h, Sigma = bodies
+    dtype = h.dtype
+    R, x = (np.stack(both).astype(dtype) for both in zip(*((b.R, b.point) for b in model.bodies), strict=True))
+    if np.any(np.eye(3, dtype=dtype)[None] != R):
+        h, Sigma = apply(R, h), product(product(R, Sigma), np.swapaxes(R, 1, 2))
+    points = places_of(model, params)
+    if points is not None:
+        x = jnp.stack([points[i] for i in _numbers_of_bodies(model)])
+    if points is not None or np.any(x):
+        moved = h + m[:, None] * x
+        Sigma, h = Sigma + outer(x, h) + outer(moved, x), moved
+    nodes = [b.node for b in model.bodies]
+    if nodes == list(model.tree.links):
+        return Inertia(m, h, Sigma)
+    on = np.array([[node == link for node in nodes] for link in model.tree.links])
+    return Inertia(*(total(on, y.reshape(len(y), -1)).reshape(-1, *y.shape[1:]) for y in (m, h, Sigma)))
+
+
+def _numbers_of_bodies(model: Model):
+    names = [place.name for place in model.places]
+    return [names.index(body.name) for body in model.bodies]
+
+
+def offsets_of(model: Model, params: PyTree):
+    """Places of the nodes, (K, 3), where positions are free; else None."""
+    if model.offsets is None:
+        return None
+    return _affine(model.offsets[0], params["position"])
+
+
+def places_of(model: Model, params: PyTree):
+    """Origins of bodies and markers in their nodes, where positions are free; else None."""
+    return None if model.offsets is None else _affine(model.offsets[1], params["position"])
+
+
+def _affine(known: tuple, x: Array) -> Array:
+    constant, slope = (np.asarray(y, x.dtype) for y in known)
+    return jnp.asarray(constant) + (slope.reshape(-1, x.size) @ x.ravel()).reshape(-1, 3)
+
+
+# ----------------------------------------------------------------------------
+# Places
+
+
+def frames_of(model: Model, q: PyTree, params: PyTree) -> list[Frame]:
+    """Of all bodies and markers, in the world."""
+    p = position(model.tree, q)
+    placed, dtype = place(model.tree, p, offsets_of(model, params)), jax.tree.leaves(q)[0].dtype
+    points = places_of(model, params)
+    return [
+        _in_world(
+            model, placed, p.y, one.node, one.R, np.asarray(one.point, dtype) if points is None else points[i], dtype
+        )
+        for i, one in enumerate(model.places)
+    ]
+
+
+def _in_world(model: Model, placed: Placed, y: Array, node: int, R: np.ndarray, x, dtype) -> Frame:
+    R = R.astype(dtype)
+    if node < 0:
+        return Frame(jnp.asarray(R), jnp.asarray(x))
+    above, origin, root = placed.R[node], placed.y[node], model.roots[node]
+    origin = origin if root < 0 else origin + y[root]
+    return Frame(product(above, R), origin + apply(above, x))
+
+
+# ----------------------------------------------------------------------------
+# Functions of the system
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """r(q, v, w, t, params), structured like v."""
+
+    model: Model
+
+    def __call__(self, q: PyTree, v: PyTree, w: PyTree, t: Real, params: PyTree) -> PyTree:
+        tree = self.model.tree
+        dv, dw = rates(tree, v), rates(tree, w)
+        p = position(tree, q)
+        r = inverse_dynamics(
+            tree, p, dv, dw, inertia_of(self.model, params), params["gravity"], offsets_of(self.model, params)
+        )
+        r = r + params["armature"] * dw
+        return as_rates(tree, r - applied(self.model, q, p, dv, t, params))
+
+
+@dataclass(frozen=True)
+class Mass:
+    """M(q), (nv, nv), with the armature."""
+
+    model: Model
+
+    def __call__(self, q: PyTree, params: PyTree) -> Array:
+        tree = self.model.tree
+        M = mass_matrix(tree, position(tree, q), inertia_of(self.model, params), offsets_of(self.model, params))
+        return M + params["armature"][:, None] * np.eye(tree.rates, dtype=M.dtype)
+
+
+@dataclass(frozen=True)
+class Friction:
+    """The limits of dry friction: structured like v where all rates rub, else (k,), of those that do."""
+
+    model: Model
+    all_rub: bool
+
+    def __call__(self, q: PyTree, v: PyTree, *others: PyTree) -> PyTree:
+        limits = others[-1]["frictionloss"]
+        return as_rates(self.model.tree, limits) if self.all_rub else limits
+
+
+@dataclass(frozen=True)
+class Sliding:
+    """The rates that rub, (k,)."""
+
+    model: Model
+    rubbing: tuple
+
+    def __call__(self, q: PyTree, v: PyTree, *others: PyTree) -> Array:
+        return rates(self.model.tree, v)[np.asarray(self.rubbing)]
+
+
+def applied(model: Model, q: PyTree, p: Position, v: Array, t: Real, params: PyTree) -> Array:
+    """Generalised forces of springs, dampers, motors, stops and what acts from outside: (nv,)."""
+    tree, n = model.tree, model.tree.rates - model.tree.scalars
+    force = -params["damping"] * v
+    x, rate = p.x, v[n:]
+    along = -params["stiffness"] * (x - params["springref"])
+    if model.drives:
+        along = along + driven(model, x, rate, t, params)
+    for k, stop in enumerate(model.stops):
+        along = along.at[stop.slot].add(stopped(stop, x, rate, params["stop_stiffness"][k], params["stop_damping"][k]))
+    force = force + (jnp.concatenate([jnp.zeros(n, v.dtype), along]) if n else along)
+    for k, spring in enumerate(model.springs):
+        force = sprung(model, spring, params["spring_stiffness"][k], p, force)
+    if "torque" in params:
+        force = force + rates(tree, at_time(params["torque"], t))
+    if "wrench" in params:
+        force = force + wrenches(model, q, t, params)
+    return force
+
+
+def at_time(x: PyTree, t: Real) -> PyTree:
+    """An input that is a function of the time, or constant."""
+    return x(t) if callable(x) else x
+
+
+def driven(model: Model, x: Array, rate: Array, t: Real, params: PyTree) -> Array:
+    """gear F of each motor, on hinges and slides: (ns,)."""
+    u = at_time(params["ctrl"], t)
+    slots = np.array([drive.slot for drive in model.drives])
+    on = slots[None, :] == np.arange(len(x))[:, None]
+    gear = params["gear"]
+    s, sdot = (
+        gear * (x[slots] if not _is_all(slots, x) else x),
+        gear * (rate[slots] if not _is_all(slots, x) else rate),
+    )
+    u = _clipped(u, [drive.ctrlrange for drive in model.drives])
+    kinds = np.array([drive.kind for drive in model.drives])
+    known = {name: (kinds == name).astype(x.dtype) for name in ("torque", "position", "velocity")}
+    F = params["kp"] * (known["position"] * u - s) + params["kv"] * (known["velocity"] * u - sdot) + params["offset"]
+    F = F + known["torque"] * params["gain"] * u
+    F = gear * _clipped(F, [drive.forcerange for drive in model.drives])
+    return F if _is_all(slots, x) else total(on, F[:, None])[:, 0]
+
+
+def _is_all(slots: np.ndarray, x: Array) -> bool:
+    return len(slots) == len(x) and bool(np.all(slots == np.arange(len(x))))
+
+
+def _clipped(x: Array, ranges: list) -> Array:
+    """Between the ends of what has a range."""
+    if not any(ranges):
+        return x
+    low, high = np.array([r or (-np.inf, np.inf) for r in ranges], x.dtype).T
+    return jnp.clip(x, low, high)
+
+
+def stopped(stop: Stop, x: Array, rate: Array, k: Real, d: Real) -> Array:
+    """The push of a stop, k p (1 + d pdot) by the penetration p, which it never pulls (Hunt, Crossley 1975)."""
+    p = jnp.maximum(stop.side * (x[stop.slot] - stop.at), 0)
+    return -stop.side * k * p * jnp.maximum(1 + d * stop.side * rate[stop.slot], 0)
+
+
+def sprung(model: Model, spring, k: Real, p: Position, force: Array) -> Array:
+    """A spring of a ball, or of a free joint, against the turn and the way from its rest."""
+    R = np.reshape(spring.R, (3, 3)).astype(force.dtype)
+    turn = rotation.log(product(R.T, p.R[spring.ball]))
+    first = 3 * spring.ball
+    force = force.at[first : first + 3].add(-k * turn)
+    if spring.translation is None:
+        return force
+    first = 3 * (model.tree.balls + spring.translation)
+    return force.at[first : first + 3].add(-k * (p.y[spring.translation] - np.asarray(spring.x, force.dtype)))
+
+
+def wrenches(model: Model, q: PyTree, t: Real, params: PyTree) -> Array:
+    """The generalised force of moments and forces on bodies: {name: (6,), or a function of t}, world axes."""
+    p = position(model.tree, q)
+    placed, points = place(model.tree, p, offsets_of(model, params)), places_of(model, params)
+    force = jnp.zeros(model.tree.rates, placed.S.dtype)
+    names = [one.name for one in model.places]
+    for name, wrench in params["wrench"].items():
+        if name not in names:
+            raise ValueError(f'params["wrench"] must be on bodies or markers, {", ".join(names)}; received {name!r}.')
+        i = names.index(name)
+        one, wrench = model.places[i], at_time(wrench, t)
+        if one.node < 0:
+            continue
+        x = placed.y[one.node] + apply(
+            placed.R[one.node], np.asarray(one.point, force.dtype) if points is None else points[i]
+        )
+        about_root = jnp.concatenate([wrench[:3] + cross(x, wrench[3:]), wrench[3:]])
+        below = model.tree.carries[one.node].astype(force.dtype)
+        force = force + below * jnp.sum(placed.S * about_root[None, :], axis=-1)
+    return force
+
+
+# ----------------------------------------------------------------------------
+# Loops
+
+
+@dataclass(frozen=True)
+class Loops:
+    """Phi(q, t, params), (m,)."""
+
+    model: Model
+
+    def __call__(self, q: PyTree, t: Real, params: PyTree) -> Array:
+        frames = frames_of(self.model, q, params)
+        x = position(self.model.tree, q).x
+        Phi = jnp.concatenate([_gap(row, frames, x) for row in self.model.loops])
+        return Phi if self.model.rows is None else Phi[np.asarray(self.model.rows)]
+
+
+def _gap(row: Row, frames: list[Frame], x: Array) -> Array:
+    """What a loop is open by."""
+    if row.kind == "couple":
+        (r1, r2), coefficients = row.constants
+        y = 0.0 * x[row.first] if row.second is None else x[row.second] - r2
+        wanted = sum(c * y**k for k, c in enumerate(coefficients))
+        return (x[row.first] - r1 - wanted)[None]
+    a, b, *rest = (np.asarray(c, x.dtype) for c in row.constants)
+    first, second = (frames[i] for i in (row.first, row.second))
+    apart = first.x + apply(first.R, a) - second.x - apply(second.R, b)
+    if row.kind == "connect":
+        return apart
+    Q = product(jnp.swapaxes(product(first.R, rest[0].reshape(3, 3)), 0, 1), second.R)
+    return jnp.concatenate([apart, axial(Q) / 2])
+
+
+# ----------------------------------------------------------------------------
+# Ends of ranges as events
+
+
+@dataclass(frozen=True)
+class Reaches:
+    """What falls to zero where a joint reaches an end of its range."""
+
+    model: Model
+    stop: Stop
+
+    def __call__(self, q: PyTree, v: PyTree, t: Real, params: PyTree) -> Array:
+        return self.stop.side * (self.stop.at - position(self.model.tree, q).x[self.stop.slot])

@@ -1,0 +1,561 @@
+"""Mechanisms: a tree of bodies, its motors and its loops, as a `System` with parameters and a start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.bodies.description import WORLD, Body, Connect, Couple, Marker, Motor, Weld
+from hhtjax.bodies.equations import (
+    Dynamics,
+    Frame,
+    Friction,
+    Loops,
+    Mass,
+    Reaches,
+    Sliding,
+    as_rates,
+    frames_of,
+    inertia_of,
+    of_links,
+    offsets_of,
+    position,
+    rates,
+    second_moment,
+)
+from hhtjax.bodies.equations import applied as applied_forces
+from hhtjax.bodies.model import Drive, Model, Place, Row, Spring, Stop, Structure, structure
+from hhtjax.bodies.newton_euler import Inertia, outer
+from hhtjax.bodies.newton_euler import inverse_dynamics as of_tree
+from hhtjax.bodies.tree import Tree
+from hhtjax.checks import require_one_of
+from hhtjax.description import Array, PyTree, Real
+from hhtjax.primitives import plain
+from hhtjax.systems import kinematics
+from hhtjax.systems.events import Event, impact
+from hhtjax.systems.system import System
+
+GRAVITY = (0.0, 0.0, -9.80665)
+INDEPENDENT = 1e-6  # sine of the angle to the rows before, below which a row of a loop says nothing new
+STOP_TIME = 0.005  # s, half a period of what hits a stiff stop
+RESTITUTION = 0.3
+UPPER = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # entries of a tensor, as in theta
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism:
+    """A mechanism, and what a run needs besides a stepper and a step size; made by `tree` and `load`.
+
+    Attributes:
+        system: a `System` in minimal coordinates.
+        params: dict of arrays in SI units. One entry a body in `bodies`: mass (nb,), com (nb, 3), inertia (nb, 3, 3),
+            about the centre of mass in the frame of the body; one a rate: damping, armature (nv,); one a hinge
+            or slide: stiffness, springref (ns,); gravity (3,).
+            Where there are motors: gear, gain, kp, kv, offset, ctrl (na,),
+            the last of which may be a function of t. Where there is dry friction: frictionloss (k,), of the rates in
+            `rubbing`. Where asked for: position (number of bodies, 3), spring_stiffness, stop_stiffness, stop_damping,
+            restitution. May be added: "torque", a generalised force structured like v, and "wrench", {body: (moment,
+            force) (6,)} in world axes, at the origin of the body or marker; constants, or functions of t.
+        q0, v0: the position that is described, moved onto the loops where they were open, and rest. q is (ns,) where
+            there are hinges and slides only, else a dict: "ball" (., 3, 3), "free" {"R": (., 3, 3), "x": (., 3)}, and
+            "joint" (ns,); v is structured like q, with material angular velocities (., 3) in the place of rotations.
+        events: of the ends of ranges, for `simulate(events=)`; None but with limits="event".
+        joints, bodies, motors: names, in the order of coordinates and params.
+        markers: names of all frames: the world, bodies, markers.
+        rubbing: numbers of the rates with dry friction.
+        unsupported: what of a file is left out, as `load` was told.
+    """
+
+    system: System
+    params: dict
+    q0: Any
+    v0: Any
+    events: tuple[Event, ...] | None
+    joints: tuple[str, ...]
+    bodies: tuple[str, ...]
+    motors: tuple[str, ...]
+    markers: tuple[str, ...]
+    rubbing: tuple[int, ...]
+    unsupported: tuple[str, ...]
+    model: Model
+    rates_of: dict
+
+    def __repr__(self):
+        tree = self.model.tree
+        loops = f", {_rows(self.model)} rows of loops" if self.model.loops else ""
+        return f"Mechanism({len(self.bodies)} bodies, {tree.rates} rates{loops}, {len(self.motors)} motors)"
+
+    def index(self, joint: str) -> int | slice | tuple:
+        """Where the rates of a joint are in the vector of rates, and in damping and armature: a number, or numbers.
+
+        Where all joints are hinges and slides, it is the place in q too.
+
+        Raises: KeyError: no joint of that name.
+        """
+        if joint not in self.rates_of:
+            raise KeyError(f"index: no joint is named {joint!r}; there are {', '.join(self.joints)}.")
+        found = self.rates_of[joint]
+        return found[0] if len(found) == 1 else found
+
+    def body_index(self, body: str) -> int:
+        """The place of a body in mass, com and inertia.
+
+        Raises: KeyError: no body with a mass of that name.
+        """
+        if body not in self.bodies:
+            raise KeyError(f"body_index: no body with a mass is named {body!r}; there are {', '.join(self.bodies)}.")
+        return self.bodies.index(body)
+
+    def frames(self, q: PyTree, params: PyTree = None) -> dict[str, Frame]:
+        """The frame of each body and marker in the world, {name: Frame(R, x)}; params: None for its own."""
+        params = self.params if params is None else params
+        return dict(zip(self.markers, frames_of(self.model, q, params), strict=True))
+
+
+def tree(
+    bodies: Sequence[Body],
+    *,
+    motors: Sequence[Motor] = (),
+    loops: Sequence[Connect | Weld | Couple] = (),
+    markers: Sequence[Marker] = (),
+    gravity: Any = GRAVITY,
+    friction: str = "dry",
+    limits: str | None = None,
+    free: Sequence[str] = (),
+) -> Mechanism:
+    """A mechanism of bodies, each on its parent, in minimal coordinates.
+
+    Args:
+        bodies: `Body`s, each behind its parent. Those without a mass are frames only.
+        motors: `Motor`s. loops: `Connect`, `Weld` and `Couple`, constraints of the `System`. Rows that say what others
+            say already, as the third of a pin joint in a plane does, are found here and left out.
+        markers: `Marker`s, further frames.
+        gravity: (3,), m/s^2.
+        friction: "dry", the set-valued friction of the joints (`System(friction=)`), or "ignore".
+        limits: of ranges, None where there are none: "ignore"; "stop", stiff springs that damp, with stop_stiffness and
+            stop_damping among params; or "event", impacts (`Mechanism.events`).
+        free: ("position",) for the positions of bodies among params; they are part of the program otherwise, which is
+            faster, as it knows their zeros.
+
+    Returns:
+        A `Mechanism`.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value; names that are not known, or taken twice; loops
+            that cannot be closed.
+
+    Example: a crane of a trolley (2 kg) and a rod (1 kg, 1 m).
+
+    >>> import numpy as np, hhtjax
+    >>> from hhtjax.bodies import Body, Joint, tree
+    >>> crane = tree([
+    ...     Body("trolley", joints=Joint("prismatic", axis=[1, 0, 0], damping=0.1), mass=2.0),
+    ...     Body("rod", "trolley", Joint("revolute", axis=[0, 1, 0]), mass=1.0, com=[0, 0, -0.5],
+    ...          inertia=[1 / 12, 1 / 12, 0])])
+    >>> run = hhtjax.simulate(
+    ...     crane.system, hhtjax.hht(), np.array([0.0, 0.5]), crane.v0, crane.params, dt=1e-2, num_steps=100)
+    >>> run.q.shape, crane.frames(run.q[-1])["rod"].x.shape
+    ((101, 2), (3,))
+    """
+    return assembled("tree", bodies, motors, loops, markers, gravity, friction, limits, free)
+
+
+def assembled(caller, bodies, motors, loops, markers, gravity, friction, limits, free, unsupported=()) -> Mechanism:
+    """The mechanism; `caller` is who is asked for it."""
+    bodies = _all_of(caller, "bodies", bodies, Body)
+    motors, markers = _all_of(caller, "motors", motors, Motor), _all_of(caller, "markers", markers, Marker)
+    loops = _all_of(caller, "loops", loops, (Connect, Weld, Couple))
+    require_one_of(caller, "friction", friction, ("dry", "ignore"))
+    require_one_of(caller, "limits", limits, (None, "ignore", "stop", "event"))
+    if set(free) - {"position"}:
+        raise ValueError(f'{caller}: `free` may hold "position"; received {free!r}.')
+    parts = structure(caller, bodies)
+    if not parts.nodes:
+        raise ValueError(f"{caller}: `bodies` must have at least one joint; received {len(bodies)} bodies without.")
+    massive = [body for body in bodies if body.mass > 0 and parts.node_of[body.name] >= 0]
+    if not massive:
+        raise ValueError(f"{caller}: no body of `bodies` that moves has a mass.")
+    links = sorted({parts.node_of[body.name] for body in massive})
+    own = Tree(tuple(parts.nodes), tuple(links))
+    places = _places(caller, parts, bodies, markers)
+    by_name = {place.name: place for place in places}
+    rubbing = tuple(i for joint, found in parts.joints.values() if joint.friction for i in found)
+    stops = _stops(parts)
+    if stops and limits is None:
+        raise ValueError(f'{caller}: joints have a `range`: say what they do, limits="stop", "event" or "ignore".')
+    stops = () if limits == "ignore" else stops
+    model = Model(
+        own,
+        tuple(by_name[body.name] for body in sorted(massive, key=lambda body: parts.node_of[body.name])),
+        tuple(places),
+        tuple(_drive(caller, parts, motor) for motor in motors),
+        _springs(bodies, parts),
+        stops if limits == "stop" else (),
+        tuple(_row(caller, parts, list(by_name), loop) for loop in loops),
+        None,
+        _roots(parts.nodes),
+        _affine_maps(caller, bodies, markers) if free else None,
+    )
+    params = _params(model, parts, bodies, motors, gravity, rubbing if friction == "dry" else ())
+    params |= {"position": _array([body.position for body in bodies])} if free else {}
+    q0 = _at_rest(model, parts, bodies)
+    v0 = as_rates(own, jnp.zeros(own.rates, params["mass"].dtype))
+    if model.stops:
+        diagonal = np.diag(Mass(model)(q0, params))[own.rates - own.scalars :]
+        at = np.array([stop.slot for stop in model.stops])
+        params["stop_stiffness"] = _array(diagonal[at] * (np.pi / STOP_TIME) ** 2)
+        params["stop_damping"] = _array(np.ones(len(at)))
+    if limits == "event" and stops:
+        params["restitution"] = _array(RESTITUTION)
+    if model.loops:
+        model, q0 = _closed(caller, model, q0, v0, params)
+    rubbing = rubbing if friction == "dry" else ()
+    ends = tuple(Event(Reaches(model, stop), impact("restitution")) for stop in stops) if limits == "event" else ()
+    return Mechanism(
+        _system(model, rubbing), params, q0, v0, ends or None,
+        tuple(parts.joints), tuple(place.name for place in model.bodies),
+        tuple(motor.name or motor.joint for motor in motors), tuple(by_name), rubbing, tuple(unsupported), model,
+        {name: found for name, (_, found) in parts.joints.items()},
+    )  # fmt: skip
+
+
+def _system(model: Model, rubbing: tuple) -> System:
+    """What has no loop has no constraint, and what does not rub no friction."""
+    more: dict = {"constraint": Loops(model)} if model.loops else {}
+    if rubbing:
+        all_rub = list(rubbing) == list(range(model.tree.rates))
+        more["friction"] = Friction(model, all_rub)
+        if not all_rub:
+            more["sliding"] = Sliding(model, rubbing)
+    return System(Mass(model), dynamics=Dynamics(model), **more)
+
+
+def _array(x) -> Array:
+    return jnp.asarray(np.asarray(x, float), jnp.result_type(float))
+
+
+def _all_of(caller: str, name: str, values: Any, kind: Any) -> list:
+    if not isinstance(values, (list, tuple)) or not all(isinstance(x, kind) for x in values):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        words = " or ".join(k.__name__ for k in kinds)
+        raise TypeError(f"{caller}: `{name}` must be a sequence of {words}; received {values!r}.")
+    return list(values)
+
+
+def _places(caller: str, parts: Structure, bodies: list[Body], markers: list[Marker]) -> list[Place]:
+    """Frames of bodies and markers in their nodes."""
+    found = [Place(WORLD, -1, tuple(np.eye(3).ravel().tolist()), (0.0, 0.0, 0.0))]
+    for body in bodies:
+        R, x = parts.frame_of[body.name]
+        found.append(Place(body.name, parts.node_of[body.name], tuple(R.ravel().tolist()), tuple(x.tolist())))
+    for marker in markers:
+        if marker.name in [place.name for place in found]:
+            raise ValueError(f"{caller}: two frames are named {marker.name!r}.")
+        _known(caller, "markers", marker.body, parts.node_of)
+        R, x = parts.frame_of[marker.body]
+        E, d = R @ np.reshape(marker.rotation, (3, 3)), x + R @ np.asarray(marker.position)
+        found.append(Place(marker.name, parts.node_of[marker.body], tuple(E.ravel().tolist()), tuple(d.tolist())))
+    return found
+
+
+def _known(caller: str, name: str, value: str, known):
+    if value not in known:
+        raise ValueError(f"{caller}: `{name}` names {value!r}; there are {', '.join(known)}.")
+
+
+def _roots(nodes) -> tuple:
+    """Of each node, the slot of the translation that its tree begins with, or -1."""
+    found: list[int] = []
+    for node in nodes:
+        found.append(node.slot if node.kind == "translation" else found[node.parent] if node.parent >= 0 else -1)
+    return tuple(found)
+
+
+def _drive(caller: str, parts: Structure, motor: Motor) -> Drive:
+    _known(caller, "motors", motor.joint, parts.slots)
+    return Drive(parts.slots[motor.joint], motor.kind, motor.ctrlrange, motor.forcerange)
+
+
+def _stops(parts: Structure) -> tuple:
+    return tuple(
+        Stop(parts.slots[name], side, end)
+        for name, (joint, _) in parts.joints.items()
+        if joint.range is not None
+        for side, end in zip((-1, 1), joint.range, strict=True)
+    )
+
+
+def _springs(bodies: list[Body], parts: Structure) -> tuple:
+    """Those of balls and free joints, in the order of `_spring_stiffness`."""
+    found, tree = [], parts.nodes
+    for body in bodies:
+        for number, joint in enumerate(body.joints):
+            if joint.kind not in ("ball", "free") or not joint.stiffness:
+                continue
+            name = joint.name or (body.name if number == 0 else f"{body.name}_{number + 1}")
+            of_rates = parts.joints[name][1]
+            ball = next(node for node in tree if node.kind == "ball" and set(node.rates) <= set(of_rates))
+            way = next((x.slot for x in tree if x.kind == "translation" and set(x.rates) <= set(of_rates)), None)
+            R = body.rotation if joint.kind == "free" else tuple(np.eye(3).ravel().tolist())
+            found.append(Spring(ball.slot, way, R, body.position))
+    return tuple(found)
+
+
+def _row(caller: str, parts: Structure, names: list, loop) -> Row:
+    """A loop by numbers."""
+    if isinstance(loop, Couple):
+        for name in (loop.first, loop.second):
+            if name is not None:
+                _known(caller, "loops", name, parts.slots)
+        second = None if loop.second is None else parts.slots[loop.second]
+        return Row("couple", parts.slots[loop.first], second, (loop.origins, loop.coefficients))
+    for name in (loop.first, loop.second):
+        _known(caller, "loops", name, names)
+    first, second = (names.index(name) for name in (loop.first, loop.second))
+    if isinstance(loop, Weld):
+        return Row("weld", first, second, (loop.anchor1, loop.anchor2, loop.rotation))
+    return Row("connect", first, second, (loop.anchor1, loop.anchor2))
+
+
+def _params(model: Model, parts: Structure, bodies, motors, gravity, rubbing: tuple) -> dict:
+    """The description as arrays."""
+    by_name = {body.name: body for body in bodies}
+    own = [by_name[place.name] for place in model.bodies]
+    tree = model.tree
+    of_rates = {name: np.zeros(tree.rates) for name in ("damping", "armature", "friction", "stiffness", "rest")}
+    for joint, found in parts.joints.values():
+        for name, values in of_rates.items():
+            values[list(found)] = getattr(joint, name)
+    first = tree.rates - tree.scalars
+    params = {
+        "mass": _array([body.mass for body in own]),
+        "com": _array([body.com for body in own]),
+        "inertia": _array(np.reshape([body.inertia for body in own], (-1, 3, 3))),
+        "gravity": _array(gravity),
+        "damping": _array(of_rates["damping"]),
+        "armature": _array(of_rates["armature"]),
+        "stiffness": _array(of_rates["stiffness"][first:]),
+        "springref": _array(of_rates["rest"][first:]),
+    }
+    if params["gravity"].shape != (3,) or not np.all(np.isfinite(params["gravity"])):
+        raise ValueError(f"tree: `gravity` must be finite numbers (3,); received {gravity!r}.")
+    if motors:
+        for name in ("gear", "gain", "kp", "kv", "offset"):
+            params[name] = _array([getattr(motor, name) for motor in motors])
+        params["ctrl"] = _array(np.zeros(len(motors)))
+    if rubbing:
+        params["frictionloss"] = _array(of_rates["friction"][list(rubbing)])
+    if model.springs:
+        values = [j.stiffness for body in bodies for j in body.joints if j.kind in ("ball", "free") and j.stiffness]
+        params["spring_stiffness"] = _array(values)
+    return params
+
+
+def _at_rest(model: Model, parts: Structure, bodies) -> PyTree:
+    """The position that is described."""
+    tree = model.tree
+    joint = np.zeros(tree.scalars)
+    for name, slot in parts.slots.items():
+        joint[slot] = parts.joints[name][0].reference
+    if not tree.balls:
+        return _array(joint)
+    free = [body for body in bodies if any(joint.kind == "free" for joint in body.joints)]
+    found = {}
+    if tree.balls > tree.frees:
+        found["ball"] = _array(np.tile(np.eye(3), (tree.balls - tree.frees, 1, 1)))
+    if free:
+        R = np.reshape([body.rotation for body in free], (-1, 3, 3))
+        found["free"] = {"R": _array(R), "x": _array([body.position for body in free])}
+    if tree.scalars:
+        found["joint"] = _array(joint)
+    return found
+
+
+def _affine_maps(caller: str, bodies: list[Body], markers: list[Marker]) -> tuple:
+    """Places of nodes, and of frames in them, as affine functions of the positions of all bodies."""
+
+    def at(positions: np.ndarray):
+        moved = [body.placed_at(x) for body, x in zip(bodies, positions, strict=True)]
+        parts = structure(caller, moved)
+        places = _places(caller, parts, moved, markers)
+        return np.array([n.offset for n in parts.nodes]), np.array([place.point for place in places])
+
+    base = [at(np.zeros((len(bodies), 3)))[k] for k in (0, 1)]
+    units = np.eye(3 * len(bodies)).reshape(-1, len(bodies), 3)
+    slopes = [np.stack([at(unit)[k] - base[k] for unit in units], axis=-1) for k in (0, 1)]
+    return tuple((_nested(b), _nested(s)) for b, s in zip(base, slopes, strict=True))
+
+
+def _nested(x: np.ndarray):
+    return tuple(_nested(y) for y in x) if x.ndim else float(x)
+
+
+# ----------------------------------------------------------------------------
+# Loops
+
+
+def _rows(model: Model) -> int:
+    sizes = {"connect": 3, "weld": 6, "couple": 1}
+    return sum(sizes[row.kind] for row in model.loops) if model.rows is None else len(model.rows)
+
+
+def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
+    """The model with those rows of its loops that are independent near the start, and a position on the loops."""
+    blocks, (q, unravel) = kinematics.layout(q0, v0), ravel_pytree(q0)
+    loops = Loops(model)
+
+    @jax.jit
+    def linearized(q: Array):
+        """Phi and B."""
+        zero = jnp.zeros(model.tree.rates, q.dtype)
+
+        def Phi(x: Array) -> Array:
+            return loops(unravel(kinematics.move(blocks, q, x)), 0.0, params)
+
+        return Phi(zero), jax.jacfwd(Phi)(zero)
+
+    move = jax.jit(partial(kinematics.move, blocks))
+    with plain():  # small programs, compiled once
+        q, B = _onto_loops(caller, q, linearized, move)
+        near = [B]
+        for seed in (1, 2):  # at a special position more rows may depend on each other than elsewhere
+            x = np.random.default_rng(seed).normal(size=B.shape[1])
+            x = x - np.linalg.pinv(B, rcond=1e-9) @ (B @ x)  # along the loops
+            size = np.linalg.norm(x)
+            if size > 1e-9:
+                near.append(_onto_loops(caller, move(q, jnp.asarray(0.05 * x / size)), linearized, move)[1])
+    rows = np.concatenate(near, axis=1)
+    size = np.linalg.norm(rows, axis=1)
+    able = np.flatnonzero(size > INDEPENDENT * size.max(initial=1e-300))
+    if not able.size:
+        raise ValueError(f"{caller}: `loops` hold nothing that moves.")
+    found: Any = scipy.linalg.qr((rows[able] / size[able, None]).T, mode="r", pivoting=True)
+    R, order = found
+    rank = int(np.sum(np.abs(np.diag(R)) > INDEPENDENT))
+    kept = tuple(sorted(able[order[:rank]].tolist()))
+    return model._replace(rows=None if len(kept) == len(rows) else kept), unravel(q)
+
+
+def _onto_loops(caller: str, q: Array, linearized, move):
+    """The position nearest to q on the loops, and B there, by Gauss-Newton."""
+    for _ in range(50):
+        Phi, B = map(np.asarray, linearized(q))
+        if np.max(np.abs(Phi)) <= 1e-12:
+            break
+        q = move(q, jnp.asarray(-np.linalg.pinv(B, rcond=1e-9) @ Phi, q.dtype))
+    if not np.max(np.abs(Phi)) <= 1e-6:
+        raise ValueError(
+            f"{caller}: the loops cannot be closed from the position that is described: {np.max(np.abs(Phi)):.3g} m or "
+            "rad is left. Describe a position that is nearer."
+        )
+    return q, B
+
+
+# ----------------------------------------------------------------------------
+# Functions of a mechanism, for use without a run
+
+
+def inverse_dynamics(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> PyTree:
+    """What the joints must exert for the accelerations w: M(q) w + bias(q, v), with armature, gravity and nothing else.
+
+    Args: robot; q, v, w; params: None for its own.
+    Returns: structured like v, N m and N.
+
+    >>> from hhtjax.bodies import Body, Joint, inverse_dynamics, tree
+    >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
+    >>> inverse_dynamics(rod, jnp.zeros(1), jnp.zeros(1), jnp.ones(1)).round(4).tolist()            # m l^2/3 - m g l/2
+    [-13.71]
+    """
+    model, params = robot.model, robot.params if params is None else params
+    tree, dw = model.tree, rates(robot.model.tree, w)
+    r = of_tree(
+        tree,
+        position(tree, q),
+        rates(tree, v),
+        dw,
+        inertia_of(model, params),
+        params["gravity"],
+        offsets_of(model, params),
+    )
+    return as_rates(tree, r + params["armature"] * dw)
+
+
+def mass_matrix(robot: Mechanism, q: PyTree, params: PyTree = None) -> Array:
+    """M(q), (nv, nv), with the armature; rows in the order of `jax.flatten_util.ravel_pytree(v)`.
+
+    >>> from hhtjax.bodies import Body, Joint, mass_matrix, tree
+    >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
+    >>> mass_matrix(rod, jnp.zeros(1)).round(6).tolist()                                                     # m l^2/3
+    [[1.0]]
+    """
+    return Mass(robot.model)(q, robot.params if params is None else params)
+
+
+def frames(robot: Mechanism, q: PyTree, params: PyTree = None) -> dict[str, Frame]:
+    """`Mechanism.frames`."""
+    return robot.frames(q, params)
+
+
+def forces(robot: Mechanism, q: PyTree, v: PyTree, t: Real = 0.0, params: PyTree = None) -> PyTree:
+    """Generalised forces of springs, dampers, motors, stops and what acts from outside, without gravity and friction.
+
+    Args: robot; q, v; t, s; params: None for its own.
+    Returns: structured like v.
+    """
+    model, params = robot.model, robot.params if params is None else params
+    p = position(model.tree, q)
+    return as_rates(model.tree, applied_forces(model, q, p, rates(model.tree, v), t, params))
+
+
+def regressor(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> Array:
+    """Y (nv, 10 nb) with inverse_dynamics - armature w = Y theta, linear in theta (10 nb,), ten numbers a body
+
+        m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the origin of the frame of the body
+
+    Atkeson, An, Hollerbach, Int. J. Robot. Res. 5(3), 1986. `inertial_parameters` gives theta.
+
+    Args: robot; q, v, w; params: for gravity (and positions, where free), None for its own.
+    Returns: (nv, 10 nb), bodies in the order of `Mechanism.bodies`.
+    """
+    model, params = robot.model, robot.params if params is None else params
+    tree, nb = model.tree, len(model.bodies)
+    dv, dw, p = rates(tree, v), rates(tree, w), position(tree, q)
+
+    def torque(theta: Array) -> Array:
+        links = of_links(model, _moments(theta), params)
+        return of_tree(tree, p, dv, dw, links, params["gravity"], offsets_of(model, params))
+
+    return jax.jacfwd(torque)(jnp.zeros(10 * nb, dv.dtype))
+
+
+def inertial_parameters(params: PyTree) -> Array:
+    """theta (10 nb,) of `regressor`, from mass, com and inertia.
+
+    >>> import jax.numpy as jnp
+    >>> params = {"mass": jnp.array([2.0]), "com": jnp.array([[0.1, 0, 0]]), "inertia": jnp.eye(3)[None]}
+    >>> inertial_parameters(params).round(3).tolist()
+    [2.0, 0.2, 0.0, 0.0, 1.0, 1.02, 1.02, 0.0, 0.0, 0.0]
+    """
+    m, c, inertia = params["mass"], params["com"], params["inertia"]
+    h = m[:, None] * c
+    squares = jnp.sum(c**2, axis=-1)[:, None, None] * np.eye(3, dtype=m.dtype)[None]
+    about = inertia + m[:, None, None] * (squares - outer(c, c))
+    upper = jnp.stack([about[:, i, j] for i, j in UPPER], axis=-1)
+    return jnp.concatenate([m[:, None], h, upper], axis=-1).ravel()
+
+
+def _moments(theta: Array) -> Inertia:
+    """Mass, first and second moments of bodies about their frames, from theta."""
+    m, h, upper = jnp.split(theta.reshape(-1, 10), [1, 4], axis=-1)
+    places = np.zeros((6, 3, 3), theta.dtype)
+    for k, (i, j) in enumerate(UPPER):
+        places[k, i, j] = places[k, j, i] = 1
+    return Inertia(m[:, 0], h, second_moment(jnp.sum(upper[:, :, None, None] * places[None], axis=1)))

@@ -1,0 +1,308 @@
+"""Robots from encoder and torque records: inertias that a body can have, what is identifiable, motions that tell.
+
+    physical_inertia        ten numbers without limits -> mass, com, inertia of a body that exists
+    base_parameters         the combinations of inertial parameters that a motion can tell
+    excitation              a periodic motion whose regressor is well conditioned, found by gradient
+
+A fit begins with `equation_error`, which simulates nothing, and ends through the step with `fit`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from hhtjax.bodies import Mechanism, regressor
+from hhtjax.checks import require_integer, require_number
+from hhtjax.description import Array, Real, is_concrete
+from hhtjax.description.presentation import shown
+
+RANK = 1e-8  # of the largest singular value, below which a combination of parameters moves nothing
+NAMES = "m", "m cx", "m cy", "m cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"
+
+
+def physical_inertia(theta: Array) -> dict[str, Array]:
+    """Mass, centre of mass and inertia of a body that exists, whatever the ten numbers: the log-Cholesky map.
+
+        U = exp(alpha) [[exp(d1), s12, s13, t1], [0, exp(d2), s23, t2], [0, 0, exp(d3), t3], [0, 0, 0, 1]]
+        U U^T = [[Sigma, m c], [m c^T, m]],    I = tr(Sigma_c) 1 - Sigma_c
+
+    So m = exp(2 alpha), c = t, and with A the upper triangle of the d and s, Sigma_c = m A A^T.
+
+    Args:
+        theta: (..., 10): alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3.
+
+    Returns:
+        A dict: mass (...,), kg; com (..., 3), m; inertia (..., 3, 3), about the centre of mass, kg m^2: entries of
+        `Mechanism.params`.
+
+    Raises: ValueError: theta of another shape.
+
+    C. Rucker, P. Wensing, IEEE Robot. Autom. Lett. 7(2), 2022, 2684-2691.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> body = hhtjax.identification.physical_inertia(jnp.zeros(10))
+    >>> float(body["mass"]), body["inertia"].diagonal().tolist()
+    (1.0, [2.0, 2.0, 2.0])
+    """
+    theta = jnp.asarray(theta)
+    if theta.ndim == 0 or theta.shape[-1] != 10:
+        raise ValueError(f"physical_inertia: `theta` must have shape (..., 10); received {theta.shape}.")
+    alpha, d1, d2, d3, s12, s23, s13 = jnp.moveaxis(theta[..., :7], -1, 0)
+    zero = jnp.zeros_like(d1)
+    rows = [[jnp.exp(d1), s12, s13], [zero, jnp.exp(d2), s23], [zero, zero, jnp.exp(d3)]]
+    A = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    m = jnp.exp(2 * alpha)
+    Sigma = m[..., None, None] * jnp.sum(A[..., :, None, :] * A[..., None, :, :], axis=-1)
+    trace = jnp.trace(Sigma, axis1=-2, axis2=-1)[..., None, None]
+    return {"mass": m, "com": theta[..., 7:], "inertia": trace * _unit(Sigma) - Sigma}
+
+
+def _unit(like: Array) -> Array:
+    """Unit matrices of the shape (..., 3, 3)."""
+    return jnp.broadcast_to(jnp.eye(3, dtype=like.dtype), like.shape)
+
+
+def inertia_coordinates(mass: Real, com: Array, inertia: Array) -> Array:
+    """theta (..., 10) of `physical_inertia`: where a fit starts.
+
+    Args: mass (...,), kg, > 0; com (..., 3), m; inertia (..., 3, 3), about the centre of mass, kg m^2.
+
+    Raises:
+        ValueError: no mass, or an inertia of no body with an extent in all directions: a moment as large as the sum of
+            the others.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> moments = jnp.diag(jnp.array([1.0, 2.0, 2.5]))
+    >>> theta = hhtjax.identification.inertia_coordinates(2.0, jnp.array([0.1, 0.0, 0.0]), moments)
+    >>> body = hhtjax.identification.physical_inertia(theta)
+    >>> round(float(body["mass"]), 6), body["inertia"].diagonal().round(6).tolist()
+    (2.0, [1.0, 2.0, 2.5])
+    """
+    m, com, inertia = (jnp.asarray(x, jnp.result_type(float)) for x in (mass, com, inertia))
+    trace = jnp.trace(inertia, axis1=-2, axis2=-1)[..., None, None]
+    Sigma = trace / 2 * _unit(inertia) - inertia
+    if is_concrete(m) and is_concrete(Sigma):
+        least = np.linalg.eigvalsh(np.asarray(Sigma))[..., 0]
+        if np.any(np.asarray(m) <= 0) or np.any(least <= 1e-12 * np.asarray(trace)[..., 0, 0]):
+            raise ValueError(
+                "inertia_coordinates: the mass must be positive, and each principal moment smaller than the sum of the "
+                f"others, as of a body with an extent in all directions; received mass {mass} and inertia {inertia}."
+            )
+    # an upper triangle: the lower one of the axes in reverse order
+    A = jnp.linalg.cholesky((Sigma / m[..., None, None])[..., ::-1, ::-1])[..., ::-1, ::-1]
+    d = jnp.log(jnp.diagonal(A, axis1=-2, axis2=-1))
+    s = jnp.stack([A[..., 0, 1], A[..., 1, 2], A[..., 0, 2]], axis=-1)
+    return jnp.concatenate([jnp.log(m)[..., None] / 2, d, s, com], axis=-1)
+
+
+@shown
+class BaseParameters(NamedTuple):
+    """What motions can tell of the inertial parameters of a robot; made by `base_parameters`.
+
+    Attributes:
+        count: r, how many independent numbers.
+        independent: (r,), which of the 10 nb parameters stand for them, by number.
+        names: of these, such as "link2 m cx".
+        combination: (r, 10 nb), with beta = combination theta: what is identified. Its columns of `independent` are 1.
+        unseen: names of those that enter no motion at all.
+        condition: of the regressor of `independent`, each column of length 1.
+    """
+
+    count: int
+    independent: np.ndarray
+    names: tuple[str, ...]
+    combination: np.ndarray
+    unseen: tuple[str, ...]
+    condition: float
+
+
+def base_parameters(robot: Mechanism, *, samples: int = 200, motion: Any = None, seed: int = 0) -> BaseParameters:
+    """Which combinations of the inertial parameters a motion can tell: by the rank of the regressor.
+
+    Args:
+        robot: a `Mechanism`.
+        samples: of random states, when no motion is given.
+        motion: q, v, w, each with a leading axis of samples: what these tell, in the place of all.
+        seed: of the random states.
+
+    Returns:
+        A `BaseParameters`.
+
+    Raises: TypeError, ValueError: an argument of a wrong kind or value.
+
+    M. Gautier, Numerical calculation of the base inertial parameters of robots, J. Robot. Syst. 8(4), 1991.
+
+    >>> from hhtjax.bodies import Body, Joint, tree
+    >>> import hhtjax
+    >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0.1, 0.25, 0.25])])
+    >>> hhtjax.identification.base_parameters(rod).names
+    ('rod m cx', 'rod m cz', 'rod Iyy')
+    """
+    _require_robot("base_parameters", robot)
+    require_integer("base_parameters", "samples", samples)
+    q, v, w = _random_states(robot, samples, seed) if motion is None else motion
+    Y = np.asarray(jax.jit(jax.vmap(lambda q, v, w: regressor(robot, q, v, w)))(q, v, w))
+    Y = Y.reshape(-1, Y.shape[-1])
+    names = [f"{body} {name}" for body in robot.bodies for name in NAMES]
+    size = np.linalg.norm(Y, axis=0)
+    seen = np.flatnonzero(size > RANK * size.max())
+    # from the tip to the root, as the parameters of bodies close to the base are told by the fewest motions
+    order = seen[::-1]
+    found: Any = scipy.linalg.qr(Y[:, order] / size[order], mode="r", pivoting=True)
+    R, pivots = found
+    rank = int(np.sum(np.abs(np.diag(R)) > RANK * abs(R[0, 0])))
+    independent = np.sort(order[pivots[:rank]])
+    rest = np.setdiff1d(seen, independent)
+    combination = np.zeros((rank, Y.shape[1]))
+    combination[np.arange(rank), independent] = 1
+    if rest.size:
+        share = np.linalg.lstsq(Y[:, independent], Y[:, rest], rcond=None)[0]
+        combination[:, rest] = np.where(np.abs(share) < 1e-9 * max(1.0, np.abs(share).max()), 0, share)
+    condition = float(np.linalg.cond(Y[:, independent] / size[independent]))
+    unseen = tuple(names[i] for i in np.setdiff1d(np.arange(Y.shape[1]), seen))
+    return BaseParameters(rank, independent, tuple(names[i] for i in independent), combination, unseen, condition)
+
+
+def _require_robot(caller: str, robot):
+    if not isinstance(robot, Mechanism):
+        raise TypeError(f"{caller}: `robot` must be a Mechanism, of bodies.tree or bodies.load; received {robot!r}.")
+
+
+def _random_states(robot: Mechanism, samples: int, seed: int):
+    """Positions off q0 by a radian or a metre, rates and accelerations of a few units."""
+    rng = np.random.default_rng(seed)
+    tree = robot.model.tree
+    if tree.balls:
+        raise NotImplementedError("base_parameters: for robots with balls or free joints, give `motion`.")
+    q, v, w = rng.uniform(-1, 1, (3, samples, tree.rates))
+    return np.asarray(robot.q0) + np.pi * q, 2 * v, 5 * w
+
+
+class Fourier(NamedTuple):
+    """A periodic motion, q(t) = centre + sum over k of (a_k sin(k w t) - b_k cos(k w t))/(k w), w = 2 pi/period.
+
+    A pytree, to be put into params and called with t, as what a controller is to follow.
+
+    Attributes:
+        centre: (n,). a, b: (K, n), rad/s or m/s. period: s.
+    """
+
+    centre: Array
+    a: Array
+    b: Array
+    period: Array
+
+    def __call__(self, t: Real) -> Array:
+        """q(t), (n,)."""
+        return self.motion(t)[0]
+
+    def motion(self, t: Real):
+        """q, v, w at t, (n,) each."""
+        k = jnp.arange(1, len(self.a) + 1, dtype=self.a.dtype)[:, None] * (2 * jnp.pi / self.period)
+        s, c = jnp.sin(k * t), jnp.cos(k * t)
+        q = self.centre + jnp.sum((self.a * s - self.b * c) / k, axis=0)
+        return q, jnp.sum(self.a * c + self.b * s, axis=0), jnp.sum(k * (self.b * c - self.a * s), axis=0)
+
+
+@shown
+class Excitation(NamedTuple):
+    """A motion to identify a robot by; made by `excitation`.
+
+    Attributes:
+        trajectory: a `Fourier`, called with t.
+        condition: of the regressor along it, columns of length 1 over the parameters that motions can tell.
+        start: the same of the random motion that the search began with.
+        base: the `BaseParameters` of the robot.
+    """
+
+    trajectory: Fourier
+    condition: float
+    start: float
+    base: BaseParameters
+
+
+def excitation(
+    robot: Mechanism,
+    *,
+    period: Real = 10.0,
+    harmonics: int = 5,
+    amplitude: Any = 1.0,
+    speed: Any = 2.0,
+    acceleration: Any = np.inf,
+    centre: Any = None,
+    samples: int = 100,
+    iterations: int = 200,
+    seed: int = 0,
+) -> Excitation:
+    """A periodic motion of all joints whose regressor is well conditioned, found by gradient (L-BFGS).
+
+    The cost is the logarithm of the condition number of the regressor along the motion, its columns scaled to one
+    length, with a penalty on what leaves the ranges.
+
+    Args:
+        robot: a `Mechanism` of hinges and slides.
+        period: s. harmonics: K, of each joint.
+        amplitude: how far from `centre`, rad or m; speed, acceleration: largest ones; numbers or (n,).
+        centre: (n,), None for q0.
+        samples: of a period, where the regressor is taken. iterations: of the search. seed: of its start.
+
+    Returns:
+        An `Excitation`.
+
+    Raises: TypeError, ValueError, NotImplementedError: an argument of a wrong kind or value; balls or free joints.
+
+    J. Swevers, C. Ganseman, D. Tukel, J. De Schutter, H. Van Brussel, IEEE Trans. Robot. Autom. 13(5), 1997, 730-740.
+    """
+    _require_robot("excitation", robot)
+    for name, value in (("harmonics", harmonics), ("samples", samples), ("iterations", iterations)):
+        require_integer("excitation", name, value)
+    require_number("excitation", "period", period, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    base = base_parameters(robot)
+    n = robot.model.tree.rates
+    centre = jnp.asarray(robot.q0 if centre is None else centre, float)
+    limits = [np.broadcast_to(np.asarray(x, float), (n,)) for x in (amplitude, speed, acceleration)]
+    t = jnp.arange(samples) * (period / samples)
+
+    def trajectory(x: Real) -> Fourier:
+        a, b = x.reshape(2, harmonics, n)
+        return Fourier(centre, a, b, jnp.asarray(float(period)))
+
+    def values(x: Real):
+        """Singular values of the scaled regressor, and by how much ranges are left."""
+        q, v, w = jax.vmap(trajectory(x).motion)(t)
+        Y = jax.vmap(lambda q, v, w: regressor(robot, q, v, w))(q, v, w)[..., base.independent]
+        Y = Y.reshape(-1, base.count)
+        size = jnp.sqrt(jnp.sum(Y**2, axis=0))
+        sigma = jnp.linalg.svd(Y / size[None, :], compute_uv=False)
+        parts = [
+            y / limit[None, :]
+            for y, limit in zip((q - centre[None, :], v, w), limits, strict=True)
+            if np.all(np.isfinite(limit))
+        ]
+        beyond = sum(jnp.mean(jnp.maximum(jnp.abs(y) - 0.97, 0) ** 2) for y in parts)
+        return sigma, beyond
+
+    def cost(x: Real):
+        sigma, beyond = values(x)
+        return jnp.log(sigma[0] / sigma[-1]) + 1e4 * beyond
+
+    rng = np.random.default_rng(seed)
+    x0 = rng.normal(size=2 * harmonics * n)
+    q, v, w = jax.vmap(trajectory(x0).motion)(t)
+    reach = max(
+        float(np.max(np.abs(y) / limit[None, :])) for y, limit in zip((q - centre[None, :], v, w), limits, strict=True)
+    )
+    x0 = x0 / reach * 0.97  # inside all ranges
+    value_and_grad = jax.jit(jax.value_and_grad(cost))
+    found = scipy.optimize.minimize(
+        lambda x: tuple(np.asarray(y, float) for y in value_and_grad(x)), x0, jac=True, method="L-BFGS-B",
+        options={"maxiter": iterations},
+    )  # fmt: skip
+    start, end = (np.asarray(jax.jit(values)(x)[0]) for x in (x0, found.x))
+    return Excitation(trajectory(jnp.asarray(found.x)), float(end[0] / end[-1]), float(start[0] / start[-1]), base)

@@ -1,0 +1,365 @@
+"""Mechanisms from bodies and joints: their equations, slopes, order, gradients, loops, friction, motors and ends."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import check_gradient
+from jax.flatten_util import ravel_pytree
+from mechanisms import four_bar, random_tree, servo_arm
+
+import hhtjax
+from hhtjax import bodies
+from hhtjax.bodies import Body, Connect, Couple, Joint, Motor, Weld, tree
+from hhtjax.bodies import newton_euler as ne
+from hhtjax.bodies.equations import inertia_of, position, rates
+from hhtjax.rotation import exp
+from hhtjax.systems import kinematics
+
+ALL = ("free", "ball", "revolute", "prismatic", "planar", "ball")
+BRANCHED = (-1, 0, 1, 1, 0, 4)
+
+
+def state(robot, seed=0):
+    """A random position, v and w, structured."""
+    rng = np.random.default_rng(seed)
+    _, unravel = ravel_pytree(robot.v0)
+    n = robot.model.tree.rates
+    blocks, (q, back) = kinematics.layout(robot.q0, robot.v0), ravel_pytree(robot.q0)
+    q = back(kinematics.move(blocks, q, jnp.asarray(rng.normal(size=n))))
+    return q, *(unravel(jnp.asarray(x)) for x in rng.normal(size=(2, n)))
+
+
+def energy(robot, q, v):
+    """Kinetic, and that of gravity, of springs of hinges and slides: by the frames of the bodies alone."""
+    p, kinetic, potential = robot.params, 0.0, 0.0
+    (frames, rate) = jax.jvp(robot.frames, (q,), (along(robot, q, v),))
+    for i, name in enumerate(robot.bodies):
+        (R, x), (dR, dx) = frames[name], rate[name]
+        Om = ne.axial(R.T @ dR) / 2
+        u = dx + dR @ p["com"][i]
+        kinetic += (p["mass"][i] * u @ u + Om @ p["inertia"][i] @ Om) / 2
+        potential -= p["mass"][i] * p["gravity"] @ (x + R @ p["com"][i])
+    flat = rates(robot.model.tree, v)
+    return kinetic + jnp.sum(p["armature"] * flat**2) / 2, potential
+
+
+def along(robot, q, v):
+    """The rate of q."""
+    blocks, (flat, back) = kinematics.layout(q, v), ravel_pytree(q)
+    return back(kinematics.rate(blocks, flat, ravel_pytree(v)[0]))
+
+
+@pytest.mark.parametrize("parents", [None, BRANCHED])
+def test_equations_are_those_of_the_energy(parents):
+    """M is the Hessian of the kinetic energy, and v.(bias) = dT/dt at M w = 0 less what gravity does."""
+    robot = random_tree(ALL, parents=parents)
+    q, v, w = state(robot)
+    flat, unravel = ravel_pytree(v)
+
+    @jax.jit
+    def expected(flat):
+        T, power = jax.hessian(lambda x: energy(robot, q, unravel(x))[0])(flat), None
+
+        def total(s):
+            blocks, (at, back) = kinematics.layout(q, v), ravel_pytree(q)
+            moved = back(kinematics.move(blocks, at, s * flat))
+            return sum(energy(robot, moved, v))
+
+        power = jax.jvp(total, (0.0,), (1.0,))[1]
+        return T, power
+
+    M, power = expected(flat)
+    found = jax.jit(partial(bodies.mass_matrix, robot))(q)
+    np.testing.assert_allclose(found, M, rtol=1e-12, atol=1e-12)
+    zero = unravel(0 * flat)
+    bias = ravel_pytree(jax.jit(partial(bodies.inverse_dynamics, robot))(q, v, zero))[0]
+    assert float(flat @ bias) == pytest.approx(float(power), rel=1e-11)
+    w_flat = ravel_pytree(w)[0]
+    whole = ravel_pytree(jax.jit(partial(bodies.inverse_dynamics, robot))(q, v, w))[0]
+    np.testing.assert_allclose(whole - bias, M @ w_flat, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("parents", [None, BRANCHED])
+def test_slopes_are_those_of_autodiff(parents):
+    robot = random_tree(ALL, parents=parents)
+    own, params = robot.model.tree, robot.params
+    q, v, w = state(robot, 1)
+    p, v, w = position(own, q), rates(own, v), rates(own, w)
+    links = inertia_of(robot.model, params)
+
+    @partial(jax.jit, static_argnums=0)
+    def slopes_of(function, x, v, w, mass, gravity):
+        nr, nf = own.balls, own.frees
+        R = jax.vmap(lambda R, psi: R @ exp(psi))(p.R, x[: 3 * nr].reshape(-1, 3))
+        at = ne.Position(p.x + x[3 * (nr + nf) :], R, p.y + x[3 * nr : 3 * (nr + nf)].reshape(-1, 3))
+        return function(own, at, v, w, links._replace(m=mass), gravity)
+
+    at = jnp.zeros(own.rates), v, w, links.m, params["gravity"]
+    every = (1, 2, 3, 4, 5)
+    plain = jax.jacfwd(slopes_of, every)(ne.plain_inverse_dynamics, *at)
+    closed = jax.jacfwd(slopes_of, every)(ne.inverse_dynamics, *at)
+    for x, y in zip(closed, plain, strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-13 * max(1.0, float(np.abs(y).max())))
+    found = ne.slopes(own, p, v, w, links, params["gravity"])
+    np.testing.assert_allclose(found.q, plain[0], rtol=0, atol=1e-13 * float(np.abs(plain[0]).max()))
+    np.testing.assert_allclose(found.value, slopes_of(ne.inverse_dynamics, *at), rtol=1e-13)
+
+
+@pytest.fixture(scope="module")
+def tumbling():
+    """A free body with a ball and a hinge on it; its end by small steps of the trapezoidal rule."""
+    robot = random_tree(("free", "ball", "revolute"), seed=3)
+    rng = np.random.default_rng(3)
+    v0 = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), robot.v0)
+    fine = hhtjax.simulate(
+        robot.system, hhtjax.newmark(), robot.q0, v0, robot.params, dt=2e-4, num_steps=2000, save_every=2000
+    )
+    return robot, v0, jax.tree.map(lambda x: x[-1], fine.q)
+
+
+@pytest.mark.slow
+def test_order_two_for_every_alpha(tumbling):
+    """With a free joint, a ball and a hinge; one program for all."""
+    robot, v0, expected = tumbling
+    expected = ravel_pytree(expected)[0]
+    ends = {}
+    for alpha in (0.0, -0.1, -1 / 3):
+        run = hhtjax.sweep(
+            robot.system, hhtjax.hht(jnp.asarray(alpha)), robot.q0, v0, robot.params,
+            dts=[0.02, 0.01, 0.005], duration=0.4, num_samples=1,
+        )  # fmt: skip
+        lasts = [ravel_pytree(jax.tree.map(lambda x, i=i: x[i, -1], run.q))[0] for i in range(3)]
+        errors = [float(jnp.linalg.norm(last - expected)) for last in lasts]
+        ends[alpha] = np.log2(np.array(errors[:-1]) / errors[1:])
+    for alpha, slopes in ends.items():
+        np.testing.assert_allclose(slopes, 2, atol=0.15, err_msg=str(alpha))
+
+
+@pytest.mark.slow
+def test_gradients_in_all_inertial_params():
+    """Forward = reverse = central differences, through the closed slopes and their derivatives."""
+    robot = random_tree(("revolute", "ball"), seed=5)
+    names = ("mass", "com", "inertia", "damping", "armature", "gravity")
+
+    def end(some):
+        run = hhtjax.simulate(
+            robot.system,
+            hhtjax.hht(-0.1),
+            robot.q0,
+            robot.v0,
+            robot.params | some,
+            dt=0.02,
+            num_steps=10,
+            save_every=10,
+        )
+        return sum(jnp.sum(jnp.sin(x[-1])) for x in jax.tree.leaves((run.q, run.v)))
+
+    check_gradient(end, {name: robot.params[name] for name in names})
+
+
+def test_a_four_bar_closes_and_keeps_closed():
+    """Two rows of the pin's three say all; the gap stays at rounding; one freedom."""
+    robot = four_bar()
+    assert len(robot.model.rows) == 2
+    ends = [robot.frames(robot.q0)[name] for name in ("coupler", "rocker")]
+    tips = [f.x + f.R @ jnp.array([x, 0, 0]) for f, x in zip(ends, (0.8, 0.5), strict=True)]
+    np.testing.assert_allclose(tips[0], tips[1], atol=1e-12)
+    run = hhtjax.simulate(robot.system, hhtjax.hht(), robot.q0, robot.v0, robot.params, dt=1e-3, num_steps=300)
+    run.check()
+    gap = jax.vmap(lambda q: bodies.equations.Loops(robot.model._replace(rows=None))(q, 0.0, robot.params))(run.q)
+    assert float(jnp.max(jnp.abs(gap))) < 1e-11
+    assert float(jnp.max(jnp.abs(run.q[-1] - run.q[0]))) > 0.01
+
+
+def test_loops_that_cannot_be_closed_are_refused():
+    one = Body("bar", joints=Joint(axis=(0, 1, 0)), mass=1.0, com=(0.5, 0, 0), inertia=(0.1, 0.1, 0.1))
+    with pytest.raises(ValueError, match="cannot be closed from the position that is described: 1 m"):
+        tree([one], loops=[Connect("world", "bar", (2.0, 0, 0), (1.0, 0, 0))])
+    with pytest.raises(ValueError, match="hold nothing that moves"):
+        tree([one], loops=[Connect("world", "bar")])
+    with pytest.raises(ValueError, match="`loops` names 'rod'"):
+        tree([one], loops=[Connect("world", "rod")])
+
+
+def test_couplings_hold_and_weld():
+    """A follower turns by its polynomial; a welded body keeps its place and orientation."""
+    joint = {"axis": (0, 1, 0), "damping": 0.2}
+    bar = {"mass": 1.0, "com": (0.2, 0, 0), "inertia": (0.1, 0.1, 0.1)}
+    robot = tree(
+        [
+            Body("driver", joints=Joint(**joint), **bar),
+            Body("follower", joints=Joint(**joint), position=(1, 0, 0), **bar),
+            Body("held", joints=Joint("free"), position=(0.5, 0, 0), **bar),
+        ],
+        loops=[Couple("follower", "driver", (0.1, -2.0, 0.3)), Weld("driver", "held", (0.5, 0, 0))],
+    )
+    driver, follower = robot.q0["joint"]
+    assert follower == pytest.approx(0.1 - 2 * driver + 0.3 * driver**2)
+    run = hhtjax.simulate(robot.system, hhtjax.hht(), robot.q0, robot.v0, robot.params, dt=5e-3, num_steps=60)
+    run.check()
+    driver, follower = run.q["joint"].T
+    np.testing.assert_allclose(follower, 0.1 - 2 * driver + 0.3 * driver**2, atol=1e-11)
+    end = robot.frames(jax.tree.map(lambda x: x[-1], run.q))
+    np.testing.assert_allclose(end["held"].R, end["driver"].R, atol=1e-11)
+    np.testing.assert_allclose(end["held"].x, end["driver"].x + end["driver"].R @ jnp.array([0.5, 0, 0]), atol=1e-11)
+
+
+def test_more_rows_than_coordinates_are_a_matter_of_redundancy():
+    """All three rows of a pin, twice, on two coordinates of a bar: refused as dependent, and run as least squares."""
+    robot = four_bar()
+    whole = bodies.equations.Loops(robot.model._replace(rows=None))
+    system = hhtjax.System(
+        robot.system.mass, dynamics=robot.system.dynamics,
+        constraint=lambda q, t, params: jnp.tile(whole(q, t, params), 2),
+    )  # fmt: skip
+    args = system, robot.q0, robot.v0, robot.params
+    with pytest.raises(ValueError, match=r"rows \[1, 4\] have no gradient"):
+        hhtjax.simulate(args[0], hhtjax.hht(), *args[1:], dt=1e-3, num_steps=20)
+    stepper = hhtjax.hht(redundant="least_squares")
+    run = hhtjax.simulate(args[0], stepper, *args[1:], dt=1e-3, num_steps=20)
+    run.check()
+    known = hhtjax.simulate(robot.system, hhtjax.hht(), *args[1:], dt=1e-3, num_steps=20)
+    np.testing.assert_allclose(run.q, known.q, atol=1e-9)
+
+
+def test_servo_and_dry_friction():
+    """The arm holds where the servo's torque, less gravity's, is below the friction."""
+    robot = servo_arm()
+    assert robot.rubbing == (0, 1)
+    assert robot.motors == ("upper", "fore")
+    run = hhtjax.simulate(
+        robot.system, hhtjax.hht(), robot.q0, robot.v0, robot.params | {"ctrl": jnp.array([0.1, 0.2])},
+        dt=2e-3, num_steps=1000, save_every=1000,
+    )  # fmt: skip
+    run.check()
+    assert bool(jnp.all(run.sticking[-1]))
+    still = bodies.inverse_dynamics(robot, run.q[-1], robot.v0, robot.v0)
+    driven = bodies.forces(robot, run.q[-1], robot.v0, 0.0, robot.params | {"ctrl": jnp.array([0.1, 0.2])})
+    np.testing.assert_allclose(driven - still, run.friction[-1], atol=1e-6)
+    assert float(jnp.max(jnp.abs(run.q[-1] - jnp.array([0.1, 0.2])))) < 0.05
+
+
+def test_motors_clip_and_outer_loads_act():
+    """F of a motor by its formula and its ranges; torque and wrench as the virtual work says."""
+    link = {"mass": 1.0, "inertia": (0.1, 0.1, 0.1), "com": (0.3, 0, 0)}
+    robot = tree(
+        [
+            Body("a", joints=Joint(axis=(0, 1, 0)), **link),
+            Body("b", "a", Joint("prismatic", (1, 0, 0)), position=(0.5, 0, 0), **link),
+        ],
+        motors=[
+            Motor("a", "torque", gear=3.0, gain=2.0, ctrlrange=(-1, 1), offset=0.5),
+            Motor("b", "velocity", kv=4.0, forcerange=(-2, 2)),
+        ],
+        gravity=(0, 0, 0),
+    )  # fmt: skip
+    q, v = jnp.array([0.3, 0.1]), jnp.array([0.2, -0.1])
+
+    def acting(**params):
+        return bodies.forces(robot, q, v, 0.5, robot.params | params)
+
+    np.testing.assert_allclose(acting(ctrl=jnp.array([0.4, 0.2])), [3 * (0.8 + 0.5), 4 * (0.2 + 0.1)])
+    np.testing.assert_allclose(acting(ctrl=jnp.array([9.0, 9.0])), [3 * 2.5, 2.0])
+    np.testing.assert_allclose(acting(ctrl=lambda t: jnp.array([t, 0.0])), [3 * 1.5, 0.4])
+    rest = acting()
+    np.testing.assert_allclose(acting(torque=lambda t: jnp.array([t, 1.0])) - rest, [0.5, 1.0])
+    wrench = jnp.array([0.1, 0.2, -0.3, 1.0, -2.0, 0.5])
+
+    def moved(dq):
+        frame = robot.frames(q + dq)["b"]
+        start = robot.frames(q)["b"]
+        return wrench[:3] @ ne.axial(frame.R @ start.R.T) / 2 + wrench[3:] @ frame.x
+
+    np.testing.assert_allclose(acting(wrench={"b": wrench}) - rest, jax.grad(moved)(0 * q), atol=1e-14)
+    with pytest.raises(ValueError, match="'c'"):
+        acting(wrench={"c": wrench})
+
+
+@pytest.mark.parametrize("limits", ["stop", "event"])
+def test_ends_of_ranges(limits):
+    """A pendulum that falls onto the end of its range comes back."""
+    bar = Body(
+        "bar", joints=Joint(axis=(0, 1, 0), range=(-2.0, 0.4)), mass=1.0, com=(0.5, 0, 0), inertia=(0.1, 0.1, 0.1)
+    )
+    with pytest.raises(ValueError, match="say what they do"):
+        tree([bar])
+    robot = tree([bar], limits=limits)
+    run = hhtjax.simulate(
+        robot.system, hhtjax.hht(), robot.q0, robot.v0, robot.params, dt=1e-3, num_steps=400, events=robot.events
+    )
+    run.check()
+    assert robot.events is None if limits == "stop" else len(robot.events) == 2
+    assert 0.39 < float(jnp.max(run.q)) < 0.42
+    assert float(run.v[jnp.argmax(run.q[:, 0]) + 30, 0]) < -0.05
+
+
+def test_positions_may_be_free():
+    """The same motion, and a derivative of places in the offset of a link."""
+    made = [random_tree(("revolute", "prismatic", "ball"), seed=7, free=free) for free in ((), ("position",))]
+    q, v, w = state(made[0])
+    for f in (bodies.inverse_dynamics, lambda robot, q, v, w: robot.frames(q)):
+        same = [jax.jit(partial(f, robot))(q, v, w) for robot in made]
+        jax.tree.map(partial(np.testing.assert_allclose, atol=1e-12), *same)
+    robot = made[1]
+
+    def torque(x):
+        found = bodies.inverse_dynamics(robot, q, v, w, robot.params | {"position": robot.params["position"] + x})
+        return jnp.sum(jnp.sin(ravel_pytree(found)[0]))
+
+    check_gradient(torque, jnp.zeros((3, 3)))
+
+
+def test_regressor_is_linear_in_theta():
+    robot = random_tree(("revolute", "ball", "prismatic"), seed=2)
+    q, v, w = state(robot)
+    Y, theta = jax.jit(partial(bodies.regressor, robot))(q, v, w), bodies.inertial_parameters(robot.params)
+    torque = ravel_pytree(bodies.inverse_dynamics(robot, q, v, w, robot.params | {"armature": jnp.zeros(5)}))[0]
+    np.testing.assert_allclose(Y @ theta, torque, rtol=1e-11, atol=1e-12)
+
+
+def test_denavit_hartenberg_in_both_conventions():
+    """The frame of each link is the product of the screws of its rows."""
+    rows = np.array([[0.1, 0.5, 0.2, 0.3], [0.4, -1.2, 0.1, -0.2], [0.2, 0.7, -0.3, 0.9]])
+    q = np.array([0.4, -0.8, 1.1])
+    for modified in (False, True):
+        robot = tree(bodies.denavit_hartenberg(rows, modified=modified, mass=[1.0] * 3, inertia=[(0.1, 0.1, 0.1)] * 3))
+        T = np.eye(4)
+        for (a, alpha, d, theta), angle in zip(rows, q, strict=True):
+            turn, link = bodies.description._screw(2, theta + angle, d), bodies.description._screw(0, alpha, a)
+            T = T @ (link @ turn if modified else turn @ link)
+        found = robot.frames(jnp.asarray(q))["link3"]
+        np.testing.assert_allclose(found.R, T[:3, :3], atol=1e-14)
+        np.testing.assert_allclose(found.x, T[:3, 3], atol=1e-14)
+
+
+BODY = {"mass": 1.0, "com": (0.1, 0, 0), "inertia": (0.1, 0.1, 0.1)}
+WRONG = [
+    (lambda: Joint("hinge"), "`kind` must be one of revolute"),
+    (lambda: Joint(axis=(0, 0, 0)), "`axis` must be a direction"),
+    (lambda: Joint(range=(1, 0)), r"\(lowest, highest\)"),
+    (lambda: Joint("ball", rest=1.0), "`rest` belongs to revolute"),
+    (lambda: Joint(damping=-1.0), "`damping` must be 0 or more"),
+    (lambda: Body("b", mass=1.0, inertia=(1, 1, 3)), "none larger than the sum"),
+    (lambda: Body("b", inertia=(1, 1, 1)), "has inertia and no mass"),
+    (lambda: Body("world"), 'must not be "world"'),
+    (lambda: Body("b", joints=[Joint("free"), Joint()]), "a free joint is the only one"),
+    (lambda: Body("b", rotation=np.ones((3, 3))), "must be a rotation"),
+    (lambda: Motor("a", "servo"), "torque, position or velocity"),
+    (lambda: tree([Body("b", "c", Joint(), **BODY)]), "hangs on 'c'"),
+    (lambda: tree([Body("b", joints=Joint(), **BODY)] * 2), "two bodies are named 'b'"),
+    (lambda: tree([Body("b", **BODY)]), "at least one joint"),
+    (lambda: tree([Body("b", joints=Joint())]), "has a mass"),
+    (lambda: tree([Body("b", joints=Joint(), **BODY)], motors=[Motor("c")]), "`motors` names 'c'"),
+    (lambda: tree([Body("b", joints=Joint(), **BODY)], friction="wet"), "`friction` must be one of 'dry'"),
+    (lambda: bodies.denavit_hartenberg([[1, 2, 3]]), r"finite numbers \(N, 4\)"),
+    (lambda: bodies.flexible(Joint(), 1e4), "with an armature"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "words"), WRONG)
+def test_a_wrong_description_is_refused(make, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        make()

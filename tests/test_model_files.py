@@ -1,0 +1,291 @@
+"""Mechanisms from MJCF and URDF: the equations of mujoco, every pitfall, and one list of what is not modelled."""
+
+import importlib.util
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from hhtjax import bodies
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="needs mujoco (extra models)")
+
+# a tree with all kinds of joints, several on one body, anchors off the origin, springs, servos, an offset reference
+TREE = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option gravity="0.3 -0.5 -9.81"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="base" pos="0.1 0.2 0.3" quat="0.9 0.1 -0.2 0.3">
+      <freejoint name="floating"/>
+      <inertial pos="0.05 -0.02 0.1" mass="3" fullinertia="0.2 0.25 0.3 0.01 0.02 -0.03"/>
+      <body name="upper" pos="0.3 0 0.1" euler="0.3 -0.2 0.5">
+        <joint name="swing" axis="0 1 0.2" pos="0.05 0.1 0" damping="0.4" stiffness="3" springref="0.2" ref="0.3" armature="0.07"/>
+        <joint name="lift" type="slide" axis="0.1 0 1" pos="0.2 0 0" stiffness="50" damping="2"/>
+        <inertial pos="0.1 0.05 0" mass="1.2" diaginertia="0.02 0.03 0.025"/>
+        <body name="wrist" pos="0.2 0.1 0">
+          <joint name="ball" type="ball" pos="-0.05 0 0.1" damping="0.3" stiffness="1.5"/>
+          <geom type="box" size="0.1 0.05 0.02" pos="0.05 0.02 0" density="800"/>
+          <site name="tool" pos="0.1 0 0.05" quat="0.7 0.7 0 0"/>
+          <body name="pad" pos="0.1 0 0" euler="0.1 0.2 0.3"><geom type="sphere" size="0.05" mass="0.4"/></body>
+        </body>
+      </body>
+    </body>
+    <body name="pole" pos="1 0 0"><joint name="pole" axis="1 0 0"/><geom type="capsule" size="0.03" fromto="0 0 0 0 0 0.5" mass="0.7"/></body>
+  </worldbody>
+  <actuator>
+    <motor joint="swing" gear="5"/>
+    <position joint="lift" kp="300" kv="15" gear="2"/>
+    <velocity joint="pole" kv="3" ctrlrange="-0.5 0.5"/>
+    <general joint="pole" gainprm="4" biastype="affine" biasprm="0.5 -2 -0.3" forcerange="-3 3"/>
+  </actuator>
+</mujoco>
+"""  # noqa: E501
+
+ARM = "".join(
+    f'<body name="link{i}" pos="{0.05 * (i % 2)} 0.02 {0.2 + 0.02 * i}" euler="{20 * i} {-15 * i} {10 * i}">'
+    f'<joint name="joint{i}" axis="{i % 2} {(i + 1) % 2} 0.3" armature="0.1" damping="{0.2 + 0.1 * i}"/>'
+    f'<inertial pos="0.01 {0.02 * i} 0.1" mass="{4 - 0.4 * i}" diaginertia="0.03 0.04 0.02"/>'
+    for i in range(7)
+)
+ARM = f"<mujoco><worldbody>{ARM}{'</body>' * 7}</worldbody></mujoco>"
+
+
+def state_of(robot, seed=0):
+    """A random q, v, w of ours."""
+    rng = np.random.default_rng(seed)
+    tree = robot.model.tree
+    _, unravel = ravel_pytree(robot.v0)
+
+    def rotations(n):
+        return jnp.stack([bodies.description.of_quaternion(x) for x in rng.normal(size=(n, 4))])
+
+    if tree.balls:
+        q = {}
+        if "ball" in robot.q0:
+            q["ball"] = rotations(tree.balls - tree.frees)
+        if "free" in robot.q0:
+            q["free"] = {"R": rotations(tree.frees), "x": jnp.asarray(rng.normal(size=(tree.frees, 3)))}
+        if "joint" in robot.q0:
+            q["joint"] = jnp.asarray(rng.normal(size=tree.scalars))
+    else:
+        q = jnp.asarray(rng.normal(size=tree.rates))
+    return q, *(unravel(jnp.asarray(x)) for x in rng.normal(size=(2, tree.rates)))
+
+
+def as_mujoco(m, robot, q):
+    """qpos, and the places of its rates in ours."""
+    import mujoco
+
+    tree = robot.model.tree
+    qpos, order = m.qpos0.copy(), np.zeros(m.nv, int)
+    balls = frees = scalars = 0
+    plain = tree.balls - tree.frees
+    joint = q["joint"] if tree.balls and tree.scalars else q
+    for j in range(m.njnt):
+        a, d, kind = m.jnt_qposadr[j], m.jnt_dofadr[j], int(m.jnt_type[j])
+        if kind == 0:
+            order[d : d + 3] = np.arange(3) + 3 * (tree.balls + frees)
+            order[d + 3 : d + 6] = np.arange(3) + 3 * (plain + frees)
+            qpos[a : a + 3] = q["free"]["x"][frees]
+            mujoco.mju_mat2Quat(qpos[a + 3 : a + 7], np.array(q["free"]["R"][frees]).ravel())
+            frees += 1
+        elif kind == 1:
+            order[d : d + 3] = np.arange(3) + 3 * balls
+            mujoco.mju_mat2Quat(qpos[a : a + 4], np.array(q["ball"][balls]).ravel())
+            balls += 1
+        else:
+            order[d] = 3 * (tree.balls + tree.frees) + scalars
+            qpos[a] = joint[scalars]
+            scalars += 1
+    return qpos, order
+
+
+@pytest.mark.parametrize("text", [ARM, TREE], ids=["seven axes", "all kinds of joints"])
+def test_equations_are_those_of_mujoco(text):
+    """M, bias, forces, accelerations, places of bodies and sites."""
+    import mujoco
+
+    robot, m = bodies.load(text), mujoco.MjModel.from_xml_string(text)
+    q, v, w = state_of(robot)
+    qpos, order = as_mujoco(m, robot, q)
+    data = mujoco.MjData(m)
+    data.qpos[:], data.qvel[:] = qpos, np.asarray(ravel_pytree(v)[0])[order]
+    data.ctrl[:] = np.random.default_rng(1).normal(size=m.nu)
+    mujoco.mj_forward(m, data)
+    M = np.zeros((m.nv, m.nv))
+    columns = np.eye(m.nv)
+    for i in range(m.nv):
+        mujoco.mj_mulM(m, data, M[i], columns[i])
+    params = robot.params | ({"ctrl": jnp.asarray(data.ctrl)} if m.nu else {})
+    found = jax.jit(partial(bodies.mass_matrix, robot))(q)[np.ix_(order, order)]
+    still = jax.tree.map(jnp.zeros_like, w)
+    bias = ravel_pytree(jax.jit(partial(bodies.inverse_dynamics, robot))(q, v, still))[0][order]
+    force = ravel_pytree(bodies.forces(robot, q, v, 0.0, params))[0][order]
+    close = partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
+    close(found, M)
+    close(bias, data.qfrc_bias)
+    close(force, data.qfrc_passive + data.qfrc_actuator)
+    acceleration = np.linalg.solve(found, force - bias)
+    np.testing.assert_allclose(acceleration, data.qacc, rtol=0, atol=1e-12 * max(1.0, np.abs(data.qacc).max()))
+    frames = robot.frames(q)
+    for i in range(1, m.nbody):
+        close(frames[m.body(i).name].x, data.xpos[i])
+    for i in range(m.nsite):
+        close(frames[m.site(i).name].x, data.site_xpos[i])
+        close(frames[m.site(i).name].R.ravel(), data.site_xmat[i])
+
+
+LOOPED = """
+<mujoco>
+  <worldbody>
+    <body name="crank"><joint name="crank" axis="0 1 0"/><geom type="capsule" size="0.01" fromto="0 0 0 0.3 0 0" contype="0" conaffinity="0"/>
+      <site name="pin1" pos="0.3 0 0"/>
+      <body name="rod" pos="0.3 0 0"><joint name="rod" axis="0 1 0"/><geom type="capsule" size="0.01" fromto="0 0 0 0.6 0 0" contype="0" conaffinity="0"/>
+        <site name="pin2" pos="0.6 0 0"/></body></body>
+    <body name="slider" pos="0.9 0 0"><joint name="slider" type="slide" axis="1 0 0"/><geom type="box" size="0.05 0.05 0.05" contype="0" conaffinity="0"/>
+      <site name="pin3"/></body>
+    <body name="follower" pos="0 1 0"><joint name="follower" axis="0 1 0"/><geom type="sphere" size="0.05" pos="0.1 0 0" contype="0" conaffinity="0"/></body>
+  </worldbody>
+  <equality>
+    <connect site1="pin2" site2="pin3"/>
+    <joint joint1="follower" joint2="crank" polycoef="0.05 2 0 0 0"/>
+    <connect body1="crank" body2="rod" anchor="0.3 0 0" active="false"/>
+  </equality>
+</mujoco>
+"""  # noqa: E501
+
+
+def test_loops_of_a_file():
+    """A slider crank by sites, and gears; what is inactive is not there; rows that say nothing new neither."""
+    robot = bodies.load(LOOPED)
+    assert [row.kind for row in robot.model.loops] == ["connect", "couple"]
+    assert len(robot.model.rows) == 3
+    frames = robot.frames(robot.q0)
+    np.testing.assert_allclose(frames["pin2"].x, frames["pin3"].x, atol=1e-12)
+    bar = bodies.load(
+        LOOPED.replace('<connect site1="pin2" site2="pin3"/>', '<connect body1="rod" body2="slider" anchor="0.6 0 0"/>')
+    )
+    np.testing.assert_allclose(bar.q0, robot.q0, atol=1e-12)
+    weld = bodies.load(
+        LOOPED.replace('<connect site1="pin2" site2="pin3"/>', '<weld body1="crank" body2="follower"/>')
+        .replace('<joint joint1="follower" joint2="crank" polycoef="0.05 2 0 0 0"/>', "")
+    )  # fmt: skip
+    moved = weld.frames(weld.q0)
+    np.testing.assert_allclose(moved["follower"].R, moved["crank"].R, atol=1e-12)
+
+
+URDF = """
+<robot name="arm">
+  <link name="floor"/>
+  <link name="base"><inertial><origin xyz="0 0 0.1"/><mass value="4"/><inertia ixx="0.1" iyy="0.1" izz="0.05" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><mesh filename="package://nowhere/base.stl"/></geometry></collision></link>
+  <link name="upper"><inertial><origin xyz="0.2 0 0" rpy="0.1 0.2 0.3"/><mass value="2"/><inertia ixx="0.01" iyy="0.05" izz="0.05" ixy="0.001" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="package://nowhere/upper.stl"/></geometry></visual></link>
+  <link name="flange"/>
+  <joint name="mount" type="fixed"><parent link="floor"/><child link="base"/></joint>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.3" rpy="0 0 1.570796"/><axis xyz="0 1 0"/>
+    <dynamics damping="0.7" friction="0.3"/><limit lower="-1" upper="2" effort="10" velocity="3"/></joint>
+  <joint name="tip" type="fixed"><parent link="upper"/><child link="flange"/><origin xyz="0.4 0 0"/></joint>
+</robot>
+"""  # noqa: E501
+
+
+def test_a_urdf_keeps_its_fixed_links_and_needs_no_meshes():
+    robot = bodies.load(URDF, ignore=("contact",), limits="ignore")
+    assert robot.joints == ("shoulder",)
+    assert "flange" in robot.markers
+    assert robot.unsupported == ("contact: collision shapes of base",)
+    assert float(robot.params["damping"][0]) == 0.7
+    assert float(robot.params["frictionloss"][0]) == 0.3
+    np.testing.assert_allclose(robot.frames(jnp.zeros(1))["flange"].x, [0, 0.4, 0.3], atol=1e-6)
+    floating = bodies.load(URDF, ignore=("contact",), limits="ignore", base="free")
+    assert floating.bodies == ("base", "upper")
+    assert set(floating.q0) == {"free", "joint"}
+    payload = bodies.Body("payload", "flange", mass=1.5, inertia=(0.01, 0.01, 0.01))
+    loaded = bodies.load(
+        URDF, ignore=("contact",), limits="ignore", more=[payload], joints={"shoulder": {"friction": 2.0}},
+        motors=[bodies.Motor("shoulder", "position", kp=100.0)],
+    )  # fmt: skip
+    assert loaded.bodies == ("upper", "payload")
+    assert float(loaded.params["frictionloss"][0]) == 2.0
+    gained = bodies.mass_matrix(loaded, loaded.q0) - bodies.mass_matrix(robot, robot.q0)
+    assert float(gained[0, 0]) == pytest.approx(1.5 * 0.4**2 + 0.01)
+
+
+def in_world(more="", joint="", top=""):
+    return (
+        f'<mujoco>{top}<worldbody><body name="a"><joint name="j" {joint}/><geom size="0.1" contype="0" conaffinity="0"/>'  # noqa: E501
+        f'<site name="s"/></body></worldbody>{more}</mujoco>'
+    )
+
+
+TOUCHING = """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="a" pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""  # noqa: E501
+NOT_MODELLED = {
+    "contact": TOUCHING,
+    "limits": in_world(joint='range="-10 10" limited="true"'),
+    "tendon": in_world('<tendon><fixed stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>'),
+    "fluid": in_world(top='<option density="1.2"/>'),
+    "gravcomp": in_world().replace('name="a"', 'name="a" gravcomp="1"'),
+    "actuator": in_world('<actuator><motor site="s" gear="1 0 0 0 0 0"/></actuator>'),
+    "actuator ": in_world('<actuator><general joint="j" dyntype="filter" dynprm="0.1"/></actuator>'),
+    "actuator  ": in_world('<actuator><damper joint="j" kv="1" ctrlrange="0 1"/></actuator>'),
+    "actuatorfrcrange": in_world('<actuator><motor joint="j"/></actuator>', 'actuatorfrcrange="-1 1"'),
+    "equality": in_world('<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon><equality><tendon tendon1="t"/></equality>'),  # noqa: E501
+    "mocap": "<mujoco><worldbody><body mocap='true'/><body name='a'><joint/><geom size='.1' contype='0' conaffinity='0'/></body></worldbody></mujoco>",  # noqa: E501
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NOT_MODELLED)
+def test_what_acts_and_is_not_modelled_is_refused_by_name(name):
+    """And runs without it where it is ignored, and says so."""
+    text, name = NOT_MODELLED[name], name.strip()
+    with pytest.raises(NotImplementedError, match=rf"(?s)    {name}: .*ignore="):
+        bodies.load(text.replace("\n", " "))
+    robot = bodies.load(text, ignore=(name,))
+    assert [words.split(":")[0] for words in robot.unsupported] == [name]
+
+
+def test_all_of_it_is_told_at_once():
+    text = in_world('<actuator><motor site="s" gear="1 0 0 0 0 0"/></actuator>', top='<option density="1.2"/>')
+    with pytest.raises(NotImplementedError, match=r'(?s)fluid: .*actuator: .*ignore=\("fluid", "actuator",\)'):
+        bodies.load(text)
+
+
+def test_what_is_switched_off_in_the_file_is_off():
+    flags = '<option><flag gravity="disable" damper="disable" spring="disable" limit="disable" frictionloss="disable"/></option>'  # noqa: E501
+    robot = bodies.load(
+        in_world(joint='damping="1" stiffness="2" frictionloss="3" range="-1 1" limited="true"', top=flags)
+    )
+    assert all(float(jnp.max(jnp.abs(robot.params[name]))) == 0 for name in ("gravity", "damping", "stiffness"))
+    assert robot.rubbing == ()
+
+
+def test_unphysical_links_of_a_urdf_are_refused_by_name():
+    text = URDF.replace('ixx="0.1" iyy="0.1" izz="0.05"', 'ixx="0.01" iyy="0.1" izz="0.3"')
+    with pytest.raises(NotImplementedError, match=r"unphysical: .*base"):
+        bodies.load(text, ignore=("contact",), limits="ignore")
+    bodies.load(text, ignore=("contact", "unphysical"), limits="ignore", base="free")
+
+
+def test_wrong_sources_and_options_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        bodies.load(tmp_path / "missing.xml")
+    with pytest.raises(ValueError, match="no XML"):
+        bodies.load("<mujoco>")
+    with pytest.raises(ValueError, match="MJCF"):
+        bodies.load("<sdf/>")
+    with pytest.raises(TypeError, match="a path"):
+        bodies.load(3)
+    with pytest.raises(ValueError, match="mujoco cannot read"):
+        bodies.load("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
+    with pytest.raises(ValueError, match="`ignore` must be one of"):
+        bodies.load(in_world(), ignore=("contacts",))
+    with pytest.raises(ValueError, match="`joints` must be one of"):
+        bodies.load(in_world(), joints={"k": {"friction": 1.0}})
+    path = tmp_path / "model.xml"
+    path.write_text(in_world(joint='damping="0.5"'))
+    assert float(bodies.load(path).params["damping"][0]) == 0.5
