@@ -29,6 +29,7 @@ EXPERIMENTS = {
     "events": "events.events",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",
+    "robots": "robots.robots",
     "squeezer": "identification.squeezer",
     "kim2019": "kim2019.kim2019",
     "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",

@@ -363,3 +363,11 @@ WRONG = [
 def test_a_wrong_description_is_refused(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
         make()
+
+
+def test_a_mechanism_is_drawn_by_its_bars():
+    """A line from each joint to the next, and on to the end of the last body."""
+    robot = servo_arm()
+    upper, fore = robot.bars()(jnp.array([0.0, np.pi / 2]))
+    np.testing.assert_allclose(upper, [[0, 0, 0], [0.4, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(fore, [[0.4, 0, 0], [0.4, 0, -0.4]], atol=1e-12)

@@ -268,7 +268,8 @@ class Connect:
     anchor2: Any = (0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        _name("Connect", "first", self.first), _name("Connect", "second", self.second)
+        _name("Connect", "first", self.first)
+        _name("Connect", "second", self.second)
         _set(self, anchor1=_vector("Connect", "anchor1", self.anchor1))
         _set(self, anchor2=_vector("Connect", "anchor2", self.anchor2))
 
@@ -291,7 +292,8 @@ class Weld:
     rotation: Any = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        _name("Weld", "first", self.first), _name("Weld", "second", self.second)
+        _name("Weld", "first", self.first)
+        _name("Weld", "second", self.second)
         _set(self, anchor1=_vector("Weld", "anchor1", self.anchor1))
         _set(self, anchor2=_vector("Weld", "anchor2", self.anchor2))
         _set(self, rotation=_rotation("Weld", "rotation", self.rotation))
@@ -337,7 +339,8 @@ class Marker:
     rotation: Any = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        _name("Marker", "name", self.name), _name("Marker", "body", self.body)
+        _name("Marker", "name", self.name)
+        _name("Marker", "body", self.body)
         _set(self, position=_vector("Marker", "position", self.position))
         _set(self, rotation=_rotation("Marker", "rotation", self.rotation))
 

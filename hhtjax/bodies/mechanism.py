@@ -24,20 +24,11 @@ from hhtjax.bodies.equations import (
     Sliding,
     as_rates,
     frames_of,
-    inertia_of,
-    of_links,
-    offsets_of,
-    position,
-    rates,
-    second_moment,
 )
-from hhtjax.bodies.equations import applied as applied_forces
 from hhtjax.bodies.model import Drive, Model, Place, Row, Spring, Stop, Structure, structure
-from hhtjax.bodies.newton_euler import Inertia, outer
-from hhtjax.bodies.newton_euler import inverse_dynamics as of_tree
 from hhtjax.bodies.tree import Tree
 from hhtjax.checks import require_one_of
-from hhtjax.description import Array, PyTree, Real
+from hhtjax.description import Array, PyTree
 from hhtjax.primitives import plain
 from hhtjax.systems import kinematics
 from hhtjax.systems.events import Event, impact
@@ -47,7 +38,6 @@ GRAVITY = (0.0, 0.0, -9.80665)
 INDEPENDENT = 1e-6  # sine of the angle to the rows before, below which a row of a loop says nothing new
 STOP_TIME = 0.005  # s, half a period of what hits a stiff stop
 RESTITUTION = 0.3
-UPPER = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # entries of a tensor, as in theta
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +108,42 @@ class Mechanism:
         """The frame of each body and marker in the world, {name: Frame(R, x)}; params: None for its own."""
         params = self.params if params is None else params
         return dict(zip(self.markers, frames_of(self.model, q, params), strict=True))
+
+    def bars(self, params: PyTree = None) -> Bars:
+        """What to draw: a function of q that gives polylines, for `hhtjax.plot.animation`; params: None for its own.
+
+        Each body is a line from its origin to those of the bodies and markers on it, or, with none, to twice its centre
+        of mass, the other end of a uniform rod.
+        """
+        return Bars(self, self.params if params is None else params)
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """The polylines of a mechanism, (2, 3) each; made by `Mechanism.bars`."""
+
+    robot: Mechanism
+    params: dict
+
+    def __call__(self, q: PyTree) -> list[np.ndarray]:
+        places, model = _placed(self.robot.model, q, self.params), self.robot.model
+        lines = []
+        for i, (place, parent) in enumerate(zip(model.places, model.parents, strict=True)):
+            if place.name == WORLD:
+                continue
+            if parent > 0:
+                lines.append(np.stack([places[parent].x, places[i].x]))
+            if i not in model.parents and place.name in self.robot.bodies:
+                centre = np.asarray(self.params["com"][self.robot.bodies.index(place.name)])
+                end = np.asarray(places[i].x) + 2 * np.asarray(places[i].R) @ centre
+                lines.append(np.stack([places[i].x, end]))
+        return lines
+
+
+@partial(jax.jit, static_argnums=0)
+def _placed(model: Model, q: PyTree, params: dict) -> list[Frame]:
+    """`frames_of`, compiled once for a mechanism."""
+    return frames_of(model, q, {name: params[name] for name in ("position",) if name in params})
 
 
 def tree(
@@ -203,6 +229,7 @@ def assembled(caller, bodies, motors, loops, markers, gravity, friction, limits,
         None,
         _roots(parts.nodes),
         _affine_maps(caller, bodies, markers) if free else None,
+        tuple([-1] + [list(by_name).index(x.parent if isinstance(x, Body) else x.body) for x in [*bodies, *markers]]),
     )
     params = _params(model, parts, bodies, motors, gravity, rubbing if friction == "dry" else ())
     params |= {"position": _array([body.position for body in bodies])} if free else {}
@@ -457,105 +484,3 @@ def _onto_loops(caller: str, q: Array, linearized, move):
             "rad is left. Describe a position that is nearer."
         )
     return q, B
-
-
-# ----------------------------------------------------------------------------
-# Functions of a mechanism, for use without a run
-
-
-def inverse_dynamics(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> PyTree:
-    """What the joints must exert for the accelerations w: M(q) w + bias(q, v), with armature, gravity and nothing else.
-
-    Args: robot; q, v, w; params: None for its own.
-    Returns: structured like v, N m and N.
-
-    >>> from hhtjax.bodies import Body, Joint, inverse_dynamics, tree
-    >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
-    >>> inverse_dynamics(rod, jnp.zeros(1), jnp.zeros(1), jnp.ones(1)).round(4).tolist()            # m l^2/3 - m g l/2
-    [-13.71]
-    """
-    model, params = robot.model, robot.params if params is None else params
-    tree, dw = model.tree, rates(robot.model.tree, w)
-    r = of_tree(
-        tree,
-        position(tree, q),
-        rates(tree, v),
-        dw,
-        inertia_of(model, params),
-        params["gravity"],
-        offsets_of(model, params),
-    )
-    return as_rates(tree, r + params["armature"] * dw)
-
-
-def mass_matrix(robot: Mechanism, q: PyTree, params: PyTree = None) -> Array:
-    """M(q), (nv, nv), with the armature; rows in the order of `jax.flatten_util.ravel_pytree(v)`.
-
-    >>> from hhtjax.bodies import Body, Joint, mass_matrix, tree
-    >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
-    >>> mass_matrix(rod, jnp.zeros(1)).round(6).tolist()                                                     # m l^2/3
-    [[1.0]]
-    """
-    return Mass(robot.model)(q, robot.params if params is None else params)
-
-
-def frames(robot: Mechanism, q: PyTree, params: PyTree = None) -> dict[str, Frame]:
-    """`Mechanism.frames`."""
-    return robot.frames(q, params)
-
-
-def forces(robot: Mechanism, q: PyTree, v: PyTree, t: Real = 0.0, params: PyTree = None) -> PyTree:
-    """Generalised forces of springs, dampers, motors, stops and what acts from outside, without gravity and friction.
-
-    Args: robot; q, v; t, s; params: None for its own.
-    Returns: structured like v.
-    """
-    model, params = robot.model, robot.params if params is None else params
-    p = position(model.tree, q)
-    return as_rates(model.tree, applied_forces(model, q, p, rates(model.tree, v), t, params))
-
-
-def regressor(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> Array:
-    """Y (nv, 10 nb) with inverse_dynamics - armature w = Y theta, linear in theta (10 nb,), ten numbers a body
-
-        m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the origin of the frame of the body
-
-    Atkeson, An, Hollerbach, Int. J. Robot. Res. 5(3), 1986. `inertial_parameters` gives theta.
-
-    Args: robot; q, v, w; params: for gravity (and positions, where free), None for its own.
-    Returns: (nv, 10 nb), bodies in the order of `Mechanism.bodies`.
-    """
-    model, params = robot.model, robot.params if params is None else params
-    tree, nb = model.tree, len(model.bodies)
-    dv, dw, p = rates(tree, v), rates(tree, w), position(tree, q)
-
-    def torque(theta: Array) -> Array:
-        links = of_links(model, _moments(theta), params)
-        return of_tree(tree, p, dv, dw, links, params["gravity"], offsets_of(model, params))
-
-    return jax.jacfwd(torque)(jnp.zeros(10 * nb, dv.dtype))
-
-
-def inertial_parameters(params: PyTree) -> Array:
-    """theta (10 nb,) of `regressor`, from mass, com and inertia.
-
-    >>> import jax.numpy as jnp
-    >>> params = {"mass": jnp.array([2.0]), "com": jnp.array([[0.1, 0, 0]]), "inertia": jnp.eye(3)[None]}
-    >>> inertial_parameters(params).round(3).tolist()
-    [2.0, 0.2, 0.0, 0.0, 1.0, 1.02, 1.02, 0.0, 0.0, 0.0]
-    """
-    m, c, inertia = params["mass"], params["com"], params["inertia"]
-    h = m[:, None] * c
-    squares = jnp.sum(c**2, axis=-1)[:, None, None] * np.eye(3, dtype=m.dtype)[None]
-    about = inertia + m[:, None, None] * (squares - outer(c, c))
-    upper = jnp.stack([about[:, i, j] for i, j in UPPER], axis=-1)
-    return jnp.concatenate([m[:, None], h, upper], axis=-1).ravel()
-
-
-def _moments(theta: Array) -> Inertia:
-    """Mass, first and second moments of bodies about their frames, from theta."""
-    m, h, upper = jnp.split(theta.reshape(-1, 10), [1, 4], axis=-1)
-    places = np.zeros((6, 3, 3), theta.dtype)
-    for k, (i, j) in enumerate(UPPER):
-        places[k, i, j] = places[k, j, i] = 1
-    return Inertia(m[:, 0], h, second_moment(jnp.sum(upper[:, :, None, None] * places[None], axis=1)))

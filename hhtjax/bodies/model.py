@@ -76,6 +76,7 @@ class Model(NamedTuple):
     rows: tuple | None  # which rows of the loops are kept, None for all
     roots: tuple  # of each node: the slot of the translation that its tree begins with, or -1
     offsets: tuple | None  # the affine maps from positions of bodies to those of nodes and places, where they are free
+    parents: tuple  # of each place: the number of the one that it hangs on, 0 the world, -1 for the world itself
 
 
 class Structure(NamedTuple):

@@ -98,7 +98,7 @@ def equation_error(
             flat, x, rate = flatten("equation_error", system, q, v, t, params)
             t = t.astype(rate.dtype)
             left = flat.residual(x, rate, ravel_pytree(a if flat.positions else v)[0], t, params)
-            return left if flat.friction is None else _with_sliding(flat, left, slowest, x, rate, t, params)
+            return left if slowest is None else _with_sliding(flat, left, slowest, x, rate, t, params)
 
         slowest = None if getattr(system, "friction", None) is None else SLOW * _largest_sliding(system, inside, params)
         return jax.vmap(one)(*inside)

@@ -71,7 +71,10 @@ def _unit(like: Array) -> Array:
 def inertia_coordinates(mass: Real, com: Array, inertia: Array) -> Array:
     """theta (..., 10) of `physical_inertia`: where a fit starts.
 
-    Args: mass (...,), kg, > 0; com (..., 3), m; inertia (..., 3, 3), about the centre of mass, kg m^2.
+    Args: mass: (...,), kg, > 0. com: (..., 3), m. inertia: (..., 3, 3), about the centre of mass, kg m^2.
+
+    Returns:
+        theta, (..., 10).
 
     Raises:
         ValueError: no mass, or an inertia of no body with an extent in all directions: a moment as large as the sum of
@@ -258,6 +261,13 @@ def excitation(
     Raises: TypeError, ValueError, NotImplementedError: an argument of a wrong kind or value; balls or free joints.
 
     J. Swevers, C. Ganseman, D. Tukel, J. De Schutter, H. Van Brussel, IEEE Trans. Robot. Autom. 13(5), 1997, 730-740.
+
+    >>> from hhtjax.bodies import Body, Joint, tree
+    >>> import hhtjax
+    >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0.1, 0.25, 0.25])])
+    >>> found = hhtjax.identification.excitation(rod, period=4.0, harmonics=3, iterations=20)
+    >>> found.condition < found.start, found.trajectory(0.5).shape
+    (True, (1,))
     """
     _require_robot("excitation", robot)
     for name, value in (("harmonics", harmonics), ("samples", samples), ("iterations", iterations)):
@@ -267,7 +277,7 @@ def excitation(
     n = robot.model.tree.rates
     centre = jnp.asarray(robot.q0 if centre is None else centre, float)
     limits = [np.broadcast_to(np.asarray(x, float), (n,)) for x in (amplitude, speed, acceleration)]
-    t = jnp.arange(samples) * (period / samples)
+    t = np.arange(samples) * (float(period) / samples)
 
     def trajectory(x: Real) -> Fourier:
         a, b = x.reshape(2, harmonics, n)

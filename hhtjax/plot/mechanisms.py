@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.animation import FuncAnimation
 from matplotlib.ticker import MaxNLocator
 
+from hhtjax.bodies import Mechanism
 from hhtjax.checks import require_function, require_number
 from hhtjax.description import Real
 from hhtjax.plot.styles import COLOURS, canvas, legend, look, require_run, with_unit
@@ -36,7 +37,8 @@ def animation(
 
     Args:
         solution: of one run.
-        points: `points(q)` -> (k, 2) or (k, 3), the corners of a polyline; or a list or tuple of these.
+        points: `points(q)` -> (k, 2) or (k, 3), the corners of a polyline; or a list or tuple of these. Or a
+            `hhtjax.bodies.Mechanism`, whose bodies are drawn as bars.
         fps: frames per second of film.
         speed: time of the run for each second of film.
         trace: number of a point of the first polyline whose path is drawn, or several.
@@ -125,6 +127,7 @@ def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = 
 
 def _frames(caller: str, solution: Solution, points: Callable, times: np.ndarray):
     """For each time a list of polylines, all of one dimension."""
+    points = points.bars() if isinstance(points, Mechanism) else points
     require_function(caller, "points", points, "points(q)")
     q = interpolate(solution, times).q
     frames = []
