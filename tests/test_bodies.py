@@ -371,3 +371,9 @@ def test_a_mechanism_is_drawn_by_its_bars():
     upper, fore = robot.bars()(jnp.array([0.0, np.pi / 2]))
     np.testing.assert_allclose(upper, [[0, 0, 0], [0.4, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(fore, [[0.4, 0, 0], [0.4, 0, -0.4]], atol=1e-12)
+
+
+def test_a_mechanism_can_be_made_where_something_is_traced():
+    """With loops and stops, whose rows and stiffness are numbers."""
+    made = jax.jit(lambda q: four_bar().frames(q)["rocker"].x)(jnp.zeros(3))
+    np.testing.assert_allclose(made, four_bar().frames(jnp.zeros(3))["rocker"].x)

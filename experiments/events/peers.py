@@ -43,7 +43,7 @@ def ours(x, steps, duration):
 
 def by_mujoco(steps, duration):
     """A slide joint with a limit at zero: a stiff spring and the damper that gives e, as stiff as the step allows."""
-    import mujoco  # pyright: ignore[reportMissingImports]  # of an extra of its own
+    mujoco: Any = importlib.import_module("mujoco")  # of an extra of its own
 
     dt = duration / steps
     k, ratio = (CONTACT / dt) ** 2, -np.log(E) / np.hypot(np.pi, np.log(E))

@@ -9,6 +9,7 @@ import importlib.util
 import os
 import time
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -116,7 +117,7 @@ def ours(scene, system, stepper, params, size):
 
 def mujoco_model(params, dt, impedance):
     """A slide with a spring, a damper and friction, pushed by a motor."""
-    import mujoco  # pyright: ignore[reportMissingImports]  # of an extra of its own
+    mujoco: Any = importlib.import_module("mujoco")  # of an extra of its own
 
     hard = "" if impedance is None else f'solimpfriction="{impedance} {impedance} 0.001" solreffriction="{2 * dt} 1" '
     text = (
@@ -131,8 +132,8 @@ def mujoco_model(params, dt, impedance):
 
 def mujoco_run(model, force, every):
     """q at the start and after each `every` steps, with a force for each step."""
-    import mujoco  # pyright: ignore[reportMissingImports]
-    from mujoco import rollout  # pyright: ignore[reportMissingImports]
+    mujoco: Any = importlib.import_module("mujoco")  # of an extra of its own
+    rollout: Any = importlib.import_module("mujoco.rollout")
 
     data, whole = mujoco.MjData(model), mujoco.mjtState.mjSTATE_FULLPHYSICS
     start = np.zeros(mujoco.mj_stateSize(model, whole))

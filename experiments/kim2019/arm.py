@@ -202,8 +202,9 @@ def draw_motion(panels, scene, q):
     @jax.jit
     @jax.vmap
     def corners(q):
-        R, x = arm.frames(q, scene.params)
-        return jnp.concatenate([jnp.zeros((1, 3)), x, (x[-1] + R[-1] @ scene.params["com"][-1])[None]])
+        frames = list(arm.mechanism().frames(q, scene.params).values())
+        tool = frames[-1].x + frames[-1].R @ scene.params["com"][-1]
+        return jnp.stack([*(frame.x for frame in frames), tool])
 
     places = np.asarray(corners(jnp.concatenate([scene.q0[None], q])))
     for axes, down, label, place in zip(panels, (1, 2), "yz", ("above", "the side"), strict=True):

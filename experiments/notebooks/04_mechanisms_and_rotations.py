@@ -204,8 +204,8 @@ for name, run in tumble.items():
 # was; about the middle one it turns over. The reason lies in the equations, not in the method: angular momentum, which
 # nothing enforces, is kept to the figures printed above, and R stays orthogonal to rounding.
 #
-# Both together, rotations and constraints, make mechanisms in space: see `hhtjax.scenes.body_chain`, rods on spherical
-# joints, and `hhtjax.scenes.top`.
+# Mechanisms in space need no equations by hand: `hhtjax.bodies` makes them from bodies and joints, or from files. See
+# `hhtjax.scenes.body_chain`, rods on ball joints, and `hhtjax.scenes.arm`.
 #
 # ## What to try next
 #

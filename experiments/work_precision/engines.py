@@ -1,6 +1,8 @@
 """MuJoCo and exudyn: chains of links with their own joints, springs and dampers, for which they are made."""
 
+import importlib
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +25,7 @@ def links(name):
 
 def mujoco_model(m, length, k, c, gravity, integrator):
     """Hinges about z, point masses at the ends."""
-    import mujoco  # pyright: ignore[reportMissingImports]  # of an extra of its own
+    mujoco: Any = importlib.import_module("mujoco")  # of an extra of its own
 
     body = ""
     for i in reversed(range(len(m))):
@@ -42,8 +44,8 @@ def mujoco_model(m, length, k, c, gravity, integrator):
 
 def mujoco_entries(name, sizes=SIZES):
     """Rows; all steps of a run in one call of `mujoco.rollout`."""
-    import mujoco  # pyright: ignore[reportMissingImports]
-    from mujoco import rollout  # pyright: ignore[reportMissingImports]
+    mujoco: Any = importlib.import_module("mujoco")  # of an extra of its own
+    rollout: Any = importlib.import_module("mujoco.rollout")
 
     mujoco.set_mju_user_warning(lambda text: None)
     duration, rows = cases()[name].scene.duration, []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -28,7 +29,7 @@ from hhtjax.bodies.equations import (
 from hhtjax.bodies.model import Drive, Model, Place, Row, Spring, Stop, Structure, structure
 from hhtjax.bodies.tree import Tree
 from hhtjax.checks import require_one_of
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, is_tracing
 from hhtjax.primitives import plain
 from hhtjax.systems import kinematics
 from hhtjax.systems.events import Event, impact
@@ -194,7 +195,13 @@ def tree(
     return assembled("tree", bodies, motors, loops, markers, gravity, friction, limits, free)
 
 
-def assembled(caller, bodies, motors, loops, markers, gravity, friction, limits, free, unsupported=()) -> Mechanism:
+def assembled(*parts: Any) -> Mechanism:
+    """The mechanism of `_assembled`: of numbers that are known, also where a function is being traced."""
+    with jax.ensure_compile_time_eval() if is_tracing() else nullcontext():
+        return _assembled(*parts)
+
+
+def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits, free, unsupported=()) -> Mechanism:
     """The mechanism; `caller` is who is asked for it."""
     bodies = _all_of(caller, "bodies", bodies, Body)
     motors, markers = _all_of(caller, "motors", motors, Motor), _all_of(caller, "markers", markers, Marker)
