@@ -161,10 +161,10 @@ def tree(
     """A mechanism of bodies, each on its parent, in minimal coordinates.
 
     Args:
-        bodies: `Body`s, each behind its parent. Those without a mass are frames only.
-        motors: `Motor`s. loops: `Connect`, `Weld` and `Couple`, constraints of the `System`. Rows that say what others
-            say already, as the third of a pin joint in a plane does, are found here and left out.
-        markers: `Marker`s, further frames.
+        bodies: each a `Body`, behind its parent. Those without a mass are frames only.
+        motors: each a `Motor`. loops: `Connect`, `Weld` and `Couple`, constraints of the `System`. Rows that say what
+            others say already, as the third of a pin joint in a plane does, are found here and left out.
+        markers: each a `Marker`, a further frame.
         gravity: (3,), m/s^2.
         friction: "dry", the set-valued friction of the joints (`System(friction=)`), or "ignore".
         limits: of ranges, None where there are none: "ignore"; "stop", stiff springs that damp, with stop_stiffness and

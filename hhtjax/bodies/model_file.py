@@ -57,7 +57,7 @@ def load(
         base: of a URDF, which does not say it: "fixed" to the world, or "free".
         joints: what the file does not say of its joints: fields of `Joint` by name, {"elbow": {"friction": 2.0}}; those
             under "*" are of all hinges and slides.
-        more: further `Body`s behind those of the file, such as a payload on the frame of a tool.
+        more: further bodies (`Body`), behind those of the file, such as a payload on the frame of a tool.
         motors, loops, markers: further ones.
         friction, free: as in `tree`.
         limits: "ignore", "stop" or "event", as in `tree`; None if there are none.

@@ -54,7 +54,7 @@ class Tree:
     """Joints, each behind the one it hangs on, and which of their frames carry mass. Hashable; equal ones are alike.
 
     Attributes:
-        nodes: of `Node`s, each behind its parent. K is their number.
+        nodes: each a `Node`, behind its parent. K is their number.
         links: numbers of the nodes that carry mass, (L,).
         scalars, balls, frees, rates: numbers of hinges and slides; of balls, those of free joints among them; of free
             joints; of all rates, nv.
