@@ -207,6 +207,14 @@ def test_couplings_hold_and_weld():
     np.testing.assert_allclose(end["held"].x, end["driver"].x + end["driver"].R @ jnp.array([0.5, 0, 0]), atol=1e-11)
 
 
+def test_a_weld_half_a_turn_off_is_refused():
+    """Its rows vanish there, too."""
+    free = {"joints": Joint("free"), "mass": 1.0, "inertia": (0.1, 0.1, 0.1)}
+    tree([Body("b", rotation=(np.cos(0.5), np.sin(0.5), 0, 0), **free)], loops=[Weld("world", "b")])
+    with pytest.raises(ValueError, match="half a turn off"):
+        tree([Body("b", rotation=(0.05, 1.0, 0, 0), **free)], loops=[Weld("world", "b")])
+
+
 def test_more_rows_than_coordinates_are_a_matter_of_redundancy():
     """All three rows of a pin, twice, on two coordinates of a bar: refused as dependent, and run as least squares."""
     robot = four_bar()
@@ -263,6 +271,9 @@ def test_motors_clip_and_outer_loads_act():
 
     np.testing.assert_allclose(acting(ctrl=jnp.array([0.4, 0.2])), [3 * (0.8 + 0.5), 4 * (0.2 + 0.1)])
     np.testing.assert_allclose(acting(ctrl=jnp.array([9.0, 9.0])), [3 * 2.5, 2.0])
+    np.testing.assert_allclose(acting(ctrl=jnp.array([1, 0])), acting(ctrl=jnp.array([1.0, 0.0])))
+    with pytest.raises(ValueError, match="an input for each motor"):
+        acting(ctrl=jnp.ones(1))
     np.testing.assert_allclose(acting(ctrl=lambda t: jnp.array([t, 0.0])), [3 * 1.5, 0.4])
     rest = acting()
     np.testing.assert_allclose(acting(torque=lambda t: jnp.array([t, 1.0])) - rest, [0.5, 1.0])
@@ -348,6 +359,9 @@ WRONG = [
     (lambda: Body("b", joints=[Joint("free"), Joint()]), "a free joint is the only one"),
     (lambda: Body("b", rotation=np.ones((3, 3))), "must be a rotation"),
     (lambda: Motor("a", "servo"), "torque, position or velocity"),
+    (lambda: Motor("a", "position", gain=2.0), "`gain` belongs to torque motors"),
+    (lambda: Motor("a", ctrlrange=(1, -1)), r"`ctrlrange` must be \(lowest"),
+    (lambda: Joint("free", anchor=(1, 0, 0)), "turns about the origin of its body"),
     (lambda: tree([Body("b", "c", Joint(), **BODY)]), "hangs on 'c'"),
     (lambda: tree([Body("b", joints=Joint(), **BODY)] * 2), "two bodies are named 'b'"),
     (lambda: tree([Body("b", **BODY)]), "at least one joint"),
@@ -377,3 +391,13 @@ def test_a_mechanism_can_be_made_where_something_is_traced():
     """With loops and stops, whose rows and stiffness are numbers."""
     made = jax.jit(lambda q: four_bar().frames(q)["rocker"].x)(jnp.zeros(3))
     np.testing.assert_allclose(made, four_bar().frames(jnp.zeros(3))["rocker"].x)
+
+
+def test_params_that_would_be_ignored_are_refused():
+    robot = four_bar()
+    zero = jnp.zeros(3)
+    for name in ("position", "ctrl"):
+        with pytest.raises(ValueError, match=f"{name}.* is not read"):
+            robot.system.dynamics(zero, zero, zero, 0.0, robot.params | {name: jnp.zeros((3, 3))})
+    with pytest.raises(NotImplementedError, match="say nothing new"):
+        four_bar(free=("position",))

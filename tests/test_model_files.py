@@ -207,7 +207,8 @@ def test_a_urdf_keeps_its_fixed_links_and_needs_no_meshes():
     assert set(floating.q0) == {"free", "joint"}
     payload = bodies.Body("payload", "flange", mass=1.5, inertia=(0.01, 0.01, 0.01))
     loaded = bodies.load(
-        URDF, ignore=("contact",), limits="ignore", more=[payload], joints={"shoulder": {"friction": 2.0}},
+        URDF, ignore=("contact", "actuatorfrcrange"), limits="ignore", more=[payload],
+        joints={"shoulder": {"friction": 2.0}},
         motors=[bodies.Motor("shoulder", "position", kp=100.0)],
     )  # fmt: skip
     assert loaded.bodies == ("upper", "payload")
@@ -289,3 +290,42 @@ def test_wrong_sources_and_options_are_refused(tmp_path):
     path = tmp_path / "model.xml"
     path.write_text(in_world(joint='damping="0.5"'))
     assert float(bodies.load(path).params["damping"][0]) == 0.5
+
+
+def test_rotors_of_all_motors_count_and_gears_are_their_own():
+    """Also where the motor is switched off, or ignored; behind an actuator of several outputs."""
+    body = '<body name="{0}"><joint name="{0}" {1}/><geom size="0.1" contype="0" conaffinity="0"/></body>'
+    world = body.format("b", 'type="ball"') + body.format("h", "")
+    acts = '<orientation joint="b"/><motor name="m" joint="h" gear="7" armature="0.01"/>'
+    off = "<option><flag actuation='disable'/></option>"
+    for more in ("", off):
+        text = f"<mujoco>{more}<worldbody>{world}</worldbody><actuator>{acts}</actuator></mujoco>"
+        robot = bodies.load(text, ignore=("actuator",))
+        assert float(robot.params["armature"][-1]) == pytest.approx(0.49)
+        assert robot.motors == (() if more else ("m",))
+    assert float(bodies.load(text.replace(off, ""), ignore=("actuator",)).params["gear"][0]) == 7
+
+
+def test_what_a_caller_adds_acts_too():
+    """A range that the file does not have; the effort of a URDF, where there are motors."""
+    with pytest.raises(ValueError, match="say what they do"):
+        bodies.load(in_world(), joints={"j": {"range": (-1, 1)}})
+    with pytest.raises(NotImplementedError, match=r"(?s)actuatorfrcrange: shoulder"):
+        bodies.load(URDF, ignore=("contact",), limits="ignore", motors=[bodies.Motor("shoulder")])
+    with pytest.raises(ValueError, match="is for URDF"):
+        bodies.load(in_world(), base="free")
+
+
+def test_parent_and_child_touch_where_the_filter_is_off():
+    shapes = '<body name="b"><joint/><geom size="0.1"/></body>'
+    text = f'<mujoco>{{}}<worldbody><body name="a"><joint/><geom size="0.1"/>{shapes}</body></worldbody></mujoco>'
+    bodies.load(text.format(""))
+    with pytest.raises(NotImplementedError, match="contact"):
+        bodies.load(text.format('<option><flag filterparent="disable"/></option>'))
+
+
+def test_an_inertia_without_mass_is_refused_by_name():
+    massless = '<body name="b" pos="0.1 0 0"><inertial pos="0 0 0" mass="0" diaginertia="0.3 0.3 0.3"/></body></body>'
+    text = in_world().replace("</body>", massless)
+    with pytest.raises(NotImplementedError, match=r"massless: .*b"):
+        bodies.load(text)

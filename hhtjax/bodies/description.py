@@ -90,8 +90,8 @@ class Joint:
             under the shortest turn from z to `axis`.
         anchor: a point of the axis, or the centre of a ball, in the frame of the body, m.
         name: of the joint; None for that of its body.
-        stiffness, rest: of a spring, N m/rad or N/m, and where it is relaxed; of balls and free joints at rest = 0, the
-            orientation and place of q0 = none.
+        stiffness, rest: of a spring, N m/rad or N/m, and where it is relaxed. Balls and free joints are relaxed where
+            they are described; `rest` is 0 then. Of joints of several rates one number is of all.
         damping: N m s/rad or N s/m. armature: inertia of a rotor, as the joint sees it, kg m^2 or kg.
         friction: limit of dry friction, N m or N, >= 0.
         range: (lowest, highest), for one rate only; None without.
@@ -124,6 +124,10 @@ class Joint:
             if self.kind not in SCALARS and value:
                 raise ValueError(f"Joint: `{name}` belongs to revolute and prismatic joints; received {value!r}.")
             _set(self, **{name: value})
+        if self.kind == "free" and any(self.anchor):
+            raise ValueError(
+                f"Joint: a free joint turns about the origin of its body; received `anchor` {self.anchor!r}."
+            )
         if self.range is not None:
             if self.kind not in SCALARS:
                 raise ValueError(f"Joint: `range` belongs to revolute and prismatic joints; this is {self.kind}.")
@@ -216,9 +220,9 @@ def _inertia(name: str, inertia: Any, mass: float) -> tuple:
 class Motor:
     """What drives a joint: the torque gear * F, at the motor's angle s = gear * q, by the input u (params["ctrl"]).
 
-        "torque"      F = gain u
-        "position"    F = kp (u - s) - kv sdot
-        "velocity"    F = kv (u - sdot)
+        "torque"      F = gain u - kp s - kv sdot + offset
+        "position"    F = kp (u - s) - kv sdot + offset
+        "velocity"    F = kv (u - sdot) - kp s + offset
 
     Args:
         joint: name of a revolute or prismatic joint. kind: one of the three.
@@ -247,9 +251,14 @@ class Motor:
         for name in ("gear", "gain", "kp", "kv", "offset"):
             value = require_number("Motor", name, getattr(self, name), np.isfinite, "be finite")
             _set(self, **{name: float(value)})
+        if self.kind != "torque" and self.gain != 1:
+            raise ValueError(f"Motor: `gain` belongs to torque motors; a servo has kp and kv; received {self.gain!r}.")
         for name in ("ctrlrange", "forcerange"):
             if getattr(self, name) is not None:
-                _set(self, **{name: _vector("Motor", name, getattr(self, name), (2,))})
+                low, high = _vector("Motor", name, getattr(self, name), (2,))
+                if not low < high:
+                    raise ValueError(f"Motor: `{name}` must be (lowest, highest); received {getattr(self, name)!r}.")
+                _set(self, **{name: (low, high)})
 
 
 @dataclass(frozen=True)

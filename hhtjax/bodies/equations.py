@@ -185,6 +185,7 @@ class Dynamics:
 
     def __call__(self, q: PyTree, v: PyTree, w: PyTree, t: Real, params: PyTree) -> PyTree:
         tree = self.model.tree
+        _require_read(self.model, params)
         dv, dw = rates(tree, v), rates(tree, w)
         p = position(tree, q)
         r = inverse_dynamics(
@@ -192,6 +193,14 @@ class Dynamics:
         )
         r = r + params["armature"] * dw
         return as_rates(tree, r - applied(self.model, q, p, dv, t, params))
+
+
+def _require_read(model: Model, params: PyTree):
+    """An error for params that would be ignored."""
+    if "position" in params and model.offsets is None:
+        raise ValueError('params["position"] is not read: make the mechanism with free=("position",).')
+    if "ctrl" in params and not model.drives:
+        raise ValueError('params["ctrl"] is not read: the mechanism has no motors.')
 
 
 @dataclass(frozen=True)
@@ -256,7 +265,9 @@ def at_time(x: PyTree, t: Real) -> PyTree:
 
 def driven(model: Model, x: Array, rate: Array, t: Real, params: PyTree) -> Array:
     """gear F of each motor, on hinges and slides: (ns,)."""
-    u = at_time(params["ctrl"], t)
+    u = jnp.asarray(at_time(params["ctrl"], t), x.dtype)
+    if u.shape != (len(model.drives),):
+        raise ValueError(f'params["ctrl"] must be ({len(model.drives)},), an input for each motor; received {u.shape}.')
     slots = np.array([drive.slot for drive in model.drives])
     on = slots[None, :] == np.arange(len(x))[:, None]
     gear = params["gear"]
@@ -341,6 +352,11 @@ class Loops:
         Phi = jnp.concatenate([_gap(row, frames, x) for row in self.model.loops])
         return Phi if self.model.rows is None else Phi[np.asarray(self.model.rows)]
 
+    def turns(self, q: PyTree, params: PyTree) -> Array:
+        """Of each weld the trace of the rotation by which it is open: 3 where it is closed, -1 half a turn off."""
+        frames = frames_of(self.model, q, params)
+        return jnp.stack([jnp.trace(_turn(row, frames)) for row in self.model.loops if row.kind == "weld"])
+
 
 def _gap(row: Row, frames: list[Frame], x: Array) -> Array:
     """What a loop is open by."""
@@ -349,13 +365,19 @@ def _gap(row: Row, frames: list[Frame], x: Array) -> Array:
         y = 0.0 * x[row.first] if row.second is None else x[row.second] - r2
         wanted = sum(c * y**k for k, c in enumerate(coefficients))
         return (x[row.first] - r1 - wanted)[None]
-    a, b, *rest = (np.asarray(c, x.dtype) for c in row.constants)
+    a, b = (np.asarray(c, x.dtype) for c in row.constants[:2])
     first, second = (frames[i] for i in (row.first, row.second))
     apart = first.x + apply(first.R, a) - second.x - apply(second.R, b)
     if row.kind == "connect":
         return apart
-    Q = product(jnp.swapaxes(product(first.R, rest[0].reshape(3, 3)), 0, 1), second.R)
-    return jnp.concatenate([apart, axial(Q) / 2])
+    return jnp.concatenate([apart, axial(_turn(row, frames)) / 2])
+
+
+def _turn(row: Row, frames: list[Frame]) -> Array:
+    """The rotation by which a weld is open, (3, 3)."""
+    first, second = (frames[i].R for i in (row.first, row.second))
+    between = np.reshape(row.constants[2], (3, 3)).astype(first.dtype)
+    return product(jnp.swapaxes(product(first, between), 0, 1), second)
 
 
 # ----------------------------------------------------------------------------

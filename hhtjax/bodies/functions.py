@@ -19,7 +19,7 @@ from hhtjax.bodies.equations import (
 )
 from hhtjax.bodies.equations import applied as applied_forces
 from hhtjax.bodies.mechanism import Mechanism
-from hhtjax.bodies.newton_euler import Inertia, outer
+from hhtjax.bodies.newton_euler import Inertia, outer, plain_inverse_dynamics
 from hhtjax.bodies.newton_euler import inverse_dynamics as of_tree
 from hhtjax.description import Array, PyTree, Real
 
@@ -122,7 +122,7 @@ def regressor(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree 
 
     def torque(theta: Array) -> Array:
         links = of_links(model, _moments(theta), params)
-        return of_tree(tree, p, dv, dw, links, params["gravity"], offsets_of(model, params))
+        return plain_inverse_dynamics(tree, p, dv, dw, links, params["gravity"], offsets_of(model, params))
 
     return jax.jacfwd(torque)(jnp.zeros(10 * nb, dv.dtype))
 

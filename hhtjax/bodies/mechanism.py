@@ -251,6 +251,10 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
         params["restitution"] = _array(RESTITUTION)
     if model.loops:
         model, q0 = _closed(caller, model, q0, v0, params)
+    if free and model.rows is not None:
+        raise NotImplementedError(
+            f'{caller}: free=("position",) is not for loops with rows that say nothing new here: elsewhere they may.'
+        )
     rubbing = rubbing if friction == "dry" else ()
     ends = tuple(Event(Reaches(model, stop), impact("restitution")) for stop in stops) if limits == "event" else ()
     return Mechanism(
@@ -457,15 +461,22 @@ def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
         return Phi(zero), jax.jacfwd(Phi)(zero)
 
     move = jax.jit(partial(kinematics.move, blocks))
+    welded = jax.jit(lambda q: loops.turns(unravel(q), params))
+
+    def turned_over(q: Array) -> bool:
+        return bool(np.any(np.asarray(welded(q)) < 1)) if any(row.kind == "weld" for row in model.loops) else False
+
     with plain():  # small programs, compiled once
-        q, B = _onto_loops(caller, q, linearized, move)
+        q, B = _onto_loops(caller, q, linearized, move, turned_over)
         near = [B]
         for seed in (1, 2):  # at a special position more rows may depend on each other than elsewhere
             x = np.random.default_rng(seed).normal(size=B.shape[1])
             x = x - np.linalg.pinv(B, rcond=1e-9) @ (B @ x)  # along the loops
             size = np.linalg.norm(x)
             if size > 1e-9:
-                near.append(_onto_loops(caller, move(q, jnp.asarray(0.05 * x / size)), linearized, move)[1])
+                near.append(
+                    _onto_loops(caller, move(q, jnp.asarray(0.05 * x / size)), linearized, move, turned_over)[1]
+                )
     rows = np.concatenate(near, axis=1)
     size = np.linalg.norm(rows, axis=1)
     able = np.flatnonzero(size > INDEPENDENT * size.max(initial=1e-300))
@@ -478,13 +489,17 @@ def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
     return model._replace(rows=None if len(kept) == len(rows) else kept), unravel(q)
 
 
-def _onto_loops(caller: str, q: Array, linearized, move):
+def _onto_loops(caller: str, q: Array, linearized, move, turned_over):
     """The position nearest to q on the loops, and B there, by Gauss-Newton."""
     for _ in range(50):
         Phi, B = map(np.asarray, linearized(q))
         if np.max(np.abs(Phi)) <= 1e-12:
             break
         q = move(q, jnp.asarray(-np.linalg.pinv(B, rcond=1e-9) @ Phi, q.dtype))
+    if turned_over(q):
+        raise ValueError(
+            f"{caller}: a weld of `loops` would close half a turn off: describe a position that is nearer."
+        )
     if not np.max(np.abs(Phi)) <= 1e-6:
         raise ValueError(
             f"{caller}: the loops cannot be closed from the position that is described: {np.max(np.abs(Phi)):.3g} m or "

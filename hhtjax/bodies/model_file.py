@@ -10,6 +10,7 @@ that is missing something is not run by accident. Names:
     "equality"           constraints other than connect, weld and joint
     "springyield", "polynomial", "actuatorfrcrange"
     "unphysical"         links of a URDF with an inertia that no body has
+    "massless"           bodies with an inertia and no mass
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from hhtjax.checks import require_one_of
 
 KNOWN = (
     "contact", "limits", "tendon", "flex", "plugin", "fluid", "mocap", "gravcomp", "actuator", "equality",
-    "springyield", "polynomial", "actuatorfrcrange", "unphysical",
+    "springyield", "polynomial", "actuatorfrcrange", "unphysical", "massless",
 )  # fmt: skip
 
 CHANGED = "stiffness", "rest", "damping", "armature", "friction", "range"  # fields of joints that a file may lack
@@ -81,8 +82,8 @@ def load(
     for name in ignore:
         require_one_of("load", "ignore", name, KNOWN)
     require_one_of("load", "base", base, ("fixed", "free"))
-    model, acting = _compiled(source, base, "unphysical" in ignore)
-    acting += _acting(model, limits)
+    model, acting = _compiled(source, base)
+    acting += _acting(model, limits, bool(motors))
     refused = [(name, what) for name, what in acting if name not in ignore]
     if refused:
         words = "\n".join(f"    {name}: {what}" for name, what in refused)
@@ -97,7 +98,7 @@ def load(
     return assembled(
         "load", of_file + list(more), parts.motors() + list(motors), parts.loops() + list(loops),
         parts.markers() + list(markers), parts.gravity, friction,
-        limits or "ignore", free, unsupported,
+        "ignore" if limits is None and "limits" in ignore else limits, free, unsupported,
     )  # fmt: skip
 
 
@@ -116,7 +117,7 @@ def _with_changes(bodies: list[Body], joints: dict) -> list[Body]:
     return [body.with_joints(map(changed, body.joints)) for body in bodies]
 
 
-def _compiled(source: Any, base: str, balanced: bool):
+def _compiled(source: Any, base: str):
     """The model as mujoco compiles it, and what its text holds that acts and that mujoco does not see then."""
     mujoco = _mujoco()
     text, folder = _text(source)
@@ -128,10 +129,12 @@ def _compiled(source: Any, base: str, balanced: bool):
         raise ValueError(f"load: `source` must be MJCF (mujoco) or URDF (robot); its root is {root.tag!r}.")
     acting = []
     try:
+        if root.tag == "mujoco" and base == "free":
+            raise ValueError("`base` is for URDF; MJCF says itself what is free.")
         if root.tag == "mujoco":
             spec = mujoco.MjSpec.from_file(os.fspath(source)) if folder else mujoco.MjSpec.from_string(text)
         else:
-            acting = _simplified(root, balanced)
+            acting = _simplified(root)
             spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
             if base == "free":
                 spec.worldbody.first_body().add_freejoint()
@@ -158,7 +161,7 @@ def _text(source: Any):
         return file.read(), True
 
 
-def _simplified(root, balanced: bool) -> list:
+def _simplified(root) -> list:
     """A URDF without shapes, whose files mostly are not there, and all links kept. What acts and is seen here only."""
     acting = []
     touching = [link.get("name") for link in root.iter("link") if link.find("collision") is not None]
@@ -202,7 +205,7 @@ def _some(names: list) -> str:
     return ", ".join(map(str, names[:5])) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def _acting(m, limits: str | None) -> list:
+def _acting(m, limits: str | None, motors: bool) -> list:
     """What acts in a compiled model and is not in the equations here: (name, words)."""
     mujoco = _mujoco()
     found: list = []
@@ -217,7 +220,7 @@ def _acting(m, limits: str | None) -> list:
     off = m.opt.disableflags
     if not off & (int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)):
         add("contact", "shapes that can touch", m.npair > 0 or _can_touch(m))
-    limited = (m.jnt_limited > 0) & ~_off(off, "LIMIT", "CONSTRAINT")
+    limited = (m.jnt_limited > 0) & (not _off(off, "LIMIT", "CONSTRAINT"))
     if limits is None:
         add("limits", f"ranges of {names('joint', limited)} (limits= takes them as stops or events)", limited)
     balls = limited & (m.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))
@@ -244,8 +247,14 @@ def _acting(m, limits: str | None) -> list:
         if values is not None and np.size(values):
             acts = np.any(np.reshape(values, (len(values), -1)) != 0, axis=1)
             add(name, names(kind, acts) if kind else "damping that is not linear", acts)
-    if m.nu and not _off(off, "ACTUATION"):
+    rotors = np.flatnonzero(getattr(m, "actuator_armature", np.zeros(0))).tolist()
+    unseen = [i for i in rotors if not _turns(m, i)]
+    add("actuator", f"rotors of motors that are on no hinge or slide ({len(unseen)})", unseen)
+    massless = (m.body_mass == 0) & np.any(m.body_inertia != 0, axis=1)
+    add("massless", f"inertia without mass of {names('body', massless)}", massless)
+    if (_num_actuators(m) or motors) and not _off(off, "ACTUATION"):
         add("actuatorfrcrange", names("joint", m.jnt_actfrclimited), m.jnt_actfrclimited)
+    if _num_actuators(m) and not _off(off, "ACTUATION"):
         strange = np.array([_strangeness(m, i) is not None for i in range(_num_actuators(m))])
         words = "; ".join(
             f"{_name_of(m, 'actuator', int(i))} ({_strangeness(m, int(i))})" for i in np.flatnonzero(strange)[:5]
@@ -268,6 +277,7 @@ def _off(flags: int, *names: str) -> bool:
 def _can_touch(m) -> bool:
     """Whether two shapes of different bodies may collide, by their bits and by whose parent is whose."""
     geoms = [i for i in range(m.ngeom) if m.geom_contype[i] or m.geom_conaffinity[i]]
+    filtered = not _off(m.opt.disableflags, "FILTERPARENT")
     excluded = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in m.exclude_signature}
     for k, i in enumerate(geoms):
         for j in geoms[k + 1 :]:
@@ -277,7 +287,7 @@ def _can_touch(m) -> bool:
             if not meets or wa == wb or tuple(sorted((int(a), int(b)))) in excluded:
                 continue
             above = m.body_weldid[m.body_parentid[wa]], m.body_weldid[m.body_parentid[wb]]
-            if (wa and wb) and (above[0] == wb or above[1] == wa):
+            if filtered and (wa and wb) and (above[0] == wb or above[1] == wa):
                 continue  # a parent and its child
             return True
     return False
@@ -287,12 +297,31 @@ def _num_actuators(m) -> int:
     return len(m.actuator_trntype)
 
 
+def _on_joint(m, i: int) -> bool:
+    """Whether an actuator is on a joint."""
+    kinds = _mujoco().mjtTrn
+    return int(m.actuator_trntype[i]) in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
+
+
+def _turns(m, i: int) -> bool:
+    """Whether it is on a hinge or a slide."""
+    kinds = _mujoco().mjtJoint
+    one = int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE)
+    return _on_joint(m, i) and int(m.jnt_type[m.actuator_trnid[i, 0]]) in one
+
+
+def _gear(m, i: int) -> float:
+    """Of an actuator; one that has several outputs has as many rows of them."""
+    rows = getattr(m, "actuator_outadr", None)
+    return float(m.actuator_gear[i if rows is None else rows[i], 0])
+
+
 def _strangeness(m, i: int) -> str | None:
     """Why an actuator is none of `Motor`'s kinds; None for one that is, or that is switched off."""
     mujoco = _mujoco()
     if m.opt.disableactuator & (1 << int(m.actuator_group[i])):
         return None
-    if m.actuator_trntype[i] not in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+    if not _on_joint(m, i):
         return "not on a joint"
     if m.jnt_type[m.actuator_trnid[i, 0]] not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
         return "on a ball or free joint"
@@ -302,7 +331,7 @@ def _strangeness(m, i: int) -> str | None:
         return "its gain is not fixed"
     if m.actuator_biastype[i] not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
         return "its bias is not affine"
-    for name in ("actuator_damping", "actuator_dampingpoly", "actuator_delay", "actuator_plasticnum"):
+    for name in ("actuator_damping", "actuator_dampingpoly", "actuator_delay"):
         values = getattr(m, name, None)
         if values is not None and np.any(values[i]):
             return name.replace("actuator_", "with ")
@@ -311,7 +340,7 @@ def _strangeness(m, i: int) -> str | None:
 
 def _name_of(m, kind: str, i: int) -> str:
     """The name in the file, or kind and number where it has none."""
-    name = getattr(m, {"joint": "jnt"}.get(kind, kind) if kind == "joint" else kind)(i).name
+    name = getattr(m, "jnt" if kind == "joint" else kind)(i).name
     return name or f"{kind}{i}"
 
 
@@ -372,12 +401,9 @@ class _Reader:
     def rotor(self, j: int) -> float:
         """The armature of the motors of a joint, as it sees it."""
         m = self.m
-        values = getattr(m, "actuator_armature", None)
-        if values is None:
-            return 0.0
-        return float(
-            sum(values[i] * m.actuator_gear[i, 0] ** 2 for i in self.actuators() if m.actuator_trnid[i, 0] == j)
-        )
+        values = getattr(m, "actuator_armature", np.zeros(_num_actuators(m)))
+        here = [i for i in np.flatnonzero(values).tolist() if _on_joint(m, i) and m.actuator_trnid[i, 0] == j]
+        return float(sum(values[i] * _gear(m, i) ** 2 for i in here))  # rotors turn, whether or not they are driven
 
     def actuators(self):
         """Numbers of those that are modelled, and switched on."""
@@ -405,7 +431,7 @@ class _Reader:
         clamps = not _off(m.opt.disableflags, "CLAMPCTRL")
         k = m.actuator_ctrladr[i] if hasattr(m, "actuator_ctrladr") else i
         return Motor(
-            self.joint_names[m.actuator_trnid[i, 0]], kind, float(m.actuator_gear[i, 0]), gain, kp, kv, b0,
+            self.joint_names[m.actuator_trnid[i, 0]], kind, _gear(m, i), gain, kp, kv, b0,
             tuple(m.actuator_ctrlrange[k]) if m.actuator_ctrllimited[k] and clamps else None,
             tuple(m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else None,
             self.name("actuator", i),

@@ -360,9 +360,13 @@ def wrenched(X: Array, F: Array) -> Array:
 
 def total(mask: np.ndarray, x: Array) -> Array:
     """Sums of rows of x."""
-    return jnp.asarray(mask, x.dtype) @ x
+    return jnp.matmul(jnp.asarray(mask, x.dtype), x, precision="highest")
 
 
 def products(X: Array, Y: Array) -> Array:
     """X Y^T."""
-    return jnp.sum(X[:, None, :] * Y[None, :, :], axis=-1) if len(X) <= ELEMENTWISE else X @ Y.T
+    return (
+        jnp.sum(X[:, None, :] * Y[None, :, :], axis=-1)
+        if len(X) <= ELEMENTWISE
+        else jnp.matmul(X, Y.T, precision="highest")
+    )

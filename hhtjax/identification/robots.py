@@ -153,13 +153,13 @@ def base_parameters(robot: Mechanism, *, samples: int = 200, motion: Any = None,
     Y = np.asarray(jax.jit(jax.vmap(lambda q, v, w: regressor(robot, q, v, w)))(q, v, w))
     Y = Y.reshape(-1, Y.shape[-1])
     names = [f"{body} {name}" for body in robot.bodies for name in NAMES]
+    rank_tolerance = max(RANK, 100 * float(np.finfo(Y.dtype).eps))
     size = np.linalg.norm(Y, axis=0)
-    seen = np.flatnonzero(size > RANK * size.max())
-    # from the tip to the root, as the parameters of bodies close to the base are told by the fewest motions
-    order = seen[::-1]
+    seen = np.flatnonzero(size > rank_tolerance * size.max())
+    order = seen[::-1]  # of equal ones, those of the tip
     found: Any = scipy.linalg.qr(Y[:, order] / size[order], mode="r", pivoting=True)
     R, pivots = found
-    rank = int(np.sum(np.abs(np.diag(R)) > RANK * abs(R[0, 0])))
+    rank = int(np.sum(np.abs(np.diag(R)) > rank_tolerance * abs(R[0, 0])))
     independent = np.sort(order[pivots[:rank]])
     rest = np.setdiff1d(seen, independent)
     combination = np.zeros((rank, Y.shape[1]))
@@ -175,6 +175,8 @@ def base_parameters(robot: Mechanism, *, samples: int = 200, motion: Any = None,
 def _require_robot(caller: str, robot):
     if not isinstance(robot, Mechanism):
         raise TypeError(f"{caller}: `robot` must be a Mechanism, of bodies.tree or bodies.load; received {robot!r}.")
+    if robot.model.loops:
+        raise NotImplementedError(f"{caller}: `robot` has loops, and its joints cannot move on their own.")
 
 
 def _random_states(robot: Mechanism, samples: int, seed: int):
@@ -277,6 +279,8 @@ def excitation(
     n = robot.model.tree.rates
     centre = jnp.asarray(robot.q0 if centre is None else centre, float)
     limits = [np.broadcast_to(np.asarray(x, float), (n,)) for x in (amplitude, speed, acceleration)]
+    if not all(np.all(x > 0) for x in limits):
+        raise ValueError("excitation: `amplitude`, `speed` and `acceleration` must be positive.")
     t = np.arange(samples) * (float(period) / samples)
 
     def trajectory(x: Real) -> Fourier:
@@ -290,11 +294,7 @@ def excitation(
         Y = Y.reshape(-1, base.count)
         size = jnp.sqrt(jnp.sum(Y**2, axis=0))
         sigma = jnp.linalg.svd(Y / size[None, :], compute_uv=False)
-        parts = [
-            y / limit[None, :]
-            for y, limit in zip((q - centre[None, :], v, w), limits, strict=True)
-            if np.all(np.isfinite(limit))
-        ]
+        parts = [y / limit[None, :] for y, limit in zip((q - centre[None, :], v, w), limits, strict=True)]
         beyond = sum(jnp.mean(jnp.maximum(jnp.abs(y) - 0.97, 0) ** 2) for y in parts)
         return sigma, beyond
 
@@ -304,15 +304,19 @@ def excitation(
 
     rng = np.random.default_rng(seed)
     x0 = rng.normal(size=2 * harmonics * n)
-    q, v, w = jax.vmap(trajectory(x0).motion)(t)
-    reach = max(
-        float(np.max(np.abs(y) / limit[None, :])) for y, limit in zip((q - centre[None, :], v, w), limits, strict=True)
-    )
-    x0 = x0 / reach * 0.97  # inside all ranges
+
+    def largest(x: np.ndarray) -> float:
+        """Part of its range that the motion takes, at four times as many times; a range is linear in x."""
+        q, v, w = jax.vmap(trajectory(x).motion)(np.arange(4 * samples) * (float(period) / samples / 4))
+        moves = zip((q - centre[None, :], v, w), limits, strict=True)
+        return max(float(np.max(np.abs(y) / limit[None, :])) for y, limit in moves)
+
+    x0 = x0 / largest(x0) * 0.97  # inside all ranges
     value_and_grad = jax.jit(jax.value_and_grad(cost))
     found = scipy.optimize.minimize(
         lambda x: tuple(np.asarray(y, float) for y in value_and_grad(x)), x0, jac=True, method="L-BFGS-B",
         options={"maxiter": iterations},
     )  # fmt: skip
-    start, end = (np.asarray(jax.jit(values)(x)[0]) for x in (x0, found.x))
-    return Excitation(trajectory(jnp.asarray(found.x)), float(end[0] / end[-1]), float(start[0] / start[-1]), base)
+    x = found.x / max(1.0, largest(found.x))
+    start, end = (np.asarray(jax.jit(values)(x)[0]) for x in (x0, x))
+    return Excitation(trajectory(jnp.asarray(x)), float(end[0] / end[-1]), float(start[0] / start[-1]), base)
