@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.bodies.description import WORLD, Body, Connect, Couple, Marker, Motor, Weld
@@ -482,7 +482,8 @@ def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
     able = np.flatnonzero(size > INDEPENDENT * size.max(initial=1e-300))
     if not able.size:
         raise ValueError(f"{caller}: `loops` hold nothing that moves.")
-    found: Any = scipy.linalg.qr((rows[able] / size[able, None]).T, mode="r", pivoting=True)
+    linalg: Any = import_module("scipy.linalg")  # when it is asked for: `import hhtjax` does without
+    found = linalg.qr((rows[able] / size[able, None]).T, mode="r", pivoting=True)
     R, order = found
     rank = int(np.sum(np.abs(np.diag(R)) > INDEPENDENT))
     kept = tuple(sorted(able[order[:rank]].tolist()))

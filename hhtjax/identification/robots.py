@@ -9,13 +9,12 @@ A fit begins with `equation_error`, which simulates nothing, and ends through th
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
-import scipy.optimize
 
 from hhtjax.bodies import Mechanism, regressor
 from hhtjax.checks import require_integer, require_number
@@ -157,7 +156,8 @@ def base_parameters(robot: Mechanism, *, samples: int = 200, motion: Any = None,
     size = np.linalg.norm(Y, axis=0)
     seen = np.flatnonzero(size > rank_tolerance * size.max())
     order = seen[::-1]  # of equal ones, those of the tip
-    found: Any = scipy.linalg.qr(Y[:, order] / size[order], mode="r", pivoting=True)
+    linalg: Any = import_module("scipy.linalg")  # when it is asked for: `import hhtjax` does without
+    found = linalg.qr(Y[:, order] / size[order], mode="r", pivoting=True)
     R, pivots = found
     rank = int(np.sum(np.abs(np.diag(R)) > rank_tolerance * abs(R[0, 0])))
     independent = np.sort(order[pivots[:rank]])
@@ -313,7 +313,8 @@ def excitation(
 
     x0 = x0 / largest(x0) * 0.97  # inside all ranges
     value_and_grad = jax.jit(jax.value_and_grad(cost))
-    found = scipy.optimize.minimize(
+    optimize: Any = import_module("scipy.optimize")
+    found = optimize.minimize(
         lambda x: tuple(np.asarray(y, float) for y in value_and_grad(x)), x0, jac=True, method="L-BFGS-B",
         options={"maxiter": iterations},
     )  # fmt: skip
