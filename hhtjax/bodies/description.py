@@ -277,14 +277,14 @@ class Connect:
     anchor2: Any = (0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        _name("Connect", "first", self.first)
-        _name("Connect", "second", self.second)
-        _set(self, anchor1=_vector("Connect", "anchor1", self.anchor1))
-        _set(self, anchor2=_vector("Connect", "anchor2", self.anchor2))
+        caller = type(self).__name__
+        _name(caller, "first", self.first)
+        _name(caller, "second", self.second)
+        _set(self, anchor1=_vector(caller, "anchor1", self.anchor1), anchor2=_vector(caller, "anchor2", self.anchor2))
 
 
 @dataclass(frozen=True)
-class Weld:
+class Weld(Connect):
     """A frame of one body held to a frame of another, place and orientation: six constraints.
 
     Args:
@@ -294,17 +294,10 @@ class Weld:
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
     """
 
-    first: str
-    second: str
-    anchor1: Any = (0.0, 0.0, 0.0)
-    anchor2: Any = (0.0, 0.0, 0.0)
     rotation: Any = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        _name("Weld", "first", self.first)
-        _name("Weld", "second", self.second)
-        _set(self, anchor1=_vector("Weld", "anchor1", self.anchor1))
-        _set(self, anchor2=_vector("Weld", "anchor2", self.anchor2))
+        super().__post_init__()
         _set(self, rotation=_rotation("Weld", "rotation", self.rotation))
 
 

@@ -268,24 +268,16 @@ def driven(model: Model, x: Array, rate: Array, t: Real, params: PyTree) -> Arra
     u = jnp.asarray(at_time(params["ctrl"], t), x.dtype)
     if u.shape != (len(model.drives),):
         raise ValueError(f'params["ctrl"] must be ({len(model.drives)},), an input for each motor; received {u.shape}.')
-    slots = np.array([drive.slot for drive in model.drives])
-    on = slots[None, :] == np.arange(len(x))[:, None]
-    gear = params["gear"]
-    s, sdot = (
-        gear * (x[slots] if not _is_all(slots, x) else x),
-        gear * (rate[slots] if not _is_all(slots, x) else rate),
-    )
+    slots, gear = np.array([drive.slot for drive in model.drives]), params["gear"]
+    one_each = slots.tolist() == list(range(len(x)))
+    s, sdot = (gear * (y if one_each else y[slots]) for y in (x, rate))
     u = _clipped(u, [drive.ctrlrange for drive in model.drives])
     kinds = np.array([drive.kind for drive in model.drives])
     known = {name: (kinds == name).astype(x.dtype) for name in ("torque", "position", "velocity")}
     F = params["kp"] * (known["position"] * u - s) + params["kv"] * (known["velocity"] * u - sdot) + params["offset"]
     F = F + known["torque"] * params["gain"] * u
     F = gear * _clipped(F, [drive.forcerange for drive in model.drives])
-    return F if _is_all(slots, x) else total(on, F[:, None])[:, 0]
-
-
-def _is_all(slots: np.ndarray, x: Array) -> bool:
-    return len(slots) == len(x) and bool(np.all(slots == np.arange(len(x))))
+    return F if one_each else total(slots[None, :] == np.arange(len(x))[:, None], F[:, None])[:, 0]
 
 
 def _clipped(x: Array, ranges: list) -> Array:

@@ -220,7 +220,9 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
     own = Tree(tuple(parts.nodes), tuple(links))
     places = _places(caller, parts, bodies, markers)
     by_name = {place.name: place for place in places}
-    rubbing = tuple(i for joint, found in parts.joints.values() if joint.friction for i in found)
+    rubs = friction == "dry"
+    rubbing = tuple(i for made in parts.joints.values() if rubs and made.joint.friction for i in made.rates)
+    springs = _springs(parts)
     stops = _stops(parts)
     if stops and limits is None:
         raise ValueError(f'{caller}: joints have a `range`: say what they do, limits="stop", "event" or "ignore".')
@@ -230,7 +232,7 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
         tuple(by_name[body.name] for body in sorted(massive, key=lambda body: parts.node_of[body.name])),
         tuple(places),
         tuple(_drive(caller, parts, motor) for motor in motors),
-        _springs(bodies, parts),
+        tuple(springs),
         stops if limits == "stop" else (),
         tuple(_row(caller, parts, list(by_name), loop) for loop in loops),
         None,
@@ -238,7 +240,8 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
         _affine_maps(caller, bodies, markers) if free else None,
         tuple([-1] + [list(by_name).index(x.parent if isinstance(x, Body) else x.body) for x in [*bodies, *markers]]),
     )
-    params = _params(model, parts, bodies, motors, gravity, rubbing if friction == "dry" else ())
+    params = _params(model, parts, bodies, motors, gravity, rubbing)
+    params |= {"spring_stiffness": _array(list(springs.values()))} if springs else {}
     params |= {"position": _array([body.position for body in bodies])} if free else {}
     q0 = _at_rest(model, parts, bodies)
     v0 = as_rates(own, jnp.zeros(own.rates, params["mass"].dtype))
@@ -255,13 +258,12 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
         raise NotImplementedError(
             f'{caller}: free=("position",) is not for loops with rows that say nothing new here: elsewhere they may.'
         )
-    rubbing = rubbing if friction == "dry" else ()
     ends = tuple(Event(Reaches(model, stop), impact("restitution")) for stop in stops) if limits == "event" else ()
     return Mechanism(
         _system(model, rubbing), params, q0, v0, ends or None,
         tuple(parts.joints), tuple(place.name for place in model.bodies),
         tuple(motor.name or motor.joint for motor in motors), tuple(by_name), rubbing, tuple(unsupported), model,
-        {name: found for name, (_, found) in parts.joints.items()},
+        {name: made.rates for name, made in parts.joints.items()},
     )  # fmt: skip
 
 
@@ -325,26 +327,20 @@ def _drive(caller: str, parts: Structure, motor: Motor) -> Drive:
 def _stops(parts: Structure) -> tuple:
     return tuple(
         Stop(parts.slots[name], side, end)
-        for name, (joint, _) in parts.joints.items()
-        if joint.range is not None
-        for side, end in zip((-1, 1), joint.range, strict=True)
+        for name, made in parts.joints.items()
+        if made.joint.range is not None
+        for side, end in zip((-1, 1), made.joint.range, strict=True)
     )
 
 
-def _springs(bodies: list[Body], parts: Structure) -> tuple:
-    """Those of balls and free joints, in the order of `_spring_stiffness`."""
-    found, tree = [], parts.nodes
-    for body in bodies:
-        for number, joint in enumerate(body.joints):
-            if joint.kind not in ("ball", "free") or not joint.stiffness:
-                continue
-            name = joint.name or (body.name if number == 0 else f"{body.name}_{number + 1}")
-            of_rates = parts.joints[name][1]
-            ball = next(node for node in tree if node.kind == "ball" and set(node.rates) <= set(of_rates))
-            way = next((x.slot for x in tree if x.kind == "translation" and set(x.rates) <= set(of_rates)), None)
+def _springs(parts: Structure) -> dict[Spring, float]:
+    """Those of balls and free joints, and their stiffness."""
+    found = {}
+    for joint, body, (ball, *ways) in parts.joints.values():
+        if joint.kind in ("ball", "free") and joint.stiffness:
             R = body.rotation if joint.kind == "free" else tuple(np.eye(3).ravel().tolist())
-            found.append(Spring(ball.slot, way, R, body.position))
-    return tuple(found)
+            found[Spring(ball.slot, ways[0].slot if ways else None, R, body.position)] = joint.stiffness
+    return found
 
 
 def _row(caller: str, parts: Structure, names: list, loop) -> Row:
@@ -369,9 +365,9 @@ def _params(model: Model, parts: Structure, bodies, motors, gravity, rubbing: tu
     own = [by_name[place.name] for place in model.bodies]
     tree = model.tree
     of_rates = {name: np.zeros(tree.rates) for name in ("damping", "armature", "friction", "stiffness", "rest")}
-    for joint, found in parts.joints.values():
+    for made in parts.joints.values():
         for name, values in of_rates.items():
-            values[list(found)] = getattr(joint, name)
+            values[list(made.rates)] = getattr(made.joint, name)
     first = tree.rates - tree.scalars
     params = {
         "mass": _array([body.mass for body in own]),
@@ -391,9 +387,6 @@ def _params(model: Model, parts: Structure, bodies, motors, gravity, rubbing: tu
         params["ctrl"] = _array(np.zeros(len(motors)))
     if rubbing:
         params["frictionloss"] = _array(of_rates["friction"][list(rubbing)])
-    if model.springs:
-        values = [j.stiffness for body in bodies for j in body.joints if j.kind in ("ball", "free") and j.stiffness]
-        params["spring_stiffness"] = _array(values)
     return params
 
 
@@ -402,7 +395,7 @@ def _at_rest(model: Model, parts: Structure, bodies) -> PyTree:
     tree = model.tree
     joint = np.zeros(tree.scalars)
     for name, slot in parts.slots.items():
-        joint[slot] = parts.joints[name][0].reference
+        joint[slot] = parts.joints[name].joint.reference
     if not tree.balls:
         return _array(joint)
     free = [body for body in bodies if any(joint.kind == "free" for joint in body.joints)]
@@ -426,10 +419,10 @@ def _affine_maps(caller: str, bodies: list[Body], markers: list[Marker]) -> tupl
         places = _places(caller, parts, moved, markers)
         return np.array([n.offset for n in parts.nodes]), np.array([place.point for place in places])
 
-    base = [at(np.zeros((len(bodies), 3)))[k] for k in (0, 1)]
-    units = np.eye(3 * len(bodies)).reshape(-1, len(bodies), 3)
-    slopes = [np.stack([at(unit)[k] - base[k] for unit in units], axis=-1) for k in (0, 1)]
-    return tuple((_nested(b), _nested(s)) for b, s in zip(base, slopes, strict=True))
+    bases = at(np.zeros((len(bodies), 3)))
+    moved = zip(*map(at, np.eye(3 * len(bodies)).reshape(-1, len(bodies), 3)), strict=True)
+    slopes = [np.stack(x, axis=-1) - base[..., None] for x, base in zip(moved, bases, strict=True)]
+    return tuple((_nested(b), _nested(s)) for b, s in zip(bases, slopes, strict=True))
 
 
 def _nested(x: np.ndarray):
@@ -483,8 +476,7 @@ def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
     if not able.size:
         raise ValueError(f"{caller}: `loops` hold nothing that moves.")
     linalg: Any = import_module("scipy.linalg")  # when it is asked for: `import hhtjax` does without
-    found = linalg.qr((rows[able] / size[able, None]).T, mode="r", pivoting=True)
-    R, order = found
+    R, order = linalg.qr((rows[able] / size[able, None]).T, mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > INDEPENDENT))
     kept = tuple(sorted(able[order[:rank]].tolist()))
     return model._replace(rows=None if len(kept) == len(rows) else kept), unravel(q)

@@ -79,38 +79,53 @@ class Model(NamedTuple):
     parents: tuple  # of each place: the number of the one that it hangs on, 0 the world, -1 for the world itself
 
 
+class Made(NamedTuple):
+    """A joint of a description and what it became."""
+
+    joint: Joint
+    body: Body
+    nodes: tuple[Node, ...]  # of a free joint: the ball, then the translation, as rates are ordered
+
+    @property
+    def rates(self) -> tuple:
+        """Its numbers in the vector of rates."""
+        return tuple(i for node in self.nodes for i in node.rates)
+
+
 class Structure(NamedTuple):
     """What is made of bodies: the model's tree, and how names and numbers belong together."""
 
     nodes: list[Node]
     node_of: dict[str, int]  # body -> node, -1
     frame_of: dict[str, tuple[np.ndarray, np.ndarray]]  # body -> its frame in that node
-    joints: dict[str, tuple[Joint, tuple]]  # name -> joint, rates
-    slots: dict[str, int]  # name of a joint of one rate -> slot
+    joints: dict[str, Made]  # by name
+
+    @property
+    def slots(self) -> dict[str, int]:
+        """Name of a joint of one rate -> slot."""
+        return {name: made.nodes[0].slot for name, made in self.joints.items() if len(made.rates) == 1}
 
 
 def structure(caller: str, bodies: list[Body]) -> Structure:
     """The nodes of bodies, in their order; errors for names that are taken twice, or not known yet."""
-    counts = _counts(bodies)
-    next_slot = {"scalar": 0, "ball": 0, "free": 0}
-    node_of, frame_of = {WORLD: -1}, {WORLD: (np.eye(3), np.zeros(3))}
+    kinds = [joint.kind for body in bodies for joint in body.joints]
+    plain_balls, frees = kinds.count("ball"), kinds.count("free")
+    turning = 3 * (plain_balls + frees)  # rates of balls, those of free joints among them: they come first
+    next_slot = {"scalar": 0, "ball": 0, "free ball": plain_balls, "translation": 0}
+    first_rate = {"scalar": turning + 3 * frees, "ball": 0, "free ball": 0, "translation": turning}
     nodes: list[Node] = []
-    joints: dict[str, tuple[Joint, tuple]] = {}
-    slots: dict[str, int] = {}
 
-    def rates(kind: str, slot: int) -> tuple:
-        first = {"ball": 3 * slot, "free": 3 * (counts["balls"] + slot), "scalar": counts["turning"] + slot}[kind]
-        return tuple(range(first, first + (1 if kind == "scalar" else 3)))
-
-    def add(kind: str, parent: int, E, offset, axis=(0.0, 0.0, 1.0)) -> int:
-        sort = {"hinge": "scalar", "slide": "scalar", "translation": "free"}.get(kind, "ball")
-        slot = next_slot[sort]
+    def add(kind: str, parent: int, E, offset, axis=(0.0, 0.0, 1.0), free: bool = False) -> int:
+        sort = "scalar" if kind in ("hinge", "slide") else "free ball" if kind == "ball" and free else kind
+        slot, size = next_slot[sort], 1 if sort == "scalar" else 3
         next_slot[sort] += 1
-        of_rates = rates(sort, slot) if sort != "ball" else rates("ball", slot)
-        nodes.append(Node(parent, kind, _numbers(E), _numbers(offset), _numbers(axis), slot, of_rates))
+        first = first_rate[sort] + size * slot
+        rates = tuple(range(first, first + size))
+        nodes.append(Node(parent, kind, _numbers(E), _numbers(offset), _numbers(axis), slot, rates))
         return len(nodes) - 1
 
-    free_ball = counts["balls"] - counts["frees"]  # balls of free joints come behind the others
+    node_of, frame_of = {WORLD: -1}, {WORLD: (np.eye(3), np.zeros(3))}
+    joints: dict[str, Made] = {}
     for body in bodies:
         if body.name in node_of:
             raise ValueError(f"{caller}: two bodies are named {body.name!r}.")
@@ -123,48 +138,22 @@ def structure(caller: str, bodies: list[Body]) -> Structure:
             name = joint.name or (body.name if number == 0 else f"{body.name}_{number + 1}")
             if name in joints:
                 raise ValueError(f"{caller}: two joints are named {name!r}.")
-            if joint.kind == "free":
-                node = add("translation", -1, np.eye(3), np.zeros(3))
-                slot = free_ball
-                free_ball += 1
-                first = 3 * slot
-                nodes.append(
-                    Node(
-                        node,
-                        "ball",
-                        _numbers(np.eye(3)),
-                        (0.0, 0.0, 0.0),
-                        (0.0, 0.0, 1.0),
-                        slot,
-                        tuple(range(first, first + 3)),
-                    )
-                )
-                joints[name] = joint, (*nodes[-1].rates, *nodes[-2].rates)
-                node, E, x = len(nodes) - 1, np.eye(3), np.zeros(3)
-                continue
-            anchor = np.asarray(joint.anchor)
-            x = x + E @ (anchor - last)
             before = len(nodes)
-            for kind, axis in _simple(joint):
-                if kind != "ball" and joint.reference:
-                    E, x = _before(kind, E, x, axis, joint.reference)
-                node = add(kind, node, E, x, axis)
+            if joint.kind == "free":
                 E, x = np.eye(3), np.zeros(3)
-            last = anchor
+                node = add("ball", add("translation", -1, E, x), E, x, free=True)
+            else:
+                anchor = np.asarray(joint.anchor)
+                x, last = x + E @ (anchor - last), anchor
+                for kind, axis in _simple(joint):
+                    if kind != "ball" and joint.reference:
+                        E, x = _before(kind, E, x, axis, joint.reference)
+                    node = add(kind, node, E, x, axis)
+                    E, x = np.eye(3), np.zeros(3)
             own = nodes[before:]
-            joints[name] = joint, tuple(i for one in own for i in one.rates)
-            if len(own) == 1 and own[0].kind != "ball":
-                slots[name] = own[0].slot
-        node_of[body.name], frame_of[body.name] = node, (E, x - E @ last if body.joints else x)
-    return Structure(nodes, node_of, frame_of, joints, slots)
-
-
-def _counts(bodies: list[Body]) -> dict:
-    """How many balls there are, those of free joints among them, and rates that do not belong to hinges and slides."""
-    kinds = [joint.kind for body in bodies for joint in body.joints]
-    frees = kinds.count("free")
-    balls = kinds.count("ball") + frees
-    return {"balls": balls, "frees": frees, "turning": 3 * (balls + frees)}
+            joints[name] = Made(joint, body, tuple(own[::-1] if joint.kind == "free" else own))
+        node_of[body.name], frame_of[body.name] = node, (E, x - E @ last)
+    return Structure(nodes, node_of, frame_of, joints)
 
 
 def _simple(joint: Joint):

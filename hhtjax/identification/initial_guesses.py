@@ -17,6 +17,7 @@ from hhtjax.description import Array, PyTree, Real
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.friction import directions
 from hhtjax.systems.sampled import Sampled, band_limited_motion, sampled
 from hhtjax.systems.system import (
     AnySystem,
@@ -119,13 +120,11 @@ def _largest_sliding(system, motion: tuple, params: PyTree) -> Array:
 
 def _with_sliding(flat, left: Array, slowest: Array, q: Array, v: Array, t: Array, params: PyTree) -> Array:
     """The rows with H^T tau, tau = F sign(s); 0 where something enters that is slower than `slowest`, and may stick."""
-    law = flat.friction
-    s, pull = jax.vjp(lambda v: law.sliding(q, v, t, params), v)
+    s, H = flat.friction.sliding(q, v, t, params), directions(flat, q, t, params)
     fast = jnp.abs(s) > slowest
-    tau = law.limit(q, v, None, t, params) * jnp.where(fast, jnp.sign(s), 0)
+    tau = flat.friction.limit(q, v, None, t, params) * jnp.where(fast, jnp.sign(s), 0)
     slow = jnp.where(fast, 0.0, 1.0).astype(s.dtype)
-    H = jax.jacfwd(lambda v: law.sliding(q, v, t, params))(v)
-    return jnp.where(jnp.abs(H).T @ slow > 0, 0, left + pull(tau)[0])
+    return jnp.where(jnp.abs(H).T @ slow > 0, 0, left + H.T @ tau)
 
 
 def _require_no_rotations(system, q: PyTree, t: Array, params: PyTree):

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.bodies import Mechanism, regressor
+from hhtjax.bodies.equations import second_moment
 from hhtjax.checks import require_integer, require_number
 from hhtjax.description import Array, Real, is_concrete
 from hhtjax.description.presentation import shown
@@ -59,12 +60,11 @@ def physical_inertia(theta: Array) -> dict[str, Array]:
     m = jnp.exp(2 * alpha)
     Sigma = m[..., None, None] * jnp.sum(A[..., :, None, :] * A[..., None, :, :], axis=-1)
     trace = jnp.trace(Sigma, axis1=-2, axis2=-1)[..., None, None]
-    return {"mass": m, "com": theta[..., 7:], "inertia": trace * _unit(Sigma) - Sigma}
-
-
-def _unit(like: Array) -> Array:
-    """Unit matrices of the shape (..., 3, 3)."""
-    return jnp.broadcast_to(jnp.eye(3, dtype=like.dtype), like.shape)
+    return {
+        "mass": m,
+        "com": theta[..., 7:],
+        "inertia": trace * np.broadcast_to(np.eye(3, dtype=m.dtype), Sigma.shape) - Sigma,
+    }
 
 
 def inertia_coordinates(mass: Real, com: Array, inertia: Array) -> Array:
@@ -88,7 +88,7 @@ def inertia_coordinates(mass: Real, com: Array, inertia: Array) -> Array:
     """
     m, com, inertia = (jnp.asarray(x, jnp.result_type(float)) for x in (mass, com, inertia))
     trace = jnp.trace(inertia, axis1=-2, axis2=-1)[..., None, None]
-    Sigma = trace / 2 * _unit(inertia) - inertia
+    Sigma = second_moment(inertia)
     if is_concrete(m) and is_concrete(Sigma):
         least = np.linalg.eigvalsh(np.asarray(Sigma))[..., 0]
         if np.any(np.asarray(m) <= 0) or np.any(least <= 1e-12 * np.asarray(trace)[..., 0, 0]):
@@ -157,8 +157,7 @@ def base_parameters(robot: Mechanism, *, samples: int = 200, motion: Any = None,
     seen = np.flatnonzero(size > rank_tolerance * size.max())
     order = seen[::-1]  # of equal ones, those of the tip
     linalg: Any = import_module("scipy.linalg")  # when it is asked for: `import hhtjax` does without
-    found = linalg.qr(Y[:, order] / size[order], mode="r", pivoting=True)
-    R, pivots = found
+    R, pivots = linalg.qr(Y[:, order] / size[order], mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > rank_tolerance * abs(R[0, 0])))
     independent = np.sort(order[pivots[:rank]])
     rest = np.setdiff1d(seen, independent)
