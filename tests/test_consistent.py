@@ -1,5 +1,7 @@
 """What is compared is the number that is used; and constants are folded as XLA computes them."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from jax import lax
 import hhtjax
 from hhtjax.jaxpr.scalars import by_scalars, join, split
 from hhtjax.primitives import compat, consistent
+from hhtjax.primitives.consistent import held
 
 pytestmark = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
 
@@ -129,3 +132,21 @@ def test_numbers_of_a_method_as_arrays_inside_jit():
     wrong = jnp.array(0.5)
     with pytest.raises(ValueError, match="alpha"):
         jax.jit(lambda: hhtjax.hht(wrong) and 0)()
+
+
+@pytest.mark.parametrize("dtype", [bool, np.int32, np.uint8, np.float32, np.float64, complex])
+def test_the_call_that_holds_a_number_computes_it(dtype):
+    """XLA:CPU makes wrong programs of calls that return a parameter."""
+    x = jnp.asarray([0, 1, 2, 0], dtype)
+    program = jax.jit(held).lower(x).compile()
+    assert "call(" in program.as_text()
+    assert not re.findall(r"ROOT [^\n]* parameter\(", program.as_text())
+    assert program(x).dtype == x.dtype
+    np.testing.assert_array_equal(program(x), x)
+
+
+def test_what_is_held_keeps_its_sign_and_is_not_a_number_where_it_was_not():
+    x = np.array([np.nan, 0.0, -0.0, np.inf, -np.inf])
+    found = jax.jit(held)(x)
+    np.testing.assert_array_equal(found, x)
+    np.testing.assert_array_equal(np.signbit(found)[1:], np.signbit(x)[1:])

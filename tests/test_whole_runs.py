@@ -103,9 +103,9 @@ def test_events_the_same_on_plain_jax(name):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("seed", [1, 2, 5])
-def test_random_systems(seed):
-    """programs.py --whole-runs makes more of them."""
+@pytest.mark.parametrize(("seed", "mode"), [(1, "both"), (2, "both"), (5, "both"), (830017, "vmap")])
+def test_random_systems(seed, mode):
+    """programs.py --whole-runs makes more of them. The last was wrong by 2e-5 while a call returned its parameter."""
     with usual_promotion():
         _, *run = whole_runs.random_run(seed)
-        assert not list(whole_runs.compare(*run, modes=("both",)))
+        assert not list(whole_runs.compare(*run, modes=(mode,)))

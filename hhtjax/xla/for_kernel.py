@@ -440,13 +440,8 @@ def kernel(form: ClosedJaxpr):
 
     XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once a constant is put in its place.
     So the kernel returns a number that takes an element of each, and the values are hidden from XLA."""
-    number = len(form.out_avals)
-
-    def body(*args: Array):
-        return [*as_call(form)(*args), *_of_each(args)]
-
-    body = _with_attributes(body, inlineable="false", xla_cpu_small_call="true")
-    return lambda *args: body(*lax.optimization_barrier(args))[:number]
+    call = _one_call(form, lambda _, args: _of_each(args), inlineable="false", xla_cpu_small_call="true")
+    return lambda *args: call(*lax.optimization_barrier(args))
 
 
 def as_call(closed: ClosedJaxpr) -> Callable:
@@ -466,15 +461,33 @@ def as_call(closed: ClosedJaxpr) -> Callable:
     return jaxpr_as_fun(ClosedJaxpr(around.jaxpr.replace(eqns=[call], effects=closed.effects), around.consts))
 
 
-def _with_attributes(f: Callable, **attributes: str):
-    """f, which returns a list, as a call that bears these."""
-    call = jax.jit(f, keep_unused=True)
+def _one_call(closed: ClosedJaxpr, more: Callable, name: str = "kernel", **attributes: str):
+    """The function of a closed jaxpr, as a call that bears these attributes; more(results, arguments): what it returns
+    besides, for XLA alone.
+
+    Results that are arguments do not pass through the call: XLA:CPU may keep a parameter that a call returns where
+    another number is kept."""
+    given = _passed_by(closed.jaxpr)
+
+    def body(*args: Array):
+        found = [x for i, x in enumerate(as_call(closed)(*args)) if i not in given]
+        return [*found, *more(found, args)]
+
+    body.__name__ = name
+    call = jax.jit(body, keep_unused=True)
 
     def bearing(*args: Array):
-        found = call(*args)
-        return [set_xla_metadata(found[0], **attributes), *found[1:]]  # it finds what made the value
+        first, *rest = call(*args)
+        found = iter([set_xla_metadata(first, **attributes), *rest])  # it finds what made the value
+        return [args[given[i]] if i in given else next(found) for i in range(len(closed.out_avals))]
 
     return bearing
+
+
+def _passed_by(jaxpr: Jaxpr) -> dict:
+    """The number of a result that is an argument -> the number of that."""
+    results = enumerate(jaxpr.outvars)
+    return {i: jaxpr.invars.index(x) for i, x in results if not isinstance(x, Literal) and x in jaxpr.invars}
 
 
 def _of_each(values: tuple):
@@ -498,16 +511,12 @@ def computed_once(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The closed jaxpr as a call that XLA does not inline, and so computes once, however many users its values have.
 
     What has a single result XLA may divide among threads, and then the kernel does not link: it gets a second one."""
-    number = len(closed.out_avals)
-    if not number:
+    if len(_passed_by(closed.jaxpr)) == len(closed.out_avals):  # nothing to compute
         return closed
 
-    def body(*args: Array):
-        found = as_call(closed)(*args)
-        if number > 1 or found[0].size <= 1:
-            return found
-        return [*found, _first(next((x for x in args if x.size), found[0]))]  # of what is known before all else
+    def second(found: list, args: tuple):
+        if len(found) > 1 or found[0].size <= 1:
+            return []
+        return [_first(next((x for x in args if x.size), found[0]))]  # of what is known before all else
 
-    body.__name__ = ONCE
-    call = _with_attributes(body, inlineable="false")
-    return jax.make_jaxpr(lambda *args: call(*args)[:number])(*closed.in_avals)
+    return jax.make_jaxpr(_one_call(closed, second, ONCE, inlineable="false"))(*closed.in_avals)
