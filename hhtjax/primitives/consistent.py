@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
@@ -212,13 +213,14 @@ def _lower(ctx, x):
 
 
 def _same(x: Array) -> Array:
-    """x, computed in a way that XLA does not see through."""
+    """x, by an operation on its bits that XLA leaves, and that LLVM takes out."""
     if x.dtype == bool:
-        return _same(x.astype(np.float32)) != 0
-    if jnp.issubdtype(x.dtype, np.inexact):
-        return jnp.where(x == x, x, -x)
-    one = x.dtype.type(1)
-    return -(-x - one) - one
+        return _same(x.astype(np.int8)) != 0
+    if jnp.issubdtype(x.dtype, np.complexfloating):
+        return lax.complex(_same(x.real), _same(x.imag))
+    if jnp.issubdtype(x.dtype, np.floating):
+        return lax.bitcast_convert_type(_same(lax.bitcast_convert_type(x, f"int{8 * x.dtype.itemsize}")), x.dtype)
+    return x & x
 
 
 held_p = Primitive("hhtjax_held")
