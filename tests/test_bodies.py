@@ -139,6 +139,21 @@ def test_order_two_for_every_alpha(tumbling):
 
 
 @pytest.mark.slow
+def test_derivatives_in_entries_of_an_inertia_are_symmetric():
+    """So a descent keeps it the inertia of a body: the closed slopes take it for symmetric, plain ones would not."""
+    robot = random_tree(("revolute", "revolute"))
+    q, v, w = state(robot)
+
+    def torque(inertia):
+        """Slopes times a change, as in a step."""
+        r = partial(bodies.inverse_dynamics, robot, params=robot.params | {"inertia": inertia})
+        return jnp.sum(jnp.sin(jax.jvp(lambda q, v: r(q, v, w), (q, v), (v, w))[1]))
+
+    slope = jax.grad(torque)(jnp.asarray(robot.params["inertia"]))
+    assert float(jnp.max(jnp.abs(slope))) > 0.01
+    np.testing.assert_allclose(slope, jnp.swapaxes(slope, 1, 2), rtol=1e-10, atol=1e-12)
+
+
 def test_gradients_in_all_inertial_params():
     """Forward = reverse = central differences, through the closed slopes and their derivatives."""
     robot = random_tree(("revolute", "ball"), seed=5)

@@ -101,7 +101,11 @@ def inertia_of(model: Model, params: PyTree) -> Inertia:
 
 
 def second_moment(inertia: Array) -> Array:
-    """Sigma = tr(I)/2 1 - I, of tensors of inertia I (..., 3, 3)."""
+    """Sigma = tr(I)/2 1 - I, of tensors of inertia I (..., 3, 3).
+
+    Of their symmetric parts: so the derivatives in I_ij and I_ji are the same, and a fit keeps I symmetric.
+    """
+    inertia = (inertia + jnp.swapaxes(inertia, -1, -2)) / 2
     return trace(inertia)[..., None] / 2 * np.broadcast_to(np.eye(3, dtype=inertia.dtype), inertia.shape) - inertia
 
 
