@@ -224,13 +224,32 @@ class Motor:
         "position"    F = kp (u - s) - kv sdot + offset
         "velocity"    F = kv (u - sdot) - kp s + offset
 
+    With an activation z, an internal state of the system, z stands in the place of u:
+
+        "integrator"  zdot = u
+        "filter"      zdot = (u - z)/timeconst
+
     Args:
         joint: name of a revolute or prismatic joint. kind: one of the three.
         gear: transmission. gain, kp, kv: see the formulas. name: None for that of the joint.
         offset: a constant force, added to F.
         ctrlrange, forcerange: (lowest, highest) of u and of F, which are clipped; None without.
+        activation: "integrator" or "filter"; None without.
+        timeconst: of a filter, s, > 0.
+        actrange: (lowest, highest) of z, for a motor with an activation; None without. F reads z clipped to it, and
+            beyond its ends z is drawn back with a time constant of 1 ms, so that it does not wind up.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> from hhtjax.bodies import Body, Joint, Motor, tree
+    >>> rod = Body("rod", joints=Joint(axis=[0, 0, 1], damping=0.5), mass=2.0, com=[0.3, 0, 0], inertia=[0, 0.1, 0.1])
+    >>> arm = tree([rod], motors=[Motor("rod", activation="filter", timeconst=0.1)])
+    >>> run = hhtjax.simulate(
+    ...     arm.system, hhtjax.hht(), arm.q0, arm.v0, arm.params | {"ctrl": jnp.ones(1)}, z0=arm.z0, dt=1e-2,
+    ...     num_steps=500)
+    >>> round(float(run.z[10, 0]), 3), round(float(run.v[-1, 0]), 2)                    # 1 - 1/e, u/damping
+    (0.632, 2.0)
     """
 
     joint: str
@@ -243,9 +262,13 @@ class Motor:
     ctrlrange: Any = None
     forcerange: Any = None
     name: str | None = None
+    activation: str | None = None
+    timeconst: float | None = None
+    actrange: Any = None
 
     def __post_init__(self):
         _name("Motor", "joint", self.joint)
+        self._check_activation()
         if self.kind not in ("torque", "position", "velocity"):
             raise ValueError(f"Motor: `kind` must be torque, position or velocity; received {self.kind!r}.")
         for name in ("gear", "gain", "kp", "kv", "offset"):
@@ -253,12 +276,27 @@ class Motor:
             _set(self, **{name: float(value)})
         if self.kind != "torque" and self.gain != 1:
             raise ValueError(f"Motor: `gain` belongs to torque motors; a servo has kp and kv; received {self.gain!r}.")
-        for name in ("ctrlrange", "forcerange"):
+        for name in ("ctrlrange", "forcerange", "actrange"):
             if getattr(self, name) is not None:
                 low, high = _vector("Motor", name, getattr(self, name), (2,))
                 if not low < high:
                     raise ValueError(f"Motor: `{name}` must be (lowest, highest); received {getattr(self, name)!r}.")
                 _set(self, **{name: (low, high)})
+
+    def _check_activation(self):
+        """An error for another one, and for what belongs to none."""
+        if self.activation not in (None, "integrator", "filter"):
+            raise ValueError(f"Motor: `activation` must be integrator, filter or None; received {self.activation!r}.")
+        if (self.activation == "filter") != (self.timeconst is not None):
+            raise ValueError(
+                f'Motor: `timeconst` belongs to a motor with activation="filter", which needs one; received '
+                f"{self.timeconst!r} with the activation {self.activation!r}."
+            )
+        if self.timeconst is not None:
+            value = require_number("Motor", "timeconst", self.timeconst, lambda x: 0 < x < np.inf, "be positive")
+            _set(self, timeconst=float(value))
+        if self.actrange is not None and self.activation is None:
+            raise ValueError(f"Motor: `actrange` belongs to motors with an activation; received {self.actrange!r}.")
 
 
 @dataclass(frozen=True)

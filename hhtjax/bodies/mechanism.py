@@ -16,6 +16,8 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.bodies.description import WORLD, Body, Connect, Couple, Marker, Motor, Weld
 from hhtjax.bodies.equations import (
+    ActivatedDynamics,
+    Activation,
     Dynamics,
     Frame,
     Friction,
@@ -50,16 +52,19 @@ class Mechanism:
         params: dict of arrays in SI units. One entry a body in `bodies`: mass (nb,), com (nb, 3), inertia (nb, 3, 3),
             about the centre of mass in the frame of the body; one a rate: damping, armature (nv,); one a hinge
             or slide: stiffness, springref (ns,); gravity (3,).
-            Where there are motors: gear, gain, kp, kv, offset, ctrl (na,),
-            the last of which may be a function of t. Where there is dry friction: frictionloss (k,), of the rates in
+            Where there are motors: gear, gain, kp, kv, offset, ctrl (na,), the last of which may be a function of t;
+            and timeconst (na,) where some are filters. Where there is dry friction: frictionloss (k,), of the rates in
             `rubbing`. Where asked for: position (number of bodies, 3), spring_stiffness, stop_stiffness, stop_damping,
             restitution. May be added: "torque", a generalised force structured like v, and "wrench", {body: (moment,
             force) (6,)} in world axes, at the origin of the body or marker; constants, or functions of t.
         q0, v0: the position that is described, moved onto the loops where they were open, and rest. q is (ns,) where
             there are hinges and slides only, else a dict: "ball" (., 3, 3), "free" {"R": (., 3, 3), "x": (., 3)}, and
             "joint" (ns,); v is structured like q, with material angular velocities (., 3) in the place of rotations.
+        z0: activations of motors (nz,), 0 or the end of their range that is nearest, for `simulate(z0=)`; None where
+            there are none.
         events: of the ends of ranges, for `simulate(events=)`; None but with limits="event".
         joints, bodies, motors: names, in the order of coordinates and params.
+        activations: names of the motors that have one, in the order of z.
         markers: names of all frames: the world, bodies, markers.
         rubbing: numbers of the rates with dry friction.
         unsupported: what of a file is left out, as `load` was told.
@@ -69,10 +74,12 @@ class Mechanism:
     params: dict
     q0: Any
     v0: Any
+    z0: Any
     events: tuple[Event, ...] | None
     joints: tuple[str, ...]
     bodies: tuple[str, ...]
     motors: tuple[str, ...]
+    activations: tuple[str, ...]
     markers: tuple[str, ...]
     rubbing: tuple[int, ...]
     unsupported: tuple[str, ...]
@@ -259,10 +266,11 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
             f'{caller}: free=("position",) is not for loops with rows that say nothing new here: elsewhere they may.'
         )
     ends = tuple(Event(Reaches(model, stop), impact("restitution")) for stop in stops) if limits == "event" else ()
+    names = tuple(motor.name or motor.joint for motor in motors)
     return Mechanism(
-        _system(model, rubbing), params, q0, v0, ends or None,
+        _system(model, rubbing), params, q0, v0, _activations(model), ends or None,
         tuple(parts.joints), tuple(place.name for place in model.bodies),
-        tuple(motor.name or motor.joint for motor in motors), tuple(by_name), rubbing, tuple(unsupported), model,
+        names, tuple(names[i] for i in model.activated), tuple(by_name), rubbing, tuple(unsupported), model,
         {name: made.rates for name, made in parts.joints.items()},
     )  # fmt: skip
 
@@ -275,7 +283,15 @@ def _system(model: Model, rubbing: tuple) -> System:
         more["friction"] = Friction(model, all_rub)
         if not all_rub:
             more["sliding"] = Sliding(model, rubbing)
+    if model.activated:
+        return System(Mass(model), dynamics=ActivatedDynamics(model), internal=Activation(model), **more)
     return System(Mass(model), dynamics=Dynamics(model), **more)
+
+
+def _activations(model: Model) -> Array | None:
+    """z0: 0, or the nearest end of their range."""
+    ranges = [model.drives[i].actrange or (-np.inf, np.inf) for i in model.activated]
+    return _array([min(max(0.0, low), high) for low, high in ranges]) if ranges else None
 
 
 def _array(x) -> Array:
@@ -321,7 +337,9 @@ def _roots(nodes) -> tuple:
 
 def _drive(caller: str, parts: Structure, motor: Motor) -> Drive:
     _known(caller, "motors", motor.joint, parts.slots)
-    return Drive(parts.slots[motor.joint], motor.kind, motor.ctrlrange, motor.forcerange)
+    return Drive(
+        parts.slots[motor.joint], motor.kind, motor.ctrlrange, motor.forcerange, motor.activation, motor.actrange
+    )
 
 
 def _stops(parts: Structure) -> tuple:
@@ -385,6 +403,8 @@ def _params(model: Model, parts: Structure, bodies, motors, gravity, rubbing: tu
         for name in ("gear", "gain", "kp", "kv", "offset"):
             params[name] = _array([getattr(motor, name) for motor in motors])
         params["ctrl"] = _array(np.zeros(len(motors)))
+    if any(motor.activation == "filter" for motor in motors):
+        params["timeconst"] = _array([1.0 if motor.timeconst is None else motor.timeconst for motor in motors])
     if rubbing:
         params["frictionloss"] = _array(of_rates["friction"][list(rubbing)])
     return params

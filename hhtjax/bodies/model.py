@@ -29,12 +29,14 @@ class Place(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """A motor: the slot of its joint, and what its formula has. Clipped are u and F, where a range is given."""
+    """A motor: the slot of its joint, and what its formula has. Clipped are u, F and z, where a range is given."""
 
     slot: int
     kind: str
     ctrlrange: tuple | None
     forcerange: tuple | None
+    activation: str | None
+    actrange: tuple | None
 
 
 class Spring(NamedTuple):
@@ -77,6 +79,11 @@ class Model(NamedTuple):
     roots: tuple  # of each node: the slot of the translation that its tree begins with, or -1
     offsets: tuple | None  # the affine maps from positions of bodies to those of nodes and places, where they are free
     parents: tuple  # of each place: the number of the one that it hangs on, 0 the world, -1 for the world itself
+
+    @property
+    def activated(self) -> tuple[int, ...]:
+        """Numbers of the motors with an internal state."""
+        return tuple(i for i, drive in enumerate(self.drives) if drive.activation)
 
 
 class Made(NamedTuple):

@@ -6,7 +6,7 @@ that is missing something is not run by accident. Names:
     "contact"            bodies that can touch
     "limits"             ranges of joints, unless `limits` says what they are
     "tendon", "flex", "plugin", "fluid", "mocap", "gravcomp"
-    "actuator"           motors of other kinds than `Motor`: muscles, activation, on sites, tendons, balls
+    "actuator"           motors of other kinds than `Motor`: muscles, on sites, tendons, balls
     "equality"           constraints other than connect, weld and joint
     "springyield", "polynomial", "actuatorfrcrange"
     "unphysical"         links of a URDF with an inertia that no body has
@@ -32,6 +32,8 @@ KNOWN = (
     "contact", "limits", "tendon", "flex", "plugin", "fluid", "mocap", "gravcomp", "actuator", "equality",
     "springyield", "polynomial", "actuatorfrcrange", "unphysical", "massless",
 )  # fmt: skip
+
+SHORTEST = 1e-15  # s, mujoco's mjMINVAL, below which no filter is
 
 CHANGED = "stiffness", "rest", "damping", "armature", "friction", "range"  # fields of joints that a file may lack
 
@@ -65,7 +67,8 @@ def load(
 
     Returns:
         A `Mechanism`, with the names of the file, its positions (`qpos`) as coordinates, and q0 = qpos0.
-        `unsupported` lists what was ignored.
+        `unsupported` lists what was ignored. Motors with an activation (integrator, filter, filterexact) have one here.
+        Their flag `actearly` is about the steps of mujoco, and makes no difference here.
 
     Raises:
         ImportError: mujoco is not installed. FileNotFoundError: no such file.
@@ -325,8 +328,8 @@ def _strangeness(m, i: int) -> str | None:
         return "not on a joint"
     if m.jnt_type[m.actuator_trnid[i, 0]] not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
         return "on a ball or free joint"
-    if m.actuator_dyntype[i] != int(mujoco.mjtDyn.mjDYN_NONE):
-        return "with an activation"
+    if m.actuator_dyntype[i] not in _activations():
+        return f"with the activation {mujoco.mjtDyn(m.actuator_dyntype[i]).name.removeprefix('mjDYN_').lower()}"
     if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED):
         return "its gain is not fixed"
     if m.actuator_biastype[i] not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
@@ -336,6 +339,13 @@ def _strangeness(m, i: int) -> str | None:
         if values is not None and np.any(values[i]):
             return name.replace("actuator_", "with ")
     return None
+
+
+def _activations() -> dict:
+    """Of the numbers that mujoco has for them, those that `Motor` has."""
+    kinds = _mujoco().mjtDyn
+    known = kinds.mjDYN_NONE, kinds.mjDYN_INTEGRATOR, kinds.mjDYN_FILTER, kinds.mjDYN_FILTEREXACT
+    return dict(zip(map(int, known), (None, "integrator", "filter", "filter"), strict=True))
 
 
 def _name_of(m, kind: str, i: int) -> str:
@@ -430,11 +440,14 @@ class _Reader:
             kind, gain = "velocity", 1.0
         clamps = not _off(m.opt.disableflags, "CLAMPCTRL")
         k = m.actuator_ctrladr[i] if hasattr(m, "actuator_ctrladr") else i
+        activation = _activations()[int(m.actuator_dyntype[i])]
         return Motor(
             self.joint_names[m.actuator_trnid[i, 0]], kind, _gear(m, i), gain, kp, kv, b0,
             tuple(m.actuator_ctrlrange[k]) if m.actuator_ctrllimited[k] and clamps else None,
             tuple(m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else None,
-            self.name("actuator", i),
+            self.name("actuator", i), activation,
+            max(float(m.actuator_dynprm[i, 0]), SHORTEST) if activation == "filter" else None,
+            tuple(m.actuator_actrange[i]) if activation and m.actuator_actlimited[i] else None,
         )  # fmt: skip
 
     def loops(self) -> list:
