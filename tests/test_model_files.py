@@ -301,6 +301,21 @@ def test_all_of_it_is_told_at_once():
         bodies.load(text)
 
 
+def test_gravity_is_that_of_the_file_or_of_the_caller():
+    moon = [0, 0, -1.62]
+    off = '<option><flag gravity="disable"/></option>'
+    for text, given, expected in (
+        (in_world(), None, [0, 0, -9.81]),
+        (in_world(top='<option gravity="1 0 0"/>'), None, [1, 0, 0]),
+        (in_world(top='<option gravity="1 0 0"/>'), moon, moon),
+        (in_world(top=off), None, [0, 0, 0]),
+        (in_world(top=off), moon, moon),
+    ):
+        np.testing.assert_allclose(bodies.load(text, gravity=given).params["gravity"], expected)
+    with pytest.raises(ValueError, match=r"load: `gravity` must be finite numbers of shape \(3,\); received -9.81"):
+        bodies.load(in_world(), gravity=-9.81)
+
+
 def test_what_is_switched_off_in_the_file_is_off():
     flags = '<option><flag gravity="disable" damper="disable" spring="disable" limit="disable" frictionloss="disable"/></option>'  # noqa: E501
     robot = bodies.load(

@@ -20,7 +20,7 @@ WORLD = "world"
 UNIT = 1e-6  # by which an axis, or a rotation, may miss length 1
 
 
-def _vector(caller: str, name: str, value: Any, shape: tuple = (3,)) -> tuple:
+def vector(caller: str, name: str, value: Any, shape: tuple = (3,)) -> tuple:
     """Finite numbers of a shape, as a tuple of Python floats."""
     try:
         x = np.asarray(value, float)
@@ -33,7 +33,7 @@ def _vector(caller: str, name: str, value: Any, shape: tuple = (3,)) -> tuple:
 
 def _direction(caller: str, name: str, value: Any) -> tuple:
     """A vector that is not zero, made a unit vector."""
-    x = np.array(_vector(caller, name, value))
+    x = np.array(vector(caller, name, value))
     size = np.linalg.norm(x)
     if size == 0:
         raise ValueError(f"{caller}: `{name}` must be a direction; received {value!r}.")
@@ -115,7 +115,7 @@ class Joint:
     def __post_init__(self):
         if self.kind not in KINDS:
             raise ValueError(f"Joint: `kind` must be one of {', '.join(KINDS)}; received {self.kind!r}.")
-        _set(self, axis=_direction("Joint", "axis", self.axis), anchor=_vector("Joint", "anchor", self.anchor))
+        _set(self, axis=_direction("Joint", "axis", self.axis), anchor=vector("Joint", "anchor", self.anchor))
         for name in ("stiffness", "damping", "armature", "friction"):
             value = require_number("Joint", name, getattr(self, name), lambda x: 0 <= x < np.inf, "be 0 or more")
             _set(self, **{name: float(value)})
@@ -131,7 +131,7 @@ class Joint:
         if self.range is not None:
             if self.kind not in SCALARS:
                 raise ValueError(f"Joint: `range` belongs to revolute and prismatic joints; this is {self.kind}.")
-            low, high = _vector("Joint", "range", self.range, (2,))
+            low, high = vector("Joint", "range", self.range, (2,))
             if not low < high:
                 raise ValueError(f"Joint: `range` must be (lowest, highest); received {self.range!r}.")
             _set(self, range=(low, high))
@@ -173,8 +173,8 @@ class Body:
             raise ValueError(f"Body: a free joint is the only one of a body on the world; {self.name!r} has others.")
         _set(self, joints=tuple(joints))
         mass = require_number("Body", "mass", self.mass, lambda m: 0 <= m < np.inf, "be 0 or more")
-        _set(self, mass=float(mass), com=_vector("Body", "com", self.com))
-        _set(self, position=_vector("Body", "position", self.position))
+        _set(self, mass=float(mass), com=vector("Body", "com", self.com))
+        _set(self, position=vector("Body", "position", self.position))
         _set(self, rotation=_rotation("Body", "rotation", self.rotation))
         _set(self, inertia=_inertia(self.name, self.inertia, self.mass))
 
@@ -197,7 +197,7 @@ def _inertia(name: str, inertia: Any, mass: float) -> tuple:
     shape = np.shape(inertia)
     if shape not in ((3,), (6,), (3, 3)):
         raise ValueError(f"Body: `inertia` of {name!r} must have shape (3, 3), (3,) or (6,); received {inertia!r}.")
-    x = np.reshape(_vector("Body", "inertia", inertia, shape), shape)
+    x = np.reshape(vector("Body", "inertia", inertia, shape), shape)
     if shape == (3,):
         x = np.diag(x)
     elif shape == (6,):
@@ -278,7 +278,7 @@ class Motor:
             raise ValueError(f"Motor: `gain` belongs to torque motors; a servo has kp and kv; received {self.gain!r}.")
         for name in ("ctrlrange", "forcerange", "actrange"):
             if getattr(self, name) is not None:
-                low, high = _vector("Motor", name, getattr(self, name), (2,))
+                low, high = vector("Motor", name, getattr(self, name), (2,))
                 if not low < high:
                     raise ValueError(f"Motor: `{name}` must be (lowest, highest); received {getattr(self, name)!r}.")
                 _set(self, **{name: (low, high)})
@@ -318,7 +318,7 @@ class Connect:
         caller = type(self).__name__
         _name(caller, "first", self.first)
         _name(caller, "second", self.second)
-        _set(self, anchor1=_vector(caller, "anchor1", self.anchor1), anchor2=_vector(caller, "anchor2", self.anchor2))
+        _set(self, anchor1=vector(caller, "anchor1", self.anchor1), anchor2=vector(caller, "anchor2", self.anchor2))
 
 
 @dataclass(frozen=True)
@@ -359,8 +359,8 @@ class Couple:
         _name("Couple", "first", self.first)
         if self.second is not None:
             _name("Couple", "second", self.second)
-        _set(self, coefficients=_vector("Couple", "coefficients", self.coefficients, np.shape(self.coefficients)))
-        _set(self, origins=_vector("Couple", "origins", self.origins, (2,)))
+        _set(self, coefficients=vector("Couple", "coefficients", self.coefficients, np.shape(self.coefficients)))
+        _set(self, origins=vector("Couple", "origins", self.origins, (2,)))
 
 
 @dataclass(frozen=True)
@@ -381,7 +381,7 @@ class Marker:
     def __post_init__(self):
         _name("Marker", "name", self.name)
         _name("Marker", "body", self.body)
-        _set(self, position=_vector("Marker", "position", self.position))
+        _set(self, position=vector("Marker", "position", self.position))
         _set(self, rotation=_rotation("Marker", "rotation", self.rotation))
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.bodies.description import WORLD, Body, Connect, Couple, Marker, Motor, Weld
+from hhtjax.bodies.description import WORLD, Body, Connect, Couple, Marker, Motor, Weld, vector
 from hhtjax.bodies.equations import (
     ActivatedDynamics,
     Activation,
@@ -172,7 +172,7 @@ def tree(
         motors: each a `Motor`. loops: `Connect`, `Weld` and `Couple`, constraints of the `System`. Rows that say what
             others say already, as the third of a pin joint in a plane does, are found here and left out.
         markers: each a `Marker`, a further frame.
-        gravity: (3,), m/s^2.
+        gravity: (3,), m/s^2; the default is standard gravity, 9.80665 downwards. (A file that `load` reads has 9.81.)
         friction: "dry", the set-valued friction of the joints (`System(friction=)`), or "ignore".
         limits: of ranges, None where there are none: "ignore"; "stop", stiff springs that damp, with stop_stiffness and
             stop_damping among params; or "event", impacts (`Mechanism.events`).
@@ -247,7 +247,7 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
         _affine_maps(caller, bodies, markers) if free else None,
         tuple([-1] + [list(by_name).index(x.parent if isinstance(x, Body) else x.body) for x in [*bodies, *markers]]),
     )
-    params = _params(model, parts, bodies, motors, gravity, rubbing)
+    params = _params(caller, model, parts, bodies, motors, gravity, rubbing)
     params |= {"spring_stiffness": _array(list(springs.values()))} if springs else {}
     params |= {"position": _array([body.position for body in bodies])} if free else {}
     q0 = _at_rest(model, parts, bodies)
@@ -377,7 +377,7 @@ def _row(caller: str, parts: Structure, names: list, loop) -> Row:
     return Row("connect", first, second, (loop.anchor1, loop.anchor2))
 
 
-def _params(model: Model, parts: Structure, bodies, motors, gravity, rubbing: tuple) -> dict:
+def _params(caller: str, model: Model, parts: Structure, bodies, motors, gravity, rubbing: tuple) -> dict:
     """The description as arrays."""
     by_name = {body.name: body for body in bodies}
     own = [by_name[place.name] for place in model.bodies]
@@ -391,14 +391,12 @@ def _params(model: Model, parts: Structure, bodies, motors, gravity, rubbing: tu
         "mass": _array([body.mass for body in own]),
         "com": _array([body.com for body in own]),
         "inertia": _array(np.reshape([body.inertia for body in own], (-1, 3, 3))),
-        "gravity": _array(gravity),
+        "gravity": _array(vector(caller, "gravity", gravity)),
         "damping": _array(of_rates["damping"]),
         "armature": _array(of_rates["armature"]),
         "stiffness": _array(of_rates["stiffness"][first:]),
         "springref": _array(of_rates["rest"][first:]),
     }
-    if params["gravity"].shape != (3,) or not np.all(np.isfinite(params["gravity"])):
-        raise ValueError(f"tree: `gravity` must be finite numbers (3,); received {gravity!r}.")
     if motors:
         for name in ("gear", "gain", "kp", "kv", "offset"):
             params[name] = _array([getattr(motor, name) for motor in motors])

@@ -48,6 +48,7 @@ def load(
     motors: Sequence[Motor] = (),
     loops: Sequence[Connect | Weld | Couple] = (),
     markers: Sequence[Marker] = (),
+    gravity: Any = None,
     friction: str = "dry",
     limits: str | None = None,
     free: Sequence[str] = (),
@@ -62,6 +63,8 @@ def load(
             under "*" are of all hinges and slides.
         more: further bodies (`Body`), behind those of the file, such as a payload on the frame of a tool.
         motors, loops, markers: further ones.
+        gravity: (3,), m/s^2, in the place of that of the file; None for the latter, which is (0, 0, -9.81) where the
+            file says nothing, as in mujoco. (The default of `tree` is standard gravity, 9.80665.)
         friction, free: as in `tree`.
         limits: "ignore", "stop" or "event", as in `tree`; None if there are none.
 
@@ -100,7 +103,7 @@ def load(
     of_file = _with_changes(parts.bodies(), joints or {})
     return assembled(
         "load", of_file + list(more), parts.motors() + list(motors), parts.loops() + list(loops),
-        parts.markers() + list(markers), parts.gravity, friction,
+        parts.markers() + list(markers), parts.gravity if gravity is None else gravity, friction,
         "ignore" if limits is None and "limits" in ignore else limits, free, unsupported,
     )  # fmt: skip
 
