@@ -15,6 +15,7 @@ from hhtjax import bodies
 from hhtjax.bodies import Body, Connect, Couple, Joint, Motor, Weld, tree
 from hhtjax.bodies import newton_euler as ne
 from hhtjax.bodies.equations import inertia_of, position, rates
+from hhtjax.bodies.model import numpy_mass_matrix
 from hhtjax.rotation import exp
 from hhtjax.systems import kinematics
 
@@ -54,7 +55,7 @@ def along(robot, q, v):
 
 @pytest.mark.parametrize("parents", [None, BRANCHED])
 def test_equations_are_those_of_the_energy(parents):
-    """M is the Hessian of the kinetic energy, and v.(bias) = dT/dt at M w = 0 less what gravity does."""
+    """M is the Hessian of the kinetic energy, and v.(bias) = dT/dt at M w = 0 less what gravity does; M by NumPy."""
     robot = random_tree(ALL, parents=parents)
     q, v, w = state(robot)
     flat, unravel = ravel_pytree(v)
@@ -74,6 +75,8 @@ def test_equations_are_those_of_the_energy(parents):
     M, power = expected(flat)
     found = jax.jit(partial(bodies.mass_matrix, robot))(q)
     np.testing.assert_allclose(found, M, rtol=1e-12, atol=1e-12)
+    by_numpy = numpy_mass_matrix(robot.model, jax.tree.map(np.asarray, q), robot.params)
+    np.testing.assert_allclose(by_numpy, M, rtol=1e-12, atol=1e-12)
     zero = unravel(0 * flat)
     bias = ravel_pytree(jax.jit(partial(bodies.inverse_dynamics, robot))(q, v, zero))[0]
     assert float(flat @ bias) == pytest.approx(float(power), rel=1e-11)
@@ -315,6 +318,14 @@ def test_positions_may_be_free():
         same = [jax.jit(partial(f, robot))(q, v, w) for robot in made]
         jax.tree.map(partial(np.testing.assert_allclose, atol=1e-12), *same)
     robot = made[1]
+    fixed = Body("plate", position=(0, 0, 9.0), mass=1.0)
+    mixed = tree([fixed, Body("a", "plate", Joint(), **BODY), Body("b", "a"), Body("c", "b", Joint(), **BODY)],
+                 free=("position",))  # fmt: skip
+    assert mixed.bodies == ("a", "c")  # and behind them the plate and b
+    moved = mixed.params | {"position": jnp.arange(12.0).reshape(4, 3)}
+    found = mixed.frames(mixed.q0, moved)
+    for name, parent, row in (("a", "plate", 0), ("c", "b", 1), ("plate", "world", 2), ("b", "a", 3)):
+        np.testing.assert_allclose(found[name].x - found[parent].x, moved["position"][row], atol=1e-14)
 
     def torque(x):
         found = bodies.inverse_dynamics(robot, q, v, w, robot.params | {"position": robot.params["position"] + x})
@@ -357,7 +368,11 @@ WRONG = [
     (lambda: Body("b", inertia=(1, 1, 1)), "has inertia and no mass"),
     (lambda: Body("world"), 'must not be "world"'),
     (lambda: Body("b", joints=[Joint("free"), Joint()]), "a free joint is the only one"),
-    (lambda: Body("b", rotation=np.ones((3, 3))), "must be a rotation"),
+    (lambda: Body("b", rotation=np.ones((3, 3))), "(?s)must be a rotation, .* off by 3 and has det R = 0"),
+    (lambda: Body("b", rotation=(0, 0, 0, 0)), "a quaternion that is not zero"),
+    (lambda: tree([Body("b", joints=Joint(), **BODY), Body("tip", "b", Joint())]), "joint 'tip' .* is singular"),
+    (lambda: tree([Body("b", joints=Joint("ball"), mass=1.0, com=(0, 0, 0.5))]), "joint 'b' .* is singular"),
+    (lambda: tree([Body("b", joints=[Joint(name="x"), Joint()], **BODY)]), "joints 'x', 'b_2' .* matrix is singular"),
     (lambda: Motor("a", "servo"), "torque, position or velocity"),
     (lambda: Motor("a", "position", gain=2.0), "`gain` belongs to torque motors"),
     (lambda: Motor("a", ctrlrange=(1, -1)), r"`ctrlrange` must be \(lowest"),
@@ -383,6 +398,14 @@ def test_a_wrong_description_is_refused(make, words):
         make()
 
 
+def test_unnamed_joints_of_a_body_are_told_apart():
+    """The second is BODY_2, but for a spring behind the joint of a motor."""
+    motor = Joint(axis=(0, 1, 0), armature=0.1)
+    robot = tree([Body("a", joints=bodies.flexible(motor, 1e3), **BODY), Body("b", "a", [Joint(), motor], **BODY)])
+    assert robot.joints == ("a", "a_spring", "b", "b_2")
+    assert [robot.index(name) for name in robot.joints] == [0, 1, 2, 3]
+
+
 def test_a_mechanism_is_drawn_by_its_bars():
     """A line from each joint to the next, and on to the end of the last body."""
     robot = servo_arm()
@@ -400,7 +423,7 @@ def test_a_mechanism_can_be_made_where_something_is_traced():
 def test_params_that_would_be_ignored_are_refused():
     robot = four_bar()
     zero = jnp.zeros(3)
-    for name in ("position", "ctrl"):
+    for name in ("position", "ctrl", "frictionloss"):
         with pytest.raises(ValueError, match=f"{name}.* is not read"):
             robot.system.dynamics(zero, zero, zero, 0.0, robot.params | {name: jnp.zeros((3, 3))})
     with pytest.raises(NotImplementedError, match="say nothing new"):

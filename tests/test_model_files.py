@@ -1,6 +1,7 @@
 """Mechanisms from MJCF and URDF: the equations of mujoco, every pitfall, and one list of what is not modelled."""
 
 import importlib.util
+import time
 from functools import partial
 
 import jax
@@ -247,6 +248,10 @@ def test_a_urdf_keeps_its_fixed_links_and_needs_no_meshes():
     assert float(robot.params["damping"][0]) == 0.7
     assert float(robot.params["frictionloss"][0]) == 0.3
     np.testing.assert_allclose(robot.frames(jnp.zeros(1))["flange"].x, [0, 0.4, 0.3], atol=1e-6)
+    root = URDF.replace('"floor"', '"world"')
+    assert bodies.load(root, ignore=("contact",), limits="ignore", base="free").joints == ("joint0", "shoulder")
+    with pytest.raises(ValueError, match=r"load: `base` is \"free\", and the root .*mount \(floating\). Rename"):
+        bodies.load(root.replace('"mount" type="fixed"', '"mount" type="floating"'), base="free")
     floating = bodies.load(URDF, ignore=("contact",), limits="ignore", base="free")
     assert floating.bodies == ("base", "upper")
     assert set(floating.q0) == {"free", "joint"}
@@ -382,6 +387,18 @@ def test_parent_and_child_touch_where_the_filter_is_off():
     bodies.load(text.format(""))
     with pytest.raises(NotImplementedError, match="contact"):
         bodies.load(text.format('<option><flag filterparent="disable"/></option>'))
+
+
+def test_thousands_of_shapes_that_cannot_touch_are_read_at_once():
+    """Of bodies side by side whose bits exclude each other; but for one more."""
+    shapes = '<geom size="0.1" pos="{0} 0 0" contype="1" conaffinity="0"/>' * 40
+    many = "".join(f'<body name="b{i}"><joint/>{shapes.format(i)}</body>' for i in range(100))
+    text = f"<mujoco><worldbody>{many}{{}}</worldbody></mujoco>"
+    start = time.perf_counter()
+    bodies.load(text.format(""))
+    assert time.perf_counter() - start < 4  # pair by pair it took 8 s
+    with pytest.raises(NotImplementedError, match="contact"):
+        bodies.load(text.format('<body><joint/><geom size="0.1" contype="0" conaffinity="1"/></body>'))
 
 
 def test_an_inertia_without_mass_is_refused_by_name():

@@ -41,13 +41,19 @@ def _direction(caller: str, name: str, value: Any) -> tuple:
 
 
 def _rotation(caller: str, name: str, value: Any) -> tuple:
-    """A rotation as 9 numbers: from a matrix (3, 3), or a unit quaternion (4,) with its real part first."""
-    x = np.asarray(value, float) if np.shape(value) in ((4,), (3, 3)) else None
-    if x is None:
+    """A rotation as 9 numbers: from a matrix (3, 3), or a quaternion (4,) of any length, with its real part first."""
+    if np.shape(value) not in ((4,), (3, 3)):
         raise ValueError(f"{caller}: `{name}` must be a matrix (3, 3) or a quaternion (4,); received {value!r}.")
+    x = np.reshape(vector(caller, name, value, np.shape(value)), np.shape(value))
+    if x.shape == (4,) and not np.any(x):
+        raise ValueError(f"{caller}: `{name}` must be a quaternion that is not zero; received {value!r}.")
     R = of_quaternion(x) if x.shape == (4,) else x
-    if not (np.allclose(R @ R.T, np.eye(3), atol=UNIT) and np.linalg.det(R) > 0):
-        raise ValueError(f"{caller}: `{name}` must be a rotation; received {value!r}.")
+    error = np.max(np.abs(R @ R.T - np.eye(3)))
+    if error > UNIT or np.linalg.det(R) < 0:
+        raise ValueError(
+            f"{caller}: `{name}` must be a rotation, with R R^T = 1 to {UNIT:g} and det R = 1; received {value!r}, "
+            f"which is off by {error:.3g} and has det R = {np.linalg.det(R):.3g}."
+        )
     return tuple(tidy(R).ravel().tolist())
 
 
@@ -89,7 +95,8 @@ class Joint:
         axis: in the frame of the body; made a unit vector. The two directions of "planar" are the images of x and y
             under the shortest turn from z to `axis`.
         anchor: a point of the axis, or the centre of a ball, in the frame of the body, m.
-        name: of the joint; None for that of its body.
+        name: of the joint; None for that of its body. Further joints of a body without a name are BODY_2, ..., and a
+            spring on the axis of the joint before it, as `flexible` makes one, is JOINT_spring.
         stiffness, rest: of a spring, N m/rad or N/m, and where it is relaxed. Balls and free joints are relaxed where
             they are described; `rest` is 0 then. Of joints of several rates one number is of all.
         damping: N m s/rad or N s/m. armature: inertia of a rotor, as the joint sees it, kg m^2 or kg.
@@ -148,7 +155,7 @@ class Body:
         mass: kg. com: centre of mass, (3,), m. inertia: about it, (3, 3), its diagonal (3,), or Ixx, Iyy, Izz, Ixy,
             Ixz, Iyz (6,), kg m^2. All in the frame of the body.
         position, rotation: of the frame of the body in that of its parent, where its joints are at zero: (3,) in m, and
-            a matrix (3, 3) or a quaternion (w, x, y, z).
+            a matrix (3, 3) or a quaternion (w, x, y, z), whose length does not matter.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value; a mass or an inertia that no body has.
     """
@@ -393,7 +400,7 @@ def flexible(joint: Joint, stiffness: float, damping: float = 0.0) -> tuple[Join
         stiffness: N m/rad (N/m). damping: N m s/rad (N s/m), across the spring.
 
     Returns:
-        Two joints, for `Body(joints=)`; the second, whose coordinate is the deflection, is named NAME_spring.
+        Two joints, for `Body(joints=)`; the second, whose coordinate is the deflection, is named JOINT_spring.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value; a joint without armature, whose motor would
         have no inertia, or of more than one rate.

@@ -235,6 +235,11 @@ def _require_read(model: Model, params: PyTree):
         raise ValueError('params["position"] is not read: make the mechanism with free=("position",).')
     if "ctrl" in params and not model.drives:
         raise ValueError('params["ctrl"] is not read: the mechanism has no motors.')
+    if "frictionloss" in params and not model.rubbing:
+        raise ValueError(
+            'params["frictionloss"] is not read: no joint rubs. Make the mechanism with `friction` of a joint above 0, '
+            'and with friction="dry".'
+        )
 
 
 @dataclass(frozen=True)
@@ -254,11 +259,15 @@ class Friction:
     """The limits of dry friction: structured like v where all rates rub, else (k,), of those that do."""
 
     model: Model
-    all_rub: bool
 
     def __call__(self, q: PyTree, v: PyTree, *others: PyTree) -> PyTree:
         limits = others[-1]["frictionloss"]
-        return as_rates(self.model.tree, limits) if self.all_rub else limits
+        return as_rates(self.model.tree, limits) if all_rub(self.model) else limits
+
+
+def all_rub(model: Model) -> bool:
+    """Whether every rate does, in its order."""
+    return list(model.rubbing) == list(range(model.tree.rates))
 
 
 @dataclass(frozen=True)
@@ -266,10 +275,9 @@ class Sliding:
     """The rates that rub, (k,)."""
 
     model: Model
-    rubbing: tuple
 
     def __call__(self, q: PyTree, v: PyTree, *others: PyTree) -> Array:
-        return rates(self.model.tree, v)[np.asarray(self.rubbing)]
+        return rates(self.model.tree, v)[np.asarray(self.model.rubbing)]
 
 
 def applied(model: Model, q: PyTree, p: Position, v: Array, z: Array | None, t: Real, params: PyTree) -> Array:

@@ -58,7 +58,8 @@ def load(
     Args:
         source: path of a file, or its text.
         ignore: names of what acts in the file and is to be left out (see above).
-        base: of a URDF, which does not say it: "fixed" to the world, or "free".
+        base: of a URDF, which does not say it: "fixed" to the world, or "free". A root link named "world" is the world
+            itself: "free" lets the one link loose that is fixed to it.
         joints: what the file does not say of its joints: fields of `Joint` by name, {"elbow": {"friction": 2.0}}; those
             under "*" are of all hinges and slides.
         more: further bodies (`Body`), behind those of the file, such as a payload on the frame of a tool.
@@ -134,9 +135,9 @@ def _compiled(source: Any, base: str):
     if root.tag not in ("robot", "mujoco"):
         raise ValueError(f"load: `source` must be MJCF (mujoco) or URDF (robot); its root is {root.tag!r}.")
     acting = []
+    if base == "free":
+        _require_one_root(root)
     try:
-        if root.tag == "mujoco" and base == "free":
-            raise ValueError("`base` is for URDF; MJCF says itself what is free.")
         if root.tag == "mujoco":
             spec = mujoco.MjSpec.from_file(os.fspath(source)) if folder else mujoco.MjSpec.from_string(text)
         else:
@@ -147,6 +148,19 @@ def _compiled(source: Any, base: str):
         return spec.compile(), acting
     except ValueError as error:
         raise ValueError(f"load: mujoco cannot read `source`: {error}") from None
+
+
+def _require_one_root(root):
+    """An error for a root link "world" that carries more than one fixed link: mujoco makes it the world itself."""
+    if root.tag == "mujoco":
+        raise ValueError('load: `base` is for URDF; MJCF says itself what is free; received "free".')
+    held = [joint for joint in root.iter("joint") if getattr(joint.find("parent"), "attrib", {}).get("link") == WORLD]
+    if len(held) > 1 or any(joint.get("type") != "fixed" for joint in held):
+        names = _some([f"{joint.get('name')} ({joint.get('type')})" for joint in held])
+        raise ValueError(
+            f'load: `base` is "free", and the root link of the URDF is "world", which does not move: only one link '
+            f"that is fixed to it can be let loose; it carries the joints {names}. Rename the link."
+        )
 
 
 def _mujoco() -> Any:
@@ -282,21 +296,28 @@ def _off(flags: int, *names: str) -> bool:
 
 def _can_touch(m) -> bool:
     """Whether two shapes of different bodies may collide, by their bits and by whose parent is whose."""
-    geoms = [i for i in range(m.ngeom) if m.geom_contype[i] or m.geom_conaffinity[i]]
     filtered = not _off(m.opt.disableflags, "FILTERPARENT")
-    excluded = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in m.exclude_signature}
-    for k, i in enumerate(geoms):
-        for j in geoms[k + 1 :]:
-            a, b = m.geom_bodyid[i], m.geom_bodyid[j]
-            wa, wb = m.body_weldid[a], m.body_weldid[b]
-            meets = (m.geom_contype[i] & m.geom_conaffinity[j]) | (m.geom_contype[j] & m.geom_conaffinity[i])
-            if not meets or wa == wb or tuple(sorted((int(a), int(b)))) in excluded:
-                continue
-            above = m.body_weldid[m.body_parentid[wa]], m.body_weldid[m.body_parentid[wb]]
-            if filtered and (wa and wb) and (above[0] == wb or above[1] == wa):
-                continue  # a parent and its child
+    excluded = [_pair(int(s) >> 16, int(s) & 0xFFFF) for s in m.exclude_signature]
+    shapes = np.stack([m.geom_contype, m.geom_conaffinity, m.geom_bodyid], axis=1).astype(np.int64)
+    shapes = np.unique(shapes[(shapes[:, :2] != 0).any(axis=1)], axis=0)
+    kinds, likes, body = shapes.T
+    fixed = m.body_weldid[body]
+    above = m.body_weldid[m.body_parentid[fixed]]
+    for i in range(len(shapes) - 1):
+        later = slice(i + 1, None)
+        meets = ((kinds[i] & likes[later]) | (kinds[later] & likes[i])) != 0
+        meets &= (fixed[later] != fixed[i]) & ~np.isin(_pair(body[i], body[later]), excluded)
+        if filtered:  # a parent and its child, but for the world
+            related = (above[i] == fixed[later]) | (above[later] == fixed[i])
+            meets &= ~(related & (fixed[i] != 0) & (fixed[later] != 0))
+        if meets.any():
             return True
     return False
+
+
+def _pair(a: Any, b: Any) -> Any:
+    """A number for two bodies, whichever comes first."""
+    return np.minimum(a, b) * 65536 + np.maximum(a, b)
 
 
 def _num_actuators(m) -> int:
