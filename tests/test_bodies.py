@@ -236,6 +236,19 @@ def test_more_rows_than_coordinates_are_a_matter_of_redundancy():
     np.testing.assert_allclose(run.q, known.q, atol=1e-9)
 
 
+def test_dynamics_that_is_not_affine_is_refused():
+    """Where its slope reads w; a piecewise form of an affine one is let through."""
+    one = jnp.ones(2)
+
+    def run(dynamics, params=None):
+        system = hhtjax.System(dynamics=dynamics)
+        return hhtjax.simulate(system, hhtjax.hht(), one, one, params, dt=0.1, num_steps=1)
+
+    with pytest.raises(ValueError, match=r"simulate: `dynamics` must be affine in w, .*= 0.0134 in row 1, at q0 and"):
+        run(lambda q, v, w, t, params: params * w * (1 + jnp.array([0.0, 1e-3]) * w), 2.0)
+    run(lambda q, v, w, t, params: jnp.where(w > 0, 2.0, 2.0) * w + q)
+
+
 def test_servo_and_dry_friction():
     """The arm holds where the servo's torque, less gravity's, is below the friction."""
     robot = servo_arm()

@@ -186,6 +186,7 @@ class Dynamics:
     """r(q, v, w, t, params), structured like v."""
 
     model: Model
+    is_affine = True  # in w
 
     def __call__(self, q: PyTree, v: PyTree, w: PyTree, t: Real, params: PyTree) -> PyTree:
         return residual(self.model, q, v, w, None, t, params)
@@ -196,6 +197,7 @@ class ActivatedDynamics:
     """r(q, v, w, z, t, params), structured like v, where motors have an activation z."""
 
     model: Model
+    is_affine = True
 
     def __call__(self, q: PyTree, v: PyTree, w: PyTree, z: Array, t: Real, params: PyTree) -> PyTree:
         return residual(self.model, q, v, w, z, t, params)

@@ -32,7 +32,7 @@ from hhtjax.steppers.stepper import require_capable, require_stepper, require_sy
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.initial_conditions import initial_values, require_consistent, with_known_rows
+from hhtjax.systems.initial_conditions import initial_values, require_affine, require_consistent, with_known_rows
 from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses
 from hhtjax.xla import Programs
 
@@ -77,6 +77,7 @@ class Problem(NamedTuple):
         require_number(caller, "t0", t0, np.isfinite, "be finite")
         q0, v0, z0 = initial_values(caller, system, q0, v0, z0, level=4)
         require_capable(caller, system, stepper, q0, v0)
+        require_affine(caller, system, q0, v0, t0, params, z0)
         if system.friction is not None:
             system = with_known_rows(caller, system, q0, v0, t0, params, z0)
         if system.constraint is not None:
