@@ -355,6 +355,47 @@ def test_regressor_is_linear_in_theta():
     np.testing.assert_allclose(Y @ theta, torque, rtol=1e-11, atol=1e-12)
 
 
+def beam_of(elements, **more):
+    """Of 0.7 m, clamped, with 3 N m^2 about y and 5 N m^2 about z, 0.4 kg/m."""
+    return tree(bodies.beam("b", length=0.7, elements=elements, EI=(3.0, 5.0), rhoA=0.4, **more), gravity=(0, 0, 0))
+
+
+def frequencies(robot):
+    """Of small vibrations about q0, rad/s, in increasing order."""
+    M = numpy_mass_matrix(robot.model, np.asarray(robot.q0), robot.params)
+    root = np.diag(1 / np.sqrt(robot.params["stiffness"]))
+    return 1 / np.sqrt(np.linalg.eigvalsh(root @ M @ root)[::-1])
+
+
+def test_a_beam_is_that_of_euler_and_bernoulli():
+    """Tip deflection and frequencies, with errors of second order in the length of an element; damping; gradients."""
+    L, EI, rhoA, F = 0.7, np.array([3.0, 5.0]), 0.4, np.array([0.2, -0.3])  # EI about y, z; F along z, y
+    first = 1.8751040687**2 * np.sqrt(EI / rhoA) / L**2
+    errors = []
+    for n in (3, 6, 12):
+        robot = beam_of(n)
+        params = robot.params | {"wrench": {"b_tip": jnp.array([0, 0, 0, 0, F[1], F[0]])}}
+
+        def tip(scale, robot=robot, params=params):
+            bent = bodies.forces(robot, robot.q0, robot.v0, 0.0, params) / (scale * params["stiffness"])
+            return jax.jvp(lambda q: robot.frames(q)["b_tip"].x, (robot.q0,), (bent,))[1]
+
+        expected = F * L**3 / (3 * EI) * (1 - 1 / (4 * n**2))
+        np.testing.assert_allclose(tip(1.0)[2:0:-1], expected, rtol=1e-12)
+        errors.append(frequencies(robot)[:2] / first - 1)
+    np.testing.assert_allclose(jax.jacfwd(tip)(1.0), -tip(1.0), rtol=1e-12)
+    assert np.all(np.abs(errors[-1]) < 2e-3)
+    np.testing.assert_allclose(np.log2(np.abs(np.array(errors[:-1]) / errors[1:])), 2, atol=0.1)
+    twisting = beam_of(12, GJ=2.0, rhoI=(1e-4, 2e-4), damping=0.01, joints=Joint(axis=(0, 0, 1), stiffness=1e9))
+    torsion = np.pi / 2 * np.sqrt(2.0 / 3e-4) / L
+    assert np.min(np.abs(frequencies(twisting) / torsion - 1)) < 2e-3
+    p = twisting.params
+    np.testing.assert_allclose(p["damping"][1:], 0.01 * p["stiffness"][1:], rtol=1e-12)
+    total = float(jnp.sum(p["mass"]))
+    assert total == pytest.approx(rhoA * L)
+    assert twisting.joints[:4] == ("b1", "b2_z", "b2_y", "b2_x")
+
+
 def test_denavit_hartenberg_in_both_conventions():
     """The frame of each link is the product of the screws of its rows."""
     rows = np.array([[0.1, 0.5, 0.2, 0.3], [0.4, -1.2, 0.1, -0.2], [0.2, 0.7, -0.3, 0.9]])
@@ -402,6 +443,11 @@ WRONG = [
     (lambda: tree([Body("b", joints=Joint(), **BODY)], friction="wet"), "`friction` must be one of 'dry'"),
     (lambda: bodies.denavit_hartenberg([[1, 2, 3]]), r"finite numbers \(N, 4\)"),
     (lambda: bodies.flexible(Joint(), 1e4), "with an armature"),
+    (lambda: beam_of(0), "beam: `elements` must be a positive integer; received 0"),
+    (lambda: beam_of(2, damping=-1.0), "beam: `damping` must be 0 or more; received -1"),
+    (lambda: beam_of(2, GJ=1.0), "beam: `rhoI` must be 0 or more, and positive for a beam that twists"),
+    (lambda: bodies.beam("b", length=1.0, elements=2, EI=(1, 2, 3), rhoA=1.0), r"one number, or \(about y, about z\)"),
+    (lambda: bodies.beam("b", length=1.0, elements=2, EI=-1.0, rhoA=1.0), "beam: `EI` must be positive; received -1"),
 ]  # fmt: skip
 
 
