@@ -30,9 +30,10 @@ from hhtjax.runs.driver import equal_steps
 from hhtjax.runs.event_step import nearness
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 from hhtjax.systems import zero_order_hold
+from hhtjax.systems.affine import require_affine
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.flat_system import flatten
-from hhtjax.systems.initial_conditions import initial_values, require_affine, require_consistent, with_known_rows
+from hhtjax.systems.initial_conditions import initial_values, require_consistent, with_known_rows
 from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses
 from hhtjax.xla import Programs
 
