@@ -104,6 +104,8 @@ def test_rows_that_may_stick_are_left_out_and_count_as_no_samples():
     found = hhtjax.fit(lambda F: residuals({"F": F, "push": push})[0], 1.0)
     assert float(found.params) == pytest.approx(3.0, abs=4 * float(found.standard_errors))
     assert len(found.residual) == len(first)
+    of_values = jax.jit(lambda y: hhtjax.equation_error(system, y, dt, cutoff=5.0)({"F": 1.0, "push": push})[0])(values)
+    np.testing.assert_allclose(of_values[np.asarray(of_values) != 0], first, rtol=1e-9)
     with_params = hhtjax.System(
         jnp.array([2.0, 1.0]), system.force, friction=system.friction,
         sliding=lambda q, v, t, params: v[:1] - params["belt"],
@@ -112,5 +114,7 @@ def test_rows_that_may_stick_are_left_out_and_count_as_no_samples():
     assert [len(x) for x in kept] == [t.size - 40] * 2
     assert int(np.sum(np.asarray(kept[0]) != 0)) == len(first)
     np.testing.assert_allclose(np.asarray(kept[0])[np.asarray(kept[0]) != 0], first, rtol=1e-12)
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=r"determine params\[1\] not at all"):
+        hhtjax.fit(lambda F: [F[0] - first, F[1] * first[:0]], jnp.ones(2))  # as of a joint that rests throughout
     with pytest.raises(ValueError, match="equation_error: `values` must slide somewhere"):
         hhtjax.equation_error(hhtjax.scenes.dry_oscillator.SYSTEM, np.zeros((99, 1)), dt, cutoff=5.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -90,7 +91,7 @@ def equation_error(
     motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)
     q, v, a = jax.tree.transpose(jax.tree.structure(values), jax.tree.structure((0, 0, 0)), motion)
     samples = jax.tree.leaves(q)[0].shape[0]
-    left_out = int(jnp.ceil(MARGIN / (cutoff * dt)))
+    left_out = math.ceil(MARGIN / float(cutoff * dt))
     if samples <= 2 * left_out:
         raise ValueError(
             f"equation_error: `values` must have more than {2 * left_out} samples, because at both ends a period of "
