@@ -384,6 +384,9 @@ def test_a_beam_is_that_of_euler_and_bernoulli():
         np.testing.assert_allclose(tip(1.0)[2:0:-1], expected, rtol=1e-12)
         errors.append(frequencies(robot)[:2] / first - 1)
     np.testing.assert_allclose(jax.jacfwd(tip)(1.0), -tip(1.0), rtol=1e-12)
+    circle = robot.frames(jnp.tile(jnp.array([2 * np.pi / n, 0.0]), n))["b_tip"]  # by a moment 2 pi EI/L at the tip
+    np.testing.assert_allclose(circle.x, 0, atol=1e-14)
+    np.testing.assert_allclose(circle.R, np.eye(3), atol=1e-14)
     assert np.all(np.abs(errors[-1]) < 2e-3)
     np.testing.assert_allclose(np.log2(np.abs(np.array(errors[:-1]) / errors[1:])), 2, atol=0.1)
     twisting = beam_of(12, GJ=2.0, rhoI=(1e-4, 2e-4), damping=0.01, joints=Joint(axis=(0, 0, 1), stiffness=1e9))

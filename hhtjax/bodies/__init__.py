@@ -70,6 +70,12 @@ Loops
 `Connect`, `Weld` and `Couple` close loops of a tree, as constraints of the system. Rows that only repeat what others
 say are left out when the mechanism is made: a pin in the plane has three rows, and two that count.
 
+What gives way
+--------------
+
+`flexible` puts a spring behind the gear of a motor, `beam` makes a link of rigid pieces with springs between them. Both
+are joints with `stiffness`, which is in params: it can be fitted. Stiff springs ask for no small steps.
+
 How it is computed
 ------------------
 

@@ -188,7 +188,7 @@ def tree(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; names that are not known, or taken twice; loops
-            that cannot be closed.
+            that cannot be closed; without loops, joints that can move without moving a mass.
 
     Example: a crane of a trolley (2 kg) and a rod (1 kg, 1 m).
 
