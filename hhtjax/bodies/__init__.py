@@ -63,6 +63,7 @@ Coordinates
 q and v are arrays (n,) where there are hinges and slides only: `Mechanism.index` gives the place of a joint. Otherwise
 q is a dict: "ball", rotation matrices (., 3, 3) from the body to its parent; "free", with "R" (., 3, 3) and "x" (., 3)
 in the world; "joint", hinges and slides. v has material angular velocities (., 3) in the place of matrices.
+Motors with an activation add internal states: start runs with `z0=robot.z0`, which is None without.
 
 Loops
 -----
