@@ -15,6 +15,7 @@ from hhtjax import bodies
 from hhtjax.bodies import Body, Connect, Couple, Joint, Motor, Weld, tree
 from hhtjax.bodies import newton_euler as ne
 from hhtjax.bodies.equations import inertia_of, position, rates
+from hhtjax.bodies.model import numpy_mass_matrix
 from hhtjax.rotation import exp
 from hhtjax.systems import kinematics
 
@@ -54,7 +55,7 @@ def along(robot, q, v):
 
 @pytest.mark.parametrize("parents", [None, BRANCHED])
 def test_equations_are_those_of_the_energy(parents):
-    """M is the Hessian of the kinetic energy, and v.(bias) = dT/dt at M w = 0 less what gravity does."""
+    """M is the Hessian of the kinetic energy, and v.(bias) = dT/dt at M w = 0 less what gravity does; M by NumPy."""
     robot = random_tree(ALL, parents=parents)
     q, v, w = state(robot)
     flat, unravel = ravel_pytree(v)
@@ -74,6 +75,8 @@ def test_equations_are_those_of_the_energy(parents):
     M, power = expected(flat)
     found = jax.jit(partial(bodies.mass_matrix, robot))(q)
     np.testing.assert_allclose(found, M, rtol=1e-12, atol=1e-12)
+    by_numpy = numpy_mass_matrix(robot.model, jax.tree.map(np.asarray, q), robot.params)
+    np.testing.assert_allclose(by_numpy, M, rtol=1e-12, atol=1e-12)
     zero = unravel(0 * flat)
     bias = ravel_pytree(jax.jit(partial(bodies.inverse_dynamics, robot))(q, v, zero))[0]
     assert float(flat @ bias) == pytest.approx(float(power), rel=1e-11)
@@ -248,6 +251,19 @@ def test_more_rows_than_coordinates_are_a_matter_of_redundancy():
     np.testing.assert_allclose(run.q, known.q, atol=1e-9)
 
 
+def test_dynamics_that_is_not_affine_is_refused():
+    """Where its slope reads w; a piecewise form of an affine one is let through."""
+    one = jnp.ones(2)
+
+    def run(dynamics, params=None):
+        system = hhtjax.System(dynamics=dynamics)
+        return hhtjax.simulate(system, hhtjax.hht(), one, one, params, dt=0.1, num_steps=1)
+
+    with pytest.raises(ValueError, match=r"simulate: `dynamics` must be affine in w, .*= 0.0134 in row 1, at q0 and"):
+        run(lambda q, v, w, t, params: params * w * (1 + jnp.array([0.0, 1e-3]) * w), 2.0)
+    run(lambda q, v, w, t, params: jnp.where(w > 0, 2.0, 2.0) * w + q)
+
+
 def test_servo_and_dry_friction():
     """The arm holds where the servo's torque, less gravity's, is below the friction."""
     robot = servo_arm()
@@ -330,6 +346,14 @@ def test_positions_may_be_free():
         same = [jax.jit(partial(f, robot))(q, v, w) for robot in made]
         jax.tree.map(partial(np.testing.assert_allclose, atol=1e-12), *same)
     robot = made[1]
+    fixed = Body("plate", position=(0, 0, 9.0), mass=1.0)
+    mixed = tree([fixed, Body("a", "plate", Joint(), **BODY), Body("b", "a"), Body("c", "b", Joint(), **BODY)],
+                 free=("position",))  # fmt: skip
+    assert mixed.bodies == ("a", "c")  # and behind them the plate and b
+    moved = mixed.params | {"position": jnp.arange(12.0).reshape(4, 3)}
+    found = mixed.frames(mixed.q0, moved)
+    for name, parent, row in (("a", "plate", 0), ("c", "b", 1), ("plate", "world", 2), ("b", "a", 3)):
+        np.testing.assert_allclose(found[name].x - found[parent].x, moved["position"][row], atol=1e-14)
 
     def torque(x):
         found = bodies.inverse_dynamics(robot, q, v, w, robot.params | {"position": robot.params["position"] + x})
@@ -344,6 +368,50 @@ def test_regressor_is_linear_in_theta():
     Y, theta = jax.jit(partial(bodies.regressor, robot))(q, v, w), bodies.inertial_parameters(robot.params)
     torque = ravel_pytree(bodies.inverse_dynamics(robot, q, v, w, robot.params | {"armature": jnp.zeros(5)}))[0]
     np.testing.assert_allclose(Y @ theta, torque, rtol=1e-11, atol=1e-12)
+
+
+def beam_of(elements, **more):
+    """Of 0.7 m, clamped, with 3 N m^2 about y and 5 N m^2 about z, 0.4 kg/m."""
+    return tree(bodies.beam("b", length=0.7, elements=elements, EI=(3.0, 5.0), rhoA=0.4, **more), gravity=(0, 0, 0))
+
+
+def frequencies(robot):
+    """Of small vibrations about q0, rad/s, in increasing order."""
+    M = numpy_mass_matrix(robot.model, np.asarray(robot.q0), robot.params)
+    root = np.diag(1 / np.sqrt(robot.params["stiffness"]))
+    return 1 / np.sqrt(np.linalg.eigvalsh(root @ M @ root)[::-1])
+
+
+def test_a_beam_is_that_of_euler_and_bernoulli():
+    """Tip deflection and frequencies, with errors of second order in the length of an element; damping; gradients."""
+    L, EI, rhoA, F = 0.7, np.array([3.0, 5.0]), 0.4, np.array([0.2, -0.3])  # EI about y, z; F along z, y
+    first = 1.8751040687**2 * np.sqrt(EI / rhoA) / L**2
+    errors = []
+    for n in (3, 6, 12):
+        robot = beam_of(n)
+        params = robot.params | {"wrench": {"b_tip": jnp.array([0, 0, 0, 0, F[1], F[0]])}}
+
+        def tip(scale, robot=robot, params=params):
+            bent = bodies.forces(robot, robot.q0, robot.v0, 0.0, params) / (scale * params["stiffness"])
+            return jax.jvp(lambda q: robot.frames(q)["b_tip"].x, (robot.q0,), (bent,))[1]
+
+        expected = F * L**3 / (3 * EI) * (1 - 1 / (4 * n**2))
+        np.testing.assert_allclose(tip(1.0)[2:0:-1], expected, rtol=1e-12)
+        errors.append(frequencies(robot)[:2] / first - 1)
+    np.testing.assert_allclose(jax.jacfwd(tip)(1.0), -tip(1.0), rtol=1e-12)
+    circle = robot.frames(jnp.tile(jnp.array([2 * np.pi / n, 0.0]), n))["b_tip"]  # by a moment 2 pi EI/L at the tip
+    np.testing.assert_allclose(circle.x, 0, atol=1e-14)
+    np.testing.assert_allclose(circle.R, np.eye(3), atol=1e-14)
+    assert np.all(np.abs(errors[-1]) < 2e-3)
+    np.testing.assert_allclose(np.log2(np.abs(np.array(errors[:-1]) / errors[1:])), 2, atol=0.1)
+    twisting = beam_of(12, GJ=2.0, rhoI=(1e-4, 2e-4), damping=0.01, joints=Joint(axis=(0, 0, 1), stiffness=1e9))
+    torsion = np.pi / 2 * np.sqrt(2.0 / 3e-4) / L
+    assert np.min(np.abs(frequencies(twisting) / torsion - 1)) < 2e-3
+    p = twisting.params
+    np.testing.assert_allclose(p["damping"][1:], 0.01 * p["stiffness"][1:], rtol=1e-12)
+    total = float(jnp.sum(p["mass"]))
+    assert total == pytest.approx(rhoA * L)
+    assert twisting.joints[:4] == ("b1", "b2_z", "b2_y", "b2_x")
 
 
 def test_denavit_hartenberg_in_both_conventions():
@@ -372,10 +440,18 @@ WRONG = [
     (lambda: Body("b", inertia=(1, 1, 1)), "has inertia and no mass"),
     (lambda: Body("world"), 'must not be "world"'),
     (lambda: Body("b", joints=[Joint("free"), Joint()]), "a free joint is the only one"),
-    (lambda: Body("b", rotation=np.ones((3, 3))), "must be a rotation"),
+    (lambda: Body("b", rotation=np.ones((3, 3))), "(?s)must be a rotation, .* off by 3 and has det R = 0"),
+    (lambda: Body("b", rotation=(0, 0, 0, 0)), "a quaternion that is not zero"),
+    (lambda: tree([Body("b", joints=Joint(), **BODY), Body("tip", "b", Joint())]), "joint 'tip' .* is singular"),
+    (lambda: tree([Body("b", joints=Joint("ball"), mass=1.0, com=(0, 0, 0.5))]), "joint 'b' .* is singular"),
+    (lambda: tree([Body("b", joints=[Joint(name="x"), Joint()], **BODY)]), "joints 'x', 'b_2' .* matrix is singular"),
     (lambda: Motor("a", "servo"), "torque, position or velocity"),
     (lambda: Motor("a", "position", gain=2.0), "`gain` belongs to torque motors"),
     (lambda: Motor("a", ctrlrange=(1, -1)), r"`ctrlrange` must be \(lowest"),
+    (lambda: Motor("a", activation="muscle"), "`activation` must be integrator, filter or None; received 'muscle'"),
+    (lambda: Motor("a", activation="filter"), "`timeconst` belongs to a motor with activation=\"filter\", which needs"),
+    (lambda: Motor("a", activation="filter", timeconst=0.0), "`timeconst` must be positive; received 0"),
+    (lambda: Motor("a", actrange=(0, 1)), "`actrange` belongs to motors with an activation"),
     (lambda: Joint("free", anchor=(1, 0, 0)), "turns about the origin of its body"),
     (lambda: tree([Body("b", "c", Joint(), **BODY)]), "hangs on 'c'"),
     (lambda: tree([Body("b", joints=Joint(), **BODY)] * 2), "two bodies are named 'b'"),
@@ -385,6 +461,11 @@ WRONG = [
     (lambda: tree([Body("b", joints=Joint(), **BODY)], friction="wet"), "`friction` must be one of 'dry'"),
     (lambda: bodies.denavit_hartenberg([[1, 2, 3]]), r"finite numbers \(N, 4\)"),
     (lambda: bodies.flexible(Joint(), 1e4), "with an armature"),
+    (lambda: beam_of(0), "beam: `elements` must be a positive integer; received 0"),
+    (lambda: beam_of(2, damping=-1.0), "beam: `damping` must be 0 or more; received -1"),
+    (lambda: beam_of(2, GJ=1.0), "beam: `rhoI` must be 0 or more, and positive for a beam that twists"),
+    (lambda: bodies.beam("b", length=1.0, elements=2, EI=(1, 2, 3), rhoA=1.0), r"one number, or \(about y, about z\)"),
+    (lambda: bodies.beam("b", length=1.0, elements=2, EI=-1.0, rhoA=1.0), "beam: `EI` must be positive; received -1"),
 ]  # fmt: skip
 
 
@@ -392,6 +473,14 @@ WRONG = [
 def test_a_wrong_description_is_refused(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
         make()
+
+
+def test_unnamed_joints_of_a_body_are_told_apart():
+    """The second is BODY_2, but for a spring behind the joint of a motor."""
+    motor = Joint(axis=(0, 1, 0), armature=0.1)
+    robot = tree([Body("a", joints=bodies.flexible(motor, 1e3), **BODY), Body("b", "a", [Joint(), motor], **BODY)])
+    assert robot.joints == ("a", "a_spring", "b", "b_2")
+    assert [robot.index(name) for name in robot.joints] == [0, 1, 2, 3]
 
 
 def test_a_mechanism_is_drawn_by_its_bars():
@@ -411,7 +500,7 @@ def test_a_mechanism_can_be_made_where_something_is_traced():
 def test_params_that_would_be_ignored_are_refused():
     robot = four_bar()
     zero = jnp.zeros(3)
-    for name in ("position", "ctrl"):
+    for name in ("position", "ctrl", "frictionloss"):
         with pytest.raises(ValueError, match=f"{name}.* is not read"):
             robot.system.dynamics(zero, zero, zero, 0.0, robot.params | {name: jnp.zeros((3, 3))})
     with pytest.raises(NotImplementedError, match="say nothing new"):

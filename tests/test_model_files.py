@@ -1,6 +1,7 @@
 """Mechanisms from MJCF and URDF: the equations of mujoco, every pitfall, and one list of what is not modelled."""
 
 import importlib.util
+import time
 from functools import partial
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
+import hhtjax
 from hhtjax import bodies
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="needs mujoco (extra models)")
@@ -41,6 +43,9 @@ TREE = """
     <position joint="lift" kp="300" kv="15" gear="2"/>
     <velocity joint="pole" kv="3" ctrlrange="-0.5 0.5"/>
     <general joint="pole" gainprm="4" biastype="affine" biasprm="0.5 -2 -0.3" forcerange="-3 3"/>
+    <intvelocity joint="swing" kp="20" kv="1" actrange="-4 4"/>
+    <general joint="lift" dyntype="filter" dynprm="0.2" gainprm="7" ctrlrange="-0.4 0.4"/>
+    <position joint="pole" kp="9" timeconst="0.05" gear="2"/>
   </actuator>
 </mujoco>
 """  # noqa: E501
@@ -106,7 +111,7 @@ def as_mujoco(m, robot, q):
 
 @pytest.mark.parametrize("text", [ARM, TREE], ids=["seven axes", "all kinds of joints"])
 def test_equations_are_those_of_mujoco(text):
-    """M, bias, forces, accelerations, places of bodies and sites."""
+    """M, bias, forces, accelerations, rates of activations, places of bodies and sites."""
     import mujoco
 
     robot, m = bodies.load(text), mujoco.MjModel.from_xml_string(text)
@@ -115,6 +120,7 @@ def test_equations_are_those_of_mujoco(text):
     data = mujoco.MjData(m)
     data.qpos[:], data.qvel[:] = qpos, np.asarray(ravel_pytree(v)[0])[order]
     data.ctrl[:] = np.random.default_rng(1).normal(size=m.nu)
+    data.act[:] = np.random.default_rng(2).normal(size=m.na)
     mujoco.mj_forward(m, data)
     M = np.zeros((m.nv, m.nv))
     columns = np.eye(m.nv)
@@ -124,19 +130,59 @@ def test_equations_are_those_of_mujoco(text):
     found = jax.jit(partial(bodies.mass_matrix, robot))(q)[np.ix_(order, order)]
     still = jax.tree.map(jnp.zeros_like, w)
     bias = ravel_pytree(jax.jit(partial(bodies.inverse_dynamics, robot))(q, v, still))[0][order]
-    force = ravel_pytree(bodies.forces(robot, q, v, 0.0, params))[0][order]
+    z = jnp.asarray(data.act) if m.na else None
+    force = ravel_pytree(bodies.forces(robot, q, v, 0.0, params, z))[0][order]
     close = partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
     close(found, M)
     close(bias, data.qfrc_bias)
     close(force, data.qfrc_passive + data.qfrc_actuator)
     acceleration = np.linalg.solve(found, force - bias)
     np.testing.assert_allclose(acceleration, data.qacc, rtol=0, atol=1e-12 * max(1.0, np.abs(data.qacc).max()))
+    if m.na:
+        assert len(robot.activations) == len(robot.z0) == m.na == 3
+        close(robot.system.internal(q, v, z, 0.0, params), data.act_dot)
     frames = robot.frames(q)
     for i in range(1, m.nbody):
         close(frames[m.body(i).name].x, data.xpos[i])
     for i in range(m.nsite):
         close(frames[m.site(i).name].x, data.site_xpos[i])
         close(frames[m.site(i).name].R.ravel(), data.site_xmat[i])
+
+
+ACTIVATED = """
+<mujoco>
+  <option timestep="1e-4" integrator="RK4"/>
+  <worldbody><body><joint name="j" axis="0 1 0" damping="1" armature="0.3"/>
+    <inertial pos="0.3 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
+  <actuator>
+    <general joint="j" dyntype="integrator" gainprm="20" actlimited="true" actrange="-0.2 0.25"/>
+    <motor joint="j" gear="3"/>
+    <general joint="j" dyntype="filterexact" dynprm="0.02" gainprm="3" actearly="true"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_activations_run_as_in_mujoco():
+    """An integrator that reaches both ends of its range and leaves them at once; a filter; a motor without."""
+    import mujoco
+
+    def ctrl(t, xp):
+        return xp.stack([xp.sin(3 * t), 0.1 * xp.cos(t), xp.cos(4 * t)])
+
+    robot, m = bodies.load(ACTIVATED), mujoco.MjModel.from_xml_string(ACTIVATED)
+    data, angles, states = mujoco.MjData(m), [], []
+    for i in range(20000):
+        data.ctrl[:] = ctrl((i + 0.5) * 1e-4, np)
+        mujoco.mj_step(m, data)
+        angles.append(float(data.qpos[0]))
+        states.append(np.array(data.act))
+    params = robot.params | {"ctrl": lambda t: ctrl(t, jnp)}
+    run = hhtjax.simulate(robot.system, hhtjax.hht(), robot.q0, robot.v0, params, z0=robot.z0, dt=4e-3, num_steps=500)
+    run.check()
+    np.testing.assert_allclose(run.q[1:, 0], angles[39::40], atol=1e-3)
+    np.testing.assert_allclose(run.z[1:], states[39::40], atol=3e-3)
+    assert float(jnp.max(run.z[:, 0])) > 0.25
 
 
 LOOPED = """
@@ -202,6 +248,10 @@ def test_a_urdf_keeps_its_fixed_links_and_needs_no_meshes():
     assert float(robot.params["damping"][0]) == 0.7
     assert float(robot.params["frictionloss"][0]) == 0.3
     np.testing.assert_allclose(robot.frames(jnp.zeros(1))["flange"].x, [0, 0.4, 0.3], atol=1e-6)
+    root = URDF.replace('"floor"', '"world"')
+    assert bodies.load(root, ignore=("contact",), limits="ignore", base="free").joints == ("joint0", "shoulder")
+    with pytest.raises(ValueError, match=r"load: `base` is \"free\", and the root .*mount \(floating\). Rename"):
+        bodies.load(root.replace('"mount" type="fixed"', '"mount" type="floating"'), base="free")
     floating = bodies.load(URDF, ignore=("contact",), limits="ignore", base="free")
     assert floating.bodies == ("base", "upper")
     assert set(floating.q0) == {"free", "joint"}
@@ -232,7 +282,7 @@ NOT_MODELLED = {
     "fluid": in_world(top='<option density="1.2"/>'),
     "gravcomp": in_world().replace('name="a"', 'name="a" gravcomp="1"'),
     "actuator": in_world('<actuator><motor site="s" gear="1 0 0 0 0 0"/></actuator>'),
-    "actuator ": in_world('<actuator><general joint="j" dyntype="filter" dynprm="0.1"/></actuator>'),
+    "actuator ": in_world('<actuator><muscle joint="j" lengthrange="0 1"/></actuator>'),
     "actuator  ": in_world('<actuator><damper joint="j" kv="1" ctrlrange="0 1"/></actuator>'),
     "actuatorfrcrange": in_world('<actuator><motor joint="j"/></actuator>', 'actuatorfrcrange="-1 1"'),
     "equality": in_world('<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon><equality><tendon tendon1="t"/></equality>'),  # noqa: E501
@@ -254,6 +304,21 @@ def test_all_of_it_is_told_at_once():
     text = in_world('<actuator><motor site="s" gear="1 0 0 0 0 0"/></actuator>', top='<option density="1.2"/>')
     with pytest.raises(NotImplementedError, match=r'(?s)fluid: .*actuator: .*ignore=\("fluid", "actuator",\)'):
         bodies.load(text)
+
+
+def test_gravity_is_that_of_the_file_or_of_the_caller():
+    moon = [0, 0, -1.62]
+    off = '<option><flag gravity="disable"/></option>'
+    for text, given, expected in (
+        (in_world(), None, [0, 0, -9.81]),
+        (in_world(top='<option gravity="1 0 0"/>'), None, [1, 0, 0]),
+        (in_world(top='<option gravity="1 0 0"/>'), moon, moon),
+        (in_world(top=off), None, [0, 0, 0]),
+        (in_world(top=off), moon, moon),
+    ):
+        np.testing.assert_allclose(bodies.load(text, gravity=given).params["gravity"], expected)
+    with pytest.raises(ValueError, match=r"load: `gravity` must be finite numbers of shape \(3,\); received -9.81"):
+        bodies.load(in_world(), gravity=-9.81)
 
 
 def test_what_is_switched_off_in_the_file_is_off():
@@ -322,6 +387,18 @@ def test_parent_and_child_touch_where_the_filter_is_off():
     bodies.load(text.format(""))
     with pytest.raises(NotImplementedError, match="contact"):
         bodies.load(text.format('<option><flag filterparent="disable"/></option>'))
+
+
+def test_thousands_of_shapes_that_cannot_touch_are_read_at_once():
+    """Of bodies side by side whose bits exclude each other; but for one more."""
+    shapes = '<geom size="0.1" pos="{0} 0 0" contype="1" conaffinity="0"/>' * 40
+    many = "".join(f'<body name="b{i}"><joint/>{shapes.format(i)}</body>' for i in range(100))
+    text = f"<mujoco><worldbody>{many}{{}}</worldbody></mujoco>"
+    start = time.perf_counter()
+    bodies.load(text.format(""))
+    assert time.perf_counter() - start < 4  # pair by pair it took 8 s
+    with pytest.raises(NotImplementedError, match="contact"):
+        bodies.load(text.format('<body><joint/><geom size="0.1" contype="0" conaffinity="1"/></body>'))
 
 
 def test_an_inertia_without_mass_is_refused_by_name():

@@ -79,3 +79,42 @@ def test_friction_and_damping_from_a_record_of_angles_and_torques():
     found = hhtjax.fit(lambda x: residuals(known | x), {"frictionloss": jnp.ones(2), "damping": jnp.ones(2)})
     for name in ("frictionloss", "damping"):
         np.testing.assert_allclose(found.params[name], true[name], rtol=0.02)
+
+
+def test_rows_that_may_stick_are_left_out_and_count_as_no_samples():
+    """A block that is pushed to and fro, with long rests in between: intervals are those of the rows that slide."""
+    t, dt = np.arange(0, 20, 0.01), 0.01
+    way = np.interp(t % 4, [0, 1, 2, 3, 4], [0, 0, 1, 1, 0])  # rests for half of the time
+    q = 0.5 * np.convolve(np.pad(way, 20, mode="edge"), np.hanning(43)[1:-1] / np.hanning(43).sum(), "valid")
+    v, a = np.gradient(q, dt), np.gradient(np.gradient(q, dt), dt)
+    rng = np.random.default_rng(0)
+    q = q + 2e-3 * rng.normal(size=t.size)
+    system = hhtjax.System(
+        jnp.array([2.0, 1.0]), lambda q, v, t, params: params["push"](t) - jnp.array([0.0, 1.0]) * q,
+        friction=lambda q, v, t, params: params["F"] * np.ones(1), sliding=lambda q, v, t, params: v[:1],
+    )  # fmt: skip
+    push = 2 * a + 3 * np.sign(np.round(v, 6)) + 0.3 * rng.normal(size=t.size)
+    push = hhtjax.sampled(np.stack([push, np.cos(t)], axis=1), dt)
+    values = np.stack([q, np.zeros_like(q)], axis=1)
+    residuals = hhtjax.equation_error(system, values, dt, cutoff=5.0)
+    first, second = residuals({"F": 1.0, "push": push})
+    moving = np.abs(v[20:-20]) > 0.1
+    assert abs(len(first) - moving.sum()) < 0.15 * moving.sum()
+    assert len(second) == t.size - 40
+    found = hhtjax.fit(lambda F: residuals({"F": F, "push": push})[0], 1.0)
+    assert float(found.params) == pytest.approx(3.0, abs=4 * float(found.standard_errors))
+    assert len(found.residual) == len(first)
+    of_values = jax.jit(lambda y: hhtjax.equation_error(system, y, dt, cutoff=5.0)({"F": 1.0, "push": push})[0])(values)
+    np.testing.assert_allclose(of_values[np.asarray(of_values) != 0], first, rtol=1e-9)
+    with_params = hhtjax.System(
+        jnp.array([2.0, 1.0]), system.force, friction=system.friction,
+        sliding=lambda q, v, t, params: v[:1] - params["belt"],
+    )  # fmt: skip
+    kept = hhtjax.equation_error(with_params, values, dt, cutoff=5.0)({"F": 1.0, "push": push, "belt": 0.0})
+    assert [len(x) for x in kept] == [t.size - 40] * 2
+    assert int(np.sum(np.asarray(kept[0]) != 0)) == len(first)
+    np.testing.assert_allclose(np.asarray(kept[0])[np.asarray(kept[0]) != 0], first, rtol=1e-12)
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=r"determine params\[1\] not at all"):
+        hhtjax.fit(lambda F: [F[0] - first, F[1] * first[:0]], jnp.ones(2))  # as of a joint that rests throughout
+    with pytest.raises(ValueError, match="equation_error: `values` must slide somewhere"):
+        hhtjax.equation_error(hhtjax.scenes.dry_oscillator.SYSTEM, np.zeros((99, 1)), dt, cutoff=5.0)

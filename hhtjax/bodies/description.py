@@ -20,7 +20,7 @@ WORLD = "world"
 UNIT = 1e-6  # by which an axis, or a rotation, may miss length 1
 
 
-def _vector(caller: str, name: str, value: Any, shape: tuple = (3,)) -> tuple:
+def vector(caller: str, name: str, value: Any, shape: tuple = (3,)) -> tuple:
     """Finite numbers of a shape, as a tuple of Python floats."""
     try:
         x = np.asarray(value, float)
@@ -33,7 +33,7 @@ def _vector(caller: str, name: str, value: Any, shape: tuple = (3,)) -> tuple:
 
 def _direction(caller: str, name: str, value: Any) -> tuple:
     """A vector that is not zero, made a unit vector."""
-    x = np.array(_vector(caller, name, value))
+    x = np.array(vector(caller, name, value))
     size = np.linalg.norm(x)
     if size == 0:
         raise ValueError(f"{caller}: `{name}` must be a direction; received {value!r}.")
@@ -41,13 +41,19 @@ def _direction(caller: str, name: str, value: Any) -> tuple:
 
 
 def _rotation(caller: str, name: str, value: Any) -> tuple:
-    """A rotation as 9 numbers: from a matrix (3, 3), or a unit quaternion (4,) with its real part first."""
-    x = np.asarray(value, float) if np.shape(value) in ((4,), (3, 3)) else None
-    if x is None:
+    """A rotation as 9 numbers: from a matrix (3, 3), or a quaternion (4,) of any length, with its real part first."""
+    if np.shape(value) not in ((4,), (3, 3)):
         raise ValueError(f"{caller}: `{name}` must be a matrix (3, 3) or a quaternion (4,); received {value!r}.")
+    x = np.reshape(vector(caller, name, value, np.shape(value)), np.shape(value))
+    if x.shape == (4,) and not np.any(x):
+        raise ValueError(f"{caller}: `{name}` must be a quaternion that is not zero; received {value!r}.")
     R = of_quaternion(x) if x.shape == (4,) else x
-    if not (np.allclose(R @ R.T, np.eye(3), atol=UNIT) and np.linalg.det(R) > 0):
-        raise ValueError(f"{caller}: `{name}` must be a rotation; received {value!r}.")
+    error = np.max(np.abs(R @ R.T - np.eye(3)))
+    if error > UNIT or np.linalg.det(R) < 0:
+        raise ValueError(
+            f"{caller}: `{name}` must be a rotation, with R R^T = 1 to {UNIT:g} and det R = 1; received {value!r}, "
+            f"which is off by {error:.3g} and has det R = {np.linalg.det(R):.3g}."
+        )
     return tuple(tidy(R).ravel().tolist())
 
 
@@ -89,7 +95,8 @@ class Joint:
         axis: in the frame of the body; made a unit vector. The two directions of "planar" are the images of x and y
             under the shortest turn from z to `axis`.
         anchor: a point of the axis, or the centre of a ball, in the frame of the body, m.
-        name: of the joint; None for that of its body.
+        name: of the joint; None for that of its body. Further joints of a body without a name are BODY_2, ..., and a
+            spring on the axis of the joint before it, as `flexible` makes one, is JOINT_spring.
         stiffness, rest: of a spring, N m/rad or N/m, and where it is relaxed. Balls and free joints are relaxed where
             they are described; `rest` is 0 then. Of joints of several rates one number is of all.
         damping: N m s/rad or N s/m. armature: inertia of a rotor, as the joint sees it, kg m^2 or kg.
@@ -115,7 +122,7 @@ class Joint:
     def __post_init__(self):
         if self.kind not in KINDS:
             raise ValueError(f"Joint: `kind` must be one of {', '.join(KINDS)}; received {self.kind!r}.")
-        _set(self, axis=_direction("Joint", "axis", self.axis), anchor=_vector("Joint", "anchor", self.anchor))
+        _set(self, axis=_direction("Joint", "axis", self.axis), anchor=vector("Joint", "anchor", self.anchor))
         for name in ("stiffness", "damping", "armature", "friction"):
             value = require_number("Joint", name, getattr(self, name), lambda x: 0 <= x < np.inf, "be 0 or more")
             _set(self, **{name: float(value)})
@@ -131,7 +138,7 @@ class Joint:
         if self.range is not None:
             if self.kind not in SCALARS:
                 raise ValueError(f"Joint: `range` belongs to revolute and prismatic joints; this is {self.kind}.")
-            low, high = _vector("Joint", "range", self.range, (2,))
+            low, high = vector("Joint", "range", self.range, (2,))
             if not low < high:
                 raise ValueError(f"Joint: `range` must be (lowest, highest); received {self.range!r}.")
             _set(self, range=(low, high))
@@ -148,7 +155,7 @@ class Body:
         mass: kg. com: centre of mass, (3,), m. inertia: about it, (3, 3), its diagonal (3,), or Ixx, Iyy, Izz, Ixy,
             Ixz, Iyz (6,), kg m^2. All in the frame of the body.
         position, rotation: of the frame of the body in that of its parent, where its joints are at zero: (3,) in m, and
-            a matrix (3, 3) or a quaternion (w, x, y, z).
+            a matrix (3, 3) or a quaternion (w, x, y, z), whose length does not matter.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value; a mass or an inertia that no body has.
     """
@@ -173,8 +180,8 @@ class Body:
             raise ValueError(f"Body: a free joint is the only one of a body on the world; {self.name!r} has others.")
         _set(self, joints=tuple(joints))
         mass = require_number("Body", "mass", self.mass, lambda m: 0 <= m < np.inf, "be 0 or more")
-        _set(self, mass=float(mass), com=_vector("Body", "com", self.com))
-        _set(self, position=_vector("Body", "position", self.position))
+        _set(self, mass=float(mass), com=vector("Body", "com", self.com))
+        _set(self, position=vector("Body", "position", self.position))
         _set(self, rotation=_rotation("Body", "rotation", self.rotation))
         _set(self, inertia=_inertia(self.name, self.inertia, self.mass))
 
@@ -197,7 +204,7 @@ def _inertia(name: str, inertia: Any, mass: float) -> tuple:
     shape = np.shape(inertia)
     if shape not in ((3,), (6,), (3, 3)):
         raise ValueError(f"Body: `inertia` of {name!r} must have shape (3, 3), (3,) or (6,); received {inertia!r}.")
-    x = np.reshape(_vector("Body", "inertia", inertia, shape), shape)
+    x = np.reshape(vector("Body", "inertia", inertia, shape), shape)
     if shape == (3,):
         x = np.diag(x)
     elif shape == (6,):
@@ -224,13 +231,32 @@ class Motor:
         "position"    F = kp (u - s) - kv sdot + offset
         "velocity"    F = kv (u - sdot) - kp s + offset
 
+    With an activation z, an internal state of the system, z stands in the place of u:
+
+        "integrator"  zdot = u
+        "filter"      zdot = (u - z)/timeconst
+
     Args:
         joint: name of a revolute or prismatic joint. kind: one of the three.
         gear: transmission. gain, kp, kv: see the formulas. name: None for that of the joint.
         offset: a constant force, added to F.
         ctrlrange, forcerange: (lowest, highest) of u and of F, which are clipped; None without.
+        activation: "integrator" or "filter"; None without.
+        timeconst: of a filter, s, > 0.
+        actrange: (lowest, highest) of z, for a motor with an activation; None without. F reads z clipped to it, and
+            beyond its ends z is drawn back with a time constant of 1 ms, so that it does not wind up.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> from hhtjax.bodies import Body, Joint, Motor, tree
+    >>> rod = Body("rod", joints=Joint(axis=[0, 0, 1], damping=0.5), mass=2.0, com=[0.3, 0, 0], inertia=[0, 0.1, 0.1])
+    >>> arm = tree([rod], motors=[Motor("rod", activation="filter", timeconst=0.1)])
+    >>> run = hhtjax.simulate(
+    ...     arm.system, hhtjax.hht(), arm.q0, arm.v0, arm.params | {"ctrl": jnp.ones(1)}, z0=arm.z0, dt=1e-2,
+    ...     num_steps=500)
+    >>> round(float(run.z[10, 0]), 3), round(float(run.v[-1, 0]), 2)                    # 1 - 1/e, u/damping
+    (0.632, 2.0)
     """
 
     joint: str
@@ -243,9 +269,13 @@ class Motor:
     ctrlrange: Any = None
     forcerange: Any = None
     name: str | None = None
+    activation: str | None = None
+    timeconst: float | None = None
+    actrange: Any = None
 
     def __post_init__(self):
         _name("Motor", "joint", self.joint)
+        self._check_activation()
         if self.kind not in ("torque", "position", "velocity"):
             raise ValueError(f"Motor: `kind` must be torque, position or velocity; received {self.kind!r}.")
         for name in ("gear", "gain", "kp", "kv", "offset"):
@@ -253,12 +283,27 @@ class Motor:
             _set(self, **{name: float(value)})
         if self.kind != "torque" and self.gain != 1:
             raise ValueError(f"Motor: `gain` belongs to torque motors; a servo has kp and kv; received {self.gain!r}.")
-        for name in ("ctrlrange", "forcerange"):
+        for name in ("ctrlrange", "forcerange", "actrange"):
             if getattr(self, name) is not None:
-                low, high = _vector("Motor", name, getattr(self, name), (2,))
+                low, high = vector("Motor", name, getattr(self, name), (2,))
                 if not low < high:
                     raise ValueError(f"Motor: `{name}` must be (lowest, highest); received {getattr(self, name)!r}.")
                 _set(self, **{name: (low, high)})
+
+    def _check_activation(self):
+        """An error for another one, and for what belongs to none."""
+        if self.activation not in (None, "integrator", "filter"):
+            raise ValueError(f"Motor: `activation` must be integrator, filter or None; received {self.activation!r}.")
+        if (self.activation == "filter") != (self.timeconst is not None):
+            raise ValueError(
+                f'Motor: `timeconst` belongs to a motor with activation="filter", which needs one; received '
+                f"{self.timeconst!r} with the activation {self.activation!r}."
+            )
+        if self.timeconst is not None:
+            value = require_number("Motor", "timeconst", self.timeconst, lambda x: 0 < x < np.inf, "be positive")
+            _set(self, timeconst=float(value))
+        if self.actrange is not None and self.activation is None:
+            raise ValueError(f"Motor: `actrange` belongs to motors with an activation; received {self.actrange!r}.")
 
 
 @dataclass(frozen=True)
@@ -280,7 +325,7 @@ class Connect:
         caller = type(self).__name__
         _name(caller, "first", self.first)
         _name(caller, "second", self.second)
-        _set(self, anchor1=_vector(caller, "anchor1", self.anchor1), anchor2=_vector(caller, "anchor2", self.anchor2))
+        _set(self, anchor1=vector(caller, "anchor1", self.anchor1), anchor2=vector(caller, "anchor2", self.anchor2))
 
 
 @dataclass(frozen=True)
@@ -321,8 +366,8 @@ class Couple:
         _name("Couple", "first", self.first)
         if self.second is not None:
             _name("Couple", "second", self.second)
-        _set(self, coefficients=_vector("Couple", "coefficients", self.coefficients, np.shape(self.coefficients)))
-        _set(self, origins=_vector("Couple", "origins", self.origins, (2,)))
+        _set(self, coefficients=vector("Couple", "coefficients", self.coefficients, np.shape(self.coefficients)))
+        _set(self, origins=vector("Couple", "origins", self.origins, (2,)))
 
 
 @dataclass(frozen=True)
@@ -343,7 +388,7 @@ class Marker:
     def __post_init__(self):
         _name("Marker", "name", self.name)
         _name("Marker", "body", self.body)
-        _set(self, position=_vector("Marker", "position", self.position))
+        _set(self, position=vector("Marker", "position", self.position))
         _set(self, rotation=_rotation("Marker", "rotation", self.rotation))
 
 
@@ -355,7 +400,7 @@ def flexible(joint: Joint, stiffness: float, damping: float = 0.0) -> tuple[Join
         stiffness: N m/rad (N/m). damping: N m s/rad (N s/m), across the spring.
 
     Returns:
-        Two joints, for `Body(joints=)`; the second, whose coordinate is the deflection, is named NAME_spring.
+        Two joints, for `Body(joints=)`; the second, whose coordinate is the deflection, is named JOINT_spring.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value; a joint without armature, whose motor would
         have no inertia, or of more than one rate.

@@ -3,6 +3,8 @@
     r(q, v, w, t) = ID(q, v, w) + armature w + damping v + stiffness (q - springref)
                     - motors - torque - wrenches - stops
 
+and zdot of the motors that have an activation z.
+
 Each is a frozen object that holds the model, so that equal mechanisms share compiled programs.
 """
 
@@ -34,6 +36,8 @@ from hhtjax.bodies.newton_euler import (
 )
 from hhtjax.bodies.tree import Tree
 from hhtjax.description import Array, PyTree, Real
+
+DRAWN_BACK = 1e-3  # s, the time constant by which an activation beyond its range comes back
 
 
 class Frame(NamedTuple):
@@ -186,17 +190,49 @@ class Dynamics:
     """r(q, v, w, t, params), structured like v."""
 
     model: Model
+    is_affine = True  # in w
 
     def __call__(self, q: PyTree, v: PyTree, w: PyTree, t: Real, params: PyTree) -> PyTree:
-        tree = self.model.tree
-        _require_read(self.model, params)
-        dv, dw = rates(tree, v), rates(tree, w)
-        p = position(tree, q)
-        r = inverse_dynamics(
-            tree, p, dv, dw, inertia_of(self.model, params), params["gravity"], offsets_of(self.model, params)
-        )
-        r = r + params["armature"] * dw
-        return as_rates(tree, r - applied(self.model, q, p, dv, t, params))
+        return residual(self.model, q, v, w, None, t, params)
+
+
+@dataclass(frozen=True)
+class ActivatedDynamics:
+    """r(q, v, w, z, t, params), structured like v, where motors have an activation z."""
+
+    model: Model
+    is_affine = True
+
+    def __call__(self, q: PyTree, v: PyTree, w: PyTree, z: Array, t: Real, params: PyTree) -> PyTree:
+        return residual(self.model, q, v, w, z, t, params)
+
+
+def residual(model: Model, q: PyTree, v: PyTree, w: PyTree, z: Array | None, t: Real, params: PyTree) -> PyTree:
+    """What `Dynamics` gives."""
+    tree = model.tree
+    _require_read(model, params)
+    dv, dw = rates(tree, v), rates(tree, w)
+    p = position(tree, q)
+    r = inverse_dynamics(tree, p, dv, dw, inertia_of(model, params), params["gravity"], offsets_of(model, params))
+    r = r + params["armature"] * dw
+    return as_rates(tree, r - applied(model, q, p, dv, z, t, params))
+
+
+@dataclass(frozen=True)
+class Activation:
+    """zdot, (nz,)."""
+
+    model: Model
+
+    def __call__(self, q: PyTree, v: PyTree, z: Array, t: Real, params: PyTree) -> Array:
+        numbers = np.array(self.model.activated)
+        drives = [self.model.drives[i] for i in numbers]
+        u = inputs(self.model, z.dtype, t, params)[numbers]
+        filters = np.array([drive.activation == "filter" for drive in drives])
+        rate = u
+        if filters.any():
+            rate = jnp.where(filters, (u - z) / params["timeconst"][numbers], u)
+        return rate - (z - _clipped(z, [drive.actrange for drive in drives])) / DRAWN_BACK
 
 
 def _require_read(model: Model, params: PyTree):
@@ -205,6 +241,11 @@ def _require_read(model: Model, params: PyTree):
         raise ValueError('params["position"] is not read: make the mechanism with free=("position",).')
     if "ctrl" in params and not model.drives:
         raise ValueError('params["ctrl"] is not read: the mechanism has no motors.')
+    if "frictionloss" in params and not model.rubbing:
+        raise ValueError(
+            'params["frictionloss"] is not read: no joint rubs. Make the mechanism with `friction` of a joint above 0, '
+            'and with friction="dry".'
+        )
 
 
 @dataclass(frozen=True)
@@ -224,11 +265,15 @@ class Friction:
     """The limits of dry friction: structured like v where all rates rub, else (k,), of those that do."""
 
     model: Model
-    all_rub: bool
 
     def __call__(self, q: PyTree, v: PyTree, *others: PyTree) -> PyTree:
         limits = others[-1]["frictionloss"]
-        return as_rates(self.model.tree, limits) if self.all_rub else limits
+        return as_rates(self.model.tree, limits) if all_rub(self.model) else limits
+
+
+def all_rub(model: Model) -> bool:
+    """Whether every rate does, in its order."""
+    return list(model.rubbing) == list(range(model.tree.rates))
 
 
 @dataclass(frozen=True)
@@ -236,20 +281,19 @@ class Sliding:
     """The rates that rub, (k,)."""
 
     model: Model
-    rubbing: tuple
 
     def __call__(self, q: PyTree, v: PyTree, *others: PyTree) -> Array:
-        return rates(self.model.tree, v)[np.asarray(self.rubbing)]
+        return rates(self.model.tree, v)[np.asarray(self.model.rubbing)]
 
 
-def applied(model: Model, q: PyTree, p: Position, v: Array, t: Real, params: PyTree) -> Array:
+def applied(model: Model, q: PyTree, p: Position, v: Array, z: Array | None, t: Real, params: PyTree) -> Array:
     """Generalised forces of springs, dampers, motors, stops and what acts from outside: (nv,)."""
     tree, n = model.tree, model.tree.rates - model.tree.scalars
     force = -params["damping"] * v
     x, rate = p.x, v[n:]
     along = -params["stiffness"] * (x - params["springref"])
     if model.drives:
-        along = along + driven(model, x, rate, t, params)
+        along = along + driven(model, x, rate, z, t, params)
     for k, stop in enumerate(model.stops):
         along = along.at[stop.slot].add(stopped(stop, x, rate, params["stop_stiffness"][k], params["stop_damping"][k]))
     force = force + (jnp.concatenate([jnp.zeros(n, v.dtype), along]) if n else along)
@@ -267,15 +311,24 @@ def at_time(x: PyTree, t: Real) -> PyTree:
     return x(t) if callable(x) else x
 
 
-def driven(model: Model, x: Array, rate: Array, t: Real, params: PyTree) -> Array:
-    """gear F of each motor, on hinges and slides: (ns,)."""
-    u = jnp.asarray(at_time(params["ctrl"], t), x.dtype)
+def inputs(model: Model, dtype: np.dtype, t: Real, params: PyTree) -> Array:
+    """u of each motor, within its range: (na,)."""
+    u = jnp.asarray(at_time(params["ctrl"], t), dtype)
     if u.shape != (len(model.drives),):
         raise ValueError(f'params["ctrl"] must be ({len(model.drives)},), an input for each motor; received {u.shape}.')
+    return _clipped(u, [drive.ctrlrange for drive in model.drives])
+
+
+def driven(model: Model, x: Array, rate: Array, z: Array | None, t: Real, params: PyTree) -> Array:
+    """gear F of each motor, on hinges and slides: (ns,)."""
+    u = inputs(model, x.dtype, t, params)
+    if z is not None:
+        numbers = np.array(model.activated)
+        within = _clipped(z, [model.drives[i].actrange for i in numbers])
+        u = within if len(numbers) == len(u) else u.at[numbers].set(within)
     slots, gear = np.array([drive.slot for drive in model.drives]), params["gear"]
     one_each = slots.tolist() == list(range(len(x)))
     s, sdot = (gear * (y if one_each else y[slots]) for y in (x, rate))
-    u = _clipped(u, [drive.ctrlrange for drive in model.drives])
     kinds = np.array([drive.kind for drive in model.drives])
     known = {name: (kinds == name).astype(x.dtype) for name in ("torque", "position", "velocity")}
     F = params["kp"] * (known["position"] * u - s) + params["kv"] * (known["velocity"] * u - sdot) + params["offset"]
@@ -387,5 +440,5 @@ class Reaches:
     model: Model
     stop: Stop
 
-    def __call__(self, q: PyTree, v: PyTree, t: Real, params: PyTree) -> Array:
+    def __call__(self, q: PyTree, v: PyTree, *others: PyTree) -> Array:
         return self.stop.side * (self.stop.at - position(self.model.tree, q).x[self.stop.slot])

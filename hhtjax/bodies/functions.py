@@ -82,10 +82,12 @@ def frames(robot: Mechanism, q: PyTree, params: PyTree = None) -> dict[str, Fram
     return robot.frames(q, params)
 
 
-def forces(robot: Mechanism, q: PyTree, v: PyTree, t: Real = 0.0, params: PyTree = None) -> PyTree:
+def forces(
+    robot: Mechanism, q: PyTree, v: PyTree, t: Real = 0.0, params: PyTree = None, z: Array | None = None
+) -> PyTree:
     """Generalised forces of springs, dampers, motors, stops and what acts from outside, without gravity and friction.
 
-    Args: robot: a `Mechanism`. q, v: as in its system. t: s. params: None for its own.
+    Args: robot: a `Mechanism`. q, v: as in its system. t: s. params: None for its own. z: activations, None for z0.
     Returns: structured like v.
     Raises: KeyError: params without an entry. ValueError: a wrench on what is no body.
 
@@ -95,8 +97,8 @@ def forces(robot: Mechanism, q: PyTree, v: PyTree, t: Real = 0.0, params: PyTree
     [-0.2]
     """
     model, params = robot.model, robot.params if params is None else params
-    p = position(model.tree, q)
-    return as_rates(model.tree, applied_forces(model, q, p, rates(model.tree, v), t, params))
+    p, z = position(model.tree, q), robot.z0 if z is None else z
+    return as_rates(model.tree, applied_forces(model, q, p, rates(model.tree, v), z, t, params))
 
 
 def regressor(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> Array:

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hhtjax.bodies.description import WORLD, Body, Connect, Couple, Marker, Motor, Weld
+from hhtjax.bodies.description import WORLD, Body, Connect, Couple, Marker, Motor, Weld, of_quaternion, vector
 from hhtjax.bodies.equations import (
+    ActivatedDynamics,
+    Activation,
     Dynamics,
     Frame,
     Friction,
@@ -23,10 +25,11 @@ from hhtjax.bodies.equations import (
     Mass,
     Reaches,
     Sliding,
+    all_rub,
     as_rates,
     frames_of,
 )
-from hhtjax.bodies.model import Drive, Model, Place, Row, Spring, Stop, Structure, structure
+from hhtjax.bodies.model import Drive, Model, Place, Row, Spring, Stop, Structure, numpy_mass_matrix, structure
 from hhtjax.bodies.tree import Tree
 from hhtjax.checks import require_one_of
 from hhtjax.description import Array, PyTree, is_tracing
@@ -39,6 +42,7 @@ GRAVITY = (0.0, 0.0, -9.80665)
 INDEPENDENT = 1e-6  # sine of the angle to the rows before, below which a row of a loop says nothing new
 STOP_TIME = 0.005  # s, half a period of what hits a stiff stop
 RESTITUTION = 0.3
+SINGULAR = 1e-12  # eigenvalue of the mass matrix, its diagonal scaled to 1, that is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +54,21 @@ class Mechanism:
         params: dict of arrays in SI units. One entry a body in `bodies`: mass (nb,), com (nb, 3), inertia (nb, 3, 3),
             about the centre of mass in the frame of the body; one a rate: damping, armature (nv,); one a hinge
             or slide: stiffness, springref (ns,); gravity (3,).
-            Where there are motors: gear, gain, kp, kv, offset, ctrl (na,),
-            the last of which may be a function of t. Where there is dry friction: frictionloss (k,), of the rates in
-            `rubbing`. Where asked for: position (number of bodies, 3), spring_stiffness, stop_stiffness, stop_damping,
-            restitution. May be added: "torque", a generalised force structured like v, and "wrench", {body: (moment,
-            force) (6,)} in world axes, at the origin of the body or marker; constants, or functions of t.
+            Where there are motors: gear, gain, kp, kv, offset, ctrl (na,), the last of which may be a function of t;
+            and timeconst (na,) where some are filters. Where there is dry friction: frictionloss (k,), of the rates in
+            `rubbing`. Where asked for: position (number of all bodies, 3), of those in `bodies`, in their order, and
+            behind them of those without a mass that moves, in the order of the description; spring_stiffness,
+            stop_stiffness, stop_damping, restitution. May be added: "torque", a generalised force structured like v,
+            and "wrench", {body: (moment, force) (6,)} in world axes, at the origin of the body or marker; constants, or
+            functions of t.
         q0, v0: the position that is described, moved onto the loops where they were open, and rest. q is (ns,) where
             there are hinges and slides only, else a dict: "ball" (., 3, 3), "free" {"R": (., 3, 3), "x": (., 3)}, and
             "joint" (ns,); v is structured like q, with material angular velocities (., 3) in the place of rotations.
+        z0: activations of motors (nz,), 0 or the end of their range that is nearest, for `simulate(z0=)`; None where
+            there are none.
         events: of the ends of ranges, for `simulate(events=)`; None but with limits="event".
         joints, bodies, motors: names, in the order of coordinates and params.
+        activations: names of the motors that have one, in the order of z.
         markers: names of all frames: the world, bodies, markers.
         rubbing: numbers of the rates with dry friction.
         unsupported: what of a file is left out, as `load` was told.
@@ -69,10 +78,12 @@ class Mechanism:
     params: dict
     q0: Any
     v0: Any
+    z0: Any
     events: tuple[Event, ...] | None
     joints: tuple[str, ...]
     bodies: tuple[str, ...]
     motors: tuple[str, ...]
+    activations: tuple[str, ...]
     markers: tuple[str, ...]
     rubbing: tuple[int, ...]
     unsupported: tuple[str, ...]
@@ -84,7 +95,7 @@ class Mechanism:
         loops = f", {_rows(self.model)} rows of loops" if self.model.loops else ""
         return f"Mechanism({len(self.bodies)} bodies, {tree.rates} rates{loops}, {len(self.motors)} motors)"
 
-    def index(self, joint: str) -> int | slice | tuple:
+    def index(self, joint: str) -> int | tuple[int, ...]:
         """Where the rates of a joint are in the vector of rates, and in damping and armature: a number, or numbers.
 
         Where all joints are hinges and slides, it is the place in q too.
@@ -165,7 +176,7 @@ def tree(
         motors: each a `Motor`. loops: `Connect`, `Weld` and `Couple`, constraints of the `System`. Rows that say what
             others say already, as the third of a pin joint in a plane does, are found here and left out.
         markers: each a `Marker`, a further frame.
-        gravity: (3,), m/s^2.
+        gravity: (3,), m/s^2; the default is standard gravity, 9.80665 downwards. (A file that `load` reads has 9.81.)
         friction: "dry", the set-valued friction of the joints (`System(friction=)`), or "ignore".
         limits: of ranges, None where there are none: "ignore"; "stop", stiff springs that damp, with stop_stiffness and
             stop_damping among params; or "event", impacts (`Mechanism.events`).
@@ -177,7 +188,7 @@ def tree(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; names that are not known, or taken twice; loops
-            that cannot be closed.
+            that cannot be closed; without loops, joints that can move without moving a mass.
 
     Example: a crane of a trolley (2 kg) and a rod (1 kg, 1 m).
 
@@ -214,6 +225,7 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
     if not parts.nodes:
         raise ValueError(f"{caller}: `bodies` must have at least one joint; received {len(bodies)} bodies without.")
     massive = [body for body in bodies if body.mass > 0 and parts.node_of[body.name] >= 0]
+    massive.sort(key=lambda body: parts.node_of[body.name])
     if not massive:
         raise ValueError(f"{caller}: no body of `bodies` that moves has a mass.")
     links = sorted({parts.node_of[body.name] for body in massive})
@@ -222,6 +234,7 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
     by_name = {place.name: place for place in places}
     rubs = friction == "dry"
     rubbing = tuple(i for made in parts.joints.values() if rubs and made.joint.friction for i in made.rates)
+    ordered = massive + [body for body in bodies if body.mass == 0 or parts.node_of[body.name] < 0]
     springs = _springs(parts)
     stops = _stops(parts)
     if stops and limits is None:
@@ -229,20 +242,21 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
     stops = () if limits == "ignore" else stops
     model = Model(
         own,
-        tuple(by_name[body.name] for body in sorted(massive, key=lambda body: parts.node_of[body.name])),
+        tuple(by_name[body.name] for body in massive),
         tuple(places),
         tuple(_drive(caller, parts, motor) for motor in motors),
         tuple(springs),
+        rubbing,
         stops if limits == "stop" else (),
         tuple(_row(caller, parts, list(by_name), loop) for loop in loops),
         None,
         _roots(parts.nodes),
-        _affine_maps(caller, bodies, markers) if free else None,
+        _affine_maps(caller, bodies, markers, ordered) if free else None,
         tuple([-1] + [list(by_name).index(x.parent if isinstance(x, Body) else x.body) for x in [*bodies, *markers]]),
     )
-    params = _params(model, parts, bodies, motors, gravity, rubbing)
+    params = _params(caller, model, parts, bodies, motors, gravity, rubbing)
     params |= {"spring_stiffness": _array(list(springs.values()))} if springs else {}
-    params |= {"position": _array([body.position for body in bodies])} if free else {}
+    params |= {"position": _array([body.position for body in ordered])} if free else {}
     q0 = _at_rest(model, parts, bodies)
     v0 = as_rates(own, jnp.zeros(own.rates, params["mass"].dtype))
     if model.stops:
@@ -254,28 +268,38 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
         params["restitution"] = _array(RESTITUTION)
     if model.loops:
         model, q0 = _closed(caller, model, q0, v0, params)
+    else:
+        _require_inertia(caller, model, parts, q0, params)
     if free and model.rows is not None:
         raise NotImplementedError(
             f'{caller}: free=("position",) is not for loops with rows that say nothing new here: elsewhere they may.'
         )
     ends = tuple(Event(Reaches(model, stop), impact("restitution")) for stop in stops) if limits == "event" else ()
+    names = tuple(motor.name or motor.joint for motor in motors)
     return Mechanism(
-        _system(model, rubbing), params, q0, v0, ends or None,
+        _system(model), params, q0, v0, _activations(model), ends or None,
         tuple(parts.joints), tuple(place.name for place in model.bodies),
-        tuple(motor.name or motor.joint for motor in motors), tuple(by_name), rubbing, tuple(unsupported), model,
+        names, tuple(names[i] for i in model.activated), tuple(by_name), rubbing, tuple(unsupported), model,
         {name: made.rates for name, made in parts.joints.items()},
     )  # fmt: skip
 
 
-def _system(model: Model, rubbing: tuple) -> System:
+def _system(model: Model) -> System:
     """What has no loop has no constraint, and what does not rub no friction."""
     more: dict = {"constraint": Loops(model)} if model.loops else {}
-    if rubbing:
-        all_rub = list(rubbing) == list(range(model.tree.rates))
-        more["friction"] = Friction(model, all_rub)
-        if not all_rub:
-            more["sliding"] = Sliding(model, rubbing)
+    if model.rubbing:
+        more["friction"] = Friction(model)
+        if not all_rub(model):
+            more["sliding"] = Sliding(model)
+    if model.activated:
+        return System(Mass(model), dynamics=ActivatedDynamics(model), internal=Activation(model), **more)
     return System(Mass(model), dynamics=Dynamics(model), **more)
+
+
+def _activations(model: Model) -> Array | None:
+    """z0: 0, or the nearest end of their range."""
+    ranges = [model.drives[i].actrange or (-np.inf, np.inf) for i in model.activated]
+    return _array([min(max(0.0, low), high) for low, high in ranges]) if ranges else None
 
 
 def _array(x) -> Array:
@@ -321,7 +345,9 @@ def _roots(nodes) -> tuple:
 
 def _drive(caller: str, parts: Structure, motor: Motor) -> Drive:
     _known(caller, "motors", motor.joint, parts.slots)
-    return Drive(parts.slots[motor.joint], motor.kind, motor.ctrlrange, motor.forcerange)
+    return Drive(
+        parts.slots[motor.joint], motor.kind, motor.ctrlrange, motor.forcerange, motor.activation, motor.actrange
+    )
 
 
 def _stops(parts: Structure) -> tuple:
@@ -359,7 +385,7 @@ def _row(caller: str, parts: Structure, names: list, loop) -> Row:
     return Row("connect", first, second, (loop.anchor1, loop.anchor2))
 
 
-def _params(model: Model, parts: Structure, bodies, motors, gravity, rubbing: tuple) -> dict:
+def _params(caller: str, model: Model, parts: Structure, bodies, motors, gravity, rubbing: tuple) -> dict:
     """The description as arrays."""
     by_name = {body.name: body for body in bodies}
     own = [by_name[place.name] for place in model.bodies]
@@ -373,18 +399,18 @@ def _params(model: Model, parts: Structure, bodies, motors, gravity, rubbing: tu
         "mass": _array([body.mass for body in own]),
         "com": _array([body.com for body in own]),
         "inertia": _array(np.reshape([body.inertia for body in own], (-1, 3, 3))),
-        "gravity": _array(gravity),
+        "gravity": _array(vector(caller, "gravity", gravity)),
         "damping": _array(of_rates["damping"]),
         "armature": _array(of_rates["armature"]),
         "stiffness": _array(of_rates["stiffness"][first:]),
         "springref": _array(of_rates["rest"][first:]),
     }
-    if params["gravity"].shape != (3,) or not np.all(np.isfinite(params["gravity"])):
-        raise ValueError(f"tree: `gravity` must be finite numbers (3,); received {gravity!r}.")
     if motors:
         for name in ("gear", "gain", "kp", "kv", "offset"):
             params[name] = _array([getattr(motor, name) for motor in motors])
         params["ctrl"] = _array(np.zeros(len(motors)))
+    if any(motor.activation == "filter" for motor in motors):
+        params["timeconst"] = _array([1.0 if motor.timeconst is None else motor.timeconst for motor in motors])
     if rubbing:
         params["frictionloss"] = _array(of_rates["friction"][list(rubbing)])
     return params
@@ -410,11 +436,42 @@ def _at_rest(model: Model, parts: Structure, bodies) -> PyTree:
     return found
 
 
-def _affine_maps(caller: str, bodies: list[Body], markers: list[Marker]) -> tuple:
-    """Places of nodes, and of frames in them, as affine functions of the positions of all bodies."""
+def _require_inertia(caller: str, model: Model, parts: Structure, q0: PyTree, params: dict):
+    """An error with the names of joints that can move without moving a mass, at the start and elsewhere."""
+    rng = np.random.default_rng(0)
+    start = jax.tree.map(np.asarray, q0)
+    elsewhere = jax.tree.map(lambda x: _turned(x, rng) if x.ndim == 3 else x + rng.normal(size=x.shape), start)
+    if not _massless(numpy_mass_matrix(model, elsewhere, params)).any():
+        return
+    weak = _massless(numpy_mass_matrix(model, start, params))
+    names = [repr(name) for name, made in parts.joints.items() if weak[list(made.rates)].any()]
+    if names:
+        raise ValueError(
+            f"{caller}: the joint{'s' * (len(names) > 1)} {', '.join(names)} of `bodies` can move without moving a "
+            "mass, and the mass matrix is singular: give what is carried a mass and an inertia, or a joint `armature`."
+        )
+
+
+def _massless(M: np.ndarray) -> np.ndarray:
+    """Which rates are part of a motion that no mass takes part in: (nv,)."""
+    scale = np.sqrt(np.diagonal(M))
+    if not np.all(scale > 0):
+        return scale == 0
+    moments, ways = np.linalg.eigh(M / np.outer(scale, scale))
+    return (np.abs(ways[:, 0]) > 0.1) & (moments[0] < SINGULAR)
+
+
+def _turned(R: np.ndarray, rng) -> np.ndarray:
+    """Other rotations (n, 3, 3)."""
+    return R @ np.reshape([of_quaternion(x) for x in rng.normal(size=(len(R), 4))], R.shape)
+
+
+def _affine_maps(caller: str, bodies: list[Body], markers: list[Marker], ordered: list[Body]) -> tuple:
+    """Places of nodes, and of frames in them, as affine functions of the positions of all bodies, as ordered."""
+    numbers = [ordered.index(body) for body in bodies]
 
     def at(positions: np.ndarray):
-        moved = [body.placed_at(x) for body, x in zip(bodies, positions, strict=True)]
+        moved = [body.placed_at(x) for body, x in zip(bodies, positions[numbers], strict=True)]
         parts = structure(caller, moved)
         places = _places(caller, parts, moved, markers)
         return np.array([n.offset for n in parts.nodes]), np.array([place.point for place in places])

@@ -6,6 +6,7 @@ motor drives what. What is data, in params: masses, springs, gears, gravity.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,12 +30,14 @@ class Place(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """A motor: the slot of its joint, and what its formula has. Clipped are u and F, where a range is given."""
+    """A motor: the slot of its joint, and what its formula has. Clipped are u, F and z, where a range is given."""
 
     slot: int
     kind: str
     ctrlrange: tuple | None
     forcerange: tuple | None
+    activation: str | None
+    actrange: tuple | None
 
 
 class Spring(NamedTuple):
@@ -63,20 +66,38 @@ class Row(NamedTuple):
     constants: tuple
 
 
-class Model(NamedTuple):
-    """All that is part of the program."""
+class _Fields(NamedTuple):
+    """Of a `Model`."""
 
     tree: Tree
     bodies: tuple[Place, ...]  # those that carry mass, as in params
     places: tuple[Place, ...]  # of all bodies and markers
     drives: tuple[Drive, ...]
     springs: tuple[Spring, ...]
+    rubbing: tuple  # numbers of the rates with dry friction
     stops: tuple[Stop, ...]
     loops: tuple[Row, ...]
     rows: tuple | None  # which rows of the loops are kept, None for all
     roots: tuple  # of each node: the slot of the translation that its tree begins with, or -1
     offsets: tuple | None  # the affine maps from positions of bodies to those of nodes and places, where they are free
     parents: tuple  # of each place: the number of the one that it hangs on, 0 the world, -1 for the world itself
+
+
+class Model(_Fields):
+    """All that is part of the program."""
+
+    def __hash__(self):
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Found once: a run asks for it often, and it is as long as the model."""
+        return tuple.__hash__(self)
+
+    @property
+    def activated(self) -> tuple[int, ...]:
+        """Numbers of the motors with an internal state."""
+        return tuple(i for i, drive in enumerate(self.drives) if drive.activation)
 
 
 class Made(NamedTuple):
@@ -135,7 +156,7 @@ def structure(caller: str, bodies: list[Body]) -> Structure:
         E, x = R @ np.reshape(body.rotation, (3, 3)), x + R @ np.asarray(body.position)
         last = np.zeros(3)  # what of the body's frame the last anchor is
         for number, joint in enumerate(body.joints):
-            name = joint.name or (body.name if number == 0 else f"{body.name}_{number + 1}")
+            name = joint.name or _unnamed(body, number, list(joints))
             if name in joints:
                 raise ValueError(f"{caller}: two joints are named {name!r}.")
             before = len(nodes)
@@ -154,6 +175,15 @@ def structure(caller: str, bodies: list[Body]) -> Structure:
             joints[name] = Made(joint, body, tuple(own[::-1] if joint.kind == "free" else own))
         node_of[body.name], frame_of[body.name] = node, (E, x - E @ last)
     return Structure(nodes, node_of, frame_of, joints)
+
+
+def _unnamed(body: Body, number: int, before: list[str]) -> str:
+    """A name for a joint without one; before: those of the joints before it."""
+    if number == 0:
+        return body.name
+    joint, last = body.joints[number], body.joints[number - 1]
+    spring = joint.stiffness and (joint.kind, joint.axis, joint.anchor) == (last.kind, last.axis, last.anchor)
+    return f"{before[-1]}_spring" if spring else f"{body.name}_{number + 1}"
 
 
 def _simple(joint: Joint):
@@ -184,3 +214,47 @@ def _before(kind: str, E, x, axis, reference: float):
 
 def _numbers(x) -> Any:
     return tuple(tidy(np.asarray(x, float)).ravel().tolist())
+
+
+def numpy_mass_matrix(model: Model, q: Any, params: dict) -> np.ndarray:
+    """M (nv, nv) by NumPy, which compiles nothing, for looking at once.
+
+    M = armature + sum over bodies of m u^T u + a^T I a, with the velocities that unit rates give, u of the centre and a
+    of the turning. q: as in the system, of NumPy arrays.
+    """
+    own = model.tree
+    if own.balls:
+        x, R_free, y_free = q.get("joint"), q.get("free", {}).get("R"), q.get("free", {}).get("x")
+        balls = [*q.get("ball", []), *(R_free if R_free is not None else [])]
+    else:
+        x, balls, y_free = q, [], None
+    R, y, turns, ways = [], [], np.zeros((own.rates, 3)), np.zeros((own.rates, 3))
+    for node in own.nodes:
+        E, d, axis = node.E, np.asarray(node.offset), np.asarray(node.axis)
+        if node.kind == "hinge":
+            EK, EKK = node.turns
+            E = E + np.sin(x[node.slot]) * EK + (1 - np.cos(x[node.slot])) * EKK
+        elif node.kind == "slide":
+            d = d + x[node.slot] * (E @ axis)
+        elif node.kind == "ball":
+            E = E @ balls[node.slot]
+        else:
+            d = d + y_free[node.slot]
+        above, origin = (np.eye(3), np.zeros(3)) if node.parent < 0 else (R[node.parent], y[node.parent])
+        R.append(above @ E)
+        y.append(origin + above @ d)
+        rates = list(node.rates)
+        if node.kind in ("hinge", "ball"):
+            turns[rates] = R[-1] @ axis if node.kind == "hinge" else R[-1].T
+            ways[rates] = np.cross(y[-1], turns[rates])
+        else:
+            ways[rates] = R[-1] @ axis if node.kind == "slide" else np.eye(3)
+    m, c, inertia = (np.asarray(params[name], float) for name in ("mass", "com", "inertia"))
+    M = np.diag(np.asarray(params["armature"], float))
+    for i, body in enumerate(model.bodies):
+        B = R[body.node] @ body.R
+        centre = y[body.node] + R[body.node] @ np.asarray(body.point) + B @ c[i]
+        moves = own.carries[body.node][:, None]
+        a, u = turns * moves, (ways + np.cross(turns, centre)) * moves
+        M = M + m[i] * u @ u.T + a @ (B @ inertia[i] @ B.T) @ a.T
+    return M

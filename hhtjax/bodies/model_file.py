@@ -6,7 +6,7 @@ that is missing something is not run by accident. Names:
     "contact"            bodies that can touch
     "limits"             ranges of joints, unless `limits` says what they are
     "tendon", "flex", "plugin", "fluid", "mocap", "gravcomp"
-    "actuator"           motors of other kinds than `Motor`: muscles, activation, on sites, tendons, balls
+    "actuator"           motors of other kinds than `Motor`: muscles, on sites, tendons, balls
     "equality"           constraints other than connect, weld and joint
     "springyield", "polynomial", "actuatorfrcrange"
     "unphysical"         links of a URDF with an inertia that no body has
@@ -33,6 +33,8 @@ KNOWN = (
     "springyield", "polynomial", "actuatorfrcrange", "unphysical", "massless",
 )  # fmt: skip
 
+SHORTEST = 1e-15  # s, mujoco's mjMINVAL, below which no filter is
+
 CHANGED = "stiffness", "rest", "damping", "armature", "friction", "range"  # fields of joints that a file may lack
 
 
@@ -46,6 +48,7 @@ def load(
     motors: Sequence[Motor] = (),
     loops: Sequence[Connect | Weld | Couple] = (),
     markers: Sequence[Marker] = (),
+    gravity: Any = None,
     friction: str = "dry",
     limits: str | None = None,
     free: Sequence[str] = (),
@@ -55,17 +58,21 @@ def load(
     Args:
         source: path of a file, or its text.
         ignore: names of what acts in the file and is to be left out (see above).
-        base: of a URDF, which does not say it: "fixed" to the world, or "free".
+        base: of a URDF, which does not say it: "fixed" to the world, or "free". A root link named "world" is the world
+            itself: "free" lets the one link loose that is fixed to it.
         joints: what the file does not say of its joints: fields of `Joint` by name, {"elbow": {"friction": 2.0}}; those
             under "*" are of all hinges and slides.
         more: further bodies (`Body`), behind those of the file, such as a payload on the frame of a tool.
         motors, loops, markers: further ones.
+        gravity: (3,), m/s^2, in the place of that of the file; None for the latter, which is (0, 0, -9.81) where the
+            file says nothing, as in mujoco. (The default of `tree` is standard gravity, 9.80665.)
         friction, free: as in `tree`.
         limits: "ignore", "stop" or "event", as in `tree`; None if there are none.
 
     Returns:
         A `Mechanism`, with the names of the file, its positions (`qpos`) as coordinates, and q0 = qpos0.
-        `unsupported` lists what was ignored.
+        `unsupported` lists what was ignored. Motors with an activation (integrator, filter, filterexact) have one here.
+        Their flag `actearly` is about the steps of mujoco, and makes no difference here.
 
     Raises:
         ImportError: mujoco is not installed. FileNotFoundError: no such file.
@@ -97,7 +104,7 @@ def load(
     of_file = _with_changes(parts.bodies(), joints or {})
     return assembled(
         "load", of_file + list(more), parts.motors() + list(motors), parts.loops() + list(loops),
-        parts.markers() + list(markers), parts.gravity, friction,
+        parts.markers() + list(markers), parts.gravity if gravity is None else gravity, friction,
         "ignore" if limits is None and "limits" in ignore else limits, free, unsupported,
     )  # fmt: skip
 
@@ -128,9 +135,9 @@ def _compiled(source: Any, base: str):
     if root.tag not in ("robot", "mujoco"):
         raise ValueError(f"load: `source` must be MJCF (mujoco) or URDF (robot); its root is {root.tag!r}.")
     acting = []
+    if base == "free":
+        _require_one_root(root)
     try:
-        if root.tag == "mujoco" and base == "free":
-            raise ValueError("`base` is for URDF; MJCF says itself what is free.")
         if root.tag == "mujoco":
             spec = mujoco.MjSpec.from_file(os.fspath(source)) if folder else mujoco.MjSpec.from_string(text)
         else:
@@ -141,6 +148,19 @@ def _compiled(source: Any, base: str):
         return spec.compile(), acting
     except ValueError as error:
         raise ValueError(f"load: mujoco cannot read `source`: {error}") from None
+
+
+def _require_one_root(root):
+    """An error for a root link "world" that carries more than one fixed link: mujoco makes it the world itself."""
+    if root.tag == "mujoco":
+        raise ValueError('load: `base` is for URDF; MJCF says itself what is free; received "free".')
+    held = [joint for joint in root.iter("joint") if getattr(joint.find("parent"), "attrib", {}).get("link") == WORLD]
+    if len(held) > 1 or any(joint.get("type") != "fixed" for joint in held):
+        names = _some([f"{joint.get('name')} ({joint.get('type')})" for joint in held])
+        raise ValueError(
+            f'load: `base` is "free", and the root link of the URDF is "world", which does not move: only one link '
+            f"that is fixed to it can be let loose; it carries the joints {names}. Rename the link."
+        )
 
 
 def _mujoco() -> Any:
@@ -276,21 +296,28 @@ def _off(flags: int, *names: str) -> bool:
 
 def _can_touch(m) -> bool:
     """Whether two shapes of different bodies may collide, by their bits and by whose parent is whose."""
-    geoms = [i for i in range(m.ngeom) if m.geom_contype[i] or m.geom_conaffinity[i]]
     filtered = not _off(m.opt.disableflags, "FILTERPARENT")
-    excluded = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in m.exclude_signature}
-    for k, i in enumerate(geoms):
-        for j in geoms[k + 1 :]:
-            a, b = m.geom_bodyid[i], m.geom_bodyid[j]
-            wa, wb = m.body_weldid[a], m.body_weldid[b]
-            meets = (m.geom_contype[i] & m.geom_conaffinity[j]) | (m.geom_contype[j] & m.geom_conaffinity[i])
-            if not meets or wa == wb or tuple(sorted((int(a), int(b)))) in excluded:
-                continue
-            above = m.body_weldid[m.body_parentid[wa]], m.body_weldid[m.body_parentid[wb]]
-            if filtered and (wa and wb) and (above[0] == wb or above[1] == wa):
-                continue  # a parent and its child
+    excluded = [_pair(int(s) >> 16, int(s) & 0xFFFF) for s in m.exclude_signature]
+    shapes = np.stack([m.geom_contype, m.geom_conaffinity, m.geom_bodyid], axis=1).astype(np.int64)
+    shapes = np.unique(shapes[(shapes[:, :2] != 0).any(axis=1)], axis=0)
+    kinds, likes, body = shapes.T
+    fixed = m.body_weldid[body]
+    above = m.body_weldid[m.body_parentid[fixed]]
+    for i in range(len(shapes) - 1):
+        later = slice(i + 1, None)
+        meets = ((kinds[i] & likes[later]) | (kinds[later] & likes[i])) != 0
+        meets &= (fixed[later] != fixed[i]) & ~np.isin(_pair(body[i], body[later]), excluded)
+        if filtered:  # a parent and its child, but for the world
+            related = (above[i] == fixed[later]) | (above[later] == fixed[i])
+            meets &= ~(related & (fixed[i] != 0) & (fixed[later] != 0))
+        if meets.any():
             return True
     return False
+
+
+def _pair(a: Any, b: Any) -> Any:
+    """A number for two bodies, whichever comes first."""
+    return np.minimum(a, b) * 65536 + np.maximum(a, b)
 
 
 def _num_actuators(m) -> int:
@@ -325,8 +352,8 @@ def _strangeness(m, i: int) -> str | None:
         return "not on a joint"
     if m.jnt_type[m.actuator_trnid[i, 0]] not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
         return "on a ball or free joint"
-    if m.actuator_dyntype[i] != int(mujoco.mjtDyn.mjDYN_NONE):
-        return "with an activation"
+    if m.actuator_dyntype[i] not in _activations():
+        return f"with the activation {mujoco.mjtDyn(m.actuator_dyntype[i]).name.removeprefix('mjDYN_').lower()}"
     if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED):
         return "its gain is not fixed"
     if m.actuator_biastype[i] not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
@@ -336,6 +363,13 @@ def _strangeness(m, i: int) -> str | None:
         if values is not None and np.any(values[i]):
             return name.replace("actuator_", "with ")
     return None
+
+
+def _activations() -> dict:
+    """Of the numbers that mujoco has for them, those that `Motor` has."""
+    kinds = _mujoco().mjtDyn
+    known = kinds.mjDYN_NONE, kinds.mjDYN_INTEGRATOR, kinds.mjDYN_FILTER, kinds.mjDYN_FILTEREXACT
+    return dict(zip(map(int, known), (None, "integrator", "filter", "filter"), strict=True))
 
 
 def _name_of(m, kind: str, i: int) -> str:
@@ -430,11 +464,14 @@ class _Reader:
             kind, gain = "velocity", 1.0
         clamps = not _off(m.opt.disableflags, "CLAMPCTRL")
         k = m.actuator_ctrladr[i] if hasattr(m, "actuator_ctrladr") else i
+        activation = _activations()[int(m.actuator_dyntype[i])]
         return Motor(
             self.joint_names[m.actuator_trnid[i, 0]], kind, _gear(m, i), gain, kp, kv, b0,
             tuple(m.actuator_ctrlrange[k]) if m.actuator_ctrllimited[k] and clamps else None,
             tuple(m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else None,
-            self.name("actuator", i),
+            self.name("actuator", i), activation,
+            max(float(m.actuator_dynprm[i, 0]), SHORTEST) if activation == "filter" else None,
+            tuple(m.actuator_actrange[i]) if activation and m.actuator_actlimited[i] else None,
         )  # fmt: skip
 
     def loops(self) -> list:

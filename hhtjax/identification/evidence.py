@@ -49,7 +49,7 @@ def residuals_of(result: FitResult) -> Residuals:
         r, w = np.asarray(leaf, float), np.asarray(weight, float)
         axis = time_axis(r.shape, result.starts is not None)
         r, w = (np.moveaxis(np.atleast_1d(x), axis, 0) for x in (r, w))
-        r, w = (x.reshape(len(x), -1) for x in (r, w))
+        r, w = (x.reshape(len(x), math.prod(x.shape[1:])) for x in (r, w))  # leaves may be empty
         names.append(jax.tree_util.keystr(path, simple=True, separator="."))
         plain.append(r)
         present.append(w != 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import evaluate, require_function
-from hhtjax.description import Array, PyTree, Real
+from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import FitResult
 from hhtjax.systems.flat_system import flatten
@@ -28,6 +29,7 @@ from hhtjax.systems.system import (
 
 ARGUMENTS = set(inspect.signature(fit).parameters) - {"params0"}
 SLOW = 0.02  # part of the largest sliding velocity, below which a place may stick for all that a record tells
+NOISE = 3.0  # standard deviations of the noise of a sliding velocity, below which it may stick, too
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
 
@@ -44,8 +46,10 @@ def equation_error(
 
     Of a `FirstOrderSystem` y' - f(y, t, params), for a measured y.
 
-    With dry friction it holds H^T F sign(s) too, and rows are 0 where something slides slower than a fiftieth of its
-    largest velocity, as it may stick there.
+    With dry friction it holds H^T F sign(s) too. Where something may stick its friction is not known, and the rows that
+    it enters are left out: they count as no samples. It may stick where it slides slower than a fiftieth of its largest
+    velocity, or than three standard deviations of the noise of its velocity. That noise is taken to be white, as large
+    as what the values hold above the cutoff.
 
     Nothing is simulated, and most parameters enter linearly: so the fit converges from anywhere, and its estimate is a
     start for the fit through the simulation. It is no more than that, because noise and filter bias it.
@@ -60,10 +64,13 @@ def equation_error(
             has to stay well below half the sampling rate of the sparsest part.
 
     Returns:
-        A function of params, whose result is (samples without both ends, n), in units of force.
+        A function of params, whose result is (samples without both ends, n), in units of force. With dry friction it is
+        a list of n arrays, the rows of each coordinate that are left. Where `sliding` reads params, or the values are
+        traced, which rows these are is not known before: they are 0 then, and count.
 
     Raises:
-        TypeError, ValueError: what is no system; as `band_limited_motion` and `sampled`; no samples between the ends.
+        TypeError, ValueError: what is no system; as `band_limited_motion` and `sampled`; no samples between the ends;
+            nothing that slides.
         NotImplementedError: a system with constraints or internal states; when called, with rotations.
 
     >>> import jax.numpy as jnp, hhtjax
@@ -84,7 +91,7 @@ def equation_error(
     motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)
     q, v, a = jax.tree.transpose(jax.tree.structure(values), jax.tree.structure((0, 0, 0)), motion)
     samples = jax.tree.leaves(q)[0].shape[0]
-    left_out = int(jnp.ceil(MARGIN / (cutoff * dt)))
+    left_out = math.ceil(MARGIN / float(cutoff * dt))
     if samples <= 2 * left_out:
         raise ValueError(
             f"equation_error: `values` must have more than {2 * left_out} samples, because at both ends a period of "
@@ -92,39 +99,87 @@ def equation_error(
         )
     t = t0 + jnp.linspace(0, dt * (samples - 1), samples)
     inside = jax.tree.map(lambda y: y[left_out : samples - left_out], (q, v, a, t))
+    rubs = getattr(system, "friction", None) is not None
+    noise = _noise_of_rates(values, q, float(cutoff * dt)) / dt if rubs else None
+    kept = _rows_that_slide(system, inside, noise) if rubs else None
 
-    def residuals(params: PyTree) -> Array:
+    def residuals(params: PyTree) -> Any:
         def one(q: PyTree, v: PyTree, a: PyTree, t: Array) -> Array:
             _require_no_rotations(system, q, t, params)
             flat, x, rate = flatten("equation_error", system, q, v, t, params)
             t = t.astype(rate.dtype)
             left = flat.residual(x, rate, ravel_pytree(a if flat.positions else v)[0], t, params)
-            return left if slowest is None else _with_sliding(flat, left, slowest, x, rate, t, params)
+            return _with_friction(flat, left, x, rate, t, params) if rubs else left
 
-        slowest = None if getattr(system, "friction", None) is None else SLOW * _largest_sliding(system, inside, params)
-        return jax.vmap(one)(*inside)
+        rows = jax.vmap(one)(*inside)
+        if not rubs:
+            return rows
+        if kept is not None:
+            return [column[numbers] for column, numbers in zip(rows.T, kept, strict=True)]
+        return list(jnp.where(_slides(system, inside, noise, params), rows, 0).T)
 
     return residuals
 
 
-def _largest_sliding(system, motion: tuple, params: PyTree) -> Array:
-    """Of each place that rubs, the largest sliding velocity of a motion: (m,)."""
-
-    def one(q: PyTree, v: PyTree, t: Array) -> Array:
-        flat, x, rate = flatten("equation_error", system, q, v, t, params)
-        return jnp.abs(flat.friction.sliding(x, rate, t.astype(rate.dtype), params))
-
-    q, v, _, t = motion
-    return jnp.max(jax.vmap(one)(q, v, t), axis=0)
-
-
-def _with_sliding(flat, left: Array, slowest: Array, q: Array, v: Array, t: Array, params: PyTree) -> Array:
-    """The rows with H^T tau, tau = F sign(s); 0 where something enters that is slower than `slowest`, and may stick."""
+def _with_friction(flat, left: Array, q: Array, v: Array, t: Array, params: PyTree) -> Array:
+    """The rows with H^T tau, tau = F sign(s)."""
     s, H = flat.friction.sliding(q, v, t, params), directions(flat, q, t, params)
-    fast = jnp.abs(s) > slowest
-    tau = flat.friction.limit(q, v, None, t, params) * jnp.where(fast, jnp.sign(s), 0)
-    slow = jnp.where(fast, 0.0, 1.0).astype(s.dtype)
-    return jnp.where(jnp.abs(H).T @ slow > 0, 0, left + H.T @ tau)
+    return left + H.T @ (flat.friction.limit(q, v, None, t, params) * jnp.sign(s))
+
+
+def _noise_of_rates(values: PyTree, smooth: PyTree, cutoff: float) -> Array:
+    """Standard deviation of the noise of rates below the cutoff, by what is above, times the sampling period: (n,).
+
+    cutoff: in cycles a sample. White noise sigma has the part sqrt(1 - 2 cutoff) of it above the cutoff, and gives a
+    rate of 2 pi cutoff sqrt(2 cutoff/3) sigma below it.
+    """
+
+    def rms(y: Real, smooth: Array) -> Array:
+        return jnp.sqrt(jnp.mean((jnp.asarray(y) - smooth) ** 2, axis=0)).ravel()
+
+    sizes = jnp.concatenate(jax.tree.leaves(jax.tree.map(rms, values, smooth)))
+    above = max(1 - 2 * cutoff, 1e-12)  # with a cutoff at half the sampling rate nothing tells
+    return sizes * float(2 * np.pi * cutoff * np.sqrt(2 * cutoff / 3 / above))
+
+
+class _NotKnown:
+    """In the place of params: an error where they are read."""
+
+    def __getattr__(self, name: str):
+        raise TypeError("the params are not known yet")
+
+    __getitem__ = __iter__ = __bool__ = __len__ = __getattr__
+
+
+def _rows_that_slide(system, motion: tuple, noise: Real) -> list | None:
+    """Numbers of the samples of each row into which nothing enters that may stick; None where params decide that."""
+    if not all(map(is_concrete, jax.tree.leaves((motion, noise)))):
+        return None
+    try:
+        slides = np.asarray(jax.jit(lambda motion: _slides(system, motion, noise, _NotKnown()))(motion))
+    except Exception:  # whatever a user's function does with params that are none; it is called again with some
+        return None
+    if not slides.any():
+        raise ValueError("equation_error: `values` must slide somewhere where `system` has dry friction; nothing does.")
+    return [np.flatnonzero(column) for column in slides.T]
+
+
+def _slides(system, motion: tuple, noise: Real, params: PyTree) -> Array:
+    """Whether nothing that enters a row is so slow that it may stick: (samples, n)."""
+    q, v, _, t = motion
+
+    def one(q: PyTree, v: PyTree, t: Array):
+        rate, unravel = ravel_pytree(v)
+
+        def sliding(rate: Array) -> Array:
+            return rate if system.sliding is None else jnp.asarray(system.sliding(q, unravel(rate), t, params))
+
+        return jnp.abs(sliding(rate)), jnp.abs(jax.jacfwd(sliding)(rate))
+
+    s, H = jax.vmap(one)(q, v, t)
+    of_noise = jnp.sqrt(jnp.sum((H * noise[None, None, :]) ** 2, axis=-1))
+    slow = s <= jnp.maximum(SLOW * jnp.max(s, axis=0)[None, :], NOISE * of_noise)
+    return ~jnp.any(slow[:, :, None] & (H > 0), axis=1)
 
 
 def _require_no_rotations(system, q: PyTree, t: Array, params: PyTree):

@@ -4,7 +4,8 @@
     base_parameters         the combinations of inertial parameters that a motion can tell
     excitation              a periodic motion whose regressor is well conditioned, found by gradient
 
-A fit begins with `equation_error`, which simulates nothing, and ends through the step with `fit`.
+A fit begins with `equation_error`, which simulates nothing, and ends through the step with `fit`. An example, from a
+model file to friction with its interval, is in `hhtjax.bodies`.
 """
 
 from __future__ import annotations

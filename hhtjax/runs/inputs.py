@@ -30,6 +30,7 @@ from hhtjax.runs.driver import equal_steps
 from hhtjax.runs.event_step import nearness
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 from hhtjax.systems import zero_order_hold
+from hhtjax.systems.affine import require_affine
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, require_consistent, with_known_rows
@@ -77,6 +78,7 @@ class Problem(NamedTuple):
         require_number(caller, "t0", t0, np.isfinite, "be finite")
         q0, v0, z0 = initial_values(caller, system, q0, v0, z0, level=4)
         require_capable(caller, system, stepper, q0, v0)
+        require_affine(caller, system, q0, v0, t0, params, z0)
         if system.friction is not None:
             system = with_known_rows(caller, system, q0, v0, t0, params, z0)
         if system.constraint is not None:

@@ -48,10 +48,11 @@ class System(Description):
 
                 r(q, v, w, t) = M(q, t) w - Q(q, v, t)
 
-            It must be affine in w. The implicit steps then call nothing else, and take its slopes by `jax.jacfwd`, or
-            by the rule that it brings (`jax.custom_jvp`). Where M or Q is asked for alone, at a start or by an explicit
-            method, M is its slope in w and Q is -r(q, v, 0, t); `mass` may be given beside it where it is known with
-            fewer operations. With internal states it is `dynamics(q, v, w, z, t, params)`.
+            It must be affine in w; a start with known numbers looks at that, once. The implicit steps then call nothing
+            else, and take its slopes by `jax.jacfwd`, or by the rule that it brings (`jax.custom_jvp`). Where M or Q is
+            asked for alone, at a start or by an explicit method, M is its slope in w and Q is -r(q, v, 0, t); `mass`
+            may be given beside it where it is known with fewer operations. With internal states it is `dynamics(q, v,
+            w, z, t, params)`.
         internal: g, the rate of internal states z of first order, such as the current of a motor, the integral of a
             controller, hysteresis, or a Maxwell branch: `internal(q, v, z, t, params)`, a pytree structured like z,
             of any shapes. The force is then `force(q, v, z, t, params)`, and runs take a `z0`:
