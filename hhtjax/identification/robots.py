@@ -245,10 +245,15 @@ def excitation(
     iterations: int = 200,
     seed: int = 0,
 ) -> Excitation:
-    """A periodic motion of all joints whose regressor is well conditioned, found by gradient (L-BFGS).
+    """A periodic motion of all joints whose regressor is large and well conditioned, found by gradient (L-BFGS).
 
-    The cost is the logarithm of the condition number of the regressor along the motion, its columns scaled to one
-    length, with a penalty on what leaves the ranges.
+    The regressor Y along the motion gives torques from parameters. With its columns y_j scaled to one length, and p
+    of them, the cost is
+
+        log cond(Y) - (1/p) sum_j log |y_j|,
+
+    with a penalty on what leaves the ranges. The first term tells parameters apart, the second lifts them out of the
+    noise: without it the motion is slow and small.
 
     Args:
         robot: a `Mechanism` of hinges and slides.
@@ -288,7 +293,7 @@ def excitation(
         return Fourier(centre, a, b, jnp.asarray(float(period)))
 
     def values(x: Real):
-        """Singular values of the scaled regressor, and by how much ranges are left."""
+        """Singular values of the scaled regressor, the mean logarithm of its columns, how much ranges are left."""
         q, v, w = jax.vmap(trajectory(x).motion)(t)
         Y = jax.vmap(lambda q, v, w: regressor(robot, q, v, w))(q, v, w)[..., base.independent]
         Y = Y.reshape(-1, base.count)
@@ -296,11 +301,11 @@ def excitation(
         sigma = jnp.linalg.svd(Y / size[None, :], compute_uv=False)
         parts = [y / limit[None, :] for y, limit in zip((q - centre[None, :], v, w), limits, strict=True)]
         beyond = sum(jnp.mean(jnp.maximum(jnp.abs(y) - 0.97, 0) ** 2) for y in parts)
-        return sigma, beyond
+        return sigma, jnp.mean(jnp.log(size)), beyond
 
     def cost(x: Real):
-        sigma, beyond = values(x)
-        return jnp.log(sigma[0] / sigma[-1]) + 1e4 * beyond
+        sigma, size, beyond = values(x)
+        return jnp.log(sigma[0] / sigma[-1]) - size + 1e4 * beyond
 
     rng = np.random.default_rng(seed)
     x0 = rng.normal(size=2 * harmonics * n)
