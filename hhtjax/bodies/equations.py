@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax import rotation
+from hhtjax.bodies.arguments import require_params, require_position, require_rates, require_shape
 from hhtjax.bodies.model import Model, Row, Stop
 from hhtjax.bodies.newton_euler import (
     Inertia,
@@ -210,7 +211,10 @@ class ActivatedDynamics:
 def residual(model: Model, q: PyTree, v: PyTree, w: PyTree, z: Array | None, t: Real, params: PyTree) -> PyTree:
     """What `Dynamics` gives."""
     tree = model.tree
-    _require_read(model, params)
+    require_params(model, params)
+    require_position(tree, q)
+    for name, x in (("v", v), ("w", w)):
+        require_rates(tree, name, x)
     dv, dw = rates(tree, v), rates(tree, w)
     p = position(tree, q)
     r = inverse_dynamics(tree, p, dv, dw, inertia_of(model, params), params["gravity"], offsets_of(model, params))
@@ -235,19 +239,6 @@ class Activation:
         return rate - (z - _clipped(z, [drive.actrange for drive in drives])) / DRAWN_BACK
 
 
-def _require_read(model: Model, params: PyTree):
-    """An error for params that would be ignored."""
-    if "position" in params and model.offsets is None:
-        raise ValueError('params["position"] is not read: make the mechanism with free=("position",).')
-    if "ctrl" in params and not model.drives:
-        raise ValueError('params["ctrl"] is not read: the mechanism has no motors.')
-    if "frictionloss" in params and not model.rubbing:
-        raise ValueError(
-            'params["frictionloss"] is not read: no joint rubs. Make the mechanism with `friction` of a joint above 0, '
-            'and with friction="dry".'
-        )
-
-
 @dataclass(frozen=True)
 class Mass:
     """M(q), (nv, nv), with the armature."""
@@ -256,6 +247,8 @@ class Mass:
 
     def __call__(self, q: PyTree, params: PyTree) -> Array:
         tree = self.model.tree
+        require_params(self.model, params)
+        require_position(tree, q)
         M = mass_matrix(tree, position(tree, q), inertia_of(self.model, params), offsets_of(self.model, params))
         return M + params["armature"][:, None] * np.eye(tree.rates, dtype=M.dtype)
 
@@ -300,7 +293,9 @@ def applied(model: Model, q: PyTree, p: Position, v: Array, z: Array | None, t: 
     for k, spring in enumerate(model.springs):
         force = sprung(model, spring, params["spring_stiffness"][k], p, force)
     if "torque" in params:
-        force = force + rates(tree, at_time(params["torque"], t))
+        torque = at_time(params["torque"], t)
+        require_rates(tree, 'params["torque"]', torque)
+        force = force + rates(tree, torque)
     if "wrench" in params:
         force = force + wrenches(model, q, t, params)
     return force
@@ -373,7 +368,8 @@ def wrenches(model: Model, q: PyTree, t: Real, params: PyTree) -> Array:
         if name not in names:
             raise ValueError(f'params["wrench"] must be on bodies or markers, {", ".join(names)}; received {name!r}.')
         i = names.index(name)
-        one, wrench = model.places[i], at_time(wrench, t)
+        one, wrench = model.places[i], jnp.asarray(at_time(wrench, t), force.dtype)
+        require_shape(f'params["wrench"]["{name}"]', wrench, (6,))
         if one.node < 0:
             continue
         x = placed.y[one.node] + apply(

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hhtjax.bodies.arguments import require_activations, require_params, require_position, require_rates
 from hhtjax.bodies.equations import (
     Frame,
     Mass,
@@ -26,19 +27,31 @@ from hhtjax.description import Array, PyTree, Real
 UPPER = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # entries of a tensor, as in theta
 
 
+def _known(caller: str, robot: Mechanism, params: PyTree, q: PyTree, **rates_given: PyTree):
+    """The model and the params, after a look at all arguments."""
+    if not isinstance(robot, Mechanism):
+        raise TypeError(f"{caller}: `robot` must be a Mechanism, by `tree` or `load`; received {type(robot).__name__}.")
+    params = robot.params if params is None else params
+    require_params(robot.model, params)
+    require_position(robot.model.tree, q)
+    for name, value in rates_given.items():
+        require_rates(robot.model.tree, name, value)
+    return robot.model, params
+
+
 def inverse_dynamics(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> PyTree:
     """What the joints must exert for the accelerations w: M(q) w + bias(q, v), with armature, gravity and nothing else.
 
     Args: robot: a `Mechanism`. q, v, w: as in its system. params: None for its own.
     Returns: structured like v, N m and N.
-    Raises: KeyError: params without an entry.
+    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
 
     >>> from hhtjax.bodies import Body, Joint, inverse_dynamics, tree
     >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
     >>> inverse_dynamics(rod, jnp.zeros(1), jnp.zeros(1), jnp.ones(1)).round(4).tolist()            # m l^2/3 - m g l/2
     [-13.71]
     """
-    model, params = robot.model, robot.params if params is None else params
+    model, params = _known("inverse_dynamics", robot, params, q, v=v, w=w)
     tree, dw = model.tree, rates(robot.model.tree, w)
     r = of_tree(
         tree,
@@ -57,14 +70,15 @@ def mass_matrix(robot: Mechanism, q: PyTree, params: PyTree = None) -> Array:
 
     Args: robot: a `Mechanism`. q: as in its system. params: None for its own.
     Returns: (nv, nv).
-    Raises: KeyError: params without an entry.
+    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
 
     >>> from hhtjax.bodies import Body, Joint, mass_matrix, tree
     >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
     >>> mass_matrix(rod, jnp.zeros(1)).round(6).tolist()                                                     # m l^2/3
     [[1.0]]
     """
-    return Mass(robot.model)(q, robot.params if params is None else params)
+    model, params = _known("mass_matrix", robot, params, q)
+    return Mass(model)(q, params)
 
 
 def frames(robot: Mechanism, q: PyTree, params: PyTree = None) -> dict[str, Frame]:
@@ -72,13 +86,14 @@ def frames(robot: Mechanism, q: PyTree, params: PyTree = None) -> dict[str, Fram
 
     Args: robot: a `Mechanism`. q: as in its system. params: None for its own.
     Returns: a dict, {name: Frame(R, x)}.
-    Raises: KeyError: params without an entry.
+    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
 
     >>> from hhtjax.bodies import Body, Joint, frames, tree
     >>> rod = Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], position=[0, 0, 2])
     >>> frames(tree([rod]), jnp.zeros(1))["rod"].x.tolist()
     [0.0, 0.0, 2.0]
     """
+    _known("frames", robot, params, q)
     return robot.frames(q, params)
 
 
@@ -89,15 +104,18 @@ def forces(
 
     Args: robot: a `Mechanism`. q, v: as in its system. t: s. params: None for its own. z: activations, None for z0.
     Returns: structured like v.
-    Raises: KeyError: params without an entry. ValueError: a wrench on what is no body.
+    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape; a wrench
+        on what is no body.
 
     >>> from hhtjax.bodies import Body, Joint, forces, tree
     >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0], damping=0.2), mass=3.0, com=[0.5, 0, 0])])
     >>> forces(rod, jnp.zeros(1), jnp.ones(1)).tolist()
     [-0.2]
     """
-    model, params = robot.model, robot.params if params is None else params
-    p, z = position(model.tree, q), robot.z0 if z is None else z
+    model, params = _known("forces", robot, params, q, v=v)
+    z = robot.z0 if z is None else z
+    require_activations(model, z)
+    p = position(model.tree, q)
     return as_rates(model.tree, applied_forces(model, q, p, rates(model.tree, v), z, t, params))
 
 
@@ -110,7 +128,7 @@ def regressor(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree 
 
     Args: robot: a `Mechanism`. q, v, w: as in its system. params: for gravity and free positions, None for its own.
     Returns: (nv, 10 nb), bodies in the order of `Mechanism.bodies`.
-    Raises: KeyError: params without an entry.
+    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
 
     >>> from hhtjax.bodies import Body, Joint, inertial_parameters, regressor, tree
     >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
@@ -118,7 +136,7 @@ def regressor(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree 
     >>> Y.shape, (Y @ inertial_parameters(rod.params)).round(2).tolist()                    # m l^2/3 - m g l/2
     ((1, 10), [-13.71])
     """
-    model, params = robot.model, robot.params if params is None else params
+    model, params = _known("regressor", robot, params, q, v=v, w=w)
     tree, nb = model.tree, len(model.bodies)
     dv, dw, p = rates(tree, v), rates(tree, w), position(tree, q)
 
@@ -134,7 +152,7 @@ def inertial_parameters(params: PyTree) -> Array:
 
     Args: params: those of a `Mechanism`.
     Returns: (10 nb,).
-    Raises: KeyError: params without an entry.
+    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
 
     >>> import jax.numpy as jnp
     >>> params = {"mass": jnp.array([2.0]), "com": jnp.array([[0.1, 0, 0]]), "inertia": jnp.eye(3)[None]}

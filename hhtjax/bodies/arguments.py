@@ -1,0 +1,140 @@
+"""What users give to the functions of a mechanism: positions, rates and params of the right shapes, or an error.
+
+Shapes are known while a program is traced, so this costs nothing when it runs. Without it a number too few would be
+broadcast, and the result wrong without a word.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.bodies.model import Model
+from hhtjax.bodies.tree import Tree
+from hhtjax.checks import describe
+from hhtjax.description import PyTree
+
+SIMILAR = 0.8  # from which on a name is a misspelling of another
+
+
+def require_position(tree: Tree, q: PyTree):
+    """An error for q of another shape."""
+    _require("q", q, _shapes(tree, (3, 3)))
+
+
+def require_rates(tree: Tree, name: str, v: PyTree):
+    """The same for v, w, and a torque; name: of the argument."""
+    _require(name, v, _shapes(tree, (3,)))
+
+
+def require_activations(model: Model, z: PyTree):
+    """The same for z."""
+    number = len(model.activated)
+    if number:
+        _require("z", z, (number,))
+    elif z is not None:
+        raise ValueError(f"z must be None: no motor of the mechanism has an activation; received {np.shape(z)}.")
+
+
+def require_params(model: Model, params: PyTree):
+    """An error for entries of another shape, for what would be ignored, and for names that look misspelt.
+
+    Other names pass: a force of the user's own may read them.
+    """
+    if not isinstance(params, dict):
+        raise TypeError(f"params must be a dict, as `Mechanism.params`; received {type(params).__name__}.")
+    known = entries(model)
+    for name, value in params.items():
+        if name in known:
+            if known[name] is None:
+                raise ValueError(f'params["{name}"] is not read: {UNREAD[name]}')
+            if not callable(value):
+                _require(f'params["{name}"]', value, known[name])
+        elif name not in OTHERS:
+            near = get_close_matches(str(name), [*known, *OTHERS], 1, SIMILAR)
+            if near:
+                raise ValueError(f'params["{name}"] is not read; did you mean "{near[0]}"?')
+
+
+OTHERS = "torque", "wrench", "restitution"  # which are looked at where they are read
+UNREAD = {
+    "position": 'make the mechanism with free=("position",).',
+    "ctrl": "the mechanism has no motors.",
+    "timeconst": "no motor of the mechanism is a filter.",
+    "frictionloss": 'no joint rubs. Make the mechanism with `friction` of a joint above 0, and with friction="dry".',
+    "stop_stiffness": 'make the mechanism with limits="stop", and joints with a `range`.',
+    "stop_damping": 'make the mechanism with limits="stop", and joints with a `range`.',
+    "spring_stiffness": "no ball and no free joint has a `stiffness`.",
+    **dict.fromkeys(("gear", "gain", "kp", "kv", "offset"), "the mechanism has no motors."),
+}
+
+
+def entries(model: Model) -> dict[str, tuple | None]:
+    """The shape of each entry of params; None: not read."""
+    tree, bodies, motors = model.tree, len(model.bodies), len(model.drives)
+    filters = any(drive.activation == "filter" for drive in model.drives)
+
+    def some(number: int | bool, shape: tuple):
+        return shape if number else None
+
+    return {
+        "mass": (bodies,),
+        "com": (bodies, 3),
+        "inertia": (bodies, 3, 3),
+        "gravity": (3,),
+        "damping": (tree.rates,),
+        "armature": (tree.rates,),
+        "stiffness": (tree.scalars,),
+        "springref": (tree.scalars,),
+        **{name: some(motors, (motors,)) for name in ("gear", "gain", "kp", "kv", "offset", "ctrl")},
+        "timeconst": some(filters, (motors,)),
+        "frictionloss": some(len(model.rubbing), (len(model.rubbing),)),
+        "position": some(model.offsets is not None, (_positions(model), 3)),
+        "spring_stiffness": some(len(model.springs), (len(model.springs),)),
+        "stop_stiffness": some(len(model.stops), (len(model.stops),)),
+        "stop_damping": some(len(model.stops), (len(model.stops),)),
+    }
+
+
+def _positions(model: Model) -> int:
+    if model.offsets is None:
+        return 0
+    constant, slope = (np.asarray(x) for x in model.offsets[0])
+    return slope.size // constant.size // 3
+
+
+def _shapes(tree: Tree, of_rotation: tuple) -> PyTree:
+    if not tree.balls:
+        return (tree.scalars,)
+    n, f = tree.balls - tree.frees, tree.frees
+    shapes: dict = {"ball": (n, *of_rotation)} if n else {}
+    if f:
+        shapes["free"] = {"R": (f, *of_rotation), "x": (f, 3)}
+    if tree.scalars:
+        shapes["joint"] = (tree.scalars,)
+    return shapes
+
+
+def _require(name: str, value: PyTree, expected: PyTree):
+    """An error for a value that is not of these shapes."""
+    if isinstance(expected, dict):
+        if not isinstance(value, dict) or set(value) != set(expected):
+            words = ", ".join(repr(key) for key in expected)
+            received = sorted(value) if isinstance(value, dict) else type(value).__name__
+            raise ValueError(f"{name} must be a dict with {words}; received {received}.")
+        for key, inside in expected.items():
+            _require(f'{name}["{key}"]', value[key], inside)
+        return
+    require_shape(name, value, expected)
+
+
+def require_shape(name: str, value: PyTree, expected: tuple):
+    """An error for what is no array of this shape."""
+    try:
+        shape = jnp.shape(value)
+    except TypeError:
+        shape = None
+    if shape != expected:
+        raise ValueError(f"{name} must be an array of shape {expected}; received {describe(value)}.")
