@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.bodies import Body, Connect, Joint, Mechanism, Motor, denavit_hartenberg, tree
@@ -23,13 +25,24 @@ ALONG = 1, 0, 0, 1, 1, 2  # axis of each cylinder in its frame
 
 
 class Case(NamedTuple):
-    """A mechanism in both forms, a start, a length, and what it is."""
+    """A mechanism in both forms, a start, a length, and what it is.
+
+    springs: the coordinates of elastic joints, whose torques are compared; stiffness: theirs, N m/rad.
+    """
 
     words: str
     robot: Mechanism
     text: str
     q0: np.ndarray
+    v0: np.ndarray
     duration: float
+    springs: tuple = ()
+    stiffness: float = 0.0
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether set points move."""
+        return callable(self.robot.params.get("ctrl"))
 
 
 def cylinder(mass, radius, length, axis):
@@ -81,31 +94,43 @@ def mjcf(bodies, motors=(), loops=(), controls=(), gravity=GRAVITY) -> str:
 
 
 def made(words, bodies, q0, duration, motors=(), loops=(), ctrl=None) -> Case:
-    """Both forms; ctrl: set points, constant."""
+    """Both forms, at rest; ctrl: set points, constant."""
     robot = tree(bodies, motors=motors, loops=loops, gravity=GRAVITY)
     if ctrl is not None:
         robot.params["ctrl"] = np.asarray(ctrl, float)
-    return Case(words, robot, mjcf(bodies, motors, loops), np.asarray(q0, float), duration)
+    start = np.asarray(robot.q0) + np.asarray(q0, float)  # those with loops have been closed
+    return Case(words, robot, mjcf(bodies, motors, loops), start, np.zeros_like(start), duration)
 
 
-def ur5() -> Case:
-    """The arm on position servos, sent from one pose to another."""
+def ur5(smooth: bool = False) -> Case:
+    """The arm on position servos, sent from one pose to another: at once, or, smooth, along set points in 1 s."""
     inertia = [cylinder(m, *size, axis) for m, size, axis in zip(MASSES, SIZES, ALONG, strict=True)]
     bodies = denavit_hartenberg(UR5, mass=MASSES, com=CENTRES, inertia=inertia, armature=[0.5, 0.5, 0.5, 0.1, 0.1, 0.1])
     kp = np.array([2000.0, 2000.0, 2000.0, 500.0, 500.0, 500.0])
     motors = [Motor(f"joint{i + 1}", "position", kp=k, kv=0.1 * k) for i, k in enumerate(kp)]
-    return made(
-        "UR5 on servos, 6 joints",
-        bodies,
-        [0.0, -1.2, 1.4, -0.4, 0.5, 0.2],
-        2.0,
-        motors,
-        ctrl=[0.6, -0.9, 1.0, 0.1, 0.0, -0.3],
-    )
+    q0, there = np.array([0.0, -1.2, 1.4, -0.4, 0.5, 0.2]), np.array([0.6, -0.9, 1.0, 0.1, 0.0, -0.3])
+    words = f"UR5 on servos, set points that {'move smoothly' if smooth else 'jump'}"
+    case = made(words, bodies, q0, 2.0, motors, ctrl=there)
+    if smooth:
+        zero = jnp.zeros(len(q0))
+        held = case.robot.system.dynamics(jnp.asarray(q0), zero, zero, 0.0, case.robot.params)
+        here = there + held / kp  # at rest there
+        case.robot.params["ctrl"] = jax.tree_util.Partial(along, here, jnp.asarray(there))
+    return case
+
+
+def along(here, there, t):
+    """From one place to another in 1 s, with rates and accelerations that begin and end with zero."""
+    s = jnp.clip(t, 0.0, 1.0)
+    return here + (there - here) * s**3 * (10 - 15 * s + 6 * s**2)
 
 
 def flexible(stiffness: float, ringing: bool) -> Case:
-    """Two links on flexible joints: hinges of motors with armature, springs behind them; from rest, or let go bent."""
+    """Two links on flexible joints: hinges of motors with armature, springs behind them.
+
+    ringing: it starts with springs that carry nothing, though the motion loads them; else with springs that are bent
+    by about what it loads them with.
+    """
     bodies = []
     for i, name in enumerate(("upper", "fore")):
         motor = Joint("revolute", (0, 1, 0), name=f"{name} motor", armature=1.0, damping=5.0)
@@ -113,9 +138,40 @@ def flexible(stiffness: float, ringing: bool) -> Case:
         link = {"mass": 4.0 - i, "com": (0.2, 0, 0), "inertia": (0.01, 0.08, 0.08)}
         bodies.append(Body(name, "upper" if i else "world", (motor, spring), position=(0.4 * i, 0, 0), **link))
     motors = [Motor(f"{name} motor", "position", kp=2000.0, kv=200.0) for name in ("upper", "fore")]
-    bent = 20.0 / stiffness if ringing else 0.0  # by 20 N m
-    words = f"flexible joints, k = {stiffness:.0e}, {'let go bent' if ringing else 'from rest'}"
-    return made(words, bodies, [0.1, bent, 0.2, -bent], 0.5, motors, ctrl=[0.6, -0.3])
+    exponent = int(np.log10(stiffness))
+    words = f"flexible joints, k = 1e{exponent} N m/rad, {'ringing' if ringing else 'smooth'} start"
+    case = made(words, bodies, [0.1, 0.0, 0.2, 0.0], 0.6, motors, ctrl=[0.6, -0.3])
+    case = case._replace(springs=(1, 3), stiffness=stiffness)
+    return case if ringing else loaded(case)
+
+
+def loaded(case: Case) -> Case:
+    """The start whose springs neither ring nor creep: their own accelerations are zero, and so are the rates of these.
+
+    Springs x and their rates for the motors' q and v: acceleration(x, rate) = 0, and rate = dx/dt along the motion that
+    this makes of the motors. Of second order in the time of a spring over that of the motion.
+    """
+    robot, springs = case.robot, np.array(case.springs)
+
+    @jax.jit
+    def acceleration(q, v):
+        M = robot.system.mass(q, robot.params)
+        return jnp.linalg.solve(M, -robot.system.dynamics(q, v, jnp.zeros_like(v), 0.0, robot.params))
+
+    def bent(q, v):
+        for _ in range(20):
+            along = jax.jacfwd(lambda x: acceleration(q.at[springs].set(x), v)[springs])(q[springs])
+            q = q.at[springs].add(-jnp.linalg.solve(along, acceleration(q, v)[springs]))
+        return q
+
+    q, v, step = jnp.asarray(case.q0), jnp.asarray(case.v0), 1e-5
+    others = np.setdiff1d(np.arange(len(q)), springs)
+    for _ in range(5):
+        q = bent(q, v)
+        w = acceleration(q, v)
+        later = bent(q.at[others].add(step * v[others]), v.at[others].add(step * w[others]))
+        v = v.at[springs].set((later[springs] - q[springs]) / step)
+    return case._replace(q0=np.asarray(q), v0=np.asarray(v))
 
 
 def four_bar() -> Case:
@@ -163,3 +219,22 @@ def chain(n: int) -> Case:
             )
         )
     return made(f"chain of {n} links", bodies, 0.1 * np.ones(n), 0.5)
+
+
+def four_bars(loops: int) -> Mechanism:
+    """A row of four-bar loops, benchmark A02 of multibody codes (`hhtjax.scenes.four_bars`), by bodies in space.
+
+    Cranks of 1 m and 1 kg on pivots 1 m apart; from the end of each a coupler, whose other end is that of the next.
+    Each end closes three rows, of which the one across the plane says nothing.
+    """
+    upright, lying = (1 / 12, 1 / 12, 0.0), (0.0, 1 / 12, 1 / 12)
+    cranks = [
+        Body(f"crank{i}", "world", Joint("revolute", (0, 1, 0)), 1.0, (0, 0, 0.5), upright, (float(i), 0, 0))
+        for i in range(loops + 1)
+    ]
+    couplers = [
+        Body(f"coupler{i}", f"crank{i}", Joint("revolute", (0, 1, 0)), 1.0, (0.5, 0, 0), lying, (0, 0, 1))
+        for i in range(loops)
+    ]
+    ends = [Connect(f"coupler{i}", f"crank{i + 1}", (1, 0, 0), (0, 0, 1)) for i in range(loops)]
+    return tree([*cranks, *couplers], loops=ends, gravity=GRAVITY)
