@@ -1,9 +1,9 @@
 """Error against step size and time of a run, beside MuJoCo and exudyn, for equations that all programs share.
 
-Errors are the largest of any coordinate at all samples, 20 ms apart. The reference is MuJoCo's RK4 with small steps,
-so an independent program; for the loop, which is soft there, and set points that move, which are held there for a
-step, SciPy's DOP853. Times of ours
-are steps times that of a step in `simulate`, warm; those of the others are of their runs, in compiled code.
+Errors are the largest of any coordinate at all samples, 20 ms apart. The reference is MuJoCo's RK4 with small steps, so
+an independent program. SciPy's DOP853 is it for the loop, which is soft in MuJoCo, and for set points that move, which
+MuJoCo holds for a step. Times of ours are steps times that of a step in `simulate`, warm; those of the others are of
+their runs, in compiled code.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def run(report: Report, fast: bool) -> dict:
     for name in (name for name, found in peers.items() if not found):
         report.progress(f"{name} is not installed (extra peers): without it")
     cases = [(models.ur5(smooth=True), [*VARIANTS]), (models.ur5(), [*VARIANTS])]
-    elastic = [OURS, "hht, alpha = 0", "hht, alpha = -0.3"]
+    elastic = [OURS, "hht, alpha = 0", "hht, alpha = -0.3", "hht, Newton"]
     for k in (1e6,) if fast else (1e4, 1e6):
         cases += [(models.flexible(k, ringing), elastic) for ringing in (False, True)]
     cases += [(models.four_bar(), [OURS])]
@@ -52,7 +52,7 @@ def run(report: Report, fast: bool) -> dict:
         cases = [(case, [OURS]) for case, _ in cases]
     found = []
     for case, variants in cases:
-        found.append(compared(case, variants, peers, (1, 4, 20) if fast else STEPS[:6] if large(case) else STEPS))
+        found.append(compared(case, variants, peers, (1, 4, 20) if fast else STEPS[:7] if large(case) else STEPS))
         report.progress(f"{case.words}: done")
     for case in found:
         table(report, case)
@@ -76,11 +76,13 @@ def compared(case: Case, variants: list[str], peers: dict, sizes: tuple) -> dict
 
     def entry(name: str, sizes: tuple, path) -> None:
         rows: dict[str, list] = {"h_s": [], "error_rad": [], "late_error_rad": [], "time_s": []}
-        rows |= {"torque_error": []} if case.springs else {}
+        rows |= {"torque_error": [], "late_torque_error": []} if case.springs else {}
         for steps in sizes:
             q, seconds = path(steps)
             values = [SAMPLE / steps, error(q, exact), error(q, exact, after=LATE), seconds]
-            values += [error(q, exact, case.springs) / largest(exact, case.springs)] if case.springs else []
+            if case.springs:  # of torques -k q, over the largest of them
+                scale = largest(exact, case.springs)
+                values += [error(q, exact, case.springs, after) / scale for after in (0.0, LATE)]
             for key, value in zip(rows, values, strict=True):
                 rows[key].append(value)
         found["methods"][name] = rows
@@ -203,12 +205,12 @@ def same(found: dict, peer: str) -> bool:
     return found["accelerations"].get(peer, np.inf) <= SAME
 
 
-def reference(case: Case, with_mujoco: bool, samples: int):
+def reference(case: Case, with_mujoco: bool, samples: int) -> tuple[Any, Any]:
     """q at the samples, and the same with half of the steps, None by DOP853."""
     if case.robot.model.loops or case.is_driven or not with_mujoco:
         return by_dop853(case, samples), None
     steps = 4000 if case.springs else 400 if large(case) else 800
-    return (by_mujoco.path(case, "RK4", samples, n)[0] for n in (steps, steps // 2))
+    return by_mujoco.path(case, "RK4", samples, steps)[0], by_mujoco.path(case, "RK4", samples, steps // 2)[0]
 
 
 def by_dop853(case: Case, samples: int) -> np.ndarray:

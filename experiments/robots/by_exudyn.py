@@ -65,7 +65,9 @@ def built(robot: Mechanism, q0: np.ndarray, v0: np.ndarray) -> tuple:
             gravity=np.asarray(p["gravity"]).tolist(),
             jointTypes=[exu.JointType.RevoluteZ] * n,
             linkParents=[x.parent for x in nodes],
-            jointTransformations=exu.Matrix3DList([B.T @ x.E @ T for B, x, T in zip(before, nodes, turns, strict=True)]),
+            jointTransformations=exu.Matrix3DList(
+                [B.T @ x.E @ T for B, x, T in zip(before, nodes, turns, strict=True)]
+            ),
             jointOffsets=exu.Vector3DList([B.T @ np.asarray(x.offset) for B, x in zip(before, nodes, strict=True)]),
             linkInertiasCOM=exu.Matrix3DList(list(inertias)),
             linkCOMs=exu.Vector3DList(list(centres)),

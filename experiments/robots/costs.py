@@ -1,16 +1,13 @@
-"""Times of a step beside MuJoCo's, in turns, and a gradient over a run; a row of four-bar loops; humanoids.
+"""Times of a step beside MuJoCo's, in turns, and a gradient over a run.
 
 Times are the least of several, of the clock and of the processor, the start of each run another.
 """
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
-import os
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from typing import Any
 
 import jax
@@ -21,8 +18,6 @@ import hhtjax
 from experiments.report import Report
 from experiments.robots import by_mujoco, models
 from experiments.robots.accuracy import OURS, large, whole
-from hhtjax import bodies
-from hhtjax.bodies.equations import Loops
 
 INERTIAL = "mass", "com", "inertia"
 OTHERS = "damping", "armature"
@@ -95,107 +90,3 @@ def gradient(report: Report, fast: bool) -> dict:
     found["ratio"] = float(np.median(np.array(times["gradient"]) / np.array(times["run"])))
     report.progress("gradient {ratio:.2f} of the run, first call {gradient_first_cpu_s:.1f} CPU s".format(**found))
     return found
-
-
-def four_bars(report: Report, fast: bool) -> dict:
-    """A row of loops in one model: rows that say nothing new are left out when it is made."""
-    loops, num_steps, dt = (4, 50, 5e-3) if fast else (40, 200, 5e-3)
-    made: list = []
-    _, made_s = clocks(lambda: made.append(models.four_bars(loops)))
-    robot = made[0]
-    cranks = np.array([robot.index(f"crank{i}") for i in range(loops + 1)])
-    v0 = np.full(robot.model.tree.rates, -1.0)
-    v0[cranks] = 1.0  # the ends of the cranks at 1 m/s, couplers upright
-    every = Loops(robot.model._replace(rows=None))
-
-    def simulated(shift: float = 0.0):
-        return jax.block_until_ready(
-            hhtjax.simulate(
-                robot.system, hhtjax.hht(), robot.q0, jnp.asarray(v0), robot.params,
-                dt=dt * (1 + shift), num_steps=num_steps, save_every=num_steps // 10,
-            )
-        )  # fmt: skip
-
-    _, first = clocks(simulated)
-    seconds = [clocks(lambda k=k: simulated(1e-9 * k)) for k in (1, 2)]
-    solution = simulated()
-    solution.check()
-    gap = jax.vmap(lambda q: every(q, 0.0, robot.params))(solution.q)
-    B = np.asarray(jax.jacfwd(lambda q: every(q, 0.0, robot.params))(solution.q[-1]))
-    exact = crank(loops, np.asarray(solution.t))
-    found = {
-        "loops": loops, "coordinates": int(B.shape[1]), "rows": int(B.shape[0]),
-        "rank": int(np.linalg.matrix_rank(B, tol=1e-9)), "rows_kept": len(robot.model.rows or range(len(B))),
-        "dt_s": dt, "num_steps": num_steps, "made_cpu_s": made_s, "first_cpu_s": first,
-        "us_a_step": min(x[0] for x in seconds) / num_steps * 1e6,
-        "cpu_us_a_step": min(x[1] for x in seconds) / num_steps * 1e6,
-        "gap_m": float(jnp.max(jnp.abs(gap))),
-        "error_rad": float(np.max(np.abs(np.asarray(solution.q)[:, cranks] - exact[:, None]))),
-        "turned_rad": float(np.ptp(exact)),
-    }  # fmt: skip
-    report.progress(f"row of four-bars: {found}")
-    return found
-
-
-def crank(loops: int, times: np.ndarray) -> np.ndarray:
-    """The angle of all cranks from upright, by the equation of one degree of freedom: ((N + 1)/3 + N) l a'' = ..."""
-    from scipy.integrate import solve_ivp
-
-    inertia, weight = (loops + 1) / 3 + loops, ((loops + 1) / 2 + loops) * 9.81
-    found = solve_ivp(
-        lambda t, y: (y[1], weight / inertia * np.sin(y[0])), (0, times[-1]), (0.0, 1.0),
-        method="DOP853", t_eval=times, rtol=1e-12, atol=1e-13,
-    )  # fmt: skip
-    return found.y[0]
-
-
-def humanoids(report: Report, fast: bool) -> dict:
-    """Those of dm_control, where it is installed: a motion in the air, without contact, motors, friction and ranges."""
-    spec = importlib.util.find_spec("dm_control")
-    if fast or spec is None or importlib.util.find_spec("mujoco") is None:
-        why = "in a smoke run they are left out" if fast else "they need the packages dm_control and mujoco"
-        report.progress(f"SKIPPED: the humanoids; {why}")
-        return {"skipped": why}
-    found: dict[str, Any] = {"dm_control": version("dm_control"), "mujoco": version("mujoco"), "models": {}}
-    folder = os.path.join(os.path.dirname(spec.origin or ""), "suite")
-    for name in ("humanoid", "humanoid_CMU"):
-        found["models"][name] = in_the_air(os.path.join(folder, f"{name}.xml"))
-        report.progress(f"{name}: {found['models'][name]}")
-    return found
-
-
-def in_the_air(path: str, num_steps: int = 100, dt: float = 2e-3) -> dict:
-    """A model of a file, falling: first call, and times of a step beside MuJoCo's in turns."""
-    mujoco = importlib.import_module("mujoco")
-    made: list = []
-    _, made_s = clocks(
-        lambda: made.append(bodies.load(path, ignore=("contact", "actuator"), limits="ignore", friction="ignore"))
-    )
-    robot = made[0]
-
-    def simulated(shift: float = 0.0):
-        found = hhtjax.simulate(
-            robot.system, hhtjax.hht(), robot.q0, robot.v0, robot.params,
-            dt=dt * (1 + shift), num_steps=num_steps, save_every=num_steps,
-        )  # fmt: skip
-        return jax.block_until_ready(found)
-
-    first_s, first_cpu_s = clocks(simulated)
-    model = by_mujoco.with_options(mujoco.MjModel.from_xml_path(path), "implicitfast", dt)
-    kinds = mujoco.mjtDisableBit
-    for kind in ("CONTACT", "LIMIT", "FRICTIONLOSS", "ACTUATION"):
-        model.opt.disableflags |= int(getattr(kinds, f"mjDSBL_{kind}"))
-    own, theirs = [], []
-    for turn in range(3):
-        own.append(clocks(lambda turn=turn: simulated(1e-9 * (1 + turn))))
-        theirs.append(
-            by_mujoco.rolled(model, model.qpos0, np.zeros(model.nv), np.zeros(model.nu), 10 * num_steps)[1:]
-        )
-    solution = simulated()
-    clock, processor = (min(x) / num_steps * 1e6 for x in zip(*own, strict=True))
-    peer = min(x[0] for x in theirs) / (10 * num_steps) * 1e6
-    return {
-        "rates": robot.model.tree.rates, "made_cpu_s": made_s, "first_s": first_s, "first_cpu_s": first_cpu_s,
-        "us_a_step": clock, "cpu_us_a_step": processor, "mujoco_us_a_step": peer,
-        "finite": all(bool(np.isfinite(x).all()) for x in jax.tree.leaves(solution.v)),
-    }  # fmt: skip

@@ -158,10 +158,13 @@ def loaded(case: Case) -> Case:
         M = robot.system.mass(q, robot.params)
         return jnp.linalg.solve(M, -robot.system.dynamics(q, v, jnp.zeros_like(v), 0.0, robot.params))
 
+    def own(x, q, v):
+        return acceleration(q.at[springs].set(x), v)[springs]
+
     def bent(q, v):
-        for _ in range(20):
-            along = jax.jacfwd(lambda x: acceleration(q.at[springs].set(x), v)[springs])(q[springs])
-            q = q.at[springs].add(-jnp.linalg.solve(along, acceleration(q, v)[springs]))
+        for _ in range(20):  # Newton's iteration
+            x = q[springs]
+            q = q.at[springs].set(x - jnp.linalg.solve(jax.jacfwd(own)(x, q, v), own(x, q, v)))
         return q
 
     q, v, step = jnp.asarray(case.q0), jnp.asarray(case.v0), 1e-5
