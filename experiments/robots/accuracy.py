@@ -158,7 +158,7 @@ def whole(case: Case, num_steps: int, shift: float = 0.0):
 
 def seconds_a_step(case: Case, repeats: int = 4) -> float:
     """Of `simulate`, warm, nothing of it known from the run before; the least of some."""
-    num_steps, times = 500 if large(case) else 5000, []
+    num_steps, times = 300 if large(case) else 5000, []
     for k in range(repeats + 1):
         start = time.perf_counter()
         whole(case, num_steps, 1e-9 * k)

@@ -64,7 +64,7 @@ def step_times(report: Report, fast: bool) -> dict:
 
 def gradient(report: Report, fast: bool) -> dict:
     """A reverse gradient in all inertial parameters over the run; what first calls take."""
-    case = models.flexible(1e6, False) if fast else models.ur5()
+    case = models.chain(1) if fast else models.ur5()
     names = INERTIAL + OTHERS
     num_steps = 100 if fast else 1000
 

@@ -224,13 +224,13 @@ def chain(n: int) -> Case:
     return made(f"chain of {n} links", bodies, 0.1 * np.ones(n), 0.5)
 
 
-def four_bars(loops: int) -> Mechanism:
+def four_bars(loops: int) -> Case:
     """A row of four-bar loops, benchmark A02 of multibody codes (`hhtjax.scenes.four_bars`), by bodies in space.
 
     Cranks of 1 m and 1 kg on pivots 1 m apart; from the end of each a coupler, whose other end is that of the next.
     Each end closes three rows, of which the one across the plane says nothing.
     """
-    upright, lying = (1 / 12, 1 / 12, 0.0), (0.0, 1 / 12, 1 / 12)
+    upright, lying = (1 / 12, 1 / 12, 1e-3), (1e-3, 1 / 12, 1 / 12)
     cranks = [
         Body(f"crank{i}", "world", Joint("revolute", (0, 1, 0)), 1.0, (0, 0, 0.5), upright, (float(i), 0, 0))
         for i in range(loops + 1)
@@ -240,4 +240,7 @@ def four_bars(loops: int) -> Mechanism:
         for i in range(loops)
     ]
     ends = [Connect(f"coupler{i}", f"crank{i + 1}", (1, 0, 0), (0, 0, 1)) for i in range(loops)]
-    return tree([*cranks, *couplers], loops=ends, gravity=GRAVITY)
+    case = made(f"row of {loops} four-bars", [*cranks, *couplers], np.zeros(2 * loops + 1), 0.6, loops=ends)
+    v0 = np.full(2 * loops + 1, -1.0)
+    v0[[case.robot.index(f"crank{i}") for i in range(loops + 1)]] = 1.0  # ends of cranks at 1 m/s; couplers stay level
+    return case._replace(v0=v0)
