@@ -39,7 +39,7 @@ def step_times(report: Report, fast: bool) -> dict:
     """Microseconds of a step, in turns; the ratio to implicitfast is the median over the turns."""
     found = {}
     peers = by_mujoco.integrators() if importlib.util.find_spec("mujoco") else []
-    cases = [models.flexible(1e6, False), models.ur5(), models.four_bar(), models.chain(24), models.chain(50)]
+    cases = [models.flexible(1e6, "jump"), models.ur5(), models.four_bar(), models.chain(24), models.chain(50)]
     for case in cases[:1] if fast else cases:
         steps = 300 if large(case) else 5000
         times: dict[str, list] = {name: [] for name in (OURS, *peers)}

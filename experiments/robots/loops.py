@@ -36,13 +36,17 @@ def run(report: Report, fast: bool) -> dict:
     ours = partial(simulated, robot.system, case.q0, case.v0, robot.params)
     natural = partial(simulated, scene.system, scene.q0, scene.v0, scene.params)
     (_, first), (_, first_natural) = clocks(ours), clocks(natural)
+    theirs = None
     times: dict[str, list] = {"ours": [], "natural": [], "mujoco": []}
     for turn in range(1, 3):
         times["ours"].append(clocks(lambda k=turn: ours(1e-9 * k)))
         times["natural"].append(clocks(lambda k=turn: natural(1e-9 * k)))
         if importlib.util.find_spec("mujoco"):
             model = by_mujoco.as_model(case.text, "implicitfast", dt)
-            times["mujoco"].append(by_mujoco.rolled(model, case.q0, case.v0, np.zeros(0), num_steps)[1:])
+            order = by_mujoco.order(case, model)
+            path, *seconds = by_mujoco.rolled(model, case.q0[order], case.v0[order], np.zeros(0), num_steps)
+            theirs = path[num_steps // 10 - 1 :: num_steps // 10, 1 : 1 + model.nq][:, np.argsort(order)[cranks]]
+            times["mujoco"].append(seconds)
     least = {name: [min(x) / num_steps * 1e6 for x in zip(*values, strict=True)] for name, values in times.items()}
     solution = ours()
     solution.check()
@@ -56,6 +60,7 @@ def run(report: Report, fast: bool) -> dict:
         "us_a_step": least["ours"][0], "cpu_us_a_step": least["ours"][1],
         "natural_us_a_step": least["natural"][0], "natural_first_cpu_s": first_natural,
         "mujoco_us_a_step": least["mujoco"][0] if least["mujoco"] else None,
+        "mujoco_error_rad": None if theirs is None else float(np.max(np.abs(theirs - exact[1:, None]))),
         "gap_m": float(jnp.max(jnp.abs(gap))),
         "error_rad": float(np.max(np.abs(np.asarray(solution.q)[:, cranks] - exact[:, None]))),
         "turned_rad": float(np.ptp(exact)),

@@ -115,21 +115,21 @@ def ur5(smooth: bool = False) -> Case:
         zero = jnp.zeros(len(q0))
         held = case.robot.system.dynamics(jnp.asarray(q0), zero, zero, 0.0, case.robot.params)
         here = there + held / kp  # at rest there
-        case.robot.params["ctrl"] = jax.tree_util.Partial(along, here, jnp.asarray(there))
+        case.robot.params["ctrl"] = jax.tree_util.Partial(along, here, jnp.asarray(there), jnp.asarray(1.0))
     return case
 
 
-def along(here, there, t):
-    """From one place to another in 1 s, with rates and accelerations that begin and end with zero."""
-    s = jnp.clip(t, 0.0, 1.0)
+def along(here, there, duration, t):
+    """From one place to another, with rates and accelerations that begin and end with zero."""
+    s = jnp.clip(t / duration, 0.0, 1.0)
     return here + (there - here) * s**3 * (10 - 15 * s + 6 * s**2)
 
 
-def flexible(stiffness: float, ringing: bool) -> Case:
-    """Two links on flexible joints: hinges of motors with armature, springs behind them.
+def flexible(stiffness: float, start: str) -> Case:
+    """Two links on flexible joints: hinges of motors with armature, springs behind them, servos on the motors.
 
-    ringing: it starts with springs that carry nothing, though the motion loads them; else with springs that are bent
-    by about what it loads them with.
+    start: "at rest", in equilibrium, set points move smoothly within 0.5 s; "ringing", the same from springs that carry
+    nothing; "jump", set points jump, from springs that are bent by about what that loads them with.
     """
     bodies = []
     for i, name in enumerate(("upper", "fore")):
@@ -137,12 +137,32 @@ def flexible(stiffness: float, ringing: bool) -> Case:
         spring = Joint("revolute", (0, 1, 0), name=f"{name} spring", stiffness=stiffness, damping=1e-4 * stiffness)
         link = {"mass": 4.0 - i, "com": (0.2, 0, 0), "inertia": (0.01, 0.08, 0.08)}
         bodies.append(Body(name, "upper" if i else "world", (motor, spring), position=(0.4 * i, 0, 0), **link))
-    motors = [Motor(f"{name} motor", "position", kp=2000.0, kv=200.0) for name in ("upper", "fore")]
-    exponent = int(np.log10(stiffness))
-    words = f"flexible joints, k = 1e{exponent} N m/rad, {'ringing' if ringing else 'smooth'} start"
-    case = made(words, bodies, [0.1, 0.0, 0.2, 0.0], 0.6, motors, ctrl=[0.6, -0.3])
+    kp, there = 2000.0, np.array([0.6, -0.3])
+    motors = [Motor(f"{name} motor", "position", kp=kp, kv=200.0) for name in ("upper", "fore")]
+    words = f"flexible joints, k = 1e{int(np.log10(stiffness))} N m/rad, "
+    words += {"at rest": "from rest", "ringing": "ringing", "jump": "set points that jump"}[start]
+    case = made(words, bodies, [0.1, 0.0, 0.2, 0.0], 0.6, motors, ctrl=there)
     case = case._replace(springs=(1, 3), stiffness=stiffness)
-    return case if ringing else loaded(case)
+    return loaded(case) if start == "jump" else moved(case, there, kp, start == "ringing")
+
+
+def moved(case: Case, there: np.ndarray, kp: float, ringing: bool) -> Case:
+    """Set points that begin where the motors hold still, and springs in equilibrium, or without a load."""
+    robot, springs = case.robot, np.array(case.springs)
+    motors = np.setdiff1d(np.arange(len(case.q0)), springs)
+    zero = jnp.zeros(len(case.q0))
+
+    def missing(x):
+        return robot.system.dynamics(jnp.asarray(case.q0).at[springs].set(x), zero, zero, 0.0, robot.params)
+
+    x = jnp.zeros(len(springs))
+    for _ in range(5):  # Newton's iteration
+        x = x - jnp.linalg.solve(jax.jacfwd(missing)(x)[springs], missing(x)[springs])
+    here = there + missing(x)[motors] / kp
+    robot.params["ctrl"] = jax.tree_util.Partial(along, here, jnp.asarray(there), jnp.asarray(0.5))
+    q0 = np.array(case.q0)
+    q0[springs] = 0.0 if ringing else np.asarray(x)
+    return case._replace(q0=q0)
 
 
 def loaded(case: Case) -> Case:

@@ -56,6 +56,6 @@ def errors(cases: list, over: str):
 
 
 def style(name: str) -> dict:
-    """Of a method's line: ours is thick."""
+    """Of a method's line: ours is thick, and behind the others."""
     i = METHODS.index(name)
-    return {"color": COLOURS[i], "marker": MARKERS[i], "ms": 2.5, "lw": 1.0 if i else 2.0, "zorder": 3 - i / 10}
+    return {"color": COLOURS[i], "marker": MARKERS[i], "ms": 2.5, "lw": 1.0 if i else 2.5, "zorder": 2 + i / 10}
