@@ -198,6 +198,7 @@ def page(numbers):
             gap_duration=closed["duration_s"],
             explained=closed["loop_over_steps"],
             turned=loops["turned_rad"],
+            made=loops["made_cpu_s"],
             row_of_loops=row_of_loops(loops),
             loops_dt=1e3 * loops["dt_s"],
             **{key: loops[key] for key in ("loops", "rows", "coordinates", "rank", "rows_kept")},
