@@ -149,7 +149,7 @@ def humanoids(found: dict) -> str:
         return f"Not run: {found['skipped']}."
     rows = [
         [
-            name, x["rates"], f"{x['us_a_step']:.0f}", f"{x['mujoco_us_a_step']:.0f}",
+            name, x["rates"], f"{x['us_a_step']:.0f}", f"{x['cpu_us_a_step']:.0f}", f"{x['mujoco_us_a_step']:.0f}",
             f"{x['us_a_step'] / x['mujoco_us_a_step']:.0f}", f"{x['first_cpu_s']:.0f}", "yes" if x["finite"] else "no",
         ]
         for name, x in found["models"].items()
@@ -158,7 +158,16 @@ def humanoids(found: dict) -> str:
         f"Models of dm_control {found['dm_control']}, which fall without contact, motors, dry friction and ranges, in "
         "both programs. Steps of 2 ms."
     )
-    header = ["", "rates", "us a step", "MuJoCo implicitfast", "ratio", "first call, CPU s", "finite"]
+    header = [
+        "",
+        "rates",
+        "us a step",
+        "CPU us a step",
+        "MuJoCo implicitfast, us",
+        "ratio",
+        "first call, CPU s",
+        "finite",
+    ]
     return f"{words}\n\n{table(header, rows)}"
 
 

@@ -41,7 +41,9 @@ def errors(cases: list, over: str):
                 error = np.array([np.nan if e is None else e for e in x["error_rad"]], float)
                 panel.loglog(1e3 * np.array(x[over], float), error, **style(name))
         panel.set(xlabel="time of a run (ms)" if over == "time_s" else "step size (ms)", ylabel="largest error (rad)")
-        panel.set_title(case["case"], fontsize=7)
+        panel.set_title(
+            case["case"].replace("flexible joints, ", "flexible joints: ").replace(" N m/rad", ""), fontsize=7
+        )
         found = [e for x in case["methods"].values() for e in x["error_rad"] if e]
         panel.set_ylim(max(min(found) / 3, 1e-12), min(10.0, 3 * max(found)))
         panel.grid(alpha=0.25, lw=0.5)
@@ -56,6 +58,7 @@ def errors(cases: list, over: str):
 
 
 def style(name: str) -> dict:
-    """Of a method's line: ours is thick, and behind the others."""
+    """Of a method's line: what others cover is thick, and behind them."""
     i = METHODS.index(name)
-    return {"color": COLOURS[i], "marker": MARKERS[i], "ms": 2.5, "lw": 1.0 if i else 2.5, "zorder": 2 + i / 10}
+    thick = {"hht": 2.5, "MuJoCo implicitfast": 2.2, "MuJoCo implicit": 1.4, "exudyn generalized alpha": 1.8}
+    return {"color": COLOURS[i], "marker": MARKERS[i], "ms": 2.5, "lw": thick.get(name, 0.9), "zorder": 2 + i / 10}
