@@ -262,5 +262,7 @@ def four_bars(loops: int) -> Case:
     ends = [Connect(f"coupler{i}", f"crank{i + 1}", (1, 0, 0), (0, 0, 1)) for i in range(loops)]
     case = made(f"row of {loops} four-bars", [*cranks, *couplers], np.zeros(2 * loops + 1), 0.6, loops=ends)
     v0 = np.full(2 * loops + 1, -1.0)
-    v0[[case.robot.index(f"crank{i}") for i in range(loops + 1)]] = 1.0  # ends of cranks at 1 m/s; couplers stay level
+    v0[np.array([case.robot.index(f"crank{i}") for i in range(loops + 1)])] = (
+        1.0  # ends of cranks at 1 m/s; couplers stay level
+    )
     return case._replace(v0=v0)
