@@ -20,6 +20,7 @@ LARGEST = {".png": 200_000, ".gif": 400_000}  # bytes
         "friction",
         "kim2019",
         "reported",
+        "robots",
         "stability",
         "sweeps",
         "work_precision",

@@ -1,0 +1,1 @@
+"""Robots: mechanisms from bodies and joints, beside MuJoCo and exudyn."""

@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.bodies import Body, Connect, Joint, Mechanism, Motor, denavit_hartenberg, tree
@@ -23,13 +25,24 @@ ALONG = 1, 0, 0, 1, 1, 2  # axis of each cylinder in its frame
 
 
 class Case(NamedTuple):
-    """A mechanism in both forms, a start, a length, and what it is."""
+    """A mechanism in both forms, a start, a length, and what it is.
+
+    springs: the coordinates of elastic joints, whose torques are compared; stiffness: theirs, N m/rad.
+    """
 
     words: str
     robot: Mechanism
     text: str
     q0: np.ndarray
+    v0: np.ndarray
     duration: float
+    springs: tuple = ()
+    stiffness: float = 0.0
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether set points move."""
+        return callable(self.robot.params.get("ctrl"))
 
 
 def cylinder(mass, radius, length, axis):
@@ -81,41 +94,107 @@ def mjcf(bodies, motors=(), loops=(), controls=(), gravity=GRAVITY) -> str:
 
 
 def made(words, bodies, q0, duration, motors=(), loops=(), ctrl=None) -> Case:
-    """Both forms; ctrl: set points, constant."""
+    """Both forms, at rest; ctrl: set points, constant."""
     robot = tree(bodies, motors=motors, loops=loops, gravity=GRAVITY)
     if ctrl is not None:
         robot.params["ctrl"] = np.asarray(ctrl, float)
-    return Case(words, robot, mjcf(bodies, motors, loops), np.asarray(q0, float), duration)
+    start = np.asarray(robot.q0) + np.asarray(q0, float)  # those with loops have been closed
+    return Case(words, robot, mjcf(bodies, motors, loops), start, np.zeros_like(start), duration)
 
 
-def ur5() -> Case:
-    """The arm on position servos, sent from one pose to another."""
+def ur5(smooth: bool = False) -> Case:
+    """The arm on position servos, sent from one pose to another: at once, or, smooth, along set points in 1 s."""
     inertia = [cylinder(m, *size, axis) for m, size, axis in zip(MASSES, SIZES, ALONG, strict=True)]
     bodies = denavit_hartenberg(UR5, mass=MASSES, com=CENTRES, inertia=inertia, armature=[0.5, 0.5, 0.5, 0.1, 0.1, 0.1])
     kp = np.array([2000.0, 2000.0, 2000.0, 500.0, 500.0, 500.0])
     motors = [Motor(f"joint{i + 1}", "position", kp=k, kv=0.1 * k) for i, k in enumerate(kp)]
-    return made(
-        "UR5 on servos, 6 joints",
-        bodies,
-        [0.0, -1.2, 1.4, -0.4, 0.5, 0.2],
-        2.0,
-        motors,
-        ctrl=[0.6, -0.9, 1.0, 0.1, 0.0, -0.3],
-    )
+    q0, there = np.array([0.0, -1.2, 1.4, -0.4, 0.5, 0.2]), np.array([0.6, -0.9, 1.0, 0.1, 0.0, -0.3])
+    words = f"UR5 on servos, set points that {'move smoothly' if smooth else 'jump'}"
+    case = made(words, bodies, q0, 2.0, motors, ctrl=there)
+    if smooth:
+        zero = jnp.zeros(len(q0))
+        held = case.robot.system.dynamics(jnp.asarray(q0), zero, zero, 0.0, case.robot.params)
+        here = there + held / kp  # at rest there
+        case.robot.params["ctrl"] = jax.tree_util.Partial(along, here, jnp.asarray(there), jnp.asarray(1.0))
+    return case
 
 
-def flexible(stiffness: float, ringing: bool) -> Case:
-    """Two links on flexible joints: hinges of motors with armature, springs behind them; from rest, or let go bent."""
+def along(here, there, duration, t):
+    """From one place to another, with rates and accelerations that begin and end with zero."""
+    s = jnp.clip(t / duration, 0.0, 1.0)
+    return here + (there - here) * s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def flexible(stiffness: float, start: str) -> Case:
+    """Two links on flexible joints: hinges of motors with armature, springs behind them, servos on the motors.
+
+    start: "at rest", in equilibrium, set points move smoothly within 0.5 s; "ringing", the same from springs that carry
+    nothing; "jump", set points jump, from springs that are bent by about what that loads them with.
+    """
     bodies = []
     for i, name in enumerate(("upper", "fore")):
         motor = Joint("revolute", (0, 1, 0), name=f"{name} motor", armature=1.0, damping=5.0)
         spring = Joint("revolute", (0, 1, 0), name=f"{name} spring", stiffness=stiffness, damping=1e-4 * stiffness)
         link = {"mass": 4.0 - i, "com": (0.2, 0, 0), "inertia": (0.01, 0.08, 0.08)}
         bodies.append(Body(name, "upper" if i else "world", (motor, spring), position=(0.4 * i, 0, 0), **link))
-    motors = [Motor(f"{name} motor", "position", kp=2000.0, kv=200.0) for name in ("upper", "fore")]
-    bent = 20.0 / stiffness if ringing else 0.0  # by 20 N m
-    words = f"flexible joints, k = {stiffness:.0e}, {'let go bent' if ringing else 'from rest'}"
-    return made(words, bodies, [0.1, bent, 0.2, -bent], 0.5, motors, ctrl=[0.6, -0.3])
+    kp, there = 2000.0, np.array([0.6, -0.3])
+    motors = [Motor(f"{name} motor", "position", kp=kp, kv=200.0) for name in ("upper", "fore")]
+    words = f"flexible joints, k = 1e{int(np.log10(stiffness))} N m/rad, "
+    words += {"at rest": "from rest", "ringing": "ringing", "jump": "set points that jump"}[start]
+    case = made(words, bodies, [0.1, 0.0, 0.2, 0.0], 0.6, motors, ctrl=there)
+    case = case._replace(springs=(1, 3), stiffness=stiffness)
+    return loaded(case) if start == "jump" else moved(case, there, kp, start == "ringing")
+
+
+def moved(case: Case, there: np.ndarray, kp: float, ringing: bool) -> Case:
+    """Set points that begin where the motors hold still, and springs in equilibrium, or without a load."""
+    robot, springs = case.robot, np.array(case.springs)
+    motors = np.setdiff1d(np.arange(len(case.q0)), springs)
+    zero = jnp.zeros(len(case.q0))
+
+    def missing(x):
+        return robot.system.dynamics(jnp.asarray(case.q0).at[springs].set(x), zero, zero, 0.0, robot.params)
+
+    x = jnp.zeros(len(springs))
+    for _ in range(5):  # Newton's iteration
+        x = x - jnp.linalg.solve(jax.jacfwd(missing)(x)[springs], missing(x)[springs])
+    here = there + missing(x)[motors] / kp
+    robot.params["ctrl"] = jax.tree_util.Partial(along, here, jnp.asarray(there), jnp.asarray(0.5))
+    q0 = np.array(case.q0)
+    q0[springs] = 0.0 if ringing else np.asarray(x)
+    return case._replace(q0=q0)
+
+
+def loaded(case: Case) -> Case:
+    """The start whose springs neither ring nor creep: their own accelerations are zero, and so are the rates of these.
+
+    Springs x and their rates for the motors' q and v: acceleration(x, rate) = 0, and rate = dx/dt along the motion that
+    this makes of the motors. Of second order in the time of a spring over that of the motion.
+    """
+    robot, springs = case.robot, np.array(case.springs)
+
+    @jax.jit
+    def acceleration(q, v):
+        M = robot.system.mass(q, robot.params)
+        return jnp.linalg.solve(M, -robot.system.dynamics(q, v, jnp.zeros_like(v), 0.0, robot.params))
+
+    def own(x, q, v):
+        return acceleration(q.at[springs].set(x), v)[springs]
+
+    def bent(q, v):
+        for _ in range(20):  # Newton's iteration
+            x = q[springs]
+            q = q.at[springs].set(x - jnp.linalg.solve(jax.jacfwd(own)(x, q, v), own(x, q, v)))
+        return q
+
+    q, v, step = jnp.asarray(case.q0), jnp.asarray(case.v0), 1e-5
+    others = np.setdiff1d(np.arange(len(q)), springs)
+    for _ in range(5):
+        q = bent(q, v)
+        w = acceleration(q, v)
+        later = bent(q.at[others].add(step * v[others]), v.at[others].add(step * w[others]))
+        v = v.at[springs].set((later[springs] - q[springs]) / step)
+    return case._replace(q0=np.asarray(q), v0=np.asarray(v))
 
 
 def four_bar() -> Case:
@@ -163,3 +242,27 @@ def chain(n: int) -> Case:
             )
         )
     return made(f"chain of {n} links", bodies, 0.1 * np.ones(n), 0.5)
+
+
+def four_bars(loops: int) -> Case:
+    """A row of four-bar loops, benchmark A02 of multibody codes (`hhtjax.scenes.four_bars`), by bodies in space.
+
+    Cranks of 1 m and 1 kg on pivots 1 m apart; from the end of each a coupler, whose other end is that of the next.
+    Each end closes three rows, of which the one across the plane says nothing.
+    """
+    upright, lying = (1 / 12, 1 / 12, 1e-3), (1e-3, 1 / 12, 1 / 12)
+    cranks = [
+        Body(f"crank{i}", "world", Joint("revolute", (0, 1, 0)), 1.0, (0, 0, 0.5), upright, (float(i), 0, 0))
+        for i in range(loops + 1)
+    ]
+    couplers = [
+        Body(f"coupler{i}", f"crank{i}", Joint("revolute", (0, 1, 0)), 1.0, (0.5, 0, 0), lying, (0, 0, 1))
+        for i in range(loops)
+    ]
+    ends = [Connect(f"coupler{i}", f"crank{i + 1}", (1, 0, 0), (0, 0, 1)) for i in range(loops)]
+    case = made(f"row of {loops} four-bars", [*cranks, *couplers], np.zeros(2 * loops + 1), 0.6, loops=ends)
+    v0 = np.full(2 * loops + 1, -1.0)
+    v0[np.array([case.robot.index(f"crank{i}") for i in range(loops + 1)])] = (
+        1.0  # ends of cranks at 1 m/s; couplers stay level
+    )
+    return case._replace(v0=v0)

@@ -164,7 +164,7 @@ def factorize_least_squares(n: int):
     def factorize(A):
         A = lax.stop_gradient(A)
         tolerance = max(RANK_TOLERANCE, 100 * float(jnp.finfo(A.dtype).eps))
-        d = jnp.abs(jnp.diagonal(A)[:n])
+        d = jnp.abs(diagonal(A)[:n])
         first = 1 / jnp.sqrt(jnp.where(d == 0, 1, d))
         size = jnp.max(jnp.abs(first[:, None] * A[:n, n:]))
         rest = 1 / jnp.where(size == 0, 1, size)  # 0 where all constraints are switched off

@@ -19,7 +19,7 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.jaxpr import linear_map
-from hhtjax.numerics.dense_lu import UNROLLED, matvec
+from hhtjax.numerics.dense_lu import UNROLLED, diagonal, matvec
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, factorize_saddle_point, solver
 from hhtjax.primitives import staged
 from hhtjax.systems import kinematics
@@ -178,6 +178,6 @@ def dependent_row(B: Array) -> Array:
             G = eliminate(k, G)
     else:
         G = lax.fori_loop(0, m - 1, eliminate, G)
-    dependent = jnp.diagonal(G) < limit
+    dependent = diagonal(G) < limit
     first = jnp.min(jnp.where(dependent, jnp.arange(m), m))
     return jnp.where(first < m, first, -1)

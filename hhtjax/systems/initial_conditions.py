@@ -480,7 +480,7 @@ def nearest_position(system: FlatSystem, q0: PyTree, t: Array, params: PyTree, f
 def _problem(system: FlatSystem, q0: PyTree, t: Array, params: PyTree) -> Problem:
     """Sizes and slopes at the guess."""
     M, B = system.full_mass(q0, t, params), jacobian(system, q0, t, params)
-    d = jnp.diagonal(M)
+    d = diagonal(M)
     d = jnp.where(d == 0, 1, d)
     row = jnp.sqrt(jnp.sum(B**2 / d[None, :], axis=1))
     sizes = system.with_internal(jnp.zeros_like(d), jnp.zeros_like(d))

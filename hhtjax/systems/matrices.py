@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree, Real, is_array, is_concrete, is_real
-from hhtjax.numerics.dense_lu import pivots
+from hhtjax.numerics.dense_lu import diagonal, pivots
 from hhtjax.numerics.sparse_matrix import Sparse, of_scipy
 
 LARGEST_CHECKED = 256  # rows of a mass matrix that is looked at
@@ -212,9 +212,9 @@ def mass_flaw(M: Array | Sparse, massless: bool) -> Array:
         return jnp.zeros((), jnp.int32)
     M = lax.stop_gradient(M)
     symmetric, rounding = jnp.array(True), 0.0
-    smallest = jnp.min(M if M.ndim == 1 else jnp.diagonal(M))
+    smallest = jnp.min(diagonal(M))
     if M.ndim == 2 and len(M) > 1:
-        n, d, rounding = len(M), jnp.diagonal(M), float(jnp.finfo(M.dtype).eps)
+        n, d, rounding = len(M), diagonal(M), float(jnp.finfo(M.dtype).eps)
         size = jnp.sqrt(jnp.where(d > 0, d, 1))
         scaled = M / jnp.outer(size, size)
         symmetric = ~(jnp.max(jnp.abs(scaled - scaled.T)) > SYMMETRIC + 16 * n * rounding)
