@@ -67,13 +67,15 @@ def test_derivatives_and_batches_are_one_kernel_too():
     assert paths(jax.vmap(end), jnp.ones(3)) == ("one kernel",)
 
 
+@on_cpu
+@pytest.mark.compiled
 def test_a_constrained_run_that_returns_all_is_one_kernel():
     """A search for dependent rows, which only `info` shows, asked for the platform: such runs were plain."""
 
-    def length(q, params):
+    def length(q, t, params):
         return jnp.array([q @ q - 1])
 
-    pendulum = hhtjax.System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -9.81]), length)
+    pendulum = hhtjax.System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -9.81]), constraint=length)
 
     def run(x):
         return hhtjax.simulate(pendulum, hhtjax.hht(), jnp.array([1.0, 0.0]) * x, jnp.zeros(2), dt=0.01, num_steps=20)
