@@ -505,3 +505,32 @@ def test_params_that_would_be_ignored_are_refused():
             robot.system.dynamics(zero, zero, zero, 0.0, robot.params | {name: jnp.zeros((3, 3))})
     with pytest.raises(NotImplementedError, match="say nothing new"):
         four_bar(free=("position",))
+
+
+def test_arrays_of_another_shape_and_misspelt_params_are_refused():
+    """Each would be broadcast, or ignored, without a word."""
+    arm, z = servo_arm(), jnp.zeros
+    q, v = z(2), z(2)
+    floating = tree([Body("x", joints=Joint("free"), mass=1.0, inertia=(1, 1, 1.9))])
+    wrong = [
+        (lambda: bodies.mass_matrix(arm, z(3)), r"q must be an array of shape \(2,\)"),
+        (lambda: bodies.mass_matrix(arm, q, arm.params | {"inertia": z((2, 3))}), r'params\["inertia"\] must be'),
+        (lambda: bodies.forces(arm, q, v, 0.0, arm.params | {"torque": z(1)}), r'params\["torque"\] must be'),
+        (lambda: bodies.forces(arm, q, v, 0.0, arm.params | {"kp": z(1)}), r'params\["kp"\] must be'),
+        (lambda: bodies.forces(arm, q, v, 0.0, arm.params | {"torques": v}), 'did you mean "torque"'),
+        (
+            lambda: bodies.forces(arm, q, v, 0.0, arm.params | {"wrench": {"fore": z(3)}}),
+            r'\["fore"\] must be an array',
+        ),
+        (lambda: bodies.forces(arm, q, v, z=z(1)), "z must be None"),
+        (lambda: bodies.inverse_dynamics(arm, q, v, 1.0), "w must be an array"),
+        (lambda: bodies.frames(floating, z(3)), "q must be a dict with 'free'"),
+        (lambda: bodies.mass_matrix(arm, q, arm.params | {"timeconst": z(2)}), "no motor of the mechanism is a filter"),
+    ]
+    for call, words in wrong:
+        with pytest.raises(ValueError, match=words):
+            call()
+    with pytest.raises(TypeError, match="`robot` must be a Mechanism"):
+        bodies.mass_matrix(arm.system, q)
+    others = arm.params | {"stiffness of a hose": 3.0}  # of a force of the user's own
+    assert bodies.forces(arm, q, v, 0.0, others).shape == (2,)
