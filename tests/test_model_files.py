@@ -406,3 +406,49 @@ def test_an_inertia_without_mass_is_refused_by_name():
     text = in_world().replace("</body>", massless)
     with pytest.raises(NotImplementedError, match=r"massless: .*b"):
         bodies.load(text)
+
+
+def test_a_mimic_is_a_couple():
+    """q_b = 2 q_a + 0.1, as the file says; it needs no `ignore`."""
+
+    def link(name):
+        inertia = '<inertia ixx=".01" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/>'
+        return f'<link name="{name}"><inertial><mass value="1"/>{inertia}</inertial></link>'
+
+    def joint(name, child, more):
+        return (
+            f'<joint name="{name}" type="prismatic"><parent link="base"/><child link="{child}"/>'
+            f'<axis xyz="0 1 0"/>{more}<limit lower="-1" upper="1" effort="0" velocity="1"/></joint>'
+        )
+
+    text = (
+        '<robot name="hand"><link name="base"/>' + link("l1") + link("l2") + joint("a", "l1", "")
+        + joint("b", "l2", '<mimic joint="a" multiplier="2" offset="0.1"/>') + "</robot>"
+    )  # fmt: skip
+    hand = bodies.load(text, limits="ignore")
+    assert not hand.unsupported
+    assert float(hand.q0[1]) == pytest.approx(2 * float(hand.q0[0]) + 0.1, abs=1e-9)
+
+
+def test_parts_without_names_get_names_of_their_own():
+    inertial = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
+    text = (
+        f'<mujoco><worldbody><body name="body2"><joint name="joint1" axis="0 1 0"/>{inertial}'
+        f'<body><joint type="slide"/>{inertial}</body></body></worldbody></mujoco>'
+    )
+    arm = bodies.load(text)
+    assert arm.joints == ("joint1", "joint1_")
+    assert arm.bodies == ("body2", "body2_")
+
+
+def test_a_weld_without_torque_holds_a_point():
+    inertial = '<inertial mass="1" pos="0.1 0.2 0" diaginertia="1 1 1"/>'
+    body = f'<body name="{{}}" pos="0 0 {{}}"><freejoint/>{inertial}</body>'
+    text = (
+        "<mujoco><worldbody>" + body.format("a", 0) + body.format("b", 0.3) + "</worldbody><equality>"
+        '<weld body1="a" body2="b" anchor="0 0 0.1" relpose="0 0 0.3 1 0 0 0" torquescale="{}"/></equality></mujoco>'
+    )
+    assert [repr(bodies.load(text.format(scale))).split(",")[2] for scale in (0, 1)] == [
+        " 3 rows of loops",
+        " 6 rows of loops",
+    ]

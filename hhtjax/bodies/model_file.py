@@ -7,7 +7,7 @@ that is missing something is not run by accident. Names:
     "limits"             ranges of joints, unless `limits` says what they are
     "tendon", "flex", "plugin", "fluid", "mocap", "gravcomp"
     "actuator"           motors of other kinds than `Motor`: muscles, on sites, tendons, balls
-    "equality"           constraints other than connect, weld and joint
+    "equality"           constraints other than connect, weld, joint and mimic, which are loops here
     "springyield", "polynomial", "actuatorfrcrange"
     "unphysical"         links of a URDF with an inertia that no body has
     "massless"           bodies with an inertia and no mass
@@ -57,7 +57,11 @@ def load(
 
     Args:
         source: path of a file, or its text.
-        ignore: names of what acts in the file and is to be left out (see above).
+        ignore: names of what acts in the file and is to be left out: "contact", shapes that can touch; "limits",
+            ranges of joints; "tendon", "flex", "plugin", "fluid", "mocap", "gravcomp"; "actuator", muscles, motors on
+            sites, tendons and balls; "equality", constraints other than connect, weld, joint and mimic; "springyield"
+            and "polynomial", springs and dampers that are not linear; "actuatorfrcrange", limits of a joint's torque;
+            "unphysical", links of a URDF with an inertia that no body has; "massless", an inertia without mass.
         base: of a URDF, which does not say it: "fixed" to the world, or "free". A root link named "world" is the world
             itself: "free" lets the one link loose that is fixed to it.
         joints: what the file does not say of its joints: fields of `Joint` by name, {"elbow": {"friction": 2.0}}; those
@@ -197,9 +201,6 @@ def _simplified(root) -> list:
     for tag in ("transmission", "gazebo"):
         for element in root.findall(tag):
             root.remove(element)
-    mimicking = [joint for joint in root.iter("joint") if joint.find("mimic") is not None]
-    if mimicking:
-        acting.append(("equality", f"mimic of {_some([joint.get('name') for joint in mimicking])}"))
     extension = root.find("mujoco")
     extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
     compiler = extension.find("compiler")
@@ -245,7 +246,7 @@ def _acting(m, limits: str | None, motors: bool) -> list:
         add("limits", f"ranges of {names('joint', limited)} (limits= takes them as stops or events)", limited)
     balls = limited & (m.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))
     if limits in ("stop", "event"):
-        add("limits", f"cones of the balls {names('joint', balls)}", balls)
+        add("limits", f'cones of the balls {names("joint", balls)}, which only limits="ignore" leaves out', balls)
     if m.ntendon:
         acts = (
             (m.tendon_stiffness != 0) | (m.tendon_damping != 0) | (m.tendon_frictionloss != 0) | (m.tendon_limited > 0)
@@ -373,9 +374,16 @@ def _activations() -> dict:
 
 
 def _name_of(m, kind: str, i: int) -> str:
-    """The name in the file, or kind and number where it has none."""
-    name = getattr(m, "jnt" if kind == "joint" else kind)(i).name
-    return name or f"{kind}{i}"
+    """The name in the file, or kind and number where it has none, with as many "_" as make it its own."""
+    known = getattr(m, "jnt" if kind == "joint" else kind)
+    name = known(i).name
+    if name:
+        return name
+    name, number = f"{kind}{i}", {"joint": m.njnt, "body": m.nbody, "site": m.nsite}.get(kind)
+    taken = {known(k).name for k in range(_num_actuators(m) if number is None else number)} if kind != "tendon" else ()
+    while name in taken:
+        name += "_"
+    return name
 
 
 class _Reader:
@@ -501,10 +509,12 @@ class _Reader:
         data = self.m.eq_data[i]
         return Connect(a, b, data[:3] if x is None else x, data[3:6] if y is None else y)
 
-    def weld(self, i: int) -> Weld:
-        """Two frames."""
+    def weld(self, i: int) -> Weld | Connect:
+        """Two frames; without torque two points."""
         (a, x, R), (b, y, S) = self.ends(i)
         data = self.m.eq_data[i]
+        if data[10] == 0:  # torquescale
+            return Connect(a, b, data[3:6] if x is None else x, data[:3] if y is None else y)
         if x is None:
             return Weld(a, b, data[3:6], data[:3], of_quaternion(data[6:10]))
         return Weld(a, b, x, y, R @ S.T)
