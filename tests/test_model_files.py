@@ -244,12 +244,12 @@ def test_a_urdf_keeps_its_fixed_links_and_needs_no_meshes():
     robot = bodies.load(URDF, ignore=("contact",), limits="ignore")
     assert robot.joints == ("shoulder",)
     assert "flange" in robot.markers
-    assert robot.unsupported == ("contact: collision shapes of base",)
+    assert robot.unsupported == ("contact: collision shapes of base", "limits: ranges of shoulder")
     assert float(robot.params["damping"][0]) == 0.7
     assert float(robot.params["frictionloss"][0]) == 0.3
     np.testing.assert_allclose(robot.frames(jnp.zeros(1))["flange"].x, [0, 0.4, 0.3], atol=1e-6)
     root = URDF.replace('"floor"', '"world"')
-    assert bodies.load(root, ignore=("contact",), limits="ignore", base="free").joints == ("joint0", "shoulder")
+    assert bodies.load(root, ignore=("contact",), limits="ignore", base="free").joints == ("base", "shoulder")
     with pytest.raises(ValueError, match=r"load: `base` is \"free\", and the root .*mount \(floating\). Rename"):
         bodies.load(root.replace('"mount" type="fixed"', '"mount" type="floating"'), base="free")
     floating = bodies.load(URDF, ignore=("contact",), limits="ignore", base="free")
@@ -408,47 +408,102 @@ def test_an_inertia_without_mass_is_refused_by_name():
         bodies.load(text)
 
 
+LINK = '<link name="{0}"><inertial><mass value="{1}"/><inertia ixx="{2}" iyy="{3}" izz="{3}" ixy="0" ixz="0" iyz="0"/></inertial></link>'  # noqa: E501
+
+
+def two_links(second, more=""):
+    """A URDF of two links that turn side by side; of the second its line in the file."""
+    return (
+        f'<robot name="r"><link name="base"/>{LINK.format("a", 1, 1, 1)}{second}'
+        '<joint name="j" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/></joint>'
+        '<joint name="k" type="continuous"><parent link="base"/><child link="b"/>'
+        f'<origin xyz="0 1 0" rpy="0.1 0.2 0.3"/><axis xyz="0 0 1"/>{more}</joint></robot>'
+    )
+
+
 def test_a_mimic_is_a_couple():
-    """q_b = 2 q_a + 0.1, as the file says; it needs no `ignore`."""
-
-    def link(name):
-        inertia = '<inertia ixx=".01" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/>'
-        return f'<link name="{name}"><inertial><mass value="1"/>{inertia}</inertial></link>'
-
-    def joint(name, child, more):
-        return (
-            f'<joint name="{name}" type="prismatic"><parent link="base"/><child link="{child}"/>'
-            f'<axis xyz="0 1 0"/>{more}<limit lower="-1" upper="1" effort="0" velocity="1"/></joint>'
-        )
-
-    text = (
-        '<robot name="hand"><link name="base"/>' + link("l1") + link("l2") + joint("a", "l1", "")
-        + joint("b", "l2", '<mimic joint="a" multiplier="2" offset="0.1"/>') + "</robot>"
-    )  # fmt: skip
-    hand = bodies.load(text, limits="ignore")
-    assert not hand.unsupported
-    assert float(hand.q0[1]) == pytest.approx(2 * float(hand.q0[0]) + 0.1, abs=1e-9)
+    mimic = '<mimic joint="j" multiplier="2" offset="0.1"/>'
+    robot = bodies.load(two_links(LINK.format("b", 1, 1, 1), mimic))
+    assert [row.kind for row in robot.model.loops] == ["couple"]
+    assert robot.unsupported == ()
+    assert float(robot.q0[1]) == pytest.approx(0.1 + 2 * float(robot.q0[0]))
+    unread = two_links(LINK.format("b", 1, 1, 1), mimic).replace('"base"', '"world"')
+    unread = unread.replace('"k" type="continuous"', '"k" type="floating"')
+    with pytest.raises(NotImplementedError, match="equality: mimic of k, which mujoco does not read"):
+        bodies.load(unread)
 
 
-def test_parts_without_names_get_names_of_their_own():
-    inertial = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
-    text = (
-        f'<mujoco><worldbody><body name="body2"><joint name="joint1" axis="0 1 0"/>{inertial}'
-        f'<body><joint type="slide"/>{inertial}</body></body></worldbody></mujoco>'
+def test_a_rod_of_a_urdf_and_links_without_mass():
+    """What mujoco does not compile; it is read as it stands, or refused by name with a way out."""
+    rod = LINK.format("b", 2, 0, 0.3)
+    robot = bodies.load(two_links(rod))
+    np.testing.assert_allclose(np.diag(bodies.mass_matrix(robot, robot.q0)), [1, 0.3])
+    assert robot.unsupported == ()
+    strange = two_links(LINK.format("b", 2, -0.1, 0.2))
+    with pytest.raises(NotImplementedError, match="unphysical: moments of inertia that no body has: b"):
+        bodies.load(strange)
+    robot = bodies.load(strange, ignore=("unphysical",))
+    np.testing.assert_allclose(np.diag(bodies.mass_matrix(robot, robot.q0)), [1, 0.1])
+    point = two_links(LINK.format("b", 2, 0, 0))  # on its axis
+    assert bodies.load(point, ignore=("massless",)).joints == ("j",)
+    swung = two_links(  # on the axis of k at the start only
+        '<link name="b"/>'
+        + LINK.format("c", 1, 0, 0).replace("<inertial>", '<inertial><origin xyz="0 0 1"/>')
+        + '<joint name="l" type="continuous"><parent link="b"/><child link="c"/><axis xyz="1 0 0"/></joint>'
     )
-    arm = bodies.load(text)
-    assert arm.joints == ("joint1", "joint1_")
-    assert arm.bodies == ("body2", "body2_")
-
-
-def test_a_weld_without_torque_holds_a_point():
-    inertial = '<inertial mass="1" pos="0.1 0.2 0" diaginertia="1 1 1"/>'
-    body = f'<body name="{{}}" pos="0 0 {{}}"><freejoint/>{inertial}</body>'
-    text = (
-        "<mujoco><worldbody>" + body.format("a", 0) + body.format("b", 0.3) + "</worldbody><equality>"
-        '<weld body1="a" body2="b" anchor="0 0 0.1" relpose="0 0 0.3 1 0 0 0" torquescale="{}"/></equality></mujoco>'
+    assert bodies.load(swung).joints == ("j", "k", "l")
+    turned = two_links(
+        '<link name="b"/><link name="c"/>'
+        + LINK.format("d", 1, 0, 0).replace("<inertial>", '<inertial><origin xyz="0 1 1"/>')
+        + '<joint name="l" type="continuous"><parent link="b"/><child link="c"/><axis xyz="1 0 0"/></joint>'
+        '<joint name="m" type="continuous"><parent link="c"/><child link="d"/><axis xyz="0 1 0"/></joint>'
     )
-    assert [repr(bodies.load(text.format(scale))).split(",")[2] for scale in (0, 1)] == [
-        " 3 rows of loops",
-        " 6 rows of loops",
-    ]
+    with pytest.raises(ValueError, match="the joints 'k', 'm' of `bodies` can move without moving a mass"):
+        bodies.load(turned)
+    bodies.load(turned, joints={"m": {"armature": 1e-3}})
+    empty = two_links('<link name="b"/>')
+    with pytest.raises(
+        NotImplementedError, match=r"massless: joints that move no mass or turn no inertia, and have .*: k"
+    ):
+        bodies.load(empty)
+    assert bodies.load(empty, ignore=("massless",)).joints == ("j",)
+    assert bodies.load(empty, joints={"k": {"armature": 0.1}}).joints == ("j", "k")
+    assert bodies.load(empty, more=[bodies.Body("load", "b", mass=1.0, com=(0.1, 0, 0))]).joints == ("j", "k")
+
+
+def test_names_made_for_what_has_none_are_unique():
+    shape = '<geom size="0.1" contype="0" conaffinity="0"/>'
+    text = (
+        f'<mujoco><worldbody><body><joint/><joint axis="1 0 0"/>{shape}<site/><site name="site0"/></body>'
+        f'<body name="body1"><joint name="body2"/>{shape}</body><body>{"<joint/>"}{shape}</body></worldbody>'
+        '<actuator><motor joint="body2"/><motor name="actuator0" joint="body2"/></actuator></mujoco>'
+    )
+    robot = bodies.load(text)
+    assert robot.bodies == ("body1_2", "body1", "body3")
+    assert robot.joints == ("body1_2", "body1_2_2", "body2", "body3")
+    assert robot.motors == ("actuator0_2", "actuator0")
+    assert {"site0", "site0_2"} <= set(robot.markers)
+
+
+def test_a_weld_that_lets_the_bodies_turn_is_a_connection_of_points():
+    ties = '<equality><weld body1="a" body2="b" torquescale="{}" relpose="0.1 0.2 0.3 1 0 0 0" anchor="0.3 0 0"/></equality>'  # noqa: E501
+    shape = '<freejoint/><geom size="0.1" contype="0" conaffinity="0"/>'
+    text = f'<mujoco><worldbody><body name="a">{shape}</body><body name="b" pos="1 0 0">{shape}</body></worldbody>{{}}</mujoco>'  # noqa: E501
+    kinds = [bodies.load(text.format(ties.format(x))).model.loops[0].kind for x in (0, 0.5)]
+    assert kinds == ["connect", "weld"]
+    loose = bodies.load(text.format(ties.format(0)))
+    frames = loose.frames(loose.q0)
+    one = frames["a"].x + frames["a"].R @ jnp.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(one, frames["b"].x + frames["b"].R @ jnp.array([0.3, 0, 0]), atol=1e-10)
+
+
+def test_ranges_are_ignored_or_used():
+    text = in_world(joint='range="-10 10" limited="true"')
+    assert bodies.load(text, limits="ignore").unsupported == bodies.load(text, ignore=("limits",)).unsupported
+    assert bodies.load(text, limits="ignore").unsupported == ("limits: ranges of j",)
+    with pytest.raises(ValueError, match="take one of the two"):
+        bodies.load(text, ignore=("limits",), limits="stop")
+    ball = in_world(joint='type="ball" range="0 10" limited="true"')
+    with pytest.raises(NotImplementedError, match=r'(?s)cones of the balls j, for which there is only limits="ignore"'):
+        bodies.load(ball, limits="stop")
+    bodies.load(ball, limits="ignore")

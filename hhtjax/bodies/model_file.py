@@ -1,21 +1,11 @@
 """Mechanisms from MJCF and URDF files. The package mujoco reads them, and does nothing else (extra `models`).
 
 What acts in a file and is not in the equations here is refused in one list, unless it is ignored by name: a model
-that is missing something is not run by accident. Names:
-
-    "contact"            bodies that can touch
-    "limits"             ranges of joints, unless `limits` says what they are
-    "tendon", "flex", "plugin", "fluid", "mocap", "gravcomp"
-    "actuator"           motors of other kinds than `Motor`: muscles, on sites, tendons, balls
-    "equality"           constraints other than connect, weld, joint and mimic, which are loops here
-    "springyield", "polynomial", "actuatorfrcrange"
-    "unphysical"         links of a URDF with an inertia that no body has
-    "massless"           bodies with an inertia and no mass
+that is missing something is not run by accident. The docstring of `load` has the names.
 """
 
 from __future__ import annotations
 
-import importlib
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -26,6 +16,14 @@ import numpy as np
 
 from hhtjax.bodies.description import SCALARS, WORLD, Body, Connect, Couple, Joint, Marker, Motor, Weld, of_quaternion
 from hhtjax.bodies.mechanism import Mechanism, assembled
+from hhtjax.bodies.model_parts import (
+    Reader,
+    is_off,
+    num_actuators,
+    package,
+    strangeness,
+    turns,
+)
 from hhtjax.checks import require_one_of
 
 KNOWN = (
@@ -33,7 +31,8 @@ KNOWN = (
     "springyield", "polynomial", "actuatorfrcrange", "unphysical", "massless",
 )  # fmt: skip
 
-SHORTEST = 1e-15  # s, mujoco's mjMINVAL, below which no filter is
+
+SMALLEST = 1e-15  # kg, kg m^2, the same of masses and moments: mujoco compiles no body that moves and has less
 
 CHANGED = "stiffness", "rest", "damping", "armature", "friction", "range"  # fields of joints that a file may lack
 
@@ -57,11 +56,7 @@ def load(
 
     Args:
         source: path of a file, or its text.
-        ignore: names of what acts in the file and is to be left out: "contact", shapes that can touch; "limits",
-            ranges of joints; "tendon", "flex", "plugin", "fluid", "mocap", "gravcomp"; "actuator", muscles, motors on
-            sites, tendons and balls; "equality", constraints other than connect, weld, joint and mimic; "springyield"
-            and "polynomial", springs and dampers that are not linear; "actuatorfrcrange", limits of a joint's torque;
-            "unphysical", links of a URDF with an inertia that no body has; "massless", an inertia without mass.
+        ignore: names of what acts in the file and is to be left out; the list is below.
         base: of a URDF, which does not say it: "fixed" to the world, or "free". A root link named "world" is the world
             itself: "free" lets the one link loose that is fixed to it.
         joints: what the file does not say of its joints: fields of `Joint` by name, {"elbow": {"friction": 2.0}}; those
@@ -71,17 +66,37 @@ def load(
         gravity: (3,), m/s^2, in the place of that of the file; None for the latter, which is (0, 0, -9.81) where the
             file says nothing, as in mujoco. (The default of `tree` is standard gravity, 9.80665.)
         friction, free: as in `tree`.
-        limits: "ignore", "stop" or "event", as in `tree`; None if there are none.
+        limits: "ignore", "stop" or "event", as in `tree`; None if there are none. "ignore" is the same as
+            ignore=("limits",), and the only one for a file with a ball that has a range: a cone is neither stop nor
+            event here.
 
     Returns:
         A `Mechanism`, with the names of the file, its positions (`qpos`) as coordinates, and q0 = qpos0.
-        `unsupported` lists what was ignored. Motors with an activation (integrator, filter, filterexact) have one here.
-        Their flag `actearly` is about the steps of mujoco, and makes no difference here.
+        Joints and motors without a name in the file bear that of their body, BODY_2 and so on, or "actuator" and a
+        number, made unique. The `mimic` of a URDF and equalities of joints are a `Couple`; a weld whose torquescale is
+        0 is a `Connect`. `unsupported` lists what was ignored. Motors with an activation (integrator, filter,
+        filterexact) have one here. Their flag `actearly` is about the steps of mujoco, and makes no difference here.
+
+    What can be ignored:
+        "contact": bodies that can touch; they pass through each other then.
+        "limits": ranges of joints; joints turn without end then.
+        "tendon": tendons with a spring, a damper, friction, a range or an armature.
+        "flex": deformable bodies. "plugin": plugins. "fluid": a medium with density or viscosity.
+        "mocap": bodies moved from outside; they stand still then. "gravcomp": compensation of gravity at bodies.
+        "actuator": motors of other kinds than `Motor`: muscles, those on sites, tendons, balls.
+        "actuatorfrcrange": limits of the sum of the forces of all motors of a joint (`effort` in a URDF).
+        "equality": constraints other than connect, weld and joint; and a mimic that mujoco does not read.
+        "springyield": springs that yield. "polynomial": springs and dampers that are not linear.
+        "unphysical": links of a URDF with moments of inertia that no body has; all three are their mean then.
+        "massless": bodies with an inertia and no mass, which lose the inertia then; and joints of a URDF that move no
+            mass or turn no inertia, and have no armature, which are fixed then. `joints` can give them one, `more` a
+            mass.
 
     Raises:
         ImportError: mujoco is not installed. FileNotFoundError: no such file.
         NotImplementedError: something acts that is not modelled: the whole list.
-        TypeError, ValueError: an argument of a wrong kind or value; a file that mujoco cannot read, in its words.
+        TypeError, ValueError: an argument of a wrong kind or value; "limits" ignored and used at once; a file that
+            mujoco cannot read, in its words; joints that can move without moving a mass, as in `tree`.
 
     >>> from hhtjax import bodies
     >>> pendulum = bodies.load('''<mujoco><worldbody><body name="rod">
@@ -93,24 +108,60 @@ def load(
     for name in ignore:
         require_one_of("load", "ignore", name, KNOWN)
     require_one_of("load", "base", base, ("fixed", "free"))
-    model, acting = _compiled(source, base)
-    acting += _acting(model, limits, bool(motors))
-    refused = [(name, what) for name, what in acting if name not in ignore]
+    if "limits" in ignore and limits in ("stop", "event"):
+        raise ValueError(f'load: `ignore` leaves out "limits", and `limits` is {limits!r}: take one of the two.')
+    limits = "ignore" if "limits" in ignore else limits
+    model, acting, given = _compiled(source, base)
+    parts = Reader(model, given)
+    acting += _acting(parts, limits, bool(motors))
+    of_file = _with_changes(parts.bodies(), joints or {})
+    idle = _moving_nothing(of_file, list(more)) if given else []
+    if idle:
+        acting.append(("massless", f"joints that move no mass or turn no inertia, and have no armature: {_some(idle)}"))
+    ignored = {*ignore, "limits"} if limits == "ignore" else {*ignore}
+    refused = [(name, what) for name, what in acting if name not in ignored]
     if refused:
         words = "\n".join(f"    {name}: {what}" for name, what in refused)
-        names = ", ".join(f'"{name}"' for name in dict(refused))
-        raise NotImplementedError(
-            f"load: the file holds what acts and is not modelled:\n{words}\nLeave it out by name, ignore=({names},), or"
-            " change the file."
-        )
+        names = ", ".join(f'"{name}"' for name in dict(refused) if name != "limits" or limits is None)
+        way = f"Leave it out by name, ignore=({names},), or change" if names else "Change `limits`, or"
+        raise NotImplementedError(f"load: the file holds what acts and is not modelled:\n{words}\n{way} the file.")
     unsupported = tuple(f"{name}: {what}" for name, what in acting)
-    parts = _Reader(model)
-    of_file = _with_changes(parts.bodies(), joints or {})
+    of_file = [body.with_joints(joint for joint in body.joints if joint.name not in idle) for body in of_file]
+    ties = [loop for loop in parts.loops() if not (isinstance(loop, Couple) and {loop.first, loop.second} & {*idle})]
     return assembled(
-        "load", of_file + list(more), parts.motors() + list(motors), parts.loops() + list(loops),
+        "load", of_file + list(more), parts.motors() + list(motors), ties + list(loops),
         parts.markers() + list(markers), parts.gravity if gravity is None else gravity, friction,
-        "ignore" if limits is None and "limits" in ignore else limits, free, unsupported,
+        limits, free, unsupported,
     )  # fmt: skip
+
+
+def _moving_nothing(bodies: list[Body], more: list[Body]) -> list:
+    """Names of the joints without armature that move no mass, or turn no inertia, whatever the position."""
+    frames, above = {WORLD: (np.eye(3), np.zeros(3))}, {}
+    for body in [*bodies, *more]:
+        if body.parent not in frames:
+            continue  # `assembled` says so
+        R, x = frames[body.parent]
+        frames[body.name] = R @ np.reshape(body.rotation, (3, 3)), x + R @ np.asarray(body.position)
+        above[body.name] = {body.name} | above.get(body.parent, set())
+    movable = {body.name for body in [*bodies, *more] if body.joints}
+    heavy = [body for body in [*bodies, *more] if body.mass > SMALLEST and body.name in above]
+
+    def moves(body: Body, joint: Joint) -> bool:
+        """Whether there is anything that the joint accelerates."""
+        carried = [part for part in heavy if body.name in above[part.name]]
+        further = any(movable & (above[part.name] - above[body.name]) for part in carried)
+        if joint.kind != "revolute" or further:  # what is on its axis here may leave it
+            return bool(carried)
+        R, x = frames[body.name]
+        axis, centre, inertia = R @ np.asarray(joint.axis), x + R @ np.asarray(joint.anchor), 0.0
+        for part in carried:
+            S, y = frames[part.name]
+            arm = np.cross(axis, y + S @ np.asarray(part.com) - centre)
+            inertia += axis @ S @ np.reshape(part.inertia, (3, 3)) @ S.T @ axis + part.mass * (arm @ arm)
+        return bool(inertia > SMALLEST)
+
+    return [joint.name for body in bodies for joint in body.joints if not (joint.armature or moves(body, joint))]
 
 
 def _with_changes(bodies: list[Body], joints: dict) -> list[Body]:
@@ -129,8 +180,8 @@ def _with_changes(bodies: list[Body], joints: dict) -> list[Body]:
 
 
 def _compiled(source: Any, base: str):
-    """The model as mujoco compiles it, and what its text holds that acts and that mujoco does not see then."""
-    mujoco = _mujoco()
+    """The model as mujoco compiles it, what acts and mujoco does not see then, and masses that are not the model's."""
+    mujoco = package()
     text, folder = _text(source)
     try:
         root = ElementTree.fromstring(text)
@@ -138,7 +189,7 @@ def _compiled(source: Any, base: str):
         raise ValueError(f"load: `source` is no XML: {error}.") from None
     if root.tag not in ("robot", "mujoco"):
         raise ValueError(f"load: `source` must be MJCF (mujoco) or URDF (robot); its root is {root.tag!r}.")
-    acting = []
+    acting, given = [], {}
     if base == "free":
         _require_one_root(root)
     try:
@@ -149,9 +200,50 @@ def _compiled(source: Any, base: str):
             spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
             if base == "free":
                 spec.worldbody.first_body().add_freejoint()
-        return spec.compile(), acting
+            given = _without_strange_masses(spec, acting)
+        model = spec.compile()
     except ValueError as error:
         raise ValueError(f"load: mujoco cannot read `source`: {error}") from None
+    coupled = {model.jnt(int(j)).name for j in model.eq_obj1id}  # a URDF has no other constraints
+    movable = [joint for joint in root.findall("joint") if joint.get("type") != "fixed"]
+    mimics = [joint.get("name") for joint in movable if joint.find("mimic") is not None]
+    unread = [name for name in mimics if name not in coupled] if root.tag == "robot" else []
+    if unread:
+        acting.append(("equality", f"mimic of {_some(unread)}, which mujoco does not read"))
+    return model, acting, given
+
+
+def _without_strange_masses(spec, acting: list) -> dict:
+    """Masses that mujoco does not compile replaced by 1; returns what they are: mass, com, and inertia, by body."""
+    given, unphysical, massless = {}, [], []
+    for body in spec.bodies[1:]:
+        x = body.fullinertia
+        inertia = np.array([[x[0], x[3], x[4]], [x[3], x[1], x[5]], [x[4], x[5], x[2]]])
+        inertia = np.diag(body.inertia) if np.isnan(x[0]) else inertia
+        moments, axes = np.linalg.eigh(inertia)
+        strange = moments[0] <= SMALLEST or moments[2] > moments[0] + moments[1] or body.mass <= SMALLEST
+        if not strange or not (body.explicitinertial or len(body.joints)):
+            continue
+        if np.max(np.abs(moments)) <= SMALLEST:
+            moments = np.zeros(3)
+        elif body.mass <= SMALLEST:
+            massless.append(body.name)
+            moments = np.zeros(3)
+        elif moments[0] < -1e-6 * moments[2] or moments[2] > (moments[0] + moments[1]) + 1e-6 * moments[2]:
+            unphysical.append(body.name)
+            moments = np.full(3, max(np.mean(moments), 0.0))
+        elif moments[0] < 0:  # a rod, but for rounding
+            moments = np.maximum(moments, 1e-12 * moments[2])
+        R = of_quaternion(body.iquat) @ axes
+        com = np.where(np.isnan(body.ipos), 0.0, body.ipos)
+        given[body.name] = float(body.mass), com, R @ np.diag(moments) @ R.T
+        body.mass, body.ipos, body.inertia, body.explicitinertial = 1.0, com, np.ones(3), True
+        body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
+    if unphysical:
+        acting.append(("unphysical", f"moments of inertia that no body has: {_some(unphysical)}"))
+    if massless:
+        acting.append(("massless", f"inertia without mass of {_some(massless)}"))
+    return given
 
 
 def _require_one_root(root):
@@ -165,14 +257,6 @@ def _require_one_root(root):
             f'load: `base` is "free", and the root link of the URDF is "world", which does not move: only one link '
             f"that is fixed to it can be let loose; it carries the joints {names}. Rename the link."
         )
-
-
-def _mujoco() -> Any:
-    """The package, imported when a file is read."""
-    try:
-        return importlib.import_module("mujoco")
-    except ImportError:
-        raise ImportError('load: files are read by the package mujoco: pip install "hhtjax[models]".') from None
 
 
 def _text(source: Any):
@@ -195,9 +279,6 @@ def _simplified(root) -> list:
         for tag in ("visual", "collision"):
             for shape in link.findall(tag):
                 link.remove(shape)
-    unphysical = [link.get("name") for link in root.iter("link") if not _is_physical(link)]
-    if unphysical:
-        acting.append(("unphysical", f"a moment of inertia above the sum of the others: {_some(unphysical)}"))
     for tag in ("transmission", "gazebo"):
         for element in root.findall(tag):
             root.remove(element)
@@ -206,19 +287,7 @@ def _simplified(root) -> list:
     compiler = extension.find("compiler")
     compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
     compiler.set("fusestatic", "false")
-    if unphysical:
-        compiler.set("balanceinertia", "true")
     return acting
-
-
-def _is_physical(link) -> bool:
-    """Whether its principal moments are those of a body; mujoco makes all alike where they are not."""
-    inertia = link.find("inertial/inertia")
-    if inertia is None:
-        return True
-    xx, yy, zz, xy, xz, yz = (float(inertia.get(name, 0)) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
-    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return moments[2] <= moments[0] + moments[1]
 
 
 def _some(names: list) -> str:
@@ -226,9 +295,9 @@ def _some(names: list) -> str:
     return ", ".join(map(str, names[:5])) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def _acting(m, limits: str | None, motors: bool) -> list:
+def _acting(parts: Reader, limits: str | None, motors: bool) -> list:
     """What acts in a compiled model and is not in the equations here: (name, words)."""
-    mujoco = _mujoco()
+    mujoco, m = package(), parts.m
     found: list = []
 
     def add(name: str, what: str, here):
@@ -236,17 +305,19 @@ def _acting(m, limits: str | None, motors: bool) -> list:
             found.append((name, what))
 
     def names(kind: str, here) -> str:
-        return _some([_name_of(m, kind, int(i)) for i in np.flatnonzero(here)])
+        return _some([parts.names[kind][i] for i in np.flatnonzero(here)])
 
     off = m.opt.disableflags
     if not off & (int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)):
         add("contact", "shapes that can touch", m.npair > 0 or _can_touch(m))
-    limited = (m.jnt_limited > 0) & (not _off(off, "LIMIT", "CONSTRAINT"))
+    limited = (m.jnt_limited > 0) & (not is_off(off, "LIMIT", "CONSTRAINT"))
     if limits is None:
         add("limits", f"ranges of {names('joint', limited)} (limits= takes them as stops or events)", limited)
+    elif limits == "ignore":
+        add("limits", f"ranges of {names('joint', limited)}", limited)
     balls = limited & (m.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))
-    if limits in ("stop", "event"):
-        add("limits", f'cones of the balls {names("joint", balls)}, which only limits="ignore" leaves out', balls)
+    if limits != "ignore":
+        add("limits", f'cones of the balls {names("joint", balls)}, for which there is only limits="ignore"', balls)
     if m.ntendon:
         acts = (
             (m.tendon_stiffness != 0) | (m.tendon_damping != 0) | (m.tendon_frictionloss != 0) | (m.tendon_limited > 0)
@@ -269,19 +340,19 @@ def _acting(m, limits: str | None, motors: bool) -> list:
             acts = np.any(np.reshape(values, (len(values), -1)) != 0, axis=1)
             add(name, names(kind, acts) if kind else "damping that is not linear", acts)
     rotors = np.flatnonzero(getattr(m, "actuator_armature", np.zeros(0))).tolist()
-    unseen = [i for i in rotors if not _turns(m, i)]
+    unseen = [i for i in rotors if not turns(m, i)]
     add("actuator", f"rotors of motors that are on no hinge or slide ({len(unseen)})", unseen)
     massless = (m.body_mass == 0) & np.any(m.body_inertia != 0, axis=1)
     add("massless", f"inertia without mass of {names('body', massless)}", massless)
-    if (_num_actuators(m) or motors) and not _off(off, "ACTUATION"):
+    if (num_actuators(m) or motors) and not is_off(off, "ACTUATION"):
         add("actuatorfrcrange", names("joint", m.jnt_actfrclimited), m.jnt_actfrclimited)
-    if _num_actuators(m) and not _off(off, "ACTUATION"):
-        strange = np.array([_strangeness(m, i) is not None for i in range(_num_actuators(m))])
+    if num_actuators(m) and not is_off(off, "ACTUATION"):
+        strange = np.array([strangeness(m, i) is not None for i in range(num_actuators(m))])
         words = "; ".join(
-            f"{_name_of(m, 'actuator', int(i))} ({_strangeness(m, int(i))})" for i in np.flatnonzero(strange)[:5]
+            f"{parts.names['actuator'][i]} ({strangeness(m, int(i))})" for i in np.flatnonzero(strange)[:5]
         )
         add("actuator", words, strange)
-    if m.neq and not _off(off, "EQUALITY", "CONSTRAINT"):
+    if m.neq and not is_off(off, "EQUALITY", "CONSTRAINT"):
         here = (m.eq_active0 > 0) & ~np.isin(
             m.eq_type, [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD), int(mujoco.mjtEq.mjEQ_JOINT)]
         )
@@ -289,15 +360,9 @@ def _acting(m, limits: str | None, motors: bool) -> list:
     return found
 
 
-def _off(flags: int, *names: str) -> bool:
-    """Whether a part of the physics is switched off in the file."""
-    mujoco = _mujoco()
-    return any(flags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in names)
-
-
 def _can_touch(m) -> bool:
     """Whether two shapes of different bodies may collide, by their bits and by whose parent is whose."""
-    filtered = not _off(m.opt.disableflags, "FILTERPARENT")
+    filtered = not is_off(m.opt.disableflags, "FILTERPARENT")
     excluded = [_pair(int(s) >> 16, int(s) & 0xFFFF) for s in m.exclude_signature]
     shapes = np.stack([m.geom_contype, m.geom_conaffinity, m.geom_bodyid], axis=1).astype(np.int64)
     shapes = np.unique(shapes[(shapes[:, :2] != 0).any(axis=1)], axis=0)
@@ -319,220 +384,3 @@ def _can_touch(m) -> bool:
 def _pair(a: Any, b: Any) -> Any:
     """A number for two bodies, whichever comes first."""
     return np.minimum(a, b) * 65536 + np.maximum(a, b)
-
-
-def _num_actuators(m) -> int:
-    return len(m.actuator_trntype)
-
-
-def _on_joint(m, i: int) -> bool:
-    """Whether an actuator is on a joint."""
-    kinds = _mujoco().mjtTrn
-    return int(m.actuator_trntype[i]) in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
-
-
-def _turns(m, i: int) -> bool:
-    """Whether it is on a hinge or a slide."""
-    kinds = _mujoco().mjtJoint
-    one = int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE)
-    return _on_joint(m, i) and int(m.jnt_type[m.actuator_trnid[i, 0]]) in one
-
-
-def _gear(m, i: int) -> float:
-    """Of an actuator; one that has several outputs has as many rows of them."""
-    rows = getattr(m, "actuator_outadr", None)
-    return float(m.actuator_gear[i if rows is None else rows[i], 0])
-
-
-def _strangeness(m, i: int) -> str | None:
-    """Why an actuator is none of `Motor`'s kinds; None for one that is, or that is switched off."""
-    mujoco = _mujoco()
-    if m.opt.disableactuator & (1 << int(m.actuator_group[i])):
-        return None
-    if not _on_joint(m, i):
-        return "not on a joint"
-    if m.jnt_type[m.actuator_trnid[i, 0]] not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-        return "on a ball or free joint"
-    if m.actuator_dyntype[i] not in _activations():
-        return f"with the activation {mujoco.mjtDyn(m.actuator_dyntype[i]).name.removeprefix('mjDYN_').lower()}"
-    if m.actuator_gaintype[i] != int(mujoco.mjtGain.mjGAIN_FIXED):
-        return "its gain is not fixed"
-    if m.actuator_biastype[i] not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
-        return "its bias is not affine"
-    for name in ("actuator_damping", "actuator_dampingpoly", "actuator_delay"):
-        values = getattr(m, name, None)
-        if values is not None and np.any(values[i]):
-            return name.replace("actuator_", "with ")
-    return None
-
-
-def _activations() -> dict:
-    """Of the numbers that mujoco has for them, those that `Motor` has."""
-    kinds = _mujoco().mjtDyn
-    known = kinds.mjDYN_NONE, kinds.mjDYN_INTEGRATOR, kinds.mjDYN_FILTER, kinds.mjDYN_FILTEREXACT
-    return dict(zip(map(int, known), (None, "integrator", "filter", "filter"), strict=True))
-
-
-def _name_of(m, kind: str, i: int) -> str:
-    """The name in the file, or kind and number where it has none, with as many "_" as make it its own."""
-    known = getattr(m, "jnt" if kind == "joint" else kind)
-    name = known(i).name
-    if name:
-        return name
-    name, number = f"{kind}{i}", {"joint": m.njnt, "body": m.nbody, "site": m.nsite}.get(kind)
-    taken = {known(k).name for k in range(_num_actuators(m) if number is None else number)} if kind != "tendon" else ()
-    while name in taken:
-        name += "_"
-    return name
-
-
-class _Reader:
-    """The parts of a compiled model as those of a description."""
-
-    def __init__(self, m):
-        mujoco = _mujoco()
-        self.m, self.mujoco = m, mujoco
-        self.gravity = np.zeros(3) if _off(m.opt.disableflags, "GRAVITY") else np.array(m.opt.gravity)
-        self.body_names = [WORLD] + [self.name("body", i) for i in range(1, m.nbody)]
-        self.joint_names = [self.name("joint", i) for i in range(m.njnt)]
-
-    def name(self, kind: str, i: int) -> str:
-        """Of a part."""
-        return _name_of(self.m, kind, i)
-
-    def bodies(self) -> list[Body]:
-        """Of all but the world."""
-        m, found = self.m, []
-        for i in range(1, m.nbody):
-            first, count = m.body_jntadr[i], m.body_jntnum[i]
-            joints = [self.joint(j) for j in range(first, first + count)]
-            R = of_quaternion(m.body_iquat[i])
-            inertia = R @ np.diag(m.body_inertia[i]) @ R.T if m.body_mass[i] else np.zeros((3, 3))
-            found.append(
-                Body(
-                    self.body_names[i], self.body_names[m.body_parentid[i]], joints, float(m.body_mass[i]),
-                    m.body_ipos[i], (inertia + inertia.T) / 2, m.body_pos[i], m.body_quat[i],
-                )
-            )  # fmt: skip
-        return found
-
-    def joint(self, j: int) -> Joint:
-        """With springs, dampers and friction as far as they are switched on."""
-        m, kinds, off = self.m, self.mujoco.mjtJoint, self.m.opt.disableflags
-        dof, q = m.jnt_dofadr[j], m.jnt_qposadr[j]
-        kind = {
-            kinds.mjJNT_FREE: "free", kinds.mjJNT_BALL: "ball",
-            kinds.mjJNT_SLIDE: "prismatic", kinds.mjJNT_HINGE: "revolute",
-        }[kinds(m.jnt_type[j])]  # fmt: skip
-        one = kind in ("revolute", "prismatic")
-        ranged = one and m.jnt_limited[j] and not _off(off, "LIMIT", "CONSTRAINT")
-        return Joint(
-            kind,
-            m.jnt_axis[j] if one else (0.0, 0.0, 1.0),
-            (0.0, 0.0, 0.0) if kind == "free" else m.jnt_pos[j],
-            self.joint_names[j],
-            stiffness=0.0 if _off(off, "SPRING") else float(np.ravel(m.jnt_stiffness[j])[0]),
-            rest=float(m.qpos_spring[q]) if one else 0.0,
-            damping=0.0 if _off(off, "DAMPER") else float(m.dof_damping[dof]),
-            armature=float(m.dof_armature[dof]) + (self.rotor(j) if one else 0.0),
-            friction=0.0 if _off(off, "FRICTIONLOSS", "CONSTRAINT") else float(m.dof_frictionloss[dof]),
-            range=tuple(m.jnt_range[j]) if ranged else None,
-            reference=float(m.qpos0[q]) if one else 0.0,
-        )
-
-    def rotor(self, j: int) -> float:
-        """The armature of the motors of a joint, as it sees it."""
-        m = self.m
-        values = getattr(m, "actuator_armature", np.zeros(_num_actuators(m)))
-        here = [i for i in np.flatnonzero(values).tolist() if _on_joint(m, i) and m.actuator_trnid[i, 0] == j]
-        return float(sum(values[i] * _gear(m, i) ** 2 for i in here))  # rotors turn, whether or not they are driven
-
-    def actuators(self):
-        """Numbers of those that are modelled, and switched on."""
-        m = self.m
-        if _off(m.opt.disableflags, "ACTUATION"):
-            return []
-        on = [i for i in range(_num_actuators(m)) if not m.opt.disableactuator & (1 << int(m.actuator_group[i]))]
-        return [i for i in on if _strangeness(m, i) is None]
-
-    def motors(self) -> list[Motor]:
-        """F = gain u + b0 + b1 s + b2 sdot, as the kind of motor that it is."""
-        return [self.motor(i) for i in self.actuators()]
-
-    def motor(self, i: int) -> Motor:
-        """A servo where its bias follows its gain."""
-        m = self.m
-        gain = float(m.actuator_gainprm[i, 0])
-        affine = m.actuator_biastype[i] == int(self.mujoco.mjtBias.mjBIAS_AFFINE)
-        b0, b1, b2 = (float(x) for x in m.actuator_biasprm[i, :3]) if affine else (0.0, 0.0, 0.0)
-        kind, kp, kv = "torque", -b1, -b2
-        if b1 and gain == -b1:
-            kind, gain = "position", 1.0
-        elif b2 and not b1 and gain == -b2:
-            kind, gain = "velocity", 1.0
-        clamps = not _off(m.opt.disableflags, "CLAMPCTRL")
-        k = m.actuator_ctrladr[i] if hasattr(m, "actuator_ctrladr") else i
-        activation = _activations()[int(m.actuator_dyntype[i])]
-        return Motor(
-            self.joint_names[m.actuator_trnid[i, 0]], kind, _gear(m, i), gain, kp, kv, b0,
-            tuple(m.actuator_ctrlrange[k]) if m.actuator_ctrllimited[k] and clamps else None,
-            tuple(m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else None,
-            self.name("actuator", i), activation,
-            max(float(m.actuator_dynprm[i, 0]), SHORTEST) if activation == "filter" else None,
-            tuple(m.actuator_actrange[i]) if activation and m.actuator_actlimited[i] else None,
-        )  # fmt: skip
-
-    def loops(self) -> list:
-        """Of the kinds connect, weld and joint that are switched on."""
-        m, kinds = self.m, self.mujoco.mjtEq
-        if _off(m.opt.disableflags, "EQUALITY", "CONSTRAINT"):
-            return []
-        makers = {kinds.mjEQ_CONNECT: self.connect, kinds.mjEQ_WELD: self.weld, kinds.mjEQ_JOINT: self.couple}
-        return [
-            makers[kinds(m.eq_type[i])](i) for i in range(m.neq) if m.eq_active0[i] and kinds(m.eq_type[i]) in makers
-        ]
-
-    def ends(self, i: int) -> list:
-        """Body, place and orientation of both sides, where they are sites; else bodies alone."""
-        m = self.m
-        both = []
-        for k in (m.eq_obj1id[i], m.eq_obj2id[i]):
-            if m.eq_objtype[i] == int(self.mujoco.mjtObj.mjOBJ_SITE):
-                both.append((self.body_names[m.site_bodyid[k]], m.site_pos[k], of_quaternion(m.site_quat[k])))
-            else:
-                both.append((self.body_names[k], None, np.eye(3)))
-        return both
-
-    def connect(self, i: int) -> Connect:
-        """Two points."""
-        (a, x, _), (b, y, _) = self.ends(i)
-        data = self.m.eq_data[i]
-        return Connect(a, b, data[:3] if x is None else x, data[3:6] if y is None else y)
-
-    def weld(self, i: int) -> Weld | Connect:
-        """Two frames; without torque two points."""
-        (a, x, R), (b, y, S) = self.ends(i)
-        data = self.m.eq_data[i]
-        if data[10] == 0:  # torquescale
-            return Connect(a, b, data[3:6] if x is None else x, data[:3] if y is None else y)
-        if x is None:
-            return Weld(a, b, data[3:6], data[:3], of_quaternion(data[6:10]))
-        return Weld(a, b, x, y, R @ S.T)
-
-    def couple(self, i: int) -> Couple:
-        """A polynomial."""
-        m = self.m
-        first, second = m.eq_obj1id[i], m.eq_obj2id[i]
-        coefficients = np.trim_zeros(m.eq_data[i, :5], "b")
-        origins = [float(m.qpos0[m.jnt_qposadr[j]]) if j >= 0 else 0.0 for j in (first, second)]
-        second = None if second < 0 else self.joint_names[second]
-        return Couple(self.joint_names[first], second, coefficients if len(coefficients) else [0.0], origins)
-
-    def markers(self) -> list[Marker]:
-        """The sites."""
-        m, found = self.m, []
-        for i in range(m.nsite):
-            name = self.name("site", i)
-            name = f"site {name}" if name in self.body_names else name
-            found.append(Marker(name, self.body_names[m.site_bodyid[i]], m.site_pos[i], m.site_quat[i]))
-        return found
