@@ -439,6 +439,11 @@ def test_a_rod_of_a_urdf_and_links_without_mass():
     robot = bodies.load(two_links(rod))
     np.testing.assert_allclose(np.diag(bodies.mass_matrix(robot, robot.q0)), [1, 0.3])
     assert robot.unsupported == ()
+    tilted = [rod, LINK.format("b", 2, 1e-9, 0.3)]  # mujoco compiles the other one
+    tilted = [link.replace("<inertial>", '<inertial><origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/>') for link in tilted]
+    robot, other = (bodies.load(two_links(link)) for link in tilted)
+    masses = (bodies.mass_matrix(x, x.q0) for x in (robot, other))
+    np.testing.assert_allclose(*masses, atol=1e-8)
     strange = two_links(LINK.format("b", 2, -0.1, 0.2))
     with pytest.raises(NotImplementedError, match="unphysical: moments of inertia that no body has: b"):
         bodies.load(strange)

@@ -213,7 +213,7 @@ def _inertia(name: str, inertia: Any, mass: float) -> tuple:
         raise ValueError(f"Body: `inertia` of {name!r} must be symmetric; received {inertia!r}.")
     x = (x + x.T) / 2
     moments = np.linalg.eigvalsh(x)
-    if moments[0] < 0 or moments[2] > moments[0] + moments[1] + 1e-6 * moments[2]:
+    if moments[0] < -1e-12 * moments[2] or moments[2] > moments[0] + moments[1] + 1e-6 * moments[2]:
         raise ValueError(
             f"Body: `inertia` of {name!r} must be that of a body, its principal moments >= 0 and none larger than the "
             f"sum of the others; received {moments.tolist()}."
