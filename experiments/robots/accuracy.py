@@ -34,6 +34,7 @@ VARIANTS = {  # options and alpha
     "hht, alpha = -0.3": ({}, -0.3),
     "hht, Newton": ({"iterations": None}, -0.05),
 }
+TARGETS = 1e-3, 1e-4, 1e-5, 1e-7  # rad, errors at which steps and times are told
 SAME = 1e-8  # relative difference of accelerations up to which a program solves the same equations
 
 
@@ -272,12 +273,12 @@ def reached(rows: dict, target: float, key: str = "error_rad") -> Any:
 
 def table(report: Report, case: dict):
     """Of a case, the largest steps and the times of runs within errors."""
-    targets, rows = (1e-3, 1e-4, 1e-5, 1e-7), []
+    rows = []
     for name, x in case["methods"].items():
         cells: list = [name]
-        for target in targets:
+        for target in TARGETS:
             found = reached(x, target)
             cells += ["-" if y is None else y * 1e3 for y in ((found or {}).get("h_s"), (found or {}).get("time_s"))]
         rows.append(cells)
     print(case["case"] + (f"; gap {case['gap_m']:.1e} m" if "gap_m" in case else ""))
-    report.table(["method", *(f"{what} (ms) to {e:g}" for e in targets for what in ("h", "run"))], rows)
+    report.table(["method", *(f"{what} (ms) to {e:g}" for e in TARGETS for what in ("h", "run"))], rows)

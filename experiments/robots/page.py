@@ -7,10 +7,9 @@ import json
 from pathlib import Path
 
 from experiments.page import table
-from experiments.robots.accuracy import LATE, SAME, reached
+from experiments.robots.accuracy import LATE, SAME, TARGETS, reached
 
 HERE = Path(__file__).parent
-TARGETS = 1e-3, 1e-4, 1e-5, 1e-7
 STEP = 0.02  # s, at which something was aimed at
 PACKAGES = "hhtjax", "jax", "mujoco", "exudyn", "dm_control"
 
@@ -66,20 +65,26 @@ def rigid(cases) -> str:
     for case in cases:
         for name, x in case["methods"].items():
             cells = [(at_step(x, key), largest(x, 1e-4, key)) for key in ("error_rad", "late_error_rad")]
-            rows.append([case["case"].removeprefix("UR5 on servos, "), name, *(y for pair in cells for y in pair)])
+            rows.append([short(case), name, *(y for pair in cells for y in pair)])
     late = f"from {LATE:g} s on"
     header = ["", "", "error at 20 ms", "1e-4 up to (ms)", f"{late}, at 20 ms", f"{late}, 1e-4 up to (ms)"]
     return table(header, rows)
 
 
-def rigid_words(cases) -> str:
-    """What the table says of the aim."""
+def verdicts(cases, key: str, aim: float) -> str:
+    """What a table says of what was aimed at: this value of ours, with steps of 20 ms."""
     lines = []
     for case in cases:
-        value = case["methods"]["hht"]["error_rad"][case["methods"]["hht"]["h_s"].index(STEP)]
-        met = value is not None and value <= 1e-4
-        lines.append(f"{case['case'].split(', ')[1]}: {'reached' if met else 'missed'}")
+        rows = case["methods"]["hht"]
+        value = rows[key][rows["h_s"].index(STEP)]
+        met = value is not None and value <= aim
+        lines.append(f"{short(case)}: {'reached' if met else 'missed'}")
     return f"With the default that was: {'; '.join(lines)}."
+
+
+def short(case) -> str:
+    """What a case is, without the mechanism."""
+    return case["case"].removeprefix("UR5 on servos, ").removeprefix("flexible joints, ")
 
 
 def flexible(cases) -> str:
@@ -89,19 +94,9 @@ def flexible(cases) -> str:
         for name, x in case["methods"].items():
             torques = [percent(x[key][x["h_s"].index(STEP)]) for key in ("torque_error", "late_torque_error")]
             steps = [largest(x, 0.01, key) for key in ("torque_error", "late_torque_error")]
-            rows.append([case["case"].removeprefix("flexible joints, "), name, *torques, *steps])
+            rows.append([short(case), name, *torques, *steps])
     header = ["", "", "error at 20 ms", f"from {LATE:g} s on", "1 % up to (ms)", f"from {LATE:g} s on (ms)"]
     return table(header, rows)
-
-
-def flexible_words(cases) -> str:
-    """What the table says of the aim."""
-    lines = []
-    for case in cases:
-        value = case["methods"]["hht"]["torque_error"][case["methods"]["hht"]["h_s"].index(STEP)]
-        met = value is not None and value <= 0.01
-        lines.append(f"{case['case'].removeprefix('flexible joints, ')}: {'reached' if met else 'missed'}")
-    return f"With the default that was: {'; '.join(lines)}."
 
 
 def percent(x) -> str:
@@ -199,9 +194,9 @@ def page(numbers):
             reached=tables_of(cases),
             late=LATE,
             rigid=rigid(arms),
-            rigid_words=rigid_words(arms),
+            rigid_words=verdicts(arms, "error_rad", 1e-4),
             flexible=flexible(elastic),
-            flexible_words=flexible_words(elastic),
+            flexible_words=verdicts(elastic, "torque_error", 0.01),
             gap=closed["gap_m"],
             gap_dt=1e3 * closed["gap_dt_s"],
             gap_duration=closed["duration_s"],

@@ -309,8 +309,7 @@ def at_time(x: PyTree, t: Real) -> PyTree:
 def inputs(model: Model, dtype: np.dtype, t: Real, params: PyTree) -> Array:
     """u of each motor, within its range: (na,)."""
     u = jnp.asarray(at_time(params["ctrl"], t), dtype)
-    if u.shape != (len(model.drives),):
-        raise ValueError(f'params["ctrl"] must be ({len(model.drives)},), an input for each motor; received {u.shape}.')
+    require_shape('params["ctrl"]', u, (len(model.drives),))  # what is no function has been looked at
     return _clipped(u, [drive.ctrlrange for drive in model.drives])
 
 

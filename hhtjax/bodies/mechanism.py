@@ -260,7 +260,8 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
     q0 = _at_rest(model, parts, bodies)
     v0 = as_rates(own, jnp.zeros(own.rates, params["mass"].dtype))
     if model.stops:
-        diagonal = np.diag(Mass(model)(q0, params))[own.rates - own.scalars :]
+        M = numpy_mass_matrix(model, jax.tree.map(np.asarray, q0), params)
+        diagonal = np.diag(M)[own.rates - own.scalars :]
         at = np.array([stop.slot for stop in model.stops])
         params["stop_stiffness"] = _array(diagonal[at] * (np.pi / STOP_TIME) ** 2)
         params["stop_damping"] = _array(np.ones(len(at)))

@@ -28,6 +28,7 @@ def is_off(flags: int, *names: str) -> bool:
 
 
 def num_actuators(m) -> int:
+    """How many actuators there are, by what every version of mujoco has."""
     return len(m.actuator_trntype)
 
 
