@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real
@@ -31,12 +32,14 @@ from hhtjax.numerics.sparse_solve import kept
 from hhtjax.primitives import staged
 from hhtjax.steppers.implicit_solve import linearized, with_local
 from hhtjax.steppers.residual import residual
+from hhtjax.steppers.runge_kutta import mean
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.variable_step import Embedded, Errors
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
+FEW = 4  # stages
 EMBEDDED = 0.47990028, 0.51762038, 0.00247934, 0.0  # of order 2, L-stable, from the stages of `rowda`
 
 
@@ -121,39 +124,59 @@ def stages(
     tangent: Callable,
     solve: Callable,
 ):
-    """The state at t + dt, by the formulas at the top of this file, and its errors; value, tangent: of r at s."""
-    g, A, G, b, embedded = tableau
-    zero = jnp.zeros(system.size, s.q.dtype)
+    """The state at t + dt, by the formulas at the top of this file, its errors, and what dense output adds to cubics;
+    value, tangent: of r at s. Rates of a stage are those of q, v and w, (3, N)."""
+    gh, none = tableau.g * dt, jnp.zeros((3, system.size), s.v.dtype)
 
-    def increment(weights: Sequence, rates: list):
-        """dt times the weighted sum of the rates of q, of v and of w."""
-        return [dt * sum((x * k[i] for x, k in zip(weights, rates, strict=False)), zero) for i in range(3)]
+    def increment(weights: Sequence, rates: Sequence) -> Array:
+        """dt times the weighted sum of the rates."""
+        return dt * (none + mean(weights, rates))
 
-    def moved(h: Array, weights: tuple, rates: list) -> State:
+    def moved(h: Array, weights: Sequence, rates: Sequence) -> State:
         """The state after the rates so weighted, at the time t + h."""
         dq, dv, dw = increment(weights, rates)
         return State(s.t + h, s.q + system.located(dq), s.v + dv, s.w + dw)
 
-    def start(row: tuple, rates: list):
+    def start(a: Sequence, rates: Sequence):
         """Where a stage starts, and r there."""
-        at = moved(sum(row) * dt, row, rates)
+        at = moved(sum(a) * dt, a, rates)
         return at, r(at)
 
-    def stage(coupling: tuple, rates: list, at: State, value: Array):
+    def stage(c: Sequence, rates: Sequence, at: State, value: Array) -> Array:
         """Its rates."""
-        zq, zv, zw = increment(coupling, rates)
+        zq, zv, zw = increment(c, rates)
         kq = at.v + zv
-        shift = State((g + sum(coupling)) * dt, system.located(zq + g * dt * kq), zv, -at.w)
+        shift = State(gh + sum(c) * dt, system.located(zq + gh * kq), zv, -at.w)
         kv = -solve(value + tangent(shift))
-        return kq + g * dt * kv, kv, (kv - at.w - zw) / (g * dt)
+        return jnp.stack([kq + gh * kv, kv, (kv - at.w - zw) / gh])
 
-    rates, started, before = [], (s, value), A[0]
-    for row, coupling in zip(A, G, strict=True):
-        if row != before:
-            started, before = staged(partial(start, row))(rates), row
-        rates.append(staged(partial(stage, coupling))(rates, *started))
-    e_q, e_v, _ = increment([x - y for x, y in zip(b, embedded, strict=True)], rates)
-    return moved(dt, b, rates), Errors(e_q, e_v)
+    run_through = written_out if len(tableau.b) <= FEW else in_a_loop
+    rates = run_through(tableau, start, stage, (s, value))
+    e_q, e_v, _ = increment([x - y for x, y in zip(tableau.b, tableau.embedded, strict=True)], rates)
+    return moved(dt, tableau.b, rates), Errors(e_q, e_v)
+
+
+def written_out(tableau: RosenbrockTableau, start: Callable, stage: Callable, first: tuple) -> Sequence:
+    """The rates of all stages. first: where the first starts, and r there."""
+    started, before, rates = first, tableau.A[0], []
+    for a, c in zip(tableau.A, tableau.G, strict=True):
+        if a != before:
+            started, before = staged(partial(start, a))(rates), a
+        rates.append(staged(partial(stage, c))(rates, *started))
+    return rates
+
+
+def in_a_loop(tableau: RosenbrockTableau, start: Callable, stage: Callable, first: tuple) -> Sequence:
+    """The same, with one stage to compile in the place of many; its tableau is data."""
+    number, size, dtype = len(tableau.b), first[1].size, first[1].dtype
+    A, G = (jnp.asarray([[*row, *(number - len(row)) * (0.0,)] for row in rows], dtype) for rows in tableau[1:3])
+
+    def body(rates: Array, row: tuple):
+        a, c, here = row
+        rates = rates + here[:, None, None] * stage(c, rates, *start(a, rates))
+        return rates, None
+
+    return lax.scan(body, jnp.zeros((number, 3, size), dtype), (A, G, jnp.eye(number, dtype=dtype)))[0]
 
 
 def rosenbrock(rho_inf: Real = 0.0) -> Rosenbrock:

@@ -9,9 +9,9 @@ E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, Sec
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -155,9 +155,9 @@ def in_a_loop(rows: tuple, stage: Callable, s: State):
     return q, list(V), list(W)
 
 
-def mean(weights: tuple, rates: list):
-    """Their weighted sum, without those that are known to be 0."""
-    known = [(weight, k) for weight, k in zip(weights, rates, strict=True) if not is_concrete(weight) or weight]
+def mean(weights: Sequence, rates: Sequence) -> Any:
+    """Their weighted sum, without those that are known to be 0; 0 of none."""
+    known = [(weight, k) for weight, k in zip(weights, rates, strict=False) if not is_concrete(weight) or weight]
     return sum(weight * k for weight, k in known)
 
 
