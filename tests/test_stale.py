@@ -219,7 +219,7 @@ def scaled(q, factor=1.0, *, offset=0.0):
 
 @pytest.mark.parametrize(
     "f", [partial(scaled, offset=2.0), partial(partial(scaled), factor=3.0), lambda q, x=(), *, y={}: q]
-)  # noqa: B006
+)
 def test_what_has_not_changed_is_not_looked_through_again(f, monkeypatch):
     """Also where a container is empty, such as the arguments of a partial that has keywords alone."""
     form = current(f)
