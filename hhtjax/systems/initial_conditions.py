@@ -269,20 +269,18 @@ def initial_values(caller: str, system, q0: PyTree, v0: PyTree, z0: PyTree = Non
             raise ValueError(f"{caller}: `v0` must be left out for a FirstOrderSystem; received {v0!r}.")
         v0 = q0
     _require_internal(caller, system, z0)
-    if not any(map(np.size, jax.tree.leaves(q0))):
+    (in_q, structure), (in_v, of_v), (in_z, of_z) = map(jax.tree_util.tree_flatten_with_path, (q0, v0, z0))
+    if not any(np.size(x) for _, x in in_q):
         raise ValueError(f"{caller}: `q0` must hold at least one number; received {q0!r}.")
-    structure = jax.tree.structure(q0)
-    if jax.tree.structure(v0) != structure:
-        raise ValueError(
-            f"{caller}: `v0` must be a pytree structured like q0, {structure}; received {jax.tree.structure(v0)}."
-        )
+    if of_v != structure:
+        raise ValueError(f"{caller}: `v0` must be a pytree structured like q0, {structure}; received {of_v}.")
     dtypes = set()
-    for name, values in (("q0", q0), ("v0", v0), ("z0", z0)):
-        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
+    for name, leaves in (("q0", in_q), ("v0", in_v), ("z0", in_z)):
+        for path, leaf in leaves:
             dtype = _require_finite(caller, name, path, leaf)
             if is_array(leaf) and dtype.kind == "f":
                 dtypes.add(jax.dtypes.canonicalize_dtype(dtype))  # what JAX makes of it: float32 without x64
-    for (path, q), v in zip(jax.tree_util.tree_leaves_with_path(q0), jax.tree.leaves(v0), strict=True):
+    for (path, q), (_, v) in zip(in_q, in_v, strict=True):
         a, b = np.shape(q), np.shape(v)
         if kinematics.is_rotation(a, b):
             _require_rotations(f"{caller}: `q0{jax.tree_util.keystr(path)}`", q)
@@ -300,7 +298,10 @@ def initial_values(caller: str, system, q0: PyTree, v0: PyTree, z0: PyTree = Non
             PrecisionWarning,
             stacklevel=level,
         )
-    q0, v0, z0 = (jax.tree.map(partial(_as_state, dtype=dtype), values) for values in (q0, v0, z0))
+    q0, v0, z0 = (
+        of.unflatten([_as_state(x, dtype) for _, x in leaves])
+        for of, leaves in ((structure, in_q), (of_v, in_v), (of_z, in_z))
+    )
     return q0, None if first_order else v0, z0
 
 
