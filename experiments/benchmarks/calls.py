@@ -4,13 +4,14 @@
 
 So short a run takes as long as what is around it: checks of the arguments, the dispatch of a compiled function, and
 the arrays that come out. What cannot be less is the dispatch of a function with as many arguments and results that
-does nothing. Times are the least of many, in turns within one process.
+does nothing. Times are the least of many calls one after the other, the ways in turns within one process.
 """
 
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 import hhtjax
 from experiments.benchmarks.measure import least_seconds
@@ -18,7 +19,7 @@ from experiments.work_precision.cases import SAMPLES, march
 from hhtjax.primitives import one_kernel
 from hhtjax.scenes import double_pendulum
 
-REPEATS = 3000
+TURNS, CALLS = 100, 30
 DURATION = 5.0  # s
 STEPPER = hhtjax.hht()
 CONTROL = hhtjax.adaptive(1e-4, 1e-6)
@@ -58,7 +59,8 @@ def controlled(system, params, q0, v0):
 
 def loop(system, params, q0, v0):
     """The steps of the former alone: positions at their ends."""
-    return one_kernel(lambda params: march(system, STEPPER, q0, v0, params, DURATION, 1)[0], params)
+    unravel = jax.vmap(ravel_pytree(q0)[1])
+    return one_kernel(lambda params: unravel(march(system, STEPPER, q0, v0, params, DURATION, 1)[0]), params)
 
 
 def ways(simulate, scene, alone):
@@ -77,9 +79,15 @@ def ways(simulate, scene, alone):
     return found if alone is None else {"loop": partial(jax.jit(lambda p: alone(system, p, q0, v0)), data), **found}
 
 
-def row(name, steps, functions, repeats):
-    """The times of all, and two ratios over the loop alone; under error control, over the jit that returns q."""
-    seconds = least_seconds(functions, repeats)
+def seconds_of(functions, turns):
+    """{name: least wall time of a call} of some calls in each turn, as in a user's loop."""
+    found = [{name: least_seconds({name: f}, CALLS)[name] for name, f in functions.items()} for _ in range(turns)]
+    return {name: min(turn[name] for turn in found) for name in functions}
+
+
+def row(name, steps, functions, turns):
+    """The times of all, and ratios over the loop alone; under error control, over the jit that returns q."""
+    seconds = seconds_of(functions, turns)
     least = seconds.get("loop", seconds["q in a jit"])
     ratios = {f"{way}, ratio": seconds[way] / least for way in ("eager", "all in a jit", "q in a jit")}
     return {"system": name, "steps": steps, **ratios, "us": {way: 1e6 * x for way, x in seconds.items()}}
@@ -87,21 +95,12 @@ def row(name, steps, functions, repeats):
 
 def run(report, fast):
     """A row for each system with equal steps, and one for error control."""
-    repeats = 3 if fast else REPEATS
+    turns = 1 if fast else TURNS
     scenes = systems()
-    rows = [row(name, "equal", ways(equal_steps, x, loop), repeats) for name, x in scenes.items()]
+    rows = [row(name, "equal", ways(equal_steps, x, loop), turns) for name, x in scenes.items()]
     name, scene = next(iter(scenes.items()))
-    rows.append(row(name, "adaptive", ways(controlled, scene, None), repeats))
-    report.table(
-        [
-            "system",
-            "steps",
-            *(key for key in rows[0] if key.endswith("ratio")),
-            *(f"{way} (us)" for way in rows[0]["us"]),
-        ],
-        [
-            [*(x for key, x in r.items() if key != "us"), *(r["us"].get(way, "-") for way in rows[0]["us"])]
-            for r in rows
-        ],
-    )
+    rows.append(row(name, "adaptive", ways(controlled, scene, None), turns))
+    names, columns = list(rows[0]["us"]), [key for key in rows[0] if key != "us"]
+    lines = [[*(r[key] for key in columns), *(r["us"].get(way, "-") for way in names)] for r in rows]
+    report.table([*columns, *(f"{way} (us)" for way in names)], lines)
     return {"num_steps": SAMPLES, "jax": jax.__version__, "rows": rows}
