@@ -125,3 +125,8 @@ Sources
 * E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1 (1973) 241-252: `wilson`.
 * H. Hilber, T. Hughes, Earthquake Eng. Struct. Dyn. 6 (1978) 99-117: `collocation`.
 """
+
+from hhtjax.steppers.rosenbrock import Rosenbrock as Rosenbrock
+from hhtjax.steppers.runge_kutta import RungeKutta as RungeKutta
+from hhtjax.steppers.tableaus import ExplicitTableau as ExplicitTableau
+from hhtjax.steppers.tableaus import RosenbrockTableau as RosenbrockTableau
