@@ -93,7 +93,9 @@ STEPPERS = {
     "wilson": hhtjax.wilson(),
     "rowda": hhtjax.rowda(),
     "rk4": hhtjax.rk4(),
+    "rodas5p": hhtjax.rodas5p(),
     "dopri5": hhtjax.dopri5(),
+    "dop853": hhtjax.dop853(),
 }
 
 

@@ -298,7 +298,7 @@ def with_dense_term(flat, found, extra: tuple, s: Array, H: Array) -> Solution:
 
     extra: e of q, v and z, each (number of times, number of terms, number of entries) or None."""
     e_q, e_v, e_z = extra
-    s, k = s[:, None], np.arange(e_q.shape[1] if e_v is None else e_v.shape[1])
+    s, k = s[:, None], jnp.arange(e_q.shape[1], dtype=s.dtype)[None]
     weight = (s * (1 - s)) ** 2 * s**k
     rate = s ** (k + 1) * (1 - s) * ((k + 2) * (1 - s) - 2 * s) / H[:, None]
     terms = [("q", flat.unravel, weight, e_q)]

@@ -185,7 +185,7 @@ def in_a_loop(tableau: RosenbrockTableau, start: Callable, stage: Callable, firs
 
     def body(rates: Array, row: tuple):
         a, c, here = row
-        rates = rates + here[:, None, None] * stage(c, rates, *start(a, rates))
+        rates = rates + here[:, None, None] * stage(c, rates, *start(a, rates))[None]
         return rates, None
 
     return lax.scan(body, jnp.zeros((number, 3, size), dtype), (A, G, jnp.eye(number, dtype=dtype)))[0]

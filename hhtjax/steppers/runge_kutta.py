@@ -27,8 +27,6 @@ from hhtjax.steppers.variable_step import DenseTerm, Embedded, Errors
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
-FEW = 6  # stages
-
 
 @dataclass(frozen=True, eq=False)
 class RungeKutta(Embedded, Stepper):
@@ -80,7 +78,7 @@ class RungeKutta(Embedded, Stepper):
         tableau = self.tableau
         acceleration = staged(lambda q, v, t: system.acceleration(q, v, t, params), system.size)
         rows = *tableau.A, tableau.b, *tableau.extra
-        run_through = in_a_loop if system.size > SCALAR or len(rows) > FEW else written_out
+        run_through = in_a_loop if system.size > SCALAR else written_out
 
         def step(s: State):
             def moved(weights: Sequence, rates: Sequence):
@@ -120,7 +118,7 @@ def in_a_loop(rows: Sequence, stage: Callable, first: Array) -> Array:
 
     def body(rates: Array, row: tuple):
         weights, here = row
-        return rates + here[:, None, None] * stage(weights, rates), None
+        return rates + here[:, None, None] * stage(weights, rates)[None], None
 
     begun = jnp.pad(first[None], ((0, number - 1), (0, 0), (0, 0)))
     return lax.scan(body, begun, (weights, jnp.eye(number, dtype=dtype)[1:]))[0]
@@ -131,11 +129,10 @@ def errors_of(tableau: ExplicitTableau, dt: Array, rates: Sequence) -> Array:
     e = dt * mean(tableau.error, rates)
     if tableau.error_of_3 is None:
         return e
-    size = jnp.abs(e)
-    other = 0.1 * jnp.abs(dt * mean(tableau.error_of_3, rates))
-    largest = jnp.maximum(size, other)
-    part = size / jnp.where(largest == 0, 1, largest)  # whose square does not underflow
-    return size * part / jnp.sqrt(part**2 + (other / jnp.where(largest == 0, 1, largest)) ** 2 + (largest == 0))
+    other = 0.1 * dt * mean(tableau.error_of_3, rates)
+    largest = jnp.maximum(jnp.abs(e), jnp.abs(other))
+    x, y = (z / jnp.where(largest == 0, 1, largest) for z in (e, other))  # whose squares do not underflow
+    return jnp.where(largest == 0, 0, largest * x**2 / jnp.sqrt(jnp.where(largest == 0, 1, x**2 + y**2)))
 
 
 def mean(weights: Sequence, rates: Sequence) -> Any:
