@@ -286,7 +286,7 @@ def require_events(caller: str, problem: Problem, events, step: Real):
     if not problem.stepper.meets_events:
         raise NotImplementedError(
             f"{caller}: {problem.stepper.name} cannot begin anew behind an event; use hht() or another of "
-            "its family, rosenbrock(), rowda(), rk4() or dopri5()."
+            "its family, a Rosenbrock method such as rodas5p(), rk4() or dopri5()."
         )
     require_masses(caller, problem.system, "leave out `events`")
     for i, event in enumerate(events):

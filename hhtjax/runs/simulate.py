@@ -111,7 +111,7 @@ def simulate(
         t0: time of the start.
         events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
             happen, or at known times; the grid stays what it is. Steps without one take as long as before, and a look
-            at the guards. For the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`.
+            at the guards. For the `hht` family, Rosenbrock and Runge-Kutta methods.
         max_events: how many of those that change something may fall into one step; more are a failure. With `adaptive`
             steps become shorter first, and what lies behind an event has an error of its own.
         keep_events: how many `run.events` has room for.

@@ -81,12 +81,12 @@ class RungeKutta(Embedded, Stepper):
         run_through = in_a_loop if system.size > SCALAR else written_out
 
         def step(s: State):
-            def moved(weights: Sequence, rates: Sequence):
+            def moved(weights: Sequence, rates: PyTree):
                 """q and v after the rates so weighted."""
                 x, y = dt * mean(weights, rates)
                 return s.q + system.located(x), s.v + y
 
-            def stage(weights: Sequence, rates: Sequence) -> Array:
+            def stage(weights: Sequence, rates: PyTree) -> Array:
                 """The rates of q and v, (2, N)."""
                 q, v = moved(weights, rates)
                 return jnp.stack([v, acceleration(q, v, s.t + sum(weights) * dt)])
@@ -103,7 +103,7 @@ class RungeKutta(Embedded, Stepper):
         return step
 
 
-def written_out(rows: Sequence, stage: Callable, first: Array) -> Sequence:
+def written_out(rows: Sequence, stage: Callable, first: Array) -> PyTree:
     """The rates of all stages; first: those of the first."""
     rates = [first]
     for row in rows:
@@ -124,7 +124,7 @@ def in_a_loop(rows: Sequence, stage: Callable, first: Array) -> Array:
     return lax.scan(body, begun, (weights, jnp.eye(number, dtype=dtype)[1:]))[0]
 
 
-def errors_of(tableau: ExplicitTableau, dt: Array, rates: Sequence) -> Array:
+def errors_of(tableau: ExplicitTableau, dt: Array, rates: PyTree) -> Array:
     """Of q and v, (2, N)."""
     e = dt * mean(tableau.error, rates)
     if tableau.error_of_3 is None:
@@ -135,7 +135,7 @@ def errors_of(tableau: ExplicitTableau, dt: Array, rates: Sequence) -> Array:
     return jnp.where(largest == 0, 0, largest * x**2 / jnp.sqrt(jnp.where(largest == 0, 1, x**2 + y**2)))
 
 
-def mean(weights: Sequence, rates: Sequence) -> Any:
+def mean(weights: PyTree, rates: PyTree) -> Any:
     """The sum of the rates so weighted, of as many as there are weights, without those that are known to be 0."""
     known = [(weight, k) for weight, k in zip(weights, rates, strict=False) if not is_concrete(weight) or weight]
     return sum(weight * k for weight, k in known)
