@@ -13,10 +13,8 @@ from scipy.special import ellipj
 import hhtjax
 from experiments.benchmarks.chain import chain
 from experiments.cardona_geradin1989.index_1 import unconstrained, violation
-from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.dense_lu import factorize, matvec
 from hhtjax.numerics.linear_solve import reuse, solve
-from hhtjax.primitives import one_kernel
 from hhtjax.scenes import Scene, double_pendulum, duffing, squeezer, top
 
 SAMPLES = 50  # times at which positions are compared
@@ -136,27 +134,3 @@ def rms_error(name, positions):
 def flat(q):
     """A position as a vector."""
     return ravel_pytree(q)[0]
-
-
-def march(system, stepper, q0, v0, params, duration, substeps):
-    """Positions at the sample times, and the number of factorised matrices, substeps of them between samples.
-
-    A loop around `stepper.step`, the step that `hhtjax.simulate` takes, on scalars and as one kernel like there.
-    """
-
-    dt = duration / (SAMPLES * substeps)
-
-    def advance(carry):
-        state, solves = carry
-        state, info = stepper.step(system, state, params, dt)
-        return state, solves + (1 if info.iterations is None else info.iterations)
-
-    def interval(carry, _):
-        carry = jax.lax.fori_loop(0, substeps, lambda _, carry: step(carry), carry)
-        return carry, carry[0].q
-
-    start = stepper.init(system, q0, v0, params, dt)
-    form = on_scalars(advance, (start, jnp.zeros((), jnp.int32)))
-    step = form.of(advance)
-    (_, solves), path = one_kernel(lambda carry: jax.lax.scan(interval, carry, None, SAMPLES), form.tree)
-    return jax.vmap(flat)(form.joined(path)), solves
