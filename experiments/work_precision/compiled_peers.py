@@ -190,7 +190,8 @@ def sundae_entries(name, tolerances=TOLERANCES):
 # ----------------------------------------------------------------------------
 # CasADi: CVODES and IDAS of SUNDIALS, with right-hand side and Jacobian in C, made by itself.
 
-JIT = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O3", "-march=native"]}}
+FLAGS = {"flags": ["-O3", "-march=native"], "cleanup": False}  # of what lies in a folder that is left behind anyway
+JIT = {"jit": True, "compiler": "shell", "jit_cleanup": False, "jit_options": FLAGS}
 
 
 def casadi_system(name, params=None):

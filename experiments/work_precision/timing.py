@@ -82,7 +82,7 @@ def time_to(rows, error):
     return None
 
 
-def times(rows):
+def times(rows, levels=LEVELS):
     """[{method, package, time to each level}] of one case."""
     found = []
     for method in dict.fromkeys(r["method"] for r in rows):
@@ -91,13 +91,13 @@ def times(rows):
             {
                 "method": method,
                 "package": mine[0]["package"],
-                "time_s": {f"{level:g}": time_to(mine, level) for level in LEVELS},
+                "time_s": {f"{level:g}": time_to(mine, level) for level in levels},
             }
         )
     return found
 
 
-def show(report, entries):
+def show(report, entries, levels=LEVELS):
     """Times in ms."""
     rows = [[e["method"], *("-" if t is None else 1e3 * t for t in e["time_s"].values())] for e in entries]
-    report.table(["method", *(f"{level:g}" for level in LEVELS)], rows)
+    report.table(["method", *(f"{level:g}" for level in levels)], rows)
