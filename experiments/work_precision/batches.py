@@ -28,7 +28,7 @@ from experiments.work_precision.compiled_peers import (
 )
 from experiments.work_precision.expressions import Evaluation, compiled_source, places, program, python_source
 from experiments.work_precision.gradient_scenes import SCENES
-from experiments.work_precision.timing import show, time_to
+from experiments.work_precision.timing import seconds, show, times
 
 MEMBERS, SEEN = 10_000, 30
 SPREAD = 0.1  # factors of the parameters, uniform from 1 - SPREAD to 1 + SPREAD
@@ -77,8 +77,6 @@ def reference(name, members):
 
 def rows_of(name, members, method, package, settings, run):
     """Rows from coarse to fine. run: setting -> positions, (members, SAMPLES, size), or None."""
-    from experiments.work_precision.timing import seconds
-
     rows, exact = [], reference(name, members)
     for setting in settings:
         found, time_s = seconds(lambda setting=setting: run(setting), compiles=True)
@@ -97,7 +95,7 @@ def rows_of(name, members, method, package, settings, run):
 # Ours.
 
 
-def by_vmap(name, method, members):
+def by_vmap(name, method, members, sizes=SIZES):
     """Rows of `jax.vmap` of `simulate`."""
     params = unravel(name)
 
@@ -106,7 +104,7 @@ def by_vmap(name, method, members):
         return jax.vmap(lambda vector: ours.path(name, method, params(vector), n)[0])(vectors)
 
     given = jnp.asarray(vectors(name, members))
-    return rows_of(name, members, f"{method}, vmap", "ours", SIZES, lambda n: every(given, n))
+    return rows_of(name, members, f"{method}, vmap", "ours", sizes, lambda n: every(given, n))
 
 
 def swept(name, method, stepper, members, settings, dts):
@@ -225,13 +223,13 @@ PEERS = {"numbalsoda": numbalsoda_rows, "heyoka": heyoka_rows}
 
 def run(report, fast):
     """All batches."""
-    names, members = (NAMES[:1], 8) if fast else (NAMES, MEMBERS)
+    names, members = (NAMES[1:], 4) if fast else (NAMES, MEMBERS)
     there = [] if fast else [module for module in PEERS if importlib.util.find_spec(module)]
     rows, summary = [], {}
     for name in names:
         reference(name, members)
         if fast:
-            rows += by_vmap(name, "hht", members)[:1]
+            rows += by_vmap(name, "hht", members, SIZES[:1])
             continue
         mine = our_rows(name, members)
         report.progress(f"batches, {name}: ours")
@@ -239,15 +237,7 @@ def run(report, fast):
             mine += PEERS[module](name, members)
         report.progress(f"batches, {name}: the others")
         rows += mine
-        methods = dict.fromkeys((r["method"], r["package"]) for r in mine)
-        summary[name] = [
-            {
-                "method": method,
-                "package": package,
-                "time_s": {f"{x:g}": time_to([r for r in mine if r["method"] == method], x) for x in LEVELS},
-            }
-            for method, package in methods
-        ]
+        summary[name] = times(mine, LEVELS)
         print(f"{members} members, {name}: ms to an RMS error of")
         show(report, summary[name], LEVELS)
     missing = [module for module in PEERS if module not in there]
