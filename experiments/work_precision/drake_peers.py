@@ -11,6 +11,7 @@ from experiments.work_precision.engines import TINY, links
 from experiments.work_precision.timing import sweep
 
 SCHEMES = {"Radau3": "radau3", "implicit Euler": "implicit_euler", "RungeKutta5": "runge_kutta5"}
+EXPLICIT = ("RungeKutta5",)  # whose run of the stiff double pendulum had not ended after a minute
 
 
 def chain(m, length, k, c, gravity):
@@ -71,6 +72,8 @@ def drake_entries(name, tolerances=TOLERANCES):
     n, duration = len(q0), case.scene.duration
     relative = np.concatenate([np.diff(q0, prepend=0.0), np.zeros(n)])
     for called, scheme in SCHEMES.items():
+        if name.startswith("stiff") and called in EXPLICIT:
+            continue
         made = {}
 
         def solve(tolerance, scheme=scheme, made=made):

@@ -71,7 +71,7 @@ def rate(name, t, y, params):
     squeezer, whose mass matrix comes first.
     """
     case = cases()[name]
-    system = PLAIN_SINES.get(name, case.scene.system)
+    system: Any = PLAIN_SINES.get(name, case.scene.system)
     q, v = y[: case.size], y[case.size :]
     if system.constraint is not None or q.size != v.size:
         return case.rate(t, y, params)
@@ -85,9 +85,7 @@ def program(name):
     """The `Program` of a scene."""
     case = cases()[name]
     numbers, unravel = ravel_pytree(case.scene.params)
-    found = listed(
-        lambda t, y, vector: rate(name, t, y, unravel(vector)), jnp.zeros(()), jnp.asarray(case.y0), numbers
-    )
+    found = listed(lambda t, y, vector: rate(name, t, y, unravel(vector)), jnp.zeros(()), jnp.asarray(case.y0), numbers)
     return Program(found, np.asarray(numbers, float), len(case.y0))
 
 

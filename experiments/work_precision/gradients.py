@@ -151,10 +151,7 @@ def run(report, fast):
     names, rows, summary = ["forced Duffing"] if fast else list(SCENES), [], {}
     there = [module for module in ("diffrax", *compiled_gradients.ROWS) if importlib.util.find_spec(module)]
     for name in names:
-        if fast:
-            mine = forward_rows(name, SMOOTH[0], (1, 4))
-        else:
-            mine = entries(report, name, there)
+        mine = forward_rows(name, SMOOTH[0], (1, 4)) if fast else entries(report, name, there)
         rows += mine
         summary[name] = times(mine, LEVELS)
         print(f"{name}: ms to a relative error of the gradient of")

@@ -46,8 +46,8 @@ def path(name, method, params, substeps):
     system, q0, v0 = start(name, method)
     steps = {"num_steps": SAMPLES * substeps, "save_every": substeps, "extrapolate": levels}
     run = hhtjax.simulate(system, stepper, q0, v0, params, dt=case.scene.duration / steps["num_steps"], **steps)
-    counted = solves is None and run.info.iterations is not None
-    count = jnp.sum(run.info.iterations) if counted else (solves or 1) * steps["num_steps"] * (2**levels - 1)
+    counted = run.info.iterations if solves is None else None
+    count = (solves or 1) * steps["num_steps"] * (2**levels - 1) if counted is None else jnp.sum(counted)
     return jax.vmap(flat)(run.q)[1:, : case.size], count
 
 

@@ -1,4 +1,4 @@
-"""Error against time and linear solves: our steppers beside eleven other packages."""
+"""Error against time and linear solves: our steppers beside ten other packages."""
 
 import importlib.metadata
 import importlib.util
@@ -13,6 +13,7 @@ PEERS = {  # module: its distribution
     **{name: name for name in ("diffrax", "mujoco", "exudyn", "heyoka", "numbalsoda", "casadi")},
     **{"sksundae": "scikit-sundae", "pydiffsol": "pydiffsol", "pydrake": "drake"},
 }
+NEEDS = {"sksundae": ("numba",)}  # which compiles its right-hand side
 PRIMARY = "stiff double pendulum"  # every method and every kind of step-size control
 ELSEWHERE = "hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rk4"
 CHAINS = (
@@ -35,7 +36,7 @@ SIZES = tuple(2**n for n in range(12))
 
 def installed():
     """Modules of the peers that are there."""
-    return [name for name in PEERS if importlib.util.find_spec(name)]
+    return [name for name in PEERS if all(map(importlib.util.find_spec, (name, *NEEDS.get(name, ()))))]
 
 
 def measure(report, name, fast, installed):

@@ -1,4 +1,4 @@
-"""Error against time, linear solves, of gradients and of batches: our steppers beside eleven other packages."""
+"""Error against time, linear solves, of gradients and of batches: our steppers beside ten other packages."""
 
 from experiments.parts import earlier, rounded
 from experiments.report import Report
