@@ -125,7 +125,7 @@ def draw(report, lines, names):
     """The figures of runs."""
     counted = {package: [m for m in methods if "Kvaerno" not in m] for package, methods in SHOWN.items()}
     error = "RMS error ({unit})"
-    for i, some in enumerate((names[:4], names[4:]), 1):
+    for i, some in enumerate(filter(None, (names[:4], names[4:])), 1):
         report.figure(f"work_precision_time_{i}", panels(lines, some, "time_s", "time of a run (ms)", error, SHOWN))
         report.figure(
             f"work_precision_solves_{i}", panels(lines, some, "solves", "factorised matrices", error, counted)
