@@ -45,7 +45,7 @@ GRADIENTS = {
 OURS = COLOURS[0], COLOURS[0], COLOURS[6], COLOURS[6], COLOURS[5], COLOURS[5], COLOURS[7], COLOURS[7], COLOURS[7]
 THEIRS = {
     **dict(zip(PACKAGES[1:5], COLOURS[1:5], strict=True)),
-    **{"heyoka": "#000000", "numbalsoda": "#8c2d04", "CasADi": "#6a51a3", "sksundae": "#b279d6"},
+    **{"heyoka": "#e7298a", "numbalsoda": "#8c2d04", "CasADi": "#6a51a3", "sksundae": "#b279d6"},
     **{"diffsol": "#1b7837", "Drake": "#a6761d"},
 }
 
