@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from experiments.work_precision.cases import SAMPLES, cases
 from experiments.work_precision.timing import sweep
 
-TOLERANCES = tuple(10.0**-n for n in range(3, 12))
+TOLERANCES = tuple(10.0**-n for n in range(3, 14))
 SIZES = tuple(2**n for n in range(12))  # steps between sample times
 MOST_STEPS = 200_000
 CONTROLLED = "Tsit5", "Kvaerno3", "Kvaerno5"

@@ -8,25 +8,26 @@ from experiments.report import COLOURS, MARKERS
 from hhtjax.plot import subplots, work_precision
 
 WORST = 10  # error beyond which a run is not drawn
-PACKAGES = "ours", "diffrax", "SciPy", "MuJoCo", "exudyn"
+PACKAGES = (
+    *("ours", "diffrax", "SciPy", "MuJoCo", "exudyn", "heyoka", "numbalsoda", "CasADi", "sksundae", "diffsol"),
+    "Drake",
+)
 SHOWN = {  # of a package: the methods that are drawn, where the page has all of them
     "ours": (
         *("hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rk4"),
         *("hht, adaptive", "rowda, adaptive", "dopri5, adaptive"),
     ),
-    "diffrax": ("diffrax Tsit5, PID", "diffrax Kvaerno3, PID", "diffrax Kvaerno5, PID"),
-    "SciPy": (
-        "SciPy LSODA, C rhs",
-        "SciPy Radau, C rhs",
-        "SciPy DOP853, C rhs",
-        "SciPy LSODA, jitted rhs",
-        "SciPy Radau, jitted rhs",
-        "SciPy DOP853, jitted rhs",
-    ),
+    "diffrax": ("diffrax Tsit5, PID", "diffrax Kvaerno5, PID"),
+    "SciPy": ("SciPy LSODA, C rhs", "SciPy LSODA, jitted rhs"),
     "MuJoCo": ("MuJoCo implicitfast", "MuJoCo RK4"),
     "exudyn": ("exudyn generalised alpha",),
+    "heyoka": ("heyoka Taylor",),
+    "numbalsoda": ("numbalsoda LSODA", "numbalsoda DOP853"),
+    "CasADi": ("CasADi CVODES",),
+    "sksundae": ("sksundae CVODE BDF",),
+    "diffsol": ("diffsol tsit45", "diffsol bdf"),
+    "Drake": ("Drake Radau3",),
 }
-
 
 BOTH = "forward", "reverse"
 GRADIENTS = {
@@ -37,11 +38,16 @@ GRADIENTS = {
     ),
     "diffrax": tuple(f"diffrax {solver}, {mode}" for solver in ("Tsit5", "Kvaerno3", "Kvaerno5") for mode in BOTH),
     "SciPy": ("SciPy LSODA, differences",),
-    "MuJoCo": (),
-    "exudyn": (),
+    "heyoka": ("heyoka Taylor, forward",),
+    "CasADi": ("CasADi CVODES, forward",),
 }
 
 OURS = COLOURS[0], COLOURS[0], COLOURS[6], COLOURS[6], COLOURS[5], COLOURS[5], COLOURS[7], COLOURS[7], COLOURS[7]
+THEIRS = {
+    **dict(zip(PACKAGES[1:5], COLOURS[1:5], strict=True)),
+    **{"heyoka": "#e7298a", "numbalsoda": "#8c2d04", "CasADi": "#6a51a3", "sksundae": "#b279d6"},
+    **{"diffsol": "#1b7837", "Drake": "#a6761d"},
+}
 
 
 def kind(method):
@@ -52,7 +58,7 @@ def kind(method):
 def style(package, number, is_reverse):
     """Colour by package, of ours by kind; marker by method, hollow for a gradient in reverse mode."""
     line = {"ls": "-", "lw": 1.4} if package == "ours" else {"ls": "--", "lw": 0.9}
-    colour = OURS[number % len(OURS)] if package == "ours" else COLOURS[PACKAGES.index(package)]
+    colour = OURS[number % len(OURS)] if package == "ours" else THEIRS[package]
     hollow = {"mfc": "white"} if is_reverse else {}
     return line | {"color": colour, "marker": MARKERS[number % len(MARKERS)], "ms": 3.5} | hollow
 
@@ -63,7 +69,7 @@ def curves(lines, case, x, shown):
     scale = 1e3 if x == "time_s" else 1
     for package in PACKAGES:
         methods = list(dict.fromkeys(line["method"] for line in lines if line["package"] == package))
-        methods = [m for m in shown[package] if m in methods]
+        methods = [m for m in shown.get(package, ()) if m in methods]
         kinds = list(dict.fromkeys(map(kind, methods)))
         for method in methods:
             mine = [line for line in lines if (line["case"], line["method"]) == (case, method) and x in line]
@@ -107,7 +113,7 @@ def panels(lines, names, x, xlabel, ylabel, shown):
             key |= dict(zip(labels, handles, strict=True))
         unit = next((line["unit"] for line in lines if line["case"] == name and "unit" in line), "1")
         row[0].set_ylabel("\n".join([*textwrap.wrap(name, 26), ylabel.format(unit=unit)]))
-        row[0].set_ylim(max(1e-10, row[0].get_ylim()[0]), row[0].get_ylim()[1])
+        row[0].set_ylim(max(1e-12, row[0].get_ylim()[0]), row[0].get_ylim()[1])
     for panel in grid[-1]:
         panel.set_xlabel(xlabel)
     key = keys[0] | keys[1]
@@ -119,7 +125,7 @@ def draw(report, lines, names):
     """The figures of runs."""
     counted = {package: [m for m in methods if "Kvaerno" not in m] for package, methods in SHOWN.items()}
     error = "RMS error ({unit})"
-    for i, some in enumerate((names[:4], names[4:]), 1):
+    for i, some in enumerate(filter(None, (names[:4], names[4:])), 1):
         report.figure(f"work_precision_time_{i}", panels(lines, some, "time_s", "time of a run (ms)", error, SHOWN))
         report.figure(
             f"work_precision_solves_{i}", panels(lines, some, "solves", "factorised matrices", error, counted)

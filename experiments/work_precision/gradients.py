@@ -5,142 +5,42 @@ that all count alike; the error is relative, in the Euclidean norm. The referenc
 """
 
 import importlib.util
-import time
-from functools import cache, partial
-from typing import NamedTuple
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
 
 import hhtjax
-from experiments.work_precision import diffrax_peers, ours, scipy_peers
+from experiments.work_precision import compiled_gradients, diffrax_peers, ours, scipy_peers, timing
 from experiments.work_precision.cases import SAMPLES, cases, flat
 from experiments.work_precision.figures import draw_gradients
-from experiments.work_precision.timing import enough, lines, seconds, show, times
+from experiments.work_precision.gradient_scenes import SCENES, SMOOTH, nan_unless, reference, scaled, seen, start, sweep
+from experiments.work_precision.timing import lines, show, times
 
-STIFF = "hht, predictor", "hht, extrapolate=2", "rowda", "rk4"
-SMOOTH = "hht, predictor", "hht, extrapolate=2", "rk4"
-EXPLICIT = ("Tsit5", "forward"), ("Tsit5", "reverse")
-IMPLICIT = ("Kvaerno3", "forward"), ("Kvaerno5", "forward")  # reverse takes longer, to compile and to run
-PEERS = *EXPLICIT, *IMPLICIT, ("Kvaerno5", "reverse")
-SIZES = tuple(2**i for i in range(11))  # steps between sample times
+SIZES = tuple(4**i for i in range(6))  # steps between sample times, each compiled anew
+LEVELS = timing.LEVELS[:-1]  # the reference knows no more
 REVERSE_SIZES = 4, 16, 64  # each compiled anew
 MOST_STEPS = 2**15
-LONGEST_LINE = 10  # s behind its first point, after which nothing finer is tried
 STEPPERS = {"hht": ours.SMOOTH, "rk4": hhtjax.rk4()}  # of runs by `simulate`
 
 
-class Of(NamedTuple):
-    """What is done on a scene. keys: of its parameters; forward: methods with constant steps; reverse: those of
-    `simulate`; controlled: methods; peers: solvers of diffrax, and modes; seen: which positions are in the loss."""
-
-    keys: tuple[str, ...] = ("k", "c")
-    forward: tuple[str, ...] = STIFF
-    reverse: tuple[str, ...] = ("hht",)
-    controlled: tuple[str, ...] = ("rowda, adaptive",)
-    peers: tuple = PEERS
-    seen: tuple[int, ...] | None = None
-
-
-DOPRI5 = ("dopri5, adaptive",)
-SCENES = {
-    "free double pendulum": Of(("m", "l"), SMOOTH, ("rk4",), DOPRI5),
-    "stiff double pendulum": Of(),
-    "stiff double pendulum, torques as printed": Of(peers=(EXPLICIT[0], *IMPLICIT)),
-    "stiff chain of 8": Of(reverse=(), controlled=DOPRI5, peers=(*EXPLICIT, *IMPLICIT)),
-    "forced Duffing": Of(("k", "c"), SMOOTH, ("hht", "rk4"), DOPRI5),
-    "hardening spring": Of(("k", "k3"), SMOOTH, ("rk4",), DOPRI5, (*EXPLICIT, *IMPLICIT)),
-    "squeezer": Of(("c0", "moment"), SMOOTH, (), DOPRI5, EXPLICIT),
-    # all entries of a rotation have a constant sum of squares: the vertical one of the rod alone
-    "top": Of(("g", "a"), SMOOTH, ("rk4",), DOPRI5, EXPLICIT, (7,)),
-}
-
-
-def scaled(name, s):
-    """The parameters of a scene with each number of those in question times one of s."""
-    params = cases()[name].scene.params
-    values, unravel = ravel_pytree({key: params[key] for key in SCENES[name].keys})
-    return {**params, **unravel(values * s)}
-
-
-def start(name):
-    """s of the parameters as they are."""
-    params = cases()[name].scene.params
-    return jnp.ones_like(ravel_pytree({key: params[key] for key in SCENES[name].keys})[0])
-
-
-def seen(name, path):
-    """Of positions (times, size) those that are in the loss."""
-    return path[:, : cases()[name].size] if SCENES[name].seen is None else path[:, np.array(SCENES[name].seen)]
-
-
-def nan_unless(fine):
-    """A factor, so that derivatives are NaN too."""
-    return jnp.where(fine, 1.0, jnp.nan)
-
-
-@cache
-def reference(name):
-    """The gradient, by DOP853 at a tolerance of 1e-12 on the ODE with its sensitivities."""
-    case = cases()[name]
-    n, s = len(case.y0), start(name)
-
-    @jax.jit
-    def rate(t, Y):
-        y, S = Y[:n], Y[n:].reshape(n, -1)
-
-        def f(y, s):
-            return case.rate(t, y, scaled(name, s))
-
-        columns = [jax.jvp(f, (y, s), (S[:, i], jnp.zeros_like(s).at[i].set(1.0)))[1] for i in range(s.size)]
-        return jnp.concatenate([f(y, s), jnp.stack(columns, axis=1).ravel()])
-
-    Y0 = np.concatenate([case.y0, np.zeros(n * s.size)])
-    span = 0.0, case.scene.duration
-    run = solve_ivp(lambda t, Y: np.asarray(rate(t, Y)), span, Y0, "DOP853", case.times, rtol=1e-12, atol=1e-13)
-    q = seen(name, run.y[:n].T)
-    S = run.y[n:].reshape(n, s.size, -1)
-    each = np.stack([seen(name, S[:, i].T) for i in range(s.size)], axis=-1)
-    return 2 * np.mean(q[:, :, None] * each, axis=(0, 1))
-
-
-def sweep(name, method, package, settings, gradient, always_compiles=False):
-    """Rows: error and time of `gradient(setting)`, which is None where it failed."""
-    rows, exact, begun = [], reference(name), None
-    for i, setting in enumerate(settings):
-        found, time_s = seconds(lambda setting=setting: gradient(setting), i == 0 or always_compiles)
-        error = None
-        if found is not None and np.all(np.isfinite(found)):
-            error = float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
-        row = {"case": name, "method": method, "package": package, "setting": setting}
-        rows.append(row | {"rms_error": error, "time_s": time_s})
-        begun = begun or time.perf_counter()
-        if enough(time_s, error) or time.perf_counter() - begun > LONGEST_LINE:
-            break
-    return rows
-
-
 def forward_rows(name, method, sizes):
-    """Forward mode through the compiled loops, as one kernel."""
-    case, s = cases()[name], start(name)
-    stepper, levels, _ = ours.METHODS[method]
-    system, q0, v0 = case.ode if method in ours.PLAIN else (case.scene.system, case.scene.q0, case.scene.v0)
+    """Forward mode through `simulate`."""
+    s = start(name)
 
     def loss(s, substeps):
-        params, duration = scaled(name, s), case.scene.duration
-        path, _ = ours.run(system, stepper, levels, q0, v0, duration, case.size, params, substeps)
-        return jnp.mean(seen(name, path) ** 2)
+        return jnp.mean(seen(name, ours.path(name, method, scaled(name, s), substeps)[0]) ** 2)
 
-    return sweep(name, f"{method}, forward", "ours", sizes, partial(jax.jit(jax.jacfwd(loss)), s))
+    program = jax.jit(jax.jacfwd(loss), static_argnums=1)
+    return sweep(name, f"{method}, forward", "ours", sizes, lambda n: program(s, n), True)
 
 
 def reverse_rows(name, method, sizes):
     """Reverse mode through `simulate`."""
     case, s = cases()[name], start(name)
-    system, q0, v0 = case.ode if method in ours.PLAIN else (case.scene.system, case.scene.q0, case.scene.v0)
+    system, q0, v0 = ours.start(name, method)
 
     def loss(s, substeps):
         steps = {"num_steps": SAMPLES * substeps, "save_every": substeps}
@@ -226,7 +126,7 @@ def scipy_rows(name, tolerances, solver="LSODA"):
     return sweep(name, f"SciPy {solver}, differences", "SciPy", tolerances, gradient)
 
 
-def entries(report, name, installed):
+def entries(report, name, there):
     """Rows of all methods on a scene."""
     of, rows = SCENES[name], []
     reference(name)
@@ -238,8 +138,10 @@ def entries(report, name, installed):
     rows += controlled_rows(name, ours.TOLERANCES, of.controlled)
     report.progress(f"gradients, {name}: ours")
     rows += scipy_rows(name, scipy_peers.TOLERANCES[2::2])
-    if installed:
+    if "diffrax" in there:
         rows += diffrax_rows(name, diffrax_peers.TOLERANCES, of.peers)
+    for module, rows_of in compiled_gradients.ROWS.items():
+        rows += rows_of(name) if module in there else []
     report.progress(f"gradients, {name}: the others")
     return rows
 
@@ -247,15 +149,13 @@ def entries(report, name, installed):
 def run(report, fast):
     """The gradients of all scenes."""
     names, rows, summary = ["forced Duffing"] if fast else list(SCENES), [], {}
+    there = [module for module in ("diffrax", *compiled_gradients.ROWS) if importlib.util.find_spec(module)]
     for name in names:
-        if fast:
-            mine = forward_rows(name, SMOOTH[0], (1, 4))
-        else:
-            mine = entries(report, name, importlib.util.find_spec("diffrax") is not None)
+        mine = forward_rows(name, SMOOTH[0], (1, 4)) if fast else entries(report, name, there)
         rows += mine
-        summary[name] = times(mine)
+        summary[name] = times(mine, LEVELS)
         print(f"{name}: ms to a relative error of the gradient of")
-        show(report, summary[name])
+        show(report, summary[name], LEVELS)
     charts = lines(rows)
     if not fast:
         draw_gradients(report, charts, names)

@@ -1,4 +1,4 @@
-"""Our steppers, as compiled loops, and under error control."""
+"""Our steppers, by `jax.jit` of `hhtjax.simulate`: with constant steps, and under error control."""
 
 from functools import partial
 
@@ -7,13 +7,12 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 import hhtjax
-from experiments.work_precision.cases import SAMPLES, cases, flat, march
+from experiments.benchmarks.measure import least_seconds
+from experiments.work_precision.cases import SAMPLES, cases, flat
 from experiments.work_precision.timing import sweep
-from hhtjax.primitives import one_kernel
-from hhtjax.runs.extrapolate import richardson
 
 SMOOTH = hhtjax.hht(linearize="predictor")
-METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a step if it does not count them
+METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a step; None: counted, or one
     "hht": (hhtjax.hht(), 1, None),
     "hht, predictor": (SMOOTH, 1, None),
     "hht, converged": (hhtjax.hht(iterations=None), 1, None),
@@ -29,46 +28,65 @@ CONTROLLED = {  # by `adaptive`; those but the first take the system without con
     "rowda, adaptive": hhtjax.rowda(),
     "dopri5, adaptive": hhtjax.dopri5(),
 }
-TOLERANCES = tuple(10.0**-n for n in range(2, 12))
+TOLERANCES = tuple(10.0**-n for n in range(2, 14))
+CALLS = 300
 MOST_STEPS = 10_000, 100_000  # the default, and what a user takes where `check` says that this is used up
 PLAIN = "rosenbrock", "rowda", "rowda, extrapolate=2", "rk4"  # take the system without constraints and rotations
 
 
-def run(system, stepper, levels, q0, v0, duration, size, params, substeps):
-    """As `march`, extrapolated; the first `size` numbers of each position."""
+def start(name, method):
+    """The system that a method takes, and its start."""
+    case = cases()[name]
+    return case.ode if method in PLAIN else (case.scene.system, case.scene.q0, case.scene.v0)
 
-    def march_by(substeps):
-        path, solves = march(system, stepper, q0, v0, params, duration, substeps)
-        return path[:, :size], solves
 
-    if levels == 1:
-        return march_by(substeps)
-    paths, solves = jax.lax.map(march_by, substeps * 2 ** jnp.arange(levels))  # a loop, so that one program serves all
-    return richardson(list(paths), stepper.order), jnp.sum(solves)
+def path(name, method, params, substeps):
+    """Positions at the sample times, so many steps between them, and the number of factorised matrices: `simulate`."""
+    case, (stepper, levels, solves) = cases()[name], METHODS[method]
+    system, q0, v0 = start(name, method)
+    steps = {"num_steps": SAMPLES * substeps, "save_every": substeps, "extrapolate": levels}
+    run = hhtjax.simulate(system, stepper, q0, v0, params, dt=case.scene.duration / steps["num_steps"], **steps)
+    counted = run.info.iterations if solves is None else None
+    count = (solves or 1) * steps["num_steps"] * (2**levels - 1) if counted is None else jnp.sum(counted)
+    return jax.vmap(flat)(run.q)[1:, : case.size], count
 
 
 def entries(name, sizes, only=None):
-    """Rows of all methods on a case."""
+    """Rows of all methods on a case; each number of steps is a program of its own."""
     case = cases()[name]
-    system, params, q0, v0, duration = case.scene
-    vector, unravel = ravel_pytree(params)  # a call takes longer with every array that it is handed
-    counts = {n: jnp.asarray(n) for n in sizes}  # a Python number would be made an array in every call
+    vector, unravel = ravel_pytree(case.scene.params)  # a call takes longer with every array that it is handed
     rows = []
-    for method, (stepper, levels, solves) in METHODS.items():
-        if only is not None and method not in only:
-            continue
-        start = case.ode if method in PLAIN else (system, q0, v0)
+    for method in METHODS if only is None else [m for m in METHODS if m in only]:
 
-        # what stays the same is not passed on
-        fixed = partial(run, start[0], stepper, levels, *start[1:], duration, case.size)
-        program = jax.jit(lambda vector, n, fixed=fixed: one_kernel(lambda x, n: fixed(unravel(x), n), vector, n))
+        @partial(jax.jit, static_argnums=1)
+        def program(vector, substeps, method=method):
+            return path(name, method, unravel(vector), substeps)
 
-        def solve(substeps, program=program, levels=levels, solves=solves):
-            path, count = program(vector, counts[substeps])
-            return path, count if solves is None else solves * SAMPLES * substeps * (2**levels - 1)
+        def solve(substeps, program=program):
+            return program(vector, substeps)
 
-        rows += sweep(name, method, "ours", solve, sizes, lambda n: {"h_s": duration / (SAMPLES * n)})
+        tried = partial(sweep, name, method, "ours", solve, sizes)
+        rows += tried(lambda n: {"h_s": case.scene.duration / (SAMPLES * n)}, True)
     return rows
+
+
+def calls(name):
+    """Least times in s of calls of `simulate` that take one step: eager, within `jax.jit`; and of a program of nothing.
+
+    The parameters are one vector, as in all runs.
+    """
+    case = cases()[name]
+    vector, unravel = ravel_pytree(case.scene.params)
+    system, stepper = case.scene.system, hhtjax.hht()
+
+    def one(vector):
+        run = hhtjax.simulate(
+            system, stepper, case.scene.q0, case.scene.v0, unravel(vector), dt=1e-3, num_steps=1, save_every=1
+        )
+        return run.q
+
+    kinds = {"simulate": one, "jit(simulate)": jax.jit(one), "jit of nothing": jax.jit(lambda x: x + 1)}
+    return least_seconds({kind: partial(f, vector) for kind, f in kinds.items()}, CALLS)
 
 
 def controlled(name, method, unravel, most):
@@ -106,7 +124,7 @@ def controlled_rows(name, method, most, tolerances):
         found = solution(tolerance, vector)
         return jax.vmap(flat)(found.q)[1:, : case.size], found.steps.stop
 
-    program = jax.jit(lambda tolerance, vector: one_kernel(positions, tolerance, vector, around=True))
+    program = jax.jit(positions)
 
     def solve(tolerance):
         path, stop = program(numbers[tolerance], vector)

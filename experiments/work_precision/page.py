@@ -15,6 +15,7 @@ HERE = Path(__file__).parent
 STIFF = "stiff double pendulum"
 BARS = {"0.001": 30, "0.0001": 18, "1e-06": 5}
 SAMPLES = 50
+UNCOMPILED = PACKAGES[1:5]  # whose right-hand side crosses Python, or is in an engine of bodies: the bars are for these
 
 
 def ms(t):
@@ -33,7 +34,7 @@ def best_table(times):
     present = [p for p in PACKAGES if any(e["package"] == p for entries in times.values() for e in entries)]
     rows = []
     for name, entries in times.items():
-        for level in ("0.001", "0.0001", "1e-06", "1e-08"):
+        for level in list(entries[0]["time_s"])[1:]:
             cells = []
             for package in present:
                 t, method = best(entries, level, (package,))
@@ -43,10 +44,11 @@ def best_table(times):
 
 
 def bars(entries):
-    """On the stiff double pendulum: peers over ours."""
+    """On the stiff double pendulum: peers over ours; the bars are for peers whose right-hand side crosses Python, and
+    for engines."""
     rows = []
     for level, bar in BARS.items():
-        (ours, method), (theirs, peer) = best(entries, level, PACKAGES[:1]), best(entries, level, PACKAGES[1:])
+        (ours, method), (theirs, peer) = best(entries, level, PACKAGES[:1]), best(entries, level, UNCOMPILED)
         default = next(e["time_s"][level] for e in entries if e["method"] == "hht")
         ratios = ["-" if t is None or theirs is None else f"{theirs / t:.1f}" for t in (ours, default)]
         rows.append([level, f"{peer}: {ms(theirs)} ms", f"{method}: {ms(ours)} ms", *ratios, f">= {bar}"])
@@ -78,6 +80,43 @@ def losses(times, default=None):
                 f"* {name}: the default `{default}()` loses, others of ours do not, at {', '.join(default_lost)}."
             )
     return "\n".join(lines) or "Nowhere, in these runs."
+
+
+def who_wins(times):
+    """For each level: how often each package has the fastest method, over the scenes on which one gets there."""
+    levels = list(dict.fromkeys(level for entries in times.values() for level in entries[0]["time_s"]))
+    rows = []
+    for level in levels:
+        fastest = []
+        for entries in times.values():
+            t, method = best(entries, level) if level in entries[0]["time_s"] else (None, "-")
+            fastest += [] if t is None else [next(e["package"] for e in entries if e["method"] == method)]
+        counts = {package: fastest.count(package) for package in PACKAGES if package in fastest}
+        told = ", ".join(f"{package} {n}" for package, n in sorted(counts.items(), key=lambda x: -x[1]))
+        rows.append([level, told or "-"])
+    return table(["error", "scenes on which each is the fastest"], rows)
+
+
+def calls(numbers):
+    """What a call costs."""
+    found = numbers.get("calls_s")
+    if found is None:
+        return "A call: not measured in this run."
+    told = ", ".join(f"`{kind}` {1e6 * t:.0f} us" for kind, t in found.items())
+    return f"A call that takes one step of `hht()` on the stiff double pendulum: {told}."
+
+
+def batches(numbers):
+    """Of many members in one call."""
+    found = numbers.get("batches")
+    if found is None:
+        return "Not measured in this run."
+    text = (
+        f"{found['members']} members, each with its own parameters (those of the gradients, times factors of "
+        f"{1 - found['spread']:g} to {1 + found['spread']:g}), on {found['cores']} cores. Time in ms to an error:"
+    )
+    tables = [times_table(entries, name) for name, entries in found["times"].items()]
+    return "\n\n".join([text, *tables, losses(found["times"])])
 
 
 def parameters(names):
@@ -113,6 +152,9 @@ def page(numbers):
             best=best_table(times),
             bars=bars(times[STIFF]),
             losses=losses(times, "hht"),
+            wins=who_wins(times),
+            calls=calls(numbers),
+            batches=batches(numbers),
             gradient_figures="\n\n".join(
                 f"![Error of the gradient against time]({name}.png)" for name in gradient_figures(list(gradients))
             ),

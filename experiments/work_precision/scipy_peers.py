@@ -14,7 +14,7 @@ from experiments.work_precision.cases import cases
 from experiments.work_precision.timing import sweep
 
 SOLVERS = "LSODA", "Radau", "BDF", "DOP853"
-TOLERANCES = tuple(10.0**-n for n in range(3, 12))
+TOLERANCES = tuple(10.0**-n for n in range(3, 14))
 Makers = dict[str, Callable[[Any], Callable]]
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from experiments.work_precision.cases import rms_error
 
 LONGEST = 0.3  # s, of a run; nothing finer is tried after one that takes longer, or eight times as long if it is wrong
-FINEST = 1e-9  # error, below which nothing finer is tried
+FINEST = 1e-11  # error, below which nothing finer is tried
 REPEATS = 50
 PATIENCE = 0.08  # s, for the repeats of a run
-LEVELS = 1e-2, 1e-3, 1e-4, 1e-6, 1e-8
+LEVELS = 1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10
 
 
 def seconds(function, compiles):
@@ -33,15 +33,16 @@ def enough(time_s, error):
     return time_s > LONGEST or error < FINEST
 
 
-def sweep(case, method, package, solve, settings, describe):
+def sweep(case, method, package, solve, settings, describe, each_compiles=False):
     """Rows of a method on a case, from coarse to fine.
 
     solve: setting -> positions at the sample times (None if it failed), and factorised matrices, None if not known.
-    describe: setting -> its entry in the row.
+    describe: setting -> its entry in the row. each_compiles: whether every setting has a program of its own, and not
+    the first one alone.
     """
     rows = []
     for i, setting in enumerate(settings):
-        (positions, solves), time_s = seconds(lambda setting=setting: solve(setting), compiles=i == 0)
+        (positions, solves), time_s = seconds(lambda setting=setting: solve(setting), compiles=each_compiles or i == 0)
         row = {"case": case, "method": method, "package": package, **describe(setting)}
         error = rms_error(case, positions)
         rows.append(row | {"rms_error": error, "time_s": time_s, "solves": None if solves is None else int(solves)})
@@ -81,7 +82,7 @@ def time_to(rows, error):
     return None
 
 
-def times(rows):
+def times(rows, levels=LEVELS):
     """[{method, package, time to each level}] of one case."""
     found = []
     for method in dict.fromkeys(r["method"] for r in rows):
@@ -90,13 +91,13 @@ def times(rows):
             {
                 "method": method,
                 "package": mine[0]["package"],
-                "time_s": {f"{level:g}": time_to(mine, level) for level in LEVELS},
+                "time_s": {f"{level:g}": time_to(mine, level) for level in levels},
             }
         )
     return found
 
 
-def show(report, entries):
+def show(report, entries, levels=LEVELS):
     """Times in ms."""
     rows = [[e["method"], *("-" if t is None else 1e3 * t for t in e["time_s"].values())] for e in entries]
-    report.table(["method", *(f"{level:g}" for level in LEVELS)], rows)
+    report.table(["method", *(f"{level:g}" for level in levels)], rows)

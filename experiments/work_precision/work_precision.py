@@ -1,14 +1,14 @@
-"""Error against time, linear solves, and of gradients: our steppers, diffrax, SciPy, MuJoCo and exudyn."""
+"""Error against time, linear solves, of gradients and of batches: our steppers beside ten other packages."""
 
 from experiments.parts import earlier, rounded
 from experiments.report import Report
-from experiments.work_precision import gradients, runs
+from experiments.work_precision import batches, gradients, runs
 
-PARTS = runs, gradients
+PARTS = runs, gradients, batches
 
 
 def run(report: Report, fast: bool):
-    """All cases, then the gradients."""
+    """All cases, then the gradients, and batches."""
     before = earlier(report, runs) if report.parts else None
     numbers = dict(before or {})
     for part in PARTS:
