@@ -78,6 +78,7 @@ from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_eule
 from hhtjax.steppers.multistep import houbolt, park
 from hhtjax.steppers.rosenbrock import rosenbrock, rowda
 from hhtjax.steppers.runge_kutta import dopri5, rk4
+from hhtjax.steppers.taylor import taylor
 from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.systems import interop
@@ -98,7 +99,8 @@ __all__ = [  # noqa: RUF022
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
     "bossak", "conventional_hht", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
-    "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
+    "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "taylor",
+    "wilson",
     # runs
     "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
     "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep",

@@ -86,6 +86,10 @@ class Problem(NamedTuple):
         t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew
         return cls(system, stepper, q0, v0, params, t0, z0)
 
+    def controlled(self, control: Adaptive) -> Problem:
+        """The same, its stepper as it is for a tolerance."""
+        return self._replace(stepper=self.stepper.for_tolerance(control.rtol))
+
     def rates(self) -> int:
         """How many there are, of coordinates: a rotation has three, and nine numbers."""
         return sum(map(jnp.size, jax.tree.leaves(self.q0 if self.v0 is None else self.v0)))
