@@ -242,7 +242,7 @@ def _(A: tuple, dA: tuple):
 
 
 def rates(program: SeriesProgram, positions: int, arguments: Sequence, order: int, dtype: np.dtype) -> Array:
-    """v_1 to v_order, (order, N), of  q' = v,  v' = f(q, v, t):  k q_k = v_{k-1},  k v_k = w_{k-1}.
+    """v_0 to v_order, (order + 1, N), of  q' = v,  v' = f(q, v, t):  k q_k = v_{k-1},  k v_k = w_{k-1}.
 
     program: of w = f. arguments: q (positions), v (N), t and what does not move, as scalars.
     """
@@ -256,7 +256,7 @@ def rates(program: SeriesProgram, positions: int, arguments: Sequence, order: in
 
 def written_out(series: Series, positions: int, v: list, w: list, order: int) -> Array:
     """The same, with operations for each order."""
-    factors, found = [series.rows(series.first)], []
+    factors, found = [series.rows(series.first)], [_stacked(v, series.dtype)]
     for k in range(1, order + 1):
         q = [_times(x, np.asarray(1 / k, series.dtype)) for x in v[:positions]]
         v = [_times(x, np.asarray(1 / k, series.dtype)) for x in w]
@@ -286,7 +286,7 @@ def in_a_loop(series: Series, positions: int, v: list, w: list, order: int) -> A
     def body(k: Array, carry: tuple):
         A, B, v, w, found = carry
         q, v = following(k, v, w)
-        found = lax.dynamic_update_slice(found, v[None], (k - 1, 0))
+        found = lax.dynamic_update_slice(found, v[None], (k, 0))
         others = lax.dynamic_slice(B, (order - 1 - k, 0), (order, count))
         total = jnp.sum(A * others, axis=0)
         t = jnp.where(k == 1, 1, 0).astype(dtype)
@@ -298,6 +298,8 @@ def in_a_loop(series: Series, positions: int, v: list, w: list, order: int) -> A
         B = lax.dynamic_update_slice(B, b[None], (order - 1 - k, 0))
         return A, B, v, w, found
 
-    carry = *first, _stacked(v, dtype), _stacked(w, dtype), jnp.zeros((order, len(w)), dtype)
+    v0 = _stacked(v, dtype)
+    found = jnp.zeros((order + 1, len(w)), dtype).at[0].set(v0)
+    carry = *first, v0, _stacked(w, dtype), found
     *_, v, w, found = lax.fori_loop(1, order, body, carry)
-    return lax.dynamic_update_slice(found, (w / order)[None], (order - 1, 0))
+    return lax.dynamic_update_slice(found, (w / order)[None], (order, 0))

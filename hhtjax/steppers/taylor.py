@@ -14,6 +14,7 @@ A. Jorba, M. Zou, Experimental Mathematics 14 (2005) 99-117.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -28,7 +29,8 @@ from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.jaxpr import NotListed, listed
 from hhtjax.numerics.approximate_math import approximate_log
 from hhtjax.numerics.power_series import rates
-from hhtjax.numerics.series_program import SeriesProgram, series_program
+from hhtjax.numerics.series_program import series_program
+from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.variable_step import Errors
 
@@ -167,9 +169,9 @@ PROGRAMS: WeakKeyDictionary = WeakKeyDictionary()  # {force of a system: {what e
 
 
 class Known(NamedTuple):
-    """The accelerations of a system as a program on series, and what its functions close over."""
+    """The series of a system as one function of numbers, for all places of a program, and what else it takes."""
 
-    program: SeriesProgram
+    series: Callable
     constants: list
 
 
@@ -179,17 +181,21 @@ def expansion(order: int, system: FlatSystem, q: Array, v: Array, t: Array, para
     leaves = [jnp.asarray(x) for x in leaves]
     shapes = tuple((x.shape, x.dtype) for x in (q, v, t, *leaves))
     known = PROGRAMS.setdefault(system.force, {})
-    key = system.mass, id(system.massless), structure, shapes
+    key = system.mass, id(system.massless), structure, shapes, order
     if key not in known:
-        known[key] = _known(system, q, v, t, leaves, structure)
-    program, constants = known[key]
-    numbers = [x for array in (q, v, t, *leaves, *constants) for x in _scalars(array)]
-    V = rates(program, system.positions, numbers, order, v.dtype)
-    return Expansion(jnp.concatenate([v[None], V]))
+        program, constants = _known(system, q, v, t, leaves, structure)
+
+        def series(*arrays: Array) -> Array:
+            numbers = [x for array in arrays for x in _scalars(array)]
+            return rates(program, system.positions, numbers, order, v.dtype)
+
+        known[key] = Known(staged(series), constants)
+    series, constants = known[key]
+    return Expansion(series(q, v, t, *leaves, *constants))
 
 
-def _known(system: FlatSystem, q: Array, v: Array, t: Array, leaves: list, structure: Any) -> Known:
-    """The accelerations, traced and written as a program on series."""
+def _known(system: FlatSystem, q: Array, v: Array, t: Array, leaves: list, structure: Any):
+    """The accelerations, traced and written as a program on series, and what their functions close over."""
 
     def acceleration(q: Array, v: Array, t: Array, *leaves: Array) -> Array:
         return system.acceleration(q, v, t, structure.unflatten(leaves))
@@ -205,7 +211,7 @@ def _known(system: FlatSystem, q: Array, v: Array, t: Array, leaves: list, struc
 
     try:
         listing = listed(of_all, q, v, t, leaves, constants, whole=True)
-        return Known(series_program(listing, list(listing.results.flat), q.size + v.size + 1), constants)
+        return series_program(listing, list(listing.results.flat), q.size + v.size + 1), constants
     except NotListed as error:
         raise NotImplementedError(
             f"taylor: {error.name}{'' if error.line is None else f', in {error.line},'} has no Taylor series; take "
