@@ -94,6 +94,7 @@ STEPPERS = {
     "rowda": hhtjax.rowda(),
     "rk4": hhtjax.rk4(),
     "dopri5": hhtjax.dopri5(),
+    "taylor": hhtjax.taylor(order=4),
 }
 
 

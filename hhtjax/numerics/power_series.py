@@ -103,6 +103,14 @@ class Series:
 
     def begin_solve(self, solve: Solve):
         """The first coefficients of unknowns, by the inverse of the first matrix."""
+        if solve.key not in self.inverses:
+            self.inverses[solve.key] = self.inverse(solve)
+        self.settle(solve, [self.value(x, self.first) for x in solve.right], self.first)
+        for node in solve.matrix:
+            self.first[node] = self.begin(node, self.first)
+
+    def inverse(self, solve: Solve):
+        """That of the first matrix."""
         size, one = len(solve.unknowns), lax.full((), 1, self.dtype)
         columns = []
         for i in range(size):
@@ -111,14 +119,11 @@ class Series:
             for node in solve.matrix:
                 values[node] = self.begin(node, values)
             columns.append([values[x] if moves(x) else None for x in solve.results])
-        self.inverses[id(solve)] = _inverse(columns, self.dtype)
-        self.settle(solve, [self.value(x, self.first) for x in solve.right], self.first)
-        for node in solve.matrix:
-            self.first[node] = self.begin(node, self.first)
+        return _inverse(columns, self.dtype)
 
     def settle(self, solve: Solve, right: list, values: dict):
         """The unknowns of a right-hand side."""
-        S = self.inverses[id(solve)]
+        S = self.inverses[solve.key]
         if isinstance(S, list):
             found = [_sum([_times(a, x) for a, x in zip(row, right, strict=True)]) for row in S]
         else:
@@ -207,8 +212,14 @@ def _sum(terms: list):
 
 
 def _stacked(x: list, dtype: np.dtype) -> Array:
+    if not x:
+        return jnp.zeros(0, dtype)
     zero = lax.full((), 0, dtype)
     return lax.concatenate([lax.reshape(zero if y is None else y, (1,)) for y in x], 0)
+
+
+def _row(x: Array, i: int) -> Array:
+    return lax.squeeze(lax.slice(x, (i, 0), (i + 1, x.shape[1])), (0,))
 
 
 def _element(x: Array, i: int) -> Array:
@@ -288,7 +299,8 @@ def in_a_loop(series: Series, positions: int, v: list, w: list, order: int) -> A
         q, v = following(k, v, w)
         found = lax.dynamic_update_slice(found, v[None], (k, 0))
         others = lax.dynamic_slice(B, (order - 1 - k, 0), (order, count))
-        total = jnp.sum(A * others, axis=0)
+        total = _sum([lax.mul(_row(A, j), _row(others, j)) for j in range(1, order - 1)])
+        total = jnp.zeros(count, dtype) if total is None else total
         t = jnp.where(k == 1, 1, 0).astype(dtype)
         moving = [*(_element(q, i) for i in range(positions)), *(_element(v, i) for i in range(len(v))), t]
         series.advance(moving, [_element(total, i) for i in range(count)], k.astype(dtype))

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,14 +39,25 @@ class Node:
     more: Any = None
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Solve:
-    """A linear solve: M x = b. matrix: nodes that give M x from x."""
+    """A linear solve: M x = b. matrix: nodes that give M x from x, the `results`."""
 
     right: list
     unknowns: list
     matrix: list
     results: list
+
+    @cached_property
+    def key(self) -> tuple:
+        """The same for all solves with one matrix."""
+        places = {id(x): i for i, x in enumerate((*self.unknowns, *self.matrix))}
+
+        def told(x: Any):
+            return ("number", x.tobytes()) if not isinstance(x, Node) else ("own", places[id(x)]) if id(x) in places else id(x)
+
+        operations = tuple((x.kind, *map(told, x.operands)) for x in self.matrix)
+        return len(self.unknowns), operations, tuple(map(told, self.results))
 
 
 @dataclass(frozen=True)

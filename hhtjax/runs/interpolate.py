@@ -320,7 +320,8 @@ def by_series(flat: FlatSystem, a: Solution, found: Solution, series: Expansion,
     """`found`, with what is h behind a by the series from there on."""
 
     def at(series: Expansion, h: Array):
-        state = public(flat, State(h, *summed(series, h)))
+        q, v, w = summed(series, h)
+        state = public(flat, State(h, flat.located(q), v, w))
         pairs = (flat.unravel, state.q), (flat.unravel_rates, state.v), (flat.unravel_rates, state.w)
         more = (flat.unravel_internal, state.z), (flat.unravel_internal, state.zdot)
         return [None if x is None else unravel(x) for unravel, x in (*pairs, *more)]

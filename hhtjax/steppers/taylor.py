@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 LAST = 3  # coefficients that tell the radius of convergence: of motions with a symmetry two of them may vanish
-SHARE = 0.1  # of the tolerance, that the last of them may be
 HIGHEST = 40
 
 
@@ -123,9 +122,10 @@ class Taylor(Stepper):
     def proposed(self, system: FlatSystem, state: State, rtol: Array, q_size: Array, v_size: Array) -> Array:
         """The step by the radius of convergence R of the series, as of Jorba and Zou:
 
-            h = R (SHARE rtol)^(1/p),    R = min_k (size / |v_k|)^(1/k)
+            h = R rtol^(1/p),    R = min_k (size / |v_k|)^(1/k)
 
-        over the last k. sizes: (n,) and (N,), of which coefficients are parts."""
+        over the last k; the error is what follows the last term, of which that is a part of e^-2.
+        sizes: (n,) and (N,), of which coefficients are parts."""
         p, V = self._number(), state.memory.ahead.coefficients
         last = range(max(p - LAST, 0) + 1, p + 1)
         parts = [(k, jnp.max(jnp.abs(V[k]) / v_size)) for k in last]
@@ -134,7 +134,7 @@ class Taylor(Stepper):
         orders, x = (jnp.stack([jnp.asarray(y[i], V.dtype) for y in parts]) for i in (0, 1))
         tiny = float(jnp.finfo(V.dtype).tiny)
         logarithm = jnp.max(approximate_log(jnp.maximum(x, tiny)) / orders)
-        return jnp.exp(approximate_log(SHARE * rtol) / p - logarithm)
+        return jnp.exp(approximate_log(rtol) / p - logarithm)
 
     def _number(self) -> int:
         """The order."""
@@ -210,7 +210,9 @@ def _known(system: FlatSystem, q: Array, v: Array, t: Array, leaves: list, struc
         return eval_jaxpr(trace.jaxpr, [next(others[not here]) for here in moving], q, v, t, *leaves)[0]
 
     try:
-        listing = listed(of_all, q, v, t, leaves, constants, whole=True)
+        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (q, v, t, leaves, constants))
+        with jax.ensure_compile_time_eval():  # what is known of numbers, in a program too
+            listing = listed(of_all, *like, whole=True)
         return series_program(listing, list(listing.results.flat), q.size + v.size + 1), constants
     except NotListed as error:
         raise NotImplementedError(
