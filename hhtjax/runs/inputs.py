@@ -38,6 +38,7 @@ from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses
 from hhtjax.xla import Programs
 
 if TYPE_CHECKING:
+    from hhtjax.runs.adaptive import Adaptive
     from hhtjax.runs.driver import Loop
     from hhtjax.steppers.stepper import State, Stepper
     from hhtjax.systems.flat_system import FlatSystem

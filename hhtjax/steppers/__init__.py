@@ -24,12 +24,14 @@ stepper                            order                 solves per step   for
 `implicit_euler()`                 1                     Newton's          robustness
 `rk4()`                            4                     explicit          where nothing is stiff
 `dopri5()`                         5                     explicit          the same with a tolerance, `adaptive`
+`taylor(order)`                    any                   explicit          the same for many digits, of functions that
+                                                                           have Taylor series
 =================================  ====================  ================  ==========================================
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
 Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it. Internal
-states are for the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`. Dry friction is for the `hht` family. In all
-of this, but for error control, `implicit_euler` belongs to it.
+states are for the `hht` family, `rosenbrock`, `rowda`, `rk4`, `dopri5` and `taylor`. Dry friction is for the `hht` family. In
+all of this, but for error control, `implicit_euler` belongs to it.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
 of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
@@ -42,7 +44,8 @@ a point of linearisation that is cheap and good enough: which is best is measure
 Which one
 ---------
 
-Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and `dopri5()` with a tolerance.
+Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and `taylor()` with a
+tolerance; `dopri5()` where a function has no Taylor series.
 If more than five digits are wanted of something stiff, take `rowda()`, or `simulate(..., extrapolate=2)`. For fitting
 by gradients take
 `hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are to be far longer than the
@@ -121,6 +124,7 @@ Sources
 * E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, Sec. IV.7: `rosenbrock`.
 * C. Lubich, M. Roche, Computing 43 (1990) 325-342: `rowda`.
 * J. Dormand, P. Prince, J. Comput. Appl. Math. 6 (1980) 19-26: `dopri5`.
+* A. Jorba, M. Zou, Experimental Mathematics 14 (2005) 99-117: `taylor`.
 * J. Houbolt, J. Aeronaut. Sci. 17 (1950) 540-550: `houbolt`. K. Park, J. Appl. Mech. 42 (1975) 464-470: `park`.
 * E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1 (1973) 241-252: `wilson`.
 * H. Hilber, T. Hughes, Earthquake Eng. Struct. Dyn. 6 (1978) 99-117: `collocation`.

@@ -81,8 +81,8 @@ class Taylor(Stepper):
             return self
         if not is_concrete(rtol):
             raise ValueError(
-                "taylor: give `order`, such as taylor(order=12), where the tolerance is traced: it follows from `rtol`, "
-                "and is part of the program."
+                "taylor: give `order`, such as taylor(order=12), where the tolerance is traced: it follows from "
+                "`rtol`, and is part of the program."
             )
         return replace(self, order=order_for(float(np.min(rtol))))
 
