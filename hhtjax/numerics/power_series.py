@@ -317,5 +317,5 @@ def in_a_loop(series: Series, positions: int, v: list, w: list, order: int) -> A
     v0 = _stacked(v, dtype)
     found = jnp.zeros((order + 1, len(w)), dtype).at[0].set(v0)
     carry = *first, v0, _stacked(w, dtype), found
-    *_, v, w, found = lax.fori_loop(1, order, body, carry)
-    return lax.dynamic_update_slice(found, (w / order)[None], (order, 0))
+    *_, w, found = lax.fori_loop(1, order, body, carry)
+    return lax.dynamic_update_slice(found, (jnp.asarray(w) / order)[None], (order, 0))
