@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import hhtjax
 from hhtjax.numerics import power_series
 from hhtjax.scenes import double_pendulum, duffing
-from hhtjax.steppers.taylor import expansion, order_for, summed
+from hhtjax.steppers.taylor import order_for, series_of, summed
 from hhtjax.systems.flat_system import flatten
 
 A = jnp.array([[0.0, 2.0, 1.0], [1.0, 0.3, -1.0], [0.5, 1.0, 3.0]])  # whose first pivot is zero
@@ -58,7 +58,7 @@ def test_every_operation_has_the_series_of_its_function(most, monkeypatch):
 
     @jax.jit
     def both(t0, params):
-        series = expansion(16, flat, q, y, t0, params)
+        series = series_of(16, flat, q, y, t0, params).expansion()
         return jax.vmap(lambda h: (summed(series, h)[2], rate(y, t0 + h, params)))(jnp.array([-0.02, 0.02, 0.04]))
 
     found, exact = both(jnp.asarray(t0), params)

@@ -256,7 +256,13 @@ def _(A: tuple, dA: tuple):
     return S, -S @ dA[0] @ S
 
 
-def rates(program: SeriesProgram, positions: int, arguments: Sequence, order: int, dtype: np.dtype) -> Array:
+def rates(program: SeriesProgram, arguments: Sequence, dtype: np.dtype) -> Array:
+    """f(q, v, t) of the same program: (N,)."""
+    series = Series(program, arguments, dtype)
+    return _stacked(series.results(series.first), dtype)
+
+
+def coefficients(program: SeriesProgram, positions: int, arguments: Sequence, order: int, dtype: np.dtype) -> Array:
     """v_0 to v_order, (order + 1, N), of  q' = v,  v' = f(q, v, t):  k q_k = v_{k-1},  k v_k = w_{k-1}.
 
     program: of w = f. arguments: q (positions), v (N), t and what does not move, as scalars.

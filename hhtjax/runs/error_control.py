@@ -86,11 +86,15 @@ class StepTrial(NamedTuple):
     past_events: Any = None
     controller: Controller = PI
 
-    def proposed(self, walk: Walk) -> Array:
-        """The next step, of a stepper that knows it by itself: sizes are those that come with the tolerances."""
+    def proposed(self, walk: Walk, params: PyTree) -> Walk:
+        """The walk with the next step of a stepper that knows it by itself, and what it knows it from; sizes are those
+        that come with the tolerances."""
+        if not self.stepper.proposes:
+            return walk
         rtol, atol, atol_v = self.bounds[:3]
         sizes = walk.q_size + atol / rtol, walk.v_size + atol_v / rtol
-        return self.stepper.proposed(self.flat, walk.state, rtol, *sizes)
+        past, h = self.stepper.proposed(self.flat, walk.state, params, rtol, *sizes)
+        return walk._replace(past=past, h=jnp.minimum(walk.h, h))
 
     def params_of(self, walk: Walk):
         """The params of the next step."""
@@ -194,8 +198,6 @@ def next_end(trial: StepTrial, params: PyTree, walk: Walk):
     by more than the steps before, and so on from jump to jump.
     """
     t, end = walk.state.t, trial.end
-    if trial.stepper.proposes:
-        walk = walk._replace(h=jnp.minimum(walk.h, trial.proposed(walk)))
     h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
     due = jnp.minimum(end, zero_order_hold.jump_after(params, t)) if zero_order_hold.holds(params) else end
     if trial.context is not None and walk.met.over:
@@ -209,10 +211,11 @@ def next_end(trial: StepTrial, params: PyTree, walk: Walk):
 def trial_step(trial: StepTrial, walk: Walk):
     """Walk -> Walk after one try, and how that began."""
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
-    h, t1 = next_end(trial, params, walk)
+    asked = trial.proposed(walk, params)
+    h, t1 = next_end(trial, params, asked)
     resized, state = trial.stepper.resized(walk.state, h / walk.last)
     now, state = step_start(resized, trial.flat, params, h, walk.last, state)
-    s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, walk.past)(state)
+    s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, asked.past)(state)
     s1 = s1._replace(t=t1)
     q_size, v_size = map(jnp.maximum, (walk.q_size, walk.v_size), sizes(trial.flat, s1))
     error = judged(s1, info, bounds.relative(trial.flat, errors, q_size, v_size))

@@ -260,7 +260,7 @@ def kept(flat: FlatSystem, stepper: Stepper, state: State):
     """What is saved of a state, and what its dense output adds."""
     extra = None
     if stepper.reads_series:
-        return saved(flat, state), state.memory.behind
+        return saved(flat, state), state.memory
     if stepper.dense_term:
         e_q, e_v = state.memory
         extra = public(flat, State(state.t, e_q, e_v, 0 * e_v))

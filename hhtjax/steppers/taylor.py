@@ -14,7 +14,7 @@ A. Jorba, M. Zou, Experimental Mathematics 14 (2005) 99-117.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -28,7 +28,7 @@ from hhtjax.checks import require_integer
 from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.jaxpr import NotListed, listed
 from hhtjax.numerics.approximate_math import approximate_log
-from hhtjax.numerics.power_series import rates
+from hhtjax.numerics.power_series import coefficients, rates
 from hhtjax.numerics.series_program import series_program
 from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
@@ -45,13 +45,6 @@ class Expansion(NamedTuple):
     """A series sum_k v_k s^k: (order + 1, N)."""
 
     coefficients: Array
-
-
-class Expansions(NamedTuple):
-    """What a state has for memory: the series from it on, and that of the step before, which led to it."""
-
-    ahead: Expansion
-    behind: Expansion
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,46 +80,56 @@ class Taylor(Stepper):
         return replace(self, order=order_for(float(np.min(rtol))))
 
     def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
-        """The state with its series."""
-        ahead = expansion(self._number(), system, q, v, t, params)
-        return State(t, q, v, ahead.coefficients[1], memory=Expansions(ahead, ahead))
+        """The state with w = M^-1 Q, and room for the series of a step."""
+        order = self._number()
+        none = Expansion(jnp.zeros((order + 1, system.size), v.dtype))
+        return State(t, q, v, series_of(order, system, q, v, t, params).rates(), memory=none)
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
-        """The sum of the series, and the series at the end of the step."""
-        order = self._number()
+        """The sum of the series, which the end of the step keeps in memory."""
 
         def step(s: State):
-            behind = s.memory.ahead
-            change, v, _ = summed(behind, dt)
-            q, t = s.q + system.located(change), s.t + dt
-            ahead = expansion(order, system, q, v, t, params)
-            return State(t, q, v, ahead.coefficients[1], memory=Expansions(ahead, behind)), Info()
+            return self.moved(system, s, params, self.expansion(system, s, params), dt), Info()
 
         return step
+
+    def expansion(self, system: FlatSystem, s: State, params: PyTree) -> Expansion:
+        """The series from a state on."""
+        return series_of(self._number(), system, s.q, s.v, s.t, params).expansion()
+
+    def moved(self, system: FlatSystem, s: State, params: PyTree, series: Expansion, dt: Array) -> State:
+        """The state at the end of a step."""
+        change, v, _ = summed(series, dt)
+        q, t = s.q + system.located(change), s.t + dt
+        return State(t, q, v, series_of(self._number(), system, q, v, t, params).rates(), memory=series)
 
     def begin_estimates(self, system: FlatSystem, state: State):
         """Nothing is remembered."""
         return ()
 
     def bind_estimated(self, system: FlatSystem, params: PyTree, dt: Array, past: tuple):
-        """State -> State, Info, Errors, (): from what the rate of the series is off by at the end of the step."""
-        step, k = self.bind(system, params, dt), self._number() + 1
+        """State -> State, Info, Errors, (): from what the rate of the series is off by at the end of the step.
+
+        past: the series, where it is known."""
+        k = self._number() + 1
 
         def estimated(s: State):
-            s1, info = step(s)
-            e_v = (s1.w - summed(s.memory.ahead, dt)[2]) * (dt / k)
-            return s1, info, Errors(e_v * (dt / (k + 1)), e_v), ()
+            series = past if isinstance(past, Expansion) else self.expansion(system, s, params)
+            s1 = self.moved(system, s, params, series, dt)
+            e_v = (s1.w - summed(series, dt)[2]) * (dt / k)
+            return s1, Info(), Errors(e_v * (dt / (k + 1)), e_v), ()
 
         return estimated
 
-    def proposed(self, system: FlatSystem, state: State, rtol: Array, q_size: Array, v_size: Array) -> Array:
-        """The step by the radius of convergence R of the series, as of Jorba and Zou:
+    def proposed(self, system: FlatSystem, s: State, params: PyTree, rtol: Array, q_size: Array, v_size: Array):
+        """The series from a state on, and the step by its radius of convergence R, as of Jorba and Zou:
 
             h = R rtol^(1/p),    R = min_k (size / |v_k|)^(1/k)
 
         over the last k; the error is what follows the last term, of which that is a part of e^-2.
         sizes: (n,) and (N,), of which coefficients are parts."""
-        p, V = self._number(), state.memory.ahead.coefficients
+        series = self.expansion(system, s, params)
+        p, V = self._number(), series.coefficients
         last = range(max(p - LAST, 0) + 1, p + 1)
         parts = [(k, jnp.max(jnp.abs(V[k]) / v_size)) for k in last]
         if system.positions:
@@ -134,7 +137,7 @@ class Taylor(Stepper):
         orders, x = (jnp.stack([jnp.asarray(y[i], V.dtype) for y in parts]) for i in (0, 1))
         tiny = float(jnp.finfo(V.dtype).tiny)
         logarithm = jnp.max(approximate_log(jnp.maximum(x, tiny)) / orders)
-        return jnp.exp(approximate_log(rtol) / p - logarithm)
+        return series, jnp.exp(approximate_log(rtol) / p - logarithm)
 
     def _number(self) -> int:
         """The order."""
@@ -169,13 +172,29 @@ PROGRAMS: WeakKeyDictionary = WeakKeyDictionary()  # {force of a system: {what e
 
 
 class Known(NamedTuple):
-    """The series of a system as one function of numbers, for all places of a program, and what else it takes."""
+    """Functions of numbers for all places of a program, the series and the rates alone, and what else they take."""
 
     series: Callable
+    first: Callable
     constants: list
 
 
-def expansion(order: int, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Expansion:
+class At(NamedTuple):
+    """The functions at a state."""
+
+    known: Known
+    numbers: list
+
+    def expansion(self) -> Expansion:
+        """The series."""
+        return Expansion(self.known.series(*self.numbers))
+
+    def rates(self) -> Array:
+        """w."""
+        return self.known.first(*self.numbers)
+
+
+def series_of(order: int, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> At:
     """The series of the motion at a state."""
     leaves, structure = jax.tree.flatten(params)
     leaves = [jnp.asarray(x) for x in leaves]
@@ -186,12 +205,13 @@ def expansion(order: int, system: FlatSystem, q: Array, v: Array, t: Array, para
         program, constants = _known(system, q, v, t, leaves, structure)
 
         def series(*arrays: Array) -> Array:
-            numbers = [x for array in arrays for x in _scalars(array)]
-            return rates(program, system.positions, numbers, order, v.dtype)
+            return coefficients(program, system.positions, _scalars(arrays), order, v.dtype)
 
-        known[key] = Known(staged(series), constants)
-    series, constants = known[key]
-    return Expansion(series(q, v, t, *leaves, *constants))
+        def first(*arrays: Array) -> Array:
+            return rates(program, _scalars(arrays), v.dtype)
+
+        known[key] = Known(staged(series), staged(first), constants)
+    return At(known[key], [q, v, t, *leaves, *known[key].constants])
 
 
 def _known(system: FlatSystem, q: Array, v: Array, t: Array, leaves: list, structure: Any):
@@ -221,10 +241,9 @@ def _known(system: FlatSystem, q: Array, v: Array, t: Array, leaves: list, struc
         ) from None
 
 
-def _scalars(x: Array) -> list:
-    """The numbers of an array."""
-    flat = x.reshape(-1)
-    return [flat[i] for i in range(flat.size)]
+def _scalars(arrays: Sequence) -> list:
+    """The numbers of arrays."""
+    return [x[i] for x in (y.reshape(-1) for y in arrays) for i in range(x.size)]
 
 
 def taylor(order: int | None = None) -> Taylor:
