@@ -58,12 +58,33 @@ def test_every_operation_has_the_series_of_its_function(most, monkeypatch):
 
     @jax.jit
     def both(t0, params):
-        series = series_of(16, flat, q, y, t0, params).expansion()
-        return jax.vmap(lambda h: (summed(series, h)[2], rate(y, t0 + h, params)))(jnp.array([-0.02, 0.02, 0.04]))
+        return by_both(16, flat, q, y, t0, params, rate)
 
     found, exact = both(jnp.asarray(t0), params)
     for name, error in zip(OPERATIONS, jnp.max(jnp.abs(found - exact) / (1 + jnp.abs(exact)), axis=0), strict=True):
         assert error < 3e-14, name
+
+
+def by_both(order, flat, q, y, t0, params, rate):
+    """y' near t0 by the series, and by the function itself."""
+    series = series_of(order, flat, q, y, t0, params).expansion()
+    return jax.vmap(lambda h: (summed(series, h)[2], rate(y, t0 + h, params)))(jnp.array([-0.02, 0.02, 0.04]))
+
+
+def test_series_of_a_solve_has_derivatives_in_its_matrix():
+    def rate(y, t, params):
+        x = params["c"] * (0.4 + t)
+        return jnp.linalg.solve(moving_matrix(x), jnp.array([1.0, x, x * x]))
+
+    t0, y0 = jnp.asarray(0.1), jnp.zeros(3)
+
+    def both(c):
+        flat, q, y = flatten("test", hhtjax.FirstOrderSystem(rate), y0, None, t0, {"c": c})
+        return by_both(9, flat, q, y, t0, {"c": c}, rate)
+
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found, exact = jax.jit(derivative(both))(1.7)
+        np.testing.assert_allclose(found, exact, rtol=0, atol=1e-11)
 
 
 def energy(run, params):

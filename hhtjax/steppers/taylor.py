@@ -37,6 +37,7 @@ from hhtjax.steppers.variable_step import Errors
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
+SHARE = 0.1  # of the tolerance, that the last term of a step may be; theirs is exp(-2.7)
 LAST = 3  # coefficients that tell the radius of convergence: of motions with a symmetry two of them may vanish
 HIGHEST = 40
 
@@ -124,10 +125,9 @@ class Taylor(Stepper):
     def proposed(self, system: FlatSystem, s: State, params: PyTree, rtol: Array, q_size: Array, v_size: Array):
         """The series from a state on, and the step by its radius of convergence R, as of Jorba and Zou:
 
-            h = R rtol^(1/p),    R = min_k (size / |v_k|)^(1/k)
+            h = R (SHARE rtol)^(1/p),    R = min_k (size / |v_k|)^(1/k)
 
-        over the last k; the error is what follows the last term, of which that is a part of e^-2.
-        sizes: (n,) and (N,), of which coefficients are parts."""
+        over the last k. sizes: (n,) and (N,), of which coefficients are parts."""
         series = self.expansion(system, s, params)
         p, V = self._number(), series.coefficients
         last = range(max(p - LAST, 0) + 1, p + 1)
@@ -137,7 +137,7 @@ class Taylor(Stepper):
         orders, x = (jnp.stack([jnp.asarray(y[i], V.dtype) for y in parts]) for i in (0, 1))
         tiny = float(jnp.finfo(V.dtype).tiny)
         logarithm = jnp.max(approximate_log(jnp.maximum(x, tiny)) / orders)
-        return series, jnp.exp(approximate_log(rtol) / p - logarithm)
+        return series, jnp.exp(approximate_log(SHARE * rtol) / p - logarithm)
 
     def _number(self) -> int:
         """The order."""
