@@ -20,7 +20,7 @@ from hhtjax.description import Array
 from hhtjax.numerics.dense_lu import SCALAR, factorize, inverse
 from hhtjax.numerics.series_program import ON_KNOWN, Node, SeriesProgram, Solve, moves
 
-WRITTEN_OUT = 4000  # operations on scalars, of all orders
+WRITTEN_OUT = 2000  # operations on series, times the orders; of more, XLA makes no kernel, or takes long
 
 
 class Series:
