@@ -29,7 +29,7 @@ from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.jaxpr import NotListed, listed
 from hhtjax.numerics.approximate_math import approximate_log
 from hhtjax.numerics.power_series import coefficients, rates
-from hhtjax.numerics.series_program import series_program
+from hhtjax.numerics.series_program import SeriesProgram, series_program
 from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.variable_step import Errors
@@ -203,15 +203,20 @@ def series_of(order: int, system: FlatSystem, q: Array, v: Array, t: Array, para
     key = system.mass, id(system.massless), structure, shapes, order
     if key not in known:
         program, constants = _known(system, q, v, t, leaves, structure)
-
-        def series(*arrays: Array) -> Array:
-            return coefficients(program, system.positions, _scalars(arrays), order, v.dtype)
-
-        def first(*arrays: Array) -> Array:
-            return rates(program, _scalars(arrays), v.dtype)
-
-        known[key] = Known(staged(series), staged(first), constants)
+        known[key] = Known(*_functions(program, system.positions, order, v.dtype), constants)
     return At(known[key], [q, v, t, *leaves, *known[key].constants])
+
+
+def _functions(program: SeriesProgram, positions: int, order: int, dtype: np.dtype):
+    """The series and the rates, of numbers; they hold nothing of the system, which `PROGRAMS` would keep alive."""
+
+    def series(*arrays: Array) -> Array:
+        return coefficients(program, positions, _scalars(arrays), order, dtype)
+
+    def first(*arrays: Array) -> Array:
+        return rates(program, _scalars(arrays), dtype)
+
+    return staged(series), staged(first)
 
 
 def _known(system: FlatSystem, q: Array, v: Array, t: Array, leaves: list, structure: Any):
