@@ -80,6 +80,7 @@ from hhtjax.steppers.rosenbrock import rodas5p, rosenbrock, rowda
 from hhtjax.steppers.runge_kutta import dop853, dopri5, rk4, tsit5
 from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
+from hhtjax.steppers.taylor import taylor
 from hhtjax.systems import interop
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.initial_conditions import ConsistentInitial, PrecisionWarning, consistent_initial
@@ -99,7 +100,7 @@ __all__ = [  # noqa: RUF022
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
     "bossak", "conventional_hht", "dop853", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
     "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rodas5p",
-    "rosenbrock", "rowda", "tsit5", "wilson",
+    "rosenbrock", "rowda", "taylor", "tsit5", "wilson",
     # runs
     "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
     "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep",

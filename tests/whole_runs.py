@@ -27,7 +27,7 @@ def random_run(seed):
     n = rng.choice([1, 2, 2, 3, 4, 6])
     x = np.array([rng.uniform(-1, 1) for _ in range(n)])
     text, (_, _, k) = program(rng, rng.randint(3, 10), args=[x, 0.5 * x[::-1]])
-    f, kind, stepper = function(text), rng.randrange(4), rng.choice(list(STEPPERS))
+    f, kind, stepper = function(text), rng.randrange(4), rng.choice([x for x in STEPPERS if x != "taylor"])
 
     def numbers(q, v, params):
         """What the program gives, cut or repeated to one number for each unknown."""

@@ -96,6 +96,7 @@ STEPPERS = {
     "rodas5p": hhtjax.rodas5p(),
     "dopri5": hhtjax.dopri5(),
     "dop853": hhtjax.dop853(),
+    "taylor": hhtjax.taylor(order=4),
 }
 
 

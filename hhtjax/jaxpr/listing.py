@@ -4,6 +4,8 @@ An operand is a `Scalar`, or a known number. Three operations hold lists of thei
 `while` its condition and its body, whose carried variables are its results. Others make and read small arrays, whose
 name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu`, `svd` and `triangular_solve`;
 `taken` has elements of an array in another order, `map` does one operation on all, and `product` multiplies matrices.
+Where it is asked for, a linear solve is an operation `solve` on its right-hand side, whose results are the unknowns,
+with a list that makes the left-hand side of these.
 """
 
 from __future__ import annotations
@@ -48,6 +50,7 @@ class Operation:
     results: list
     params: dict = field(default_factory=dict)
     blocks: list = field(default_factory=list)
+    line: str | None = None  # of the user's that asked for it
 
 
 @dataclass(frozen=True)
@@ -140,4 +143,10 @@ def _loop(x: Operation, wanted) -> Operation:
     return replace(x, results=results, operands=operands, blocks=[unfinished, shorter])
 
 
-_SHORTER = {"cond": _branches, "while": _loop}
+def _solve(x: Operation, wanted) -> Operation:
+    """All of its unknowns belong together."""
+    (block,) = x.blocks
+    return replace(x, blocks=[_shorter(block, list(range(len(block.results))), wanted)])
+
+
+_SHORTER = {"cond": _branches, "while": _loop, "solve": _solve}

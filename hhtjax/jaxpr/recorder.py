@@ -24,6 +24,7 @@ class Recorder:
         self.places = {}  # {scalar: (array, index)} of what was read from an array
         self.orders = {}  # {array of pivots: array of the order of rows}
         self.multiples = {}  # {c x: (c, x)} for known c
+        self.line = None  # of the user's that is being recorded
 
     def record(self, name: str, dtype, *operands, **params: PyTree):
         """The result of an operation, found if it was there before."""
@@ -84,6 +85,7 @@ class Recorder:
 
     def append(self, operation: Operation):
         """At the end of the innermost list."""
+        operation.line = self.line
         self.blocks[-1].operations.append(operation)
 
     def inside(self, f: Callable) -> Block:

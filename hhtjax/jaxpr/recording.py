@@ -51,12 +51,13 @@ class NotListed(Exception):
         self.name, self.line = name, line
 
 
-def listed(f: Callable, *args: PyTree) -> Listing:
+def listed(f: Callable, *args: PyTree, whole: bool = False) -> Listing:
     """f as a list of operations on scalars, with a scalar for each number of its arguments.
 
     Args:
         f: a function of pytrees of arrays, to one.
         *args: these; shapes and types matter, values do not.
+        whole: whether linear solves, and sines by polynomials, stay operations.
 
     Returns:
         A `Listing`; its results are the tree that f returns, with object arrays of operands.
@@ -72,9 +73,10 @@ def listed(f: Callable, *args: PyTree) -> Listing:
     trace, like = jax.make_jaxpr(f, return_shape=True)(*args)
     recorder = Recorder()
     trace = lowered(trace)
+    listing = _Listing(recorder, whole)
     values = [_fresh(recorder, x.aval) for x in trace.jaxpr.invars]
     with np.errstate(all="ignore"):
-        results = [each(as_operand, x) for x in _Listing(recorder).run(trace, values)]
+        results = [each(as_operand, x) for x in listing.run(trace, values)]
     wanted = {x for value in results for x in value.flat if isinstance(x, Scalar)}
     operations = pruned(recorder.blocks[0].operations, wanted)
     for x in everywhere(operations):
@@ -103,8 +105,8 @@ def known_pieces(x) -> np.ndarray:
 class _Listing:
     """The evaluator of a jaxpr on object arrays."""
 
-    def __init__(self, recorder: Recorder):
-        self.recorder, self.lines = recorder, []
+    def __init__(self, recorder: Recorder, whole: bool = False):
+        self.recorder, self.lines, self.whole = recorder, [], whole
 
     def run(self, closed: ClosedJaxpr, values: list):
         """The values of the results of a closed jaxpr."""
@@ -114,8 +116,10 @@ class _Listing:
     def apply(self, eqn: JaxprEqn, values: list):
         """The results of one operation; of one that is not known, results that nobody may need."""
         self.lines.append(line_of(eqn))
+        self.recorder.line = self._line()
         results = self._results(eqn, eqn.primitive.name, values)
-        line = self.lines.pop() or next(filter(None, reversed(self.lines)), None)  # a cached trace has forgotten it
+        line = self._line()
+        self.lines.pop()
         if results is None:
             what = {"what": eqn.primitive.name, "line": line}
             results = [_fresh(self.recorder, x.aval) for x in eqn.outvars]
@@ -125,7 +129,13 @@ class _Listing:
         results = [x if isinstance(x, np.ndarray) else arranged([x], ()) for x in results]
         return [each(as_operand, x) for x in results]
 
+    def _line(self):
+        """The user's that is being listed; a cached trace has forgotten it."""
+        return next(filter(None, reversed(self.lines)), None)
+
     def _results(self, eqn, name: str, values):
+        if self.whole and _is_sincos(eqn):
+            return [each(lambda x, f=f: self.recorder.record(f, x.dtype, x), values[-1]) for f in ("sin", "cos")]
         if name in INLINED:
             return self.run(eqn.params[INLINED[name]], values)
         if name in LOOPS:
@@ -231,8 +241,23 @@ def _counted(listing, params: PyTree, constants: tuple, start: tuple, avals: lis
     return carry
 
 
+def _is_sincos(eqn: JaxprEqn) -> bool:
+    """Whether an operation is `hhtjax.trigonometry.sincos`."""
+    return eqn.primitive.name == "custom_jvp_call" and eqn.params["call_jaxpr"].jaxpr.debug_info.func_name == "sincos"
+
+
+def _whole_solve(listing: _Listing, eqn: JaxprEqn, constants: list, b: list):
+    """A linear solve as one operation."""
+    recorder, x = listing.recorder, [_fresh(listing.recorder, y.aval) for y in eqn.outvars]
+    block = recorder.inside(lambda: _flat(listing.run(eqn.params["jaxprs"].matvec, [*constants, *x])))
+    recorder.append(Operation("solve", [as_operand(y) for y in _flat(b)], _flat(x), blocks=[block]))
+    return x
+
+
 def _custom_linear_solve(listing, eqn: JaxprEqn, *values: np.ndarray):
     lengths = eqn.params["const_lengths"]
+    if listing.whole:
+        return _whole_solve(listing, eqn, list(values[: lengths.matvec]), list(values[sum(lengths) :]))
     start = lengths.matvec + lengths.vecmat
     constants, b = values[start : start + lengths.solve], values[sum(lengths) :]
     return listing.run(eqn.params["jaxprs"].solve, [*constants, *b])

@@ -49,7 +49,7 @@ def run_controlled(problem, times: Real, control: Adaptive, progress: bool, even
     times = checked_times("simulate", problem, times, control)
     if events is not None:
         events = require_events("simulate", problem, events, usual_step(problem.t0, times))
-    problem = problem._replace(output=beside_path(problem.output, control))
+    problem = problem.controlled(control)._replace(output=beside_path(problem.output, control))
     start, alone = (problem, times, control, events), is_untouched() and not is_pair()
     if control.verify == "tighten":
         run = run_tightened(start, alone, progress, room)
@@ -414,6 +414,7 @@ def choose_steps(
             f"dt=adaptive(..., verify={control.verify!r}) returns its steps as `run.steps`."
         )
     times = checked_times("choose_steps", problem, times, control)
+    problem = problem.controlled(control)
     room = (require_integer("choose_steps", "max_events", max_events),)
     if events is not None:
         events = require_events("choose_steps", problem, events, usual_step(problem.t0, times))

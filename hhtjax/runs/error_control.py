@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 LOWEST = 1e-4  # error of the step before, as the controller sees it
+FARTHER = 8  # times the last, that a step may be which its stepper proposes
 ROUNDINGS = 16  # of t, of which a step is at least
 DONE, TOO_SHORT, TOO_MANY, BROKEN, AT_EVENT = range(5)
 
@@ -84,6 +85,16 @@ class StepTrial(NamedTuple):
     context: Any = None
     past_events: Any = None
     controller: Controller = PI
+
+    def proposed(self, walk: Walk, params: PyTree) -> Walk:
+        """The walk with the next step of a stepper that knows it by itself, and what it knows it from; sizes are those
+        that come with the tolerances."""
+        if not self.stepper.proposes:
+            return walk
+        rtol, atol, atol_v = self.bounds[:3]
+        sizes = walk.q_size + atol / rtol, walk.v_size + atol_v / rtol
+        past, h = self.stepper.proposed(self.flat, walk.state, params, rtol, *sizes)
+        return walk._replace(past=past, h=jnp.minimum(walk.h, h))
 
     def params_of(self, walk: Walk):
         """The params of the next step."""
@@ -200,15 +211,18 @@ def next_end(trial: StepTrial, params: PyTree, walk: Walk):
 def trial_step(trial: StepTrial, walk: Walk):
     """Walk -> Walk after one try, and how that began."""
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
-    h, t1 = next_end(trial, params, walk)
+    asked = trial.proposed(walk, params)
+    h, t1 = next_end(trial, params, asked)
     resized, state = trial.stepper.resized(walk.state, h / walk.last)
     now, state = step_start(resized, trial.flat, params, h, walk.last, state)
-    s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, walk.past)(state)
+    s1, info, errors, past = resized.bind_estimated(trial.flat, now, h, asked.past)(state)
     s1 = s1._replace(t=t1)
     q_size, v_size = map(jnp.maximum, (walk.q_size, walk.v_size), sizes(trial.flat, s1))
     error = judged(s1, info, bounds.relative(trial.flat, errors, q_size, v_size))
     error = staged(lambda x: x)(error)
     h1, before = next_step(h, error, walk.before, error <= 1, order, trial.controller)
+    if trial.stepper.proposes:
+        h1 = jnp.where(error <= 1, FARTHER * h, h1)
     h1 = jnp.minimum(h1, bounds.most)
     new = walk._replace(state=s1, last=h, past=past, before=before, q_size=q_size, v_size=v_size)
     tried = TrialStep(new._replace(accepted=walk.accepted + 1), error, h1, h1, why_short(error))
@@ -243,7 +257,7 @@ def begin(trial: StepTrial, q: Array, v: Array, t0: Array):
         stepper, flat, q, v, t0, zero_order_hold.before(trial.params, t0, longest), longest, resolves=True
     )
     q_size, v_size = sizes(flat, state)
-    h = bounds.first(state, v_size, trial.end - t0)
+    h = longest if stepper.proposes else bounds.first(state, v_size, trial.end - t0)
     one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)
     past = stepper.begin_estimates(flat, state)
     walk = Walk(state, h, longest, past, 0 * one, one, q_size, v_size, none, none, none)

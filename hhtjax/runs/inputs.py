@@ -38,6 +38,7 @@ from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses
 from hhtjax.xla import Programs
 
 if TYPE_CHECKING:
+    from hhtjax.runs.adaptive import Adaptive
     from hhtjax.runs.driver import Loop
     from hhtjax.steppers.stepper import State, Stepper
     from hhtjax.systems.flat_system import FlatSystem
@@ -85,6 +86,10 @@ class Problem(NamedTuple):
             require_consistent(caller, system, q0, v0, t0, params, stepper.redundant, z0)
         t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew
         return cls(system, stepper, q0, v0, params, t0, z0)
+
+    def controlled(self, control: Adaptive) -> Problem:
+        """The same, its stepper as it is for a tolerance."""
+        return self._replace(stepper=self.stepper.for_tolerance(control.rtol))
 
     def rates(self) -> int:
         """How many there are, of coordinates: a rotation has three, and nine numbers."""

@@ -16,6 +16,7 @@ from hhtjax.runs.driver import as_path, as_solution, saved
 from hhtjax.runs.output import output_at
 from hhtjax.runs.solution import Solution, told
 from hhtjax.steppers.stepper import State, public
+from hhtjax.steppers.taylor import Expansion, summed
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.xla import Programs
 
@@ -258,6 +259,8 @@ TINY = 1e-9  # part of a run
 def kept(flat: FlatSystem, stepper: Stepper, state: State):
     """What is saved of a state, and what its dense output adds."""
     extra = None
+    if stepper.reads_series:
+        return saved(flat, state), state.memory
     if stepper.dense_term:
         extra = jax.vmap(lambda q, v: public(flat, State(state.t, q, v, 0 * v)))(*state.memory)
         extra = extra.q, (None if flat.positions == 0 else extra.v), extra.z
@@ -290,6 +293,8 @@ def read_between(
     H = jnp.where(b.t - a.t > TINY * long, b.t - a.t, long)
     s = jnp.where((a.t <= times) & (times <= reached), (times - a.t) / H, jnp.nan)
     found = between(a, b, H, s)
+    if isinstance(extra, Expansion):
+        return by_series(flat, a, found, extra, s * H)
     return found if extra is None else with_dense_term(flat, found, extra, s, H)
 
 
@@ -312,6 +317,21 @@ def with_dense_term(flat, found, extra: tuple, s: Array, H: Array) -> Solution:
             more = jax.vmap(unravel)(jnp.sum(factor[..., None] * e, axis=1))
             found = found._replace(**{name: jax.tree.map(jnp.add, getattr(found, name), more)})
     return found
+
+
+def by_series(flat: FlatSystem, a: Solution, found: Solution, series: Expansion, h: Array) -> Solution:
+    """`found`, with what is h behind a by the series from there on."""
+
+    def at(series: Expansion, h: Array):
+        q, v, w = summed(series, h)
+        state = public(flat, State(h, flat.located(q), v, w))
+        pairs = (flat.unravel, state.q), (flat.unravel_rates, state.v), (flat.unravel_rates, state.w)
+        more = (flat.unravel_internal, state.z), (flat.unravel_internal, state.zdot)
+        return [None if x is None else unravel(x) for unravel, x in (*pairs, *more)]
+
+    q, v, w, z, zdot = jax.vmap(at)(series, h)
+    q = jax.tree.map(jnp.add, a.q, q) if flat.positions else q
+    return found._replace(q=q, v=v, acceleration=w, z=z, zdot=zdot)
 
 
 def output_between(flat: FlatSystem, output: Output, params: PyTree, pair: tuple, time: Array, long) -> PyTree:

@@ -27,12 +27,14 @@ stepper                            order                 solves per step   for
 `rk4()`                            4                     explicit          where nothing is stiff
 `dopri5()`, `tsit5()`              5                     explicit          the same with a tolerance, `adaptive`
 `dop853()`                         8                     explicit          the same to eight digits and more
+`taylor(order)`                    any                   explicit          the same, quicker, for functions that have
+                                                                           Taylor series
 =================================  ====================  ================  ==========================================
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
 Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it. Internal
-states are for the `hht` family, Rosenbrock and Runge-Kutta methods. Dry friction is for the `hht` family. In all of
-this, but for error control, `implicit_euler` belongs to it.
+states are for the `hht` family, Rosenbrock and Runge-Kutta methods and `taylor`. Dry friction is for the `hht` family.
+In all of this, but for error control, `implicit_euler` belongs to it.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
 of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
@@ -45,8 +47,8 @@ a point of linearisation that is cheap and good enough: which is best is measure
 Which one
 ---------
 
-Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and `tsit5()` with a tolerance.
-If five digits or more are wanted of something stiff, take `rodas5p()`, or `simulate(..., extrapolate=2)`. For fitting
+Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and with a tolerance `taylor()`,
+or `tsit5()` where a function has no Taylor series. If five digits or more are wanted of something stiff, take `rodas5p()`, or `simulate(..., extrapolate=2)`. For fitting
 by gradients take `hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are to be
 far longer than the fastest vibration and the run blows up, try `hht(linearize="held")`, more damping (`alpha=-0.3`), or
 `hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`, and what became of
@@ -132,6 +134,7 @@ Sources
 * J. Dormand, P. Prince, J. Comput. Appl. Math. 6 (1980) 19-26: `dopri5`.
 * C. Tsitouras, Comput. Math. Appl. 62 (2011) 770-775: `tsit5`.
 * E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, Sec. II.5: `dop853`.
+* A. Jorba, M. Zou, Experimental Mathematics 14 (2005) 99-117: `taylor`.
 * J. Houbolt, J. Aeronaut. Sci. 17 (1950) 540-550: `houbolt`. K. Park, J. Appl. Mech. 42 (1975) 464-470: `park`.
 * E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1 (1973) 241-252: `wilson`.
 * H. Hilber, T. Hughes, Earthquake Eng. Struct. Dyn. 6 (1978) 99-117: `collocation`.

@@ -149,6 +149,8 @@ class Stepper(Description):
     resizes = False  # whether `resized` does anything
     estimate_order: int | None = None  # power of h with which the estimated error of a step falls; None without
     dense_term = False  # whether its memory is what dense output adds to cubics
+    reads_series = False  # whether its memory is what dense output is made of, the series of the step behind
+    proposes = False  # whether it knows the next step by itself: `proposed`
     starts_massless = False  # whether it starts without dividing by M
     redundant: str | None = None  # how constraints that depend on each other are solved
 
@@ -156,6 +158,10 @@ class Stepper(Description):
     def name(self) -> str:
         """Of the method, as messages give it."""
         return type(self).__name__
+
+    def for_tolerance(self, rtol: Real) -> Stepper:
+        """The stepper for steps under error control."""
+        return self
 
     def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
         """State at the initial time, for a `FlatSystem`."""
