@@ -37,9 +37,9 @@ LEVELS = 1e-3, 1e-6
 FINEST, LONGEST = 3e-7, 20.0  # error and s, behind which nothing finer is tried
 SIZES = tuple(2**n for n in range(9))  # steps between sample times
 TOLERANCES = tuple(10.0**-n for n in range(3, 11))
-ALONE = {"stiff double pendulum": ("hht", "rowda"), "free double pendulum": ("hht", "rk4")}  # by `hhtjax.sweep`
+ALONE = {"stiff double pendulum": ("hht", "rodas5p"), "free double pendulum": ("hht", "tsit5")}  # by `hhtjax.sweep`
 TOGETHER = {"stiff double pendulum": ("hht", "hht, extrapolate=2"), "free double pendulum": ("rk4",)}  # by `jax.vmap`
-ADAPTIVE = {"stiff double pendulum": "rowda, adaptive", "free double pendulum": "dopri5, adaptive"}
+ADAPTIVE = {"stiff double pendulum": "rodas5p, adaptive", "free double pendulum": "tsit5, adaptive"}
 
 
 @cache

@@ -14,8 +14,8 @@ PACKAGES = (
 )
 SHOWN = {  # of a package: the methods that are drawn, where the page has all of them
     "ours": (
-        *("hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rk4"),
-        *("hht, adaptive", "rowda, adaptive", "dopri5, adaptive"),
+        *("hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rodas5p", "rk4"),
+        *("hht, adaptive", "rodas5p, adaptive", "taylor, adaptive"),
     ),
     "diffrax": ("diffrax Tsit5, PID", "diffrax Kvaerno5, PID"),
     "SciPy": ("SciPy LSODA, C rhs", "SciPy LSODA, jitted rhs"),
@@ -33,7 +33,14 @@ BOTH = "forward", "reverse"
 GRADIENTS = {
     "ours": tuple(
         f"{method}, {mode}"
-        for method in ("hht, predictor", "hht, extrapolate=2", "rowda", "rowda, adaptive", "rk4", "dopri5, adaptive")
+        for method in (
+            "hht, predictor",
+            "hht, extrapolate=2",
+            "rodas5p",
+            "rodas5p, adaptive",
+            "rk4",
+            "taylor, adaptive",
+        )
         for mode in BOTH
     ),
     "diffrax": tuple(f"diffrax {solver}, {mode}" for solver in ("Tsit5", "Kvaerno3", "Kvaerno5") for mode in BOTH),

@@ -53,21 +53,23 @@ def reverse_rows(name, method, sizes):
     return sweep(name, f"{called}, reverse", "ours", sizes, lambda n: program(s, n)[1], True)
 
 
-def controlled_rows(name, tolerances, methods=("rowda, adaptive", "dopri5, adaptive")):
+def controlled_rows(name, tolerances, methods=("rodas5p, adaptive", "tsit5, adaptive")):
     """Both modes under error control, through the steps that were chosen."""
     s, rows = start(name), []
     for method in methods:
         for mode, derivative in (("forward", jax.jacfwd), ("reverse", jax.grad)):
 
             def rows_for(most, tolerances, method=method, mode=mode, derivative=derivative):
-                solution = ours.controlled(name, method, partial(scaled, name), most)
+                solution = ours.controlled(name, method, most)
 
                 def loss(s, tolerance):
-                    found = solution(tolerance, s)
+                    found = solution(tolerance, scaled(name, s))
                     value = jnp.mean(seen(name, jax.vmap(flat)(found.q)[1:]) ** 2)
                     return value * nan_unless(found.steps.stop == 0)
 
-                return sweep(name, f"{method}, {mode}", "ours", tolerances, partial(jax.jit(derivative(loss)), s))
+                own = ours.has_own_programs(method)
+                program = jax.jit(derivative(loss), static_argnums=1 if own else ())
+                return sweep(name, f"{method}, {mode}", "ours", tolerances, partial(program, s), own)
 
             rows += ours.while_needed(rows_for, tolerances)
     return rows

@@ -4,7 +4,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
 import hhtjax
 from experiments.benchmarks.measure import least_seconds
@@ -21,17 +20,24 @@ METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a 
     "rosenbrock": (hhtjax.rosenbrock(), 1, 1),
     "rowda": (hhtjax.rowda(), 1, 1),
     "rowda, extrapolate=2": (hhtjax.rowda(), 2, 1),
+    "rodas5p": (hhtjax.rodas5p(), 1, 1),
     "rk4": (hhtjax.rk4(), 1, 4),
+    "tsit5": (hhtjax.tsit5(), 1, 6),
 }
 CONTROLLED = {  # by `adaptive`; those but the first take the system without constraints and rotations
     "hht, adaptive": SMOOTH,
     "rowda, adaptive": hhtjax.rowda(),
+    "rodas5p, adaptive": hhtjax.rodas5p(),
     "dopri5, adaptive": hhtjax.dopri5(),
+    "tsit5, adaptive": hhtjax.tsit5(),
+    "dop853, adaptive": hhtjax.dop853(),
+    "taylor, adaptive": hhtjax.taylor(),
 }
 TOLERANCES = tuple(10.0**-n for n in range(2, 14))
 CALLS = 300
 MOST_STEPS = 10_000, 100_000  # the default, and what a user takes where `check` says that this is used up
-PLAIN = "rosenbrock", "rowda", "rowda, extrapolate=2", "rk4"  # take the system without constraints and rotations
+# which take the system without constraints and rotations
+PLAIN = "rosenbrock", "rowda", "rowda, extrapolate=2", "rodas5p", "rk4", "tsit5"
 
 
 def start(name, method):
@@ -54,16 +60,15 @@ def path(name, method, params, substeps):
 def entries(name, sizes, only=None):
     """Rows of all methods on a case; each number of steps is a program of its own."""
     case = cases()[name]
-    vector, unravel = ravel_pytree(case.scene.params)  # a call takes longer with every array that it is handed
-    rows = []
+    params, rows = jax.tree.map(jnp.asarray, case.scene.params), []
     for method in METHODS if only is None else [m for m in METHODS if m in only]:
 
         @partial(jax.jit, static_argnums=1)
-        def program(vector, substeps, method=method):
-            return path(name, method, unravel(vector), substeps)
+        def program(params, substeps, method=method):
+            return path(name, method, params, substeps)
 
         def solve(substeps, program=program):
-            return program(vector, substeps)
+            return program(params, substeps)
 
         tried = partial(sweep, name, method, "ours", solve, sizes)
         rows += tried(lambda n: {"h_s": case.scene.duration / (SAMPLES * n)}, True)
@@ -71,34 +76,35 @@ def entries(name, sizes, only=None):
 
 
 def calls(name):
-    """Least times in s of calls of `simulate` that take one step: eager, within `jax.jit`; and of a program of nothing.
-
-    The parameters are one vector, as in all runs.
-    """
+    """Least times in s of calls of `simulate` for one step, eager and within `jax.jit`, and of an empty program."""
     case = cases()[name]
-    vector, unravel = ravel_pytree(case.scene.params)
+    params = jax.tree.map(jnp.asarray, case.scene.params)
     system, stepper = case.scene.system, hhtjax.hht()
 
-    def one(vector):
-        run = hhtjax.simulate(
-            system, stepper, case.scene.q0, case.scene.v0, unravel(vector), dt=1e-3, num_steps=1, save_every=1
-        )
+    def one(params):
+        run = hhtjax.simulate(system, stepper, case.scene.q0, case.scene.v0, params, dt=1e-3, num_steps=1, save_every=1)
         return run.q
 
-    kinds = {"simulate": one, "jit(simulate)": jax.jit(one), "jit of nothing": jax.jit(lambda x: x + 1)}
-    return least_seconds({kind: partial(f, vector) for kind, f in kinds.items()}, CALLS)
+    nothing = jax.jit(lambda params: params[min(params)] + 1)
+    kinds = {"simulate": one, "jit(simulate)": jax.jit(one), "jit of nothing": nothing}
+    return least_seconds({kind: partial(f, params) for kind, f in kinds.items()}, CALLS)
 
 
-def controlled(name, method, unravel, most):
-    """A function of the tolerance and the parameters, as a vector: the `Solution` at the sample times."""
+def controlled(name, method, most):
+    """A function of the tolerance and the parameters: the `Solution` at the sample times."""
     case = cases()[name]
     system, q0, v0 = (case.scene.system, case.scene.q0, case.scene.v0) if method.startswith("hht") else case.ode
 
-    def solve(tolerance, vector):
+    def solve(tolerance, params):
         dt = hhtjax.adaptive(tolerance, 1e-2 * tolerance, max_steps=most)
-        return hhtjax.simulate(system, CONTROLLED[method], q0, v0, unravel(vector), dt=dt, times=case.times)
+        return hhtjax.simulate(system, CONTROLLED[method], q0, v0, params, dt=dt, times=case.times)
 
     return solve
+
+
+def has_own_programs(method):
+    """Whether each tolerance has a program of its own: the order of a Taylor series follows from it."""
+    return method.startswith("taylor")
 
 
 def while_needed(rows_for, tolerances):
@@ -116,21 +122,21 @@ def while_needed(rows_for, tolerances):
 def controlled_rows(name, method, most, tolerances):
     """Rows of one method, with so many steps at most."""
     case = cases()[name]
-    vector, unravel = ravel_pytree(case.scene.params)
-    numbers = {x: jnp.asarray(x) for x in tolerances}
-    solution = controlled(name, method, unravel, most)
+    params, of_each = jax.tree.map(jnp.asarray, case.scene.params), has_own_programs(method)
+    numbers = {x: x if of_each else jnp.asarray(x) for x in tolerances}
+    solution = controlled(name, method, most)
 
-    def positions(tolerance, vector):
-        found = solution(tolerance, vector)
+    def positions(tolerance, params):
+        found = solution(tolerance, params)
         return jax.vmap(flat)(found.q)[1:, : case.size], found.steps.stop
 
-    program = jax.jit(positions)
+    program = jax.jit(positions, static_argnums=0 if of_each else ())
 
     def solve(tolerance):
-        path, stop = program(numbers[tolerance], vector)
+        path, stop = program(numbers[tolerance], params)
         return None if stop else path, None
 
-    return sweep(name, method, "ours", solve, tolerances, lambda x: {"tolerance": x})
+    return sweep(name, method, "ours", solve, tolerances, lambda x: {"tolerance": x}, of_each)
 
 
 def controlled_entries(name, tolerances=TOLERANCES, only=tuple(CONTROLLED)):

@@ -15,7 +15,7 @@ PEERS = {  # module: its distribution
 }
 NEEDS = {"sksundae": ("numba",)}  # which compiles its right-hand side
 PRIMARY = "stiff double pendulum"  # every method and every kind of step-size control
-ELSEWHERE = "hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rk4"
+ELSEWHERE = "hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rowda", "rodas5p", "rk4", "tsit5"
 CHAINS = (
     "free double pendulum",
     PRIMARY,
@@ -27,10 +27,12 @@ ENGINES = {
     "pydrake": drake_peers.drake_entries,
 }
 UNLIKE = {  # what compiles for long is left out
-    "stiff chain of 8": ("hht", "hht, converged", "hht, extrapolate=2", "rowda", "rk4"),
-    "squeezer": ("hht", "hht, converged", "hht, extrapolate=2", "rk4"),
+    "stiff chain of 8": ("hht", "hht, converged", "hht, extrapolate=2", "rowda", "rodas5p", "rk4"),
+    "squeezer": ("hht", "hht, converged", "hht, extrapolate=2", "rodas5p", "rk4", "tsit5"),
 }
-UNCONTROLLED = {"squeezer": ("hht, adaptive", "dopri5, adaptive")}  # rowda compiles for minutes there
+UNCONTROLLED = {  # what compiles for long is left out
+    "squeezer": ("hht, adaptive", "rodas5p, adaptive", "tsit5, adaptive", "dop853, adaptive", "taylor, adaptive")
+}
 SIZES = tuple(2**n for n in range(12))
 
 
