@@ -175,7 +175,8 @@ def dopri5() -> RungeKutta:
 def tsit5() -> RungeKutta:
     """Tsitouras' pair of order 5(4), for the first-order form (q, v)' = (v, M^-1 Q): as `dopri5`, with smaller errors.
 
-    Explicit: six solves with M per step. Dense output of order 4.
+    Explicit: six solves with M per step; an undamped vibration of frequency w grows by 1e-4 a step at w h = 1, by 3e-2
+    at 2, and r h must be below 3.5 for any rate r of a decay. Dense output of order 4.
 
     References:
         Tsitouras, Computers & Mathematics with Applications 62, 2011, 770-775.
@@ -190,9 +191,9 @@ def tsit5() -> RungeKutta:
 def dop853() -> RungeKutta:
     """Dormand and Prince's method of order 8(5,3) of Hairer and Wanner, for (q, v)' = (v, M^-1 Q).
 
-    Explicit: fifteen solves with M per step, of which three are for dense output, of order 7. Unstable once
-    w h > 1.3 or so for any undamped natural frequency w. Under error control the explicit method for seven to ten
-    digits of what `taylor` refuses.
+    Explicit: fifteen solves with M per step, of which three are for dense output, of order 7. Unstable once w h > 5.9
+    for any undamped natural frequency w of the system, or r h > 6.3 for any rate r of a decay. Under error control the
+    explicit method for seven to ten digits of what `taylor` refuses.
 
     References:
         Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 2nd ed., Sec. II.5, II.6 and II.10.
