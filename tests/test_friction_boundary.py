@@ -43,7 +43,7 @@ def simulate(system, stepper=hhtjax.hht(), q0=TWO, **options):  # noqa: B008 (fr
         (ValueError, "row 0 of `sliding` does not depend on v", lambda: simulate(two(lambda q, v, t, p: v * (q - 1)))),
         (ValueError, "leave `linearize` out", lambda: simulate(two(), hhtjax.hht(linearize="held"))),
         (NotImplementedError, "RK4 cannot solve dry `friction`; use hht", lambda: simulate(two(), hhtjax.rk4())),
-        (NotImplementedError, "Rosenbrock cannot solve dry", lambda: simulate(two(), hhtjax.rowda())),
+        (NotImplementedError, "rowda cannot solve dry", lambda: simulate(two(), hhtjax.rowda())),
         (NotImplementedError, "ode: `system` has dry", lambda: hhtjax.interop.ode(two())(0.0, (TWO, TWO), None)),
     ],
 )
