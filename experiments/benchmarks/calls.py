@@ -11,11 +11,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
 import hhtjax
 from experiments.benchmarks.measure import least_seconds
-from experiments.work_precision.cases import SAMPLES, march
+from experiments.work_precision.cases import SAMPLES
+from hhtjax.jaxpr import on_scalars
 from hhtjax.primitives import one_kernel
 from hhtjax.scenes import double_pendulum
 
@@ -58,9 +58,24 @@ def controlled(system, params, q0, v0):
 
 
 def loop(system, params, q0, v0):
-    """The steps of the former alone: positions at their ends."""
-    unravel = jax.vmap(ravel_pytree(q0)[1])
-    return one_kernel(lambda params: unravel(march(system, STEPPER, q0, v0, params, DURATION, 1)[0]), params)
+    """The steps of the former alone, on scalars and as one kernel like there: positions at their ends."""
+    dt = DURATION / SAMPLES
+
+    def steps(params):
+        def advance(state):
+            return STEPPER.step(system, state, params, dt)[0]
+
+        start = STEPPER.init(system, q0, v0, params, dt)
+        form = on_scalars(advance, start)
+        step = form.of(advance)
+
+        def following(state, _):
+            state = step(state)
+            return state, state.q
+
+        return form.joined(jax.lax.scan(following, form.tree, None, SAMPLES)[1])
+
+    return one_kernel(steps, params)
 
 
 def ways(simulate, scene, alone):
