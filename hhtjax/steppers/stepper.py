@@ -149,6 +149,7 @@ class Stepper(Description):
     resizes = False  # whether `resized` does anything
     estimate_order: int | None = None  # power of h with which the estimated error of a step falls; None without
     dense_term = False  # whether its memory is what dense output adds to cubics
+    lands = False  # whether its steps under error control end at each of the times asked for
     starts_massless = False  # whether it starts without dividing by M
     redundant: str | None = None  # how constraints that depend on each other are solved
 
