@@ -20,9 +20,7 @@ II, Sec. IV.9 and VII.2.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import jax
@@ -134,7 +132,9 @@ def weights(levels: int):
     n = 2.0 * np.arange(1, levels + 1)
 
     def of(rows: range) -> list:
-        return [np.prod([n[j] ** 2 / (n[j] ** 2 - n[i] ** 2) for i in rows if i != j]) * (j in rows) for j in range(levels)]
+        return [
+            np.prod([n[j] ** 2 / (n[j] ** 2 - n[i] ** 2) for i in rows if i != j]) * (j in rows) for j in range(levels)
+        ]
 
     return np.array([of(range(levels)), of(range(1, levels))])
 
@@ -166,7 +166,7 @@ def basic_step(system: FlatSystem, params: PyTree, H: Array, levels: int, s: Sta
         q, v, _ = placed(system, s, x, u, s.w)
         w, _ = accelerations(system, q, v, s.t + i * h, params)
         ex, eu = increment(h, inverse, h * u - dx, h * in_chart(system, x, u, w) - du)
-        ends = ends + share[:, None, None] * jnp.stack([x + ex, u + eu])
+        ends = ends + share[:, None, None] * jnp.stack([x + ex, u + eu])[None]
         d = dx + 2 * ex, du + 2 * eu
         return ((x + d[0], u + d[1]), d, ends), None
 
