@@ -92,7 +92,7 @@ STEPPERS = {
     "houbolt": hhtjax.houbolt(),
     "wilson": hhtjax.wilson(),
     "rowda": hhtjax.rowda(),
-    "extrapolated": hhtjax.extrapolated(levels=2),
+    "extrapolated": hhtjax.extrapolated(levels=3),
     "rk4": hhtjax.rk4(),
     "dopri5": hhtjax.dopri5(),
 }

@@ -15,6 +15,7 @@ stepper                            order                 solves per step   for
 `kim_implicit_euler()`             1                     1                 what it compares with, literally
 `rosenbrock(rho_inf=0)`            2                     2                 one factorisation; L-stable
 `rowda()`                          3                     4                 one factorisation; L-stable: for accuracy
+`extrapolated()`                   7                     24                six digits or more, stiff, with constraints
 `houbolt()`                        2                     Newton's          a classical baseline
 `park()`                           2                     Newton's          a classical baseline
 `wilson(theta)`                    2                     Newton's          a classical baseline
@@ -27,7 +28,7 @@ stepper                            order                 solves per step   for
 =================================  ====================  ================  ==========================================
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
-Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it. Internal
+Only the `hht` family and `extrapolated` take constraints and rotations; `conventional_hht` does too, as its authors printed it. Internal
 states are for the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`. Dry friction is for the `hht` family. In all
 of this, but for error control, `implicit_euler` belongs to it.
 
@@ -119,6 +120,7 @@ Sources
 * C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13 (1985) 77-90: `formulation="ggl"`.
 * O. Bruls, A. Cardona, J. Comput. Nonlinear Dyn. 5 (2010) 031002: `kinematics="lie"`.
 * E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, Sec. IV.7: `rosenbrock`.
+* G. Bader, P. Deuflhard, Numer. Math. 41 (1983) 373-398: `extrapolated`.
 * C. Lubich, M. Roche, Computing 43 (1990) 325-342: `rowda`.
 * J. Dormand, P. Prince, J. Comput. Appl. Math. 6 (1980) 19-26: `dopri5`.
 * J. Houbolt, J. Aeronaut. Sci. 17 (1950) 540-550: `houbolt`. K. Park, J. Appl. Mech. 42 (1975) 464-470: `park`.

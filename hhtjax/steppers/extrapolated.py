@@ -8,8 +8,8 @@ displacement since the start of the step (of a rotation its rotation vector), u 
 end in S_n = y_n + (1 - h J)^-1 (h f(y_n, t_n) - d_{n-1}), which is smooth again. J is f_y at the start of the step. For
 any J the error of S_n is a series in h^2. So n = 2, 4, 6, ... and Aitken's and Neville's table take out one power after
 the other: order 2 k - 1 by k of them. With A = M, or [M, -B^T; B, 0], and K, C the derivatives of its equations in x
-and u, 1 - h J leaves the matrix A + h C + h^2 K for a change of u. Phi = 0 and dPhi/dt = 0 hold at the ends of steps, by
-a projection with M.
+and u, 1 - h J leaves the matrix A + h C + h^2 K for a change of u. A projection with M puts the ends of steps on
+Phi = 0 and dPhi/dt = 0.
 
 On y' = c y the method is A-stable for k = 3, and A(89 degrees)-stable for k = 4, where an undamped vibration of
 frequency w grows by up to 6 % a step about w H = 8, if error control lets it; both take out at once what is stiffer.
@@ -215,7 +215,7 @@ def projected(system: FlatSystem, params: PyTree, s: State, end: State):
 
 
 def extrapolated(levels: int = 4) -> Extrapolated:
-    """Extrapolation of the linearly implicit mid-point rule: order 2 k - 1 by k levels, for few digits too many.
+    """Extrapolation of the linearly implicit mid-point rule: order 2 k - 1 by k levels.
 
     Order 7 by default, stiff systems, constraints and rotations included: one Jacobian and k factorised matrices a
     step, and k (k + 1) evaluations of the acceleration, each with a factorised M (and B). For error control and six or
