@@ -29,7 +29,8 @@ stepper                            order                 solves per step   for
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
 Only the `hht` family and `extrapolated` take constraints and rotations; `conventional_hht` does too, as its authors
-printed it. Internal states are for the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`. Dry friction is for the `hht` family. In all
+printed it. Internal states are for the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`. Dry friction is for the
+`hht` family. In all
 of this, but for error control, `implicit_euler` belongs to it.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
