@@ -77,8 +77,8 @@ from hhtjax.steppers.extrapolated import extrapolated
 from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, implicit_euler, newmark
 from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_euler
 from hhtjax.steppers.multistep import houbolt, park
-from hhtjax.steppers.rosenbrock import rosenbrock, rowda
-from hhtjax.steppers.runge_kutta import dopri5, rk4
+from hhtjax.steppers.rosenbrock import rodas5p, rosenbrock, rowda
+from hhtjax.steppers.runge_kutta import dop853, dopri5, rk4, tsit5
 from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.systems import interop
@@ -98,8 +98,9 @@ __all__ = [  # noqa: RUF022
     "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
-    "bossak", "conventional_hht", "dopri5", "extrapolated", "generalized_alpha", "hht", "houbolt", "implicit_euler",
-    "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rosenbrock", "rowda", "wilson",
+    "bossak", "conventional_hht", "dop853", "dopri5", "extrapolated", "generalized_alpha", "hht", "houbolt", "implicit_euler",
+    "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rodas5p",
+    "rosenbrock", "rowda", "tsit5", "wilson",
     # runs
     "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
     "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep",

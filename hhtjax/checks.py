@@ -15,7 +15,7 @@ from hhtjax.description import Array, PyTree, freeze, is_array, is_concrete, is_
 
 def require_number(caller: str, name: str, value, valid: Callable, expectation: str):
     """The value as it is, if it is a real scalar within its range; a tracer passes unchecked."""
-    if not is_real(value) or jnp.ndim(value) != 0:
+    if not is_real(value) or getattr(value, "ndim", 0) != 0:
         large = is_array(value) and jnp.ndim(value) and (jnp.size(value) > 4 or not is_concrete(value))
         shown = f"an array of shape {jnp.shape(value)}" if large else repr(value)
         raise TypeError(f"{caller}: `{name}` must be a real number; received {shown}.")
@@ -111,18 +111,27 @@ def _in_other_order(names: list, expected: list) -> bool:
 
 def require_params(caller: str, params: PyTree):
     """The params as data, functions among them hidden; an error that names what is neither: text, objects."""
+    if all(map(_is_data, jax.tree.leaves(params))):
+        return params
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-        data = is_array(leaf) or hasattr(leaf, "__jax_array__") or isinstance(leaf, (bool, int, float, complex))
         where = f"{caller}: `params{jax.tree_util.keystr(path)}`"
+        data = _is_data(leaf) or hasattr(leaf, "__jax_array__")
         if callable(leaf) and not data:
             _require_hashable(where, leaf)
-        elif not data or (isinstance(leaf, np.ndarray) and leaf.dtype.kind in "OUSMm"):
+        elif not data:
             shown = f"an array of {leaf.dtype}" if isinstance(leaf, np.ndarray) else repr(leaf)
             raise TypeError(
                 f"{where} must be an array, a number or a function; received {shown}. What is none of them belongs "
                 "into the functions of the system."
             )
     return freeze(params)
+
+
+def _is_data(leaf) -> bool:
+    """Whether a leaf of the params is a number, or an array of them."""
+    if isinstance(leaf, np.ndarray):
+        return leaf.dtype.kind not in "OUSMm"
+    return isinstance(leaf, (bool, int, float, complex)) or is_array(leaf)
 
 
 def _require_hashable(where: str, function: Callable):

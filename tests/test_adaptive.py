@@ -30,6 +30,7 @@ METHODS = {
     "converged": hhtjax.hht(alpha=-0.3, iterations=None),
     "rosenbrock": hhtjax.rosenbrock(),
     "rowda": hhtjax.rowda(),
+    "rodas5p": hhtjax.rodas5p(),
     "dopri5": hhtjax.dopri5(),
 }
 LIGHT = hhtjax.hht(alpha=-0.05, linearize="predictor")  # a smaller program

@@ -33,7 +33,10 @@ def test_family_is_of_order_two(family, form, problem):
     assert slope(problem, stepper) == pytest.approx(2, abs=0.15)
 
 
-@pytest.mark.parametrize("name", STEPPERS)
+OWN = "rodas5p", "dop853"  # too smooth a problem to see these: test_rosenbrock.py, test_tableaus.py
+
+
+@pytest.mark.parametrize("name", [name for name in STEPPERS if name not in OWN])
 def test_stepper_has_the_order_it_states(name):
     assert slope("forced Duffing", STEPPERS[name]) == pytest.approx(STEPPERS[name].order, abs=0.15)
 

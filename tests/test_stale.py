@@ -213,6 +213,20 @@ def test_what_reads_nothing_stands_for_itself():
     assert current(change_global) is change_global
 
 
+def scaled(q, factor=1.0, *, offset=0.0):
+    return factor * q + offset
+
+
+@pytest.mark.parametrize(
+    "f", [partial(scaled, offset=2.0), partial(partial(scaled), factor=3.0), lambda q, x=(), *, y={}: q]
+)
+def test_what_has_not_changed_is_not_looked_through_again(f, monkeypatch):
+    """Also where a container is empty, such as the arguments of a partial that has keywords alone."""
+    form = current(f)
+    monkeypatch.setattr(sys.modules["hhtjax.description.current"], "Look", None)
+    assert current(f) is form
+
+
 def test_a_loop_over_records_does_not_keep_all_programs(monkeypatch):
     jitted = Programs(lambda force, q: force(q, None, None, None), static_argnums=0)
     monkeypatch.setattr(sys.modules["hhtjax.description.current"], "programs", [jitted.quick])

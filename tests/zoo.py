@@ -94,7 +94,9 @@ STEPPERS = {
     "rowda": hhtjax.rowda(),
     "extrapolated": hhtjax.extrapolated(levels=3),
     "rk4": hhtjax.rk4(),
+    "rodas5p": hhtjax.rodas5p(),
     "dopri5": hhtjax.dopri5(),
+    "dop853": hhtjax.dop853(),
 }
 
 

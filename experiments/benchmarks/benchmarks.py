@@ -1,9 +1,10 @@
-"""Speed, as ratios within one run: against C, by structure, of batches, gradients and chains, of the first call."""
+"""Speed, as ratios within one run: against C, by structure, of batches, gradients, chains, first and later calls."""
 
 from experiments.benchmarks import (
     accelerator,
     against_c,
     batches,
+    calls,
     chains,
     compile_time,
     first_call,
@@ -15,7 +16,7 @@ from experiments.benchmarks.measure import machine
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-PARTS = against_c, structure, batches, many_unknowns, gradients, chains, compile_time, first_call
+PARTS = against_c, structure, batches, many_unknowns, gradients, chains, compile_time, first_call, calls
 ON_ACCELERATOR = (accelerator,)  # --gpu: on another machine than the rest
 
 

@@ -105,6 +105,16 @@ def first_call(rows):
     return rows_table(rows, {name: name for name in columns})
 
 
+def calls(numbers):
+    """What a call costs beside its steps, if that was ever measured: `--parts calls`."""
+    if numbers is None:
+        return "Nothing was measured: `python -m experiments benchmarks --parts calls` does."
+    rows = [{**r["us"], **r} for r in numbers["rows"]]
+    ratios = [key for key in rows[0] if key.endswith("ratio")]
+    times = {f"{way} (us)": way for way in numbers["rows"][0]["us"]}
+    return rows_table(rows, {"system": "system", "steps": "steps", **{key: key for key in ratios}, **times})
+
+
 def dense(rows):
     """Ours beside the loop by hand."""
     columns = {"ours (us)": "ours_us_per_step", "by hand (us)": "hand_us_per_step", "ratio": "over_hand"}
@@ -144,7 +154,7 @@ def page(numbers):
     """The text of README.md."""
     c, batches, gradients = (numbers[part] for part in ("against_c", "batches", "gradients"))
     machine, before = numbers["machine"], json.loads((HERE / "first_call_before.json").read_text())
-    calls = first_call_rows(numbers["first_call"], before)
+    firsts = first_call_rows(numbers["first_call"], before)
     differences = [
         r["q_minus_c_rad"] for r in c["single"] if r["method"] == PREDICTOR and r["q_minus_c_rad"] is not None
     ]
@@ -236,8 +246,9 @@ def page(numbers):
                 {"method": "method", "of": "compiled", "s": "compile_s", "over Kvaerno3's": "over_kvaerno3"},
             ),
             first_steps=numbers["first_call"]["num_steps"],
-            first_call=first_call(calls),
-            halves=halves(calls),
+            first_call=first_call(firsts),
+            halves=halves(firsts),
+            calls=calls(numbers.get("calls")),
             before=before,
             cores=machine["cores"],
             busy=max(r["busy_processes"] for r in numbers["many_unknowns"]["dense"]),

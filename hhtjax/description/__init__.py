@@ -18,9 +18,12 @@ Real = Any  # a number, or an array of numbers of JAX or NumPy, on which arithme
 PyTree = Any  # whatever structure of arrays a user has
 
 
+PLAIN = frozenset([bool, int, float, complex, str, type(None)])
+
+
 def is_array(x):
     """Arrays, NumPy scalars and tracers are data; Python numbers are part of the program."""
-    return isinstance(x, (jax.Array, np.ndarray, np.generic))
+    return type(x) not in PLAIN and isinstance(x, (jax.Array, np.ndarray, np.generic))  # which takes longer to say no
 
 
 def is_concrete(x):

@@ -177,11 +177,11 @@ class Look:
 
     def _read_entries(self, i, x, suffix="", may_change=True):
         """All that a container holds; with suffix, one that the value at i has."""
-        found, n, name = _entries(x), len(self.values), self.names[i] + suffix
+        found, n, name = _entries(x), len(self.lines), self.names[i] + suffix  # an empty one adds no value, but a line
         entries = f"[*{name}, *{name}.values()]" if isinstance(x, dict) else f"[*{name}]"
-        self.lines.append(f"if [*map(id, x{n} := {entries})] != known{n}: return None")
+        self.lines.append(f"if [*map(id, y{n} := {entries})] != known{n}: return None")
         self.space[f"known{n}"] = list(map(id, found))
-        self.names += [f"x{n}[{k}]" for k in range(len(found))]
+        self.names += [f"y{n}[{k}]" for k in range(len(found))]
         self.values += found
         self.key += type(x), len(found)
         if may_change:

@@ -57,6 +57,17 @@ While a first call takes longer than two seconds, one line on stderr says so, by
 After the imports, `import gc; gc.freeze()` spares the garbage collector all that they have made, which it else looks
 through again and again while functions are traced: 5 to 20 % of a first call. The library leaves the collector alone.
 
+Later calls
+-----------
+
+take some 0.2 ms of Python where `simulate` is called as it is: its arguments are checked, and what its functions read
+is looked at. In a jit of yours they do not: a run of fifty steps then takes a tenth more than its steps in a loop of
+their own where q alone is returned, and each further array of the `Solution` takes about a microsecond. Arrays among
+params are handed over faster than numbers of Python, and several faster than one vector that is taken apart inside. JAX
+hands programs of more than a thousand operations to another thread, which takes 10 us;
+`jax.config.update("jax_cpu_enable_async_dispatch", False)`, before anything else, does without. Measured on a page,
+`experiments/benchmarks/README.md`.
+
 A controller that samples
 -------------------------
 

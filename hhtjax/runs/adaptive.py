@@ -15,7 +15,10 @@ from hhtjax.description import Description, Real, is_array, is_concrete, is_real
 if TYPE_CHECKING:
     from hhtjax.steppers.stepper import Stepper
 
-WITH_ESTIMATES = "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda, extrapolated or dopri5"
+WITH_ESTIMATES = (
+    "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda, rodas5p, extrapolated, tsit5, dopri5 or "
+    "dop853"
+)
 
 
 @dataclass(frozen=True, eq=False)

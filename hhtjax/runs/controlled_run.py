@@ -19,7 +19,7 @@ from hhtjax.numerics.batched_cond import derivative_by
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.closures import hoisted
 from hhtjax.numerics.differentiable_while import repeat
-from hhtjax.primitives import is_untouched, largest_in_batch, one_kernel, or_alone
+from hhtjax.primitives import is_traced, is_untouched, largest_in_batch, one_kernel, or_alone
 from hhtjax.runs.adaptive import adaptive, require_controlled, require_single
 from hhtjax.runs.driver import drive, resting, steps_of
 from hhtjax.runs.error_control import Steps, select_steps, trimmed
@@ -57,7 +57,7 @@ def run_controlled(problem, times: Real, control: Adaptive, progress: bool, even
     in_one = alone and passes_alone(problem, events)
     if in_one:  # else the program that chooses steps for a derivative or a batch is that of `choose_steps`
         run, steps, ends = run_in_one(problem, times, unverified(control), progress)
-        choice = lax.stop_gradient(start)
+        choice = lax.stop_gradient(start) if control.verify else start
     else:
         start, choice = run_and_choice(start)
         run, steps, ends = run_in_two(start, choice, progress, room)
@@ -171,7 +171,7 @@ def run_in_one(problem: Problem, times: Real, control: Adaptive, progress: bool 
         partial(run_recorded, progress=progress, rates=problem.rates()),
         partial(in_two_passes, progress=progress),
     )
-    if not is_tracing():
+    if not is_traced():
         return in_one(*data)
     in_one, closed_over = hoisted(in_one, *data)
     if not all_concrete(closed_over):

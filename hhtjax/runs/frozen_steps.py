@@ -14,6 +14,7 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree, is_array
 from hhtjax.numerics.closures import hoisted
+from hhtjax.primitives import is_traced
 from hhtjax.xla import calls
 
 PAIR = "hhtjax: a run, and the choice of its steps"
@@ -63,6 +64,8 @@ def chooses_steps(f: Callable, *args: PyTree) -> bool:
 
 def is_pair() -> bool:
     """Whether both points of `with_steps_for` are here."""
+    if not is_traced():  # JAX takes a millisecond to say that there is no such axis
+        return False
     try:
         lax.axis_index(PAIR)
     except NameError:

@@ -88,11 +88,19 @@ class Problem(NamedTuple):
 
     def rates(self) -> int:
         """How many there are, of coordinates: a rotation has three, and nine numbers."""
-        return sum(map(jnp.size, jax.tree.leaves(self.q0 if self.v0 is None else self.v0)))
+        return self.numbers() if self.v0 is None else sum(x.size for x in jax.tree.leaves(self.v0))
+
+    def numbers(self) -> int:
+        """How many there are in the position."""
+        return sum(x.size for x in jax.tree.leaves(self.q0))
+
+    def dtype(self) -> np.dtype:
+        """That of the state."""
+        return jax.tree.leaves(self.q0)[0].dtype
 
     def times(self, t: Array) -> Array:
         """Times in the dtype of the state."""
-        return jnp.asarray(t).astype(jax.tree.leaves(self.q0)[0].dtype)
+        return jnp.asarray(t).astype(self.dtype())
 
     def flat(self, caller: str = "simulate"):
         """The system on vectors, q, v, t0 and the params."""
@@ -241,7 +249,7 @@ class EqualSteps(NamedTuple):
 
 def refined(dt: Real, k: int) -> Real:
     """k steps in the place of each."""
-    return jnp.repeat(dt / k, k) if jnp.ndim(dt) else dt / k
+    return jnp.repeat(dt / k, k) if np.ndim(dt) else dt / k
 
 
 def warn_of_jumps_to(problem: Problem, dt: Real, times: Real):
@@ -278,7 +286,7 @@ def require_events(caller: str, problem: Problem, events, step: Real):
     if not problem.stepper.meets_events:
         raise NotImplementedError(
             f"{caller}: {problem.stepper.name} cannot begin anew behind an event; use hht() or another of "
-            "its family, rosenbrock(), rowda(), rk4() or dopri5()."
+            "its family, a Rosenbrock method such as rodas5p(), rk4() or dopri5()."
         )
     require_masses(caller, problem.system, "leave out `events`")
     for i, event in enumerate(events):

@@ -259,8 +259,7 @@ def kept(flat: FlatSystem, stepper: Stepper, state: State):
     """What is saved of a state, and what its dense output adds."""
     extra = None
     if stepper.dense_term:
-        e_q, e_v = state.memory
-        extra = public(flat, State(state.t, e_q, e_v, 0 * e_v))
+        extra = jax.vmap(lambda q, v: public(flat, State(state.t, q, v, 0 * v)))(*state.memory)
         extra = extra.q, (None if flat.positions == 0 else extra.v), extra.z
     return saved(flat, state), extra
 
@@ -295,9 +294,13 @@ def read_between(
 
 
 def with_dense_term(flat, found, extra: tuple, s: Array, H: Array) -> Solution:
-    """`found`, with s^2 (1 - s)^2 times what the stepper's dense output adds to cubics, and the rate of that."""
-    weight, rate = (s * (1 - s)) ** 2, 2 * s * (1 - s) * (1 - 2 * s) / H
+    """`found`, with s^2 (1 - s)^2 sum_k s^k e_k, what the stepper's dense output adds to cubics, and the rate of that.
+
+    extra: e of q, v and z, each (number of times, number of terms, number of entries) or None."""
     e_q, e_v, e_z = extra
+    s, k = s[:, None], jnp.arange(e_q.shape[1], dtype=s.dtype)[None]
+    weight = (s * (1 - s)) ** 2 * s**k
+    rate = s ** (k + 1) * (1 - s) * ((k + 2) * (1 - s) - 2 * s) / H[:, None]
     terms = [("q", flat.unravel, weight, e_q)]
     if flat.positions:
         terms += [("v", flat.unravel_rates, weight, e_v), ("acceleration", flat.unravel_rates, rate, e_v)]
@@ -306,7 +309,7 @@ def with_dense_term(flat, found, extra: tuple, s: Array, H: Array) -> Solution:
         terms += [("v", flat.unravel_rates, rate, e_q)]
     for name, unravel, factor, e in terms:
         if e is not None:
-            more = jax.vmap(unravel)(factor[:, None] * e)
+            more = jax.vmap(unravel)(jnp.sum(factor[..., None] * e, axis=1))
             found = found._replace(**{name: jax.tree.map(jnp.add, getattr(found, name), more)})
     return found
 

@@ -111,7 +111,7 @@ def simulate(
         t0: time of the start.
         events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
             happen, or at known times; the grid stays what it is. Steps without one take as long as before, and a look
-            at the guards. For the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`.
+            at the guards. For the `hht` family, Rosenbrock and Runge-Kutta methods.
         max_events: how many of those that change something may fall into one step; more are a failure. With `adaptive`
             steps become shorter first, and what lies behind an event has an error of its own.
         keep_events: how many `run.events` has room for.
@@ -171,7 +171,7 @@ def simulate(
         require_integer("simulate", "max_events", max_events),
         require_integer("simulate", "keep_events", keep_events),
     )
-    dtype = jax.tree.leaves(problem.q0)[0].dtype
+    dtype = problem.dtype()
     if duration is not None or num_samples is not None:
         rest = {"num_steps": num_steps, "times": times, "save_every": save_every}
         require_one_length("simulate", duration, num_samples, **rest)
@@ -182,7 +182,7 @@ def simulate(
     if isinstance(dt, Adaptive):
         require_control_alone("simulate", times, num_steps, save_every, extrapolate)
         return told("simulate", run_controlled(problem, times, dt, progress, events, room), throw)
-    kind = {"rates": problem.rates(), "numbers": sum(map(jnp.size, jax.tree.leaves(problem.q0)))}
+    kind = {"rates": problem.rates(), "numbers": problem.numbers()}
     if times is not None:
         times = require_sample_times(times, problem.t0, dtype, "simulate")
         dt = require_steps_to("simulate", times, dt, num_steps, save_every, problem.t0)
@@ -212,8 +212,9 @@ def simulate(
 
     def run(k) -> Solution:
         sizes = {"num_steps": k * num_steps, "save_every": k * save_every, "room": room, "progress": progress}
-        sizes["grows"] = jnp.ndim(dt) > 0 and grows_at_once(dt)
-        data = problem, refined(dt, k), events, known_factors(problem, refined(dt, k))
+        sizes["grows"] = np.ndim(dt) > 0 and grows_at_once(dt)
+        step = refined(dt, k)
+        data = problem, step, events, known_factors(problem, step)
         with callbacks_named():
             return _simulate(*data, in_batch=is_in_batch(), **sizes, **kind)
 

@@ -342,7 +342,7 @@ def told(caller: str, solution: Solution, throw: bool) -> Solution:
     if solution.failure is None or not is_concrete(solution.failure.step):
         return solution
     failure, steps = solution.failure.step, solution.steps
-    failed = np.any(np.asarray(failure) > 0) or (steps is not None and np.any(np.asarray(steps.stop) > 0))
+    failed = np.asarray(failure).any() or (steps is not None and np.asarray(steps.stop).any())
     if (failed or solution.error is not None) and solution._is_known() and (fault := solution._fault()):
         if throw:
             raise SimulationError(f"{caller}: {fault}")

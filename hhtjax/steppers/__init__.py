@@ -15,6 +15,8 @@ stepper                            order                 solves per step   for
 `kim_implicit_euler()`             1                     1                 what it compares with, literally
 `rosenbrock(rho_inf=0)`            2                     2                 one factorisation; L-stable
 `rowda()`                          3                     4                 one factorisation; L-stable: for accuracy
+`rodas5p()`                        5                     8                 the same to six digits and more, with a
+                                                                           tolerance, `adaptive`
 `extrapolated()`                   7                     24                six digits or more, stiff, with constraints
 `houbolt()`                        2                     Newton's          a classical baseline
 `park()`                           2                     Newton's          a classical baseline
@@ -24,14 +26,14 @@ stepper                            order                 solves per step   for
                                    damping, else 1
 `implicit_euler()`                 1                     Newton's          robustness
 `rk4()`                            4                     explicit          where nothing is stiff
-`dopri5()`                         5                     explicit          the same with a tolerance, `adaptive`
+`dopri5()`, `tsit5()`              5                     explicit          the same with a tolerance, `adaptive`
+`dop853()`                         8                     explicit          the same to eight digits and more
 =================================  ====================  ================  ==========================================
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
 Only the `hht` family and `extrapolated` take constraints and rotations; `conventional_hht` does too, as its authors
-printed it. Internal states are for the `hht` family, `rosenbrock`, `rowda`, `rk4` and `dopri5`. Dry friction is for the
-`hht` family. In all
-of this, but for error control, `implicit_euler` belongs to it.
+printed it. Internal states are for the `hht` family, `extrapolated`, Rosenbrock and Runge-Kutta methods. Dry friction
+is for the `hht` family. In all of this, but for error control, `implicit_euler` belongs to it.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
 of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
@@ -44,11 +46,10 @@ a point of linearisation that is cheap and good enough: which is best is measure
 Which one
 ---------
 
-Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and `dopri5()` with a tolerance.
-If more than five digits are wanted of something stiff, take `rowda()`, or `simulate(..., extrapolate=2)`. For fitting
-by gradients take
-`hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are to be far longer than the
-fastest vibration and the run blows up, try `hht(linearize="held")`, more damping (`alpha=-0.3`), or
+Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and `tsit5()` with a tolerance.
+If five digits or more are wanted of something stiff, take `rodas5p()`, or `simulate(..., extrapolate=2)`. For fitting
+by gradients take `hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are to be
+far longer than the fastest vibration and the run blows up, try `hht(linearize="held")`, more damping (`alpha=-0.3`), or
 `hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`, and what became of
 the tables and figures of the paper of 2019 on another, `experiments/kim2019/README.md`.
 
@@ -96,8 +97,14 @@ True
 
 A method that remembers something of the size of the last step has a `resized`, too, as in `variable_step.py`.
 
-An explicit Runge-Kutta method is its tableau (`runge_kutta.py`), and a Rosenbrock method its (`rosenbrock.py`): the
-numbers and the order, with the error and dense output where it has them.
+An explicit Runge-Kutta method is its numbers, an `ExplicitTableau`, and a Rosenbrock method a `RosenbrockTableau`:
+with those of an error and of dense output, where it has them, all runs and gradients work as with those of the library.
+
+>>> from hhtjax.steppers import ExplicitTableau, RungeKutta
+>>> kutta = RungeKutta(ExplicitTableau("Kutta", A=((0.5,), (-1.0, 2.0)), b=(1 / 6, 2 / 3, 1 / 6)), order=3)
+>>> run = hhtjax.simulate(oscillator, kutta, *start, dt=1e-3, num_steps=1000)
+>>> abs(float(run.q[-1, 0] - jnp.cos(10.0))) < 1e-6
+True
 
 A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
 `implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
@@ -122,9 +129,17 @@ Sources
 * O. Bruls, A. Cardona, J. Comput. Nonlinear Dyn. 5 (2010) 031002: `kinematics="lie"`.
 * E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, Sec. IV.7: `rosenbrock`.
 * G. Bader, P. Deuflhard, Numer. Math. 41 (1983) 373-398: `extrapolated`.
+* G. Steinebach, BIT Numer. Math. 63 (2023) 27: `rodas5p`.
 * C. Lubich, M. Roche, Computing 43 (1990) 325-342: `rowda`.
 * J. Dormand, P. Prince, J. Comput. Appl. Math. 6 (1980) 19-26: `dopri5`.
+* C. Tsitouras, Comput. Math. Appl. 62 (2011) 770-775: `tsit5`.
+* E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, Sec. II.5: `dop853`.
 * J. Houbolt, J. Aeronaut. Sci. 17 (1950) 540-550: `houbolt`. K. Park, J. Appl. Mech. 42 (1975) 464-470: `park`.
 * E. Wilson, I. Farhoomand, K. Bathe, Earthquake Eng. Struct. Dyn. 1 (1973) 241-252: `wilson`.
 * H. Hilber, T. Hughes, Earthquake Eng. Struct. Dyn. 6 (1978) 99-117: `collocation`.
 """
+
+from hhtjax.steppers.rosenbrock import Rosenbrock as Rosenbrock
+from hhtjax.steppers.runge_kutta import RungeKutta as RungeKutta
+from hhtjax.steppers.tableaus import ExplicitTableau as ExplicitTableau
+from hhtjax.steppers.tableaus import RosenbrockTableau as RosenbrockTableau

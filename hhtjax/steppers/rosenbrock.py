@@ -17,10 +17,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real
@@ -31,28 +32,32 @@ from hhtjax.numerics.sparse_solve import kept
 from hhtjax.primitives import staged
 from hhtjax.steppers.implicit_solve import linearized, with_local
 from hhtjax.steppers.residual import residual
+from hhtjax.steppers.runge_kutta import mean
 from hhtjax.steppers.stepper import Info, State, Stepper
-from hhtjax.steppers.variable_step import Embedded, Errors
+from hhtjax.steppers.tableaus import RODAS5P, ROWDA, RosenbrockTableau
+from hhtjax.steppers.variable_step import DenseTerm, Errors, Tabulated
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
-EMBEDDED = 0.47990028, 0.51762038, 0.00247934, 0.0  # of order 2, L-stable, from the stages of `rowda`
-
-
-class RosenbrockTableau(NamedTuple):
-    """g, and the rows of A and G below the diagonal, of any length up to it; b, and the one of an embedded method."""
-
-    g: Any
-    A: tuple
-    G: tuple
-    b: tuple
-    embedded: tuple
+FEW = 4  # stages
 
 
 @dataclass(frozen=True, eq=False)
-class Rosenbrock(Embedded, Stepper):
-    """A method given by its tableau; made by `rosenbrock` and `rowda`."""
+class Rosenbrock(Tabulated, Stepper):
+    """A method given by its tableau; made by `rosenbrock`, `rowda` and `rodas5p`.
+
+    One of your own is its tableau and its order, here the linearly implicit trapezoidal rule with Euler's beside it:
+
+    >>> import hhtjax, jax.numpy as jnp
+    >>> from hhtjax.steppers import Rosenbrock, RosenbrockTableau
+    >>> tableau = RosenbrockTableau("mine", g=0.5, A=((), (1.0,)), G=((), (-1.0,)), b=(0.5, 0.5), embedded=(1.0, 0.0))
+    >>> mine = Rosenbrock(tableau, order=2)
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
+    >>> run = hhtjax.simulate(spring, mine, jnp.ones(1), jnp.zeros(1), dt=0.01, num_steps=100)
+    >>> bool(abs(run.q[-1, 0] - jnp.cos(1.0)) < 1e-4)
+    True
+    """
 
     tableau: RosenbrockTableau
     order: int
@@ -62,13 +67,14 @@ class Rosenbrock(Embedded, Stepper):
     keeps_sparse = True
 
     @property
+    def name(self) -> str:
+        """Of the method."""
+        return self.tableau.name
+
+    @property
     def estimate_order(self) -> int:
         """One more than the order of the embedded method, which is one less than that of this."""
         return self.order
-
-    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
-        """w0 = M^-1 Q."""
-        return State(t, q, v, system.acceleration(q, v, t, params))
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The step without its estimate."""
@@ -100,6 +106,7 @@ class Rosenbrock(Embedded, Stepper):
             once = factorized(jax.linearize(r, State(instant, zero, zero, zero))[1])
 
         def step(s: State):
+            s = s._replace(memory=None)  # of the step before
             value, tangent = staged(partial(linearized, r), system.size)(s)
             solve = once if system.linear else factorized(tangent, s)
             end, errors = stages(system, self.tableau, s, dt, r, value, tangent, solve)
@@ -121,39 +128,67 @@ def stages(
     tangent: Callable,
     solve: Callable,
 ):
-    """The state at t + dt, by the formulas at the top of this file, and its errors; value, tangent: of r at s."""
-    g, A, G, b, embedded = tableau
-    zero = jnp.zeros(system.size, s.q.dtype)
+    """The state at t + dt, by the formulas at the top of this file, and its errors.
 
-    def increment(weights: Sequence, rates: list):
-        """dt times the weighted sum of the rates of q, of v and of w."""
-        return [dt * sum((x * k[i] for x, k in zip(weights, rates, strict=False)), zero) for i in range(3)]
+    value, tangent: of r at s. The rates of a stage are those of q, v and w, (3, N).
+    """
+    gh, none = tableau.g * dt, jnp.zeros((3, system.size), s.v.dtype)
 
-    def moved(h: Array, weights: tuple, rates: list) -> State:
+    def increment(weights: Sequence, rates: PyTree) -> Array:
+        """dt times the weighted sum of the rates."""
+        return dt * (none + mean(weights, rates))
+
+    def moved(h: Array, weights: Sequence, rates: PyTree) -> State:
         """The state after the rates so weighted, at the time t + h."""
         dq, dv, dw = increment(weights, rates)
         return State(s.t + h, s.q + system.located(dq), s.v + dv, s.w + dw)
 
-    def start(row: tuple, rates: list):
+    def start(a: Sequence, rates: PyTree):
         """Where a stage starts, and r there."""
-        at = moved(sum(row) * dt, row, rates)
+        at = moved(sum(a) * dt, a, rates)
         return at, r(at)
 
-    def stage(coupling: tuple, rates: list, at: State, value: Array):
+    def stage(c: Sequence, rates: PyTree, at: State, value: Array) -> Array:
         """Its rates."""
-        zq, zv, zw = increment(coupling, rates)
+        zq, zv, zw = increment(c, rates)
         kq = at.v + zv
-        shift = State((g + sum(coupling)) * dt, system.located(zq + g * dt * kq), zv, -at.w)
+        shift = State(gh + sum(c) * dt, system.located(zq + gh * kq), zv, -at.w)
         kv = -solve(value + tangent(shift))
-        return kq + g * dt * kv, kv, (kv - at.w - zw) / (g * dt)
+        return jnp.stack([kq + gh * kv, kv, (kv - at.w - zw) / gh])
 
-    rates, started, before = [], (s, value), A[0]
-    for row, coupling in zip(A, G, strict=True):
-        if row != before:
-            started, before = staged(partial(start, row))(rates), row
-        rates.append(staged(partial(stage, coupling))(rates, *started))
-    e_q, e_v, _ = increment([x - y for x, y in zip(b, embedded, strict=True)], rates)
-    return moved(dt, b, rates), Errors(e_q, e_v)
+    run_through = written_out if len(tableau.b) <= FEW else in_a_loop
+    rates = run_through(tableau, start, stage, (s, value))
+    e_q, e_v, _ = increment([x - y for x, y in zip(tableau.b, tableau.embedded, strict=True)], rates)
+    end = moved(dt, tableau.b, rates)
+    if tableau.dense is not None:
+        e = jnp.stack([increment(row, rates) for row in tableau.dense])
+        end = end._replace(memory=DenseTerm(e[:, 0, : s.q.size], e[:, 1]))
+    return end, Errors(e_q, e_v)
+
+
+def written_out(tableau: RosenbrockTableau, start: Callable, stage: Callable, first: tuple) -> PyTree:
+    """The rates of all stages. first: where the first starts, and r there."""
+    started, before, rates = first, tableau.A[0], []
+    for a, c in zip(tableau.A, tableau.G, strict=True):
+        if a != before:
+            started, before = staged(partial(start, a))(rates), a
+        rates.append(staged(partial(stage, c))(rates, *started))
+    return rates
+
+
+def in_a_loop(tableau: RosenbrockTableau, start: Callable, stage: Callable, first: tuple) -> PyTree:
+    """The same, with one stage to compile in the place of many; its tableau is data."""
+    number, size, dtype = len(tableau.b), first[1].size, first[1].dtype
+    A, G = (
+        jnp.asarray([[*row, *(number - len(row)) * (0.0,)] for row in rows], dtype) for rows in (tableau.A, tableau.G)
+    )
+
+    def body(rates: Array, row: tuple):
+        a, c, here = row
+        rates = rates + here[:, None, None] * stage(c, rates, *start(a, rates))[None]
+        return rates, None
+
+    return lax.scan(body, jnp.zeros((number, 3, size), dtype), (A, G, jnp.eye(number, dtype=dtype)))[0]
 
 
 def rosenbrock(rho_inf: Real = 0.0) -> Rosenbrock:
@@ -187,7 +222,8 @@ def rosenbrock(rho_inf: Real = 0.0) -> Rosenbrock:
     """
     rho = require_number("rosenbrock", "rho_inf", rho_inf, lambda x: 0 <= x <= 1, "lie in [0, 1]")
     g = 0.5 / (1 + ((1 + rho) / 2) ** 0.5)
-    return Rosenbrock(RosenbrockTableau(g, ((), (g,)), ((), (-2 * g**2,)), (1 - 0.5 / g, 0.5 / g), (1.0, 0.0)), 2)
+    A, G, b = ((), (g,)), ((), (-2 * g**2,)), (1 - 0.5 / g, 0.5 / g)
+    return Rosenbrock(RosenbrockTableau("rosenbrock", g, A, G, b, (1.0, 0.0)), 2)
 
 
 def rowda() -> Rosenbrock:
@@ -203,8 +239,30 @@ def rowda() -> Rosenbrock:
     >>> hhtjax.rowda().order
     3
     """
-    stage_2, stage_3 = (0.5,), (0.28, 0.72)  # stage 4 starts from where stage 3 does
-    G = (), (-0.1121794871794876,), (2.54, -3.84), (29 / 75, -0.72, 1 / 30)
-    return Rosenbrock(
-        RosenbrockTableau(0.3, ((), stage_2, stage_3, stage_3), G, (2 / 3, 0.0, 1 / 30, 0.3), EMBEDDED), 3
-    )
+    return Rosenbrock(ROWDA, 3)
+
+
+def rodas5p() -> Rosenbrock:
+    """Rodas5P, Steinebach's eight-stage Rosenbrock method of order 5: one Jacobian, one factorisation, eight solves.
+
+    Order 5, L-stable, g = 0.2119; its error estimate and its dense output are of order 4. For stiff motion that is
+    wanted to six digits and more, best under error control, `simulate(..., dt=adaptive(...))`: a step costs some nine
+    of `hht`. Constraints and rotations are refused; where steps do not resolve a stiff direction that turns it fails as
+    `rosenbrock` does.
+
+    Returns:
+        A `Stepper`.
+
+    References:
+        Steinebach, BIT Numerical Mathematics 63, 2023, article 27 (coefficients, dense output).
+
+    >>> import hhtjax, jax.numpy as jnp
+    >>> def force(q, v, t, params):                                     # which draws q to cos(t) within microseconds
+    ...     return -1e8 * (q - jnp.cos(t)) - 1e6 * (v + jnp.sin(t)) - jnp.cos(t)
+    >>> dt = hhtjax.adaptive(rtol=1e-8, atol=1e-10)
+    >>> start = jnp.ones(1), jnp.zeros(1)
+    >>> run = hhtjax.simulate(hhtjax.System(jnp.ones(1), force), hhtjax.rodas5p(), *start, dt=dt, times=[1.0])
+    >>> bool(abs(run.q[-1, 0] - jnp.cos(1.0)) < 1e-8), int(run.steps.accepted) < 150
+    (True, True)
+    """
+    return Rosenbrock(RODAS5P, 5)

@@ -9,53 +9,33 @@ E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, Sec
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax.description import Array, PyTree, Real, is_concrete
+from hhtjax.description import Array, PyTree, is_concrete
 from hhtjax.numerics.dense_lu import SCALAR
 from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
-from hhtjax.steppers.variable_step import Embedded, Errors
+from hhtjax.steppers.tableaus import CLASSICAL, DOP853, DORMAND_PRINCE, TSITOURAS, ExplicitTableau
+from hhtjax.steppers.variable_step import DenseTerm, Errors, Tabulated
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 
-class ExplicitTableau(NamedTuple):
-    """An explicit Runge-Kutta method of s stages.
-
-    Attributes:
-        name: of the method.
-        A: the rows of the stages 2 to s, those entries that are below the diagonal.
-        b: (s,), the end of the step.
-        error: (s + 1,), the weights (*b, 0) of the s stages and of the rate at the end of the step, less those of the
-            embedded method; many sources print the negative. None without an estimate.
-        embedded_order: of that method.
-        dense: (s + 1,), the weights d of dense output: s^2 (1 - s)^2 h sum_i d_i k_i beside the cubic Hermite
-            polynomial, s in [0, 1] from the start to the end of the step; None for cubics alone.
-    """
-
-    name: str
-    A: tuple
-    b: tuple
-    error: tuple | None = None
-    embedded_order: int | None = None
-    dense: tuple | None = None
-
-
 @dataclass(frozen=True, eq=False)
-class RungeKutta(Embedded, Stepper):
-    """A method given by its tableau; made by `rk4` and `dopri5`.
+class RungeKutta(Tabulated, Stepper):
+    """A method given by its tableau; made by `rk4`, `tsit5`, `dopri5` and `dop853`.
 
     One of your own is its tableau and its order:
 
     >>> import hhtjax, jax.numpy as jnp
+    >>> from hhtjax.steppers import ExplicitTableau, RungeKutta
     >>> tableau = ExplicitTableau("Heun", A=((1.0,),), b=(0.5, 0.5), error=(-0.5, 0.5, 0.0), embedded_order=1)
     >>> heun = RungeKutta(tableau, order=2)
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
@@ -81,18 +61,8 @@ class RungeKutta(Embedded, Stepper):
         """One more than the order of the embedded method."""
         return None if self.tableau.embedded_order is None else self.tableau.embedded_order + 1
 
-    @property
-    def dense_term(self) -> bool:
-        """Whether dense output is more than cubics."""
-        return self.tableau.dense is not None
-
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name}, order={self.order})"
-
-    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
-        """w0 = M^-1 Q, the first stage of the first step."""
-        memory = Errors(0 * q, 0 * v) if self.dense_term else None
-        return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The step without its estimate."""
@@ -105,81 +75,70 @@ class RungeKutta(Embedded, Stepper):
 
     def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array):
         """State -> State, Info, Errors; the first stage is the acceleration that the step before ended with."""
+        tableau = self.tableau
         acceleration = staged(lambda q, v, t: system.acceleration(q, v, t, params), system.size)
-        rows = *self.tableau.A, self.tableau.b
+        rows = *tableau.A, tableau.b, *tableau.extra
         run_through = in_a_loop if system.size > SCALAR else written_out
 
-        def stage(s: State, node: Real, weights: PyTree, V: PyTree, W: PyTree):
-            """q, v and w of a stage, from the v and w of those before it."""
-            q, v = s.q + system.located(dt * mean(weights, V)), s.v + dt * mean(weights, W)
-            return q, v, acceleration(q, v, s.t + node * dt)
-
-        def increments(weights: tuple | None, V: list, W: list):
-            """What q and v gain by these weights."""
-            return None if weights is None else Errors(system.located(dt * mean(weights, V)), dt * mean(weights, W))
-
         def step(s: State):
-            q, V, W = run_through(rows, stage, s)
-            end = State(s.t + dt, q, V[-1], W[-1], memory=increments(self.tableau.dense, V, W))
-            errors = self.tableau.error
-            return end, Info(), None if errors is None else Errors(dt * mean(errors, V), dt * mean(errors, W))
+            def moved(weights: Sequence, rates: PyTree):
+                """q and v after the rates so weighted."""
+                x, y = dt * mean(weights, rates)
+                return s.q + system.located(x), s.v + y
+
+            def stage(weights: Sequence, rates: PyTree) -> Array:
+                """The rates of q and v, (2, N)."""
+                q, v = moved(weights, rates)
+                return jnp.stack([v, acceleration(q, v, s.t + sum(weights) * dt)])
+
+            rates = run_through(rows, stage, jnp.stack([s.v, s.w]))
+            q, _ = moved(tableau.b, rates)
+            v, w = rates[len(tableau.b)]
+            end = State(s.t + dt, q, v, w)
+            if tableau.dense is not None:
+                e = jnp.stack([dt * mean(row, rates) for row in tableau.dense])
+                end = end._replace(memory=DenseTerm(e[:, 0, : s.q.size], e[:, 1]))
+            return end, Info(), None if tableau.error is None else Errors(*errors_of(tableau, dt, rates))
 
         return step
 
 
-def written_out(rows: tuple, stage: Callable, s: State):
-    """q at the end of a step, and the rates v and w of all stages and of the end."""
-    q, V, W = s.q, [s.v], [s.w]
+def written_out(rows: Sequence, stage: Callable, first: Array) -> PyTree:
+    """The rates of all stages; first: those of the first."""
+    rates = [first]
     for row in rows:
-        q, v, w = stage(s, sum(row), row, V, W)
-        V.append(v)
-        W.append(w)
-    return q, V, W
+        rates.append(stage(row, rates))
+    return rates
 
 
-def in_a_loop(rows: tuple, stage: Callable, s: State):
-    """The same, with one acceleration to compile in the place of several, which may take minutes."""
-    number = len(rows) + 1
-    nodes = jnp.asarray(np.array([sum(row) for row in rows]), s.v.dtype)
-    weights = jnp.asarray(np.array([(*row, *(number - len(row)) * (0.0,)) for row in rows]), s.v.dtype)
+def in_a_loop(rows: Sequence, stage: Callable, first: Array) -> Array:
+    """The same, with one stage to compile in the place of many; the tableau is data."""
+    number, dtype = len(rows) + 1, first.dtype
+    weights = jnp.asarray(np.array([(*row, *(number - len(row)) * (0.0,)) for row in rows]), dtype)
 
-    def body(i: Array, carry: tuple):
-        _, V, W = carry
-        row, node = (lax.dynamic_index_in_dim(x, i, keepdims=False) for x in (weights, nodes))
-        q, v, w = stage(s, node, row, V, W)
-        here = (jnp.arange(number) == i + 1)[:, None]  # an update at i is a scatter, and no kernel, in a derivative
-        return q, *(jnp.where(here, x, X) for X, x in ((V, v), (W, w)))
+    def body(rates: Array, row: tuple):
+        weights, here = row
+        return rates + here[:, None, None] * stage(weights, rates)[None], None
 
-    V, W = (jnp.pad(x[None], ((0, number - 1), (0, 0))) for x in (s.v, s.w))
-    q, V, W = lax.fori_loop(0, number - 1, body, (s.q, V, W))
-    return q, list(V), list(W)
+    begun = jnp.pad(first[None], ((0, number - 1), (0, 0), (0, 0)))
+    return lax.scan(body, begun, (weights, jnp.eye(number, dtype=dtype)[1:]))[0]
 
 
-def mean(weights: tuple, rates: list):
-    """Their weighted sum, without those that are known to be 0."""
-    known = [(weight, k) for weight, k in zip(weights, rates, strict=True) if not is_concrete(weight) or weight]
+def errors_of(tableau: ExplicitTableau, dt: Array, rates: PyTree) -> Array:
+    """Of q and v, (2, N)."""
+    e = dt * mean(tableau.error, rates)
+    if tableau.error_of_3 is None:
+        return e
+    other = 0.1 * dt * mean(tableau.error_of_3, rates)
+    largest = jnp.maximum(jnp.abs(e), jnp.abs(other))
+    x, y = (z / jnp.where(largest == 0, 1, largest) for z in (e, other))  # whose squares do not underflow
+    return jnp.where(largest == 0, 0, largest * x**2 / jnp.sqrt(jnp.where(largest == 0, 1, x**2 + y**2)))
+
+
+def mean(weights: PyTree, rates: PyTree) -> Any:
+    """The sum of the rates so weighted, of as many as there are weights, without those that are known to be 0."""
+    known = [(weight, k) for weight, k in zip(weights, rates, strict=False) if not is_concrete(weight) or weight]
     return sum(weight * k for weight, k in known)
-
-
-CLASSICAL = ExplicitTableau("RK4", A=((1 / 2,), (0.0, 1 / 2), (0.0, 0.0, 1.0)), b=(1 / 6, 1 / 3, 1 / 3, 1 / 6))
-
-DORMAND_PRINCE = ExplicitTableau(
-    "dopri5",
-    A=(
-        (1 / 5,),
-        (3 / 40, 9 / 40),
-        (44 / 45, -56 / 15, 32 / 9),
-        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    ),
-    b=(35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-    error=(71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40),
-    embedded_order=4,
-    dense=(
-        *(-12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072),
-        *(701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423),
-    ),
-)
 
 
 def rk4() -> RungeKutta:
@@ -211,3 +170,35 @@ def dopri5() -> RungeKutta:
     5
     """
     return RungeKutta(DORMAND_PRINCE, 5)
+
+
+def tsit5() -> RungeKutta:
+    """Tsitouras' pair of order 5(4), for the first-order form (q, v)' = (v, M^-1 Q): as `dopri5`, with smaller errors.
+
+    Explicit: six solves with M per step. Dense output of order 4.
+
+    References:
+        Tsitouras, Computers & Mathematics with Applications 62, 2011, 770-775.
+
+    >>> import hhtjax
+    >>> hhtjax.tsit5().order
+    5
+    """
+    return RungeKutta(TSITOURAS, 5)
+
+
+def dop853() -> RungeKutta:
+    """Dormand and Prince's method of order 8(5,3) of Hairer and Wanner, for (q, v)' = (v, M^-1 Q).
+
+    Explicit: fifteen solves with M per step, of which three are for dense output, of order 7. Unstable once
+    w h > 1.3 or so for any undamped natural frequency w. Under error control the explicit method for seven to ten
+    digits of what `taylor` refuses.
+
+    References:
+        Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 2nd ed., Sec. II.5, II.6 and II.10.
+
+    >>> import hhtjax
+    >>> hhtjax.dop853().order
+    8
+    """
+    return RungeKutta(DOP853, 8)

@@ -271,7 +271,7 @@ def bound(stepper: Stepper, system: FlatSystem, params: PyTree, dt: Array, last:
     if system.matrices is not None and not stepper.keeps_sparse:
         raise NotImplementedError(
             f"{stepper.name} cannot keep the matrices of the system sparse; use hht() or another of its "
-            "family, rosenbrock(), rowda(), rk4() or dopri5(), or hand over arrays: K.toarray()."
+            "family, a Rosenbrock method such as rodas5p(), rk4() or dopri5(), or hand over arrays: K.toarray()."
         )
     if not zero_order_hold.holds(params):
         return stepper.bind(system, params, dt)
@@ -344,7 +344,7 @@ def require_capable(caller: str, system: AnySystem, stepper: Stepper, q0: PyTree
     if system.internal is not None and not stepper.solves_internal:
         raise NotImplementedError(
             f"{caller}: {name} cannot solve the `internal` states; use hht() or another of its family, "
-            "rosenbrock(), rowda(), rk4() or dopri5()."
+            "a Rosenbrock method such as rodas5p(), rk4() or dopri5()."
         )
     if system.friction is not None and not stepper.solves_friction:
         raise NotImplementedError(f"{caller}: {name} cannot solve dry `friction`; use hht() or another of its family.")

@@ -33,11 +33,11 @@ import jax.numpy as jnp
 from hhtjax.description import Array, PyTree, is_concrete
 from hhtjax.numerics.batched_cond import call_where
 from hhtjax.steppers.residual import Coefficients, weighted
-from hhtjax.steppers.stepper import bound
+from hhtjax.steppers.stepper import State, bound
 from hhtjax.systems import zero_order_hold
 
 if TYPE_CHECKING:
-    from hhtjax.steppers.stepper import State, Stepper
+    from hhtjax.steppers.stepper import Stepper
     from hhtjax.systems.flat_system import FlatSystem
 
 GROWTH = 2.05  # of a step, up to which the recursion follows
@@ -131,6 +131,15 @@ class Errors(NamedTuple):
     v: PyTree
 
 
+class DenseTerm(NamedTuple):
+    """What dense output adds to cubics: s^2 (1 - s)^2 sum_k s^k e_k, s in [0, 1] from the start to the end of a step.
+
+    q, v: e_k of the positions, (terms, n), and of the rates, (terms, N). In `State.memory`, of the step before."""
+
+    q: Array
+    v: Array
+
+
 class Past(NamedTuple):
     """What the estimate of the family remembers of the step before: (w1 - w)/h, and h, which is 0 before the first."""
 
@@ -184,7 +193,7 @@ def family_errors(c: Coefficients, h: Array, w: Array, w1: Array, past: Past, d:
 
 
 class Embedded:
-    """A method of several stages, among which is one of lower order: their difference is the estimate."""
+    """A method of several stages; its estimate is the difference from one of lower order."""
 
     def begin_estimates(self, system: FlatSystem, state: State):
         """Nothing is remembered."""
@@ -203,3 +212,22 @@ class Embedded:
     def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array) -> Any:
         """State -> State, Info, Errors."""
         raise NotImplementedError
+
+
+class Tabulated(Embedded):
+    """The same, given by its tableau."""
+
+    tableau: Any  # with `dense`, rows of weights, or None for cubics alone
+
+    @property
+    def dense_term(self) -> bool:
+        """Whether dense output is more than cubics."""
+        return self.tableau.dense is not None
+
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
+        """w0 = M^-1 Q."""
+        memory = None
+        if self.dense_term:
+            terms = len(self.tableau.dense)
+            memory = DenseTerm(jnp.zeros((terms, *q.shape), q.dtype), jnp.zeros((terms, *v.shape), v.dtype))
+        return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)

@@ -101,8 +101,8 @@ Internal states
 
 Hysteresis, the bristles of friction, the current of a motor, the integral of a controller, a Maxwell branch: what has a
 rate, and no position, is a z behind q and v, any pytree, zdot = g(q, v, z, t). It is solved along with the motion, in
-the same factorisation and to the same order, however fast it is, by the `hht` family, `rosenbrock`, `rowda` and (unless
-it is fast) `rk4` and `dopri5`, with constraints, rotations, sweeps and gradients. Forces take z too.
+the same factorisation and to the same order, however fast it is, by the `hht` family, Rosenbrock methods and (unless it
+is fast) Runge-Kutta methods, with constraints, rotations, sweeps and gradients. Forces take z too.
 
 >>> def torque(q, v, z, t, params):
 ...     return params["kt"] * z["current"] - 0.01 * v

@@ -45,6 +45,7 @@ CONSISTENT = 1e-6  # distance of initial values from consistent ones that passes
 SMALL = 1e-3  # of a mechanism's size, if that is so small that the former does not tell
 ROUNDINGS = 1000  # of q, which nobody asks about
 CHECKED = ("q0", "Phi"), ("v0", "dPhi/dt")
+SINGLE_OR_DOUBLE = frozenset([np.dtype(np.float32), np.dtype(np.float64)])
 
 
 @shown
@@ -268,24 +269,22 @@ def initial_values(caller: str, system, q0: PyTree, v0: PyTree, z0: PyTree = Non
             raise ValueError(f"{caller}: `v0` must be left out for a FirstOrderSystem; received {v0!r}.")
         v0 = q0
     _require_internal(caller, system, z0)
-    if not sum(np.size(x) for x in jax.tree.leaves(q0)):
+    (in_q, structure), (in_v, of_v), (in_z, of_z) = map(jax.tree_util.tree_flatten_with_path, (q0, v0, z0))
+    if not any(np.size(x) for _, x in in_q):
         raise ValueError(f"{caller}: `q0` must hold at least one number; received {q0!r}.")
-    structure = jax.tree.structure(q0)
-    if jax.tree.structure(v0) != structure:
-        raise ValueError(
-            f"{caller}: `v0` must be a pytree structured like q0, {structure}; received {jax.tree.structure(v0)}."
-        )
+    if of_v != structure:
+        raise ValueError(f"{caller}: `v0` must be a pytree structured like q0, {structure}; received {of_v}.")
     dtypes = set()
-    for name, values in (("q0", q0), ("v0", v0), ("z0", z0)):
-        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
-            dtype = _require_finite(f"{caller}: `{name}{jax.tree_util.keystr(path)}`", leaf)
-            if is_array(leaf) and jnp.issubdtype(dtype, jnp.floating):
-                dtypes.add(jnp.result_type(leaf))  # what JAX makes of it: float32 without x64
-    for (path, q), v in zip(jax.tree_util.tree_leaves_with_path(q0), jax.tree.leaves(v0), strict=True):
-        if kinematics.is_rotation(jnp.shape(q), jnp.shape(v)):
+    for name, leaves in (("q0", in_q), ("v0", in_v), ("z0", in_z)):
+        for path, leaf in leaves:
+            dtype = _require_finite(caller, name, path, leaf)
+            if is_array(leaf) and dtype.kind == "f":
+                dtypes.add(jax.dtypes.canonicalize_dtype(dtype))  # what JAX makes of it: float32 without x64
+    for (path, q), (_, v) in zip(in_q, in_v, strict=True):
+        a, b = np.shape(q), np.shape(v)
+        if kinematics.is_rotation(a, b):
             _require_rotations(f"{caller}: `q0{jax.tree_util.keystr(path)}`", q)
-        elif jnp.shape(q) != jnp.shape(v):
-            a, b = jnp.shape(q), jnp.shape(v)
+        elif a != b:
             turns = a[-2:] == (3, 3) or (a[-1:], b[-1:]) == ((4,), (3,))  # or is a quaternion
             rotation = ", but (3,) for a rotation, a matrix (3, 3)" if turns else ""
             raise ValueError(
@@ -299,8 +298,16 @@ def initial_values(caller: str, system, q0: PyTree, v0: PyTree, z0: PyTree = Non
             PrecisionWarning,
             stacklevel=level,
         )
-    q0, v0, z0 = (jax.tree.map(lambda x: jnp.asarray(x, dtype), values) for values in (q0, v0, z0))
+    q0, v0, z0 = (
+        of.unflatten([_as_state(x, dtype) for _, x in leaves])
+        for of, leaves in ((structure, in_q), (of_v, in_v), (of_z, in_z))
+    )
     return q0, None if first_order else v0, z0
+
+
+def _as_state(x: Real, dtype: np.dtype) -> Array:
+    """An array of JAX of this dtype; one that is such already as it is, because asking takes JAX 7 us."""
+    return x if isinstance(x, jax.Array) and x.dtype == dtype and not x.weak_type else jnp.asarray(x, dtype)
 
 
 def _the_one(caller: str, dtypes, q0: PyTree, v0: PyTree, z0: PyTree) -> np.dtype:
@@ -323,8 +330,12 @@ def _require_internal(caller: str, system: LinearSystem | System, z0: PyTree):
         raise ValueError(f"{caller}: `z0` must hold at least one number; received {z0!r}.")
 
 
-def _require_finite(where: str, leaf: Real) -> np.dtype:
+def _require_finite(caller: str, name: str, path: tuple, leaf: Real) -> np.dtype:
     """The dtype of a leaf, or an error for what is no array of finite numbers of single or double precision."""
+    is_float = is_array(leaf) and leaf.dtype in SINGLE_OR_DOUBLE
+    if is_float and (not is_concrete(leaf) or np.isfinite(np.asarray(leaf)).all()):
+        return leaf.dtype
+    where = f"{caller}: `{name}{jax.tree_util.keystr(path)}`"
     if not is_array(leaf) and (isinstance(leaf, bool) or not isinstance(leaf, (int, float, complex))):
         raise TypeError(f"{where} must be an array or a number; received {leaf!r}.")
     dtype = getattr(leaf, "dtype", None) or np.result_type(leaf)

@@ -34,8 +34,8 @@ class LinearSystem(Description):
         M, C, K: mass, damping and stiffness: arrays (n, n), or (n,) for a diagonal, or matrices of scipy.sparse, such
             as `scipy.io.mmread` gives, or functions of params that return arrays, or what `hhtjax.sparse` makes. C and
             K may be None. Rows follow `jax.flatten_util.ravel_pytree(v)`. Sparse matrices of more than 300 rows stay
-            sparse, are factorised by SciPy's SuperLU, and solved with in each step by the `hht` family, `rosenbrock`
-            and `rowda`, with the same derivatives; smaller ones become dense, or diagonals.
+            sparse, are factorised by SciPy's SuperLU, and solved with in each step by the `hht` family and
+            Rosenbrock methods, with the same derivatives; smaller ones become dense, or diagonals.
             M may be singular where M and C are arrays, and C damps all coordinates without mass, such as the node
             between a spring and a damper: with the `hht` family, whose smooth start never divides by M, and fixed
             steps, without events, held inputs and friction. q is of order 2, v as well but for alpha = 0, where that

@@ -62,7 +62,7 @@ class System(Description):
             Both are solved at once, in one factorisation of their common size, to the order of the stepper, however
             fast z is. (With alpha = 0, or rho_inf = 1, a fast z that starts off the values it is drawn to swings
             about them for ever, as the trapezoidal rule does: damp, or start it there.) For the `hht` family,
-            `rosenbrock`, `rowda`, `rk4` and `dopri5`. g should have bounded slopes: no relays, and |z|^nu at z = 0 has
+            Rosenbrock and Runge-Kutta methods. g should have bounded slopes: no relays, and |z|^nu at z = 0 has
             derivatives in nu that are not finite, unless written exp(nu log(|z| + 1e-12)).
         friction: F >= 0, the limits of dry friction, `friction(q, v, t, params)`, a pytree structured like v: of each
             coordinate, 0 where nothing rubs; with `sliding` (m,), one for each of its rows. It is called with z behind
