@@ -98,8 +98,8 @@ __all__ = [  # noqa: RUF022
     "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
-    "bossak", "conventional_hht", "dop853", "dopri5", "extrapolated", "generalized_alpha", "hht", "houbolt", "implicit_euler",
-    "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rodas5p",
+    "bossak", "conventional_hht", "dop853", "dopri5", "extrapolated", "generalized_alpha", "hht", "houbolt",
+    "implicit_euler", "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rodas5p",
     "rosenbrock", "rowda", "tsit5", "wilson",
     # runs
     "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",

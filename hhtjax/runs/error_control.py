@@ -128,7 +128,7 @@ class Bounds(NamedTuple):
         n, N = flat.positions, flat.size
         rounding = ROUNDINGS * float(jnp.finfo(t0.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(end))
         each = jnp.concatenate([jnp.full(n, atol_v), jnp.full(N - n, atol)])
-        power = 1 - stepper.estimate_order / stepper.order
+        power = min(0.0, 1 - stepper.estimate_order / stepper.order)  # no step has a looser tolerance than the run
         return cls(rtol, atol, each, rtol**power, jnp.maximum(least, rounding), most)
 
     def relative(self, flat: FlatSystem, errors: Errors, q_size: Array, v_size: Array) -> Array:
