@@ -93,9 +93,8 @@ class Extrapolated(Embedded, Stepper):
         def step(s: State):
             (x, u), (x_less, u_less) = basic_step(system, params, dt, self.levels, s)
             t, (q, v, _) = s.t + dt, placed(system, s, x, u, s.w)
-            q, v, info = projected(system, params, s, system.tidy(State(t, q, v, s.w)))
-            w, L = accelerations(system, q, v, t, params)
-            return State(t, q, v, w, L=L), info, Errors(x - x_less, u - u_less)
+            s1, info = on_constraints(system, params, s, system.tidy(State(t, q, v, s.w)))
+            return s1, info, Errors(x - x_less, u - u_less)
 
         return step
 
@@ -201,17 +200,24 @@ def matrices(system: FlatSystem, params: PyTree, s: State, h: Array):
     return lax.map(lambda h: differentiable_inverse(A + h * C + h**2 * K_all), h), A[:, :N], K
 
 
-def projected(system: FlatSystem, params: PyTree, s: State, end: State):
-    """q and v of the end of a step from s, on the constraints, and the `Info`."""
+def on_constraints(system: FlatSystem, params: PyTree, s: State, end: State):
+    """The end of a step from s, moved onto the constraints, with its w and L; and the `Info`.
+
+    Two corrections of q by one matrix leave a rest of the third power of what was wrong. dPhi/dt is linear in v: one
+    correction leaves rounding, if its matrix is that of the new q, which w and L need anyway.
+    """
     t, q, v = end.t, end.q, end.v
     if not system.num_constraints:
-        return q, v, Info()
-    solve, zero = saddle_point(system, q, t, params), jnp.zeros_like(v)
-    q = system.move(q, solve(zero, -violation(system, q, v, t, params)[0])[0])
+        return end._replace(w=system.acceleration(q, v, t, params)), Info()
+    zero, move = jnp.zeros_like(v), saddle_point(system, q, t, params)
+    for _ in range(2):
+        q = system.move(q, move(zero, -violation(system, q, v, t, params)[0])[0])
+    solve = saddle_point(system, q, t, params)
     v = v + solve(zero, -violation(system, q, v, t, params)[1])[0]
+    w, L = solve(system.force(q, v, t, params), -curvature(system, q, v, t, params))
     constraint, rate = (jnp.max(jnp.abs(x)) for x in violation(system, q, v, t, params))
     row = dependent_row(jacobian(system, s.q, s.t, params))
-    return q, v, Info(constraint=constraint, constraint_rate=rate, dependent_row=row)
+    return State(t, q, v, w, L=L), Info(constraint=constraint, constraint_rate=rate, dependent_row=row)
 
 
 def extrapolated(levels: int = 4) -> Extrapolated:
