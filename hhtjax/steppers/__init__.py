@@ -17,7 +17,7 @@ stepper                            order                 solves per step   for
 `rowda()`                          3                     4                 one factorisation; L-stable: for accuracy
 `rodas5p()`                        5                     8                 the same to six digits and more, with a
                                                                            tolerance, `adaptive`
-`extrapolated()`                   7                     24                six digits or more, stiff, with constraints
+`extrapolated()`                   5                     15                six digits or more, stiff, with constraints
 `houbolt()`                        2                     Newton's          a classical baseline
 `park()`                           2                     Newton's          a classical baseline
 `wilson(theta)`                    2                     Newton's          a classical baseline

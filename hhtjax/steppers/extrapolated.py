@@ -11,8 +11,10 @@ the other: order 2 k - 1 by k of them. With A = M, or [M, -B^T; B, 0], and K, C 
 and u, 1 - h J leaves the matrix A + h C + h^2 K for a change of u. A projection with M puts the ends of steps on
 Phi = 0 and dPhi/dt = 0.
 
-On y' = c y the method is A-stable for k = 3, and A(89 degrees)-stable for k = 4, where an undamped vibration of
-frequency w grows by up to 6 % a step about w H = 8, if error control lets it; both take out at once what is stiffer.
+On y' = c y the method is A-stable for k = 3, the default, and A(89 degrees)-stable for k = 4, where an undamped vibration
+of frequency w grows by up to 6 % a step about w H = 8, if error control lets it; both take out at once what is stiffer.
+On the squeezer with tolerances of 1e-4 to 1e-10 the error of a run is at most 1.2 of them for k = 3, as with `hht`,
+4.6 for k = 4 and 4.5 for k = 5.
 
 G. Bader, P. Deuflhard, Numer. Math. 41, 1983, 373-398; E. Hairer, G. Wanner, Solving Ordinary Differential Equations
 II, Sec. IV.9 and VII.2.
@@ -220,13 +222,14 @@ def on_constraints(system: FlatSystem, params: PyTree, s: State, end: State):
     return State(t, q, v, w, L=L), Info(constraint=constraint, constraint_rate=rate, dependent_row=row)
 
 
-def extrapolated(levels: int = 4) -> Extrapolated:
+def extrapolated(levels: int = 3) -> Extrapolated:
     """Extrapolation of the linearly implicit mid-point rule: order 2 k - 1 by k levels.
 
-    Order 7 by default, stiff systems, constraints and rotations included: one Jacobian and k factorised matrices a
+    Order 5 by default, stiff systems, constraints and rotations included: one Jacobian and k factorised matrices a
     step, and k (k + 1) evaluations of the acceleration, each with a factorised M (and B). For error control and six or
-    more digits; at three digits `hht` is as fast. A-stable for levels=3, nearly so for 4; see the module's docstring.
-    Steps under error control end at each of `times`.
+    more digits. A-stable for levels=3. Levels=4 are nearly so and need half the steps at ten digits, but an error of a
+    run may be several times its tolerance; see the module's docstring. Steps under error control end at each of
+    `times`. Events and dry friction are refused.
 
     Args:
         levels: k, from 2 to 6.
@@ -242,7 +245,7 @@ def extrapolated(levels: int = 4) -> Extrapolated:
 
     >>> import hhtjax
     >>> hhtjax.extrapolated().order
-    7
+    5
     >>> hhtjax.extrapolated(levels=9)
     Traceback (most recent call last):
     ValueError: extrapolated: `levels` must be from 2 to 6; received 9.
