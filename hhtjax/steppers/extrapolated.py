@@ -11,10 +11,10 @@ the other: order 2 k - 1 by k of them. With A = M, or [M, -B^T; B, 0], and K, C 
 and u, 1 - h J leaves the matrix A + h C + h^2 K for a change of u. A projection with M puts the ends of steps on
 Phi = 0 and dPhi/dt = 0.
 
-On y' = c y the method is A-stable for k = 3, the default, and A(89 degrees)-stable for k = 4, where an undamped vibration
-of frequency w grows by up to 6 % a step about w H = 8, if error control lets it; both take out at once what is stiffer.
-On the squeezer with tolerances of 1e-4 to 1e-10 the error of a run is at most 1.2 of them for k = 3, as with `hht`,
-4.6 for k = 4 and 4.5 for k = 5.
+On y' = c y the method is A-stable for k = 3, the default, and A(89 degrees)-stable for k = 4, where an undamped
+vibration of frequency w grows by up to 6 % a step about w H = 8, if error control lets it; both take out at once what
+is stiffer. On the squeezer with tolerances of 1e-4 to 1e-10 the error of a run is at most 1.2 of them for k = 3, as
+with `hht`, 4.6 for k = 4 and 4.5 for k = 5.
 
 G. Bader, P. Deuflhard, Numer. Math. 41, 1983, 373-398; E. Hairer, G. Wanner, Solving Ordinary Differential Equations
 II, Sec. IV.9 and VII.2.
