@@ -50,8 +50,9 @@ Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is qui
 If five digits or more are wanted of something stiff, take `rodas5p()`, with constraints or rotations `extrapolated()`
 and a tolerance, or `simulate(..., extrapolate=2)`. For fitting by gradients take `hht(linearize="predictor")`, which is
 smooth in all that can be differentiated. If steps are to be far longer than the fastest vibration and the run blows up,
-try `hht(linearize="held")`, more damping (`alpha=-0.3`), or `hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`, and what became of
-the tables and figures of the paper of 2019 on another, `experiments/kim2019/README.md`.
+try `hht(linearize="held")`, more damping (`alpha=-0.3`), or `hht(iterations=None)`. Where each of them fails is on one
+page, `experiments/stability/README.md`, and what became of the tables and figures of the paper of 2019 on another,
+`experiments/kim2019/README.md`.
 
 How long a step
 ---------------

@@ -14,7 +14,7 @@ Phi = 0 and dPhi/dt = 0.
 On y' = c y the method is A-stable for k = 3, the default, and A(89 degrees)-stable for k = 4, where an undamped
 vibration of frequency w grows by up to 6 % a step about w H = 8, if error control lets it; both take out at once what
 is stiffer. Of 49 tolerances from 1e-4 to 1e-10 on the squeezer, the error of the run is at most 1.2 times the tolerance
-for k = 3, where it is mostly far below, but up to 10 times for k = 4 and 5: their steps are as long as what they miss.
+for k = 3, where it is mostly far below, but up to 10 times for k = 4 and 5.
 
 G. Bader, P. Deuflhard, Numer. Math. 41, 1983, 373-398; E. Hairer, G. Wanner, Solving Ordinary Differential Equations
 II, Sec. IV.9 and VII.2.
