@@ -73,6 +73,7 @@ from hhtjax.runs.solution import Events, FailedRunWarning, Failure, SimulationEr
 from hhtjax.runs.sweep import sweep
 from hhtjax.runs.sweep_to_disk import load_sweep, sweep_to_disk
 from hhtjax.steppers.collocation import wilson
+from hhtjax.steppers.extrapolated import extrapolated
 from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, implicit_euler, newmark
 from hhtjax.steppers.kim2019 import conventional_hht, kim_hht, kim_implicit_euler
 from hhtjax.steppers.multistep import houbolt, park
@@ -98,8 +99,8 @@ __all__ = [  # noqa: RUF022
     "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients",
-    "bossak", "conventional_hht", "dop853", "dopri5", "generalized_alpha", "hht", "houbolt", "implicit_euler",
-    "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rodas5p",
+    "bossak", "conventional_hht", "dop853", "dopri5", "extrapolated", "generalized_alpha", "hht", "houbolt",
+    "implicit_euler", "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rodas5p",
     "rosenbrock", "rowda", "taylor", "tsit5", "wilson",
     # runs
     "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",

@@ -33,7 +33,8 @@ def test_family_is_of_order_two(family, form, problem):
     assert slope(problem, stepper) == pytest.approx(2, abs=0.15)
 
 
-OWN = "rodas5p", "dop853"  # too smooth a problem to see these: test_rosenbrock.py, test_tableaus.py
+# too smooth a problem to see these: test_rosenbrock.py, test_tableaus.py, test_extrapolated.py
+OWN = "rodas5p", "dop853", "extrapolated"
 
 
 @pytest.mark.parametrize("name", [name for name in STEPPERS if name not in OWN])

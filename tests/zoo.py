@@ -92,6 +92,7 @@ STEPPERS = {
     "houbolt": hhtjax.houbolt(),
     "wilson": hhtjax.wilson(),
     "rowda": hhtjax.rowda(),
+    "extrapolated": hhtjax.extrapolated(levels=3),
     "rk4": hhtjax.rk4(),
     "rodas5p": hhtjax.rodas5p(),
     "dopri5": hhtjax.dopri5(),

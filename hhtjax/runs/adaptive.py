@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from hhtjax.steppers.stepper import Stepper
 
 WITH_ESTIMATES = (
-    "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda, rodas5p, tsit5, dopri5, dop853 or taylor"
+    "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda, rodas5p, extrapolated, tsit5, dopri5, "
+    "dop853 or taylor"
 )
 
 

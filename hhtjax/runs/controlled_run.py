@@ -141,7 +141,7 @@ def run_recorded(problem: Problem, times: Array, control: Adaptive, progress: bo
 
     def record(problem: Problem, times: Array, control: Adaptive):
         steps, ends, run = select_steps(
-            problem, problem.times(times[-1]), control, progress, times=problem.times(times)
+            problem, problem.times(due(problem, times)), control, progress, times=problem.times(times)
         )
         return run, steps, ends
 
@@ -208,7 +208,12 @@ def steps_for(choice: tuple, progress: bool, room: tuple):
     problem, times, control, events = choice
     control, problem = replace(control, verify=False), problem._replace(output=None)
     keywords = {"progress": progress, "room": room[:1], "rates": problem.rates()}
-    return chosen_steps(problem, times[-1], control, events, **keywords)
+    return chosen_steps(problem, due(problem, times), control, events, **keywords)
+
+
+def due(problem: Problem, times: Real) -> Real:
+    """The end of a run; or all of its times, for a stepper that lands on them."""
+    return times if problem.stepper.lands else times[-1]
 
 
 class Grid(NamedTuple):

@@ -85,6 +85,7 @@ class StepTrial(NamedTuple):
     context: Any = None
     past_events: Any = None
     controller: Controller = PI
+    stops: Any = None  # times at which steps end, too
 
     def proposed(self, walk: Walk, params: PyTree) -> Walk:
         """The walk with the next step of a stepper that knows it by itself, and what it knows it from; sizes are those
@@ -138,7 +139,7 @@ class Bounds(NamedTuple):
         n, N = flat.positions, flat.size
         rounding = ROUNDINGS * float(jnp.finfo(t0.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(end))
         each = jnp.concatenate([jnp.full(n, atol_v), jnp.full(N - n, atol)])
-        power = 1 - stepper.estimate_order / stepper.order
+        power = min(0.0, 1 - stepper.estimate_order / stepper.order)  # no step has a looser tolerance than the run
         return cls(rtol, atol, each, rtol**power, jnp.maximum(least, rounding), most)
 
     def relative(self, flat: FlatSystem, errors: Errors, q_size: Array, v_size: Array) -> Array:
@@ -200,6 +201,8 @@ def next_end(trial: StepTrial, params: PyTree, walk: Walk):
     t, end = walk.state.t, trial.end
     h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
     due = jnp.minimum(end, zero_order_hold.jump_after(params, t)) if zero_order_hold.holds(params) else end
+    if trial.stops is not None:
+        due = jnp.minimum(due, jnp.min(jnp.where(trial.stops > t, trial.stops, end)))
     if trial.context is not None and walk.met.over:
         due = jnp.minimum(due, trial.context.events.due_after(t, walk.met.over))
     left = due - t
@@ -416,12 +419,15 @@ def select_steps(
     times: Array | None = None,
 ):
     """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf behind them; no tracer of autodiff may
-    come in. times: where samples are kept on the way, (K,); the third result is the `Solution` there, or None."""
+    come in. times: where samples are kept on the way, (K,); the third result is the `Solution` there, or None. end: or
+    the times, (K,), for a stepper that lands on them."""
     if progress:
         announce()
+    stops, end = (end, end[-1]) if end.ndim else (None, end)
     flat, q, v, t0, _ = problem.flat()
     bounds = Bounds.of(flat, problem.stepper, control, t0, end)
-    trial = trial_of(problem, end, bounds, control.max_steps, events, room)._replace(controller=controller)
+    trial = trial_of(problem, end, bounds, control.max_steps, events, room)
+    trial = trial._replace(controller=controller, stops=stops)
     walk, start = begin(trial, q, v, t0)
     plain = partial(trial_step, trial._replace(context=None))
     form = on_scalars(plain, walk, derivatives=False)  # as in a run: events are seldom

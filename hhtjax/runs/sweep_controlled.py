@@ -247,7 +247,9 @@ class Search(NamedTuple):
     def trial(self, arrays: list, bounds: Bounds) -> StepTrial:
         """How a member's steps are tried."""
         members = self.members
-        return trial_of(members.problem(arrays), self.end, bounds, self.max_steps, members.events, members.room)
+        problem = members.problem(arrays)
+        trial = trial_of(problem, self.end, bounds, self.max_steps, members.events, members.room)
+        return trial._replace(stops=members.times if problem.stepper.lands else None)
 
     def next(self, arrays: list, bounds: Bounds, walk: Walk):
         """The walk after one try, the same if it is over, and the end of the step; NaN where none was accepted."""

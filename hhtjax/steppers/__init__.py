@@ -17,6 +17,7 @@ stepper                            order                 solves per step   for
 `rowda()`                          3                     4                 one factorisation; L-stable: for accuracy
 `rodas5p()`                        5                     8                 the same to six digits and more, with a
                                                                            tolerance, `adaptive`
+`extrapolated()`                   5                     15                six digits or more, stiff, with constraints
 `houbolt()`                        2                     Newton's          a classical baseline
 `park()`                           2                     Newton's          a classical baseline
 `wilson(theta)`                    2                     Newton's          a classical baseline
@@ -32,9 +33,9 @@ stepper                            order                 solves per step   for
 =================================  ====================  ================  ==========================================
 
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
-Only the `hht` family takes constraints and rotations; `conventional_hht` does too, as its authors printed it. Internal
-states are for the `hht` family, Rosenbrock and Runge-Kutta methods and `taylor`. Dry friction is for the `hht` family.
-In all of this, but for error control, `implicit_euler` belongs to it.
+Only the `hht` family and `extrapolated` take constraints and rotations; `conventional_hht` does too, as its authors
+printed it. Internal states are for the `hht` family, `extrapolated`, Rosenbrock and Runge-Kutta methods and `taylor`.
+Dry friction is for the `hht` family. In all of this, but for error control, `implicit_euler` belongs to it.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
 of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
@@ -49,11 +50,11 @@ Which one
 
 Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and with a tolerance `taylor()`,
 or `tsit5()` where a function has no Taylor series. If five digits or more are wanted of something stiff, take
-`rodas5p()`, or `simulate(..., extrapolate=2)`. For fitting by gradients take `hht(linearize="predictor")`, which is
-smooth in all that can be differentiated. If steps are to be far longer than the fastest vibration and the run blows up,
-try `hht(linearize="held")`, more damping (`alpha=-0.3`), or `hht(iterations=None)`. Where each of them fails is on one
-page, `experiments/stability/README.md`, and what became of the tables and figures of the paper of 2019 on another,
-`experiments/kim2019/README.md`.
+`rodas5p()`, with constraints or rotations `extrapolated()` and a tolerance, or `simulate(..., extrapolate=2)`. For
+fitting by gradients take `hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are
+to be far longer than the fastest vibration and the run blows up, try `hht(linearize="held")`, more damping
+(`alpha=-0.3`), or `hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`,
+and what became of the tables and figures of the paper of 2019 on another, `experiments/kim2019/README.md`.
 
 How long a step
 ---------------
@@ -130,6 +131,7 @@ Sources
 * C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13 (1985) 77-90: `formulation="ggl"`.
 * O. Bruls, A. Cardona, J. Comput. Nonlinear Dyn. 5 (2010) 031002: `kinematics="lie"`.
 * E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, Sec. IV.7: `rosenbrock`.
+* G. Bader, P. Deuflhard, Numer. Math. 41 (1983) 373-398: `extrapolated`.
 * G. Steinebach, BIT Numer. Math. 63 (2023) 27: `rodas5p`.
 * C. Lubich, M. Roche, Computing 43 (1990) 325-342: `rowda`.
 * J. Dormand, P. Prince, J. Comput. Appl. Math. 6 (1980) 19-26: `dopri5`.

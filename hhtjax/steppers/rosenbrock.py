@@ -35,7 +35,7 @@ from hhtjax.steppers.residual import residual
 from hhtjax.steppers.runge_kutta import mean
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.tableaus import RODAS5P, ROWDA, RosenbrockTableau
-from hhtjax.steppers.variable_step import DenseTerm, Embedded, Errors
+from hhtjax.steppers.variable_step import DenseTerm, Errors, Tabulated
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
@@ -44,7 +44,7 @@ FEW = 4  # stages
 
 
 @dataclass(frozen=True, eq=False)
-class Rosenbrock(Embedded, Stepper):
+class Rosenbrock(Tabulated, Stepper):
     """A method given by its tableau; made by `rosenbrock`, `rowda` and `rodas5p`.
 
     One of your own is its tableau and its order, here the linearly implicit trapezoidal rule with Euler's beside it:

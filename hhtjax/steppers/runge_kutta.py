@@ -22,14 +22,14 @@ from hhtjax.numerics.dense_lu import SCALAR
 from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.tableaus import CLASSICAL, DOP853, DORMAND_PRINCE, TSITOURAS, ExplicitTableau
-from hhtjax.steppers.variable_step import DenseTerm, Embedded, Errors
+from hhtjax.steppers.variable_step import DenseTerm, Errors, Tabulated
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 
 @dataclass(frozen=True, eq=False)
-class RungeKutta(Embedded, Stepper):
+class RungeKutta(Tabulated, Stepper):
     """A method given by its tableau; made by `rk4`, `tsit5`, `dopri5` and `dop853`.
 
     One of your own is its tableau and its order:

@@ -151,6 +151,7 @@ class Stepper(Description):
     dense_term = False  # whether its memory is what dense output adds to cubics
     reads_series = False  # whether its memory is what dense output is made of, the series of the step behind
     proposes = False  # whether it knows the next step by itself: `proposed`
+    lands = False  # whether its steps under error control end at each of the times asked for
     starts_massless = False  # whether it starts without dividing by M
     redundant: str | None = None  # how constraints that depend on each other are solved
 

@@ -193,22 +193,7 @@ def family_errors(c: Coefficients, h: Array, w: Array, w1: Array, past: Past, d:
 
 
 class Embedded:
-    """A method of several stages, given by its tableau; its estimate is the difference from one of lower order."""
-
-    tableau: Any  # with `dense`, rows of weights, or None for cubics alone
-
-    @property
-    def dense_term(self) -> bool:
-        """Whether dense output is more than cubics."""
-        return self.tableau.dense is not None
-
-    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
-        """w0 = M^-1 Q."""
-        memory = None
-        if self.dense_term:
-            terms = len(self.tableau.dense)
-            memory = DenseTerm(jnp.zeros((terms, *q.shape), q.dtype), jnp.zeros((terms, *v.shape), v.dtype))
-        return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
+    """A method of several stages; its estimate is the difference from one of lower order."""
 
     def begin_estimates(self, system: FlatSystem, state: State):
         """Nothing is remembered."""
@@ -227,3 +212,22 @@ class Embedded:
     def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array) -> Any:
         """State -> State, Info, Errors."""
         raise NotImplementedError
+
+
+class Tabulated(Embedded):
+    """The same, given by its tableau."""
+
+    tableau: Any  # with `dense`, rows of weights, or None for cubics alone
+
+    @property
+    def dense_term(self) -> bool:
+        """Whether dense output is more than cubics."""
+        return self.tableau.dense is not None
+
+    def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
+        """w0 = M^-1 Q."""
+        memory = None
+        if self.dense_term:
+            terms = len(self.tableau.dense)
+            memory = DenseTerm(jnp.zeros((terms, *q.shape), q.dtype), jnp.zeros((terms, *v.shape), v.dtype))
+        return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
