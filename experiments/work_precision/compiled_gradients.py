@@ -72,7 +72,7 @@ def casadi_gradient(name, kind, tolerance):
     run = casadi_integrator(system, kind, case.times, tolerance)
     factors = casadi.MX.sym("factors", count)
     path = run(x0=casadi.DM(np.asarray(case.y0)), p=factors)["xf"]
-    shown = list(range(case.size)) if SCENES[name].seen is None else list(SCENES[name].seen)
+    shown = list(SCENES[name].seen or range(case.size))
     q = casadi.vec(path[shown, :])
     slope = casadi.jtimes(q, factors, casadi.DM.eye(count))  # forward mode
     return casadi.Function("gradient", [factors], [2 / q.numel() * casadi.mtimes(q.T, slope)])
