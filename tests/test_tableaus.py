@@ -56,7 +56,7 @@ def defects(b, A, of_one, order, s=1.0):
 
 
 def filled(rows, size):
-    return np.array([[*row, *(size - len(row)) * (0.0,)] for row in rows])
+    return np.array(tableaus.filled(rows, size))
 
 
 def dense_weights(tableau, s, b, first, last):

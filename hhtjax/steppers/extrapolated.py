@@ -79,16 +79,7 @@ class Extrapolated(Embedded, Stepper):
         w, L = accelerations(system, q, v, t, params)
         return State(t, q, v, w, L=L)
 
-    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
-        """The step without its estimate."""
-        step = self.bind_pair(system, params, dt)
-
-        def plain(s: State):
-            return step(s)[:2]
-
-        return plain
-
-    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array):
+    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array, estimating: bool = True):
         """State -> State, Info, Errors."""
         system = system.settled(params)
 

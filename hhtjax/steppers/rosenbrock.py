@@ -34,8 +34,8 @@ from hhtjax.steppers.implicit_solve import linearized, with_local
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.runge_kutta import mean
 from hhtjax.steppers.stepper import Info, State, Stepper
-from hhtjax.steppers.tableaus import RODAS5P, ROWDA, RosenbrockTableau
-from hhtjax.steppers.variable_step import DenseTerm, Errors, Tabulated
+from hhtjax.steppers.tableaus import RODAS5P, ROWDA, RosenbrockTableau, filled
+from hhtjax.steppers.variable_step import Errors, Tabulated
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
@@ -67,23 +67,9 @@ class Rosenbrock(Tabulated, Stepper):
     keeps_sparse = True
 
     @property
-    def name(self) -> str:
-        """Of the method."""
-        return self.tableau.name
-
-    @property
     def estimate_order(self) -> int:
         """One more than the order of the embedded method, which is one less than that of this."""
         return self.order
-
-    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
-        """The step without its estimate."""
-        step = self.bind_pair(system, params, dt, estimating=False)
-
-        def plain(s: State):
-            return step(s)[:2]
-
-        return plain
 
     def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array, estimating: bool = True):
         """State -> State, Info, Errors; for a linear system the matrix is factorised here, once."""
@@ -109,7 +95,7 @@ class Rosenbrock(Tabulated, Stepper):
             s = s._replace(memory=None)  # of the step before
             value, tangent = staged(partial(linearized, r), system.size)(s)
             solve = once if system.linear else factorized(tangent, s)
-            end, errors = stages(system, self.tableau, s, dt, r, value, tangent, solve)
+            end, errors = stages(system, self, s, dt, r, value, tangent, solve)
             if estimating and not system.linear:  # what the derivatives at the start do not know of the end
                 d = g * dt * jnp.abs(solve(r(end)))
                 errors = Errors(jnp.abs(errors.q) + g * dt * d, jnp.abs(errors.v) + d)
@@ -120,7 +106,7 @@ class Rosenbrock(Tabulated, Stepper):
 
 def stages(
     system: FlatSystem,
-    tableau: RosenbrockTableau,
+    method: Rosenbrock,
     s: State,
     dt: Array,
     r: Callable,
@@ -132,6 +118,7 @@ def stages(
 
     value, tangent: of r at s. The rates of a stage are those of q, v and w, (3, N).
     """
+    tableau = method.tableau
     gh, none = tableau.g * dt, jnp.zeros((3, system.size), s.v.dtype)
 
     def increment(weights: Sequence, rates: PyTree) -> Array:
@@ -159,11 +146,8 @@ def stages(
     run_through = written_out if len(tableau.b) <= FEW else in_a_loop
     rates = run_through(tableau, start, stage, (s, value))
     e_q, e_v, _ = increment([x - y for x, y in zip(tableau.b, tableau.embedded, strict=True)], rates)
-    end = moved(dt, tableau.b, rates)
-    if tableau.dense is not None:
-        e = jnp.stack([increment(row, rates) for row in tableau.dense])
-        end = end._replace(memory=DenseTerm(e[:, 0, : s.q.size], e[:, 1]))
-    return end, Errors(e_q, e_v)
+    memory = method.dense_terms(s, lambda row: increment(row, rates))
+    return moved(dt, tableau.b, rates)._replace(memory=memory), Errors(e_q, e_v)
 
 
 def written_out(tableau: RosenbrockTableau, start: Callable, stage: Callable, first: tuple) -> PyTree:
@@ -179,9 +163,7 @@ def written_out(tableau: RosenbrockTableau, start: Callable, stage: Callable, fi
 def in_a_loop(tableau: RosenbrockTableau, start: Callable, stage: Callable, first: tuple) -> PyTree:
     """The same, with one stage to compile in the place of many; its tableau is data."""
     number, size, dtype = len(tableau.b), first[1].size, first[1].dtype
-    A, G = (
-        jnp.asarray([[*row, *(number - len(row)) * (0.0,)] for row in rows], dtype) for rows in (tableau.A, tableau.G)
-    )
+    A, G = (jnp.asarray(filled(rows, number), dtype) for rows in (tableau.A, tableau.G))
 
     def body(rates: Array, row: tuple):
         a, c, here = row

@@ -14,15 +14,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree, is_concrete
 from hhtjax.numerics.dense_lu import SCALAR
 from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
-from hhtjax.steppers.tableaus import CLASSICAL, DOP853, DORMAND_PRINCE, TSITOURAS, ExplicitTableau
-from hhtjax.steppers.variable_step import DenseTerm, Errors, Tabulated
+from hhtjax.steppers.tableaus import CLASSICAL, DOP853, DORMAND_PRINCE, TSITOURAS, ExplicitTableau, filled
+from hhtjax.steppers.variable_step import Errors, Tabulated
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
@@ -52,11 +51,6 @@ class RungeKutta(Tabulated, Stepper):
     keeps_sparse = True
 
     @property
-    def name(self) -> str:
-        """Of the method."""
-        return self.tableau.name
-
-    @property
     def estimate_order(self):
         """One more than the order of the embedded method."""
         return None if self.tableau.embedded_order is None else self.tableau.embedded_order + 1
@@ -64,16 +58,7 @@ class RungeKutta(Tabulated, Stepper):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name}, order={self.order})"
 
-    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
-        """The step without its estimate."""
-        step = self.bind_pair(system, params, dt)
-
-        def plain(s: State):
-            return step(s)[:2]
-
-        return plain
-
-    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array):
+    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array, estimating: bool = True):
         """State -> State, Info, Errors; the first stage is the acceleration that the step before ended with."""
         tableau = self.tableau
         acceleration = staged(lambda q, v, t: system.acceleration(q, v, t, params), system.size)
@@ -94,10 +79,7 @@ class RungeKutta(Tabulated, Stepper):
             rates = run_through(rows, stage, jnp.stack([s.v, s.w]))
             q, _ = moved(tableau.b, rates)
             v, w = rates[len(tableau.b)]
-            end = State(s.t + dt, q, v, w)
-            if tableau.dense is not None:
-                e = jnp.stack([dt * mean(row, rates) for row in tableau.dense])
-                end = end._replace(memory=DenseTerm(e[:, 0, : s.q.size], e[:, 1]))
+            end = State(s.t + dt, q, v, w, memory=self.dense_terms(s, lambda row: dt * mean(row, rates)))
             return end, Info(), None if tableau.error is None else Errors(*errors_of(tableau, dt, rates))
 
         return step
@@ -114,7 +96,7 @@ def written_out(rows: Sequence, stage: Callable, first: Array) -> PyTree:
 def in_a_loop(rows: Sequence, stage: Callable, first: Array) -> Array:
     """The same, with one stage to compile in the place of many; the tableau is data."""
     number, dtype = len(rows) + 1, first.dtype
-    weights = jnp.asarray(np.array([(*row, *(number - len(row)) * (0.0,)) for row in rows]), dtype)
+    weights = jnp.asarray(filled(rows, number), dtype)
 
     def body(rates: Array, row: tuple):
         weights, here = row

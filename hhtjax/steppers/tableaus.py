@@ -5,6 +5,7 @@ The formulas that they enter are at the top of `runge_kutta.py` and of `rosenbro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 
@@ -33,6 +34,11 @@ class ExplicitTableau(NamedTuple):
     dense: tuple | None = None
     extra: tuple = ()
     error_of_3: tuple | None = None
+
+
+def filled(rows: Sequence, size: int) -> list:
+    """Rows of so many numbers: what is missing is 0."""
+    return [[*row, *(size - len(row)) * (0.0,)] for row in rows]
 
 
 class RosenbrockTableau(NamedTuple):

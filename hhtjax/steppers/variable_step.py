@@ -24,6 +24,7 @@ both ends of a step (2.01, 2.02). With alpha = -0.05 w and L are of order 1.98 a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -199,6 +200,15 @@ class Embedded:
         """Nothing is remembered."""
         return ()
 
+    def bind(self, system: FlatSystem, params: PyTree, dt: Array):
+        """The step without its estimate."""
+        step = self.bind_pair(system, params, dt, estimating=False)
+
+        def plain(s: State):
+            return step(s)[:2]
+
+        return plain
+
     def bind_estimated(self, system: FlatSystem, params: PyTree, dt: Array, past: tuple):
         """State -> State, Info, Errors, ()."""
         step = self.bind_pair(system, params, dt)
@@ -209,8 +219,8 @@ class Embedded:
 
         return estimated
 
-    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array) -> Any:
-        """State -> State, Info, Errors."""
+    def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array, estimating: bool = True) -> Any:
+        """State -> State, Info, Errors; estimating: whether the errors are used."""
         raise NotImplementedError
 
 
@@ -218,6 +228,11 @@ class Tabulated(Embedded):
     """The same, given by its tableau."""
 
     tableau: Any  # with `dense`, rows of weights, or None for cubics alone
+
+    @property
+    def name(self) -> str:
+        """Of the method."""
+        return self.tableau.name
 
     @property
     def dense_term(self) -> bool:
@@ -231,3 +246,10 @@ class Tabulated(Embedded):
             terms = len(self.tableau.dense)
             memory = DenseTerm(jnp.zeros((terms, *q.shape), q.dtype), jnp.zeros((terms, *v.shape), v.dtype))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
+
+    def dense_terms(self, s: State, increment: Callable) -> DenseTerm | None:
+        """What dense output of a step from s adds to cubics. increment: weights -> what q and the rates gain."""
+        if not self.dense_term:
+            return None
+        e = jnp.stack([increment(row) for row in self.tableau.dense])
+        return DenseTerm(e[:, 0, : s.q.size], e[:, 1])
