@@ -24,8 +24,9 @@ METHODS = {  # name: stepper, levels of extrapolation, factorised matrices of a 
     "rk4": (hhtjax.rk4(), 1, 4),
     "tsit5": (hhtjax.tsit5(), 1, 6),
 }
-CONTROLLED = {  # by `adaptive`; those but the first take the system without constraints and rotations
+CONTROLLED = {  # by `adaptive`; those but the first two take the system without constraints and rotations
     "hht, adaptive": SMOOTH,
+    "extrapolated, adaptive": hhtjax.extrapolated(),
     "rowda, adaptive": hhtjax.rowda(),
     "rodas5p, adaptive": hhtjax.rodas5p(),
     "dopri5, adaptive": hhtjax.dopri5(),
@@ -93,7 +94,8 @@ def calls(name):
 def controlled(name, method, most):
     """A function of the tolerance and the parameters: the `Solution` at the sample times."""
     case = cases()[name]
-    system, q0, v0 = (case.scene.system, case.scene.q0, case.scene.v0) if method.startswith("hht") else case.ode
+    as_given = CONTROLLED[method].solves_constraints
+    system, q0, v0 = (case.scene.system, case.scene.q0, case.scene.v0) if as_given else case.ode
 
     def solve(tolerance, params):
         dt = hhtjax.adaptive(tolerance, 1e-2 * tolerance, max_steps=most)

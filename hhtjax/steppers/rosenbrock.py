@@ -25,7 +25,7 @@ from jax import lax
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real
-from hhtjax.numerics.dense_lu import factorize
+from hhtjax.numerics.dense_lu import SCALAR, factorize
 from hhtjax.numerics.linear_solve import factorize_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.sparse_solve import kept
@@ -143,7 +143,7 @@ def stages(
         kv = -solve(value + tangent(shift))
         return jnp.stack([kq + gh * kv, kv, (kv - at.w - zw) / gh])
 
-    run_through = written_out if len(tableau.b) <= FEW else in_a_loop
+    run_through = written_out if len(tableau.b) <= FEW or system.size <= SCALAR else in_a_loop
     rates = run_through(tableau, start, stage, (s, value))
     e_q, e_v, _ = increment([x - y for x, y in zip(tableau.b, tableau.embedded, strict=True)], rates)
     memory = method.dense_terms(s, lambda row: increment(row, rates))
