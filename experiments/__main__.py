@@ -42,6 +42,7 @@ EXPERIMENTS = {
     "benchmarks": "benchmarks.benchmarks",
     "work_precision": "work_precision.work_precision",
 }
+SYNCHRONOUS = ("work_precision",)  # which waits for each call: JAX's asynchronous dispatch takes 10 us of it
 IN_PART = ("silverbox",)  # without --full these show a part; their run takes a third argument
 MORE = " (A first look; all of it with --full.)"
 COMMANDS = {
@@ -119,6 +120,10 @@ def parse(arguments: list[str]):
 
 def run(name: str, options) -> None:
     """One experiment, in this process."""
+    if name in SYNCHRONOUS:
+        import jax
+
+        jax.config.update("jax_cpu_enable_async_dispatch", False)  # before it starts
     from experiments.report import Report
 
     part = name in IN_PART and not options.full and not options.fast

@@ -1,12 +1,8 @@
 """Error against time, linear solves, of gradients and of batches: our steppers beside ten other packages."""
 
-import jax
-
 from experiments.parts import earlier, rounded
 from experiments.report import Report
 from experiments.work_precision import batches, gradients, runs
-
-jax.config.update("jax_cpu_enable_async_dispatch", False)  # a call takes 10 us less, of ours and of diffrax
 
 PARTS = runs, gradients, batches
 
