@@ -119,6 +119,35 @@ def batches(numbers):
     return "\n\n".join([text, *tables, losses(found["times"])])
 
 
+def choices(numbers):
+    """What is chosen for each scene, and what that costs beside the best of ours, by the times of this page."""
+    found = numbers.get("choices")
+    if found is None:
+        return "Not measured in this run."
+    rows = []
+    for x in found:
+        entries, level = numbers["times"][x["case"]], f"{x['level']:g}"
+        mine = next((e["time_s"][level] for e in entries if e["method"] == x["method"]), None)
+        least, method = best(entries, level, PACKAGES[:1])
+        ratio = "-" if mine is None or least is None else f"{mine / least:.1f}"
+        stiffness = "-" if x["stiffness"] is None else f"{x['stiffness']:.2g}"
+        name = x["case"] if x["form"] == "as it is" else f"{x['case']}, {x['form']}"
+        error = "-" if x["rms_error"] is None else f"{x['rms_error']:.0e}"
+        rows.append(
+            [
+                name,
+                level,
+                stiffness,
+                x["method"].removesuffix(", adaptive"),
+                error,
+                ms(mine),
+                f"{ms(least)} ({method})",
+                ratio,
+            ]
+        )
+    return table(["scene", "error", "stiffness", "chosen", "its error", "ms", "best of ours", "ratio"], rows)
+
+
 def parameters(names):
     """Of each scene those that its gradient is taken in."""
     note = " (the loss has the height of the rod alone: all entries of a rotation have a constant sum of squares)"
@@ -155,6 +184,7 @@ def page(numbers):
             wins=who_wins(times),
             calls=calls(numbers),
             batches=batches(numbers),
+            choices=choices(numbers),
             gradient_figures="\n\n".join(
                 f"![Error of the gradient against time]({name}.png)" for name in gradient_figures(list(gradients))
             ),

@@ -2,13 +2,13 @@
 
 from experiments.parts import earlier, rounded
 from experiments.report import Report
-from experiments.work_precision import batches, gradients, runs
+from experiments.work_precision import batches, choices, gradients, runs
 
-PARTS = runs, gradients, batches
+PARTS = runs, gradients, batches, choices
 
 
 def run(report: Report, fast: bool):
-    """All cases, then the gradients, and batches."""
+    """All cases, then the gradients, batches, and what is chosen for each case."""
     before = earlier(report, runs) if report.parts else None
     numbers = dict(before or {})
     for part in PARTS:

@@ -11,8 +11,8 @@ grows before it decays, or for ever.
 >>> f"{hhtjax.analysis.damping_ratio(stepper, wh):.1e} {hhtjax.analysis.period_elongation(stepper, wh):.1e}"
 '1.5e-04 8.5e-03'
 
-Which step a system needs is answered by `suggest_step_size`; what a run made or lost by `energy_balance`; whether the
-error falls as it should by `observed_order`.
+Which stepper a motion needs is answered by `choose_stepper`, which step by `suggest_step_size`; what a run made or lost
+by `energy_balance`; whether the error falls as it should by `observed_order`.
 """
 
 from hhtjax.analysis.amplification import (
@@ -29,6 +29,8 @@ from hhtjax.analysis.amplification import (
 from hhtjax.analysis.amplification import (
     stability_region as stability_region,
 )
+from hhtjax.analysis.choice import Choice as Choice
+from hhtjax.analysis.choice import choose_stepper
 from hhtjax.analysis.convergence import ObservedOrder as ObservedOrder
 from hhtjax.analysis.convergence import observed_order
 from hhtjax.analysis.energy import EnergyBalance as EnergyBalance
@@ -45,6 +47,7 @@ from hhtjax.analysis.step_size import suggest_step_size
 
 __all__ = [
     "amplification_matrix",
+    "choose_stepper",
     "constraint_matrix",
     "damping_ratio",
     "energy_balance",

@@ -159,7 +159,7 @@ def suggest_step_size(
     params = freeze(params)
     q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
     require_capable(caller, system, stepper, q0, v0)
-    rates = _rates(*map(np.asarray, _linearize(system, q0, v0, params, t0, z0)))
+    rates = rates_of(*map(np.asarray, linearized(system, q0, v0, params, t0, z0)))
     reach = []
     for rate in rates:
         error, radius = _errors(stepper, rate / abs(rate))
@@ -205,7 +205,7 @@ def _modal_step(rates, resolved: np.ndarray, stable: np.ndarray, tolerance: Real
 
 
 @jax.jit
-def _linearize(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array, z0: PyTree):
+def linearized(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array, z0: PyTree):
     """Derivatives of w in displacement and velocity, (N, N), and B, (m, N), internal states among the velocities."""
     flat, q, v = flatten("suggest_step_size", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
@@ -218,7 +218,7 @@ def _linearize(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array
     return *jax.jacfwd(acceleration, argnums=(0, 1))(jnp.zeros_like(v), v), B
 
 
-def _rates(w_x: np.ndarray, w_v: np.ndarray, B: np.ndarray) -> np.ndarray:
+def rates_of(w_x: np.ndarray, w_v: np.ndarray, B: np.ndarray) -> np.ndarray:
     """lambda of the motions that satisfy B x = 0, one of each conjugate pair, slowest first; without rigid motions."""
     N = np.linalg.svd(B)[2][len(B) :].T if len(B) else np.eye(len(w_x))
     zero = np.zeros((N.shape[1], N.shape[1]))
@@ -300,17 +300,17 @@ def _errors_of_runs(counts: list, paths: list, order: int) -> np.ndarray:
     """Of all runs but the finest, which has an error of its own, by Richardson's extrapolation."""
     finest = paths[-1]
     with np.errstate(over="ignore", invalid="ignore"):
-        motion = _rms(finest - finest.mean(axis=0)) if np.isfinite(finest).all() else np.nan
+        motion = rms(finest - finest.mean(axis=0)) if np.isfinite(finest).all() else np.nan
         errors = []
         for n, path in zip(counts[:-1], paths[:-1], strict=True):
             hit = min(n, SAMPLES)
             every = SAMPLES // hit
-            error = _rms(path[:hit] - finest[every - 1 :: every]) / motion
+            error = rms(path[:hit] - finest[every - 1 :: every]) / motion
             errors.append(error / (1 - (n / counts[-1]) ** order))
     return np.nan_to_num(np.array(errors), nan=np.inf)
 
 
-def _rms(x: np.ndarray) -> Real:
+def rms(x: np.ndarray) -> Real:
     return np.sqrt(np.mean(x**2))
 
 

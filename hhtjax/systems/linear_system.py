@@ -215,6 +215,13 @@ def shapes_of_matrices(caller: str, system: LinearSystem, params: PyTree):
     return {name: evaluate(caller, name, A, params) if callable(A) else A for name, A in given.items()}
 
 
+def is_sparse(system: LinearSystem | System | FirstOrderSystem, params: PyTree) -> bool:
+    """Whether it is a linear system with sparse matrices."""
+    if not isinstance(system, LinearSystem):
+        return False
+    return any(isinstance(A, Sparse) for A in shapes_of_matrices("is_sparse", system, params).values())
+
+
 def require_dense(caller: str, system: LinearSystem | System | FirstOrderSystem, params: PyTree):
     """An error for a linear system with sparse matrices."""
     if isinstance(system, LinearSystem):

@@ -1,0 +1,121 @@
+"""The stepper chosen for a motion: which one, that it keeps to the error wanted, and what is said if none does."""
+
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse
+from scipy.integrate import solve_ivp
+
+import hhtjax
+from hhtjax.analysis import choose_stepper
+
+ONE = jnp.ones(1), jnp.zeros(1)
+SMOOTH = hhtjax.System(jnp.ones(1), lambda q, v, t, c: -9.81 * jnp.sin(q) - c * v)
+STIFF = hhtjax.System(jnp.ones(1), lambda q, v, t, c: -1e6 * (q - jnp.sin(t)) - 1e4 * v)
+WITHOUT_SERIES = hhtjax.System(jnp.ones(1), lambda q, v, t, c: -9.81 * jnp.sin(q) - jnp.where(v > 0, c, 0.5 * c) * v)
+MANY = hhtjax.System(jnp.ones(8), lambda q, v, t, c: -jnp.arange(1.0, 9.0) * jnp.sin(q))
+ON_CIRCLE = hhtjax.System(jnp.ones(2), lambda q, v, t, c: jnp.array([0.0, -9.81]), lambda q, t, c: (q @ q - 1.0)[None])
+CIRCLE = jnp.array([1.0, 0.0]), jnp.zeros(2)
+RUBBED = hhtjax.System(jnp.ones(1), lambda q, v, t, c: -9.0 * q, friction=lambda q, v, t, c: c * jnp.ones_like(v))
+DECAY = hhtjax.FirstOrderSystem(lambda y, t, c: jnp.array([-y[1], y[0]]))
+CHAIN = 2.0 * jnp.eye(4) - jnp.eye(4, k=1) - jnp.eye(4, k=-1)
+
+
+def name_of(choice):
+    return str(choice).split(", dt=")[0]
+
+
+def scipy_pendulum(t, damping):
+    run = solve_ivp(
+        lambda t, y: [y[1], -9.81 * np.sin(y[0]) - damping(y[1]) * y[1]], (0, t[-1]), [1, 0], "DOP853", t,
+        rtol=1e-12, atol=1e-12, max_step=0.02,
+    )  # fmt: skip
+    return run.y[0]
+
+
+@pytest.mark.parametrize(
+    ("system", "start", "tolerance", "expected"),
+    [
+        (SMOOTH, ONE, 1e-3, "tsit5()"),
+        (SMOOTH, ONE, 1e-7, "taylor()"),
+        (MANY, (jnp.ones(8), jnp.zeros(8)), 1e-7, "dop853()"),
+        (STIFF, ONE, 1e-5, "rodas5p()"),
+        (ON_CIRCLE, CIRCLE, 1e-6, "extrapolated()"),
+        (ON_CIRCLE, CIRCLE, 2e-2, 'hht(linearize="predictor")'),
+        (RUBBED, (3.0 * jnp.ones(1), jnp.zeros(1)), 1e-3, "hht()"),
+        (DECAY, (jnp.array([1.0, 0.0]),), 1e-6, "taylor()"),
+    ],
+)
+def test_the_kind_of_motion_decides(system, start, tolerance, expected):
+    found = choose_stepper(system, *start, params=0.3, duration=2.0, tolerance=tolerance)
+    assert name_of(found) == expected
+    assert found.error <= tolerance
+    assert (found.stiffness or 0) > 4 if system is STIFF else (found.stiffness or 0) < 4
+    sharp = {"rtol": 1e-3 * tolerance, "atol": 1e-5 * tolerance, "max_steps": 100_000}
+    params, times = 0.3, np.linspace(0, 2, 65)[1:]
+    run = partial(hhtjax.simulate, system, q0=start[0], v0=start[1] if len(start) > 1 else None, params=params)
+    other = {  # a method of another kind
+        "rodas5p()": hhtjax.extrapolated(), "extrapolated()": hhtjax.hht(), 'hht(linearize="predictor")': hhtjax.hht(),
+        "hht()": hhtjax.hht(alpha=-0.1),
+    }.get(expected, hhtjax.rodas5p())  # fmt: skip
+    if expected == "extrapolated()":
+        sharp |= {"rtol": 1e-8, "atol": 1e-8}
+    exact = run(stepper=other, dt=hhtjax.adaptive(**sharp), times=times).q
+    exact, q = map(np.asarray, (exact, run(stepper=found.stepper, dt=found.dt, times=times).q))
+    error = np.sqrt(np.mean((q - exact) ** 2))
+    assert error <= 1.5 * tolerance * np.sqrt(np.mean((exact - exact.mean(axis=0)) ** 2))
+
+
+def test_what_has_no_series_is_said_and_passed_over():
+    found = choose_stepper(WITHOUT_SERIES, *ONE, 0.3, duration=2.0, tolerance=1e-6)
+    assert name_of(found) == "dop853()"
+    assert "not taylor(): taylor: " in str(found)
+    assert "has no Taylor series" in str(found)
+    run = hhtjax.simulate(WITHOUT_SERIES, found.stepper, *ONE, 0.3, dt=found.dt, times=[0.5, 1.0, 2.0])
+    exact = scipy_pendulum(np.array([0, 0.5, 1.0, 2.0]), lambda v: 0.3 if v > 0 else 0.15)
+    assert np.max(abs(run.q[:, 0] - exact)) < 2e-6
+
+
+def test_sparse_matrices_are_kept():
+    K = hhtjax.sparse(scipy.sparse.csr_matrix(np.asarray(CHAIN)))
+    found = choose_stepper(hhtjax.LinearSystem(M=jnp.ones(4), K=K), jnp.arange(4.0), jnp.zeros(4), duration=2.0)
+    assert name_of(found) == "rodas5p()"
+    assert found.stiffness is None
+    assert "sparse" in found.reason
+
+
+@pytest.mark.slow
+def test_events_with_a_constraint_leave_hht():
+    low = hhtjax.Event(lambda q, v, t, c: q[1] + 2.0)
+    found = choose_stepper(ON_CIRCLE, *CIRCLE, duration=1.0, tolerance=1e-3, events=[low])
+    assert name_of(found).startswith("hht(")
+
+
+def test_growth_asks_for_a_smaller_tolerance():
+    upright = jnp.array([np.pi - 1e-3]), jnp.zeros(1)
+    found = choose_stepper(SMOOTH, *upright, 0.0, duration=6.0, tolerance=1e-3)
+    assert float(found.dt.rtol) < 1e-3
+    assert found.error <= 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"duration": 0.0}, "`duration` must be positive and finite; received 0.0"),
+        ({"tolerance": 2.0}, r"`tolerance` must lie in \(0, 1\); received 2.0"),
+        ({"num_samples": 0}, "`num_samples` must"),
+        ({"q0": jnp.zeros(1)}, "`q0` does not move within 1 s"),
+        ({"q0": jnp.array([jnp.nan])}, "`q0` must"),
+    ],
+)
+def test_bad_arguments_are_named(change, message):
+    given = {"q0": ONE[0], "v0": ONE[1], "params": 0.3, "duration": 1.0} | change
+    with pytest.raises(ValueError, match=message):
+        choose_stepper(SMOOTH, **given)
+
+
+def test_a_tolerance_that_none_reaches_is_said_with_what_each_did():
+    with pytest.raises(ValueError, match=r"no method keeps to the `tolerance`:\n  hht\(\): "):
+        choose_stepper(RUBBED, 3.0 * jnp.ones(1), jnp.zeros(1), 0.3, duration=2.0, tolerance=1e-11)
