@@ -124,7 +124,7 @@ def test_lists_of_numbers_and_missing_params_are_named(arguments, note):
 
 def test_a_constraint_is_refused_where_it_would_be_ignored():
     system = System(ONE, pull, constraint=lambda q, t, params: q)
-    message = "RK4 cannot solve the `constraint`; use hht()"
+    message = "RK4 cannot solve the `constraint`; use extrapolated(), hht()"
     check_message(NotImplementedError, f"init: {message}", lambda: STEPPERS["rk4"].init(system, ONE, ZERO, None, 0.1))
 
 

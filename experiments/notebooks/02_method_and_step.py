@@ -177,6 +177,20 @@ for extrapolate in (1, 2):
           f"{np.log2(error[0] / error[1]):.1f}")  # fmt: skip
 
 # %% [markdown]
+# ## Ask for a method
+#
+# `analysis.choose_stepper` tries: how long a step the wanted error asks for, and how fast the system could answer to a
+# push along the way. Their product tells what is stiff. It gives a method and tolerances that keep to the error.
+#
+# **Look at** what a smaller tolerance changes for the oscillator, and at what makes the elastic pendulum stiff.
+
+# %%
+rod = pendulum.q0, pendulum.v0, pendulum.params
+for tolerance in (1e-2, 1e-8):
+    print(f"oscillator, {tolerance:g}:", analysis.choose_stepper(scene.system, *start, duration=10, tolerance=tolerance))
+print("pendulum, 0.01:", analysis.choose_stepper(pendulum.system, *rod, duration=1, tolerance=1e-2))
+
+# %% [markdown]
 # ## Advice
 #
 # | your system | take | why |
@@ -184,11 +198,12 @@ for extrapolate in (1, 2):
 # | stiff springs, contacts, constraints; nothing known | `hht()` | one solve a step, damps what is not resolved |
 # | the same, and a fit through the run | `hht(linearize="predictor")` | smooth in its parameters |
 # | no energy may be lost, everything is resolved | `hht(alpha=0.0)` | no numerical damping at all, at any frequency |
-# | smooth and stiff, more than three digits | `rowda()`, or `extrapolate=2` | order 3 |
-# | smooth, nothing stiff | `rk4()` | order 4, no Jacobian |
-# | a tolerance, and no step | the same, with `dt=adaptive(rtol, atol)`; `dopri5()` for `rk4()` | steps by errors |
+# | stiff, more than three digits | `rodas5p()` with `dt=adaptive(rtol, atol)` | order 5 |
+# | constraints or rotations, more than two digits | `extrapolated()`, likewise | order 5 |
+# | smooth, nothing stiff | `tsit5()`; `taylor()` or `dop853()` from four digits on, likewise | no Jacobian |
 #
-# Then ask `suggest_step_size`, or halve the step and compare, as in notebook 1.
+# Then ask `suggest_step_size`, or halve the step and compare, as in notebook 1. What all of these take on eight scenes,
+# and what other packages do, is [one page](../work_precision/README.md).
 #
 # ## What to try next
 #

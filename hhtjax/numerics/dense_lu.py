@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -100,11 +101,20 @@ def inverse(A: Array) -> Array:
 
 
 def differentiable_inverse(A: Array) -> Array:
-    """A^-1 with derivatives, of two steps of Newton and Schulz: X <- 2 X - X A X."""
-    S = X = inverse(A)
-    for _ in range(2):
-        X = 2 * X - X @ A @ X
-    return S + (X - lax.stop_gradient(X))
+    """A^-1 with derivatives."""
+    return with_slope(inverse, A)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def with_slope(inverse: Callable, A: Array) -> Array:
+    """inverse(A), the derivative of A^-1 being -A^-1 dA A^-1."""
+    return inverse(A)
+
+
+@with_slope.defjvp
+def _(inverse: Callable, A: tuple, dA: tuple):
+    S = with_slope(inverse, *A)
+    return S, -S @ dA[0] @ S
 
 
 def _lu(A: Array):

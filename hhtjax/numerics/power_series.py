@@ -11,13 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from hhtjax.description import Array
-from hhtjax.numerics.dense_lu import SCALAR, factorize, inverse
+from hhtjax.numerics.dense_lu import SCALAR, factorize, inverse, with_slope
 from hhtjax.numerics.series_program import ON_KNOWN, Node, SeriesProgram, Solve, moves
 
 WRITTEN_OUT = 2000  # operations on series, times the orders; of more, XLA makes no kernel, or takes long
@@ -234,26 +233,18 @@ def _inverse(columns: list, dtype: np.dtype):
     """Of a matrix, given by its columns, as rows of scalars, or as an array."""
     n = len(columns)
     A = jnp.stack([_stacked(x, dtype) for x in columns], axis=1)
-    S = _differentiable_inverse(A)
-    return S if n > SCALAR else [[S[i, j] for j in range(n)] for i in range(n)]
-
-
-@jax.custom_jvp
-def _differentiable_inverse(A: Array) -> Array:
-    """A^-1, the derivative being -A^-1 dA A^-1."""
-    n = len(A)
-    if n == 1:
-        return 1 / A
     if n > SCALAR:
-        return inverse(A)
+        return with_slope(inverse, A)
+    S = with_slope(_by_columns, A)
+    return [[S[i, j] for j in range(n)] for i in range(n)]
+
+
+def _by_columns(A: Array) -> Array:
+    """A^-1 of a small A, in scalars."""
+    if len(A) == 1:
+        return 1 / A
     solve = factorize(A)
-    return jnp.stack([solve(x) for x in jnp.eye(n, dtype=A.dtype)], axis=1)
-
-
-@_differentiable_inverse.defjvp
-def _(A: tuple, dA: tuple):
-    S = _differentiable_inverse(*A)
-    return S, -S @ dA[0] @ S
+    return jnp.stack([solve(x) for x in jnp.eye(len(A), dtype=A.dtype)], axis=1)
 
 
 def rates(program: SeriesProgram, arguments: Sequence, dtype: np.dtype) -> Array:

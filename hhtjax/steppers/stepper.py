@@ -341,11 +341,11 @@ def require_capable(caller: str, system: AnySystem, stepper: Stepper, q0: PyTree
         require_masses(caller, system, 'take hht(), or another of its family, with a smooth start, not start="simple"')
     if system.constraint is not None and not stepper.solves_constraints:
         raise NotImplementedError(
-            f"{caller}: {name} cannot solve the `constraint`; use hht() or another of its family."
+            f"{caller}: {name} cannot solve the `constraint`; use extrapolated(), hht() or another of its family."
         )
     if v0 is not None and not stepper.solves_rotations and kinematics.layout(q0, v0):
         raise NotImplementedError(
-            f"{caller}: {name} cannot move the rotations in `q0`; use hht() or another of its family."
+            f"{caller}: {name} cannot move the rotations in `q0`; use extrapolated(), hht() or another of its family."
         )
     if system.internal is not None and not stepper.solves_internal:
         raise NotImplementedError(
