@@ -30,7 +30,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from hhtjax import rotation
 from hhtjax.checks import require_integer
 from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
@@ -104,21 +103,6 @@ def placed(system: FlatSystem, s: State, x: Array, u: Array, a: Array):
     return system.move(s.q, x), *system.end_of_chart(x, u, a, a)[:2]
 
 
-def in_chart(system: FlatSystem, x: Array, u: Array, w: Array) -> Array:
-    """The second rate of the displacement x, whose first is u, of an acceleration w."""
-    if not system.blocks:
-        return w
-    _, convective, _ = system.end_of_chart(x, u, 0 * w, 0 * w)
-    a = []
-    for block in system.blocks:
-        change, psi = (w - convective)[block.v], x[block.v]
-        if block.is_rotation:
-            back = jax.vmap(lambda psi, y: matvec(rotation.inverse_tangent(psi), y))
-            change = back(psi.reshape(-1, 3), change.reshape(-1, 3)).ravel()
-        a.append(change)
-    return system.with_internal(jnp.concatenate(a), w)
-
-
 def weights(levels: int):
     """(2, k): of the rows of the table in its last value, and in the one without the first row; for n = 2, 4, ..."""
     n = 2.0 * np.arange(1, levels + 1)
@@ -157,7 +141,7 @@ def basic_step(system: FlatSystem, params: PyTree, H: Array, levels: int, s: Sta
         )
         q, v, _ = placed(system, s, x, u, s.w)
         w, _ = accelerations(system, q, v, s.t + i * h, params)
-        ex, eu = increment(h, inverse, h * u - dx, h * in_chart(system, x, u, w) - du)
+        ex, eu = increment(h, inverse, h * u - dx, h * system.in_chart(x, u, w) - du)
         ends = ends + share[:, None, None] * jnp.stack([x + ex, u + eu])[None]
         d = dx + 2 * ex, du + 2 * eu
         return ((x + d[0], u + d[1]), d, ends), None

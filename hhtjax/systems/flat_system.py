@@ -143,6 +143,12 @@ class FlatSystem(NamedTuple):
         ends = kinematics.end_of_chart(self.blocks, *map(self.located, (x, *rates)))
         return tuple(map(self.with_internal, ends, rates))
 
+    def in_chart(self, x: Array, v: Array, w: Array) -> Array:
+        """The second rate of the displacement x, whose first is v, of an acceleration w."""
+        if not self.blocks:
+            return w
+        return self.with_internal(kinematics.in_chart(self.blocks, *map(self.located, (x, v, w))), w)
+
     def tidy(self, state):
         """The state at the end of a step, its rotations orthogonal to rounding."""
         return state._replace(q=kinematics.orthonormalize(self.blocks, state.q))

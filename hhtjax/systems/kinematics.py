@@ -100,6 +100,15 @@ def end_of_chart(blocks: tuple, x: Array, v: Array, w: Array, a: Array):
     return tuple(jnp.concatenate([y.ravel() for y in parts]) for parts in zip(*ends, strict=True))
 
 
+def in_chart(blocks: tuple, x: Array, v: Array, w: Array) -> Array:
+    """The second rate of the displacement x, whose first is v, of an acceleration w: `end_of_chart`, backwards."""
+
+    def turn(w: Array, psi: Array, psidot: Array) -> Array:
+        return matvec(rotation.inverse_tangent(psi), w - rotation.tangent_rate(psi, psidot))
+
+    return _each(blocks, lambda w, x, v: w, turn, w, x, v)
+
+
 def hermite(rise: Array, d0: Array, d1: Array, s: Array) -> Array:
     """The cubic in s from 0 at 0 to `rise` at 1, with slopes d0 and d1 there."""
     return s * (d0 + s * (3 * rise - 2 * d0 - d1 + s * (d0 + d1 - 2 * rise)))
