@@ -187,7 +187,9 @@ for extrapolate in (1, 2):
 # %%
 rod = pendulum.q0, pendulum.v0, pendulum.params
 for tolerance in (1e-2, 1e-8):
-    print(f"oscillator, {tolerance:g}:", analysis.choose_stepper(scene.system, *start, duration=10, tolerance=tolerance))
+    print(
+        f"oscillator, {tolerance:g}:", analysis.choose_stepper(scene.system, *start, duration=10, tolerance=tolerance)
+    )
 print("pendulum, 0.01:", analysis.choose_stepper(pendulum.system, *rod, duration=1, tolerance=1e-2))
 
 # %% [markdown]

@@ -63,7 +63,10 @@ def entries(name, everything, tolerances=TOLERANCES, sizes=SIZES):
         numbers = {x: jnp.asarray(case.scene.duration / (SAMPLES * x) if fixed else x) for x in settings}
 
         def solve(setting, solver=solver, fixed=fixed, numbers=numbers):
-            y, steps, fine = run(case.rate, unravel, solver, fixed, *arguments, numbers[setting])
+            return run(case.rate, unravel, solver, fixed, *arguments, numbers[setting])
+
+        def read(found, solver=solver):
+            y, steps, fine = found
             if not fine:
                 return None, None
             return np.asarray(y)[:, : case.size], STAGES[solver] * steps if solver in STAGES else None
@@ -71,6 +74,7 @@ def entries(name, everything, tolerances=TOLERANCES, sizes=SIZES):
         kind = "constant" if fixed else "PID"
         tried = partial(sweep, name, f"diffrax {solver}, {kind}", "diffrax", solve, settings)
         rows += tried(
-            lambda x, fixed=fixed: {"h_s": case.scene.duration / (SAMPLES * x)} if fixed else {"tolerance": x}
+            lambda x, fixed=fixed: {"h_s": case.scene.duration / (SAMPLES * x)} if fixed else {"tolerance": x},
+            read=read,
         )
     return rows

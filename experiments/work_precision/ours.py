@@ -135,10 +135,13 @@ def controlled_rows(name, method, most, tolerances):
     program = jax.jit(positions, static_argnums=0 if of_each else ())
 
     def solve(tolerance):
-        path, stop = program(numbers[tolerance], params)
+        return program(numbers[tolerance], params)
+
+    def read(found):
+        path, stop = found
         return None if stop else path, None
 
-    return sweep(name, method, "ours", solve, tolerances, lambda x: {"tolerance": x}, of_each)
+    return sweep(name, method, "ours", solve, tolerances, lambda x: {"tolerance": x}, of_each, read)
 
 
 def controlled_entries(name, tolerances=TOLERANCES, only=tuple(CONTROLLED)):

@@ -33,16 +33,18 @@ def enough(time_s, error):
     return time_s > LONGEST or error < FINEST
 
 
-def sweep(case, method, package, solve, settings, describe, each_compiles=False):
+def sweep(case, method, package, solve, settings, describe, each_compiles=False, read=lambda found: found):
     """Rows of a method on a case, from coarse to fine.
 
-    solve: setting -> positions at the sample times (None if it failed), and factorised matrices, None if not known.
+    solve: setting -> what `read`, whose time does not count, turns into positions at the sample times (None if it
+    failed), and factorised matrices, None if not known.
     describe: setting -> its entry in the row. each_compiles: whether every setting has a program of its own, and not
     the first one alone.
     """
     rows = []
     for i, setting in enumerate(settings):
-        (positions, solves), time_s = seconds(lambda setting=setting: solve(setting), compiles=each_compiles or i == 0)
+        found, time_s = seconds(lambda setting=setting: solve(setting), compiles=each_compiles or i == 0)
+        positions, solves = read(found)
         row = {"case": case, "method": method, "package": package, **describe(setting)}
         error = rms_error(case, positions)
         rows.append(row | {"rms_error": error, "time_s": time_s, "solves": None if solves is None else int(solves)})
