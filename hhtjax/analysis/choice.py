@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.analysis.step_size import linearized, rates_of, rms
-from hhtjax.checks import require_integer, require_number
-from hhtjax.description import PyTree, Real, freeze
+from hhtjax.checks import require_integer, require_number, require_params
+from hhtjax.description import PyTree, Real, all_concrete
 from hhtjax.runs.adaptive import Adaptive, adaptive
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import SimulationError, Solution
@@ -26,7 +26,7 @@ from hhtjax.steppers.taylor import taylor
 from hhtjax.systems.events import Event
 from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.linear_system import is_sparse
-from hhtjax.systems.system import AnySystem, FirstOrderSystem
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses, require_system
 
 METHODS = {
     "taylor()": taylor(),
@@ -123,7 +123,7 @@ def choose_stepper(
     Args:
         system, q0, v0, params, z0, t0, events: as in `simulate`.
         duration: s, positive.
-        tolerance: in (0, 1), of the RMS error of q at the samples, relative to the motion of q about its mean.
+        tolerance: in (1e-13, 1), of the RMS error of q at the samples, relative to the motion of q about its mean.
         num_samples: at equal distances; where errors are compared. extrapolated() ends a step at each.
 
     Returns:
@@ -131,7 +131,8 @@ def choose_stepper(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a q that does not move; a tolerance that no method
-            reaches, with what each of them did; JAX in single precision.
+            reaches, with what each of them did; JAX in single precision; called inside of jit.
+        NotImplementedError: coordinates without mass.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> pendulum = hhtjax.System(jnp.ones(1), lambda q, v, t, c: -9.81 * jnp.sin(q) - c * v)
@@ -146,41 +147,46 @@ def choose_stepper(
     rodas5p()
     """
     caller = "choose_stepper"
+    require_system(caller, system, massless=True)
+    require_masses(caller, system, "no error control knows them; take hht() and steps of one size")
+    if not all_concrete((q0, v0, params, duration, z0, tolerance, t0)):
+        raise TypeError(f"{caller}: the arguments must be known numbers; received a tracer: call it outside of jit.")
+    params = require_params(caller, params)
+    require_number(caller, "t0", t0, np.isfinite, "be finite")
     require_number(caller, "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    require_number(caller, "tolerance", tolerance, lambda x: 0 < x < 1, "lie in (0, 1)")
+    require_number(caller, "tolerance", tolerance, lambda x: FINEST < x < 1, f"lie in ({FINEST:g}, 1)")
     num_samples = require_integer(caller, "num_samples", num_samples)
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
     start = initial_values(caller, system, q0, v0, z0)
     q0, v0, z0 = start if not isinstance(system, FirstOrderSystem) else (start[0], None, None)
 
+    def run_at(name: str, dt: Adaptive) -> Tried:
+        start = {"z0": z0, "t0": t0, "duration": duration, "num_samples": num_samples, "events": events}
+        return Tried(dt, simulate(system, METHODS[name], q0, v0, params, dt=dt, throw=True, **start))
+
     def run(name: str, rtol: Real, atol: Real) -> Tried:
-        def with_room(most: int) -> Tried:
-            dt = adaptive(rtol, atol, max_steps=most)
-            start = {"z0": z0, "t0": t0, "duration": duration, "num_samples": num_samples, "events": events}
-            return Tried(dt, simulate(system, METHODS[name], q0, v0, params, dt=dt, throw=True, **start))
-
+        dt = partial(adaptive, rtol, atol)
         try:
-            return with_room(MOST_STEPS[0])
+            return run_at(name, dt(max_steps=MOST_STEPS[0]))
         except SimulationError:
-            return with_room(MOST_STEPS[1])
+            return run_at(name, dt(max_steps=MOST_STEPS[1]))
 
-    sparse = is_sparse(system, freeze(params))
+    sparse = is_sparse(system, params)
     able = [name for name, stepper in METHODS.items() if _is_able(system, stepper, q0, v0, events, sparse)]
     rough, told = float(tolerance), []
     probes = [name for name in ("rodas5p()", "extrapolated()", "hht()") if name in able]
     probe = _first(probes, lambda name: run(name, rough, 1e-2 * rough * _size(q0)).run, told)[1]
     motion = _motion(probe)
-    if not motion > 0:
+    if not motion > np.finfo(probe.t.dtype).eps * np.max(np.abs(_path(probe))):
         raise ValueError(f"{caller}: `q0` does not move within {duration:g} s: there is no error relative to a motion.")
 
     stiffness = None
     if "tsit5()" in able and not sparse:
-        stiffness = _largest_rate(system, probe, freeze(params)) * float(duration) / int(probe.steps.accepted)
+        stiffness = _largest_rate(system, probe, params) * float(probe.t[-1] - probe.t[0]) / int(probe.steps.accepted)
     names, reason = _in_order(able, system, stiffness, float(tolerance), _numbers(q0, v0, z0))
     name, (found, error) = _first(names, partial(_within, run, float(tolerance), motion), told)
-    again = partial(run, name, found.dt.rtol, found.dt.atol)
-    seconds = min(_seconds(again) for _ in range(TIMED))
+    seconds = min(_seconds(partial(run_at, name, found.dt)) for _ in range(TIMED))
     reason = "\n".join([reason, *(f"not {line}" for line in told)])
     return Choice(METHODS[name], found.dt, error, seconds, int(found.run.steps.accepted), stiffness, reason)
 
@@ -193,7 +199,11 @@ def _in_order(able: Sequence, system: AnySystem, stiffness: float | None, tolera
     elif "rodas5p()" not in able:
         names = rest[::-1] if tolerance >= ROUGHEST else rest
         reason = "constraints or rotations: " + (
-            "order 2 is enough" if tolerance >= ROUGHEST else "the method of order 5 that knows them"
+            "order 2 is enough"
+            if tolerance >= ROUGHEST
+            else "the method of order 5 that knows them"
+            if "extrapolated()" in able
+            else "only the hht family knows them and all else that there is"
         )
     elif stiffness is None or stiffness > STIFF:
         names = rest
