@@ -143,6 +143,30 @@ def test_inside_jit_nothing_can_be_chosen(wrt):
         jax.jit(lambda x: choose_stepper(SMOOTH, **given | {wrt: x}).error)(given[wrt])
 
 
+@pytest.mark.parametrize("duration", [8.0, 20.0])
+def test_motion_that_grows_far_beyond_its_start_is_followed_from_there(duration):
+    """q'' = 25 q: an atol beside exp(100) let all steps pass, and two runs with the same steps agreed."""
+    start = jnp.ones(1), jnp.ones(1)
+    system = hhtjax.System(jnp.ones(1), lambda q, v, t, c: 25.0 * q)
+    found = choose_stepper(system, *start, duration=duration)
+    times = np.linspace(0, duration, 65)[1:]
+    q = np.asarray(hhtjax.simulate(system, found.stepper, *start, dt=found.dt, times=times).q)[1:, 0]
+    exact = 0.6 * np.exp(5 * times) + 0.4 * np.exp(-5 * times)
+    error = np.sqrt(np.mean((q - exact) ** 2)) / np.std(exact)
+    assert error <= 1e-3
+    assert found.error == pytest.approx(error, rel=0.5)
+
+
+def test_a_push_that_long_steps_pass_over_is_found():
+    """Two runs without it took the same 7 steps, and agreed."""
+    at_rest = jnp.zeros(1), jnp.zeros(1)
+    pushed = hhtjax.System(jnp.ones(1), lambda q, v, t, c: -4.0 * q + 50.0 * jnp.exp(-(((t - 4.0) / 0.02) ** 2)))
+    found = choose_stepper(pushed, *at_rest, duration=5.0)
+    run = hhtjax.simulate(pushed, found.stepper, *at_rest, dt=found.dt, times=[4.3, 5.0])
+    exact = 0.5 * np.sqrt(np.pi) * np.exp(-(0.02**2)) * np.sin(2 * (np.array([4.3, 5.0]) - 4.0))
+    assert np.max(abs(run.q[1:, 0] - exact)) < 2e-3
+
+
 @pytest.mark.slow
 def test_motion_that_an_event_ends_is_stiff_by_the_time_it_takes():
     ends = hhtjax.Event(at=0.15, terminal=True)

@@ -45,6 +45,8 @@ LINEARIZED_AT = 16  # samples
 LARGEST_STATE = 400  # rates, whose eigenvalues take a second
 FINEST = 1e-13  # rtol
 MOST_STEPS = 10_000, 100_000
+GROWN = 100.0  # times its size at first, up to which a motion is the scale of atol
+PARTS = 64  # of a duration, in each of which something is looked for
 TIMED = 3
 
 
@@ -114,7 +116,8 @@ def choose_stepper(
     and where a method does not know what the system has, has no series for its functions, or fails, the next of them.
     These are the fastest of their kinds on the scenes of `python -m experiments work_precision`, which shows what each
     choice costs beside the best one. The tolerance becomes smaller until two runs, at rtol and rtol/10, agree within
-    what is wanted. It takes as long as compiling two or three programs and some ten runs.
+    what is wanted; where the second takes no more steps than the first, it is made again with steps of at most 1/64 of
+    the duration. It takes as long as compiling two or three programs and some ten runs.
 
     Where it fails: two runs that agree can both be wrong, as where a fast vibration is damped out of both; on chaos no
     two agree. Methods at constant steps are not tried: on linear systems, whose matrix is factorised once then, and
@@ -165,8 +168,8 @@ def choose_stepper(
         start = {"z0": z0, "t0": t0, "duration": duration, "num_samples": num_samples, "events": events}
         return Tried(dt, simulate(system, METHODS[name], q0, v0, params, dt=dt, throw=True, **start))
 
-    def run(name: str, rtol: Real, atol: Real) -> Tried:
-        dt = partial(adaptive, rtol, atol)
+    def run(name: str, rtol: Real, atol: Real, parts: int = 1) -> Tried:
+        dt = partial(adaptive, rtol, atol, dt_max=float(duration) / parts if parts > 1 else np.inf)
         try:
             return run_at(name, dt(max_steps=MOST_STEPS[0]))
         except SimulationError:
@@ -177,7 +180,7 @@ def choose_stepper(
     rough, told = float(tolerance), []
     probes = [name for name in ("rodas5p()", "extrapolated()", "hht()") if name in able]
     probe = _first(probes, lambda name: run(name, rough, 1e-2 * rough * _size(q0)).run, told)[1]
-    motion = _motion(probe)
+    motion, size = _motion(probe), _size_at_first(probe)
     if not motion > np.finfo(probe.t.dtype).eps * np.max(np.abs(_path(probe))):
         raise ValueError(f"{caller}: `q0` does not move within {duration:g} s: there is no error relative to a motion.")
 
@@ -185,7 +188,9 @@ def choose_stepper(
     if "tsit5()" in able and not sparse:
         stiffness = _largest_rate(system, probe, params) * float(probe.t[-1] - probe.t[0]) / int(probe.steps.accepted)
     names, reason = _in_order(able, system, stiffness, float(tolerance), _numbers(q0, v0, z0))
-    name, (found, error) = _first(names, partial(_within, run, float(tolerance), motion), told)
+    name, (found, error) = _first(
+        names, partial(_within, run, float(tolerance), motion, min(motion, GROWN * size)), told
+    )
     seconds = min(_seconds(partial(run_at, name, found.dt)) for _ in range(TIMED))
     reason = "\n".join([reason, *(f"not {line}" for line in told)])
     return Choice(METHODS[name], found.dt, error, seconds, int(found.run.steps.accepted), stiffness, reason)
@@ -230,14 +235,20 @@ def _first(names: Sequence, attempt: Callable, told: list):
     raise ValueError("\n  ".join(["choose_stepper: no method keeps to the `tolerance`:", *told]))
 
 
-def _within(run: Callable, tolerance: float, motion: float, name: str):
-    """The run with the largest rtol that keeps to the tolerance, and its error by one with a tenth of that."""
+def _within(run: Callable, tolerance: float, motion: float, scale: float, name: str):
+    """The run with the largest rtol that keeps to the tolerance, and its error by one with a tenth of that.
+
+    atol is 1e-2 rtol of the scale. Where the second run takes no more steps, both may pass over the same: then it is
+    made again, with steps no longer than a PARTS-th of the whole.
+    """
     rtol, error = tolerance, np.inf
-    now = run(name, rtol, 1e-2 * rtol * motion)
+    now = run(name, rtol, 1e-2 * rtol * scale)
     while rtol > FINEST:
         rtol *= 0.1
-        then = run(name, rtol, 1e-2 * rtol * motion)
-        error = float(rms(_path(now.run) - _path(then.run)) / motion)
+        then = run(name, rtol, 1e-2 * rtol * scale)
+        blind = int(then.run.steps.accepted) <= int(now.run.steps.accepted)
+        other = run(name, rtol, 1e-2 * rtol * scale, PARTS) if blind else then
+        error = float(rms(_path(now.run) - _path(other.run)) / motion)
         if error <= tolerance:
             return now, error
         now = then
@@ -286,6 +297,12 @@ def _motion(run: Solution) -> float:
 def _size(q0: PyTree) -> float:
     """The largest number of a position, or 1 where all are 0."""
     return max(float(np.max(np.abs(x), initial=0)) for x in jax.tree.leaves(q0)) or 1.0
+
+
+def _size_at_first(run: Solution) -> float:
+    """The largest number of q at the start and the sample behind it, beside which the errors that grow are small or
+    not; infinite where all are 0."""
+    return float(np.max(np.abs(_path(run)[:-1][:2]))) or np.inf
 
 
 def _numbers(*start: PyTree) -> int:
