@@ -46,7 +46,7 @@ LARGEST_STATE = 400  # rates, whose eigenvalues take a second
 FINEST = 1e-13  # rtol
 MOST_STEPS = 10_000, 100_000
 GROWN = 100.0  # times its size at first, up to which a motion is the scale of atol
-PARTS = 64  # of a duration, in each of which something is looked for
+PARTS = 64  # of a duration: the longest steps where something may have been passed over
 TIMED = 3
 
 
@@ -180,7 +180,7 @@ def choose_stepper(
     rough, told = float(tolerance), []
     probes = [name for name in ("rodas5p()", "extrapolated()", "hht()") if name in able]
     probe = _first(probes, lambda name: run(name, rough, 1e-2 * rough * _size(q0)).run, told)[1]
-    motion, size = _motion(probe), _size_at_first(probe)
+    motion, size = _motion(probe), _size_at_first(probe, float(duration) / PARTS)
     if not motion > np.finfo(probe.t.dtype).eps * np.max(np.abs(_path(probe))):
         raise ValueError(f"{caller}: `q0` does not move within {duration:g} s: there is no error relative to a motion.")
 
@@ -299,10 +299,11 @@ def _size(q0: PyTree) -> float:
     return max(float(np.max(np.abs(x), initial=0)) for x in jax.tree.leaves(q0)) or 1.0
 
 
-def _size_at_first(run: Solution) -> float:
-    """The largest number of q at the start and the sample behind it, beside which the errors that grow are small or
-    not; infinite where all are 0."""
-    return float(np.max(np.abs(_path(run)[:-1][:2]))) or np.inf
+def _size_at_first(run: Solution, part: float) -> float:
+    """How far from 0 a number of q is at the start or the sample behind it, or comes at its first rate in that part of
+    the time; infinite where all is 0. Errors made at first, which may grow as the motion does, are small beside it."""
+    rates = max(float(np.max(np.abs(x[0]), initial=0)) for x in jax.tree.leaves(run.v))
+    return max(float(np.max(np.abs(_path(run)[:-1][:2]))), part * rates) or np.inf
 
 
 def _numbers(*start: PyTree) -> int:
