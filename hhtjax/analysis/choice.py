@@ -105,10 +105,12 @@ def choose_stepper(
     """The stepper for a motion, and the tolerances with which it keeps the error that is wanted.
 
     A run with a method for stiff systems tells how long a step h the error alone asks for. At 16 of its samples the
-    system is linearised, as in `suggest_step_size`, and the mean of the largest |lambda| found. Then
+    system is linearised, as in `suggest_step_size`, and the mean of the largest |lambda| found; beyond 400 velocities
+    only at the last. Then
 
         dry friction                        hht()
-        constraints or rotations            extrapolated(); hht() from a tolerance of 1e-2 on, and with events
+        constraints or rotations            extrapolated(); hht(linearize="predictor") from a tolerance of 1e-2 on, and
+                                            with events
         |lambda| h > 4, or sparse matrices  rodas5p()
         nothing of these                    tsit5() from a tolerance of 1e-3 on; taylor() for 12 numbers of state or
                                             less; otherwise dop853()
@@ -119,9 +121,9 @@ def choose_stepper(
     what is wanted; where the second takes no more steps than the first, it is made again with steps of at most 1/64 of
     the duration. It takes as long as compiling two or three programs and some ten runs.
 
-    Where it fails: two runs that agree can both be wrong, as where a fast vibration is damped out of both; on chaos no
-    two agree. Methods at constant steps are not tried: on linear systems, whose matrix is factorised once then, and
-    for motions of a few dozen steps they can be faster.
+    Where it fails: two runs that agree can both be wrong, as where a fast vibration is damped out of both, or both
+    pass over a short push; on chaos no two agree. Methods at constant steps are not tried: on linear systems, whose
+    matrix is factorised once then, and for motions of a few dozen steps they can be faster.
 
     Args:
         system, q0, v0, params, z0, t0, events: as in `simulate`.
@@ -134,7 +136,7 @@ def choose_stepper(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a q that does not move; a tolerance that no method
-            reaches, with what each of them did; JAX in single precision; called inside of jit.
+            reaches, with what each of them did; JAX in single precision; called inside of jit, vmap or grad.
         NotImplementedError: coordinates without mass.
 
     >>> import jax.numpy as jnp, hhtjax
@@ -153,7 +155,9 @@ def choose_stepper(
     require_system(caller, system, massless=True)
     require_masses(caller, system, "no error control knows them; take hht() and steps of one size")
     if not all_concrete((q0, v0, params, duration, z0, tolerance, t0)):
-        raise TypeError(f"{caller}: the arguments must be known numbers; received a tracer: call it outside of jit.")
+        raise TypeError(
+            f"{caller}: the arguments must be known numbers; received a tracer: call it outside of jit, vmap and grad."
+        )
     params = require_params(caller, params)
     require_number(caller, "t0", t0, np.isfinite, "be finite")
     require_number(caller, "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
