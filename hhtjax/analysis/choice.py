@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.analysis.step_size import linearized, rates_of, rms
-from hhtjax.checks import require_integer, require_number
-from hhtjax.description import PyTree, Real, freeze
+from hhtjax.checks import require_integer, require_number, require_params
+from hhtjax.description import PyTree, Real, all_concrete
 from hhtjax.runs.adaptive import Adaptive, adaptive
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import SimulationError, Solution
@@ -26,7 +26,7 @@ from hhtjax.steppers.taylor import taylor
 from hhtjax.systems.events import Event
 from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.linear_system import is_sparse
-from hhtjax.systems.system import AnySystem, FirstOrderSystem
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses, require_system
 
 METHODS = {
     "taylor()": taylor(),
@@ -45,6 +45,8 @@ LINEARIZED_AT = 16  # samples
 LARGEST_STATE = 400  # rates, whose eigenvalues take a second
 FINEST = 1e-13  # rtol
 MOST_STEPS = 10_000, 100_000
+GROWN = 100.0  # times its size at first, up to which a motion is the scale of atol
+PARTS = 64  # of a duration: the longest steps where something may have been passed over
 TIMED = 3
 
 
@@ -103,10 +105,12 @@ def choose_stepper(
     """The stepper for a motion, and the tolerances with which it keeps the error that is wanted.
 
     A run with a method for stiff systems tells how long a step h the error alone asks for. At 16 of its samples the
-    system is linearised, as in `suggest_step_size`, and the mean of the largest |lambda| found. Then
+    system is linearised, as in `suggest_step_size`, and the mean of the largest |lambda| found; beyond 400 velocities
+    only at the last. Then
 
         dry friction                        hht()
-        constraints or rotations            extrapolated(); hht() from a tolerance of 1e-2 on, and with events
+        constraints or rotations            extrapolated(); hht(linearize="predictor") from a tolerance of 1e-2 on, and
+                                            with events
         |lambda| h > 4, or sparse matrices  rodas5p()
         nothing of these                    tsit5() from a tolerance of 1e-3 on; taylor() for 12 numbers of state or
                                             less; otherwise dop853()
@@ -114,16 +118,17 @@ def choose_stepper(
     and where a method does not know what the system has, has no series for its functions, or fails, the next of them.
     These are the fastest of their kinds on the scenes of `python -m experiments work_precision`, which shows what each
     choice costs beside the best one. The tolerance becomes smaller until two runs, at rtol and rtol/10, agree within
-    what is wanted. It takes as long as compiling two or three programs and some ten runs.
+    what is wanted; where the second takes no more steps than the first, it is made again with steps of at most 1/64 of
+    the duration. It takes as long as compiling two or three programs and some ten runs.
 
-    Where it fails: two runs that agree can both be wrong, as where a fast vibration is damped out of both; on chaos no
-    two agree. Methods at constant steps are not tried: on linear systems, whose matrix is factorised once then, and
-    for motions of a few dozen steps they can be faster.
+    Where it fails: two runs that agree can both be wrong, as where a fast vibration is damped out of both, or both
+    pass over a short push; on chaos no two agree. Methods at constant steps are not tried: on linear systems, whose
+    matrix is factorised once then, and for motions of a few dozen steps they can be faster.
 
     Args:
         system, q0, v0, params, z0, t0, events: as in `simulate`.
         duration: s, positive.
-        tolerance: in (0, 1), of the RMS error of q at the samples, relative to the motion of q about its mean.
+        tolerance: in (1e-13, 1), of the RMS error of q at the samples, relative to the motion of q about its mean.
         num_samples: at equal distances; where errors are compared. extrapolated() ends a step at each.
 
     Returns:
@@ -131,7 +136,8 @@ def choose_stepper(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a q that does not move; a tolerance that no method
-            reaches, with what each of them did; JAX in single precision.
+            reaches, with what each of them did; JAX in single precision; called inside of jit, vmap or grad.
+        NotImplementedError: coordinates without mass.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> pendulum = hhtjax.System(jnp.ones(1), lambda q, v, t, c: -9.81 * jnp.sin(q) - c * v)
@@ -146,41 +152,50 @@ def choose_stepper(
     rodas5p()
     """
     caller = "choose_stepper"
+    require_system(caller, system, massless=True)
+    require_masses(caller, system, "no error control knows them; take hht() and steps of one size")
+    if not all_concrete((q0, v0, params, duration, z0, tolerance, t0)):
+        raise TypeError(
+            f"{caller}: the arguments must be known numbers; received a tracer: call it outside of jit, vmap and grad."
+        )
+    params = require_params(caller, params)
+    require_number(caller, "t0", t0, np.isfinite, "be finite")
     require_number(caller, "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    require_number(caller, "tolerance", tolerance, lambda x: 0 < x < 1, "lie in (0, 1)")
+    require_number(caller, "tolerance", tolerance, lambda x: FINEST < x < 1, f"lie in ({FINEST:g}, 1)")
     num_samples = require_integer(caller, "num_samples", num_samples)
     if jnp.result_type(float) != jnp.float64:
         raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
     start = initial_values(caller, system, q0, v0, z0)
     q0, v0, z0 = start if not isinstance(system, FirstOrderSystem) else (start[0], None, None)
 
-    def run(name: str, rtol: Real, atol: Real) -> Tried:
-        def with_room(most: int) -> Tried:
-            dt = adaptive(rtol, atol, max_steps=most)
-            start = {"z0": z0, "t0": t0, "duration": duration, "num_samples": num_samples, "events": events}
-            return Tried(dt, simulate(system, METHODS[name], q0, v0, params, dt=dt, throw=True, **start))
+    def run_at(name: str, dt: Adaptive) -> Tried:
+        start = {"z0": z0, "t0": t0, "duration": duration, "num_samples": num_samples, "events": events}
+        return Tried(dt, simulate(system, METHODS[name], q0, v0, params, dt=dt, throw=True, **start))
 
+    def run(name: str, rtol: Real, atol: Real, parts: int = 1) -> Tried:
+        dt = partial(adaptive, rtol, atol, dt_max=float(duration) / parts if parts > 1 else np.inf)
         try:
-            return with_room(MOST_STEPS[0])
+            return run_at(name, dt(max_steps=MOST_STEPS[0]))
         except SimulationError:
-            return with_room(MOST_STEPS[1])
+            return run_at(name, dt(max_steps=MOST_STEPS[1]))
 
-    sparse = is_sparse(system, freeze(params))
+    sparse = is_sparse(system, params)
     able = [name for name, stepper in METHODS.items() if _is_able(system, stepper, q0, v0, events, sparse)]
     rough, told = float(tolerance), []
     probes = [name for name in ("rodas5p()", "extrapolated()", "hht()") if name in able]
     probe = _first(probes, lambda name: run(name, rough, 1e-2 * rough * _size(q0)).run, told)[1]
-    motion = _motion(probe)
-    if not motion > 0:
+    motion, size = _motion(probe), _size_at_first(probe, float(duration) / PARTS)
+    if not motion > np.finfo(probe.t.dtype).eps * np.max(np.abs(_path(probe))):
         raise ValueError(f"{caller}: `q0` does not move within {duration:g} s: there is no error relative to a motion.")
 
     stiffness = None
     if "tsit5()" in able and not sparse:
-        stiffness = _largest_rate(system, probe, freeze(params)) * float(duration) / int(probe.steps.accepted)
+        stiffness = _largest_rate(system, probe, params) * float(probe.t[-1] - probe.t[0]) / int(probe.steps.accepted)
     names, reason = _in_order(able, system, stiffness, float(tolerance), _numbers(q0, v0, z0))
-    name, (found, error) = _first(names, partial(_within, run, float(tolerance), motion), told)
-    again = partial(run, name, found.dt.rtol, found.dt.atol)
-    seconds = min(_seconds(again) for _ in range(TIMED))
+    name, (found, error) = _first(
+        names, partial(_within, run, float(tolerance), motion, min(motion, GROWN * size)), told
+    )
+    seconds = min(_seconds(partial(run_at, name, found.dt)) for _ in range(TIMED))
     reason = "\n".join([reason, *(f"not {line}" for line in told)])
     return Choice(METHODS[name], found.dt, error, seconds, int(found.run.steps.accepted), stiffness, reason)
 
@@ -193,7 +208,11 @@ def _in_order(able: Sequence, system: AnySystem, stiffness: float | None, tolera
     elif "rodas5p()" not in able:
         names = rest[::-1] if tolerance >= ROUGHEST else rest
         reason = "constraints or rotations: " + (
-            "order 2 is enough" if tolerance >= ROUGHEST else "the method of order 5 that knows them"
+            "order 2 is enough"
+            if tolerance >= ROUGHEST
+            else "the method of order 5 that knows them"
+            if "extrapolated()" in able
+            else "only the hht family knows them and all else that there is"
         )
     elif stiffness is None or stiffness > STIFF:
         names = rest
@@ -220,14 +239,20 @@ def _first(names: Sequence, attempt: Callable, told: list):
     raise ValueError("\n  ".join(["choose_stepper: no method keeps to the `tolerance`:", *told]))
 
 
-def _within(run: Callable, tolerance: float, motion: float, name: str):
-    """The run with the largest rtol that keeps to the tolerance, and its error by one with a tenth of that."""
+def _within(run: Callable, tolerance: float, motion: float, scale: float, name: str):
+    """The run with the largest rtol that keeps to the tolerance, and its error by one with a tenth of that.
+
+    atol is 1e-2 rtol of the scale. Where the second run takes no more steps, both may pass over the same: then it is
+    made again, with steps no longer than a PARTS-th of the whole.
+    """
     rtol, error = tolerance, np.inf
-    now = run(name, rtol, 1e-2 * rtol * motion)
+    now = run(name, rtol, 1e-2 * rtol * scale)
     while rtol > FINEST:
         rtol *= 0.1
-        then = run(name, rtol, 1e-2 * rtol * motion)
-        error = float(rms(_path(now.run) - _path(then.run)) / motion)
+        then = run(name, rtol, 1e-2 * rtol * scale)
+        blind = int(then.run.steps.accepted) <= int(now.run.steps.accepted)
+        other = run(name, rtol, 1e-2 * rtol * scale, PARTS) if blind else then
+        error = float(rms(_path(now.run) - _path(other.run)) / motion)
         if error <= tolerance:
             return now, error
         now = then
@@ -276,6 +301,13 @@ def _motion(run: Solution) -> float:
 def _size(q0: PyTree) -> float:
     """The largest number of a position, or 1 where all are 0."""
     return max(float(np.max(np.abs(x), initial=0)) for x in jax.tree.leaves(q0)) or 1.0
+
+
+def _size_at_first(run: Solution, part: float) -> float:
+    """How far from 0 a number of q is at the start or the sample behind it, or comes at its first rate in that part of
+    the time; infinite where all is 0. Errors made at first, which may grow as the motion does, are small beside it."""
+    rates = max(float(np.max(np.abs(x[0]), initial=0)) for x in jax.tree.leaves(run.v))
+    return max(float(np.max(np.abs(_path(run)[:-1][:2]))), part * rates) or np.inf
 
 
 def _numbers(*start: PyTree) -> int:
