@@ -97,5 +97,7 @@ def test_other_points_of_linearisation_are_refused(where):
 
 @pytest.mark.parametrize("name", ["kim_hht", "rk4"])
 def test_other_steppers_refuse(name):
-    with pytest.raises(NotImplementedError, match=r"simulate: .* cannot solve the `constraint`; use extrapolated\(\), hht\(\)"):
+    with pytest.raises(
+        NotImplementedError, match=r"simulate: .* cannot solve the `constraint`; use extrapolated\(\), hht\(\)"
+    ):
         simulate(constrained(level), getattr(hhtjax, name)(), jnp.ones(2), jnp.zeros(2))

@@ -152,19 +152,7 @@ def choose_stepper(
     rodas5p()
     """
     caller = "choose_stepper"
-    require_system(caller, system, massless=True)
-    require_masses(caller, system, "no error control knows them; take hht() and steps of one size")
-    if not all_concrete((q0, v0, params, duration, z0, tolerance, t0)):
-        raise TypeError(
-            f"{caller}: the arguments must be known numbers; received a tracer: call it outside of jit, vmap and grad."
-        )
-    params = require_params(caller, params)
-    require_number(caller, "t0", t0, np.isfinite, "be finite")
-    require_number(caller, "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    require_number(caller, "tolerance", tolerance, lambda x: FINEST < x < 1, f"lie in ({FINEST:g}, 1)")
-    num_samples = require_integer(caller, "num_samples", num_samples)
-    if jnp.result_type(float) != jnp.float64:
-        raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
+    params = _require(caller, system, params, (q0, v0, z0), duration, tolerance, num_samples, t0)
     start = initial_values(caller, system, q0, v0, z0)
     q0, v0, z0 = start if not isinstance(system, FirstOrderSystem) else (start[0], None, None)
 
@@ -200,32 +188,48 @@ def choose_stepper(
     return Choice(METHODS[name], found.dt, error, seconds, int(found.run.steps.accepted), stiffness, reason)
 
 
+def _require(
+    caller: str, system: AnySystem, params: PyTree, start: tuple, duration, tolerance, num_samples, t0: Real
+) -> PyTree:
+    """params, checked; an error for what cannot be chosen for."""
+    require_system(caller, system, massless=True)
+    require_masses(caller, system, "no error control knows them; take hht() and steps of one size")
+    if not all_concrete((start, params, duration, tolerance, t0)):
+        raise TypeError(
+            f"{caller}: the arguments must be known numbers; received a tracer: call it outside of jit, vmap and grad."
+        )
+    require_number(caller, "t0", t0, np.isfinite, "be finite")
+    require_number(caller, "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
+    require_number(caller, "tolerance", tolerance, lambda x: FINEST < x < 1, f"lie in ({FINEST:g}, 1)")
+    require_integer(caller, "num_samples", num_samples)
+    if jnp.result_type(float) != jnp.float64:
+        raise ValueError(f"{caller}: needs double precision: call jax.config.update('jax_enable_x64', True) first.")
+    return require_params(caller, params)
+
+
 def _in_order(able: Sequence, system: AnySystem, stiffness: float | None, tolerance: float, numbers: int):
     """The names of the methods that are able, best first, and why."""
     rest = ["rodas5p()", "extrapolated()", 'hht(linearize="predictor")']
     if system.friction is not None:
         names, reason = ["hht()"], "dry friction: only the hht family solves it"
     elif "rodas5p()" not in able:
-        names = rest[::-1] if tolerance >= ROUGHEST else rest
-        reason = "constraints or rotations: " + (
-            "order 2 is enough"
-            if tolerance >= ROUGHEST
-            else "the method of order 5 that knows them"
-            if "extrapolated()" in able
-            else "only the hht family knows them and all else that there is"
-        )
-    elif stiffness is None or stiffness > STIFF:
-        names = rest
-        reason = (
-            "sparse matrices: taken as stiff"
-            if stiffness is None
-            else f"stiff: |lambda| h = {stiffness:.3g} for the h that the error asks for; explicit: below {STIFF:g}"
-        )
+        names, reason = rest, "constraints or rotations: "
+        if tolerance >= ROUGHEST:
+            names, reason = rest[::-1], reason + "order 2 is enough"
+        elif "extrapolated()" in able:
+            reason += "the method of order 5 that knows them"
+        else:
+            reason += "only the hht family knows them and all else that there is"
+    elif stiffness is None:
+        names, reason = rest, "sparse matrices: taken as stiff"
     else:
-        small = ["taylor()"] if numbers <= FEW else []
-        names = ["tsit5()"] if tolerance >= ROUGH else [*small, "dop853()"]
-        names += rest
-        reason = f"not stiff: |lambda| h = {stiffness:.3g} for the h that the error asks for; explicit: below {STIFF:g}"
+        steps = f"|lambda| h = {stiffness:.3g}, h the step that the error alone asks for"
+        if stiffness > STIFF:
+            names, reason = rest, f"stiff: {steps}; stable steps of an explicit method would be many more"
+        else:
+            small = ["taylor()"] if numbers <= FEW else []
+            names = [*(["tsit5()"] if tolerance >= ROUGH else [*small, "dop853()"]), *rest]
+            reason = f"not stiff: {steps}; explicit methods are stable with it up to some {STIFF:g}"
     return [name for name in names if name in able], reason
 
 
