@@ -29,7 +29,7 @@ from hhtjax.numerics.dense_lu import SCALAR, factorize
 from hhtjax.numerics.linear_solve import factorize_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.sparse_solve import kept
-from hhtjax.primitives import staged
+from hhtjax.primitives import row_written, staged
 from hhtjax.steppers.implicit_solve import linearized, with_local
 from hhtjax.steppers.residual import residual
 from hhtjax.steppers.runge_kutta import mean
@@ -166,11 +166,11 @@ def in_a_loop(tableau: RosenbrockTableau, start: Callable, stage: Callable, firs
     A, G = (jnp.asarray(filled(rows, number), dtype) for rows in (tableau.A, tableau.G))
 
     def body(rates: Array, row: tuple):
-        a, c, here = row
-        rates = rates + here[:, None, None] * stage(c, rates, *start(a, rates))[None]
-        return rates, None
+        i, a, c = row
+        new = staged(lambda rates: stage(c, rates, *start(a, rates)))(rates)
+        return row_written(rates, new, i), None
 
-    return lax.scan(body, jnp.zeros((number, 3, size), dtype), (A, G, jnp.eye(number, dtype=dtype)))[0]
+    return lax.scan(body, jnp.zeros((number, 3, size), dtype), (jnp.arange(number), A, G))[0]
 
 
 def rosenbrock(rho_inf: Real = 0.0) -> Rosenbrock:

@@ -18,7 +18,7 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree, is_concrete
 from hhtjax.numerics.dense_lu import SCALAR
-from hhtjax.primitives import staged
+from hhtjax.primitives import row_written, staged
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.tableaus import CLASSICAL, DOP853, DORMAND_PRINCE, TSITOURAS, ExplicitTableau, filled
 from hhtjax.steppers.variable_step import Errors, Tabulated
@@ -96,14 +96,13 @@ def written_out(rows: Sequence, stage: Callable, first: Array) -> PyTree:
 def in_a_loop(rows: Sequence, stage: Callable, first: Array) -> Array:
     """The same, with one stage to compile in the place of many; the tableau is data."""
     number, dtype = len(rows) + 1, first.dtype
-    weights = jnp.asarray(filled(rows, number), dtype)
 
     def body(rates: Array, row: tuple):
-        weights, here = row
-        return rates + here[:, None, None] * stage(weights, rates)[None], None
+        i, weights = row
+        return row_written(rates, stage(weights, rates), i), None
 
     begun = jnp.pad(first[None], ((0, number - 1), (0, 0), (0, 0)))
-    return lax.scan(body, begun, (weights, jnp.eye(number, dtype=dtype)[1:]))[0]
+    return lax.scan(body, begun, (jnp.arange(1, number), jnp.asarray(filled(rows, number), dtype)))[0]
 
 
 def errors_of(tableau: ExplicitTableau, dt: Array, rates: PyTree) -> Array:
