@@ -34,6 +34,7 @@ from hhtjax.checks import require_integer
 from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import differentiable_inverse, matvec
+from hhtjax.primitives import staged
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.variable_step import Embedded, Errors
 from hhtjax.systems.constraints import (
@@ -131,6 +132,12 @@ def basic_step(system: FlatSystem, params: PyTree, H: Array, levels: int, s: Sta
         du = matvec(inverse, matvec(A, c) - h * matvec(K, b))[:N]
         return b + h * du, du
 
+    def correction(h: Array, i: Array, inverse: Array, x: Array, u: Array, dx: Array, du: Array):
+        """Half of what the next increment is longer than the last, (dx, du)."""
+        q, v, _ = placed(system, s, x, u, s.w)
+        w, _ = accelerations(system, q, v, s.t + i * h, params)
+        return increment(h, inverse, h * u - dx, h * system.in_chart(x, u, w) - du)
+
     def body(carry: tuple, at: tuple):
         y, d, ends = carry
         h, i, inverse, share = at
@@ -139,9 +146,7 @@ def basic_step(system: FlatSystem, params: PyTree, H: Array, levels: int, s: Sta
         x, u, dx, du = (
             jnp.where(first, new, old) for new, old in zip((dx0, s.v + du0, dx0, du0), (*y, *d), strict=True)
         )
-        q, v, _ = placed(system, s, x, u, s.w)
-        w, _ = accelerations(system, q, v, s.t + i * h, params)
-        ex, eu = increment(h, inverse, h * u - dx, h * system.in_chart(x, u, w) - du)
+        ex, eu = staged(correction)(h, i, inverse, x, u, dx, du)
         ends = ends + share[:, None, None] * jnp.stack([x + ex, u + eu])[None]
         d = dx + 2 * ex, du + 2 * eu
         return ((x + d[0], u + d[1]), d, ends), None
