@@ -14,8 +14,8 @@ PACKAGES = (
 )
 SHOWN = {  # of a package: the methods that are drawn, where the page has all of them
     "ours": (
-        *("hht", "hht, converged", "hht, extrapolate=2", "hht, extrapolate=3", "rodas5p", "rk4"),
-        *("hht, adaptive", "rodas5p, adaptive", "taylor, adaptive"),
+        *("hht", "hht, extrapolate=2", "rowda", "rodas5p", "tsit5"),
+        *(f"{x}, adaptive" for x in ("hht", "extrapolated", "rodas5p", "tsit5", "dop853", "taylor")),
     ),
     "diffrax": ("diffrax Tsit5, PID", "diffrax Kvaerno5, PID"),
     "SciPy": ("SciPy LSODA, C rhs", "SciPy LSODA, jitted rhs"),
@@ -49,7 +49,7 @@ GRADIENTS = {
     "CasADi": ("CasADi CVODES, forward",),
 }
 
-OURS = COLOURS[0], COLOURS[0], COLOURS[6], COLOURS[6], COLOURS[5], COLOURS[5], COLOURS[7], COLOURS[7], COLOURS[7]
+OURS = tuple(COLOURS[i] for i in (0, 0, 5, 5, 5, 7, 7, 7, 6, 6, 6))  # hht, others; the same with error control
 THEIRS = {
     **dict(zip(PACKAGES[1:5], COLOURS[1:5], strict=True)),
     **{"heyoka": "#e7298a", "numbalsoda": "#8c2d04", "CasADi": "#6a51a3", "sksundae": "#b279d6"},
