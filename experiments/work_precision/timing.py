@@ -55,7 +55,7 @@ def sweep(case, method, package, solve, settings, describe, each_compiles=False,
 
 def lines(rows):
     """The rows of each method on each case as one line, their numbers as lists: for the figures, and short in JSON."""
-    numbers = "h_s", "tolerance", "rms_error", "time_s", "solves"
+    numbers = "h_s", "tolerance", "setting", "rms_error", "time_s", "solves"
     found: dict = {}
     for row in rows:
         same = {key: x for key, x in row.items() if key not in numbers}
