@@ -118,6 +118,8 @@ SLOW = {
     "top, lie, converged": Case(top.minimal, hht(-0.1, kinematics="lie", iterations=None), 1e-4, 500),
     "maxwell, rosenbrock": Case(maxwell.vibration, hhtjax.rosenbrock(), 1e-3),
     "maxwell, rk4": Case(maxwell.vibration, hhtjax.rk4(), 1e-4),
+    "stages in a loop": Case(zoo("forced double pendulum"), hhtjax.rodas5p(), 1e-3, 500),
+    "stages in a loop, first order": Case(decay, hhtjax.dop853(), 1e-2, 500),
     "bar": Case(Bar, hht(-0.1), 1e-3),
     "bar, converged": Case(Bar, hht(-0.1, iterations=None), 1e-3, 500),
     "first order": Case(decay, hht(-0.1), 1e-3),

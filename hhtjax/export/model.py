@@ -15,7 +15,15 @@ from hhtjax.checks import require_params
 from hhtjax.description import Array, PyTree, all_concrete, thaw
 from hhtjax.primitives import structural
 from hhtjax.steppers.friction_switching import is_settled
-from hhtjax.steppers.stepper import INTERNAL, behind_jump, entered, require_capable, require_stepper, require_system
+from hhtjax.steppers.stepper import (
+    INTERNAL,
+    Stepper,
+    behind_jump,
+    entered,
+    require_capable,
+    require_stepper,
+    require_system,
+)
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, with_known_rows
 from hhtjax.systems.linear_system import require_dense
@@ -213,7 +221,7 @@ def begin(made: Given, numbers: Numbers):
         q0, v0, z0 = (starts.get(name) for name in ("q0", "v0", "z0"))
         flat, q, v = flatten(made.caller, made.system, q0, v0, t0, params, z0)
         _, state = entered(made.stepper.astype(q.dtype), flat, q, v, t0, params, dt)
-        return state, _flags(state, None)
+        return _kept(made.stepper, state), _flags(state, None)
 
     return f
 
@@ -227,9 +235,14 @@ def step(made: Given, numbers: Numbers):
         if numbers.inputs:
             state = behind_jump(stepper, flat, state, old, now, dt)
         state, info = stepper.bind(flat, now, dt)(state)
-        return state, _flags(state, info)
+        return _kept(stepper, state), _flags(state, info)
 
     return f
+
+
+def _kept(stepper: Stepper, state: State) -> State:
+    """The state without what only dense output reads, which C has not."""
+    return state._replace(memory=None) if stepper.dense_term or stepper.reads_series else state
 
 
 def _flags(state: State, info: Info | None) -> Array:

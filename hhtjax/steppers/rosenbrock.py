@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 FEW = 4  # stages
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Rosenbrock(Tabulated, Stepper):
     """A method given by its tableau; made by `rosenbrock`, `rowda` and `rodas5p`.
 

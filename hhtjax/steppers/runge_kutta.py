@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RungeKutta(Tabulated, Stepper):
     """A method given by its tableau; made by `rk4`, `tsit5`, `dopri5` and `dop853`.
 
@@ -54,9 +54,6 @@ class RungeKutta(Tabulated, Stepper):
     def estimate_order(self):
         """One more than the order of the embedded method."""
         return None if self.tableau.embedded_order is None else self.tableau.embedded_order + 1
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name}, order={self.order})"
 
     def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array, estimating: bool = True):
         """State -> State, Info, Errors; the first stage is the acceleration that the step before ended with."""

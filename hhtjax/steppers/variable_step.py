@@ -228,6 +228,10 @@ class Tabulated(Embedded):
     """The same, given by its tableau."""
 
     tableau: Any  # with `dense`, rows of weights, or None for cubics alone
+    order: int
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name}, order={self.order})"
 
     @property
     def name(self) -> str:
