@@ -225,7 +225,7 @@ def _in_order(able: Sequence, system: AnySystem, stiffness: float | None, tolera
     else:
         steps = f"|lambda| h = {stiffness:.3g}, h the step that the error alone asks for"
         if stiffness > STIFF:
-            names, reason = rest, f"stiff: {steps}; stable steps of an explicit method would be many more"
+            names, reason = rest, f"stiff: {steps}; an explicit method needs shorter ones to be stable"
         else:
             small = ["taylor()"] if numbers <= FEW else []
             names = [*(["tsit5()"] if tolerance >= ROUGH else [*small, "dop853()"]), *rest]
