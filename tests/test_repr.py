@@ -230,7 +230,7 @@ def test_every_result_with_arrays_is_shown():
             yield from (x for name, x in vars(room).items() if not name.startswith("_"))
 
     tuples = {x for x in public() if isinstance(x, type) and issubclass(x, tuple)}
-    of_numbers = {"Eigenvalue", "Explanation", "Gaussian", "Mode", "StepSize"}
+    of_numbers = {"Choice", "Eigenvalue", "Explanation", "Gaussian", "Mode", "StepSize"}
     unseen = {x.__name__ for x in tuples if x.__dir__ is object.__dir__}
     assert unseen == of_numbers
     assert shown.__doc__

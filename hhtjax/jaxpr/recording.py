@@ -29,6 +29,7 @@ from hhtjax.jaxpr.scalar_rules import (
     is_structural,
     is_understood,
 )
+from hhtjax.primitives.batching import written
 from hhtjax.primitives.interpreter import alone, evaluate, line_of, lowered
 
 if TYPE_CHECKING:
@@ -145,6 +146,9 @@ class _Listing:
         if name == "hhtjax_values":  # a function that autodiff keeps whole, such as a root
             shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
             return self.run(lowered(jax.make_jaxpr(eqn.params["f"])(shapes)), values)
+        if name == "hhtjax_row_written":
+            shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
+            return self.run(jax.make_jaxpr(partial(written, **eqn.params))(*shapes), values)
         if name == "hhtjax_inside":  # functions come in two forms: outside of a kernel LAPACK's
             return [known_pieces(np.bool_(False))]
         known = all(is_known(x) for value in values for x in value.flat)
