@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.analysis.step_size import linearized, rates_of, rms
+from hhtjax.analysis.step_size import linearized, motion_of, rates_of, rms
 from hhtjax.checks import require_integer, require_number, require_params
 from hhtjax.description import PyTree, Real, all_concrete
 from hhtjax.runs.adaptive import Adaptive, adaptive
@@ -25,7 +25,7 @@ from hhtjax.steppers.stepper import Stepper, require_capable
 from hhtjax.steppers.taylor import taylor
 from hhtjax.systems.events import Event
 from hhtjax.systems.initial_conditions import initial_values
-from hhtjax.systems.linear_system import is_sparse
+from hhtjax.systems.linear_system import sparse_matrices
 from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_masses, require_system
 
 METHODS = {
@@ -153,6 +153,7 @@ def choose_stepper(
     """
     caller = "choose_stepper"
     params = _require(caller, system, params, (q0, v0, z0), duration, tolerance, num_samples, t0)
+    tolerance, told = float(tolerance), []
     start = initial_values(caller, system, q0, v0, z0)
     q0, v0, z0 = start if not isinstance(system, FirstOrderSystem) else (start[0], None, None)
 
@@ -167,22 +168,19 @@ def choose_stepper(
         except SimulationError:
             return run_at(name, dt(max_steps=MOST_STEPS[1]))
 
-    sparse = is_sparse(system, params)
+    sparse = bool(sparse_matrices(caller, system, params))
     able = [name for name, stepper in METHODS.items() if _is_able(system, stepper, q0, v0, events, sparse)]
-    rough, told = float(tolerance), []
     probes = [name for name in ("rodas5p()", "extrapolated()", "hht()") if name in able]
-    probe = _first(probes, lambda name: run(name, rough, 1e-2 * rough * _size(q0)).run, told)[1]
-    motion, size = _motion(probe), _size_at_first(probe, float(duration) / PARTS)
+    probe = _first(probes, lambda name: run(name, tolerance, 1e-2 * tolerance * _size(q0)).run, told)[1]
+    motion, size = float(motion_of(_path(probe))), _size_at_first(probe, float(duration) / PARTS)
     if not motion > np.finfo(probe.t.dtype).eps * np.max(np.abs(_path(probe))):
         raise ValueError(f"{caller}: `q0` does not move within {duration:g} s: there is no error relative to a motion.")
 
     stiffness = None
     if "tsit5()" in able and not sparse:
         stiffness = _largest_rate(system, probe, params) * float(probe.t[-1] - probe.t[0]) / int(probe.steps.accepted)
-    names, reason = _in_order(able, system, stiffness, float(tolerance), _numbers(q0, v0, z0))
-    name, (found, error) = _first(
-        names, partial(_within, run, float(tolerance), motion, min(motion, GROWN * size)), told
-    )
+    names, reason = _in_order(able, system, stiffness, tolerance, _numbers(q0, v0, z0))
+    name, (found, error) = _first(names, partial(_within, run, tolerance, motion, min(motion, GROWN * size)), told)
     seconds = min(_seconds(partial(run_at, name, found.dt)) for _ in range(TIMED))
     reason = "\n".join([reason, *(f"not {line}" for line in told)])
     return Choice(METHODS[name], found.dt, error, seconds, int(found.run.steps.accepted), stiffness, reason)
@@ -294,12 +292,6 @@ def _is_able(
 def _path(run: Solution) -> np.ndarray:
     """q at the samples, (K, N)."""
     return np.concatenate([np.reshape(x, (len(run.t), -1)) for x in jax.tree.leaves(run.q)], axis=1)
-
-
-def _motion(run: Solution) -> float:
-    """The RMS of q about its mean."""
-    path = _path(run)
-    return float(rms(path - path.mean(axis=0)))
 
 
 def _size(q0: PyTree) -> float:

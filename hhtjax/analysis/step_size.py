@@ -300,7 +300,7 @@ def _errors_of_runs(counts: list, paths: list, order: int) -> np.ndarray:
     """Of all runs but the finest, which has an error of its own, by Richardson's extrapolation."""
     finest = paths[-1]
     with np.errstate(over="ignore", invalid="ignore"):
-        motion = rms(finest - finest.mean(axis=0)) if np.isfinite(finest).all() else np.nan
+        motion = motion_of(finest) if np.isfinite(finest).all() else np.nan
         errors = []
         for n, path in zip(counts[:-1], paths[:-1], strict=True):
             hit = min(n, SAMPLES)
@@ -311,7 +311,13 @@ def _errors_of_runs(counts: list, paths: list, order: int) -> np.ndarray:
 
 
 def rms(x: np.ndarray) -> Real:
+    """The root of the mean square."""
     return np.sqrt(np.mean(x**2))
+
+
+def motion_of(path: np.ndarray) -> Real:
+    """The RMS of a path (K, n) about its mean."""
+    return rms(path - path.mean(axis=0))
 
 
 @jax.jit

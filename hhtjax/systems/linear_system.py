@@ -215,22 +215,19 @@ def shapes_of_matrices(caller: str, system: LinearSystem, params: PyTree):
     return {name: evaluate(caller, name, A, params) if callable(A) else A for name, A in given.items()}
 
 
-def is_sparse(system: LinearSystem | System | FirstOrderSystem, params: PyTree) -> bool:
-    """Whether it is a linear system with sparse matrices."""
-    if not isinstance(system, LinearSystem):
-        return False
-    return any(isinstance(A, Sparse) for A in shapes_of_matrices("is_sparse", system, params).values())
+def sparse_matrices(caller: str, system: LinearSystem | System | FirstOrderSystem, params: PyTree) -> dict:
+    """Of a linear system those matrices that are sparse, by name; none of another."""
+    found = shapes_of_matrices(caller, system, params) if isinstance(system, LinearSystem) else {}
+    return {name: A for name, A in found.items() if isinstance(A, Sparse)}
 
 
 def require_dense(caller: str, system: LinearSystem | System | FirstOrderSystem, params: PyTree):
     """An error for a linear system with sparse matrices."""
-    if isinstance(system, LinearSystem):
-        for name, A in shapes_of_matrices(caller, system, params).items():
-            if isinstance(A, Sparse):
-                raise NotImplementedError(
-                    f"{caller}: `{name}` must be an array; received a sparse matrix of {len(A)} rows: "
-                    "hhtjax.analysis.modal_reduction reduces a system to its lowest modes, K.toarray() makes an array."
-                )
+    for name, A in sparse_matrices(caller, system, params).items():
+        raise NotImplementedError(
+            f"{caller}: `{name}` must be an array; received a sparse matrix of {len(A)} rows: "
+            "hhtjax.analysis.modal_reduction reduces a system to its lowest modes, K.toarray() makes an array."
+        )
 
 
 def with_known_matrices(
