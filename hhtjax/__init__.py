@@ -63,7 +63,7 @@ from hhtjax.identification.refinement import refine
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sensors import accelerometer, measure, windows
 from hhtjax.identification.transforms import bounded, fixed, positive
-from hhtjax.numerics.structured_solve import banded, conjugate_gradients
+from hhtjax.numerics.structured_solve import banded, conjugate_gradients, sparse_lu
 from hhtjax.runs.adaptive import adaptive
 from hhtjax.runs.controlled_run import choose_steps
 from hhtjax.runs.error_control import Steps
@@ -83,6 +83,7 @@ from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.taylor import taylor
 from hhtjax.systems import interop
+from hhtjax.systems.elements import Elements, Joints
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.initial_conditions import ConsistentInitial, PrecisionWarning, consistent_initial
 from hhtjax.systems.matrices import sparse
@@ -94,11 +95,11 @@ from hhtjax.xla import Explanation, explain, keep_programs, plain
 __all__ = [  # noqa: RUF022
     "__version__", "analysis", "bodies", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
-    "FirstOrderSystem", "LinearSystem", "System", "ConsistentInitial", "consistent_initial", "JumpWarning",
-    "PrecisionWarning", "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled", "sparse",
-    "spline_gain_error",
+    "FirstOrderSystem", "LinearSystem", "System", "Elements", "Joints", "ConsistentInitial", "consistent_initial",
+    "JumpWarning", "PrecisionWarning", "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled",
+    "sparse", "spline_gain_error",
     # steppers
-    "Info", "State", "Stepper", "banded", "conjugate_gradients",
+    "Info", "State", "Stepper", "banded", "conjugate_gradients", "sparse_lu",
     "bossak", "conventional_hht", "dop853", "dopri5", "extrapolated", "generalized_alpha", "hht", "houbolt",
     "implicit_euler", "kim_hht", "kim_implicit_euler", "newmark", "operator_splitting", "park", "rk4", "rodas5p",
     "rosenbrock", "rowda", "taylor", "tsit5", "wilson",

@@ -14,7 +14,8 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_integer
 from hhtjax.description import Array, Description, PyTree, Real, is_concrete
 from hhtjax.description.presentation import shown
-from hhtjax.numerics.sparse_matrix import Sparse, is_positive_definite
+from hhtjax.numerics.sparse_matrix import Sparse
+from hhtjax.numerics.superlu import is_positive_definite
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import SYMMETRIC, constant_matrix, is_sparse, require_mass
 

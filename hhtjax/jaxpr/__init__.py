@@ -29,6 +29,7 @@ an entry. Random programs of all operations are compared by `python tests/progra
 looks at what XLA compiled.
 """
 
+from hhtjax.jaxpr.dependencies import dependencies as dependencies
 from hhtjax.jaxpr.linear_maps import linear_map as linear_map
 from hhtjax.jaxpr.listing import Listing as Listing
 from hhtjax.jaxpr.listing import Scalar as Scalar

@@ -17,7 +17,8 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree, Real
-from hhtjax.numerics.sparse_matrix import Sparse, factorize_sparse
+from hhtjax.numerics.sparse_matrix import Sparse
+from hhtjax.numerics.superlu import factorize_sparse
 from hhtjax.primitives import Bilinear, choose, structural
 
 UNROLLED = 8

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from hashlib import blake2b
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree, Real
-from hhtjax.primitives import on_host
+from hhtjax.numerics.sparsity import dissected
 
 PADDING = 2  # slots for each entry, up to which all entries have places in layers
 WRITTEN_OUT = 32  # layers, up to which a product is one loop
@@ -26,7 +25,8 @@ class Pattern:
     `width` gathers. What a few long rows have beyond is behind. Equal patterns are equal.
     """
 
-    def __init__(self, n: int, rows: np.ndarray, columns: np.ndarray):
+    def __init__(self, n: int, rows: np.ndarray, columns: np.ndarray, free: int | None = None):
+        """free: number of unknowns that elimination may take in any order; those behind are multipliers."""
         self.n, self.rows, self.columns = n, rows.astype(np.int32), columns.astype(np.int32)
         counts = np.bincount(rows, minlength=n)
         longest, nnz = int(counts.max(initial=1)), len(rows)
@@ -36,7 +36,8 @@ class Pattern:
         self.slots = np.where(late, self.width * n + np.cumsum(late) - 1, rank * n + rows).astype(np.int32)
         self.tail = rows[late].astype(np.int32), columns[late].astype(np.int32)
         self.size = self.width * n + int(late.sum())
-        digest = blake2b(np.array([n]).tobytes(), digest_size=16)
+        self.free = n if free is None else free
+        digest = blake2b(np.array([n, self.free]).tobytes(), digest_size=16)
         for x in (self.rows, self.columns):
             digest.update(x.tobytes())
         self.digest = digest.digest()
@@ -65,11 +66,36 @@ class Pattern:
         found[self.slots] = True
         return found
 
+    @cached_property
+    def elimination(self) -> Elimination:
+        """The order in which it is eliminated, with little fill."""
+        from scipy.sparse import csr_array
+
+        entries = csr_array((np.ones(len(self.rows), bool), (self.rows, self.columns)), shape=(self.n, self.n))
+        order = dissected(entries, self.free)
+        place = np.empty(self.n, np.intc)
+        place[order] = np.arange(self.n, dtype=np.intc)
+        rows, columns = place[self.rows], place[self.columns]
+        sort = np.lexsort((rows, columns))
+        starts = np.concatenate([[0], np.cumsum(np.bincount(columns, minlength=self.n))]).astype(np.intc)
+        return Elimination(order, self.slots[sort], rows[sort], columns[sort], starts)
+
     def spread(self, numbers: np.ndarray) -> np.ndarray:
         """Those of the entries, in their slots."""
         found = np.zeros(self.size, np.result_type(numbers))
         found[self.slots] = numbers
         return found
+
+
+class Elimination(NamedTuple):
+    """The columns of a matrix in an order, as SuperLU takes them. order: (n,), the unknowns; slots, rows, columns: of
+    each entry; starts: of each column."""
+
+    order: np.ndarray
+    slots: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+    starts: np.ndarray
 
 
 @jax.tree_util.register_pytree_node_class
@@ -224,120 +250,3 @@ def union(*patterns: Pattern):
         place[pattern.slots[np.searchsorted(every, key)]] = p.slots
         places.append(place)
     return pattern, places
-
-
-# ----------------------------------------------------------------------------
-# Solves with sparse matrices: SciPy's SuperLU, factorised once, called by the program where it runs.
-#
-# A program carries the numbers of a matrix and a digest of them, and no factors. These are kept here, the last KEPT of
-# them, by digest; what is missing is factorised again. So a solve is a pure function, which JAX may call as often as it
-# likes, and may move, batch or leave out.
-
-
-KEPT = 4  # factors, of a batch those of all members twice
-WORDS = 4  # of a digest
-LEFT = 1e4  # roundings that a solve may leave with pivots on the diagonal, before they are chosen freely
-
-_factors: OrderedDict = OrderedDict()
-_lock = threading.Lock()
-
-
-def factorize_sparse(A: Sparse):
-    """The function (b, trans=0) -> A^-1 b, or A^-T b, with a `Sparse` A factorised once and constant to autodiff.
-
-    A singular A gives NaN.
-    """
-    values = lax.stop_gradient(A.values)
-    digest = on_host(partial(_factorize, A.pattern), jax.ShapeDtypeStruct((WORDS,), jnp.uint32), values)
-
-    def apply(b: Array, trans: int = 0) -> Array:
-        return on_host(partial(_solve, A.pattern, trans), jax.ShapeDtypeStruct(b.shape, b.dtype), digest, values, b)
-
-    return apply
-
-
-def _factorize(pattern: Pattern, values: np.ndarray) -> np.ndarray:
-    """(..., WORDS): the digests of values (..., slots), whose factors are kept."""
-    values = np.asarray(values)
-    flat = values.reshape(-1, values.shape[-1])
-    digests = [blake2b(x.tobytes(), digest_size=4 * WORDS).digest() for x in flat]
-    _obtain(pattern, digests, flat)
-    return np.frombuffer(b"".join(digests), np.uint32).reshape(*values.shape[:-1], WORDS)
-
-
-def _solve(pattern: Pattern, trans: int, digests: np.ndarray, values: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(..., n): of a batch as `on_host` hands it over."""
-    digests, values, b = map(np.asarray, (digests, values, b))
-    number = digests.size // WORDS
-    keys = [x.tobytes() for x in digests.reshape(number, WORDS)]
-    matrices = np.broadcast_to(values, (*digests.shape[:-1], values.shape[-1])).reshape(number, -1)
-    factors = _obtain(pattern, keys, matrices)
-    shape = np.broadcast_shapes(digests.shape[:-1], b.shape[:-1])
-    which = np.broadcast_to(np.arange(number).reshape(digests.shape[:-1]), shape).ravel()
-    b = np.broadcast_to(b, (*shape, pattern.n)).reshape(-1, pattern.n)
-    if number == 1:
-        return _substitute(factors[0], b.T, trans).T.reshape(*shape, pattern.n)
-    return np.stack([_substitute(factors[i], x, trans) for i, x in zip(which, b, strict=True)]).reshape(*shape, -1)
-
-
-def _substitute(factors, b: np.ndarray, trans: int) -> np.ndarray:
-    """NaN where there are no factors."""
-    return np.full_like(b, np.nan) if factors is None else factors.solve(b, "T" if trans else "N")
-
-
-def _obtain(pattern: Pattern, digests: list, values: np.ndarray):
-    """The factors of these matrices, as those used last."""
-    found = []
-    for digest, x in zip(digests, values, strict=True):
-        key = pattern.digest, x.dtype.char, digest
-        with _lock:
-            factors = _factors.pop(key, _MISSING)
-        if factors is _MISSING:
-            factors = superlu(pattern, x)
-        with _lock:
-            _factors[key] = factors
-        found.append(factors)
-    with _lock:
-        while len(_factors) > max(KEPT, 2 * len(found)):
-            _factors.popitem(last=False)
-    return found
-
-
-_MISSING = object()
-
-
-def superlu(pattern: Pattern, values: np.ndarray):
-    """SuperLU's factors; None of a matrix that is singular, or not finite.
-
-    In the mode for matrices with large diagonals and symmetric patterns, which finite elements have: half the fill of
-    free pivoting. Where that loses digits pivots are free.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.linalg import splu
-
-    starts = np.concatenate([[0], np.cumsum(np.bincount(pattern.rows, minlength=pattern.n))])
-    A = csr_array((values[pattern.slots], pattern.columns, starts), shape=(pattern.n, pattern.n)).tocsc()
-    if not np.all(np.isfinite(values)):
-        return None
-    b = A @ np.ones(pattern.n, values.dtype)
-    enough = LEFT * np.finfo(values.dtype).eps * np.max(abs(A) @ np.ones(pattern.n, values.dtype))
-    symmetric = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.001, "options": {"SymmetricMode": True}}
-    for options in (symmetric, {}):
-        try:
-            factors = splu(A, **options)
-        except RuntimeError:  # a pivot is zero
-            continue
-        if np.max(np.abs(A @ factors.solve(b) - b)) <= enough:
-            return factors
-    return None
-
-
-def is_positive_definite(A):
-    """Whether a symmetric matrix of scipy.sparse is so, by the signs of its pivots."""
-    from scipy.sparse.linalg import splu
-
-    try:
-        factors = splu(A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    except RuntimeError:  # singular
-        return False
-    return np.array_equal(factors.perm_r, factors.perm_c) and np.min(factors.U.diagonal()) > 0

@@ -12,12 +12,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.sparse.linalg import cg
 
 from hhtjax.checks import require_integer, require_number
 from hhtjax.description import Array, PyTree, Real
-from hhtjax.numerics.linear_solve import Structured, solve
+from hhtjax.numerics.block_tridiagonal import factorize_blocks, solve_blocks
+from hhtjax.numerics.linear_solve import Structured
+from hhtjax.numerics.sparsity import pattern_of
 
 
 @dataclass(frozen=True)
@@ -29,10 +32,18 @@ class Banded(Structured):
 
     def of_map(self, f: Callable, like: PyTree):
         """(b, trans=0) -> A^-1 b, or A^-T b."""
-        bands = lax.stop_gradient(find_bands(f, like, self.half_bandwidth))
-        transposed = jnp.stack([jnp.roll(band, i - self.half_bandwidth) for i, band in enumerate(bands)])[::-1]
-        solve_bands = solve_tridiagonal if self.half_bandwidth == 1 else solve_blocks
-        return lambda b, trans=0: solve_bands(transposed if trans else bands, b)
+        p, n = self.half_bandwidth, like.size
+        bands = lax.stop_gradient(find_bands(f, like, p))
+        if p == 1:
+            transposed = jnp.stack([jnp.roll(band, i - p) for i, band in enumerate(bands)])[::-1]
+            return lambda b, trans=0: solve_tridiagonal(transposed if trans else bands, b)
+        factors = factorize_blocks(*blocks_of(bands))
+
+        def apply(b: Array, trans: int = 0) -> Array:
+            rows = jnp.pad(b, (0, -n % p)).reshape(-1, p)
+            return solve_blocks(factors, rows, trans).ravel()[:n]
+
+        return apply
 
 
 @dataclass(frozen=True)
@@ -109,6 +120,54 @@ def conjugate_gradients(iterations: int, tolerance: Real = None) -> ConjugateGra
     return ConjugateGradients(iterations, _tolerance("conjugate_gradients", tolerance))
 
 
+@dataclass(frozen=True, eq=False)
+class Detected(Structured):
+    """A sparse matrix, of which the pattern is given, or follows from what the functions of a system read."""
+
+    pattern: Any = None
+    tolerance: Any = None
+
+
+def sparse_lu(pattern: Any = "auto", tolerance: Real = None) -> Detected:
+    """For the `solve` of a stepper: LU factorisation of a sparse matrix, of any system, constraints included.
+
+    Its entries are found by products with a few vectors, one for each colour of its columns (Curtis, Powell, Reid
+    1974), and eliminated along the unknowns where these can be put in a row of small blocks, else by SuperLU. It pays
+    from some 30 unknowns on. A `System.from_elements` needs none of it: its own solve knows the elements.
+
+    Args:
+        pattern: (n, n), of scipy.sparse or an array, not zero wherever a force, or M, may depend on an unknown, in the
+            order of the leaves of v. "auto": what is read from the functions of the system as they are traced.
+        tolerance: as in `banded`.
+
+    Returns:
+        What `hht(solve=...)` takes.
+
+    Raises:
+        TypeError, ValueError: a pattern that is none, or not square; a tolerance that is not positive.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> def links(q, t, params):                                                      # 40 pendulums, each on the next
+    ...     return jnp.sum(jnp.diff(q, prepend=0.0, axis=0) ** 2, axis=1) - 1.0
+    >>> chain = hhtjax.System(jnp.ones(80), lambda q, v, t, params: jnp.tile(jnp.array([0.0, -9.81]), (40, 1)), links)
+    >>> start = jnp.stack([jnp.arange(1.0, 41.0), jnp.zeros(40)], axis=1)
+    >>> def end(solve):
+    ...     stepper = hhtjax.hht(linearize="predictor", solve=solve)
+    ...     return hhtjax.simulate(chain, stepper, start, 0 * start, dt=0.01, num_steps=20).q[-1]
+    >>> bool(jnp.allclose(end(hhtjax.sparse_lu()), end(None), atol=1e-9))
+    True
+    """
+    tolerance = _tolerance("sparse_lu", tolerance)
+    if isinstance(pattern, str):
+        if pattern != "auto":
+            raise ValueError(f'sparse_lu: `pattern` must be "auto", or a matrix (n, n); received {pattern!r}.')
+        return Detected(None, tolerance)
+    shape = np.shape(pattern) if not hasattr(pattern, "nnz") else pattern.shape
+    if len(shape) != 2 or shape[0] != shape[1]:
+        raise ValueError(f"sparse_lu: `pattern` must have shape (n, n); received shape {shape}.")
+    return Detected(pattern_of(pattern), tolerance)
+
+
 def _tolerance(caller: str, value):
     """As a number, which is part of the program."""
     return None if value is None else float(require_number(caller, "tolerance", value, lambda x: x > 0, "be positive"))
@@ -131,41 +190,17 @@ def solve_tridiagonal(bands: Array, b: Array) -> Array:
     return lax.linalg.tridiagonal_solve(lower, diagonal, upper, b[:, None])[:, 0]
 
 
-def solve_blocks(bands: Array, b: Array) -> Array:
-    """x with A x = b, by elimination on the blocks (p, p) of a block tridiagonal A."""
-    p, n = len(bands) // 2, b.size
+def blocks_of(bands: Array) -> tuple[Array, Array, Array]:
+    """(N, p, p) each: the blocks before, on and behind the diagonal, those at the end filled with the identity."""
+    p, n = len(bands) // 2, bands.shape[1]
     num_blocks = -(-n // p)
-    fill = num_blocks * p - n
-    bands = jnp.pad(bands, ((0, 0), (0, fill)))
-    bands = bands.at[p, n:].set(1)
-    b = jnp.pad(b, (0, fill)).reshape(num_blocks, p)
-    row, column = jnp.arange(p)[:, None], jnp.arange(p)[None, :]
+    bands = jnp.pad(bands, ((0, 0), (0, num_blocks * p - n))).at[p, n:].set(1)
+    row, column = np.arange(p)[:, None], np.arange(p)[None, :]
     rows = bands.reshape(2 * p + 1, num_blocks, p)
 
     def blocks(shift: int) -> Array:
-        """(num_blocks, p, p): the columns `shift` blocks to the right of the diagonal."""
         d = column - row + shift * p
-        found = rows[jnp.clip(d + p, 0, 2 * p), :, row]
+        found = rows[np.clip(d + p, 0, 2 * p), :, row]
         return jnp.moveaxis(jnp.where((abs(d) <= p)[:, :, None], found, 0), -1, 0)
 
-    def eliminate(carry: tuple, block: tuple):
-        upper, y = carry  # of the block above: x = y - upper x_next
-        L, D, U, b = block
-        both = solve_columns(D - L @ upper, jnp.concatenate([U, (b - L @ y)[:, None]], axis=1))
-        carry = both[:, :p], both[:, p]
-        return carry, carry
-
-    def substitute(x: Array, block: tuple):
-        upper, y = block
-        x = y - upper @ x
-        return x, x
-
-    zero = jnp.zeros((p, p), b.dtype), jnp.zeros(p, b.dtype)
-    _, eliminated = lax.scan(eliminate, zero, (blocks(-1), blocks(0), blocks(1), b))
-    _, x = lax.scan(substitute, zero[1], eliminated, reverse=True)
-    return x.reshape(-1)[:n]
-
-
-def solve_columns(A: Array, B: Array) -> Array:
-    """X with A X = B."""
-    return jax.vmap(lambda b: solve(A, b), 1, 1)(B)
+    return blocks(-1), blocks(0), blocks(1)

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Unpack
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real, is_concrete
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import Structured, factorize_with
+from hhtjax.numerics.sparse_lu import SparseLU
+from hhtjax.numerics.structured_solve import Detected
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
 from hhtjax.steppers.friction import begin_friction, bind_friction, smoothed_friction
 from hhtjax.steppers.implicit_solve import (
@@ -32,8 +34,11 @@ from hhtjax.steppers.stepper import Info, State, Stepper, join_info
 from hhtjax.steppers.variable_step import Controlled
 from hhtjax.systems import kinematics
 from hhtjax.systems.constraints import factorize_constrained
+from hhtjax.systems.step_sparsity import detected
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from hhtjax.systems.flat_system import FlatSystem
 
 
@@ -82,6 +87,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         given = self.options.solve
         if system.matrices is not None and not (given is None or isinstance(given, Structured)):
             raise NotImplementedError(f"hht: leave out `solve` with sparse matrices; received {given!r}.")
+        system = self.seen(system, params, q.dtype)
         if system.friction is not None:
             return begin_friction(self, system, q, v, t, params, dt)
         if system.num_constraints:
@@ -103,7 +109,8 @@ class GeneralizedAlpha(Controlled, Stepper):
         if self.options.start == "simple" or not system.positions or (resolves and not self.corrects(system)):
             return state
         smooth = smoothed if system.friction is None else smoothed_friction
-        return smooth(self, system.settled(params), state, params, dt, moves, resolves, alone)
+        system = self.seen(system, params, dt.dtype)
+        return smooth(self, system, state, params, dt, moves, resolves, alone)
 
     def jumped(
         self, system: FlatSystem, before: State, after: State, old: PyTree, new: PyTree, dt: Array, answer: Callable
@@ -111,7 +118,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
         if self.options.start == "simple" or not system.positions:
             return after
-        system = system.settled(new)
+        system = self.seen(system, new, dt.dtype)
 
         def again(s, params: PyTree, dt: Array):
             start = begin_friction(self, system, s.q, s.v, s.t, params, dt)
@@ -123,7 +130,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     def grown(self, system: FlatSystem, state: State, params: PyTree, dt: Array) -> State:
         """The state, or where what damps is too stiff for dt a smooth start from it."""
         smooth = smoothed if system.friction is None else smoothed_friction
-        return grown(self, system.settled(params), state, params, dt, smooth)
+        return grown(self, self.seen(system, params, dt.dtype), state, params, dt, smooth)
 
     def throws(self, system: FlatSystem) -> bool:
         """Unless there are no positions, or the recursion is to be literal."""
@@ -153,6 +160,23 @@ class GeneralizedAlpha(Controlled, Stepper):
         """A -> (b, trans) -> A^-1 b: the library's LU, or the user's solve."""
         return factorize if self.options.solve is None else factorize_with(self.options.solve)
 
+    def seen(self, system: FlatSystem, params: PyTree, dtype: np.dtype) -> FlatSystem:
+        """The system with these params, and with the sparse solve that the options, or its elements, ask for."""
+        system, given = system.settled(params), self.options.solve
+        if isinstance(given, Detected):
+            if system.friction is not None or system.matrices is not None or self.redundant is not None:
+                raise NotImplementedError(
+                    "hht: leave out `solve` with dry friction, sparse matrices or redundant constraints; received "
+                    f"{given!r}."
+                )
+            if system.sparse is not None and system.sparse.tolerance == given.tolerance and given.pattern is None:
+                return system
+            found = cache(lambda: detected(system, params, dtype, given.pattern))
+            return system._replace(sparse=SparseLU(lambda size: found().plan(size), given.tolerance))
+        if system.sparse is not None and (given is not None or self.redundant is not None):
+            return system._replace(sparse=None)
+        return system
+
     @property
     def redundant(self):
         """How constraints that depend on each other are solved."""
@@ -160,6 +184,8 @@ class GeneralizedAlpha(Controlled, Stepper):
 
     def factorize_for(self, system: FlatSystem):
         """The same for constrained systems, whose rows may be redundant."""
+        if system.sparse is not None:
+            return system.sparse
         if isinstance(self.options.solve, Structured):
             raise NotImplementedError(f"hht: leave out `solve` with constraints; received {self.options.solve!r}.")
         if self.redundant is None and self.options.solve is not None:
@@ -184,7 +210,7 @@ class GeneralizedAlpha(Controlled, Stepper):
             return self.factorize_for(system)
         if system.linear and system.friction is None:
             return factorized_once(self, system, params, dt)
-        return linear_part(self, system, params, dt) or self.factorize
+        return linear_part(self, system, params, dt) or system.sparse or self.factorize
 
     def factors_of(self, system: FlatSystem, dt: Array):
         """The `Factors` of a linear system of constant matrices, for those who make them once for many runs."""
@@ -192,7 +218,7 @@ class GeneralizedAlpha(Controlled, Stepper):
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The step; for a linear system its matrix is factorised here, once."""
-        system = system.settled(params)
+        system = self.seen(system, params, dt.dtype)
         if system.friction is not None:
             return bind_friction(self, system, params, dt, linear_part(self, system, params, dt))
         if system.num_constraints:

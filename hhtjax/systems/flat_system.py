@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -14,14 +14,19 @@ from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import check_like, check_matrix, count, describe, evaluate, telling_of_arguments
 from hhtjax.description import Array, PyTree, Real, thaw
-from hhtjax.numerics.dense_lu import by_factors, factorize, matvec
-from hhtjax.numerics.linear_solve import reuse, solver
+from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, matvec
+from hhtjax.numerics.linear_solve import factorize_map, reuse, solver
+from hhtjax.numerics.sparse_lu import SparseLU
 from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.primitives import consistent
 from hhtjax.systems import kinematics
+from hhtjax.systems.assembly import ElementForce
+from hhtjax.systems.elements import parts_of
 from hhtjax.systems.friction import FrictionLaw, flat_friction
+from hhtjax.systems.held_nodes import Held, at, require_start
 from hhtjax.systems.linear_system import with_known_matrices
 from hhtjax.systems.matrices import as_matrix
+from hhtjax.systems.step_sparsity import Sparsity, of_elements
 from hhtjax.systems.system import DynamicsMass, FirstOrderSystem, LinearSystem, mass_at, product_at, timed
 
 if TYPE_CHECKING:
@@ -59,6 +64,8 @@ class FlatSystem(NamedTuple):
     diagonals: Callable | None = None  # params -> M, C, K (None where absent), where all of them are diagonals (n,)
     massless: Array | None = None  # G with M G M = M, where M is singular
     factors: Factors | None = None  # `Factors` for the steps of a run, where they are known before it
+    sparse: SparseLU | None = None  # the solve of a step whose unknowns are known to meet few others
+    told: Callable | None = None  # state, params -> the state with what is held as it is told
 
     def settled(self, params: PyTree) -> FlatSystem:
         """What `settle` gives, where there is something to settle."""
@@ -101,7 +108,11 @@ class FlatSystem(NamedTuple):
             return partial(self._of_positions, partial(matvec, jnp.asarray(self.massless).astype(M.dtype)))
         if self.factors is not None and self.factors.mass is not None:
             factorize = reuse(factorize, by_factors(self.factors.mass))
-        inverse = (lambda Q: Q / M) if M.ndim == 1 else solver(M, factorize)
+        if M.ndim == 1:
+            return partial(self._of_positions, lambda Q: Q / M)
+        if self.sparse is not None:
+            return factorize_map(partial(matvec, M), jnp.zeros(self.size, M.dtype), self.sparse)
+        inverse = solver(M, factorize)
         return partial(self._of_positions, inverse)
 
     def with_ones(self, d: Array) -> Array:
@@ -150,7 +161,8 @@ class FlatSystem(NamedTuple):
         return self.with_internal(kinematics.in_chart(self.blocks, *map(self.located, (x, v, w))), w)
 
     def tidy(self, state):
-        """The state at the end of a step, its rotations orthogonal to rounding."""
+        """The state at the end of a step: what is held as it is told, and rotations orthogonal to rounding."""
+        state = state if self.told is None else self.told(state)
         return state._replace(q=kinematics.orthonormalize(self.blocks, state.q))
 
     def _of_positions(self, f: Callable, x: Array) -> Array:
@@ -227,9 +239,37 @@ def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real,
         flat = with_known_matrices(caller, system, flat, on_vectors, dtype, params)
     if system.internal is not None:
         flat, q, v = _with_internal(system, flat, q, v0, z0)
+    if not linear and isinstance(system.force, ElementForce):
+        flat = _with_elements(system, flat, q0, v0, t0, params)
     if system.friction is not None:
         flat = flat._replace(friction=flat_friction(caller, system, flat, q0, v0, z0, t0, params))
     return flat, q, v
+
+
+def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0: Real, params: PyTree) -> FlatSystem:
+    """The system with the solve that follows from where its elements are, and with what is held."""
+    force, constraint = system.force, system.constraint
+    assert isinstance(force, ElementForce)
+    require_start(force.held, q0, v0, t0, params)
+    like = jax.eval_shape(lambda *x: jax.tree.map(jnp.asarray, x), q0, v0, t0, params)
+    joints = parts_of(None if constraint is None else constraint.joints)
+
+    @cache
+    def sparsity() -> Sparsity:
+        return of_elements(parts_of(force.elements), force.mass.parts, joints, flat, like)
+
+    def settle(params: PyTree) -> FlatSystem:
+        return flat._replace(settle=None, told=partial(_told, force.held, flat, thaw(params)))
+
+    if flat.size + 2 * flat.num_constraints > LOOPED:
+        flat = flat._replace(sparse=SparseLU(lambda size: sparsity().plan(size)))
+    return flat._replace(settle=settle) if force.held is not None and force.held.moves else flat
+
+
+def _told(held: Held, flat: FlatSystem, params: PyTree, state):
+    """A state with positions and velocities as they are told."""
+    q, v = at(held, flat.unravel(state.q), flat.unravel_rates(state.v), state.t, params)
+    return state._replace(q=ravel_pytree(q)[0], v=ravel_pytree(v)[0])
 
 
 def _with_dynamics(caller: str, system, flat: FlatSystem, dtype, q0: PyTree, v0: PyTree, t0: Real, params, z0: PyTree):

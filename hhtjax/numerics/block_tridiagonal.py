@@ -1,0 +1,106 @@
+"""Elimination on the blocks of a block tridiagonal matrix: so many operations for each block, however many there are.
+
+    A x = b,    L_i x_{i-1} + D_i x_i + U_i x_{i+1} = b_i
+
+    S_i = D_i - L_i W_{i-1},   W_i = S_i^-1 U_i              once for a matrix
+    y_i = S_i^-1 (b_i - L_i y_{i-1}),   x_i = y_i - W_i x_{i+1}
+
+Pivots are chosen within a block, and blocks are taken in their order. That is enough for positive definite matrices,
+and for saddle points in which no row of a constraint comes before an unknown that it holds: each part of the matrix
+that has been eliminated is then that of a smaller mechanism. Loops over the blocks stay in a kernel.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.description import Array
+
+
+class BlockFactors(NamedTuple):
+    """Of a matrix: L, S^-1 and W, (N, b, b) each."""
+
+    lower: Array
+    inverse: Array
+    ahead: Array
+
+
+def factorize_blocks(lower: Array, middle: Array, upper: Array) -> BlockFactors:
+    """Of the matrix of these blocks (N, b, b); the first of `lower` and the last of `upper` are not read."""
+    b = middle.shape[-1]
+
+    def eliminate(before: Array, blocks: tuple):
+        L, D, U = blocks
+        S = invert_block(D - product(L, before))
+        W = product(S, U)
+        return W, (S, W)
+
+    none = jnp.zeros((b, b), middle.dtype)
+    lower = lower.at[0].set(0)
+    _, (inverse, ahead) = lax.scan(eliminate, none, (lower, middle, upper))
+    return BlockFactors(lower, inverse, ahead)
+
+
+def solve_blocks(factors: BlockFactors, b: Array, trans: int = 0) -> Array:
+    """x with A x = b, or A^T x = b: (N, b)."""
+    L, S, W = factors
+    zero = jnp.zeros_like(b[0])
+
+    def forward(y: Array, block: tuple):
+        L, S, b = block
+        y = times(S, b - times(L, y))
+        return y, y
+
+    def backward(x: Array, block: tuple):
+        W, y = block
+        x = y - times(W, x)
+        return x, x
+
+    def forward_transposed(carry: Array, block: tuple):
+        W, b = block
+        z = b - carry
+        return times_transposed(W, z), z
+
+    def backward_transposed(carry: Array, block: tuple):
+        L, S, z = block
+        x = times_transposed(S, z - carry)
+        return times_transposed(L, x), x
+
+    if trans:
+        _, z = lax.scan(forward_transposed, zero, (W, b))
+        return lax.scan(backward_transposed, zero, (L, S, z), reverse=True)[1]
+    _, y = lax.scan(forward, zero, (L, S, b))
+    return lax.scan(backward, zero, (W, y), reverse=True)[1]
+
+
+def product(A: Array, B: Array) -> Array:
+    """A B, column by column of A: fewer operations to compile than rows times columns."""
+    return sum((A[:, k, None] * B[None, k, :] for k in range(1, A.shape[1])), A[:, 0, None] * B[None, 0, :])
+
+
+def times(A: Array, x: Array) -> Array:
+    """A x."""
+    return sum((A[:, k] * x[k] for k in range(1, A.shape[1])), A[:, 0] * x[0])
+
+
+def times_transposed(A: Array, x: Array) -> Array:
+    """A^T x."""
+    return sum((A[k] * x[k] for k in range(1, A.shape[0])), A[0] * x[0])
+
+
+def invert_block(A: Array) -> Array:
+    """A^-1 by Gauss and Jordan, rows exchanged for the largest pivot."""
+    n = len(A)
+    i = jnp.arange(n)
+
+    def eliminate(k, both: Array) -> Array:
+        pivot = jnp.argmax(jnp.where(i >= k, jnp.abs(both[:, k]), -1))
+        both = both[jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))]
+        row = both[k] / both[k, k]
+        return jnp.where((i == k)[:, None], row[None, :], both - both[:, k][:, None] * row[None, :])
+
+    both = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1)
+    return lax.fori_loop(0, n, eliminate, both)[:, n:]

@@ -1,0 +1,345 @@
+"""Systems of many small parts: elements between nodes, joints between them, and what holds some of them.
+
+Each part is a function of its own few nodes. From where it sits follows which unknowns meet, and with that how a step
+is solved: see `step_sparsity.py`, and `hhtjax.numerics.sparse_lu`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial, reduce
+from hashlib import blake2b
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hhtjax.checks import require_function, takes
+from hhtjax.description import Array, PyTree, Real, is_array, is_concrete
+
+FEW = 32  # nodes of a part whose forces are added one by one
+MOST_SHARED = 16  # elements at a node, up to which their forces are gathered
+
+
+class Fixed:
+    """A pytree of arrays that is part of the program: known by its numbers."""
+
+    def __init__(self, tree: PyTree):
+        self.tree = jax.tree.map(np.asarray, tree)
+        leaves, structure = jax.tree.flatten(self.tree)
+        digest = blake2b(digest_size=16)
+        for x in leaves:
+            digest.update(repr((x.shape, x.dtype.str)).encode() + np.ascontiguousarray(x).tobytes())
+        self._key = structure, digest.digest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Fixed) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __repr__(self):
+        return ", ".join(str(x.shape) for x in jax.tree.leaves(self.tree))
+
+
+@dataclass(frozen=True, repr=False)
+class _OnNodes:
+    """What elements and joints share: a function of some nodes, as often as there are rows of `nodes`."""
+
+    function: Callable
+    nodes: Any  # given as an array, kept as `Fixed`
+    each: Any = None
+
+    signatures: ClassVar = ()
+
+    def __post_init__(self):
+        name = type(self).__name__
+        signatures = [x + ", each" * (self.each is not None) for x in self.signatures]
+        if not callable(self.function) or not any(takes(self.function, x.count(",") + 1) for x in signatures):
+            require_function(name, "function", self.function, f"function({signatures[0]})")
+        nodes = self.nodes if isinstance(self.nodes, Fixed) else _checked_nodes(name, self.nodes)
+        object.__setattr__(self, "nodes", nodes)
+        if self.each is not None and not isinstance(self.each, Fixed):
+            each = self.each
+            if callable(each):
+                require_function(name, "each", each, "each(params)")
+            else:
+                each = Fixed(self._checked_each(each))
+            object.__setattr__(self, "each", each)
+
+    def __repr__(self):
+        return f"{type(self).__name__}({getattr(self.function, '__name__', self.function)}, {self.count} of them)"
+
+    @property
+    def count(self) -> int:
+        """E, how many there are."""
+        return len(jax.tree.leaves(self.nodes.tree)[0])
+
+    def own(self, tree: PyTree) -> PyTree:
+        """The leaves (E, k, ...) of a pytree with nodes as first axis."""
+        nodes = self.nodes.tree
+        if not isinstance(nodes, dict):
+            return _taken(type(self).__name__, tree, nodes)
+        unknown = [] if isinstance(tree, dict) else ["(no dict)"]
+        unknown = unknown or [key for key in nodes if key not in tree]
+        if unknown:
+            raise ValueError(
+                f"{type(self).__name__}: `nodes` has the keys {unknown}, which the position does not have."
+            )
+        return {key: _taken(type(self).__name__, tree[key], nodes[key]) for key in sorted(nodes)}
+
+    def dofs(self, v: PyTree) -> np.ndarray:
+        """(E, s): the numbers of the unknowns of each row, in the order in which its leaves are ravelled."""
+        return _numbers(self, v)
+
+    def own_numbers(self, params: PyTree, dtype: np.dtype) -> tuple:
+        """(each,) with leaves (E, ...), or (); and of the same structure the axes for vmap."""
+        if self.each is None:
+            return (), ()
+        each = self._checked_each(self.each(params)) if callable(self.each) else self.each.tree
+        each = jax.tree.map(
+            lambda x: x if jnp.issubdtype(jnp.result_type(x), jnp.integer) else jnp.asarray(x, dtype), each
+        )
+        return (each,), (jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, each),)
+
+    def _checked_each(self, each: PyTree) -> PyTree:
+        for path, x in jax.tree_util.tree_leaves_with_path(each):
+            if jnp.ndim(x) and jnp.shape(x)[0] != self.count:
+                raise ValueError(
+                    f"{type(self).__name__}: `each{jax.tree_util.keystr(path)}` must be a number, or have one row for "
+                    f"each of the {self.count} rows of `nodes`; received shape {jnp.shape(x)}."
+                )
+        return each
+
+
+@dataclass(frozen=True, repr=False)
+class Elements(_OnNodes):
+    """Elements of one kind between nodes, for `System.from_elements`.
+
+    Args:
+        function: the generalised force on the nodes of ONE element, `function(q, v, t, params)`: leaves (k, ...) of q
+            and v are those of its k nodes, and so are those of what it returns, structured like v (a dict may leave
+            keys out: no force). Slopes are taken of it: an element that cannot be differentiated at rest, such as a
+            cable whose length is 0, needs the care that functions need. In the place of `mass` it is M w of one
+            element, `function(q, w, params)`.
+        nodes: (E, k) integers, the nodes of each element; a dict of such where q is a dict of several sets of nodes,
+            which the function then gets by these keys.
+        each: what is different from element to element: a pytree of arrays (E, ...) and of numbers that all share, or a
+            function of params that gives one. The function then gets its own part as its last argument.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or shape.
+
+    >>> import jax.numpy as jnp, numpy as np, hhtjax
+    >>> def spring(q, v, t, params, each):
+    ...     pull = each["k"] * (q[1] - q[0])
+    ...     return jnp.stack([pull, -pull])
+    >>> hhtjax.Elements(spring, np.arange(4)[:, None] + [0, 1], each={"k": 3.0})
+    Elements(spring, 4 of them)
+    """
+
+    signatures: ClassVar = ("q, v, t, params", "q, w, params")  # of a force, and of a mass
+
+    def __call__(self, q: PyTree, v: PyTree, t: Real, params: PyTree) -> PyTree:
+        """The force on all nodes, structured like v."""
+        own, axes = self.own_numbers(params, _dtype(v))
+        force = jax.vmap(lambda q, v, *own: self._complete(v, self.function(q, v, t, params, *own)), (0, 0, *axes))
+        return self.added(v, force(self.own(q), self.own(v), *own))
+
+    def product(self, q: PyTree, w: PyTree, params: PyTree) -> PyTree:
+        """M w of all nodes, where the function gives that of one element."""
+        own, axes = self.own_numbers(params, _dtype(w))
+        product = jax.vmap(lambda q, w, *own: self._complete(w, self.function(q, w, params, *own)), (0, 0, *axes))
+        return self.added(w, product(self.own(q), self.own(w), *own))
+
+    def matrices(self, q: PyTree, v: PyTree, params: PyTree) -> Array:
+        """(E, s, s): the masses of the elements."""
+        own, axes = self.own_numbers(params, _dtype(v))
+
+        def matrix(q: PyTree, v: PyTree, *own) -> Array:
+            zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, v))
+
+            def of(x: Array) -> Array:
+                w = unravel(x)
+                return ravel_pytree(self._complete(w, self.function(q, w, params, *own)))[0]
+
+            return jax.jacfwd(of)(zero)
+
+        return jax.vmap(matrix, (0, 0, *axes))(self.own(q), self.own(v), *own)
+
+    def added(self, v: PyTree, forces: PyTree) -> PyTree:
+        """What leaves (E, k, ...) of the elements add up to at the nodes, structured like v."""
+        nodes = self.nodes.tree
+        if not isinstance(nodes, dict):
+            return jax.tree.map(partial(_summed, nodes), v, forces)
+        some = {key: jax.tree.map(partial(_summed, nodes[key]), v[key], forces[key]) for key in nodes}
+        return {key: some[key] if key in some else jax.tree.map(jnp.zeros_like, v[key]) for key in v}
+
+    def _complete(self, v: PyTree, force: PyTree) -> PyTree:
+        """A force of one element with zeros for the keys that it leaves out."""
+        if isinstance(v, dict) and isinstance(force, dict):
+            unknown = sorted(set(force) - set(v))
+            if unknown:
+                raise ValueError(f"Elements: `function` returned the keys {unknown}, which the velocity does not have.")
+            force = {key: force.get(key, jax.tree.map(jnp.zeros_like, v[key])) for key in v}
+        shapes = [jax.tree.map(jnp.shape, x) for x in (force, v)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"Elements: `function` must return a force structured like v of one element, of shapes {shapes[1]}; "
+                f"received {shapes[0]}."
+            )
+        return force
+
+
+@dataclass(frozen=True, repr=False)
+class Joints(_OnNodes):
+    """Joints of one kind between nodes, for `System.from_elements`: constraints of a few nodes each.
+
+    Args:
+        function: what is zero where ONE joint holds, `function(q, t, params)` -> (m,), its rows independent.
+        nodes, each: as of `Elements`.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or shape.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> def rod(q, t, params, each):
+    ...     return jnp.sum((q[1] - q[0]) ** 2)[None] - each["length"] ** 2
+    >>> hhtjax.Joints(rod, [[0, 1], [1, 2]], each={"length": jnp.array([1.0, 2.0])})
+    Joints(rod, 2 of them)
+    """
+
+    signatures: ClassVar = ("q, t, params",)
+
+    def __call__(self, q: PyTree, t: Real, params: PyTree) -> Array:
+        """The rows of all joints, (J m,)."""
+        own, axes = self.own_numbers(params, _dtype(q))
+        rows = jax.vmap(lambda q, *own: self.function(q, t, params, *own), (0, *axes))(self.own(q), *own)
+        if not is_array(rows) or jnp.ndim(rows) != 2:
+            raise ValueError("Joints: `function` must return the rows (m,) of one joint; received another shape.")
+        return rows.ravel()
+
+
+def _checked_nodes(name: str, nodes: PyTree) -> Fixed:
+    """The nodes as arrays of integers, or an error."""
+    parts = nodes if isinstance(nodes, dict) else {"": nodes}
+    found = {}
+    for key, x in parts.items():
+        where = f"nodes[{key!r}]" if key else "nodes"
+        if not is_concrete(x):
+            raise TypeError(f"{name}: `{where}` must be known while a program is traced; received a tracer.")
+        try:
+            x = np.asarray(x)
+        except ValueError:
+            x = np.empty(0)
+        if x.ndim != 2 or not x.size or x.dtype.kind not in "iu" or x.min() < 0:
+            raise ValueError(
+                f"{name}: `{where}` must be an array (E, k) of integers, 0 or more, a row for each; received "
+                f"{'an array of ' + str(x.dtype) if x.size else 'none'} of shape {x.shape}."
+            )
+        found[key] = x.astype(np.int32)
+    if len({len(x) for x in found.values()}) > 1:
+        raise ValueError(f"{name}: `nodes` must have as many rows for each key; received {nodes!r}.")
+    return Fixed(found if isinstance(nodes, dict) else found[""])
+
+
+def _taken(name: str, tree: PyTree, nodes: np.ndarray) -> PyTree:
+    """Leaves (E, k, ...) of these nodes."""
+
+    def take(x: Array) -> Array:
+        if not jnp.ndim(x) or nodes.max() >= x.shape[0]:
+            raise ValueError(
+                f"{name}: `nodes` names node {int(nodes.max())}, and a leaf of the state has shape {jnp.shape(x)}: the "
+                "first axis of all leaves is that of the nodes, counted from 0."
+            )
+        return jnp.asarray(x).at[nodes].get(mode="promise_in_bounds")
+
+    return jax.tree.map(take, tree)
+
+
+def _dtype(tree: PyTree) -> np.dtype:
+    return jnp.result_type(jax.tree.leaves(tree)[0])
+
+
+def _numbers(part: _OnNodes, v: PyTree) -> np.ndarray:
+    """(E, s): the unknowns of each element."""
+    start, numbers = 0, []
+    leaves, structure = jax.tree.flatten(v)
+    for x in leaves:
+        size = int(np.prod(np.shape(x), dtype=int))
+        numbers.append(np.arange(start, start + size, dtype=np.int32).reshape(np.shape(x)))
+        start += size
+    tree, nodes = structure.unflatten(numbers), part.nodes.tree
+    if isinstance(nodes, dict):
+        own = {key: jax.tree.map(lambda x, i=i: x[i], tree[key]) for key, i in sorted(nodes.items())}
+    else:
+        own = jax.tree.map(lambda x: x[nodes], tree)
+    return np.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(own)], axis=1)
+
+
+def _summed(nodes: np.ndarray, x: Array, forces: Array) -> Array:
+    """(N, ...) like x: what forces (E, k, ...) on these nodes add up to."""
+    number = np.shape(x)[0]
+    forces = forces.reshape(nodes.size, *np.shape(x)[1:])
+    if nodes.size <= FEW:
+        return jnp.zeros((number, *forces.shape[1:]), forces.dtype).at[nodes.ravel()].add(forces)
+    table = _table(nodes.ravel().tobytes(), number)
+    if table is None:
+        return jax.ops.segment_sum(forces, nodes.ravel(), number)
+    forces = jnp.concatenate([forces, jnp.zeros((1, *forces.shape[1:]), forces.dtype)])
+    return reduce(jnp.add, [forces.at[row].get(mode="promise_in_bounds") for row in table])
+
+
+@lru_cache(maxsize=256)
+def _table(places: bytes, number: int) -> np.ndarray | None:
+    """(d, number): which entries of a list come to each place, and its length where there are no more; None where there
+    are too many."""
+    return table_of(np.frombuffer(places, np.int32), number)
+
+
+def table_of(places: np.ndarray, number: int) -> np.ndarray | None:
+    """The same."""
+    count = np.bincount(places, minlength=number)
+    if count.max(initial=0) > MOST_SHARED:
+        return None
+    order = np.argsort(places, kind="stable")
+    rank = np.arange(len(places)) - (np.cumsum(count) - count)[places[order]]
+    found = np.full((max(1, int(count.max(initial=1))), number), len(places), np.int32)
+    found[rank, places[order]] = order
+    return found
+
+
+# ----------------------------------------------------------------------------
+# Sums of parts. Classes of functions: equal parts give equal systems, and what a function reads is looked at.
+
+
+@dataclass(frozen=True)
+class Sum:
+    """The sum of two forces, or of two products M w."""
+
+    first: Any
+    second: Any
+
+    def __call__(self, q: PyTree, v: PyTree, t: Real, params: PyTree) -> PyTree:
+        return jax.tree.map(jnp.add, self.first(q, v, t, params), self.second(q, v, t, params))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of two constraints, one behind the other."""
+
+    first: Any
+    second: Any
+
+    def __call__(self, q: PyTree, t: Real, params: PyTree) -> Array:
+        return jnp.concatenate([self.first(q, t, params), self.second(q, t, params)])
+
+
+def parts_of(x: Any) -> list:
+    """The elements, or joints, of a sum."""
+    if x is None:
+        return []
+    return parts_of(x.first) + parts_of(x.second) if isinstance(x, (Sum, Rows)) else [x]

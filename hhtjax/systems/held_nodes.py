@@ -1,0 +1,240 @@
+"""Nodes of a system of elements that stay where they start, or move as they are told.
+
+The acceleration of what is held is known, w = a(t), and takes the place of its row of the equations. Elements and
+joints see its position and velocity as they are told, so that no error of a step adds up there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax import rotation
+from hhtjax.checks import require_function
+from hhtjax.description import Array, PyTree, Real, all_concrete
+from hhtjax.systems.kinematics import is_rotation
+
+AGREES = 1e-6  # difference, relative to the size of a state, of a start from what is told
+
+
+@dataclass(frozen=True)
+class Still:
+    """What stays: True for all of a node, or booleans structured like it, as the repr of a pytree of tuples."""
+
+    which: Any
+
+    def __call__(self, *_):
+        raise TypeError("what stays where it starts is no function of the time")
+
+
+@dataclass(frozen=True)
+class Held:
+    """Some nodes, how they are held (`Still`, or a function of t and params), and the `Held` of others."""
+
+    nodes: tuple
+    alone: bool  # whether `nodes` was a number: leaves then have no axis for it
+    how: Any
+    rest: Any = None
+
+    def __call__(self, *_):
+        raise TypeError("a description of nodes is no function")
+
+    def all(self):
+        """Each in turn."""
+        here = self
+        while here is not None:
+            yield here
+            here = here.rest
+
+    @property
+    def moves(self) -> bool:
+        """Whether some of them move."""
+        return any(not isinstance(x.how, Still) for x in self.all())
+
+    def told(self, v: PyTree, t: Real, params: PyTree):
+        """Position, velocity and acceleration of these nodes, as far as the function gives them."""
+        t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(v)))
+        one = jnp.ones_like(t)
+
+        def position(t: Real) -> PyTree:
+            return jax.tree.map(lambda x: jnp.asarray(x, t.dtype), self.how(t, params))
+
+        def velocity(t: Real) -> PyTree:
+            q, rate = jax.jvp(position, (t,), (one,))
+            return _paired(_rate, q, rate, self.here(v))
+
+        v_told, w_told = jax.jvp(velocity, (t,), (one,))
+        return position(t), v_told, w_told
+
+    def here(self, tree: PyTree) -> PyTree:
+        """The leaves of these nodes."""
+        places = self.nodes[0] if self.alone else np.array(self.nodes)
+        for x in jax.tree.leaves(tree):
+            if not jnp.ndim(x) or max(self.nodes) >= x.shape[0]:
+                raise ValueError(
+                    f"System.from_elements: `held` names node {max(self.nodes)}, and a leaf of the state has shape "
+                    f"{jnp.shape(x)}: nodes are counted from 0."
+                )
+        return jax.tree.map(lambda x: x[places], tree)
+
+    def put(self, tree: PyTree, part: PyTree) -> PyTree:
+        """The pytree with this part at these nodes."""
+        places = self.nodes[0] if self.alone else np.array(self.nodes)
+        return _paired(lambda part, x: x if part is None else x.at[places].set(part), part, tree, whole=True)
+
+
+def _rate(q: Array, qdot: Array, v: Array) -> Array:
+    """The velocity of a leaf of nodes: its rate, or vee(R^T Rdot)."""
+    if not is_rotation(q.shape, v.shape):
+        return qdot
+    vee = jnp.vectorize(lambda R, Rdot: rotation.vee(R.T @ Rdot), signature="(i,j),(i,j)->(i)")
+    return vee(q, qdot)
+
+
+def _paired(f: Callable, part: PyTree, *trees: PyTree, whole: bool = False) -> PyTree:
+    """f on the leaves of a part and of pytrees; a part of a dict may leave keys out, which then get None (whole), or
+    are left out."""
+    if not isinstance(trees[-1], dict):
+        return jax.tree.map(f, part, *trees)
+    if not isinstance(part, dict) or set(part) - set(trees[-1]):
+        raise ValueError(
+            f"System.from_elements: what `held` gives must be a dict with some of the keys {sorted(trees[-1])}; "
+            f"received {part!r}."
+        )
+    found = {}
+    for key in trees[-1]:
+        if key in part:
+            found[key] = jax.tree.map(f, part[key], *(tree[key] for tree in trees))
+        elif whole:
+            found[key] = jax.tree.map(lambda *x: f(None, *x), *(tree[key] for tree in trees))
+    return found
+
+
+def at(held: Held | None, q: PyTree, v: PyTree | None, t: Real, params: PyTree):
+    """q and v (None where it is not asked for), as elements see them. v may be any pytree of such shapes."""
+    if held is None or not held.moves:
+        return q, v
+    like = v if v is not None else velocity_like(q)
+    for some in held.all():
+        if not isinstance(some.how, Still):
+            position, velocity, _ = some.told(like, t, params)
+            q = some.put(q, position)
+            v = None if v is None else some.put(v, velocity)
+    return q, v
+
+
+def velocity_like(q: PyTree) -> PyTree:
+    """Zeros structured like the velocity of a position: leaves (..., 3, 3) are rotations."""
+
+    def zeros(x: Array) -> Array:
+        shape = jnp.shape(x)
+        return jnp.zeros(shape[:-1] if shape[-2:] == (3, 3) else shape, jnp.result_type(x))
+
+    return jax.tree.map(zeros, q)
+
+
+def accelerations(held: Held, v: PyTree, t: Real, params: PyTree):
+    """Which accelerations are known, and what they are, structured like v."""
+    known = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), bool), v)
+    a = jax.tree.map(jnp.zeros_like, v)
+    for some in held.all():
+        if isinstance(some.how, Still):
+            which = some.how.which
+            here = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), some.here(v))
+            if which is True:
+                known = some.put(known, jax.tree.map(np.ones_like, here))
+            else:
+                known = some.put(known, _spread(which, here))
+        else:
+            _, _, told = some.told(v, t, params)
+            known = some.put(known, jax.tree.map(lambda x: jnp.ones(x.shape, bool), told))
+            a = some.put(a, told)
+    return known, a
+
+
+def _spread(which: PyTree, here: PyTree) -> PyTree:
+    """Booleans of the shapes of a node, from what was given: of a key, or of each number of it."""
+    return _paired(lambda flag, x: np.broadcast_to(np.array(flag), np.shape(x)), _as_arrays(which), here)
+
+
+def _as_arrays(which: PyTree) -> PyTree:
+    if isinstance(which, dict):
+        return {key: _as_arrays(x) for key, x in which.items()}
+    return np.array(which, bool)
+
+
+def checked(held: Any) -> Held | None:
+    """The `Held` of a dict, or an error."""
+    if held is None or isinstance(held, Held):
+        return held
+    name = "System.from_elements"
+    if not isinstance(held, dict):
+        raise TypeError(f"{name}: `held` must be a dict, from nodes to how they are held; received {held!r}.")
+    found = None
+    for key, how in held.items():
+        nodes = key if isinstance(key, tuple) else (key,)
+        if not nodes or any(not isinstance(i, (int, np.integer)) or isinstance(i, bool) or i < 0 for i in nodes):
+            raise ValueError(f"{name}: the keys of `held` must be nodes, or tuples of nodes; received {key!r}.")
+        nodes = tuple(map(int, nodes))
+        if callable(how):
+            require_function(name, f"held[{key!r}]", how, "held(t, params)")
+        else:
+            how = Still(_checked_flags(name, key, how))
+        found = Held(nodes, not isinstance(key, tuple), how, found)
+    return found
+
+
+def _checked_flags(name: str, key: Any, how: Any) -> Any:
+    """True, or a hashable pytree of booleans."""
+    if how is True:
+        return True
+    if isinstance(how, dict) and how:
+        return _Flags({k: _checked_flags(name, key, x) for k, x in how.items()})
+    array = np.asarray(how)
+    if array.dtype == bool and array.ndim:
+        return tuple(array.tolist()) if array.ndim == 1 else tuple(map(tuple, array.tolist()))
+    raise TypeError(
+        f"{name}: `held[{key!r}]` must be True, booleans structured like a node, or a function (t, params); received "
+        f"{how!r}."
+    )
+
+
+class _Flags(dict):
+    """A dict that is hashable."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(sorted(self.items())))
+
+
+def require_start(held: Held | None, q0: PyTree, v0: PyTree, t0: Real, params: PyTree):
+    """An error where a start that is known is not what is held."""
+    if held is None or not all_concrete((q0, v0, t0, params)):
+        return
+    q, v = at(held, q0, v0, t0, params)
+    if not all_concrete((q, v)):
+        return
+    for name, given, told in (("q0", q0, q), ("v0", v0, v)):
+        for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(told), strict=True):
+            x, y = np.asarray(x), np.asarray(y)
+            if np.max(np.abs(x - y), initial=0) > AGREES * max(1.0, np.max(np.abs(y), initial=0)):
+                node = int(np.argmax(np.abs(x - y).reshape(len(x), -1).max(axis=1)))
+                raise ValueError(
+                    f"System.from_elements: `{name}{jax.tree_util.keystr(path)}` of node {node} must be what `held` "
+                    f"gives at the start, {y[node]}; received {x[node]}."
+                )
+    known, _ = accelerations(held, jax.tree.map(jnp.asarray, v0), t0, params)
+    told = at(held, q0, jax.tree.map(jnp.zeros_like, v0), t0, params)[1]
+    leaves = jax.tree_util.tree_leaves_with_path(v0)
+    for (path, x), here, y in zip(leaves, jax.tree.leaves(known), jax.tree.leaves(told), strict=True):
+        moving = np.asarray(here) & (np.asarray(y) == 0) & (np.abs(np.asarray(x)) > 0)
+        if np.any(moving):
+            node = int(np.flatnonzero(moving.reshape(len(moving), -1).any(axis=1))[0])
+            raise ValueError(
+                f"System.from_elements: `v0{jax.tree_util.keystr(path)}` of node {node} must be 0, as it is held; "
+                f"received {np.asarray(x)[node]}."
+            )

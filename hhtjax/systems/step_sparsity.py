@@ -1,0 +1,125 @@
+"""Which unknowns of a step meet: from the nodes of elements, from a pattern, or from what the functions read.
+
+With x the displacement of a step and eta what keeps the velocities of constraints, the equations of a step are
+
+    r(w, L, eta) = [M w - Q - B^T L;  Phi;  B v + Phi_t],    x = (...) + beta h^2 w',    w = w' + D eta
+
+in the unknowns (w', L, eta): eta enters velocities and accelerations, but no position, so that it meets only what its
+own constraint holds, and what dampers or a mass connect with that (see `hhtjax.steppers.constrained`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.description import thaw
+from hhtjax.jaxpr import dependencies
+from hhtjax.numerics.sparse_lu import Plan, plan
+from hhtjax.numerics.sparsity import product, stacked, symmetric, union
+from hhtjax.primitives import traced
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+    from hhtjax.description import PyTree
+    from hhtjax.systems.elements import Elements, Joints
+    from hhtjax.systems.flat_system import FlatSystem
+
+
+class Sparsity:
+    """Patterns of a system on vectors.
+
+    force: (n, n), of M w - Q. drag: of that part of it that v and w enter. constraint: (m, n), None without. turning:
+    of `_turning`: the numbers of a rotation meet each other.
+    """
+
+    def __init__(self, force: csr_array, drag: csr_array, constraint: csr_array | None, blocks: tuple):
+        turning = _turning(force.shape[0], blocks)
+        self.force, self.drag = (product(product(turning, symmetric(A)), turning) for A in (force, drag))
+        self.constraint = None if constraint is None else product(constraint, turning)
+
+    def plan(self, size: int) -> Plan:
+        """The `Plan` for the unknowns w, (w, L) or (w, L, eta), told by their number."""
+        G, n = self.constraint, self.force.shape[0]
+        if G is None or size == n:
+            return plan(self.force)
+        T = G.T.tocsr()
+        A = union(self.force, product(T, G))
+        if size == n + G.shape[0]:
+            return plan(stacked([[A, T], [G, None]]), n)
+        return plan(stacked([[A, T, product(self.drag, T)], [G, None, product(G, T)], [G, None, product(G, T)]]), n)
+
+
+def _turning(n: int, blocks: tuple) -> csr_array:
+    """(n, n): the identity, and full blocks for rotations."""
+    from scipy.sparse import csr_array
+
+    group = np.arange(n)
+    for block in blocks:
+        if block.is_rotation:
+            here = np.arange(block.v.start, block.v.stop)
+            group[here] = block.v.start + (here - block.v.start) // 3 * 3
+    members = csr_array((np.ones(n, bool), (np.arange(n), group)), shape=(n, n))
+    return product(members, members.T.tocsr())
+
+
+def of_elements(parts: list[Elements], masses: list[Elements], joints: list[Joints], flat: FlatSystem, at: tuple):
+    """The `Sparsity` of elements. at: shapes of q, v, t, params."""
+    q, v, t, params = at
+    n = flat.positions
+    clouds = [_pairs(part.dofs(v), n) for part in (*parts, *masses)] or [_pairs(np.zeros((1, 1), int), n)]
+    damped = [_pairs(part.dofs(v), n) for part in masses]
+    damped += [_pairs(part.dofs(v), n) for part in parts if _reads_velocity(part, q, v, t, params)]
+    none = _pairs(np.zeros((1, 1), int), n)
+    rows = None
+    if joints:
+        rows = _below([_joint_rows(joint, q, v, t, params, n) for joint in joints])
+    return Sparsity(union(*clouds), union(none, *damped), rows, flat.blocks)
+
+
+def _pairs(dofs: np.ndarray, n: int) -> csr_array:
+    """(n, n): all unknowns of each row of dofs with each other."""
+    from scipy.sparse import csr_array
+
+    s = dofs.shape[1]
+    rows, columns = np.repeat(dofs, s, axis=1).ravel(), np.tile(dofs, (1, s)).ravel()
+    return csr_array(csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape=(n, n)) > 0)
+
+
+def _reads_velocity(part: Elements, q: PyTree, v: PyTree, t: Any, params: PyTree) -> bool:
+    """Whether its force depends on v."""
+    reads = traced(lambda v, q, t, params: part(q, v, t, thaw(params)), v, q, t, params).reads(None)
+    return any(reads[: len(jax.tree.leaves(v))])
+
+
+def _joint_rows(joint: Joints, q: PyTree, v: PyTree, t: Any, params: PyTree, n: int) -> csr_array:
+    """(J m, n): each row with the unknowns of its joint."""
+    from scipy.sparse import csr_array
+
+    dofs = joint.dofs(v)
+    m = jax.eval_shape(lambda q, t, params: joint(q, t, thaw(params)), q, t, params).shape[0] // joint.count
+    columns = np.repeat(dofs, m, axis=0)
+    rows = np.repeat(np.arange(len(columns)), columns.shape[1])
+    return csr_array((np.ones(len(rows), bool), (rows, columns.ravel())), shape=(len(columns), n))
+
+
+def _below(patterns: list) -> csr_array:
+    """One below the other."""
+    return stacked([[pattern] for pattern in patterns])
+
+
+def detected(flat: FlatSystem, params: PyTree, dtype: np.dtype, pattern: csr_array | None = None) -> Sparsity:
+    """The `Sparsity` of a system from what its functions read. pattern: (n, n), in the place of what M w - Q reads."""
+    length = flat.blocks[-1].q.stop if flat.blocks else flat.positions
+    q, x, t = jnp.zeros(length, dtype), jnp.zeros(flat.size, dtype), jnp.zeros((), dtype)
+    if pattern is None:
+        pattern = dependencies(lambda x: flat.residual(flat.move(q, x), x, x, t, params), x)
+    drag = dependencies(lambda x: flat.residual(q, x, x, t, params), x)
+    rows = None
+    if flat.num_constraints:
+        rows = dependencies(lambda x: flat.constraint(flat.move(q, x), t, params), x)
+    return Sparsity(pattern, drag, rows, flat.blocks)
