@@ -4,7 +4,7 @@ Nodes carry x, y (m) and theta (rad). Along an element of length l, theta is the
 
     (1 + stretch, shear) = R(theta)^T r',    curvature = (theta2 - theta1)/l
 
-The spin-up is that of Simo, Vu-Quoc (1986), J. Appl. Mech. 53, 849-854: its beam, on a hub that is brought to 6 rad/s in 15 s.
+The spin-up is that of Simo, Vu-Quoc (1986), J. Appl. Mech. 53, 849-854: its beam, and a hub brought to 6 rad/s in 15 s.
 """
 
 from functools import partial
@@ -57,13 +57,20 @@ def pendulum(elements: int) -> Beam:
     return Beam(elements, gravity=9.81, hub=None)
 
 
-def hub_angle(beam: Beam, t):
-    """Angle of a hub that holds the first node, rad."""
+def hub_angle(beam: Beam, t, numpy=jnp):
+    """Angle of a hub that holds the first node, rad; numpy: the module that computes it."""
     if beam.hub != "spun":
         return 0.0 * t
     round_once = 2 * np.pi / SECONDS
-    starting = SPEED / SECONDS * (t**2 / 2 + (jnp.cos(round_once * t) - 1) / round_once**2)
-    return jnp.where(t < SECONDS, starting, SPEED * (t - SECONDS / 2))
+    starting = SPEED / SECONDS * (t**2 / 2 + (numpy.cos(round_once * t) - 1) / round_once**2)
+    return numpy.where(t < SECONDS, starting, SPEED * (t - SECONDS / 2))
+
+
+def in_hub(beam: Beam, tip, times):
+    """The tip's place in the turning frame of the hub: across, its lag, and along, less the length; m."""
+    angle = hub_angle(beam, times, np)
+    c, s, (x, y) = np.cos(angle), np.sin(angle), tip[:, :2].T
+    return c * y - s * x, c * x + s * y - beam.length
 
 
 def masses(beam: Beam):

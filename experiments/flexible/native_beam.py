@@ -6,7 +6,6 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from experiments.benchmarks.native import VARIANTS, compiler, doubles
@@ -51,19 +50,31 @@ class Run:
         if beam.elements % 2:
             raise ValueError(f"Run: `beam` must have an even number of elements; received {beam.elements}.")
         self.found, self.nodes = found, beam.elements + 1
-        self.options = float(dt), float(alpha), int(num_steps)
+        self.options, self.num_steps = (float(dt), float(alpha)), num_steps
         self.numbers = np.array([beam.length / beam.elements, beam.EA, beam.GA, beam.EI])
         mass = masses(beam)
         load = -beam.gravity * mass * np.array([0.0, 1.0, 0.0])
         mass[0, : beam.held], load[0, : beam.held] = HELD, 0.0
         self.mass, self.load = (np.ascontiguousarray(x.T) for x in (mass, load))
         times = dt * np.arange(1, num_steps + 1)
-        self.hub = np.asarray(jax.jit(hub_angle, static_argnums=0)(beam, times)) if beam.hub else None
+        self.hub = hub_angle(beam, times, np) if beam.hub else None
         self.start = np.zeros((4, 3, self.nodes))
         self.start[0] = straight(beam).T
         found.begin(self.numbers, self.mass, self.load, self.nodes, self.start)
 
     def __call__(self):
-        state, hub = self.start.copy(), None if self.hub is None else self.hub.ctypes.data
-        self.found.run(self.numbers, self.mass, self.load, hub, self.nodes, *self.options, state)
+        state = self.start.copy()
+        self._steps(state, 0, self.num_steps)
         return state[0].T, state[1].T
+
+    def tip(self, every: int):
+        """x, y and theta of the last node after each `every` steps, (samples, 3)."""
+        state, samples = self.start.copy(), []
+        for first in range(0, self.num_steps - every + 1, every):
+            self._steps(state, first, every)
+            samples.append(state[0, :, -1].copy())
+        return np.array(samples)
+
+    def _steps(self, state, first: int, count: int):
+        hub = None if self.hub is None else self.hub[first:].ctypes.data
+        self.found.run(self.numbers, self.mass, self.load, hub, self.nodes, *self.options, count, state)
