@@ -17,8 +17,8 @@ import numpy as np
 from experiments.flexible.beam import SECONDS, SPEED, Beam, in_hub, masses, pendulum, straight
 from experiments.flexible.native_beam import Run, library
 
-SOLVERS = "EigenSparse", "EigenSparseSymmetric", "EXUdense"
-NEWTON = {"full Newton": False, "modified Newton": True}
+SOLVER = "EigenSparse"
+DTS, FINE = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4), 5e-5  # s
 RADIUS = 0.9  # the spectral radius
 TOLERANCES = 1e-10, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2  # of its residuals, absolute; the first is its default
 
@@ -148,7 +148,7 @@ def settings(dt: float, steps: int, every: int, modified: bool, solver: str, tol
 
 
 def run(
-    model: Model, dt: float, steps: int, modified: bool, tolerance: float, *, solver: str = SOLVERS[0], every: int = 0
+    model: Model, dt: float, steps: int, modified: bool, tolerance: float, *, solver: str = SOLVER, every: int = 0
 ) -> Ran | None:
     """From the start, with a sample after each `every` steps, by default at the end alone; None where it fails."""
     exu, _ = modules()
@@ -214,36 +214,43 @@ def speeds(fast: bool = False, dt: float = 1e-3) -> list[dict]:
     return rows
 
 
-def spin_up(fast: bool = False, elements: int = 32, lumped: bool = True) -> list[dict]:
-    """Of the spin-up, for several steps: seconds, the tip's error (RMS of 20 s, m), its largest lag and its stretch.
+def errors(beam: Beam, duration: float, dts: tuple, lumped: bool = True, sample: float = 0.05) -> list[dict]:
+    """For several steps: seconds of a run, and the error of the tip's place (RMS over the samples, m).
 
-    The error is against the C source with steps of 5e-5 s, and None without a compiler; that of the elements is apart.
+    It is that of the steps alone, against the C source with steps of FINE; None without a compiler. Of the spin-up, the
+    largest lag and the stretch after it, too, m.
     """
-    beam, duration, sample = Beam(elements), 2.0 if fast else 20.0, 0.05
     model, exact = built(beam, lumped), None
     if (found := library()) is not None:
-        exact = Run(found, beam, 5e-5, round(duration / 5e-5)).tip(round(sample / 5e-5))
+        exact = Run(found, beam, FINE, round(duration / FINE)).tip(round(sample / FINE))
     rows = []
-    for dt in (1e-2, 5e-3) if fast else (1e-2, 5e-3, 2e-3, 1e-3, 5e-4):
+    for dt in dts:
         for modified in (False, True):
             steps, every = round(duration / dt), round(sample / dt)
             tolerance = tightest(model, dt, steps, modified)
-            ran = tolerance and run(model, dt, steps, modified, tolerance, every=every)
+            ran = None if tolerance is None else run(model, dt, steps, modified, tolerance, every=every)
             row = {"dt_s": dt, "newton": "modified" if modified else "full", "tolerance": tolerance}
             rows.append(row | (judged(beam, ran, exact, sample) if ran else {}))
     return rows
 
 
 def judged(beam: Beam, ran: Ran, exact: np.ndarray | None, sample: float) -> dict:
-    """Seconds and errors of a run of the spin-up."""
-    times = sample * np.arange(1, len(ran.tip) + 1)
-    lag, stretch = in_hub(beam, ran.tip, times)
+    """Seconds and errors of a run."""
     error = None if exact is None else float(np.sqrt(np.mean(np.sum((ran.tip - exact)[:, :2] ** 2, axis=1))))
-    steady = stretch[times > SECONDS]
-    return {
-        "seconds": ran.seconds,
-        "tip_error_m": error,
-        "largest_lag_m": float(lag.min()),
-        "stretch_m": float(steady.mean()) if steady.size else None,
-        "iterations_per_step": ran.iterations,
-    }
+    row = {"seconds": ran.seconds, "tip_error_m": error, "iterations_per_step": ran.iterations}
+    if beam.hub == "spun":
+        times = sample * np.arange(1, len(ran.tip) + 1)
+        lag, stretch = in_hub(beam, ran.tip, times)
+        steady = stretch[times > SECONDS]
+        row |= {"largest_lag_m": float(lag.min()), "stretch_m": float(steady.mean()) if steady.size else None}
+    return row
+
+
+def spin_up(fast: bool = False, elements: int = 32) -> list[dict]:
+    """`errors` of the spin-up, 20 s."""
+    return errors(Beam(elements), 2.0 if fast else 20.0, DTS[:2] if fast else DTS)
+
+
+def fall(fast: bool = False, elements: int = 32) -> list[dict]:
+    """`errors` of the falling beam, 2 s: it bends far."""
+    return errors(pendulum(elements), 0.1 if fast else 2.0, DTS[:2] if fast else DTS)
