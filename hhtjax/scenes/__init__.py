@@ -23,6 +23,7 @@ from hhtjax.scenes import bump_stop as bump_stop
 from hhtjax.scenes import double_pendulum as double_pendulum
 from hhtjax.scenes import dry_oscillator as dry_oscillator
 from hhtjax.scenes import duffing as duffing
+from hhtjax.scenes import flexible_slider_crank as flexible_slider_crank
 from hhtjax.scenes import four_bars as four_bars
 from hhtjax.scenes import impact_oscillator as impact_oscillator
 from hhtjax.scenes import lugre as lugre

@@ -1,0 +1,1 @@
+"""Flexible bodies of many elements: the same beam here, in C and in exudyn."""

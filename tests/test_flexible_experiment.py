@@ -1,0 +1,99 @@
+"""The beam of the flexible experiment: here, in C and in exudyn, and its closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hhtjax
+from experiments.flexible import beam, native_beam
+
+ALPHA, DT, STEPS = -0.05, 1e-3, 300
+HUNG = beam.Beam(10, gravity=9.81, hub="clamped")
+native = pytest.mark.skipif(native_beam.library() is None, reason="needs a C compiler")
+
+
+def ours(described, stepper):
+    system, q0, v0 = beam.scene(described)
+    run = hhtjax.simulate(system, stepper, q0, v0, {}, dt=DT, num_steps=STEPS, save_every=STEPS)
+    run.check()
+    return run.q[-1], run.v[-1]
+
+
+@native
+@pytest.mark.parametrize("described", [beam.pendulum(10), HUNG, beam.Beam(10)], ids=["pinned", "clamped", "spun"])
+def test_c_source_takes_the_same_steps(described):
+    stepper = hhtjax.hht(ALPHA, linearize="predictor", start="simple", solve=hhtjax.banded(5))
+    q, v = ours(described, stepper)
+    assert q.size == described.unknowns
+    for variant in "-O3 -march=native", native_beam.FAST:
+        end, speed = native_beam.Run(native_beam.library(variant), described, DT, STEPS, ALPHA)()
+        assert np.max(np.abs(end.ravel()[described.held :] - q)) < 1e-12
+        assert np.max(np.abs(speed.ravel()[described.held :] - v)) < 1e-10
+
+
+@native
+def test_c_source_goes_on_from_sample_to_sample():
+    run = native_beam.Run(native_beam.library(), beam.Beam(4), DT, 100)
+    tip = run.tip(25)
+    assert tip.shape == (4, 3)
+    np.testing.assert_array_equal(tip[-1], run()[0][-1])
+
+
+def test_c_source_asks_for_an_even_number():
+    with pytest.raises(ValueError, match="`beam` must have an even number of elements; received 3"):
+        native_beam.Run(None, beam.Beam(3), DT, 1)
+
+
+@native
+def test_spin_up():
+    """The largest lag of a finer beam, and the closed form of the stretch."""
+    spun = beam.Beam(32)
+    tip = native_beam.Run(native_beam.library(), spun, 1e-3, 20_000).tip(50)
+    times = 0.05 * np.arange(1, 401)
+    lag, stretch = beam.in_hub(spun, tip, times)
+    assert abs(lag.min() - beam.LARGEST_LAG[0]) < 5e-4
+    assert abs(times[lag.argmin()] - beam.LARGEST_LAG[1]) < 1e-6
+    assert abs(stretch[times > beam.SECONDS].mean() - beam.STRETCH) < 1e-6
+
+
+def test_stiffness_and_weight_of_the_beam():
+    """A cantilever under a small load at its tip: F L^3/(3 EI) (1 - 1/(4 E^2)) + F L/GA."""
+    clamped, load = beam.Beam(8, hub="clamped"), 1e-3
+    system, q0, v0 = beam.scene(clamped)
+    K = -jax.jacfwd(lambda q: system.force(q, v0, 0.0, {}))(q0)
+    tip = np.linalg.solve(K, load * jnp.zeros_like(q0).at[-2].set(1.0))[-2]
+    bent, sheared = 10.0**3 / (3 * clamped.EI) * (1 - 1 / (4 * 8**2)), 10.0 / clamped.GA
+    np.testing.assert_allclose(tip, load * (bent + sheared), rtol=1e-9)
+    assert abs(np.sum(system.force(q0, v0, 0.0, {"gravity": 1.0})) + 12.0 * (1 - 1 / 16)) < 1e-9
+
+
+def test_exudyn_has_the_same_beam():
+    pytest.importorskip("exudyn")
+    from experiments.flexible import by_exudyn
+
+    pinned = beam.pendulum(4)
+    M, K, _ = by_exudyn.built(pinned).system.ComputeLinearizedSystem()
+    np.testing.assert_allclose(np.array(M), np.diag(beam.masses(pinned).ravel()), atol=1e-15)
+    straight = jnp.asarray(beam.straight(pinned))
+    ours = -jax.jacfwd(lambda q: beam.elastic_force(q.reshape(-1, 3), pinned).ravel())(straight.ravel())
+    np.testing.assert_allclose(np.array(K), ours, atol=1e-14 * pinned.EA * 4)
+    for t in 0.3, 14.0, 16.0:
+        angle = by_exudyn.hub_angle(None, t, 0, 0.0)
+        assert abs(angle - beam.hub_angle(beam.Beam(4), t)) < 1e-12
+        rate = (by_exudyn.hub_angle(None, t + 1e-5, 0, 0.0) - by_exudyn.hub_angle(None, t - 1e-5, 0, 0.0)) / 2e-5
+        assert abs(by_exudyn.hub_rate(None, t, 0, 0.0) - rate) < 1e-9
+
+
+@native
+def test_exudyn_moves_alike():
+    pytest.importorskip("exudyn")
+    from experiments.flexible import by_exudyn
+
+    for row in by_exudyn.fall(fast=True) + by_exudyn.spin_up(fast=True):
+        assert row["seconds"] > 0
+        assert row["tip_error_m"] < 1e-3
+    for row in by_exudyn.speeds(fast=True):
+        assert row["ns_per_step_and_unknown"] > 0
+    with pytest.raises(ValueError, match="`beam` must be pinned or clamped"):
+        by_exudyn.cable(beam.Beam(2))
