@@ -278,7 +278,7 @@ RULES = {
     "concatenate": _concatenate,
     "reduce_sum": _reduce_sum,
     "dot_general": _dot_general,
-    **dict.fromkeys(("jit", "hhtjax_bilinear"), _call),
+    **dict.fromkeys(("jit", "hhtjax_bilinear", "hhtjax_map"), _call),
 }
 
 

@@ -39,7 +39,7 @@ UNKNOWN = "unknown"
 MOST = 100_000  # operations: of more, a compiler takes minutes
 WRITTEN_OUT = 1000  # operations more than those of a loop
 INLINED = {  # a function called: the parameter that holds it
-    **dict.fromkeys(("jit", "remat2", "hhtjax_family", "hhtjax_bilinear"), "jaxpr"),
+    **dict.fromkeys(("jit", "remat2", "hhtjax_family", "hhtjax_bilinear", "hhtjax_map"), "jaxpr"),
     **dict.fromkeys(("closed_call", "eval_jaxpr", "custom_jvp_call", "custom_vjp_call"), "call_jaxpr"),
 }
 

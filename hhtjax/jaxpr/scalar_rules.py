@@ -235,6 +235,7 @@ UNDERSTOOD = {
     "hhtjax_structural": {},
     "hhtjax_family": _of_any("n", "family", "jaxpr"),
     "hhtjax_bilinear": _of_any("product", "jaxpr"),
+    "hhtjax_map": _of_any("map", "jaxpr"),
     "hhtjax_largest_in_batch": _of_any("kept"),
 }
 

@@ -466,6 +466,7 @@ CALLS = {
     "jit": _call,
     "hhtjax_family": _family,
     "hhtjax_bilinear": lambda run, eqn, x, y: run(eqn.params["jaxpr"], [x, y]),
+    "hhtjax_map": lambda run, eqn, x: run(eqn.params["jaxpr"], [x]),
     "while": _while_loop,
     "custom_linear_solve": _custom_linear_solve,
     "custom_jvp_call": _custom_jvp_call,

@@ -34,8 +34,8 @@ def factorize_blocks(lower: Array, middle: Array, upper: Array) -> BlockFactors:
 
     def eliminate(before: Array, blocks: tuple):
         L, D, U = blocks
-        S = invert_block(D - product(L, before))
-        W = product(S, U)
+        S = invert_block(D - L @ before)
+        W = S @ U
         return W, (S, W)
 
     none = jnp.zeros((b, b), middle.dtype)
@@ -51,44 +51,29 @@ def solve_blocks(factors: BlockFactors, b: Array, trans: int = 0) -> Array:
 
     def forward(y: Array, block: tuple):
         L, S, b = block
-        y = times(S, b - times(L, y))
+        y = S @ (b - L @ y)
         return y, y
 
     def backward(x: Array, block: tuple):
         W, y = block
-        x = y - times(W, x)
+        x = y - W @ x
         return x, x
 
     def forward_transposed(carry: Array, block: tuple):
         W, b = block
         z = b - carry
-        return times_transposed(W, z), z
+        return z @ W, z
 
     def backward_transposed(carry: Array, block: tuple):
         L, S, z = block
-        x = times_transposed(S, z - carry)
-        return times_transposed(L, x), x
+        x = (z - carry) @ S
+        return x @ L, x
 
     if trans:
         _, z = lax.scan(forward_transposed, zero, (W, b))
         return lax.scan(backward_transposed, zero, (L, S, z), reverse=True)[1]
     _, y = lax.scan(forward, zero, (L, S, b))
     return lax.scan(backward, zero, (W, y), reverse=True)[1]
-
-
-def product(A: Array, B: Array) -> Array:
-    """A B, column by column of A: fewer operations to compile than rows times columns."""
-    return sum((A[:, k, None] * B[None, k, :] for k in range(1, A.shape[1])), A[:, 0, None] * B[None, 0, :])
-
-
-def times(A: Array, x: Array) -> Array:
-    """A x."""
-    return sum((A[:, k] * x[k] for k in range(1, A.shape[1])), A[:, 0] * x[0])
-
-
-def times_transposed(A: Array, x: Array) -> Array:
-    """A^T x."""
-    return sum((A[k] * x[k] for k in range(1, A.shape[0])), A[0] * x[0])
 
 
 def invert_block(A: Array) -> Array:
@@ -104,3 +89,26 @@ def invert_block(A: Array) -> Array:
 
     both = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1)
     return lax.fori_loop(0, n, eliminate, both)[:, n:]
+
+
+def block_pivots(lower: Array, middle: Array, upper: Array, limit: float) -> Array:
+    """(N, b): the pivots of an elimination without exchanges; what is divided by is not less than `limit`."""
+    b = middle.shape[-1]
+    i = jnp.arange(b)
+
+    def eliminate(before: Array, blocks: tuple):
+        L, D, U = blocks
+        S = D - L @ before
+
+        def column(k, carry: tuple):
+            both, found = carry
+            pivot = both[k, k]
+            row = both[k] / jnp.maximum(pivot, limit)
+            both = jnp.where((i == k)[:, None], row[None, :], both - both[:, k][:, None] * row[None, :])
+            return both, jnp.where(i == k, pivot, found)
+
+        both, found = lax.fori_loop(0, b, column, (jnp.concatenate([S, U], axis=1), jnp.zeros(b, S.dtype)))
+        return both[:, b:], found
+
+    none = jnp.zeros((b, b), middle.dtype)
+    return lax.scan(eliminate, none, (lower.at[0].set(0), middle, upper))[1]

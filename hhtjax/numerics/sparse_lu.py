@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial, reduce
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -18,11 +18,13 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree
-from hhtjax.numerics.block_tridiagonal import factorize_blocks, solve_blocks
+from hhtjax.numerics.block_tridiagonal import block_pivots, factorize_blocks, solve_blocks
 from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import Structured
 from hhtjax.numerics.sparse_matrix import Pattern, Sparse, gather
 from hhtjax.numerics.sparsity import colours, in_blocks, symmetric
+from hhtjax.numerics.superlu import pivots_on_host
+from hhtjax.primitives import part
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -98,16 +100,20 @@ class Plan:
         """(n,): equations are measured by the square roots of their diagonal, and constraints by those of their
         unknowns, so that no units choose the pivots; as of `factorize_saddle_point`."""
         n, free = self.n, self.free
-        here = np.full(n, self.number * n, np.int32)
-        on = self.rows == self.columns
-        here[self.rows[on]] = self.places[on]
-        d = jnp.abs(gather(_with_ends(images), here[:free]))
+        d = jnp.abs(self.diagonal(images)[:free])
         first = 1 / jnp.sqrt(jnp.where(d == 0, 1, d))
         if free == n:
             return first
         unit = gather(jnp.append(first, jnp.zeros_like(first[:1])), np.minimum(self.column_of[:, free:], free))
-        size = jnp.sum(jnp.abs(images[:, free:]) * unit, axis=0)
+        size = reduce(jnp.add, jnp.abs(images[:, free:]) * unit)
         return jnp.concatenate([first, 1 / jnp.where(size == 0, 1, size)])
+
+    def diagonal(self, images: Array) -> Array:
+        """(n,)."""
+        here = np.full(self.n, self.number * self.n, np.int32)
+        on = self.rows == self.columns
+        here[self.rows[on]] = self.places[on]
+        return gather(_with_ends(images), here)
 
     def inverse(self, images: Array) -> Callable:
         """(b, trans=0) -> A^-1 b, or A^-T b."""
@@ -116,19 +122,31 @@ class Plan:
         solve = self._by_blocks(images) if self.blocks.size <= LARGEST_BLOCK else self._by_superlu(images)
         return lambda b, trans=0: scale * solve(b, 1) if trans else solve(scale * b, 0)
 
+    def pivots(self, images: Array, limit: float) -> Array:
+        """(n,): of the elimination without exchanges of a symmetric matrix, whose diagonal is made 1, not below a limit
+        but for the pivot itself."""
+        unit = self.diagonal(images)
+        size = jnp.sqrt(jnp.where(unit > 0, unit, 1))
+        column = gather(jnp.append(size, jnp.ones_like(size[:1])), self.column_of)
+        found = _with_ends(images / size / column)
+        if self.blocks.size > LARGEST_BLOCK:
+            return pivots_on_host(self.slots[0], gather(found, self.slots[1]), limit)
+        blocks = part(partial(block_pivots, limit=limit))(*gather(found, self.in_blocks))
+        return gather(blocks.ravel(), (self.block * blocks.shape[1] + self.place).astype(np.int32))
+
     def _by_blocks(self, images: Array) -> Callable:
         found = gather(_with_ends(images), self.in_blocks)
-        factors = factorize_blocks(*found)
+        factors = part(factorize_blocks)(*found)
         N, b = found.shape[1:3]
         if N * b == self.n and np.array_equal(self.blocks.order, np.arange(self.n)):
-            return lambda x, trans: solve_blocks(factors, x.reshape(N, b), trans).ravel()
+            return lambda x, trans: part(partial(solve_blocks, trans=trans))(factors, x.reshape(N, b)).ravel()
         there = (self.block * b + self.place).astype(np.int32)
         here = np.full(N * b, self.n, np.int32)
         here[there] = np.arange(self.n, dtype=np.int32)
 
         def solve(x: Array, trans: int) -> Array:
             x = gather(jnp.append(x, jnp.zeros_like(x[:1])), here).reshape(N, b)
-            return gather(solve_blocks(factors, x, trans).ravel(), there)
+            return gather(part(partial(solve_blocks, trans=trans))(factors, x).ravel(), there)
 
         return solve
 
@@ -161,12 +179,21 @@ def plan(pattern: csr_array, free: int | None = None) -> Plan:
 
 @dataclass(frozen=True, eq=False)
 class SparseLU(Structured):
-    """A solve by the patterns of all matrices that a run may ask for. plans: number of unknowns -> `Plan`."""
+    """A solve by the patterns of all matrices that a run asks for.
 
-    plans: Callable
+    sparsity: () -> what has `plan(size)`, the `Plan` for so many unknowns, and `of_rows()`, that of B B^T.
+    """
+
+    sparsity: Callable
     tolerance: Any = None
 
     def of_map(self, f: Callable, like: PyTree):
         """(b, trans=0) -> A^-1 b, or A^-T b."""
-        made = self.plans(like.size)
+        made = self.sparsity().plan(like.size)
         return made.inverse(made.images(f, like))
+
+    def cosine_pivots(self, f: Callable, like: Array, limit: float) -> Array:
+        """The pivots (m,) of B B^T, the matrix of f, each row of B being of length 1: the squared sines of its angles
+        to the rows that are eliminated before. limit: below which a pivot is taken for this."""
+        made = self.sparsity().of_rows()
+        return made.pivots(made.images(f, like), limit)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 
 IN_ORDER = {"ColPerm": "NATURAL", "DiagPivotThresh": 0.001, "SymmetricMode": True}
+NO_EXCHANGE = {"ColPerm": "NATURAL", "DiagPivotThresh": 0.0, "SymmetricMode": True}
 PIVOTING = {"ColPerm": "COLAMD", "DiagPivotThresh": 1.0, "SymmetricMode": False}
 KEPT = 4  # factors, of a batch those of all members twice
 WORDS = 4  # of a digest
@@ -152,6 +153,25 @@ def _gstrf(n: int, numbers: np.ndarray, way: Elimination, options: dict) -> Any:
     return _superlu.gstrf(
         n, len(numbers), numbers, way.rows, way.starts, csc_construct_func=csc_array, ilu=False, options=options
     )
+
+
+def pivots_on_host(pattern: Pattern, values: Array, limit: float) -> Array:
+    """(n,): the pivots of a symmetric matrix, eliminated in the order of its pattern without exchanges. values: slots;
+    limit: what is added to the diagonal, far less than pivots that matter."""
+    like = jax.ShapeDtypeStruct((pattern.n,), values.dtype)
+    return on_host(partial(_pivots, pattern, limit / 100), like, lax.stop_gradient(values))
+
+
+def _pivots(pattern: Pattern, shift: float, values: np.ndarray) -> np.ndarray:
+    """(..., n): of a batch as `on_host` hands it over."""
+    way, flat = pattern.elimination, values.reshape(-1, values.shape[-1])
+    found = np.zeros((len(flat), pattern.n), values.dtype)
+    for x, row in zip(flat, found, strict=True):
+        numbers = x[way.slots]
+        numbers[way.rows == way.columns] += shift
+        if np.all(np.isfinite(numbers)):
+            row[way.order] = _gstrf(pattern.n, numbers, way, NO_EXCHANGE).U.diagonal()
+    return found.reshape(*values.shape[:-1], pattern.n)
 
 
 def is_positive_definite(A):

@@ -19,6 +19,7 @@
     derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
     together(f, x)            f(x), of which a batch has all values or none
     Bilinear(f, ...)          a product as one operation, with its transposes
+    Linear(f, transposed)     a linear function as one operation, with its transpose
     Family(members, rule)     functions of a number as one operation, with derivatives among them
     on_host(f, like, *args)   f(*args), an array like `like`, by a function of NumPy arrays
     plain()                   a context without all that
@@ -33,6 +34,7 @@ lowering, in the same file where all platforms share it, in `xla/lowering.py` wh
 
 from hhtjax.primitives.atomic_functions import Bilinear as Bilinear
 from hhtjax.primitives.atomic_functions import Family as Family
+from hhtjax.primitives.atomic_functions import Linear as Linear
 from hhtjax.primitives.batching import block_written as block_written
 from hhtjax.primitives.batching import in_turn as in_turn
 from hhtjax.primitives.batching import row_written as row_written

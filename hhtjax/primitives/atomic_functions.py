@@ -91,6 +91,41 @@ class Bilinear:
         return jax.jit(self.f)
 
 
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The linear function f of an array, with any number of leading axes more, whose transpose is known.
+
+    Attributes:
+        f: x -> y.
+        transposed: y -> x.
+
+    >>> first = Linear(lambda x: x[..., :1], lambda y: jnp.concatenate([y, 0 * y], axis=-1))
+    >>> print(jax.grad(lambda x: 3 * first(x)[0])(jnp.array([1.0, 2.0])))
+    [3. 0.]
+    """
+
+    f: Callable
+    transposed: Callable
+
+    def __call__(self, x: Array) -> Array:
+        x = jnp.asarray(x)
+        if not _is_one(x):
+            return self.plain(x)
+        return linear_p.bind(x, map=self, jaxpr=self.plain.trace(x).jaxpr)
+
+    @cached_property
+    def transpose(self) -> Linear:
+        """The transpose, whose own is this."""
+        found = Linear(self.transposed, self.f)
+        vars(found)["transpose"] = self
+        return found
+
+    @cached_property
+    def plain(self):
+        """The same on plain JAX."""
+        return jax.jit(self.f)
+
+
 def _is_one(*arrays: Array) -> bool:
     """Not where types say how arrays are spread over devices: each operation of JAX has a rule for that."""
     return is_on() and not any(map(_is_spread, map(jax.typeof, arrays)))
@@ -133,7 +168,14 @@ ad.defbilinear(
 batching.primitive_batchers[bilinear_p] = _batch_of_products
 
 
-for operation in (family_p, bilinear_p):
+linear_p = holds_jaxprs(Primitive("hhtjax_map"))
+linear_p.def_impl(lambda x, map, jaxpr: map.plain(x))
+linear_p.def_abstract_eval(lambda x, map, jaxpr: jaxpr.out_avals[0])
+ad.deflinear2(linear_p, lambda z, x, map, jaxpr: [map.transpose(z)])
+batching.primitive_batchers[linear_p] = lambda x, axes, map, jaxpr: (map(jnp.moveaxis(x[0], axes[0], 0)), 0)
+
+
+for operation in (family_p, bilinear_p, linear_p):
     mlir.register_lowering(
         operation, mlir.lower_fun(lambda *x, jaxpr, **_: jaxpr_as_fun(jaxpr)(*x), multiple_results=True)
     )

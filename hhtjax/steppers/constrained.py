@@ -15,20 +15,24 @@ C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13, 1985; A. Cardona
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description import Array, PyTree
 from hhtjax.numerics.dense_lu import diagonal, matvec
-from hhtjax.primitives import part
+from hhtjax.primitives import part, staged
 from hhtjax.steppers.implicit_solve import linearized_solve, newton
 from hhtjax.steppers.stepper import State, join_info
 from hhtjax.systems.constraints import (
     acceleration_and_multipliers,
     dependent_row,
+    gradient_map,
     jacobian,
+    sparse_dependent_row,
     violation,
     violation_and_reaction,
 )
@@ -52,6 +56,13 @@ def directions(system: FlatSystem, M: Array, B: Array) -> Array:
     return B.T / jnp.where(d == 0, 1, d)[:, None]
 
 
+def sparse_directions(system: FlatSystem, params: PyTree, s: State):
+    """D as a map."""
+    d = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
+    pull = jax.linear_transpose(gradient_map(system, s.q, s.t, params), jnp.zeros_like(s.v))
+    return staged(lambda eta: pull(eta)[0] / jnp.where(d == 0, 1, d))
+
+
 def equations(method, system, params: PyTree, dt, s):
     """The residual of a step from s as a function of the state, the state as one of z = (w, L, eta), and z to start at.
 
@@ -59,8 +70,14 @@ def equations(method, system, params: PyTree, dt, s):
     """
     c, n, m = method.coefficients, system.size, system.num_constraints
     ggl = method.options.formulation == "ggl"
-    B = jacobian(system, s.q, s.t, params)
-    D = part(lambda q, B: directions(system, system.mass(q, s.t, params), B))(s.q, B) if ggl else None
+    sparse = system.sparse is not None
+    B = None if sparse else jacobian(system, s.q, s.t, params)
+    D: Any = None  # the map of eta
+    if ggl and sparse:
+        D = sparse_directions(system, params, s)
+    elif ggl:
+        D = partial(matvec, part(lambda q, B: directions(system, system.mass(q, s.t, params), B))(s.q, B))
+    unit = (1 - c.alpha_m) / (1 - c.alpha_f)  # of w, by which it moves x as much as eta does
 
     def r(s: State) -> Array:
         force = system.residual(s.q, s.v, s.w, s.t, params)
@@ -69,10 +86,12 @@ def equations(method, system, params: PyTree, dt, s):
         return jnp.concatenate(rows + [rate / (c.gamma * dt)] * ggl)
 
     def shift(eta: Array):
-        return None if D is None else c.beta * dt**2 * matvec(D, eta)
+        return None if D is None else c.beta * dt**2 * D(eta)
 
     def path(z: Array):
         w, L, eta = z[:n], z[n : n + m], z[n + m :]
+        if ggl and sparse:  # in unknowns in which eta moves nothing: see step_sparsity.py
+            w = w + unit * D(eta)
         return method.arrive(system, s, dt, w, shift(eta))._replace(L=L)
 
     z = jnp.concatenate([s.w, s.L] + [jnp.zeros(m, s.q.dtype)] * ggl)
@@ -104,12 +123,17 @@ def report_constraints(method, system, params, dt, s, s1, info, B):
     If the step failed, at its predicted end.
     """
 
-    def at_end():
+    def at_start() -> Array:
+        return sparse_dependent_row(system, s.q, s.t, params) if B is None else dependent_row(B)
+
+    def at_end() -> Array:
         predicted = method.arrive(system, s, dt, s.w)
+        if B is None:
+            return sparse_dependent_row(system, predicted.q, predicted.t, params)
         return dependent_row(jacobian(system, predicted.q, predicted.t, params))
 
     def dependent() -> Array:
-        return lax.cond(jnp.all(jnp.isfinite(s1.w)), lambda: dependent_row(B), at_end)
+        return lax.cond(jnp.all(jnp.isfinite(s1.w)), at_start, at_end)
 
     constraint, rate = (jnp.max(jnp.abs(x)) for x in violation(system, s1.q, s1.v, s1.t, params))
     row = None if method.redundant else dependent()

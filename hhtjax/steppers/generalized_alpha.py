@@ -172,7 +172,7 @@ class GeneralizedAlpha(Controlled, Stepper):
             if system.sparse is not None and system.sparse.tolerance == given.tolerance and given.pattern is None:
                 return system
             found = cache(lambda: detected(system, params, dtype, given.pattern))
-            return system._replace(sparse=SparseLU(lambda size: found().plan(size), given.tolerance))
+            return system._replace(sparse=SparseLU(found, given.tolerance))
         if system.sparse is not None and (given is not None or self.redundant is not None):
             return system._replace(sparse=None)
         return system

@@ -48,7 +48,7 @@ from hhtjax.primitives import one_kernel, staged, traced
 from hhtjax.steppers.implicit_solve import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
-from hhtjax.systems.constraints import answers, curvature, jacobian, reaction, violation
+from hhtjax.systems.constraints import answers, curvature, gradient_map, jacobian, reaction, violation
 
 if TYPE_CHECKING:
     from hhtjax.numerics.linear_solve import Given
@@ -86,8 +86,8 @@ class Layer(NamedTuple):
     """What is left of the equations at a start, or at a jump.
 
     base: the state, with accelerations and multipliers to which unknown changes z = (dw, dL) are added. offset: what
-    rows are to be. X, V: displacement and velocity by a unit of dw. B, bend: of constraints, None without. M:
-    None where it is not formed."""
+    rows are to be. X, V: displacement and velocity by a unit of dw. bend: of constraints, None without; B: their
+    gradient, None too where it is sparse. M: None where it is not formed."""
 
     system: Any
     params: PyTree
@@ -105,7 +105,7 @@ class Layer(NamedTuple):
         c = method.coefficients
         B = bend = None
         if system.num_constraints:
-            B = jacobian(system, base.q, base.t, params)
+            B = jacobian(system, base.q, base.t, params) if system.sparse is None else None
             bend = curvature(system, base.q, base.v, base.t, params)
         return cls(system, params, base, offset, c.beta * h**2, c.gamma * h, B, bend)
 
@@ -124,7 +124,19 @@ class Layer(NamedTuple):
     def parts(self, z: Array):
         """dw and dL."""
         n = self.system.size
-        return z[:n], (None if self.B is None else z[n:])
+        return z[:n], (None if self.bend is None else z[n:])
+
+    def push(self, w: Array) -> Array:
+        """B w."""
+        if self.B is not None:
+            return matvec(self.B, w)
+        return gradient_map(self.system, self.base.q, self.base.t, self.params)(w)
+
+    def pull(self, L: Array) -> Array:
+        """B^T L."""
+        if self.B is not None:
+            return matvec(self.B.T, L)
+        return reaction(self.system, self.base.q, self.base.t, self.params, L)
 
     def path(self, z: Array):
         """The state behind the implicit step, given the changes of acceleration and multipliers."""
@@ -136,16 +148,16 @@ class Layer(NamedTuple):
     def rows(self, s: State, bend: Array | None = None) -> Array:
         """What is to be zero: M w - Q - B^T L, and B w + curvature."""
         force = residual(self.system, self.params, s)
-        if self.B is None:
+        if self.bend is None:
             return force - self.offset
         bend = self.bend if bend is None else bend
-        return jnp.concatenate([force - matvec(self.B.T, s.L), matvec(self.B, s.w) + bend]) - self.offset
+        return jnp.concatenate([force - self.pull(s.L), self.push(s.w) + bend]) - self.offset
 
     def product(self, z: Array):
         """The part of the rows that z enters at the start itself: M dw - B^T dL, B dw."""
         dw, dL = self.parts(z)
         force = self.inertia(dw)
-        return force if dL is None else jnp.concatenate([force - matvec(self.B.T, dL), matvec(self.B, dw)])
+        return force if dL is None else jnp.concatenate([force - self.pull(dL), self.push(dw)])
 
     def full_mass(self) -> Array:
         """M at the start, as a matrix."""
@@ -325,7 +337,7 @@ def without_layer(
 
     data = layer.data()
     large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
-    if large or options.solve is not None or options.redundant is not None:
+    if large or options.solve is not None or options.redundant is not None or layer.system.sparse is not None:
         return by_maps(method, data, h)
     moving = partial(by_matrices, differentiable, differentiable_inverse)
     return derivative_at_need(moving, partial(by_matrices, searched, inverse), method, data, h)
@@ -364,7 +376,7 @@ def finished(
     v, bend = layer.base.v, layer.bend
     if drag is not None:
         v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
-        bend = None if layer.B is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
+        bend = None if layer.bend is None else curvature(layer.system, layer.base.q, v, layer.base.t, layer.params)
     z = corrected_by(layer, inverse, layer.rows(layer.base._replace(v=v), bend), method.corrections)
     lag = lag_left(layer, inverse)
     if not corrects:
@@ -562,7 +574,7 @@ def rate_of(layer: Layer, s: State, inverse: Callable, h: Array) -> Array:
     def rows(later: Array) -> Array:
         q, v, t = system.move(s.q, later * s.v), s.v + layer.located(later * s.w), s.t + later
         force = system.residual(q, v, s.w, t, params)
-        if layer.B is None:
+        if layer.bend is None:
             return force
         along = system.rate(q, v), s.w, jnp.ones_like(t)
         _, bend = jax.jvp(lambda q, v, t: violation(system, q, v, t, params)[1], (q, v, t), along)

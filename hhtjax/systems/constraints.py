@@ -20,7 +20,13 @@ from jax import lax
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.dense_lu import UNROLLED, diagonal, matvec
-from hhtjax.numerics.linear_solve import RANK_TOLERANCE, factorize_least_squares, factorize_saddle_point, solver
+from hhtjax.numerics.linear_solve import (
+    RANK_TOLERANCE,
+    factorize_least_squares,
+    factorize_map,
+    factorize_saddle_point,
+    solver,
+)
 from hhtjax.primitives import staged
 from hhtjax.systems import kinematics
 
@@ -71,6 +77,8 @@ def pull_back(system: FlatSystem, q: Array, gradient: Array) -> Array:
 def saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree, factorize: Callable | None = None):
     """The function (force, rows) -> (x, L) with M x - B^T L = force and B x = rows, factorised once: the index-1 system
     for accelerations, and all projections."""
+    if system.sparse is not None and (factorize is None or factorize is system.sparse):
+        return _sparse_saddle_point(system, q, t, params)
     M, B = system.full_mass(q, t, params), jacobian(system, q, t, params)
     A = jnp.block([[M, -B.T], [B, jnp.zeros((len(B), len(B)), B.dtype)]])
     inverse = solver(A, factorize or factorize_constrained(system.size, None))
@@ -82,6 +90,30 @@ def saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree, factori
     return x_and_multipliers
 
 
+def _sparse_saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree):
+    """The same without matrices."""
+    n, push = system.size, gradient_map(system, q, t, params)
+    zero = jnp.zeros(n, q.dtype)
+    pull = jax.linear_transpose(push, zero)
+
+    def f(z: Array) -> Array:
+        return jnp.concatenate([system.inertia(q, z[:n], t, params) - pull(z[n:])[0], push(z[:n])])
+
+    inverse = factorize_map(f, jnp.zeros(n + system.num_constraints, q.dtype), system.sparse)
+
+    def x_and_multipliers(force: Real, rows: Array):
+        z = inverse(jnp.concatenate([force, rows]))
+        return z[:n], z[n:]
+
+    return x_and_multipliers
+
+
+def gradient_map(system: FlatSystem, q: Array, t: Array, params: PyTree):
+    """The linear map v -> B v."""
+    _, tangent = jax.linearize(lambda q: system.constraint(q, t, params), q)
+    return lambda v: tangent(system.rate(q, v))
+
+
 def answers(
     system: FlatSystem, q: Array, t: Array, params: PyTree, redundant=None, factorize: Callable | None = None
 ) -> Any:
@@ -90,7 +122,8 @@ def answers(
     if not system.num_constraints:
         inverse = system.mass_solver(system.mass(q, t, params), *(() if factorize is None else (factorize,)))
         return lambda force, rows=None: (inverse(force), None)
-    factorize = factorize or factorize_constrained(system.size, redundant)
+    if factorize is None and (system.sparse is None or redundant is not None):
+        factorize = factorize_constrained(system.size, redundant)
     x_and_multipliers, zero = saddle_point(system, q, t, params, factorize), jnp.zeros(system.num_constraints, q.dtype)
     return lambda force, rows=zero: x_and_multipliers(force, rows)
 
@@ -181,3 +214,13 @@ def dependent_row(B: Array) -> Array:
     dependent = diagonal(G) < limit
     first = jnp.min(jnp.where(dependent, jnp.arange(m), m))
     return jnp.where(first < m, first, -1)
+
+
+def sparse_dependent_row(system: FlatSystem, q: Array, t: Array, params: PyTree) -> Array:
+    """The same of a system with a sparse solve, of the rows in the order in which this takes them."""
+    assert system.sparse is not None
+    push = gradient_map(system, q, t, params)
+    pull = jax.linear_transpose(push, jnp.zeros(system.size, q.dtype))
+    limit = 1e4 * float(jnp.finfo(q.dtype).eps)
+    pivots = system.sparse.cosine_pivots(lambda L: push(pull(L)[0]), jnp.zeros(system.num_constraints, q.dtype), limit)
+    return jnp.where(jnp.any(pivots < limit), jnp.argmax(pivots < limit), -1)

@@ -19,8 +19,9 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, takes
 from hhtjax.description import Array, PyTree, Real, is_array, is_concrete
+from hhtjax.primitives import Linear
 
-FEW = 32  # nodes of a part whose forces are added one by one
+FEW = 4  # nodes of a part whose forces are added one by one
 MOST_SHARED = 16  # elements at a node, up to which their forces are gathered
 
 
@@ -255,7 +256,9 @@ def _taken(name: str, tree: PyTree, nodes: np.ndarray) -> PyTree:
                 f"{name}: `nodes` names node {int(nodes.max())}, and a leaf of the state has shape {jnp.shape(x)}: the "
                 "first axis of all leaves is that of the nodes, counted from 0."
             )
-        return jnp.asarray(x).at[nodes].get(mode="promise_in_bounds")
+        x = jnp.asarray(x)
+        rows = _at_nodes(nodes.ravel().tobytes(), x.shape[0])(x.reshape(x.shape[0], -1))
+        return rows.reshape(*nodes.shape, *x.shape[1:])
 
     return jax.tree.map(take, tree)
 
@@ -283,25 +286,31 @@ def _numbers(part: _OnNodes, v: PyTree) -> np.ndarray:
 def _summed(nodes: np.ndarray, x: Array, forces: Array) -> Array:
     """(N, ...) like x: what forces (E, k, ...) on these nodes add up to."""
     number = np.shape(x)[0]
-    forces = forces.reshape(nodes.size, *np.shape(x)[1:])
-    if nodes.size <= FEW:
-        return jnp.zeros((number, *forces.shape[1:]), forces.dtype).at[nodes.ravel()].add(forces)
-    table = _table(nodes.ravel().tobytes(), number)
-    if table is None:
-        return jax.ops.segment_sum(forces, nodes.ravel(), number)
-    forces = jnp.concatenate([forces, jnp.zeros((1, *forces.shape[1:]), forces.dtype)])
-    return reduce(jnp.add, [forces.at[row].get(mode="promise_in_bounds") for row in table])
+    forces = forces.reshape(nodes.size, -1)
+    return _at_nodes(nodes.ravel().tobytes(), number).transpose(forces).reshape(np.shape(x))
 
 
 @lru_cache(maxsize=256)
-def _table(places: bytes, number: int) -> np.ndarray | None:
-    """(d, number): which entries of a list come to each place, and its length where there are no more; None where there
-    are too many."""
-    return table_of(np.frombuffer(places, np.int32), number)
+def _at_nodes(places: bytes, number: int) -> Linear:
+    """The map from (..., number, r) to the rows at these places; transposed it adds rows up: by gathers, both."""
+    rows = np.frombuffer(places, np.int32)
+    table = table_of(rows, number) if len(rows) > FEW else None
+
+    def take(x: Array) -> Array:
+        return x.at[..., rows, :].get(mode="promise_in_bounds")
+
+    def add(y: Array) -> Array:
+        if table is None:
+            return jnp.zeros((*y.shape[:-2], number, y.shape[-1]), y.dtype).at[..., rows, :].add(y)
+        y = jnp.concatenate([y, jnp.zeros_like(y[..., :1, :])], axis=-2)
+        return reduce(jnp.add, [y.at[..., row, :].get(mode="promise_in_bounds") for row in table])
+
+    return Linear(take, add)
 
 
 def table_of(places: np.ndarray, number: int) -> np.ndarray | None:
-    """The same."""
+    """(d, number): which entries of a list come to each place, and its length where there are no more; None where there
+    are too many."""
     count = np.bincount(places, minlength=number)
     if count.max(initial=0) > MOST_SHARED:
         return None

@@ -262,7 +262,7 @@ def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0:
         return flat._replace(settle=None, told=partial(_told, force.held, flat, thaw(params)))
 
     if flat.size + 2 * flat.num_constraints > LOOPED:
-        flat = flat._replace(sparse=SparseLU(lambda size: sparsity().plan(size)))
+        flat = flat._replace(sparse=SparseLU(sparsity))
     return flat._replace(settle=settle) if force.held is not None and force.held.moves else flat
 
 

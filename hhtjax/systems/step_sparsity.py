@@ -42,6 +42,11 @@ class Sparsity:
         self.force, self.drag = (product(product(turning, symmetric(A)), turning) for A in (force, drag))
         self.constraint = None if constraint is None else product(constraint, turning)
 
+    def of_rows(self) -> Plan:
+        """The `Plan` of B B^T."""
+        assert self.constraint is not None
+        return plan(product(self.constraint, self.constraint.T.tocsr()))
+
     def plan(self, size: int) -> Plan:
         """The `Plan` for the unknowns w, (w, L) or (w, L, eta), told by their number."""
         G, n = self.constraint, self.force.shape[0]

@@ -27,7 +27,7 @@ from hhtjax.primitives.consistent import held_p
 from hhtjax.primitives.interpreter import lowered
 from hhtjax.primitives.kernel_primitive import of_jaxpr
 from hhtjax.primitives.kernels import PART, STAGED
-from hhtjax.xla.fit_for_kernel import DTYPES, lengths, verdict
+from hhtjax.xla.fit_for_kernel import DTYPES, is_of_few_terms, is_of_vector, lengths, verdict
 from hhtjax.xla.sines import sines
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def _stage_kernel(closed: ClosedJaxpr, least: int, largest: int):
 def _expanded(eqn: JaxprEqn, copier):
     """What an operation of this package does; None of any other."""
     name, params = eqn.primitive.name, eqn.params
-    if name in ("hhtjax_family", "hhtjax_bilinear"):
+    if name in ("hhtjax_family", "hhtjax_bilinear", "hhtjax_map"):
         return copier.copied(params["jaxpr"])
     if name in OURS:
         return copier.copied(_traced(partial(OURS[name], **params), [x.aval for x in eqn.invars]))
@@ -200,6 +200,8 @@ def _in_kernel(eqn: JaxprEqn, copier):
     avals = tuple(x.aval for x in eqn.invars)
     if name == "dot_general" and _is_to_write_out(eqn):
         return _product(avals, params["dimension_numbers"])
+    if name == "reduce_sum" and is_of_few_terms(eqn):
+        return _traced(partial(_sum_of_few, axes=params["axes"]), avals)
     if name in COMBINED and _is_of_few_windows(eqn):
         return _traced(partial(_scattered, COMBINED[name], params["dimension_numbers"]), avals)
     if name == "hhtjax_sines":
@@ -219,11 +221,11 @@ def _traced(f: Callable, avals: Sequence) -> ClosedJaxpr:
 
 
 def _is_to_write_out(eqn) -> bool:
-    """Of two matrices, with few terms."""
+    """Of two matrices, or of large arrays, with few terms."""
     terms, *sides = lengths(eqn)
     types = {x.aval.dtype for x in (*eqn.invars, *eqn.outvars)}
     few = 0 < terms <= MOST_TERMS and min(sides) <= MOST_ROWS
-    return min(sides) > 1 and few and len(types) == 1 and types <= EXACT
+    return few and (min(sides) > 1 or not is_of_vector(eqn)) and len(types) == 1 and types <= EXACT
 
 
 @lru_cache(maxsize=256)
@@ -243,6 +245,14 @@ def _product(avals: tuple, dimension_numbers: tuple) -> ClosedJaxpr:
         return found.reshape(*shapes[0], *shapes[1], *shapes[2])
 
     return computed_once(_traced(product, avals))
+
+
+def _sum_of_few(x: Array, axes: tuple) -> Array:
+    """A sum over axes, term by term."""
+    rest = [i for i in range(x.ndim) if i not in axes]
+    shape = [x.shape[i] for i in rest]
+    x = lax.transpose(x, (*axes, *rest)).reshape(-1, *shape)
+    return reduce(lax.add, list(x))
 
 
 # scatters
