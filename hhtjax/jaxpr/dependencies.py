@@ -24,7 +24,7 @@ from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
 from hhtjax.description import PyTree
-from hhtjax.jaxpr.dependency_rules import ELEMENTWISE, RULES, ZERO_TO_ZERO, all_on_all
+from hhtjax.jaxpr.dependency_rules import RULES, all_on_all
 from hhtjax.jaxpr.known_values import known_results
 from hhtjax.jaxpr.recording import INLINED, kept_and_carried
 from hhtjax.jaxpr.row_sets import (
@@ -53,7 +53,7 @@ WRITTEN_OUT = 64  # steps of a scan that are evaluated one by one, with the numb
 ONE_BY_ONE = 1000  # steps of a scan that are told apart; of more, each may depend on all others
 INSIDE = {  # parameter of an operation that holds a function of all its operands
     **{name: param for name, param in INLINED.items() if not name.startswith("custom_")},
-    "hhtjax_kernel": "closed",
+    **{"hhtjax_kernel": "closed", "composite": "jaxpr", "custom_vmap_call": "call"},
 }
 
 
@@ -109,9 +109,8 @@ def run(closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
     jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
     found = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, constants), *values], strict=True))
     equations = needed(jaxpr)
-    last = {x: i for i, eqn in enumerate(equations) for x in eqn.invars if not isinstance(x, Literal)}
-    for x in jaxpr.outvars:
-        last[x] = len(equations)
+    uses = [*(eqn.invars for eqn in equations), jaxpr.outvars]
+    last = {x: i for i, used in enumerate(uses) for x in used if not isinstance(x, Literal)}
 
     def read(atom):
         return _constant(atom.val) if isinstance(atom, Literal) else found[atom]
@@ -204,28 +203,8 @@ def _spread_over(eqn, found: list[Value]) -> list[Value]:
 
 
 def _custom_jvp(eqn, *values: Value):
-    """By the rule; of an elementwise function, elementwise."""
-    shape = eqn.outvars[0].aval.shape
-    if all(x.aval.shape == shape for x in eqn.outvars) and _is_elementwise(eqn.params["call_jaxpr"].jaxpr, shape):
-        return RULES["exp"](eqn, *values) * len(eqn.outvars)
+    """By the rule of forward mode."""
     return _spread_over(eqn, _of_derivative(alone(eqn), values, [x.aval for x in eqn.invars]))
-
-
-ALONE = {  # operations that keep elements apart
-    *(ELEMENTWISE + " " + ZERO_TO_ZERO).split(),
-    *"add add_any sub mul div max min integer_pow select_n floor ceil round sign eq ne lt le gt ge and or not xor".split(),
-    *"is_finite stop_gradient".split(),
-}
-
-
-def _is_elementwise(jaxpr, shape: tuple) -> bool:
-    """Whether each element of the results comes from elements at the same place, and from scalars."""
-    if any(x.aval.shape not in (shape, ()) for eqn in jaxpr.eqns for x in (*eqn.invars, *eqn.outvars)):
-        return False
-    inner = [eqn.params["jaxpr"].jaxpr for eqn in jaxpr.eqns if eqn.primitive.name == "jit"]
-    others = [eqn for eqn in jaxpr.eqns if eqn.primitive.name != "jit"]
-    known = all(x.primitive.name in ALONE or x.primitive.name == "broadcast_in_dim" for x in others)
-    return known and all(_is_elementwise(x, shape) for x in inner)
 
 
 def _custom_vjp(eqn, *values: Value):

@@ -452,7 +452,7 @@ CONSTANT = (
     "argmax argmin stop_gradient bitcast_convert_type"
 )
 IDENTITIES = (
-    "optimization_barrier device_put sharding_constraint name hhtjax_held hhtjax_watch hhtjax_structural "
+    "optimization_barrier device_put sharding_constraint layout_constraint reshard pvary name hhtjax_held hhtjax_watch hhtjax_structural "
     "hhtjax_largest_in_batch hhtjax_told hhtjax_forward_only hhtjax_or_alone"
 )
 REDUCTIONS = "reduce_sum reduce_max reduce_min reduce_prod reduce_and reduce_or reduce_xor"

@@ -92,6 +92,10 @@ def _concatenate(eqn, *arrays: np.ndarray):
     return [np.concatenate(arrays, eqn.params["dimension"])]
 
 
+def _stack(eqn, *arrays: np.ndarray):
+    return [np.stack(arrays, eqn.params["axis"])]
+
+
 def _split(eqn, x: np.ndarray):
     return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"])
 
@@ -112,6 +116,7 @@ MOVES = {
     "slice": _slice,
     "pad": _pad,
     "concatenate": _concatenate,
+    "stack": _stack,
     "split": _split,
     "unstack": _unstack,
     "tile": _tile,
