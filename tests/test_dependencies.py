@@ -28,7 +28,9 @@ def nonzeros(f, n, points=POINTS, derivative=jax.jacfwd):
 
 def pattern(f, n, *others):
     found = dependencies(f, jax.ShapeDtypeStruct((n,), float), *others)
-    assert found.dtype == bool and found.has_sorted_indices and found.shape[1] == n
+    assert found.dtype == bool
+    assert found.has_sorted_indices
+    assert found.shape[1] == n
     return found.toarray()
 
 
@@ -203,7 +205,7 @@ LOCAL = {
     "sort": (sorted_rows, 9),
     "branches": (branches, 4),
     "where and max": (where_and_max, 6),
-    "rows": (lambda x: row_written(x.reshape(2, 3), x[:3] * 2, np.array(1)).ravel(), 6),
+    "rows": (lambda x: row_written(x.reshape(2, 3), x[:3] * 2, jnp.array(1)).ravel(), 6),
     "slices": (lambda x: lax.dynamic_update_slice(x, lax.dynamic_slice(x, (1,), (2,)) ** 2, (3,))[::-1], 6),
     "solve in batches": (solved_in_batches, 18),
     "a derivative of its own": (rounded, 3),
@@ -225,8 +227,12 @@ def test_exact(name):
 
 
 def newton(x):
-    """Of a member until all of the batch are done, and a triangular loop."""
-    return jax.vmap(lambda a: lax.while_loop(lambda y: jnp.abs(y * y - a) > 1e-3, lambda y: (y + a / y) / 2, a))(1 + x**2)
+    """A root of each member of a batch."""
+
+    def root(a):
+        return lax.while_loop(lambda y: jnp.abs(y * y - a) > 1e-3, lambda y: (y + a / y) / 2, a)
+
+    return jax.vmap(root)(1 + x**2)
 
 
 def solved(x):

@@ -15,7 +15,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -165,65 +166,53 @@ def _known(eqn: JaxprEqn, values: list[Value]) -> list[Value] | None:
 # Functions with derivatives of their own: the pattern is that of the derivative, which is linear.
 
 
-def _of_derivative(f: Callable, values: Sequence[Value], avals: Sequence) -> list[Value]:
-    """The results of a function of these values, a list of arrays, by the pattern of its tangents.
-
-    avals: of its arguments.
-    """
-    moving = [x.rows is not None for x in values]
-
-    def tangents(moved: list, others: list, dots: list) -> list:
-        moved, others = iter(moved), iter(others)
-        args = [next(moved) if m else x.known if x.known is not None else next(others) for m, x in zip(moving, values)]
-
-        def g(*moved):
-            moved = iter(moved)
-            return [y for y in f(*(next(moved) if m else x for m, x in zip(moving, args))) if _has_derivative(y)]
-
-        return jax.jvp(g, [x for m, x in zip(moving, args) if m], dots)[1]
-
-    moved = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x, m in zip(avals, moving, strict=True) if m]
-    others = [
-        jax.ShapeDtypeStruct(a.shape, a.dtype)
-        for a, x, m in zip(avals, values, moving, strict=True)
-        if not m and x.known is None
-    ]
-    trace = lowered(jax.make_jaxpr(tangents)(moved, others, moved))
-    dots = [Value(x.shape, x.rows) for x in values if x.rows is not None]
-    unknown = [Value(tuple(x.shape)) for x in (*moved, *others)]
-    return run(trace, [*unknown, *dots])
+def _like(variables: Sequence) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in variables]
 
 
-def _spread_over(eqn, found: list[Value]) -> list[Value]:
+def _of_moving(f: Callable, moves: Sequence[bool], args: Sequence):
+    """f as a function of those arguments that move, to a list of the results that have derivatives; and these."""
+
+    def g(*moved):
+        given = iter(moved)
+        results = f(*(next(given) if m else x for m, x in zip(moves, args, strict=True)))
+        return [y for y in results if _has_derivative(y)]
+
+    return g, [x for m, x in zip(moves, args, strict=True) if m]
+
+
+def _spread_over(eqn, found: Sequence[Value]) -> list[Value]:
     """These for the results that have derivatives, and nothing for others."""
-    found = iter(found)
-    return [
-        Value(x.aval.shape, next(found).rows) if _has_derivative(x.aval) else Value(x.aval.shape) for x in eqn.outvars
-    ]
+    given = iter(found)
+    return [Value(x.aval.shape, next(given).rows if _has_derivative(x.aval) else None) for x in eqn.outvars]
 
 
 def _custom_jvp(eqn, *values: Value):
-    """By the rule of forward mode."""
-    return _spread_over(eqn, _of_derivative(alone(eqn), values, [x.aval for x in eqn.invars]))
+    """By the rule of forward mode: the tangents of the results depend on those of the operands, with known numbers."""
+    moves, f = [x.rows is not None for x in values], alone(eqn)
+
+    def tangents(args: list, dots: list):
+        args = [y if x.known is None else x.known for x, y in zip(values, args, strict=True)]
+        return jax.jvp(*_of_moving(f, moves, args), dots)[1]
+
+    args = _like(eqn.invars)
+    trace = lowered(jax.make_jaxpr(tangents)(args, [x for m, x in zip(moves, args, strict=True) if m]))
+    dots = [Value(x.shape, x.rows) for x in values if x.rows is not None]
+    return _spread_over(eqn, run(trace, [*(Value(x.shape) for x in args), *dots]))
 
 
 def _custom_vjp(eqn, *values: Value):
     """By the rule of reverse mode, which gives the transpose."""
-    moving = [x.rows is not None for x in values]
-    avals = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
-    outs = [x.aval for x in eqn.outvars if _has_derivative(x.aval)]
-    f = alone(eqn)
+    moves, f = [x.rows is not None for x in values], alone(eqn)
 
     def cotangents(args: list, given: list):
-        def g(*moved):
-            moved = iter(moved)
-            return [y for y in f(*(next(moved) if m else x for m, x in zip(moving, args))) if _has_derivative(y)]
+        g, moved = _of_moving(f, moves, args)
+        return jax.vjp(g, *moved)[1](given)
 
-        return jax.vjp(g, *(x for m, x in zip(moving, args) if m))[1](given)
-
-    trace = lowered(jax.make_jaxpr(cotangents)(avals, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in outs]))
-    given = _independent([Value(tuple(x.shape)) for x in outs], [True] * len(outs))
-    back = stacked(run(trace, [Value(tuple(x.shape)) for x in avals] + given))
+    args, outs = _like(eqn.invars), _like([x for x in eqn.outvars if _has_derivative(x.aval)])
+    trace = lowered(jax.make_jaxpr(cotangents)(args, outs))
+    given = _independent([Value(x.shape) for x in outs], [True] * len(outs))
+    back = stacked(run(trace, [*(Value(x.shape) for x in args), *given]))
     relation = None if back is None else back.T.tocsr()
     rows = product(relation, stacked([x for x in values if x.rows is not None]))
     return _spread_over(eqn, divided(rows, [x.shape for x in outs]))
@@ -231,8 +220,7 @@ def _custom_vjp(eqn, *values: Value):
 
 def _by_tracing(function: Callable, eqn, *values: Value):
     """An operation of our own that is a function of arrays, with the same parameters."""
-    like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
-    return run(lowered(jax.make_jaxpr(partial(function, **eqn.params))(*like)), values)
+    return run(lowered(jax.make_jaxpr(partial(function, **eqn.params))(*_like(eqn.invars))), values)
 
 
 def _two_ways(function: Callable, eqn, *values: Value):
@@ -290,8 +278,8 @@ def _relation(closed: ClosedJaxpr, parts: Sequence[Sequence[Value]], moves: Sequ
     sizes = [sum(x.size for x, m in zip(p, q, strict=True) if m) for p, q in zip(parts, moves, strict=True)]
     ends, rows, start = np.cumsum([0, *sizes]), [], 0
     for count in results:
-        group = stacked(found[start : start + count])
-        rows.append([None if group is None else group[:, a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)])
+        group: Any = stacked(found[start : start + count])
+        rows.append([None if group is None else group[:, a:b] for a, b in pairwise(ends)])
         start += count
     return rows
 
@@ -353,8 +341,7 @@ def _map(eqn, constants: Sequence[Value], rows: Sequence[Value]):
     axes = [None] * len(constants) + [0] * len(rows)
     closed = eqn.params["jaxpr"]
     f = jax.vmap(jaxpr_as_fun(closed), axes, axis_size=eqn.params["length"])
-    like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
-    return run(lowered(jax.make_jaxpr(f)(*like)), [*constants, *rows])
+    return run(lowered(jax.make_jaxpr(f)(*_like(eqn.invars))), [*constants, *rows])
 
 
 def _written_out(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: Sequence[Value]):
@@ -420,8 +407,9 @@ def _by_array(rows, length: int, shapes: Sequence) -> list[Value]:
     sizes = [math.prod(shape[1:]) for shape in shapes]
     ends = np.cumsum([0, *sizes])
     places = numbers((length, ends[-1]))
-    pairs = zip(shapes, ends[:-1], ends[1:], strict=True)
-    return [Value(tuple(shape), taken(rows, places[:, a:b])) for shape, a, b in pairs]
+    return [
+        Value(tuple(shape), taken(rows, places[:, a:b])) for shape, (a, b) in zip(shapes, pairwise(ends), strict=True)
+    ]
 
 
 def _in_every_step(length: int, relation, rows):

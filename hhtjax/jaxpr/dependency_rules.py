@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jax import lax
@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 
 def out_shape(eqn: JaxprEqn) -> tuple:
     """That of the first result."""
-    return tuple(eqn.outvars[0].aval.shape)
+    aval: Any = eqn.outvars[0].aval
+    return tuple(aval.shape)
 
 
 def all_on_all(eqn: JaxprEqn, *values: Value) -> list[Value]:
@@ -154,7 +155,7 @@ def _without_axes(shape: Sequence, axes: Sequence) -> np.ndarray:
 
 def _reduced(x: Value, axes: Sequence, shape: tuple, zero_stays: bool) -> Value:
     mask = where_nonzero(x) if zero_stays else None
-    mask = None if mask is None else mask.any(tuple(axes)).reshape(shape)
+    mask = None if mask is None else np.any(mask, tuple(axes)).reshape(shape)
     return Value(shape, grouped(x.rows, _without_axes(x.shape, axes), math.prod(shape)), nonzero=mask)
 
 
@@ -219,7 +220,7 @@ def _dot_general(eqn, x: Value, y: Value):
         for v, (axes, sizes) in zip((x, y), order, strict=True)
     ]
     shape = out_shape(eqn)
-    out = numbers((*places[0].shape[:2], places[1].shape[1]))
+    out: Any = numbers([*places[0].shape[:2], *places[1].shape[1:2]])
     rows = united(
         _terms(x.rows, places[0], masks[1], out),
         _terms(y.rows, places[1], masks[0], out.swapaxes(1, 2)),
@@ -302,7 +303,7 @@ def _flat(places: list, shape: Sequence, window: tuple, inside) -> np.ndarray:
     return np.where(inside, np.broadcast_to(flat, window), -1)
 
 
-def _read(x: Value, places: list, window: tuple, inside=True) -> Value:
+def _read(x: Value, places: list, window: tuple, inside: Any = True) -> Value:
     """The elements at these places."""
     anywhere = [i for i, place in enumerate(places) if place is None]
     kept = tuple(1 if place is None else length for place, length in zip(places, x.shape, strict=True))
@@ -314,7 +315,7 @@ def _read(x: Value, places: list, window: tuple, inside=True) -> Value:
     return Value(window, taken(x.rows, flat), nonzero=mask)
 
 
-def _written(x: Value, new: Value, places: list, inside=True, replaces: bool = False, keeps_zeros: bool = True) -> Value:
+def _written(x: Value, new: Value, places: list, inside: Any = True, replaces=False, keeps_zeros=True) -> Value:
     """x with elements of `new` at these places: in place of what stood there, if it `replaces` that, or beside it."""
     kept = tuple(1 if place is None else length for place, length in zip(places, x.shape, strict=True))
     flat = _flat(places, kept, new.shape, inside).reshape(-1)
@@ -452,9 +453,13 @@ CONSTANT = (
     "argmax argmin stop_gradient bitcast_convert_type"
 )
 IDENTITIES = (
-    "optimization_barrier device_put sharding_constraint layout_constraint reshard pvary name hhtjax_held hhtjax_watch hhtjax_structural "
+    "optimization_barrier device_put sharding_constraint layout_constraint reshard pvary name "
+    "hhtjax_held hhtjax_watch hhtjax_structural "
     "hhtjax_largest_in_batch hhtjax_told hhtjax_forward_only hhtjax_or_alone"
 )
+BLOCKS = "lu cholesky eigh eig svd qr householder_product schur hessenberg tridiagonal"
+CUMULATIVE = "cumsum cumprod cummax cummin cumlogsumexp"
+SCATTERS = "scatter scatter-add scatter-sub scatter-mul scatter-min scatter-max"
 REDUCTIONS = "reduce_sum reduce_max reduce_min reduce_prod reduce_and reduce_or reduce_xor"
 RULES = {
     **dict.fromkeys(ZERO_TO_ZERO.split(), _of_zero_zero),
@@ -465,14 +470,13 @@ RULES = {
     **{"mul": _mul, "div": _div, "integer_pow": _integer_pow, "select_n": _select_n},
     **dict.fromkeys(MOVES, _moved),
     **dict.fromkeys(REDUCTIONS.split(), _reduce),
-    **dict.fromkeys("cumsum cumprod cummax cummin cumlogsumexp".split(), _cumulative),
+    **dict.fromkeys(CUMULATIVE.split(), _cumulative),
     **{"reduce": _reduce_by_function, "sort": _sort, "top_k": _top_k},
     "dot_general": _dot_general,
-    **dict.fromkeys("lu cholesky eigh eig svd qr householder_product schur".split(), partial(_dense_blocks, 2)),
-    **{"hessenberg": partial(_dense_blocks, 2), "tridiagonal": partial(_dense_blocks, 2)},
+    **dict.fromkeys(BLOCKS.split(), partial(_dense_blocks, 2)),
     **{"tridiagonal_solve": partial(_dense_blocks, 1), "triangular_solve": _triangular_solve},
     **{"dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice, "gather": _gather},
-    **dict.fromkeys("scatter scatter-add scatter-sub scatter-mul scatter-min scatter-max".split(), _scatter),
+    **dict.fromkeys(SCATTERS.split(), _scatter),
     "hhtjax_row_written": _row_written,
     "hhtjax_inside": lambda eqn, x: [Value((), known=np.array(False))],
 }

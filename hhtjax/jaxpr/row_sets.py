@@ -193,7 +193,7 @@ def of_members(values: Sequence[Value]) -> Value:
 def either(*values: Value) -> Value:
     """What is one of these, nobody knows which."""
     masks = [where_nonzero(x) for x in values]
-    mask = None if any(x is None for x in masks) else reduce(np.logical_or, masks)
+    mask = None if any(x is None for x in masks) else np.any([x for x in masks if x is not None], axis=0)
     return Value(values[0].shape, united(*(x.rows for x in values)), nonzero=mask)
 
 
