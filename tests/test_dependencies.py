@@ -14,7 +14,7 @@ from program_writer import function, program, usual_promotion
 
 import hhtjax
 from hhtjax.jaxpr import TooDense, dependencies
-from hhtjax.primitives import row_written
+from hhtjax.primitives import choose, consistent, in_turn, one_kernel, row_written, structural, together, traced
 
 POINTS = 30
 
@@ -129,6 +129,19 @@ def long_scan(x):
     return jnp.concatenate([rows, jnp.stack([a, b])])
 
 
+def second_before(x):
+    """A carry that is forgotten after two steps, with a number for each step."""
+
+    def step(carry, row):
+        return (carry[1], row[0]), carry[0] * row[0] + row[1]
+
+    return lax.scan(step, (x[1], x[2]), (x, jnp.zeros_like(x)))[1]
+
+
+def places_in_a_long_loop(x):
+    return lax.fori_loop(0, 80, lambda i, y: y.at[i].add(x[i + 1] * x[i]), jnp.zeros(81))
+
+
 def while_stencil(x):
     """Each step spreads by one on each side, and the number of steps is data."""
 
@@ -194,6 +207,8 @@ LOCAL = {
     "map": (lambda x: lax.map(lambda row: row[0] * row[1:], x.reshape(-1, 3)).ravel(), 9),
     "loop with known places": (written_one_by_one, 6),
     "long scan": (long_scan, 140),
+    "long scan that forgets": (second_before, 100),
+    "long loop with known places": (places_in_a_long_loop, 81),
     "while": (while_stencil, 5),
     "constant band": (lambda x: BAND @ jnp.sin(x), 7),
     "constant band in einsum": (lambda x: jnp.einsum("ij,bj->bi", BAND, x.reshape(2, 7)).ravel(), 14),
@@ -253,7 +268,6 @@ SUPERSETS = {
     "cholesky": (lambda x: jnp.linalg.cholesky(jnp.diag(3 + x**2) + 0.1 * jnp.outer(x, x)).ravel(), 3),
     "eigenvalues": (lambda x: jnp.linalg.eigvalsh(jnp.diag(x) + 1), 3),
     "convolution": (lambda x: jnp.convolve(x, x[:2]), 5),
-    "very long scan": (lambda x: lax.scan(lambda c, r: (c + r, jnp.sin(c)), 0.0, jnp.tile(x, 400))[1], 3),
 }
 
 
@@ -266,6 +280,31 @@ def test_superset(name):
 def test_local_where_only_members_meet():
     """A loop of a batch: each member depends on its own unknown, though all of them go on while one does."""
     np.testing.assert_array_equal(pattern(newton, 4), np.eye(4, dtype=bool))
+
+
+def test_steps_that_are_not_told_apart(monkeypatch):
+    """Where a carry of each step would be too much."""
+    monkeypatch.setattr(sys.modules["hhtjax.jaxpr.row_sets"], "MOST", 5000)
+    found = pattern(lambda x: lax.scan(lambda y, _: (jnp.roll(y, 2) * y, None), x, None, length=100)[0], 20)
+    expected = (np.arange(20)[:, None] - np.arange(20)) % 2 == 0
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_machinery_that_has_been_traced():
+    """Functions traced before keep the operations of the library, of which a plain trace has none."""
+
+    def f(x):
+        x = one_kernel(lambda x: lax.fori_loop(0, 3, lambda i, y: jnp.sin(y) * y, x), x)
+        x = choose(lambda x: x + x, lambda x: 2 * x, structural(np.eye(6)) @ x)
+        x = jax.vmap(lambda v: in_turn(lambda v: jnp.where(v > 0, v * v, v), v > 0, v))(x)
+        x = jax.vmap(consistent(lambda v: jnp.where(v > 0.5, v, v * v)))(x)
+        (x,) = together(lambda x: [x[0] * 2], [x])
+        return jax.vmap(hhtjax.rotation.cross)(x.reshape(2, 3), jnp.ones((2, 3))).ravel()
+
+    before = traced(f, jax.ShapeDtypeStruct((6,), float))
+    expected = np.kron(np.eye(2), 1 - np.eye(3)) > 0
+    np.testing.assert_array_equal(pattern(lambda x: before(x), 6), expected)
+    np.testing.assert_array_equal(pattern(f, 6), expected)
 
 
 def test_reverse_rules_are_transposed():

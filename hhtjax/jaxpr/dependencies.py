@@ -29,7 +29,9 @@ from hhtjax.jaxpr.dependency_rules import RULES, all_on_all
 from hhtjax.jaxpr.known_values import known_results
 from hhtjax.jaxpr.recording import INLINED, kept_and_carried
 from hhtjax.jaxpr.row_sets import (
+    TooDense,
     Value,
+    between,
     closure,
     divided,
     either,
@@ -51,7 +53,7 @@ if TYPE_CHECKING:
     from jax.extend.core import JaxprEqn
 
 WRITTEN_OUT = 64  # steps of a scan that are evaluated one by one, with the numbers that are known in each
-ONE_BY_ONE = 1000  # steps of a scan that are told apart; of more, each may depend on all others
+OPERATIONS = 20_000  # the same of longer ones, where integers are known: it takes two seconds
 INSIDE = {  # parameter of an operation that holds a function of all its operands
     **{name: param for name, param in INLINED.items() if not name.startswith("custom_")},
     **{"hhtjax_kernel": "closed", "composite": "jaxpr", "custom_vmap_call": "call"},
@@ -331,9 +333,11 @@ def _scan(eqn, *values: Value):
     length = eqn.params["length"]
     if not carried and length:
         return _map(eqn, constants, rows)
-    if length <= WRITTEN_OUT:
+    work = length * len(eqn.params["jaxpr"].jaxpr.eqns)
+    is_told = work <= OPERATIONS and any(x.known is not None and x.known.dtype.kind in "iu" for x in (*carry, *rows))
+    if length <= WRITTEN_OUT or is_told:
         return _written_out(eqn, constants, carry, rows)
-    return _long_scan(eqn, constants, carry, rows)
+    return _by_relation(eqn, constants, carry, rows)
 
 
 def _map(eqn, constants: Sequence[Value], rows: Sequence[Value]):
@@ -356,60 +360,61 @@ def _written_out(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: 
     return [*carry, *outs]
 
 
-def _long_scan(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: Sequence[Value]):
-    """By the relation of one step; where there are very many, with the carry of any step in each."""
+def _by_relation(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: Sequence[Value]):
+    """All steps at once, by the relation of one."""
     closed, count, length = eqn.params["jaxpr"], len(carry), eqn.params["length"]
     given = closed.jaxpr.invars[len(constants) :]
     moves = [[x.rows is not None for x in constants], _floating(given[:count]), [x.rows is not None for x in rows]]
     parts = [constants, _before(closed.jaxpr, carry, len(constants)), [Value(x.aval.shape) for x in given[count:]]]
     after, made = _relation(closed, parts, moves, [count, len(eqn.outvars) - count])
     after = [_kept(x, moves[1], [y.size for y in carry]) for x in after]
-    fixed, state, by_step = _only(constants, moves[0]), _only(carry, moves[1]), _by_step(rows, moves[2])
+    order = np.arange(length)[::-1] if eqn.params["reverse"] else np.arange(length)
+    fixed, by_step = _only(constants, moves[0]), _by_step(rows, moves[2], order)
 
     def brought(relation: list):
-        constant = product(relation[0], fixed)
-        return united(_in_every_step(length, relation[2], by_step), _repeated(length, constant))
+        return united(_in_every_step(length, relation[2], by_step), _repeated(length, product(relation[0], fixed)))
 
-    size = sum(x.size for x, m in zip(carry, moves[1], strict=True) if m)
-    state, states = _states(length, size, after[1], state, brought(after), eqn.params["reverse"])
-    outs = united(_in_every_step(length, made[1], states), brought(made))
-    avals = [x.aval for x in eqn.outvars]
-    return [*_expanded(state, avals[:count], moves[1]), *_by_array(outs, length, [x.shape for x in avals[count:]])]
+    start, size = _only(carry, moves[1]), sum(x.size for x, m in zip(carry, moves[1], strict=True) if m)
+    try:
+        states = _states(length, size, after[1], start, brought(after))
+        last, before = between(states, length * size, (length + 1) * size), between(states, 0, length * size)
+    except TooDense:  # steps that are not told apart: each has all that the carry may depend on in any
+        each_step = grouped(_in_every_step(length, after[2], by_step), np.tile(np.arange(size), length), size)
+        last = closure(after[1], united(start, product(after[0], fixed), each_step))
+        before = None if made[1] is None else _repeated(length, last)
+    outs, avals = united(_in_every_step(length, made[1], before), brought(made)), [x.aval for x in eqn.outvars]
+    return [*_expanded(last, avals[:count], moves[1]), *_by_array(outs, order, [x.shape for x in avals[count:]])]
 
 
-def _states(length: int, size: int, relation, state, brought, reverse: bool):
-    """The carry after the last step, and the carries before all steps, one below the other.
+def _states(length: int, size: int, relation, start, brought):
+    """The carry before each step and after the last, one below the other.
 
-    brought: what each step adds to the carry.
+    That after step t depends on what was brought j steps before by the power j of the relation. Powers are taken by
+    squaring: each turn doubles the number of steps that are seen.
     """
-    if length > ONE_BY_ONE:
-        ever = grouped(brought, np.tile(np.arange(size), length), size)
-        state = closure(relation, united(state, ever))
-        return state, _repeated(length, state)
-    before = {}
-    for i in reversed(range(length)) if reverse else range(length):
-        before[i] = Value((size,), state)
-        new = None if brought is None else brought[i * size : (i + 1) * size]
-        state = united(product(relation, state), new)
-    return state, stacked([before[i] for i in range(length)])
+    rows = stacked([Value((size,), start), Value((length * size,), brought)])
+    reach = 1
+    while reach <= length and relation is not None and rows is not None:
+        others = length + 1 - reach
+        more = _in_every_step(others, relation, between(rows, 0, others * size))
+        rows = united(rows, stacked([Value((reach * size,)), Value((others * size,), more)]))
+        relation, reach = product(relation, relation), 2 * reach
+    return rows
 
 
-def _by_step(values: Sequence[Value], moves: Sequence[bool]):
+def _by_step(values: Sequence[Value], moves: Sequence[bool], order: np.ndarray):
     """The rows of those that move, first all of the first step."""
     there = [x for x, m in zip(values, moves, strict=True) if m]
     starts = np.cumsum([0, *(x.size for x in there)])
-    places = [numbers((x.shape[0], x.size // x.shape[0])) + i for x, i in zip(there, starts, strict=False)]
+    places = [numbers((x.shape[0], x.size // x.shape[0]))[order] + i for x, i in zip(there, starts, strict=False)]
     return taken(stacked(there), np.concatenate(places, 1)) if there else None
 
 
-def _by_array(rows, length: int, shapes: Sequence) -> list[Value]:
+def _by_array(rows, order: np.ndarray, shapes: Sequence) -> list[Value]:
     """The inverse, for arrays of these shapes."""
-    sizes = [math.prod(shape[1:]) for shape in shapes]
-    ends = np.cumsum([0, *sizes])
-    places = numbers((length, ends[-1]))
-    return [
-        Value(tuple(shape), taken(rows, places[:, a:b])) for shape, (a, b) in zip(shapes, pairwise(ends), strict=True)
-    ]
+    ends = np.cumsum([0, *(math.prod(shape[1:]) for shape in shapes)])
+    places = numbers((len(order), ends[-1]))[order]
+    return [Value(shape, taken(rows, places[:, a:b])) for shape, (a, b) in zip(shapes, pairwise(ends), strict=True)]
 
 
 def _in_every_step(length: int, relation, rows):

@@ -257,7 +257,7 @@ def _terms(rows, places: np.ndarray, mask: np.ndarray | None, out: np.ndarray):
 
 def _mask_of_product(masks: list, places: list, shape: tuple):
     x, y = (np.ones(p.shape, bool) if m is None else m for m, p in zip(masks, places, strict=True))
-    if (masks[0] is None and masks[1] is None) or x.size * y.shape[1] > 100 * MOST:
+    if (masks[0] is None and masks[1] is None) or math.prod(shape) * places[0].shape[2] > 100 * MOST:
         return None
     return (np.matmul(x.astype(np.float32), y.swapaxes(1, 2).astype(np.float32)) > 0).reshape(shape)
 

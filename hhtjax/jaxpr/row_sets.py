@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 MOST = 10**8  # entries of a pattern: with more, memory ends before there is a result
+LONG = 10**7  # terms of a product that takes long
+DENSE_IS_FASTER = 100  # times, for the same number of terms
 DIRECTLY = 8  # steps of a closure before its matrix is squared
 
 
@@ -127,12 +129,18 @@ def related(to: np.ndarray, origin: np.ndarray, rows, size: int):
 
 def product(relation, rows):
     """Of a relation (outputs, elements), and the rows of the elements, those of the outputs."""
+    from scipy import sparse
+
     if rows is None or relation is None:
         return None
-    counts = np.diff(rows.indptr)
-    _require_few(int(counts[relation.indices].sum(dtype=np.int64)))
-    found = relation @ rows
-    found.sort_indices()
+    (m, k), n = relation.shape, rows.shape[1]
+    work = int(np.diff(rows.indptr)[relation.indices].sum(dtype=np.int64))
+    _require_few(min(work, m * n))
+    if work > LONG and DENSE_IS_FASTER * work > m * k * n and max(m * k, k * n, m * n) <= MOST:
+        found = sparse.csr_array(relation.astype(np.float32).toarray() @ rows.astype(np.float32).toarray() > 0)
+    else:
+        found = relation @ rows
+        found.sort_indices()
     return found if found.nnz else None
 
 
@@ -164,10 +172,11 @@ def divided(rows, shapes: Sequence) -> list[Value]:
     """The inverse of `stacked`."""
     ends = np.cumsum([math.prod(shape) for shape in shapes])
     pairs = zip(shapes, ends, strict=True)
-    return [Value(shape, _part(rows, end - math.prod(shape), end)) for shape, end in pairs]
+    return [Value(shape, between(rows, end - math.prod(shape), end)) for shape, end in pairs]
 
 
-def _part(rows, start: int, stop: int):
+def between(rows, start: int, stop: int):
+    """The rows from start to stop."""
     if rows is None or start == stop:
         return None
     found = rows[start:stop]
@@ -178,7 +187,7 @@ def member(x: Value, i: int) -> Value:
     """x[i]."""
     size = math.prod(x.shape[1:])
     known, nonzero = (None if y is None else y[i] for y in (x.known, x.nonzero))
-    return Value(x.shape[1:], _part(x.rows, i * size, (i + 1) * size), known, nonzero)
+    return Value(x.shape[1:], between(x.rows, i * size, (i + 1) * size), known, nonzero)
 
 
 def of_members(values: Sequence[Value]) -> Value:
