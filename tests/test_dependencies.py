@@ -222,6 +222,7 @@ LOCAL = {
     "where and max": (where_and_max, 6),
     "rows": (lambda x: row_written(x.reshape(2, 3), x[:3] * 2, jnp.array(1)).ravel(), 6),
     "slices": (lambda x: lax.dynamic_update_slice(x, lax.dynamic_slice(x, (1,), (2,)) ** 2, (3,))[::-1], 6),
+    "set": (lambda x: x.at[np.array([2, 9, -1])].set(x[:3], mode="drop").at[0].set(1.0), 5),
     "solve in batches": (solved_in_batches, 18),
     "a derivative of its own": (rounded, 3),
     "a derivative elsewhere": (shifted, 3),

@@ -431,10 +431,10 @@ def _scatter(eqn, x: Value, indices: Value, updates: Value):
     places, inside = _windows(indices, x.shape, updates.shape, sizes, layout, clips)
     function = eqn.params.get("update_jaxpr")
     function = getattr(function, "jaxpr", function)
-    is_new = function is not None and not function.eqns and function.outvars[0] is function.invars[1]
-    plain = is_new or eqn.primitive.name != "scatter"  # else a function of the user's
-    replaces = is_new and eqn.primitive.name == "scatter" and indices.known is not None
-    return [_written(x, updates, places, inside, replaces, keeps_zeros=plain)]
+    is_new = function is None or (not function.eqns and function.outvars[0] is function.invars[1])
+    is_set = eqn.primitive.name == "scatter"
+    replaces = is_set and is_new and indices.known is not None
+    return [_written(x, updates, places, inside, replaces, keeps_zeros=is_new or not is_set)]
 
 
 # ----------------------------------------------------------------------------
