@@ -72,7 +72,7 @@ def identity(size: int, n: int, offset: int = 0):
     """Rows of elements that are unknowns offset, offset + 1, ... themselves."""
     from scipy import sparse
 
-    arrays = np.ones(size, bool), np.arange(offset, offset + size), np.arange(size + 1)
+    arrays = np.ones(size, bool), np.arange(offset, offset + size, dtype=np.int32), np.arange(size + 1, dtype=np.int32)
     return sparse.csr_array(arrays, shape=(size, n))
 
 
@@ -123,7 +123,9 @@ def related(to: np.ndarray, origin: np.ndarray, rows, size: int):
     if rows is None or not size or not len(to):
         return None
     _require_few(len(to))
-    pairs = sparse.csr_array((np.ones(len(to), bool), (to, origin)), shape=(size, rows.shape[0]))
+    pairs = sparse.csr_array(
+        (np.ones(len(to), bool), (to.astype(np.int32), origin.astype(np.int32))), shape=(size, rows.shape[0])
+    )
     return product(pairs, rows)
 
 
