@@ -3,6 +3,7 @@
     on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
     linear_map(f, like)       the matrix of a linear map, from what depends on what
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
+    dependencies(f, x)        which outputs of f may depend on which inputs, as a sparse matrix
 
 The contract
 ------------
@@ -35,4 +36,5 @@ from hhtjax.jaxpr.listing import Listing as Listing
 from hhtjax.jaxpr.listing import Scalar as Scalar
 from hhtjax.jaxpr.recording import NotListed as NotListed
 from hhtjax.jaxpr.recording import listed as listed
+from hhtjax.jaxpr.row_sets import TooDense as TooDense
 from hhtjax.jaxpr.scalars import on_scalars as on_scalars

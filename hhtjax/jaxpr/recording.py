@@ -206,7 +206,7 @@ def _while(listing, eqn: JaxprEqn, *values: np.ndarray):
 def _scan(listing, eqn: JaxprEqn, *values: np.ndarray):
     """Written out, or a loop, where that is long and reads and makes no rows."""
     params = eqn.params
-    first, carried = _kept_and_carried(params)
+    first, carried = kept_and_carried(params)
     second = first + carried
     if second == len(values) and carried == len(eqn.outvars):
         loop = _counted(listing, params, values[:first], values[first:], [x.aval for x in eqn.outvars])
@@ -223,7 +223,7 @@ def _scan(listing, eqn: JaxprEqn, *values: np.ndarray):
     return [*carry, *_back(_flat(x for column in columns for x in column), [x.aval for x in eqn.outvars[len(carry) :]])]
 
 
-def _kept_and_carried(params: PyTree):
+def kept_and_carried(params: PyTree):
     """How many of the arguments of a scan stay, and how many go from step to step."""
     if "num_carry" in params:  # JAX <= 0.11
         return params["num_consts"], params["num_carry"]
