@@ -13,11 +13,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.description import thaw
-from hhtjax.jaxpr import dependencies
+from hhtjax.jaxpr import TooDense, dependencies
 from hhtjax.numerics.sparse_lu import Plan, plan
 from hhtjax.numerics.sparsity import product, stacked, symmetric, union
 from hhtjax.primitives import traced
@@ -120,11 +119,22 @@ def _below(patterns: list) -> csr_array:
 def detected(flat: FlatSystem, params: PyTree, dtype: np.dtype, pattern: csr_array | None = None) -> Sparsity:
     """The `Sparsity` of a system from what its functions read. pattern: (n, n), in the place of what M w - Q reads."""
     length = flat.blocks[-1].q.stop if flat.blocks else flat.positions
-    q, x, t = jnp.zeros(length, dtype), jnp.zeros(flat.size, dtype), jnp.zeros((), dtype)
-    if pattern is None:
-        pattern = dependencies(lambda x: flat.residual(flat.move(q, x), x, x, t, params), x)
-    drag = dependencies(lambda x: flat.residual(q, x, x, t, params), x)
-    rows = None
-    if flat.num_constraints:
-        rows = dependencies(lambda x: flat.constraint(flat.move(q, x), t, params), x)
+    x, *at = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((flat.size,), (length,), ()))
+    at = *at, jax.eval_shape(lambda x: x, params)  # of which no value counts
+    try:
+        if pattern is None:
+            pattern = dependencies(lambda x, q, t, p: flat.residual(flat.move(q, x), x, x, t, p), x, *at)
+        drag = dependencies(lambda x, q, t, p: flat.residual(q, x, x, t, p), x, *at)
+        rows = None
+        if flat.num_constraints:
+            rows = dependencies(lambda x, q, t, p: flat.constraint(flat.move(q, x), t, p), x, *at)
+    except TooDense as error:
+        raise ValueError(
+            f"sparse_lu: the matrix of a step is not sparse, by what the functions read: {error}"
+        ) from None
+    if pattern.shape != (flat.size, flat.size):
+        raise ValueError(
+            f"sparse_lu: `pattern` must have shape ({flat.size}, {flat.size}), as v has numbers; received shape "
+            f"{pattern.shape}."
+        )
     return Sparsity(pattern, drag, rows, flat.blocks)
