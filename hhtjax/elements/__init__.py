@@ -8,8 +8,8 @@ leaves it has depends on the elements:
     bodies in space        {"r": (N, 3), "R": (N, 3, 3)}             places, m, and rotations; see `hhtjax.rotation`
     ANCF cables            {"r": (N, d), "slope": (N, d)}            places, m, and slopes dr/dx
 
-v is like q, but for rotations: its leaf "R" is (N, 3), the angular velocity Om in material components, Rdot = R hat(Om).
-Forces are like v: moments in the plane under "theta", in material components under "R".
+v is like q, but for rotations: its leaf "R" is (N, 3), the angular velocity Om in material components, Rdot = R
+hat(Om). Forces are like v: moments in the plane under "theta", in material components under "R".
 
 A function sees one element: q and v of its k nodes alone, with leaves (k, ...), and `each`, a dict of what this element
 holds: lengths, stiffnesses. There are three kinds:
@@ -40,10 +40,11 @@ A beam of two elements, clamped at one end, bent into a quarter of a circle by t
 Which element
 -------------
 
-`planar_beam` and `spatial_beam` are geometrically exact: they stretch, shear, bend and twist by any amount. They converge
-with order 2. Their nodes are bodies, to which joints can be fixed. `ancf_cable` is for what is thin: it has no shear and
-no twist, and its mass is constant without rotations. It converges with order 4 on fine meshes. `truss` and
-`spring_damper` pull along a line, `torsion_spring` turns. Weight is `gravity`. Nodes that turn in space need `gyroscopic`.
+`planar_beam` and `spatial_beam` are geometrically exact: they stretch, shear, bend and twist by any amount. They
+converge with order 2. Their nodes are bodies, to which joints can be fixed. `ancf_cable` is for what is thin: it has no
+shear and no twist, and its mass is constant without rotations. It converges with order 4 on fine meshes. `truss` and
+`spring_damper` pull along a line, `torsion_spring` turns. Weight is `gravity`. Nodes that turn in space need
+`gyroscopic`.
 
 The mass of beams is `planar_mass` or `spatial_mass`, consistent with their shape, or diagonal: `planar_lumped_mass`,
 `spatial_lumped_mass`. Lumped masses make steps cheaper; both converge with order 2. ANCF cables need `ancf_mass`.

@@ -107,6 +107,6 @@ def _times(A: np.ndarray, x: Array) -> Array:
 
 
 def _require(caller: str, q: PyTree, each: PyTree, *needed: str):
-    shape = (2, jnp.shape(q["r"])[-1]) if isinstance(q, dict) and jnp.ndim(q.get("r")) else (2, 2)
+    shape = (2, jnp.shape(q["r"])[-1]) if isinstance(q, dict) and jnp.ndim(q.get("r", 0)) else (2, 2)
     require_nodes(caller, q, r=shape, slope=shape)
     require_each(caller, each, *needed)

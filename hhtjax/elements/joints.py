@@ -1,9 +1,9 @@
 """Joints in the plane and in space: functions that are 0 where the joint holds.
 
 A joint holds together two bodies, which are nodes {"r": (2,), "theta": ()} or {"r": (3,), "R": (3, 3)}. Given one node,
-it takes the ground as the second body, whose frame is that of space. Of each body it holds a point, x_1 = r_1 + A_1 a and
-x_2 = r_2 + A_2 b, with A = R or the rotation by theta, and with offsets a and b in the frame of the body. Nodes that have
-only "r" have no frame, and so no offset; the ground has one.
+it takes the ground as the second body, whose frame is that of space. Of each body it holds a point, x_1 = r_1 + A_1 a
+and x_2 = r_2 + A_2 b, with A = R or the rotation by theta, and with offsets a and b in the frame of the body. Nodes
+that have only "r" have no frame, and so no offset; the ground has one.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def across(axis: Array) -> Array:
 def _bodies(caller: str, q: PyTree, each: PyTree):
     """The points (x_1, x_2) of both bodies, and A_2."""
     require_each(caller, each)
-    if not isinstance(q, dict) or jnp.shape(q.get("r")) not in ((1, 2), (2, 2), (1, 3), (2, 3)):
+    if not isinstance(q, dict) or jnp.shape(q.get("r", 0)) not in ((1, 2), (2, 2), (1, 3), (2, 3)):
         raise ValueError(f"{caller}: `q` must hold 'r' of one or two nodes, (k, 2) or (k, 3); received {q!r}.")
     r = q["r"]
     k, d = r.shape

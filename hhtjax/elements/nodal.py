@@ -31,7 +31,7 @@ def gravity(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dic
     """
     k, d = jnp.shape(q["r"])
     require_each("gravity", each, *(("m", "L") if "slope" in q else ("m",)))
-    if not isinstance(params, dict) or jnp.shape(params.get("gravity")) != (d,):
+    if not isinstance(params, dict) or jnp.shape(params.get("gravity", 0)) != (d,):
         raise ValueError(f"gravity: `params` must hold 'gravity' in shape {(d,)}; received {params!r}.")
     weight = number("gravity", each, "m", q["r"]) * jnp.asarray(params["gravity"], q["r"].dtype)
     shares = {"r": jnp.stack([weight / k] * k)}

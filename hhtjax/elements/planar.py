@@ -22,7 +22,8 @@ def planar_beam(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) ->
 
     hold the energy V = L/2 (EA Gamma_1^2 + GA Gamma_2^2 + EI kappa^2), and the force is -dV/dq. A rigid motion turns
     the force, and changes no strain. Damping adds `damping` times their rates to the strains.
-    Displacements converge with order 2 in L. Under a moment at its end, the angles are exact with any number of elements.
+    Displacements converge with order 2 in L. Under a moment at its end, the angles are exact with any number of
+    elements.
 
     Args:
         q, v: {"r": (2, 2) in m, "theta": (2,) in rad} of two nodes; their rates.

@@ -19,8 +19,8 @@ def spatial_beam(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -
     """The force of a beam in space that stretches, shears, bends and twists by any amount.
 
     x of the beam's frame (R of a node, or R frame) is its axis; y and z are the principal axes of its section. Two
-    nodes, one point of integration in the middle, so that thin elements do not lock. In between, places are linear,
-    and rotations R(s) = R_1 exp(s psi), psi = log(R_1^T R_2). With R_m, that in the middle, the strains (`spatial_strain`)
+    nodes, one point of integration in the middle, so that thin elements do not lock. In between, places are linear, and
+    rotations R(s) = R_1 exp(s psi), psi = log(R_1^T R_2). With R_m, that in the middle, the strains (`spatial_strain`)
 
         Gamma = R_m^T (r_2 - r_1)/L - (1, 0, 0),    kappa = psi/L
 
