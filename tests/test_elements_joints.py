@@ -124,7 +124,7 @@ def test_a_rigid_link_keeps_a_distance():
 def test_places_without_directions_are_held_too():
     """Nodes with r alone: held together, to a place of the ground, and on a line of it."""
     q = {"r": jnp.array([[1.0, 2.0], [1.5, 2.0]])}
-    np.testing.assert_allclose(elements.pin(q, 0.0, {}, {}), [-0.5, 0.0])
+    np.testing.assert_allclose(elements.pin(q, 0.0, {}, None), [-0.5, 0.0])
     first = {"r": q["r"][:1]}
     np.testing.assert_allclose(elements.pin(first, 0.0, {}, {"b": jnp.array([1.0, 1.5])}), [0.0, 0.5])
     line = {"b": jnp.array([5.0, 3.0]), "axis": jnp.array([2.0, 0.0])}
@@ -165,7 +165,7 @@ def test_a_pinned_beam_is_a_body_with_offsets():
     """Two beams pinned end to end share a place and not an angle."""
     q = {"r": jnp.array([[1.0, 0.0], [1.0, 0.0]]), "theta": jnp.array([0.2, -0.7])}
     np.testing.assert_allclose(elements.pin(q, 0.0, {}, {}), 0.0)
-    assert float(elements.weld(q, 0.0, {}, {})[2]) == pytest.approx(-0.9)
+    assert float(elements.weld(q, 0.0, {}, None)[2]) == pytest.approx(-0.9)
     assert float(elements.weld(q, 0.0, {}, {"frame": -0.9})[2]) == pytest.approx(0.0)
 
 

@@ -18,8 +18,9 @@ holds: lengths, stiffnesses. There are three kinds:
     mass     m(q, w, params, each)       M w of an acceleration w, like v
     joint    j(q, t, params, each)       rows that are 0 where the joint holds
 
-A result may lack leaves that it has nothing in. Functions of your own are elements just as well. `jax.vmap` calls one
-for many elements, and all of them take `jit`, `grad` and `jacfwd`, also where nothing is deformed.
+A result may lack leaves that it has nothing in. One `each` may serve several functions of this room: names that another
+one needs are let through, and a name that none knows is an error. Functions of your own are elements just as well.
+`jax.vmap` calls one for many elements. All take `jit`, `grad` and `jacfwd`, also where nothing is deformed.
 
 A beam of two elements, clamped at one end, bent into a quarter of a circle by the moment EI pi/(2 length) at the other:
 

@@ -24,7 +24,7 @@ def pin(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
         q: of two nodes, {"r": (2, 2), "theta": (2,)} in the plane, {"r": (2, 3), "R": (2, 3, 3)} in space; of one node,
             the ground is the second body.
         t, params: not used.
-        each: "a" and "b", (d,), m, if need be: the points in the frames of the first and the second body.
+        each: None, or "a" and "b", (d,), m, if need be: the points in the frames of the first and the second body.
 
     Returns: (d,), in m: 0 where the joint holds.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.
@@ -35,7 +35,7 @@ def pin(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
     >>> print(pin(q, 0.0, {}, {"a": jnp.array([0.5, 0.0]), "b": jnp.array([1.0, 2.0])}).round(6) + 0.0)
     [0. 0.]
     """
-    (x1, x2), _ = _bodies("pin", q, each)
+    (x1, x2), _ = _bodies("pin", q, each or {})
     return x1 - x2
 
 
@@ -56,6 +56,7 @@ def weld(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
     >>> print(weld(q, 0.0, {}, {"frame": 0.3}).round(6) + 0.0)
     [0. 0. 0.]
     """
+    each = each or {}
     (x1, x2), _ = _bodies("weld", q, each)
     return jnp.concatenate([x1 - x2, _turn("weld", q, each)])
 
