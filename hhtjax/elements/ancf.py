@@ -21,9 +21,9 @@ def ancf_cable(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> 
 
         V = int EA/2 eps^2 + EI/2 kappa^2 dx,    eps = |r'| - 1,    kappa = |r' x r''|/|r'|^2
 
-    by 3 points of Gauss. kappa is the turn per length at rest, so that the moment in a stretched cable is EI kappa, too.
-    (With eps = (|r'|^2 - 1)/2 and the curvature |r' x r''|/|r'|^3 of the deformed line, a cantilever stretched by .0006
-    has its tip a thousandth of its way off.)
+    by 3 points of Gauss. kappa is the turn per length at rest, so EI kappa is the moment of a stretched cable, too.
+    (With eps = (|r'|^2 - 1)/2 and the curvature |r' x r''|/|r'|^3 of the deformed line, the tip of a cantilever that
+    is stretched by .0006 goes a thousandth too far.)
     Displacements converge with order 4 in L, once an element turns by less than some .1 rad. Coarse meshes are too
     stiff: stretch and bending of cubics are not independent. |r'| must not be 0.
 
