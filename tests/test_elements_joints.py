@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from static_structures import moved, rates_like
 
 from hhtjax import elements, rotation
@@ -65,7 +66,7 @@ def test_joints_allow_their_motions_and_no_others(case, ground):
     assert value(q).shape == (rows,)
     np.testing.assert_allclose(value(q), 0.0, atol=2e-15)
     d = each["b"].size
-    flat, back = jax.flatten_util.ravel_pytree(rates_like(q))
+    flat, back = ravel_pytree(rates_like(q))
     slopes = jax.jit(jax.jacfwd(lambda x: value(moved(q, back(x)))))(flat)
     assert rows + free == {2: 3, 3: 6}[d]
     assert np.linalg.matrix_rank(slopes, tol=1e-6) == rows

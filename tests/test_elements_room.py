@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from static_structures import chain, equilibrium, force_of, moved, rates_like, rod_tip
 
 from hhtjax import elements, rotation
@@ -187,10 +188,10 @@ def slopes(case):
 
     def all_of_them(q):
         zero = rates_like(q)
-        flat, back = jax.flatten_util.ravel_pytree(zero)
+        flat, back = ravel_pytree(zero)
 
         def of_x(x):
-            return jax.flatten_util.ravel_pytree(whole(element(moved(q, back(x)), zero, 0.0, {}, each), q))[0]
+            return ravel_pytree(whole(element(moved(q, back(x)), zero, 0.0, {}, each), q))[0]
 
         h = 1e-5 * jnp.eye(flat.size)
         values = jax.vmap(of_x)(jnp.concatenate([h, -h]))
@@ -335,13 +336,11 @@ def test_masses_are_symmetric_positive_and_whole(kind):
     element, each = MASSES[kind]
     q = BENT[kind]
     each = each | {"frame": FRAME} if kind == "spatial" else each
-    flat, back = jax.flatten_util.ravel_pytree(rates_like(q))
-    M = jax.jacfwd(lambda w: jax.flatten_util.ravel_pytree(element(q, back(w), {}, each))[0])(flat)
+    flat, back = ravel_pytree(rates_like(q))
+    M = jax.jacfwd(lambda w: ravel_pytree(element(q, back(w), {}, each))[0])(flat)
     np.testing.assert_allclose(M, M.T, atol=1e-15)
     assert np.linalg.eigvalsh(M)[0] > 0
-    shift = jax.flatten_util.ravel_pytree(
-        {name: jnp.ones_like(x) if name == "r" else x for name, x in back(flat).items()}
-    )[0]
+    shift = ravel_pytree({name: jnp.ones_like(x) if name == "r" else x for name, x in back(flat).items()})[0]
     assert abs(shift @ M @ shift - 3.0 * 0.7 * q["r"].shape[1]) < 1e-13
 
 
