@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.description import Array, PyTree
-from hhtjax.elements.arguments import numbers, require_each, require_nodes
+from hhtjax.elements.arguments import numbers, require_each, require_nodes, shape_of
 
 MASS = np.array([[156, 22, 54, -13], [22, 4, 13, -3], [54, 13, 156, -22], [-13, -3, -22, 4]]) / 420  # of length 1
 POINTS = 3  # of Gauss: two would let one stretching go without a force, five lock more and end no closer
@@ -107,6 +107,6 @@ def _times(A: np.ndarray, x: Array) -> Array:
 
 
 def _require(caller: str, q: PyTree, each: PyTree, *needed: str):
-    shape = (2, jnp.shape(q["r"])[-1]) if isinstance(q, dict) and jnp.ndim(q.get("r", 0)) else (2, 2)
+    shape = (2, shape_of(q, "r")[-1])
     require_nodes(caller, q, r=shape, slope=shape)
     require_each(caller, each, *needed)

@@ -22,6 +22,11 @@ def require_nodes(caller: str, q: PyTree, **shapes: tuple):
             raise ValueError(f"{caller}: `q` must hold {name!r} in shape {shape}; received {jnp.shape(q[name])}.")
 
 
+def shape_of(q: PyTree, name: str) -> tuple:
+    """The shape of a leaf; (0, 0) where there is none, which `require_nodes` then tells."""
+    return (jnp.shape(q[name]) if isinstance(q, dict) and name in q else ()) or (0, 0)
+
+
 def require_each(caller: str, each: PyTree, *needed: str):
     """An error for an `each` that lacks a name, or has one that no element knows."""
     if not isinstance(each, dict) or not each.keys() >= set(needed):

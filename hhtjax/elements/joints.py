@@ -13,7 +13,7 @@ import numpy as np
 
 from hhtjax import rotation, trigonometry
 from hhtjax.description import Array, PyTree
-from hhtjax.elements.arguments import number, require_each, require_nodes
+from hhtjax.elements.arguments import number, require_each, require_nodes, shape_of
 from hhtjax.numerics.dense_lu import matvec
 
 
@@ -162,7 +162,7 @@ def across(axis: Array) -> Array:
 def _bodies(caller: str, q: PyTree, each: PyTree):
     """The points (x_1, x_2) of both bodies, and A_2."""
     require_each(caller, each)
-    if not isinstance(q, dict) or jnp.shape(q.get("r", 0)) not in ((1, 2), (2, 2), (1, 3), (2, 3)):
+    if shape_of(q, "r") not in ((1, 2), (2, 2), (1, 3), (2, 3)):
         raise ValueError(f"{caller}: `q` must hold 'r' of one or two nodes, (k, 2) or (k, 3); received {q!r}.")
     r = q["r"]
     k, d = r.shape

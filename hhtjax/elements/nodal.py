@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from hhtjax import rotation
 from hhtjax.description import Array, PyTree
-from hhtjax.elements.arguments import number, require_each, require_nodes
+from hhtjax.elements.arguments import number, require_each, require_nodes, shape_of
 from hhtjax.numerics.dense_lu import matvec
 
 
@@ -29,7 +29,8 @@ def gravity(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dic
     [[  0.   0. -15.]
      [  0.   0. -15.]]
     """
-    k, d = jnp.shape(q["r"])
+    k, d = shape_of(q, "r")
+    require_nodes("gravity", q, r=(k, d))
     require_each("gravity", each, *(("m", "L") if "slope" in q else ("m",)))
     if not isinstance(params, dict) or jnp.shape(params.get("gravity", 0)) != (d,):
         raise ValueError(f"gravity: `params` must hold 'gravity' in shape {(d,)}; received {params!r}.")
@@ -56,7 +57,7 @@ def gyroscopic(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> 
     >>> print(gyroscopic(q, v, 0.0, {}, {"J": jnp.array([1.0, 2.0, 3.0])})["R"])
     [[ 0.  0. -2.]]
     """
-    require_nodes("gyroscopic", v, R=(jnp.shape(v["R"])[0], 3))
+    require_nodes("gyroscopic", q, R=(shape_of(q, "R")[0], 3, 3))
     require_each("gyroscopic", each, "J")
     shape = (3, 3) if jnp.ndim(each["J"]) == 2 else (3,)
     J = number("gyroscopic", each, "J", v["R"], shape)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from hhtjax import rotation
 from hhtjax.description import Array, PyTree
-from hhtjax.elements.arguments import number, numbers, require_each, require_nodes
+from hhtjax.elements.arguments import number, numbers, require_each, require_nodes, shape_of
 from hhtjax.numerics.dense_lu import matvec
 
 
@@ -94,7 +94,7 @@ def torsion_spring(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree)
 
 def _line(caller: str, q: PyTree, each: PyTree, *needed: str):
     """The length, and the unit vector from node 1 to node 2, with derivatives that are numbers at length 0, too."""
-    require_nodes(caller, q, r=(2, jnp.shape(q["r"])[-1]))
+    require_nodes(caller, q, r=(2, shape_of(q, "r")[-1]))
     require_each(caller, each, *needed)
     d = q["r"][1] - q["r"][0]
     x = jnp.sum(d**2)
