@@ -125,7 +125,7 @@ def test_a_rigid_link_keeps_a_distance():
 def test_places_without_directions_are_held_too():
     """Nodes with r alone: held together, to a place of the ground, and on a line of it."""
     q = {"r": jnp.array([[1.0, 2.0], [1.5, 2.0]])}
-    np.testing.assert_allclose(elements.pin(q, 0.0, {}, None), [-0.5, 0.0])
+    np.testing.assert_allclose(elements.pin(q, 0.0, {}), [-0.5, 0.0])
     first = {"r": q["r"][:1]}
     np.testing.assert_allclose(elements.pin(first, 0.0, {}, {"b": jnp.array([1.0, 1.5])}), [0.0, 0.5])
     line = {"b": jnp.array([5.0, 3.0]), "axis": jnp.array([2.0, 0.0])}

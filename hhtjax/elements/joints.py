@@ -17,7 +17,7 @@ from hhtjax.elements.arguments import number, require_each, require_nodes, shape
 from hhtjax.numerics.dense_lu import matvec
 
 
-def pin(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
+def pin(q: PyTree, t: Array, params: PyTree, each: PyTree | None = None) -> Array:
     """x_1 - x_2: keeps two points together. A pin in the plane, 2 rows; a ball joint in space, 3 rows.
 
     Args:
@@ -39,7 +39,7 @@ def pin(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
     return x1 - x2
 
 
-def weld(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
+def weld(q: PyTree, t: Array, params: PyTree, each: PyTree | None = None) -> Array:
     """`pin`, and no rotation of one body beside the other: 3 rows in the plane, 6 in space.
 
     Turned are rows theta_2 - theta_1 - frame in the plane, and those of the skew part of R_1^T R_2 frame^T in space.
