@@ -14,7 +14,7 @@ from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import check_like, check_matrix, count, describe, evaluate, telling_of_arguments
 from hhtjax.description import Array, PyTree, Real, thaw
-from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, matvec
+from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, full_matrix, matvec
 from hhtjax.numerics.linear_solve import factorize_map, reuse, solver
 from hhtjax.numerics.sparse_lu import SparseLU
 from hhtjax.numerics.sparse_matrix import combined
@@ -126,6 +126,7 @@ class FlatSystem(NamedTuple):
         M = self.mass(q, t, params)
         if M.ndim == 1:
             return jnp.diag(self.with_ones(M))
+        M = full_matrix(M)
         return M if self.positions == self.size else block_diag(M, jnp.eye(self.size - self.positions, dtype=M.dtype))
 
     def located(self, x: Array) -> Array:
