@@ -151,6 +151,7 @@ class Layer(NamedTuple):
         if self.bend is None:
             return force - self.offset
         bend = self.bend if bend is None else bend
+        assert s.L is not None and bend is not None
         return jnp.concatenate([force - self.pull(s.L), self.push(s.w) + bend]) - self.offset
 
     def product(self, z: Array):
