@@ -109,7 +109,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         if self.options.start == "simple" or not system.positions or (resolves and not self.corrects(system)):
             return state
         smooth = smoothed if system.friction is None else smoothed_friction
-        system = self.seen(system, params, dt.dtype)
+        system = self.seen(system, params, state.q.dtype)
         return smooth(self, system, state, params, dt, moves, resolves, alone)
 
     def jumped(
@@ -118,7 +118,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
         if self.options.start == "simple" or not system.positions:
             return after
-        system = self.seen(system, new, dt.dtype)
+        system = self.seen(system, new, before.q.dtype)
 
         def again(s, params: PyTree, dt: Array):
             start = begin_friction(self, system, s.q, s.v, s.t, params, dt)
@@ -130,7 +130,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     def grown(self, system: FlatSystem, state: State, params: PyTree, dt: Array) -> State:
         """The state, or where what damps is too stiff for dt a smooth start from it."""
         smooth = smoothed if system.friction is None else smoothed_friction
-        return grown(self, self.seen(system, params, dt.dtype), state, params, dt, smooth)
+        return grown(self, self.seen(system, params, state.q.dtype), state, params, dt, smooth)
 
     def throws(self, system: FlatSystem) -> bool:
         """Unless there are no positions, or the recursion is to be literal."""
