@@ -118,7 +118,7 @@ class Plan:
     def inverse(self, images: Array) -> Callable:
         """(b, trans=0) -> A^-1 b, or A^-T b."""
         scale = self.row_scale(images)
-        images = images * scale
+        images = images * scale[None, :]
         solve = self._by_blocks(images) if self.blocks.size <= LARGEST_BLOCK else self._by_superlu(images)
         return lambda b, trans=0: scale * solve(b, 1) if trans else solve(scale * b, 0)
 
@@ -128,7 +128,7 @@ class Plan:
         unit = self.diagonal(images)
         size = jnp.sqrt(jnp.where(unit > 0, unit, 1))
         column = gather(jnp.append(size, jnp.ones_like(size[:1])), self.column_of)
-        found = _with_ends(images / size / column)
+        found = _with_ends(images / size[None, :] / column)
         if self.blocks.size > LARGEST_BLOCK:
             return pivots_on_host(self.slots[0], gather(found, self.slots[1]), limit)
         blocks = part(partial(block_pivots, limit=limit))(*gather(found, self.in_blocks))

@@ -174,7 +174,7 @@ class GeneralizedAlpha(Controlled, Stepper):
             found = cache(lambda: detected(system, params, dtype, given.pattern))
             return system._replace(sparse=SparseLU(found, given.tolerance))
         if system.sparse is not None and (given is not None or self.redundant is not None):
-            return system._replace(sparse=None)
+            return system.without_sparse_solve()
         return system
 
     @property

@@ -17,7 +17,7 @@ from hhtjax.description import Array, PyTree, Real, thaw
 from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, matvec
 from hhtjax.numerics.linear_solve import factorize_map, reuse, solver
 from hhtjax.numerics.sparse_lu import SparseLU
-from hhtjax.numerics.sparse_matrix import combined
+from hhtjax.numerics.sparse_matrix import Sparse, combined
 from hhtjax.primitives import consistent
 from hhtjax.systems import kinematics
 from hhtjax.systems.assembly import ElementForce
@@ -70,6 +70,16 @@ class FlatSystem(NamedTuple):
     def settled(self, params: PyTree) -> FlatSystem:
         """What `settle` gives, where there is something to settle."""
         return self if self.settle is None else self.settle(params)
+
+    def without_sparse_solve(self) -> FlatSystem:
+        """The system whose steps are solved by full matrices, its mass among them."""
+        mass = self.mass
+
+        def full(q: Array, t: Array, params: PyTree) -> Array:
+            M = mass(q, t, params)
+            return M.full() if isinstance(M, Sparse) else M
+
+        return self._replace(mass=full, sparse=None)
 
     def step_matrix(self, params: PyTree, w: Array, v: Array, q: Array):
         """w M + v C + q K, `Sparse` or a diagonal (n,), of factors that are numbers."""
@@ -124,6 +134,7 @@ class FlatSystem(NamedTuple):
         M = self.mass(q, t, params)
         if M.ndim == 1:
             return jnp.diag(self.with_ones(M))
+        M = M.full() if isinstance(M, Sparse) else M
         return M if self.positions == self.size else block_diag(M, jnp.eye(self.size - self.positions, dtype=M.dtype))
 
     def located(self, x: Array) -> Array:
@@ -263,6 +274,8 @@ def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0:
 
     if flat.size + 2 * flat.num_constraints > LOOPED:
         flat = flat._replace(sparse=SparseLU(sparsity))
+    else:
+        flat = flat.without_sparse_solve()
     return flat._replace(settle=settle) if force.held is not None and force.held.moves else flat
 
 
