@@ -23,7 +23,7 @@ from hhtjax.systems import kinematics
 from hhtjax.systems.assembly import ElementForce
 from hhtjax.systems.elements import parts_of
 from hhtjax.systems.friction import FrictionLaw, flat_friction
-from hhtjax.systems.held_nodes import Held, at, require_start
+from hhtjax.systems.held_nodes import Held, at, require_start, staying
 from hhtjax.systems.linear_system import with_known_matrices
 from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.step_sparsity import Sparsity, of_elements
@@ -65,6 +65,7 @@ class FlatSystem(NamedTuple):
     massless: Array | None = None  # G with M G M = M, where M is singular
     factors: Factors | None = None  # `Factors` for the steps of a run, where they are known before it
     sparse: SparseLU | None = None  # the solve of a step whose unknowns are known to meet few others
+    stays: np.ndarray | None = None  # which coordinates stay where they start, where constraints meet them
     told: Callable | None = None  # state, params -> the state with what is held as it is told
 
     def settled(self, params: PyTree) -> FlatSystem:
@@ -152,11 +153,15 @@ class FlatSystem(NamedTuple):
 
     def move(self, q: Array, x: Array) -> Array:
         """q displaced by x (N,): q + x, and R exp(x) for rotations."""
-        return kinematics.move(self.blocks, q, self.located(x))
+        return kinematics.move(self.blocks, q, self._freed(self.located(x)))
 
     def rate(self, q: Array, v: Array) -> Array:
         """qdot: v, and R hat(v) for rotations."""
-        return kinematics.rate(self.blocks, q, self.located(v))
+        return kinematics.rate(self.blocks, q, self._freed(self.located(v)))
+
+    def _freed(self, x: Array) -> Array:
+        """x with 0 for what stays, which no reaction of a constraint moves."""
+        return x if self.stays is None else jnp.where(self.stays, 0, x)
 
     def end_of_chart(self, x: Array, *rates: Array):
         """Velocity, acceleration, algorithmic acceleration, from first and second rates of the displacement x."""
@@ -263,6 +268,8 @@ def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0:
     assert isinstance(force, ElementForce)
     require_start(force.held, q0, v0, t0, params)
     like = jax.eval_shape(lambda *x: jax.tree.map(jnp.asarray, x), q0, v0, t0, params)
+    if constraint is not None:
+        flat = flat._replace(stays=staying(force.held, v0))
     joints = parts_of(None if constraint is None else constraint.joints)
 
     @cache

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from hhtjax import rotation
 from hhtjax.checks import require_function
@@ -155,6 +156,19 @@ def accelerations(held: Held, v: PyTree, t: Real, params: PyTree):
             known = some.put(known, jax.tree.map(lambda x: jnp.ones(x.shape, bool), told))
             a = some.put(a, told)
     return known, a
+
+
+def staying(held: Held | None, v: PyTree) -> np.ndarray | None:
+    """(n,): which numbers stay where they start; None for none."""
+    still = None
+    for some in () if held is None else held.all():
+        if isinstance(some.how, Still):
+            still = Held(some.nodes, some.alone, some.how, still)
+    if still is None:
+        return None
+    with jax.ensure_compile_time_eval():
+        known, _ = accelerations(still, jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), x.dtype), v), 0.0, None)
+        return np.asarray(ravel_pytree(known)[0])
 
 
 def _spread(which: PyTree, here: PyTree) -> PyTree:
