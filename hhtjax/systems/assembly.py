@@ -87,11 +87,12 @@ class ElementMass:
         if self.nodal is None:
             return jnp.zeros_like(flat)
         given = self.nodal.tree if isinstance(self.nodal, Fixed) else self.nodal(params)
-        if jax.tree.structure(given) == jax.tree.structure(v):
-            given = jax.tree.map(lambda m, x: _broadcast(m, x), given, v)
-            return ravel_pytree(given)[0].astype(flat.dtype)
-        if jnp.ndim(given) < 2 and not isinstance(given, dict) and jnp.size(given) in (1, flat.size):
+        alone = jax.tree.structure(given) == jax.tree.structure(0)
+        if alone and jnp.ndim(given) < 2 and jnp.size(given) in (1, flat.size):
             return jnp.broadcast_to(jnp.asarray(given, flat.dtype), flat.shape)
+        if jax.tree.structure(given) == jax.tree.structure(v):
+            given = jax.tree.map(_broadcast, given, v)
+            return ravel_pytree(given)[0].astype(flat.dtype)
         raise ValueError(f"{NAME}: `mass` must be structured like v, or have shape ({flat.size},); received {given!r}.")
 
     def free(self, v: PyTree, params: PyTree) -> Array:
@@ -123,9 +124,12 @@ class ElementInertia:
 def _broadcast(m: Real, x: Array) -> Array:
     """A mass for each number of a leaf: one for all, one for each node, or one for each number."""
     m = jnp.asarray(m)
-    if m.ndim and m.ndim < x.ndim:
-        m = m.reshape(m.shape + (1,) * (x.ndim - m.ndim))
-    return jnp.broadcast_to(m, x.shape)
+    if m.ndim > x.ndim or any(a not in (1, b) for a, b in zip(m.shape, x.shape, strict=False)):
+        raise ValueError(
+            f"{NAME}: a leaf of `mass` must be a number, or have one for each node or number of its leaf of v, of shape "
+            f"{x.shape}; received shape {m.shape}."
+        )
+    return jnp.broadcast_to(m.reshape(m.shape + (1,) * (x.ndim - m.ndim)), x.shape)
 
 
 def _zero(v: PyTree) -> PyTree:
