@@ -67,21 +67,27 @@ class Held:
 
         def velocity(t: Real) -> PyTree:
             q, rate = jax.jvp(position, (t,), (one,))
-            return _paired(_rate, q, rate, self.here(v))
+            return _paired(_rate, q, rate, self.here(v, q))
 
         v_told, w_told = jax.jvp(velocity, (t,), (one,))
         return position(t), v_told, w_told
 
-    def here(self, tree: PyTree) -> PyTree:
-        """The leaves of these nodes."""
+    def here(self, tree: PyTree, part: PyTree = None) -> PyTree:
+        """The leaves of these nodes; where a part is a dict, other sets of nodes need not have them."""
         places = self.nodes[0] if self.alone else np.array(self.nodes)
+        if isinstance(tree, dict) and isinstance(part, dict):
+            tree = {key: x for key, x in tree.items() if key in part or all(map(self._fit, jax.tree.leaves(x)))}
         for x in jax.tree.leaves(tree):
-            if not jnp.ndim(x) or max(self.nodes) >= x.shape[0]:
+            if not self._fit(x):
                 raise ValueError(
                     f"System.from_elements: `held` names node {max(self.nodes)}, and a leaf of the state has shape "
                     f"{jnp.shape(x)}: nodes are counted from 0."
                 )
         return jax.tree.map(lambda x: x[places], tree)
+
+    def _fit(self, x: Array) -> bool:
+        """Whether a leaf has these nodes."""
+        return bool(jnp.ndim(x)) and max(self.nodes) < x.shape[0]
 
     def put(self, tree: PyTree, part: PyTree) -> PyTree:
         """The pytree with this part at these nodes."""
@@ -146,7 +152,7 @@ def accelerations(held: Held, v: PyTree, t: Real, params: PyTree):
     for some in held.all():
         if isinstance(some.how, Still):
             which = some.how.which
-            here = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), some.here(v))
+            here = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), some.here(v, which))
             if which is True:
                 known = some.put(known, jax.tree.map(np.ones_like, here))
             else:
