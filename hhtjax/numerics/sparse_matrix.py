@@ -149,12 +149,6 @@ class Sparse:
         """The same, with numbers of this dtype."""
         return Sparse(jnp.asarray(self.values).astype(dtype), self.pattern)
 
-    def full(self) -> Array:
-        """The same as an array (n, n)."""
-        p = self.pattern
-        values = jnp.asarray(self.values)
-        return jnp.zeros(self.shape, values.dtype).at[p.rows, p.columns].set(gather(values, p.slots))
-
     def diagonal(self) -> Array:
         """(n,)."""
         p = self.pattern

@@ -6,7 +6,7 @@ The formulas are in residual.py; constraints are in constrained.py, and add rows
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -173,9 +173,19 @@ class GeneralizedAlpha(Controlled, Stepper):
                 return system
             found = cache(lambda: detected(system, params, dtype, given.pattern))
             return system._replace(sparse=SparseLU(found, given.tolerance))
+<<<<<<< HEAD
         if system.sparse is not None and (given is not None or self.redundant is not None):
             return system.without_sparse_solve()
         return system
+=======
+        if system.sparse is None:
+            return system
+        if given is not None or self.redundant is not None:
+            return system._replace(sparse=None)
+        if system.num_constraints or system.step_elements is None:
+            return system
+        return system._replace(sparse=replace(system.sparse, elements=system.step_elements(params)))
+>>>>>>> main
 
     @property
     def redundant(self):

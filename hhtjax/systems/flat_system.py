@@ -14,13 +14,14 @@ from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import check_like, check_matrix, count, describe, evaluate, telling_of_arguments
 from hhtjax.description import Array, PyTree, Real, thaw
-from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, matvec
+from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, full_matrix, matvec
 from hhtjax.numerics.linear_solve import factorize_map, reuse, solver
 from hhtjax.numerics.sparse_lu import SparseLU
 from hhtjax.numerics.sparse_matrix import Sparse, combined
 from hhtjax.primitives import consistent
 from hhtjax.systems import kinematics
 from hhtjax.systems.assembly import ElementForce
+from hhtjax.systems.element_matrix import StepMatrix
 from hhtjax.systems.elements import parts_of
 from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.held_nodes import Held, at, require_start, staying
@@ -66,6 +67,7 @@ class FlatSystem(NamedTuple):
     factors: Factors | None = None  # `Factors` for the steps of a run, where they are known before it
     sparse: SparseLU | None = None  # the solve of a step whose unknowns are known to meet few others
     stays: np.ndarray | None = None  # which coordinates stay where they start, where constraints meet them
+    step_elements: Callable | None = None  # params -> `SparseLU.elements`
     told: Callable | None = None  # state, params -> the state with what is held as it is told
 
     def settled(self, params: PyTree) -> FlatSystem:
@@ -78,7 +80,7 @@ class FlatSystem(NamedTuple):
 
         def full(q: Array, t: Array, params: PyTree) -> Array:
             M = mass(q, t, params)
-            return M.full() if isinstance(M, Sparse) else M
+            return full_matrix(M) if isinstance(M, Sparse) else M
 
         return self._replace(mass=full, sparse=None)
 
@@ -135,7 +137,7 @@ class FlatSystem(NamedTuple):
         M = self.mass(q, t, params)
         if M.ndim == 1:
             return jnp.diag(self.with_ones(M))
-        M = M.full() if isinstance(M, Sparse) else M
+        M = full_matrix(M)
         return M if self.positions == self.size else block_diag(M, jnp.eye(self.size - self.positions, dtype=M.dtype))
 
     def located(self, x: Array) -> Array:
@@ -280,7 +282,8 @@ def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0:
         return flat._replace(settle=None, told=partial(_told, force.held, flat, thaw(params)))
 
     if flat.size + 2 * flat.num_constraints > LOOPED:
-        flat = flat._replace(sparse=SparseLU(sparsity))
+        matrix = cache(lambda: StepMatrix(force, flat, like[1], sparsity().plan(flat.size)))
+        flat = flat._replace(sparse=SparseLU(sparsity), step_elements=lambda params: lambda *at: matrix()(params, *at))
     else:
         flat = flat.without_sparse_solve()
     return flat._replace(settle=settle) if force.held is not None and force.held.moves else flat
