@@ -173,19 +173,13 @@ class GeneralizedAlpha(Controlled, Stepper):
                 return system
             found = cache(lambda: detected(system, params, dtype, given.pattern))
             return system._replace(sparse=SparseLU(found, given.tolerance))
-<<<<<<< HEAD
-        if system.sparse is not None and (given is not None or self.redundant is not None):
-            return system.without_sparse_solve()
-        return system
-=======
         if system.sparse is None:
             return system
         if given is not None or self.redundant is not None:
-            return system._replace(sparse=None)
+            return system.without_sparse_solve()
         if system.num_constraints or system.step_elements is None:
             return system
         return system._replace(sparse=replace(system.sparse, elements=system.step_elements(params)))
->>>>>>> main
 
     @property
     def redundant(self):

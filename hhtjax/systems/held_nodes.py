@@ -182,7 +182,7 @@ def staying(held: Held | None, v: PyTree) -> np.ndarray | None:
     if still is None:
         return None
     with jax.ensure_compile_time_eval():
-        known, _ = accelerations(still, jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), x.dtype), v), 0.0, None)
+        known = accelerations(still, jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), x.dtype), v), 0.0, None).here
         return np.asarray(ravel_pytree(known)[0])
 
 
