@@ -126,7 +126,7 @@ def _broadcast(m: Real, x: Array) -> Array:
     m = jnp.asarray(m)
     if m.ndim > x.ndim or any(a not in (1, b) for a, b in zip(m.shape, x.shape, strict=False)):
         raise ValueError(
-            f"{NAME}: a leaf of `mass` must be a number, or have one for each node or number of its leaf of v, of shape "
+            f"{NAME}: a leaf of `mass` must be a number, or have one for each node or number of a leaf of v, of shape "
             f"{x.shape}; received shape {m.shape}."
         )
     return jnp.broadcast_to(m.reshape(m.shape + (1,) * (x.ndim - m.ndim)), x.shape)
@@ -172,6 +172,9 @@ def put_together(parts: tuple, mass: Any, held: Any):
     if not parts or not all(isinstance(x, (Elements, Joints)) for x in parts):
         raise TypeError(f"{NAME}: give Elements and Joints; received {parts!r}.")
     elements = [x for x in parts if isinstance(x, Elements)]
+    for x in elements:
+        own = "" if x.each is None else ", each"
+        require_function(NAME, repr(x), x.function, f"function(q, v, t, params{own})")
     joints = [x for x in parts if isinstance(x, Joints)]
     held = held_nodes.checked(held)
     of_mass = _checked_mass(mass, held)

@@ -24,7 +24,7 @@ from hhtjax.systems.assembly import ElementForce
 from hhtjax.systems.element_matrix import StepMatrix
 from hhtjax.systems.elements import parts_of
 from hhtjax.systems.friction import FrictionLaw, flat_friction
-from hhtjax.systems.held_nodes import Held, at, require_start, staying
+from hhtjax.systems.held_nodes import Held, at, staying
 from hhtjax.systems.linear_system import with_known_matrices
 from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.step_sparsity import Sparsity, of_elements
@@ -268,7 +268,6 @@ def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0:
     """The system with the solve that follows from where its elements are, and with what is held."""
     force, constraint = system.force, system.constraint
     assert isinstance(force, ElementForce)
-    require_start(force.held, q0, v0, t0, params)
     like = jax.eval_shape(lambda *x: jax.tree.map(jnp.asarray, x), q0, v0, t0, params)
     if constraint is not None:
         flat = flat._replace(stays=staying(force.held, v0))
