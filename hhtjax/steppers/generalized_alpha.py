@@ -164,10 +164,10 @@ class GeneralizedAlpha(Controlled, Stepper):
         """The system with these params, and with the sparse solve that the options, or its elements, ask for."""
         system, given = system.settled(params), self.options.solve
         if isinstance(given, Detected):
-            if system.friction is not None or system.matrices is not None or self.redundant is not None:
+            if system.friction is not None or system.linear or self.redundant is not None:
                 raise NotImplementedError(
-                    "hht: leave out `solve` with dry friction, sparse matrices or redundant constraints; received "
-                    f"{given!r}."
+                    "hht: leave out `solve` with dry friction, a LinearSystem (its matrices may be sparse) or redundant "
+                    f"constraints; received {given!r}."
                 )
             if system.sparse is not None and system.sparse.tolerance == given.tolerance and given.pattern is None:
                 return system

@@ -124,7 +124,8 @@ class FlatSystem(NamedTuple):
         if M.ndim == 1:
             return partial(self._of_positions, lambda Q: Q / M)
         if self.sparse is not None:
-            return factorize_map(partial(matvec, M), jnp.zeros(self.size, M.dtype), self.sparse)
+            product = partial(self._of_positions, partial(matvec, M))
+            return factorize_map(product, jnp.zeros(self.size, M.dtype), self.sparse)
         inverse = solver(M, factorize)
         return partial(self._of_positions, inverse)
 
