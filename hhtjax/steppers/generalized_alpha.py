@@ -166,8 +166,8 @@ class GeneralizedAlpha(Controlled, Stepper):
         if isinstance(given, Detected):
             if system.friction is not None or system.linear or self.redundant is not None:
                 raise NotImplementedError(
-                    "hht: leave out `solve` with dry friction, a LinearSystem (its matrices may be sparse) or redundant "
-                    f"constraints; received {given!r}."
+                    "hht: leave out `solve` with dry friction, a LinearSystem (whose matrices may be sparse) or "
+                    f"redundant constraints; received {given!r}."
                 )
             if system.sparse is not None and system.sparse.tolerance == given.tolerance and given.pattern is None:
                 return system
