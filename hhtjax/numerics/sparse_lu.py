@@ -81,7 +81,7 @@ class Plan:
             d = sparse.diagonal()
             return pivots_on_host(_scaled_on_both_sides(sparse, 1 / jnp.sqrt(jnp.where(d > 0, d, 1))), limit)
         lower, middle, upper = self._in_blocks(A)
-        d = jnp.diagonal(middle, axis1=1, axis2=2)
+        d = _diagonals(middle)
         unit = 1 / jnp.sqrt(jnp.where(d > 0, d, 1))
         before, behind = (jnp.roll(unit, shift, axis=0) for shift in (1, -1))
         blocks = [unit[:, :, None] * x * y[:, None, :] for x, y in ((lower, before), (middle, unit), (upper, behind))]
@@ -173,7 +173,7 @@ class Plan:
 def _row_scale(blocks: Array, free: np.ndarray) -> Array:
     """(N, b): equations are measured by the square roots of their diagonal, and constraints by those of their unknowns,
     so that no units choose the pivots; as of `factorize_saddle_point`."""
-    d = jnp.abs(jnp.diagonal(blocks[1], axis1=1, axis2=2))
+    d = jnp.abs(_diagonals(blocks[1]))
     first = jnp.where(free, 1 / jnp.sqrt(jnp.where(d == 0, 1, d)), 0)
     if free.all():
         return first
@@ -182,6 +182,12 @@ def _row_scale(blocks: Array, free: np.ndarray) -> Array:
     total = reduce(jnp.add, sizes)
     size = reduce(jnp.add, [total[:, :, k] for k in range(total.shape[2])])
     return jnp.where(free, first, 1 / jnp.where(size == 0, 1, size))
+
+
+def _diagonals(blocks: Array) -> Array:
+    """(N, b). jnp.diagonal would ask for the platform."""
+    N, b = blocks.shape[:2]
+    return blocks.reshape(N, b * b)[:, :: b + 1]
 
 
 def _added(A: Numbers, entries: np.ndarray) -> Array:

@@ -118,22 +118,17 @@ def bind_constrained(method, system, params: PyTree, dt: Array):
 
 
 def report_constraints(method, system, params, dt, s, s1, info, B):
-    """What the step tells about them: violations, and the row that depends on others at its start.
-
-    If the step failed, at its predicted end.
-    """
-
-    def at_start() -> Array:
-        return sparse_dependent_row(system, s.q, s.t, params) if B is None else dependent_row(B)
-
-    def at_end() -> Array:
-        predicted = method.arrive(system, s, dt, s.w)
-        if B is None:
-            return sparse_dependent_row(system, predicted.q, predicted.t, params)
-        return dependent_row(jacobian(system, predicted.q, predicted.t, params))
+    """What the step tells about them: violations, and the row that depends on others."""
 
     def dependent() -> Array:
-        return lax.cond(jnp.all(jnp.isfinite(s1.w)), at_start, at_end)
+        """At the start; if the step failed, at its predicted end."""
+        worked = jnp.all(jnp.isfinite(s1.w))
+        predicted = method.arrive(system, s, dt, s.w)
+        if B is None:
+            q, t = (jnp.where(worked, x, y) for x, y in ((s.q, predicted.q), (s.t, predicted.t)))
+            return sparse_dependent_row(system, q, t, params)
+        at_end = lambda: dependent_row(jacobian(system, predicted.q, predicted.t, params))  # noqa: E731
+        return lax.cond(worked, lambda: dependent_row(B), at_end)
 
     constraint, rate = (jnp.max(jnp.abs(x)) for x in violation(system, s1.q, s1.v, s1.t, params))
     row = None if method.redundant else dependent()

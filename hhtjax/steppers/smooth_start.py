@@ -44,6 +44,7 @@ from hhtjax.numerics.dense_lu import UNROLLED, diagonal, differentiable_inverse,
 from hhtjax.numerics.differentiable_while import implicit_root
 from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
 from hhtjax.numerics.low_rank import around
+from hhtjax.numerics.shortened_newton import improved
 from hhtjax.primitives import one_kernel, staged, traced
 from hhtjax.steppers.implicit_solve import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
@@ -59,14 +60,12 @@ if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 POWERS = 5
-ITERATIONS = 40  # of Newton's method, at most
 STEPS = 3  # of it, which are differentiated: from the second on Hessians are right
 LARGEST = 64  # unknowns whose matrix is inverted
 STIFF = 0.03  # part of a jump of the acceleration by which damping changes it within a step, and h resolves it
 LEAVES = 0.3  # part of its accelerations by which a motion changes them in a long step, so that this begins anew
 GAINED = 0.03  # part of the energy of a motion that a C may give it within a step, and still counts as a damper
 LATER = 1 / 16  # of h, for the rate of accelerations
-SHORTEST = 1e-3  # part of a Newton step below which there is no way on
 
 
 class Corrections(NamedTuple):
@@ -151,6 +150,8 @@ class Layer(NamedTuple):
         if self.bend is None:
             return force - self.offset
         bend = self.bend if bend is None else bend
+        assert s.L is not None
+        assert bend is not None
         return jnp.concatenate([force - self.pull(s.L), self.push(s.w) + bend]) - self.offset
 
     def product(self, z: Array):
@@ -437,30 +438,6 @@ def differentiable(layer: Layer):
 
     moved = lax.fori_loop(0, STEPS, again, found)
     return jax.tree.map(lambda value, x: value + (x - lax.stop_gradient(x)), found, moved)
-
-
-def improved(around, z, *more):
-    """The best z that Newton's method finds, with steps that are shortened until the next would be shorter, the next
-    step, and what else `around` tells there."""
-    eps = float(jnp.finfo(z.dtype).eps)
-
-    def unfinished(carry: tuple) -> Array:
-        _, (_, energy, *_), first, part, count = carry
-        small = (count > 0) & (energy <= eps**1.1 * first)
-        return ~small & (part > SHORTEST) & (count < ITERATIONS)
-
-    def improve(carry: tuple):
-        z, best, first, part, count = carry
-        trial = z - part * best[0]
-        found = around(trial)
-        better = found[1] < best[1]
-        z, best = tree_where(better, (trial, found), (z, best))
-        return z, best, jnp.where(count == 0, best[1], first), jnp.where(better, 1, part / 4), count + 1
-
-    one = jnp.ones((), z.dtype)
-    begin = z, (jnp.zeros_like(z), jnp.inf * one, *more), one, one, jnp.zeros((), jnp.int32)
-    z, (dz, _, *more), *_ = lax.while_loop(unfinished, improve, begin)
-    return z, dz, *more
 
 
 def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):

@@ -152,7 +152,7 @@ def _key(dofs: np.ndarray) -> tuple:
 def _mass_pattern(keys: tuple, n: int):
     """The `Pattern` of a mass, which numbers come to each of its slots, and rows and columns of the slots (n: none)."""
     i = np.arange(n)
-    pairs = [(i, i)]
+    pairs: list = [(i, i)]
     for data, shape in keys:
         dofs = np.frombuffer(data, np.int32).reshape(shape)
         s = dofs.shape[1]

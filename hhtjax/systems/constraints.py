@@ -99,6 +99,7 @@ def _sparse_saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree)
     def f(z: Array) -> Array:
         return jnp.concatenate([system.inertia(q, z[:n], t, params) - pull(z[n:])[0], push(z[:n])])
 
+    assert system.sparse is not None
     inverse = factorize_map(f, jnp.zeros(n + system.num_constraints, q.dtype), system.sparse)
 
     def x_and_multipliers(force: Real, rows: Array):

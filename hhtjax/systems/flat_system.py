@@ -289,7 +289,7 @@ def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0:
     return flat._replace(settle=settle) if force.held is not None and force.held.moves else flat
 
 
-def _told(held: Held, flat: FlatSystem, params: PyTree, state):
+def _told(held: Held | None, flat: FlatSystem, params: PyTree, state):
     """A state with positions and velocities as they are told."""
     q, v = at(held, flat.unravel(state.q), flat.unravel_rates(state.v), state.t, params)
     return state._replace(q=ravel_pytree(q)[0], v=ravel_pytree(v)[0])

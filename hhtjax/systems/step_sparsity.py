@@ -122,8 +122,9 @@ def detected(flat: FlatSystem, params: PyTree, dtype: np.dtype, pattern: csr_arr
     x, *at = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((flat.size,), (length,), ()))
     at = *at, jax.eval_shape(lambda x: x, params)  # of which no value counts
     try:
-        if pattern is None:
-            pattern = dependencies(lambda x, q, t, p: flat.residual(flat.move(q, x), x, x, t, p), x, *at)
+        reads = pattern
+        if reads is None:
+            reads = dependencies(lambda x, q, t, p: flat.residual(flat.move(q, x), x, x, t, p), x, *at)
         drag = dependencies(lambda x, q, t, p: flat.residual(q, x, x, t, p), x, *at)
         rows = None
         if flat.num_constraints:
@@ -132,9 +133,9 @@ def detected(flat: FlatSystem, params: PyTree, dtype: np.dtype, pattern: csr_arr
         raise ValueError(
             f"sparse_lu: the matrix of a step is not sparse, by what the functions read: {error}"
         ) from None
-    if pattern.shape != (flat.size, flat.size):
+    if reads.shape != (flat.size, flat.size):
         raise ValueError(
             f"sparse_lu: `pattern` must have shape ({flat.size}, {flat.size}), as v has numbers; received shape "
-            f"{pattern.shape}."
+            f"{reads.shape}."
         )
-    return Sparsity(pattern, drag, rows, flat.blocks)
+    return Sparsity(reads, drag, rows, flat.blocks)
