@@ -118,6 +118,17 @@ def test_blocks_meet_their_neighbours_alone(name):
         assert block[multiplier] >= block[:free][A[multiplier, :free]].max()
 
 
+def test_a_constraint_of_unknowns_that_are_far_apart_makes_larger_blocks():
+    A = nodal("line", 1)
+    end, other = np.flatnonzero(A.sum(axis=1) == 2)
+    row = np.zeros((1, 30), bool)
+    row[0, [end, other]] = True
+    A = np.block([[A, row.T], [row, np.zeros((1, 1), bool)]])
+    order, starts, _ = in_blocks(csr_array(A), 30)
+    block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))[np.argsort(order)]
+    assert np.max(np.abs(block[:, None] - block)[A]) == 1
+
+
 @pytest.mark.parametrize(("name", "size"), [("line", 4), ("ring", 8), ("parts", 4), ("tree", 24)])
 def test_blocks_of_long_mechanisms_are_small(name, size):
     assert in_blocks(csr_array(nodal(name)), len(nodal(name))).size <= size
@@ -142,11 +153,12 @@ def fill(A, order):
     return int(np.tril(A, -1).sum())
 
 
-def test_dissection_of_a_lattice_leaves_less_fill_than_its_rows():
+def test_dissection_of_a_lattice_leaves_less_fill_than_its_levels():
     A = np.eye(400, dtype=bool)
     pairs = lattice(20)
     A[pairs[:, 0], pairs[:, 1]] = A[pairs[:, 1], pairs[:, 0]] = True
-    assert fill(A, dissected(csr_array(A), 400)) < 0.75 * fill(A, np.arange(400))
+    by_levels = np.argsort(longest_levels(symmetric(csr_array(A))), kind="stable")
+    assert fill(A, dissected(csr_array(A), 400)) < 0.92 * fill(A, by_levels)
 
 
 def test_levels():
