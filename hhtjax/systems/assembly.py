@@ -34,8 +34,10 @@ class ElementForce:
         if self.held is None:
             return _zero(v) if self.elements is None else self.elements(q, v, t, params)
         here, now = held_nodes.at(self.held, q, v, t, params)
+        known, moves, a = accelerations(self.held, v, t, params)
+        # no slope in a velocity that is 0: a start takes the symmetric part of drag, which would move what stays
+        now = jax.tree.map(lambda v, here, told: jnp.where(here & ~told, 0, v), now, known, moves)
         Q = _zero(v) if self.elements is None else self.elements(here, now, t, params)
-        known, _, a = accelerations(self.held, v, t, params)
         if self.held.moves and self.mass.parts:
             pull = self.mass.product(here, a, params)
             Q = jax.tree.map(jnp.subtract, Q, pull)
