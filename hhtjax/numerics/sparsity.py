@@ -156,17 +156,19 @@ def in_blocks(pattern: csr_array, free: int) -> Blocks:
 
 def _levels_of(pattern: csr_array, free: int) -> np.ndarray:
     """(n,): the level of each unknown."""
-    n = pattern.shape[0]
-    found, last = np.zeros(n, int), -1
-    group = groups(pattern[:free, :free])
+    group, last = groups(pattern[:free, :free]), -1
     graph = condensed(pattern[:free, :free], group)
     of_group = np.zeros(graph.shape[0], int)
     for nodes in components(graph):
         here = longest_levels(graph[nodes][:, nodes])
         of_group[nodes] = here + last + 1
         last += here.max() + 1
-    found[:free] = of_group[group]
-    return _behind(pattern, free, found)
+    # in that direction in which multipliers, which come last, make the smaller levels
+    found = [
+        _behind(pattern, free, np.append(x[group], np.zeros(pattern.shape[0] - free, int)))
+        for x in (of_group, last - of_group)
+    ]
+    return min(found, key=lambda level: np.bincount(level).max())
 
 
 def _behind(pattern: csr_array, free: int, place: np.ndarray) -> np.ndarray:

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from hhtjax.systems.system import System
 
 
+LARGEST_WITH_FRICTION = 600  # unknowns of a system of elements
+
+
 class FlatSystem(NamedTuple):
     """A system on vectors, as the steppers see it; made by `flatten`.
 
@@ -259,13 +262,15 @@ def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real,
     if system.internal is not None:
         flat, q, v = _with_internal(system, flat, q, v0, z0)
     if not linear and isinstance(system.force, ElementForce):
-        flat = _with_elements(system, flat, q0, v0, t0, params)
+        flat = _with_elements(caller, system, flat, q0, v0, t0, params)
     if system.friction is not None:
         flat = flat._replace(friction=flat_friction(caller, system, flat, q0, v0, z0, t0, params))
     return flat, q, v
 
 
-def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0: Real, params: PyTree) -> FlatSystem:
+def _with_elements(
+    caller: str, system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0: Real, params: PyTree
+) -> FlatSystem:
     """The system with the solve that follows from where its elements are, and with what is held."""
     force, constraint = system.force, system.constraint
     assert isinstance(force, ElementForce)
@@ -281,7 +286,14 @@ def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0:
     def settle(params: PyTree) -> FlatSystem:
         return flat._replace(settle=None, told=partial(_told, force.held, flat, thaw(params)))
 
-    if flat.size + 2 * flat.num_constraints > LOOPED:
+    unknowns = flat.size + flat.num_constraints
+    if system.friction is not None and unknowns > LARGEST_WITH_FRICTION:
+        raise NotImplementedError(
+            f"{caller}: dry `friction` in a system of elements is solved with full matrices, up to "
+            f"{LARGEST_WITH_FRICTION} unknowns; received {unknowns}. Write smooth friction into the elements, or take "
+            "fewer of them."
+        )
+    if unknowns > LOOPED and system.friction is None:
         matrix = cache(lambda: StepMatrix(force, flat, like[1], sparsity().plan(flat.size)))
         flat = flat._replace(sparse=SparseLU(sparsity), step_elements=lambda params: lambda *at: matrix()(params, *at))
     else:

@@ -252,7 +252,14 @@ class System(Description):
         return cls(LagrangianMass(lagrangian), own_force, constraint, inertia, internal, friction, sliding)
 
     @classmethod
-    def from_elements(cls, *parts: Elements | Joints, mass: Any, held: dict | None = None) -> System:
+    def from_elements(
+        cls,
+        *parts: Elements | Joints,
+        mass: Any,
+        held: dict | None = None,
+        friction: Callable | None = None,
+        sliding: Callable | None = None,
+    ) -> System:
         """A system of many small parts: elements between nodes, and joints between them.
 
         Leaves of q and v have the nodes as their first axis, so that a plane frame has q = {"r": (N, 2), "theta":
@@ -272,6 +279,10 @@ class System(Description):
                 alone. A function (t, params): the position of the node, structured like q of it, from which velocity
                 and acceleration follow; a dict may leave keys out. What is held is no unknown: its row of `v` has the
                 acceleration that is known.
+            friction, sliding: as for `System`, of the whole. Steps with dry friction are solved with full matrices: up
+                to 600 unknowns.
+
+        Internal states belong to a `System` of one function, with `hht(solve=sparse_lu())`.
 
         Returns:
             A `System`.
@@ -304,7 +315,7 @@ class System(Description):
         [-0.096, 0.0]
         """
         mass, force, constraint, inertia = put_together(parts, mass, held)
-        return cls(mass, force, constraint, inertia)
+        return cls(mass, force, constraint, inertia, None, friction, sliding)
 
 
 @dataclass(frozen=True, eq=False)
