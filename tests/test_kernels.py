@@ -237,6 +237,34 @@ def test_forces_with_products_of_matrices_are_one_kernel():
         assert np.allclose(x, y, rtol=1e-11, atol=1e-13)
 
 
+SUMS = [  # shapes, and axes that are summed over: few terms of many results
+    ((3000, 2), 1),
+    ((2, 3000), 0),
+    ((4, 700, 3), (0, 2)),
+    ((1500, 3, 2), (1,)),
+    ((3000, 8), 1),
+]
+
+
+@on_cpu
+@pytest.mark.compiled
+def test_sums_of_few_terms_are_written_out():
+    """In value, in slopes, and in batches."""
+
+    def sums(p):
+        arrays = [p * jnp.cos(jnp.arange(1.0 * np.prod(shape))).reshape(shape) for shape, _ in SUMS]
+        return [jnp.sum(x, axis=axes) for x, (_, axes) in zip(arrays, SUMS, strict=True)]
+
+    def all_of(cut):
+        slope = lambda p: jax.jvp(sums, (p,), (p,))  # noqa: E731
+        return cut(sums, 2.0), cut(jax.vmap(sums), jnp.array([1.0, 2.0])), cut(slope, 2.0)
+
+    one, verdicts = run(all_of, primitives.one_kernel)
+    assert set(verdicts) == {"one kernel"}
+    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(run(all_of, lambda f, *args: f(*args))[0]), strict=True):
+        assert np.allclose(x, y, rtol=1e-12, atol=1e-12)
+
+
 @on_cpu
 @pytest.mark.compiled
 def test_a_stage_of_a_large_batch_is_not_divided_among_threads():

@@ -97,7 +97,7 @@ def test_derivatives(name, local):
 @pytest.mark.slow
 def test_batches_of_starts_and_of_matrices():
     """More matrices than factors are kept; and a sweep."""
-    number = sparse_matrix.KEPT + 2
+    number = superlu.KEPT + 2
     ks, scales = jnp.linspace(10.0, 60.0, number), jnp.linspace(0.5, 1.0, number)
 
     stepper = hhtjax.hht(linearize="predictor")

@@ -255,9 +255,9 @@ class Solution(NamedTuple):
         if left:
             return (
                 f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "
-                "half_bandwidth of banded(), more iterations of conjugate_gradients(), or another solve(A, b); a "
-                "larger `tolerance` of the first two accepts it. With sparse matrices M, C and K are too far apart in "
-                "size for this step, or for float32"
+                "half_bandwidth of banded(), a pattern of sparse_lu() that leaves nothing out, more iterations of "
+                "conjugate_gradients(), or another solve(A, b); a larger `tolerance` of these accepts it. With sparse "
+                "matrices M, C and K are too far apart in size for this step, or for float32"
             )
         if np.isinf(friction):
             return "a limit of the dry friction is negative or not finite: see `friction` of the System"

@@ -24,6 +24,7 @@ from hhtjax.runs.inputs import (
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 from hhtjax.steppers.variable_step import GROWTH
 from hhtjax.systems import zero_order_hold
+from hhtjax.systems.held_nodes import require_held_start
 from hhtjax.systems.initial_conditions import distances, examine, initial_values, require_consistent, with_known_rows
 from hhtjax.systems.system import require_masses
 
@@ -104,10 +105,11 @@ class Inputs(NamedTuple):
         if zero_order_hold.holds(params) and not isinstance(dts, Adaptive):
             _warn_of_jumps(params, t0, equal_times(t0, duration, num_samples) if times is None else times, dts)
         require_capable("sweep", system, stepper, *_member(data, mapped, 0)[1:3])
+        _, q, v, p, z = _member(data, mapped, 0)
+        require_held_start("sweep", system, q, v, t0, p)
         if system.constraint is not None:
             _require_consistent(system, data, mapped, t0)
         if system.friction is not None:
-            _, q, v, p, z = _member(data, mapped, 0)
             system = with_known_rows("sweep", system, q, v, t0, p, z)
         duration, t0 = (x if x is None or not is_concrete(x) else float(x) for x in (duration, t0))
         return cls(system, data, dts, duration, t0, mapped, int(num_samples), times, size)

@@ -164,10 +164,10 @@ class GeneralizedAlpha(Controlled, Stepper):
         """The system with these params, and with the sparse solve that the options, or its elements, ask for."""
         system, given = system.settled(params), self.options.solve
         if isinstance(given, Detected):
-            if system.friction is not None or system.matrices is not None or self.redundant is not None:
+            if system.friction is not None or system.linear or self.redundant is not None:
                 raise NotImplementedError(
-                    "hht: leave out `solve` with dry friction, sparse matrices or redundant constraints; received "
-                    f"{given!r}."
+                    "hht: leave out `solve` with dry friction, a LinearSystem (whose matrices may be sparse) or "
+                    f"redundant constraints; received {given!r}."
                 )
             if system.sparse is not None and system.sparse.tolerance == given.tolerance and given.pattern is None:
                 return system
@@ -176,7 +176,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         if system.sparse is None:
             return system
         if given is not None or self.redundant is not None:
-            return system._replace(sparse=None)
+            return system.without_sparse_solve()
         if system.num_constraints or system.step_elements is None:
             return system
         return system._replace(sparse=replace(system.sparse, elements=system.step_elements(params)))

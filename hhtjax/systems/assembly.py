@@ -34,8 +34,10 @@ class ElementForce:
         if self.held is None:
             return _zero(v) if self.elements is None else self.elements(q, v, t, params)
         here, now = held_nodes.at(self.held, q, v, t, params)
+        known, moves, a = accelerations(self.held, v, t, params)
+        # no slope in a velocity that is 0: a start takes the symmetric part of drag, which would move what stays
+        now = jax.tree.map(lambda v, here, told: jnp.where(here & ~told, 0, v), now, known, moves)
         Q = _zero(v) if self.elements is None else self.elements(here, now, t, params)
-        known, _, a = accelerations(self.held, v, t, params)
         if self.held.moves and self.mass.parts:
             pull = self.mass.product(here, a, params)
             Q = jax.tree.map(jnp.subtract, Q, pull)
@@ -87,11 +89,12 @@ class ElementMass:
         if self.nodal is None:
             return jnp.zeros_like(flat)
         given = self.nodal.tree if isinstance(self.nodal, Fixed) else self.nodal(params)
-        if jax.tree.structure(given) == jax.tree.structure(v):
-            given = jax.tree.map(lambda m, x: _broadcast(m, x), given, v)
-            return ravel_pytree(given)[0].astype(flat.dtype)
-        if jnp.ndim(given) < 2 and not isinstance(given, dict) and jnp.size(given) in (1, flat.size):
+        alone = jax.tree.structure(given) == jax.tree.structure(0)
+        if alone and jnp.ndim(given) < 2 and jnp.size(given) in (1, flat.size):
             return jnp.broadcast_to(jnp.asarray(given, flat.dtype), flat.shape)
+        if jax.tree.structure(given) == jax.tree.structure(v):
+            given = jax.tree.map(_broadcast, given, v)
+            return ravel_pytree(given)[0].astype(flat.dtype)
         raise ValueError(f"{NAME}: `mass` must be structured like v, or have shape ({flat.size},); received {given!r}.")
 
     def free(self, v: PyTree, params: PyTree) -> Array:
@@ -123,9 +126,12 @@ class ElementInertia:
 def _broadcast(m: Real, x: Array) -> Array:
     """A mass for each number of a leaf: one for all, one for each node, or one for each number."""
     m = jnp.asarray(m)
-    if m.ndim and m.ndim < x.ndim:
-        m = m.reshape(m.shape + (1,) * (x.ndim - m.ndim))
-    return jnp.broadcast_to(m, x.shape)
+    if m.ndim > x.ndim or any(a not in (1, b) for a, b in zip(m.shape, x.shape, strict=False)):
+        raise ValueError(
+            f"{NAME}: a leaf of `mass` must be a number, or have one for each node or number of a leaf of v, of shape "
+            f"{x.shape}; received shape {m.shape}."
+        )
+    return jnp.broadcast_to(m.reshape(m.shape + (1,) * (x.ndim - m.ndim)), x.shape)
 
 
 def _zero(v: PyTree) -> PyTree:
@@ -168,6 +174,9 @@ def put_together(parts: tuple, mass: Any, held: Any):
     if not parts or not all(isinstance(x, (Elements, Joints)) for x in parts):
         raise TypeError(f"{NAME}: give Elements and Joints; received {parts!r}.")
     elements = [x for x in parts if isinstance(x, Elements)]
+    for x in elements:
+        own = "" if x.each is None else ", each"
+        require_function(NAME, repr(x), x.function, f"function(q, v, t, params{own})")
     joints = [x for x in parts if isinstance(x, Joints)]
     held = held_nodes.checked(held)
     of_mass = _checked_mass(mass, held)

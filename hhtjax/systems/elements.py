@@ -22,6 +22,7 @@ from hhtjax.description import Array, PyTree, Real, is_array, is_concrete
 from hhtjax.primitives import Linear
 
 FEW = 4  # nodes of a part whose forces are added one by one
+LARGEST_NODE = 2**31 - 1  # in 32-bit indices
 MOST_SHARED = 16  # elements at a node, up to which their forces are gathered
 
 
@@ -84,8 +85,12 @@ class _OnNodes:
         nodes = self.nodes.tree
         if not isinstance(nodes, dict):
             return _taken(type(self).__name__, tree, nodes)
-        unknown = [] if isinstance(tree, dict) else ["(no dict)"]
-        unknown = unknown or [key for key in nodes if key not in tree]
+        if not isinstance(tree, dict):
+            raise ValueError(
+                f"{type(self).__name__}: `nodes` must be an array, as the position is no dict; received the "
+                f"keys {sorted(nodes)}."
+            )
+        unknown = [key for key in nodes if key not in tree]
         if unknown:
             raise ValueError(
                 f"{type(self).__name__}: `nodes` has the keys {unknown}, which the position does not have."
@@ -224,7 +229,8 @@ class Joints(_OnNodes):
         own, axes = self.own_numbers(params, _dtype(q))
         rows = jax.vmap(lambda q, *own: self.function(q, t, params, *own), (0, *axes))(self.own(q), *own)
         if not is_array(rows) or jnp.ndim(rows) != 2:
-            raise ValueError("Joints: `function` must return the rows (m,) of one joint; received another shape.")
+            of_one = jax.tree.map(lambda x: jnp.shape(x)[1:], rows)
+            raise ValueError(f"Joints: `function` must return the rows (m,) of one joint; received shape {of_one}.")
         return rows.ravel()
 
 
@@ -240,7 +246,7 @@ def _checked_nodes(name: str, nodes: PyTree) -> Fixed:
             x = np.asarray(x)
         except ValueError:
             x = np.empty(0)
-        if x.ndim != 2 or not x.size or x.dtype.kind not in "iu" or x.min() < 0:
+        if x.ndim != 2 or not x.size or x.dtype.kind not in "iu" or x.min() < 0 or x.max() > LARGEST_NODE:
             raise ValueError(
                 f"{name}: `{where}` must be an array (E, k) of integers, 0 or more, a row for each; received "
                 f"{'an array of ' + str(x.dtype) if x.size else 'none'} of shape {x.shape}."

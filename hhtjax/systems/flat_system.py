@@ -17,14 +17,14 @@ from hhtjax.description import Array, PyTree, Real, thaw
 from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, full_matrix, matvec
 from hhtjax.numerics.linear_solve import factorize_map, reuse, solver
 from hhtjax.numerics.sparse_lu import SparseLU
-from hhtjax.numerics.sparse_matrix import combined
+from hhtjax.numerics.sparse_matrix import Sparse, combined
 from hhtjax.primitives import consistent
 from hhtjax.systems import kinematics
 from hhtjax.systems.assembly import ElementForce
 from hhtjax.systems.element_matrix import StepMatrix
 from hhtjax.systems.elements import parts_of
 from hhtjax.systems.friction import FrictionLaw, flat_friction
-from hhtjax.systems.held_nodes import Held, at, require_start
+from hhtjax.systems.held_nodes import Held, at, staying
 from hhtjax.systems.linear_system import with_known_matrices
 from hhtjax.systems.matrices import as_matrix
 from hhtjax.systems.step_sparsity import Sparsity, of_elements
@@ -69,12 +69,23 @@ class FlatSystem(NamedTuple):
     massless: Array | None = None  # G with M G M = M, where M is singular
     factors: Factors | None = None  # `Factors` for the steps of a run, where they are known before it
     sparse: SparseLU | None = None  # the solve of a step whose unknowns are known to meet few others
+    stays: np.ndarray | None = None  # which coordinates stay where they start, where constraints meet them
     step_elements: Callable | None = None  # params -> `SparseLU.elements`
     told: Callable | None = None  # state, params -> the state with what is held as it is told
 
     def settled(self, params: PyTree) -> FlatSystem:
         """What `settle` gives, where there is something to settle."""
         return self if self.settle is None else self.settle(params)
+
+    def without_sparse_solve(self) -> FlatSystem:
+        """The system whose steps are solved by full matrices, its mass among them."""
+        mass = self.mass
+
+        def full(q: Array, t: Array, params: PyTree) -> Array:
+            M = mass(q, t, params)
+            return full_matrix(M) if isinstance(M, Sparse) else M
+
+        return self._replace(mass=full, sparse=None)
 
     def step_matrix(self, params: PyTree, w: Array, v: Array, q: Array):
         """w M + v C + q K, `Sparse` or a diagonal (n,), of factors that are numbers."""
@@ -116,7 +127,8 @@ class FlatSystem(NamedTuple):
         if M.ndim == 1:
             return partial(self._of_positions, lambda Q: Q / M)
         if self.sparse is not None:
-            return factorize_map(partial(matvec, M), jnp.zeros(self.size, M.dtype), self.sparse)
+            product = partial(self._of_positions, partial(matvec, M))
+            return factorize_map(product, jnp.zeros(self.size, M.dtype), self.sparse)
         inverse = solver(M, factorize)
         return partial(self._of_positions, inverse)
 
@@ -147,11 +159,15 @@ class FlatSystem(NamedTuple):
 
     def move(self, q: Array, x: Array) -> Array:
         """q displaced by x (N,): q + x, and R exp(x) for rotations."""
-        return kinematics.move(self.blocks, q, self.located(x))
+        return kinematics.move(self.blocks, q, self._freed(self.located(x)))
 
     def rate(self, q: Array, v: Array) -> Array:
         """qdot: v, and R hat(v) for rotations."""
-        return kinematics.rate(self.blocks, q, self.located(v))
+        return kinematics.rate(self.blocks, q, self._freed(self.located(v)))
+
+    def _freed(self, x: Array) -> Array:
+        """x with 0 for what stays, which no reaction of a constraint moves."""
+        return x if self.stays is None else jnp.where(self.stays, 0, x)
 
     def end_of_chart(self, x: Array, *rates: Array):
         """Velocity, acceleration, algorithmic acceleration, from first and second rates of the displacement x."""
@@ -258,8 +274,9 @@ def _with_elements(
     """The system with the solve that follows from where its elements are, and with what is held."""
     force, constraint = system.force, system.constraint
     assert isinstance(force, ElementForce)
-    require_start(force.held, q0, v0, t0, params)
     like = jax.eval_shape(lambda *x: jax.tree.map(jnp.asarray, x), q0, v0, t0, params)
+    if constraint is not None:
+        flat = flat._replace(stays=staying(force.held, v0))
     joints = parts_of(None if constraint is None else constraint.joints)
 
     @cache
@@ -279,6 +296,8 @@ def _with_elements(
     if unknowns > LOOPED and system.friction is None:
         matrix = cache(lambda: StepMatrix(force, flat, like[1], sparsity().plan(flat.size)))
         flat = flat._replace(sparse=SparseLU(sparsity), step_elements=lambda params: lambda *at: matrix()(params, *at))
+    else:
+        flat = flat.without_sparse_solve()
     return flat._replace(settle=settle) if force.held is not None and force.held.moves else flat
 
 

@@ -13,11 +13,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from hhtjax import rotation
 from hhtjax.checks import require_function
-from hhtjax.description import Array, PyTree, Real, all_concrete
+from hhtjax.description import Array, PyTree, Real, known_now
 from hhtjax.systems.kinematics import is_rotation
+from hhtjax.xla import Programs
 
 AGREES = 1e-6  # difference, relative to the size of a state, of a start from what is told
 
@@ -66,26 +68,44 @@ class Held:
 
         def velocity(t: Real) -> PyTree:
             q, rate = jax.jvp(position, (t,), (one,))
-            return _paired(_rate, q, rate, self.here(v))
+            return _paired(_rate, q, rate, self.here(v, q))
 
         v_told, w_told = jax.jvp(velocity, (t,), (one,))
         return position(t), v_told, w_told
 
-    def here(self, tree: PyTree) -> PyTree:
-        """The leaves of these nodes."""
+    def here(self, tree: PyTree, part: PyTree = None) -> PyTree:
+        """The leaves of these nodes; where a part is a dict, other sets of nodes need not have them."""
         places = self.nodes[0] if self.alone else np.array(self.nodes)
+        if isinstance(tree, dict) and isinstance(part, dict):
+            tree = {key: x for key, x in tree.items() if key in part or all(map(self._fit, jax.tree.leaves(x)))}
         for x in jax.tree.leaves(tree):
-            if not jnp.ndim(x) or max(self.nodes) >= x.shape[0]:
+            if not self._fit(x):
                 raise ValueError(
                     f"System.from_elements: `held` names node {max(self.nodes)}, and a leaf of the state has shape "
                     f"{jnp.shape(x)}: nodes are counted from 0."
                 )
         return jax.tree.map(lambda x: x[places], tree)
 
+    def _fit(self, x: Array) -> bool:
+        """Whether a leaf has these nodes."""
+        return bool(jnp.ndim(x)) and max(self.nodes) < x.shape[0]
+
     def put(self, tree: PyTree, part: PyTree) -> PyTree:
         """The pytree with this part at these nodes."""
         places = self.nodes[0] if self.alone else np.array(self.nodes)
-        return _paired(lambda part, x: x if part is None else x.at[places].set(part), part, tree, whole=True)
+
+        def placed(part: Array | None, x: Array) -> Array:
+            if part is None:
+                return x
+            here = np.shape(places) + x.shape[1:]
+            if jnp.shape(part) != here:
+                raise ValueError(
+                    f"System.from_elements: what `held` gives of {self.nodes} must have their shape {here}; "
+                    f"received shape {jnp.shape(part)}."
+                )
+            return x.at[places].set(part)
+
+        return _paired(placed, part, tree, whole=True)
 
 
 def _rate(q: Array, qdot: Array, v: Array) -> Array:
@@ -154,7 +174,7 @@ def accelerations(held: Held, v: PyTree, t: Real, params: PyTree) -> Known:
     for some in held.all():
         if isinstance(some.how, Still):
             which = some.how.which
-            here = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), some.here(v))
+            here = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), some.here(v, which))
             if which is True:
                 known = some.put(known, jax.tree.map(np.ones_like, here))
             else:
@@ -166,9 +186,32 @@ def accelerations(held: Held, v: PyTree, t: Real, params: PyTree) -> Known:
     return Known(known, moves, a)
 
 
+def staying(held: Held | None, v: PyTree) -> np.ndarray | None:
+    """(n,): which numbers stay where they start; None for none."""
+    still = None
+    for some in () if held is None else held.all():
+        if isinstance(some.how, Still):
+            still = Held(some.nodes, some.alone, some.how, still)
+    if still is None:
+        return None
+    with jax.ensure_compile_time_eval():
+        known = accelerations(still, jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), x.dtype), v), 0.0, None).here
+        return np.asarray(ravel_pytree(known)[0])
+
+
 def _spread(which: PyTree, here: PyTree) -> PyTree:
     """Booleans of the shapes of a node, from what was given: of a key, or of each number of it."""
-    return _paired(lambda flag, x: np.broadcast_to(np.array(flag), np.shape(x)), _as_arrays(which), here)
+
+    def spread(flag: np.ndarray, x: np.ndarray) -> np.ndarray:
+        try:
+            return np.broadcast_to(flag, np.shape(x))
+        except ValueError:
+            raise ValueError(
+                f"System.from_elements: booleans of `held` must have the shape {np.shape(x)} of their nodes; received "
+                f"shape {flag.shape}."
+            ) from None
+
+    return _paired(spread, _as_arrays(which), here)
 
 
 def _as_arrays(which: PyTree) -> PyTree:
@@ -220,30 +263,31 @@ class _Flags(dict):
         return hash(tuple(sorted(self.items())))
 
 
-def require_start(held: Held | None, q0: PyTree, v0: PyTree, t0: Real, params: PyTree):
+def require_held_start(caller: str, system: Any, q0: PyTree, v0: PyTree, t0: Real, params: PyTree):
     """An error where a start that is known is not what is held."""
-    if held is None or not all_concrete((q0, v0, t0, params)):
+    if getattr(getattr(system, "force", None), "held", None) is None:
         return
-    q, v = at(held, q0, v0, t0, params)
-    if not all_concrete((q, v)):
+    found = known_now(_known_start, system, q0, v0, t0, params)
+    if found is None:
         return
-    for name, given, told in (("q0", q0, q), ("v0", v0, v)):
+    q, v, stays = found
+    rest = jax.tree.map(lambda x, still: np.where(still, 0, x), v, stays)
+    for name, given, told in (("q0", q0, q), ("v0", v0, rest)):
         for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(told), strict=True):
-            x, y = np.asarray(x), np.asarray(y)
-            if np.max(np.abs(x - y), initial=0) > AGREES * max(1.0, np.max(np.abs(y), initial=0)):
-                node = int(np.argmax(np.abs(x - y).reshape(len(x), -1).max(axis=1)))
+            x = np.asarray(x)
+            agrees = max(AGREES, 100 * float(jnp.finfo(y.dtype).eps))
+            apart = np.abs(x - y).reshape(len(x), -1).max(axis=1)
+            if np.max(apart) > agrees * max(1.0, np.max(np.abs(y))):
+                node = int(np.argmax(apart))
                 raise ValueError(
-                    f"System.from_elements: `{name}{jax.tree_util.keystr(path)}` of node {node} must be what `held` "
-                    f"gives at the start, {y[node]}; received {x[node]}."
+                    f"{caller}: `{name}{jax.tree_util.keystr(path)}` of node {node} must be what `held` gives at the "
+                    f"start, {y[node]}; received {x[node]}."
                 )
-    known = accelerations(held, jax.tree.map(jnp.asarray, v0), t0, params).here
-    told = at(held, q0, jax.tree.map(jnp.zeros_like, v0), t0, params)[1]
-    leaves = jax.tree_util.tree_leaves_with_path(v0)
-    for (path, x), here, y in zip(leaves, jax.tree.leaves(known), jax.tree.leaves(told), strict=True):
-        moving = np.asarray(here) & (np.asarray(y) == 0) & (np.abs(np.asarray(x)) > 0)
-        if np.any(moving):
-            node = int(np.flatnonzero(moving.reshape(len(moving), -1).any(axis=1))[0])
-            raise ValueError(
-                f"System.from_elements: `v0{jax.tree_util.keystr(path)}` of node {node} must be 0, as it is held; "
-                f"received {np.asarray(x)[node]}."
-            )
+
+
+@Programs
+def _known_start(system: Any, q0: PyTree, v0: PyTree, t0: Real, params: PyTree):
+    """q0 and v0 as they are told, and which numbers stay."""
+    held = system.force.held
+    known = accelerations(held, v0, t0, params)
+    return *at(held, q0, v0, t0, params), jax.tree.map(lambda here, moves: here & ~moves, known.here, known.moves)
