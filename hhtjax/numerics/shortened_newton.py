@@ -34,5 +34,5 @@ def improved(around: Callable, z: Array, *more: PyTree):
 
     one = jnp.ones((), z.dtype)
     begin = z, (jnp.zeros_like(z), jnp.inf * one, *more), one, one, jnp.zeros((), jnp.int32)
-    z, (dz, _, *more), *_ = lax.while_loop(unfinished, improve, begin)
-    return z, dz, *more
+    z, (dz, _, *found), *_ = lax.while_loop(unfinished, improve, begin)
+    return z, dz, *found
