@@ -23,6 +23,7 @@ test says so (`tests/test_floors.py` holds the floors as data).
     bodies            mechanisms of bodies and joints, or from model files, as a system
     steppers          one step, one file for each family. HHT: the formulas in `residual.py`, the step in
                       `generalized_alpha.py`, its one solve in `implicit_solve.py`
+    elements          beams, cables, springs and joints of structures, as functions of one element
     systems           what moves: pytrees outside, one flat vector inside; constraints, rotations, inputs
     numerics          solves, scans, loops, extrapolation: mathematics that knows no mechanics; rotation, trigonometry
     xla               how a run becomes one kernel on the CPU
@@ -49,7 +50,7 @@ what was not computed by the same code, and has been seen to fail.
 import importlib
 import warnings
 
-from hhtjax import analysis, bodies, identification, rotation, scenes, trigonometry
+from hhtjax import analysis, bodies, elements, identification, rotation, scenes, trigonometry
 from hhtjax.description import VERSION as __version__
 from hhtjax.description.presentation import CHARTS as _CHARTS
 from hhtjax.export.export_c import ExportedC, export_c
@@ -93,7 +94,7 @@ from hhtjax.systems.zero_order_hold import JumpWarning
 from hhtjax.xla import Explanation, explain, keep_programs, plain
 
 __all__ = [  # noqa: RUF022
-    "__version__", "analysis", "bodies", "identification", "interop", "rotation", "scenes", "trigonometry",
+    "__version__", "analysis", "bodies", "elements", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
     "FirstOrderSystem", "LinearSystem", "System", "Elements", "Joints", "ConsistentInitial", "consistent_initial",
     "JumpWarning", "PrecisionWarning", "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled",
