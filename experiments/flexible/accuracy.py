@@ -20,7 +20,7 @@ from experiments.flexible.native_beam import PLAIN, Run, library
 DTS, FINE, SAMPLE, ELEMENTS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4), 5e-5, 0.05, 32  # s, s, s
 STEPPERS = {
     "hhtjax, one solve": hhtjax.hht(linearize="predictor", start="simple"),
-    "hhtjax, Newton": hhtjax.hht(iterations=None, start="simple"),
+    "hhtjax, Newton": hhtjax.hht(iterations=None, tolerance=1e-7, start="simple"),
 }
 
 
@@ -65,13 +65,13 @@ def points(described: Beam, duration: float, dts: tuple[float, ...], fast: bool)
     return rows
 
 
-def peers(scene: str, fast: bool) -> list[dict]:
+def peers(scene: str) -> list[dict]:
     """exudyn's."""
     if not importlib.util.find_spec("exudyn"):
         return []
     from experiments.flexible import by_exudyn
 
-    rows = {"spin-up": by_exudyn.spin_up, "falling beam": by_exudyn.fall}[scene](fast)
+    rows = {"spin-up": by_exudyn.spin_up, "falling beam": by_exudyn.fall}[scene]()
     keep = "dt_s", "seconds", "tip_error_m", "iterations_per_step", "tolerance"
     return [{"way": f"exudyn, {row['newton']} Newton"} | {key: row.get(key) for key in keep} for row in rows]
 
@@ -84,9 +84,7 @@ def run(report: Any, fast: bool) -> dict:
         ("spin-up", Beam(elements), 0.5 if fast else 20.0),
         ("falling beam", pendulum(elements), 0.1 if fast else 2.0),
     ):
-        found[scene] = points(described, duration, DTS[:1] if fast else DTS, fast) + (
-            [] if fast else peers(scene, fast)
-        )
+        found[scene] = points(described, duration, DTS[:1] if fast else DTS, fast) + ([] if fast else peers(scene))
         report.progress(scene)
         report.table(
             [scene, "h (s)", "time (s)", "error (m)"],

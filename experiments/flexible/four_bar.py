@@ -39,7 +39,7 @@ def corners() -> np.ndarray:
     """The four pins at first, with the crank along x, (4, 2)."""
     a, d = np.array([CRANK, 0.0]), np.array([GROUND, 0.0])
     along = (COUPLER**2 - ROCKER**2 + (GROUND - CRANK) ** 2) / (2 * (GROUND - CRANK))
-    return np.array([[0.0, 0.0], a, a + [along, np.sqrt(COUPLER**2 - along**2)], d])
+    return np.array([[0.0, 0.0], a, a + np.array([along, np.sqrt(COUPLER**2 - along**2)]), d])
 
 
 def four_bar(number: int) -> Model:

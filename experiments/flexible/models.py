@@ -133,7 +133,7 @@ def links(number: int) -> Model:
     system = hhtjax.System.from_elements(
         hhtjax.Elements(elements.gravity, i, each={"m": 1.0}), *pins, mass={"r": 1.0, "theta": 1 / 12}
     )
-    q0 = {"r": jnp.stack([jnp.arange(number) + 0.5, jnp.zeros(number)], axis=1), "theta": jnp.zeros(number)}
+    q0 = {"r": jnp.asarray(np.stack([np.arange(number) + 0.5, np.zeros(number)], axis=1)), "theta": jnp.zeros(number)}
     params = {"gravity": jnp.array([0.0, -GRAVITY])}
     return Model(system, q0, at_rest(q0), params, 3 * number)
 
@@ -148,7 +148,7 @@ def rods_in_space(number: int) -> Model:
         *each_pin(ends, number, np.zeros(3)),
         mass={"r": 1.0, "R": np.tile(J, (number, 1))},
     )
-    r = jnp.zeros((number, 3)).at[:, 0].set(jnp.arange(number) + 0.5)
+    r = jnp.zeros((number, 3)).at[:, 0].set(np.arange(number) + 0.5)
     v0 = {"r": jnp.zeros((number, 3)), "R": jnp.zeros((number, 3)).at[:, 0].set(1.0)}
     params = {"gravity": jnp.array([0.0, 0.0, -GRAVITY])}
     return Model(system, {"r": r, "R": jnp.tile(jnp.eye(3), (number, 1, 1))}, v0, params, 6 * number)

@@ -59,7 +59,7 @@ def cantilever(number: int) -> Model:
 
 
 def princeton(number: int) -> Model:
-    """The Princeton beam (Dowell, Traybar 1975): aluminium, .508 m by 12.3777 mm by 3.2024 mm, 8.896 N at 45 degrees."""
+    """The Princeton beam (Dowell, Traybar 1975): aluminium, 508 by 12.3777 by 3.2024 mm, 8.896 N at 45 degrees."""
     h, w, E, nu, length = 12.3777e-3, 3.2024e-3, 71.7e9, 0.31, 0.508
     GA, pairs = E * h * w / (2 * (1 + nu)), chain_of(number + 1)
     each = {"EA": E * h * w, "GAy": GA, "GAz": GA, "GJ": 3.103, "EIy": E * h * w**3 / 12, "EIz": E * w * h**3 / 12}
