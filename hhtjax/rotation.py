@@ -115,10 +115,10 @@ def log(R: Array) -> jax.Array:
     [0. 0. 3.]
     """
     R = _real("log", "R", R, (3, 3))
-    trace, v = jnp.trace(R), vee(R - R.T)
+    trace, v = R[0, 0] + R[1, 1] + R[2, 2], vee(R - R.T)
     block = R + R.T + (1 - trace) * structural(np.eye(3, dtype=R.dtype))
     products = jnp.block([[(1 + trace)[None, None], v[None, :]], [v[:, None], block]])  # 4 q q^T
-    q = products[jnp.argmax(jnp.diag(products))]  # a multiple of the quaternion
+    q = products[jnp.argmax(products.ravel()[:: len(products) + 1])]  # a multiple of the quaternion
     q = jnp.where(q[0] < 0, -q, q)
     q0, q = q[0], q[1:]
     y = jnp.sum(q**2)

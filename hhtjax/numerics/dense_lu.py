@@ -49,6 +49,14 @@ def diagonal(A: Array) -> Array:
     return A if A.ndim == 1 else A.ravel()[:: len(A) + 1]
 
 
+def full_matrix(A: Array | Sparse) -> Array:
+    """(n, n), of a diagonal (n,), a `Sparse` or a full one."""
+    if isinstance(A, Sparse):
+        p = A.pattern
+        return jnp.zeros(A.shape, A.dtype).at[p.rows, p.columns].set(A.values[p.slots])
+    return jnp.diag(A) if A.ndim == 1 else A
+
+
 def factorize(A):
     """The function (b, trans=0) -> A^-1 b, or A^-T b for trans=1, with A factorised once and constant to autodiff.
 

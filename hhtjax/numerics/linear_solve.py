@@ -12,7 +12,7 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
-from hhtjax.numerics.dense_lu import diagonal, factorize, matvec
+from hhtjax.numerics.dense_lu import diagonal, factorize, full_matrix, matvec
 from hhtjax.numerics.low_rank import AtState
 from hhtjax.primitives import forward_only, part, staged
 
@@ -122,8 +122,7 @@ def factorize_with(solve: Callable | Banded):
         return solve
 
     def factorize(A):
-        A = lax.stop_gradient(A)
-        A = jnp.diag(A) if A.ndim == 1 else A  # as the user's function expects it
+        A = full_matrix(lax.stop_gradient(A))  # as the user's function expects it
         return lambda b, trans=0: solve(A.T if trans else A, b)
 
     return Given(factorize)

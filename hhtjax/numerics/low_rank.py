@@ -38,7 +38,15 @@ class AtState:
         raise NotImplementedError
 
 
-class Changing:
+class Completed:
+    """A `factorize` that is completed by a state."""
+
+    def around(self, state, along: Callable) -> Any:
+        """The `factorize` for the matrix at a state. along: change of the unknowns -> change of state."""
+        raise NotImplementedError
+
+
+class Changing(Completed):
     """A `factorize` for A0 and a part J that depends on the state: `around` a state it is complete.
 
     slope: state -> the linear function of a change of state that gives the change of the nonlinear force, (k,) or (n,).
@@ -163,4 +171,4 @@ class KnownUpdate(AtState):
 
 def around(factorize: Callable | Constant, expand: Callable) -> Callable | Constant:
     """A `factorize` at the state that expand() gives with `along`, where it depends on it."""
-    return factorize.around(*expand()) if isinstance(factorize, Changing) else factorize
+    return factorize.around(*expand()) if isinstance(factorize, Completed) else factorize

@@ -1,7 +1,8 @@
-"""The solve of a step whose matrix is sparse: its entries by products with a few vectors, and an elimination by blocks.
+"""The solve of a step whose matrix is sparse: its entries from elements or products, and an elimination by blocks.
 
-The pattern says how few products tell all entries: one for each colour of its columns. Where the unknowns can be put in
-a row of small blocks, as in chains, beams, cables and rings of them, the elimination is a loop over these that stays in
+A matrix is given as numbers, and a table of which of them add up to each entry. The numbers are those of elements, or
+products with a few vectors: one for each colour of the columns tells all entries. Where the unknowns can be put in a
+row of small blocks, as in chains, beams, cables and rings of them, the elimination is a loop over these that stays in
 the kernel; else it is SuperLU's, in an order found once.
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial, reduce
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +20,12 @@ from jax import lax
 
 from hhtjax.description import Array, PyTree
 from hhtjax.numerics.block_tridiagonal import block_pivots, factorize_blocks, solve_blocks
-from hhtjax.numerics.dense_lu import factorize
 from hhtjax.numerics.linear_solve import Structured
+from hhtjax.numerics.low_rank import Completed
 from hhtjax.numerics.sparse_matrix import Pattern, Sparse, gather
 from hhtjax.numerics.sparsity import colours, in_blocks, symmetric
-from hhtjax.numerics.superlu import pivots_on_host
-from hhtjax.primitives import part
+from hhtjax.numerics.superlu import factorize_sparse, pivots_on_host
+from hhtjax.primitives import part, staged
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -32,40 +33,61 @@ if TYPE_CHECKING:
 LARGEST_BLOCK = 24  # unknowns, up to which a row of blocks is eliminated in a loop
 
 
+class Numbers(NamedTuple):
+    """A matrix by what its entries are sums of. values: (k,); table: (d, entries) of places there, k for nothing."""
+
+    values: Array
+    table: np.ndarray
+
+
 class Plan:
-    """How a matrix (n, n) with a pattern is found and factorised. free: number of unknowns that are no multipliers."""
+    """How a matrix (n, n) with a pattern is factorised. free: number of unknowns that are no multipliers.
+
+    rows, columns: of its entries.
+    """
 
     def __init__(self, pattern: csr_array, free: int):
-        self.n, self.free = pattern.shape[0], free
-        self.pattern = pattern
-        self.blocks = in_blocks(pattern, free)
-        self.colour = colours(pattern, self.blocks.order)
-        self.number = int(self.colour.max(initial=-1)) + 1
+        self.n, self.free, self.pattern = pattern.shape[0], free, pattern
         entries = pattern.tocoo()
         self.rows, self.columns = entries.row.astype(np.int32), entries.col.astype(np.int32)
-        self.places = self.colour[self.columns] * self.n + self.rows  # of the entries, among images by colours
+        self.blocks = in_blocks(pattern, free)
+
+    @property
+    def is_in_blocks(self) -> bool:
+        """Whether it is eliminated in a row of small blocks."""
+        return self.blocks.size <= LARGEST_BLOCK
 
     @cached_property
-    def column_of(self) -> np.ndarray:
-        """(number, n): the column that an image by a colour shows in a row; n where it shows none."""
-        found = np.full(self.number * self.n, self.n, np.int32)
-        found[self.places] = self.columns
-        return found.reshape(self.number, self.n)
+    def colour(self) -> np.ndarray:
+        """(n,): of each column."""
+        return colours(self.pattern, self.blocks.order)
 
-    @cached_property
-    def in_blocks(self) -> np.ndarray:
-        """(3, N, b, b): where the entries of blocks before, on and behind the diagonal are among images; behind these
-        are a 0, for entries that are none, and a 1, for the diagonal of places that are left empty."""
-        _, starts, b = self.blocks
-        N, zero = len(starts) - 1, self.number * self.n
-        block, place = self.block, self.place
-        found = np.full((3, N, b, b), zero, np.int32)
-        row, column = self.rows, self.columns
-        found[1 + block[column] - block[row], block[row], place[row], place[column]] = self.places
-        empty = np.arange(b)[None, :] >= np.diff(starts)[:, None]
-        i, k = np.nonzero(empty)
-        found[1, i, k, k] = zero + 1
-        return found
+    def by_products(self, f: Callable, like: PyTree) -> Numbers:
+        """The matrix of a linear map f, by its products with a vector for each colour."""
+        number = int(self.colour.max()) + 1
+        probes = jnp.asarray(self.colour)[None, :] == jnp.arange(number)[:, None]
+        images = lax.stop_gradient(jax.vmap(f)(probes.astype(like.dtype)))
+        return Numbers(images.ravel(), (self.colour[self.columns] * self.n + self.rows)[None])
+
+    def inverse(self, A: Numbers) -> Callable:
+        """(b, trans=0) -> A^-1 b, or A^-T b."""
+        return self._by_blocks(A) if self.is_in_blocks else self._by_superlu(A)
+
+    def pivots(self, A: Numbers, limit: float) -> Array:
+        """(n,): of the elimination without exchanges of a symmetric matrix, whose diagonal is made 1; what is divided
+        by is not less than `limit`."""
+        if not self.is_in_blocks:
+            sparse = self._sparse(A)
+            d = sparse.diagonal()
+            return pivots_on_host(_scaled_on_both_sides(sparse, 1 / jnp.sqrt(jnp.where(d > 0, d, 1))), limit)
+        lower, middle, upper = self._in_blocks(A)
+        d = _diagonals(middle)
+        unit = 1 / jnp.sqrt(jnp.where(d > 0, d, 1))
+        before, behind = (jnp.roll(unit, shift, axis=0) for shift in (1, -1))
+        blocks = [unit[:, :, None] * x * y[:, None, :] for x, y in ((lower, before), (middle, unit), (upper, behind))]
+        return gather(part(partial(block_pivots, limit=limit))(*blocks).ravel(), self.there)
+
+    # in blocks
 
     @cached_property
     def block(self) -> np.ndarray:
@@ -83,89 +105,122 @@ class Plan:
         return found
 
     @cached_property
-    def slots(self) -> tuple[Pattern, np.ndarray]:
-        """The `Pattern` for SuperLU, and where its slots are among images."""
-        sort = np.lexsort((self.columns, self.rows))
-        pattern = Pattern(self.n, self.rows[sort], self.columns[sort], self.free)
-        places = np.full(pattern.size, self.number * self.n, np.int32)
-        places[pattern.slots] = self.places[sort]
-        return pattern, places
+    def there(self) -> np.ndarray:
+        """(n,): where each unknown is in the blocks (N, b)."""
+        return (self.block * self.blocks.size + self.place).astype(np.int32)
 
-    def images(self, f: Callable, like: PyTree) -> Array:
-        """(number, n): what the matrix of f makes of a vector for each colour, ones in the columns that have it."""
-        probes = jnp.asarray(self.colour)[None, :] == jnp.arange(self.number)[:, None]
-        return lax.stop_gradient(jax.vmap(f)(probes.astype(like.dtype)))
+    @cached_property
+    def entry_in_blocks(self) -> np.ndarray:
+        """(3, N, b, b): which entries the blocks before, on and behind the diagonal have. Behind the last entry are a
+        0, for those that are none, and a 1, for the diagonal of places that are left empty."""
+        _, starts, b = self.blocks
+        row, column, block, place = self.rows, self.columns, self.block, self.place
+        found = np.full((3, len(starts) - 1, b, b), len(row), np.int32)
+        found[1 + block[column] - block[row], block[row], place[row], place[column]] = np.arange(len(row))
+        i, k = np.nonzero(np.arange(b)[None, :] >= np.diff(starts)[:, None])
+        found[1, i, k, k] = len(row) + 1
+        return found
 
-    def row_scale(self, images: Array) -> Array:
-        """(n,): equations are measured by the square roots of their diagonal, and constraints by those of their
-        unknowns, so that no units choose the pivots; as of `factorize_saddle_point`."""
-        n, free = self.n, self.free
-        d = jnp.abs(self.diagonal(images)[:free])
-        first = 1 / jnp.sqrt(jnp.where(d == 0, 1, d))
-        if free == n:
-            return first
-        unit = gather(jnp.append(first, jnp.zeros_like(first[:1])), np.minimum(self.column_of[:, free:], free))
-        size = reduce(jnp.add, jnp.abs(images[:, free:]) * unit)
-        return jnp.concatenate([first, 1 / jnp.where(size == 0, 1, size)])
+    def _in_blocks(self, A: Numbers) -> Array:
+        return _added(A, self.entry_in_blocks)
 
-    def diagonal(self, images: Array) -> Array:
-        """(n,)."""
-        here = np.full(self.n, self.number * self.n, np.int32)
-        on = self.rows == self.columns
-        here[self.rows[on]] = self.places[on]
-        return gather(_with_ends(images), here)
-
-    def inverse(self, images: Array) -> Callable:
-        """(b, trans=0) -> A^-1 b, or A^-T b."""
-        scale = self.row_scale(images)
-        images = images * scale
-        solve = self._by_blocks(images) if self.blocks.size <= LARGEST_BLOCK else self._by_superlu(images)
-        return lambda b, trans=0: scale * solve(b, 1) if trans else solve(scale * b, 0)
-
-    def pivots(self, images: Array, limit: float) -> Array:
-        """(n,): of the elimination without exchanges of a symmetric matrix, whose diagonal is made 1, not below a limit
-        but for the pivot itself."""
-        unit = self.diagonal(images)
-        size = jnp.sqrt(jnp.where(unit > 0, unit, 1))
-        column = gather(jnp.append(size, jnp.ones_like(size[:1])), self.column_of)
-        found = _with_ends(images / size / column)
-        if self.blocks.size > LARGEST_BLOCK:
-            return pivots_on_host(self.slots[0], gather(found, self.slots[1]), limit)
-        blocks = part(partial(block_pivots, limit=limit))(*gather(found, self.in_blocks))
-        return gather(blocks.ravel(), (self.block * blocks.shape[1] + self.place).astype(np.int32))
-
-    def _by_blocks(self, images: Array) -> Callable:
-        found = gather(_with_ends(images), self.in_blocks)
-        factors = part(factorize_blocks)(*found)
-        N, b = found.shape[1:3]
-        if N * b == self.n and np.array_equal(self.blocks.order, np.arange(self.n)):
-            return lambda x, trans: part(partial(solve_blocks, trans=trans))(factors, x.reshape(N, b)).ravel()
-        there = (self.block * b + self.place).astype(np.int32)
+    def _by_blocks(self, A: Numbers) -> Callable:
+        blocks = self._in_blocks(A)
+        N, b = blocks.shape[1:3]
+        free = np.ones((N, b), bool)
+        free.ravel()[self.there[self.free :]] = False
+        scale = _row_scale(blocks, free)
+        factors = part(factorize_blocks)(*(blocks * scale[None, :, :, None]))
         here = np.full(N * b, self.n, np.int32)
-        here[there] = np.arange(self.n, dtype=np.int32)
+        here[self.there] = np.arange(self.n, dtype=np.int32)
+        in_order = np.array_equal(here, np.arange(self.n))
 
-        def solve(x: Array, trans: int) -> Array:
-            x = gather(jnp.append(x, jnp.zeros_like(x[:1])), here).reshape(N, b)
-            return gather(part(partial(solve_blocks, trans=trans))(factors, x).ravel(), there)
+        def solve(x: Array, trans: int = 0) -> Array:
+            x = (x if in_order else gather(jnp.append(x, jnp.zeros_like(x[:1])), here)).reshape(N, b)
+            x = part(partial(solve_blocks, trans=trans))(factors, x if trans else x * scale)
+            x = (x * scale if trans else x).ravel()
+            return x if in_order else gather(x, self.there)
 
         return solve
 
-    def _by_superlu(self, images: Array) -> Callable:
-        pattern, places = self.slots
-        return factorize(Sparse(gather(_with_ends(images), places), pattern))
+    # by SuperLU
+
+    @cached_property
+    def entry_in_slots(self) -> tuple[Pattern, np.ndarray]:
+        """The `Pattern` for SuperLU, and the entry in each of its slots."""
+        sort = np.lexsort((self.columns, self.rows))
+        pattern = Pattern(self.n, self.rows[sort], self.columns[sort], self.free)
+        found = np.full(pattern.size, len(self.rows), np.int32)
+        found[pattern.slots] = sort
+        return pattern, found
+
+    def _sparse(self, A: Numbers) -> Sparse:
+        pattern, entries = self.entry_in_slots
+        return Sparse(_added(A, entries), pattern)
+
+    def _by_superlu(self, A: Numbers) -> Callable:
+        sparse = self._sparse(A)
+        if self.free == self.n:
+            return factorize_sparse(sparse)
+        d = jnp.abs(sparse.diagonal())
+        first = jnp.where(np.arange(self.n) < self.free, 1 / jnp.sqrt(jnp.where(d == 0, 1, d)), 0)
+        size = abs(sparse) @ first
+        scale = jnp.where(np.arange(self.n) < self.free, first, 1 / jnp.where(size == 0, 1, size))
+        solve = factorize_sparse(_scaled(sparse, scale))
+        return lambda b, trans=0: scale * solve(b, trans=1) if trans else solve(scale * b)
 
 
-def _with_ends(images: Array) -> Array:
-    """The images in a row, a 0 and a 1 behind them."""
-    return jnp.concatenate([images.ravel(), jnp.array([0, 1], images.dtype)])
+def _row_scale(blocks: Array, free: np.ndarray) -> Array:
+    """(N, b): equations are measured by the square roots of their diagonal, and constraints by those of their unknowns,
+    so that no units choose the pivots; as of `factorize_saddle_point`."""
+    d = jnp.abs(_diagonals(blocks[1]))
+    first = jnp.where(free, 1 / jnp.sqrt(jnp.where(d == 0, 1, d)), 0)
+    if free.all():
+        return first
+    around = (jnp.roll(first, 1, axis=0), first, jnp.roll(first, -1, axis=0))
+    sizes = [jnp.abs(x) * y[:, None, :] for x, y in zip(blocks, around, strict=True)]
+    total = reduce(jnp.add, sizes)
+    size = reduce(jnp.add, [total[:, :, k] for k in range(total.shape[2])])
+    return jnp.where(free, first, 1 / jnp.where(size == 0, 1, size))
+
+
+def _diagonals(blocks: Array) -> Array:
+    """(N, b). jnp.diagonal would ask for the platform."""
+    N, b = blocks.shape[:2]
+    return blocks.reshape(N, b * b)[:, :: b + 1]
+
+
+def _added(A: Numbers, entries: np.ndarray) -> Array:
+    """Entries of a matrix, the last two of which are 0 and 1, as they are asked for."""
+    k = A.values.shape[0]
+    ends = np.full((len(A.table), 2), k, np.int32)
+    ends[0, 1] = k + 1
+    table = np.concatenate([A.table, ends], axis=1)[:, entries]
+    # all numbers once: gathers would have each of them computed again
+    values = staged(lambda x: jnp.concatenate([x, jnp.array([0, 1], x.dtype)]))(A.values)
+    return reduce(jnp.add, [gather(values, row) for row in table])
+
+
+def _scaled(A: Sparse, scale: Array) -> Sparse:
+    """The matrix with its rows times these."""
+    rows = np.zeros(A.pattern.size, np.int32)
+    rows[A.pattern.slots] = A.pattern.rows
+    return Sparse(A.values * gather(scale, rows), A.pattern)
+
+
+def _scaled_on_both_sides(A: Sparse, scale: Array) -> Sparse:
+    columns = np.zeros(A.pattern.size, np.int32)
+    columns[A.pattern.slots] = A.pattern.columns
+    A = _scaled(A, scale)
+    return Sparse(A.values * gather(scale, columns), A.pattern)
 
 
 @lru_cache(maxsize=32)
-def _plan(shape: int, free: int, indptr: bytes, indices: bytes) -> Plan:
+def _plan(n: int, free: int, indptr: bytes, indices: bytes) -> Plan:
     from scipy.sparse import csr_array
 
     where = np.frombuffer(indices, np.int32), np.frombuffer(indptr, np.int32)
-    return Plan(csr_array((np.ones(len(where[0]), bool), *where), shape=(shape, shape)), free)
+    return Plan(csr_array((np.ones(len(where[0]), bool), *where), shape=(n, n)), free)
 
 
 def plan(pattern: csr_array, free: int | None = None) -> Plan:
@@ -178,22 +233,45 @@ def plan(pattern: csr_array, free: int | None = None) -> Plan:
 
 
 @dataclass(frozen=True, eq=False)
-class SparseLU(Structured):
+class SparseLU(Completed, Structured):
     """A solve by the patterns of all matrices that a run asks for.
 
-    sparsity: () -> what has `plan(size)`, the `Plan` for so many unknowns, and `of_rows()`, that of B B^T.
+    sparsity: () -> what has `plan(size)`, the `Plan` for so many unknowns, and `of_rows()`, that of B B^T. elements:
+    state, change of acceleration -> change of state, both as of `around`, -> the `Numbers` of the matrix of a step;
+    None where they are found by products.
     """
 
     sparsity: Callable
     tolerance: Any = None
+    elements: Callable | None = None
 
     def of_map(self, f: Callable, like: PyTree):
         """(b, trans=0) -> A^-1 b, or A^-T b."""
         made = self.sparsity().plan(like.size)
-        return made.inverse(made.images(f, like))
+        return made.inverse(made.by_products(f, like))
+
+    def around(self, state, along: Callable) -> Structured:
+        """The solve at a state."""
+        return self if self.elements is None else SparseAt(self, partial(self.elements, state, along), self.tolerance)
 
     def cosine_pivots(self, f: Callable, like: Array, limit: float) -> Array:
         """The pivots (m,) of B B^T, the matrix of f, each row of B being of length 1: the squared sines of its angles
         to the rows that are eliminated before. limit: below which a pivot is taken for this."""
         made = self.sparsity().of_rows()
-        return made.pivots(made.images(f, like), limit)
+        return made.pivots(made.by_products(f, like), limit)
+
+
+@dataclass(frozen=True, eq=False)
+class SparseAt(Structured):
+    """`SparseLU` at a state, where elements know the matrix."""
+
+    solve: SparseLU
+    numbers: Callable
+    tolerance: Any = None
+
+    def of_map(self, f: Callable, like: PyTree):
+        """(b, trans=0) -> A^-1 b, or A^-T b."""
+        made = self.solve.sparsity().plan(like.size)
+        if made.is_in_blocks:  # there few products tell all entries, and are as many tangents
+            return self.solve.of_map(f, like)
+        return made.inverse(self.numbers())

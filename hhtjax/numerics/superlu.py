@@ -155,11 +155,11 @@ def _gstrf(n: int, numbers: np.ndarray, way: Elimination, options: dict) -> Any:
     )
 
 
-def pivots_on_host(pattern: Pattern, values: Array, limit: float) -> Array:
-    """(n,): the pivots of a symmetric matrix, eliminated in the order of its pattern without exchanges. values: slots;
-    limit: what is added to the diagonal, far less than pivots that matter."""
-    like = jax.ShapeDtypeStruct((pattern.n,), values.dtype)
-    return on_host(partial(_pivots, pattern, limit / 100), like, lax.stop_gradient(values))
+def pivots_on_host(A: Sparse, limit: float) -> Array:
+    """(n,): the pivots of a symmetric matrix, eliminated in the order of its pattern without exchanges. limit: far less
+    than pivots that matter; a part of it is added to the diagonal."""
+    like = jax.ShapeDtypeStruct((A.pattern.n,), A.dtype)
+    return on_host(partial(_pivots, A.pattern, limit / 100), like, lax.stop_gradient(A.values))
 
 
 def _pivots(pattern: Pattern, shift: float, values: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ The formulas are in residual.py; constraints are in constrained.py, and add rows
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -173,9 +173,13 @@ class GeneralizedAlpha(Controlled, Stepper):
                 return system
             found = cache(lambda: detected(system, params, dtype, given.pattern))
             return system._replace(sparse=SparseLU(found, given.tolerance))
-        if system.sparse is not None and (given is not None or self.redundant is not None):
+        if system.sparse is None:
+            return system
+        if given is not None or self.redundant is not None:
             return system._replace(sparse=None)
-        return system
+        if system.num_constraints or system.step_elements is None:
+            return system
+        return system._replace(sparse=replace(system.sparse, elements=system.step_elements(params)))
 
     @property
     def redundant(self):

@@ -35,7 +35,7 @@ class ElementForce:
             return _zero(v) if self.elements is None else self.elements(q, v, t, params)
         here, now = held_nodes.at(self.held, q, v, t, params)
         Q = _zero(v) if self.elements is None else self.elements(here, now, t, params)
-        known, a = accelerations(self.held, v, t, params)
+        known, _, a = accelerations(self.held, v, t, params)
         if self.held.moves and self.mass.parts:
             pull = self.mass.product(here, a, params)
             Q = jax.tree.map(jnp.subtract, Q, pull)
@@ -98,7 +98,7 @@ class ElementMass:
         """(n,): what is not held."""
         if self.held is None:
             return jnp.ones(ravel_pytree(v)[0].shape, bool)
-        return ~ravel_pytree(accelerations(self.held, v, 0.0, params)[0])[0]
+        return ~ravel_pytree(accelerations(self.held, v, 0.0, params).here)[0]
 
     def product(self, q: PyTree, w: PyTree, params: PyTree) -> PyTree:
         """M w of the elements alone."""

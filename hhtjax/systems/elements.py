@@ -94,6 +94,10 @@ class _OnNodes:
 
     def dofs(self, v: PyTree) -> np.ndarray:
         """(E, s): the numbers of the unknowns of each row, in the order in which its leaves are ravelled."""
+        return np.concatenate(self.dofs_of_leaves(v), axis=1)
+
+    def dofs_of_leaves(self, v: PyTree) -> list[np.ndarray]:
+        """The same for each leaf."""
         return _numbers(self, v)
 
     def own_numbers(self, params: PyTree, dtype: np.dtype) -> tuple:
@@ -147,13 +151,13 @@ class Elements(_OnNodes):
     def __call__(self, q: PyTree, v: PyTree, t: Real, params: PyTree) -> PyTree:
         """The force on all nodes, structured like v."""
         own, axes = self.own_numbers(params, _dtype(v))
-        force = jax.vmap(lambda q, v, *own: self._complete(v, self.function(q, v, t, params, *own)), (0, 0, *axes))
+        force = jax.vmap(lambda q, v, *own: self.complete(v, self.function(q, v, t, params, *own)), (0, 0, *axes))
         return self.added(v, force(self.own(q), self.own(v), *own))
 
     def product(self, q: PyTree, w: PyTree, params: PyTree) -> PyTree:
         """M w of all nodes, where the function gives that of one element."""
         own, axes = self.own_numbers(params, _dtype(w))
-        product = jax.vmap(lambda q, w, *own: self._complete(w, self.function(q, w, params, *own)), (0, 0, *axes))
+        product = jax.vmap(lambda q, w, *own: self.complete(w, self.function(q, w, params, *own)), (0, 0, *axes))
         return self.added(w, product(self.own(q), self.own(w), *own))
 
     def matrices(self, q: PyTree, v: PyTree, params: PyTree) -> Array:
@@ -165,7 +169,7 @@ class Elements(_OnNodes):
 
             def of(x: Array) -> Array:
                 w = unravel(x)
-                return ravel_pytree(self._complete(w, self.function(q, w, params, *own)))[0]
+                return ravel_pytree(self.complete(w, self.function(q, w, params, *own)))[0]
 
             return jax.jacfwd(of)(zero)
 
@@ -179,7 +183,7 @@ class Elements(_OnNodes):
         some = {key: jax.tree.map(partial(_summed, nodes[key]), v[key], forces[key]) for key in nodes}
         return {key: some[key] if key in some else jax.tree.map(jnp.zeros_like, v[key]) for key in v}
 
-    def _complete(self, v: PyTree, force: PyTree) -> PyTree:
+    def complete(self, v: PyTree, force: PyTree) -> PyTree:
         """A force of one element with zeros for the keys that it leaves out."""
         if isinstance(v, dict) and isinstance(force, dict):
             unknown = sorted(set(force) - set(v))
@@ -267,8 +271,8 @@ def _dtype(tree: PyTree) -> np.dtype:
     return jnp.result_type(jax.tree.leaves(tree)[0])
 
 
-def _numbers(part: _OnNodes, v: PyTree) -> np.ndarray:
-    """(E, s): the unknowns of each element."""
+def _numbers(part: _OnNodes, v: PyTree) -> list[np.ndarray]:
+    """(E, s) for each leaf: the unknowns of each element."""
     start, numbers = 0, []
     leaves, structure = jax.tree.flatten(v)
     for x in leaves:
@@ -280,7 +284,7 @@ def _numbers(part: _OnNodes, v: PyTree) -> np.ndarray:
         own = {key: jax.tree.map(lambda x, i=i: x[i], tree[key]) for key, i in sorted(nodes.items())}
     else:
         own = jax.tree.map(lambda x: x[nodes], tree)
-    return np.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(own)], axis=1)
+    return [x.reshape(len(x), -1) for x in jax.tree.leaves(own)]
 
 
 def _summed(nodes: np.ndarray, x: Array, forces: Array) -> Array:
@@ -308,11 +312,11 @@ def _at_nodes(places: bytes, number: int) -> Linear:
     return Linear(take, add)
 
 
-def table_of(places: np.ndarray, number: int) -> np.ndarray | None:
+def table_of(places: np.ndarray, number: int, most: int = MOST_SHARED) -> Any:
     """(d, number): which entries of a list come to each place, and its length where there are no more; None where there
-    are too many."""
+    are more than `most`."""
     count = np.bincount(places, minlength=number)
-    if count.max(initial=0) > MOST_SHARED:
+    if count.max(initial=0) > most:
         return None
     order = np.argsort(places, kind="stable")
     rank = np.arange(len(places)) - (np.cumsum(count) - count)[places[order]]

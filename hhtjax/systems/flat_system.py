@@ -14,13 +14,14 @@ from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import check_like, check_matrix, count, describe, evaluate, telling_of_arguments
 from hhtjax.description import Array, PyTree, Real, thaw
-from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, matvec
+from hhtjax.numerics.dense_lu import LOOPED, by_factors, factorize, full_matrix, matvec
 from hhtjax.numerics.linear_solve import factorize_map, reuse, solver
 from hhtjax.numerics.sparse_lu import SparseLU
 from hhtjax.numerics.sparse_matrix import combined
 from hhtjax.primitives import consistent
 from hhtjax.systems import kinematics
 from hhtjax.systems.assembly import ElementForce
+from hhtjax.systems.element_matrix import StepMatrix
 from hhtjax.systems.elements import parts_of
 from hhtjax.systems.friction import FrictionLaw, flat_friction
 from hhtjax.systems.held_nodes import Held, at, require_start
@@ -65,6 +66,7 @@ class FlatSystem(NamedTuple):
     massless: Array | None = None  # G with M G M = M, where M is singular
     factors: Factors | None = None  # `Factors` for the steps of a run, where they are known before it
     sparse: SparseLU | None = None  # the solve of a step whose unknowns are known to meet few others
+    step_elements: Callable | None = None  # params -> `SparseLU.elements`
     told: Callable | None = None  # state, params -> the state with what is held as it is told
 
     def settled(self, params: PyTree) -> FlatSystem:
@@ -124,6 +126,7 @@ class FlatSystem(NamedTuple):
         M = self.mass(q, t, params)
         if M.ndim == 1:
             return jnp.diag(self.with_ones(M))
+        M = full_matrix(M)
         return M if self.positions == self.size else block_diag(M, jnp.eye(self.size - self.positions, dtype=M.dtype))
 
     def located(self, x: Array) -> Array:
@@ -262,7 +265,8 @@ def _with_elements(system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0:
         return flat._replace(settle=None, told=partial(_told, force.held, flat, thaw(params)))
 
     if flat.size + 2 * flat.num_constraints > LOOPED:
-        flat = flat._replace(sparse=SparseLU(sparsity))
+        matrix = cache(lambda: StepMatrix(force, flat, like[1], sparsity().plan(flat.size)))
+        flat = flat._replace(sparse=SparseLU(sparsity), step_elements=lambda params: lambda *at: matrix()(params, *at))
     return flat._replace(settle=settle) if force.held is not None and force.held.moves else flat
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -138,9 +138,18 @@ def velocity_like(q: PyTree) -> PyTree:
     return jax.tree.map(zeros, q)
 
 
-def accelerations(held: Held, v: PyTree, t: Real, params: PyTree):
-    """Which accelerations are known, and what they are, structured like v."""
-    known = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), bool), v)
+class Known(NamedTuple):
+    """What is held, structured like v. here: which numbers; moves: which of them are told where to be; a: their
+    accelerations."""
+
+    here: PyTree
+    moves: PyTree
+    a: PyTree
+
+
+def accelerations(held: Held, v: PyTree, t: Real, params: PyTree) -> Known:
+    """What is held, at a time."""
+    known = moves = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), bool), v)
     a = jax.tree.map(jnp.zeros_like, v)
     for some in held.all():
         if isinstance(some.how, Still):
@@ -152,9 +161,9 @@ def accelerations(held: Held, v: PyTree, t: Real, params: PyTree):
                 known = some.put(known, _spread(which, here))
         else:
             _, _, told = some.told(v, t, params)
-            known = some.put(known, jax.tree.map(lambda x: jnp.ones(x.shape, bool), told))
-            a = some.put(a, told)
-    return known, a
+            all_of = jax.tree.map(lambda x: jnp.ones(x.shape, bool), told)
+            known, moves, a = some.put(known, all_of), some.put(moves, all_of), some.put(a, told)
+    return Known(known, moves, a)
 
 
 def _spread(which: PyTree, here: PyTree) -> PyTree:
@@ -227,7 +236,7 @@ def require_start(held: Held | None, q0: PyTree, v0: PyTree, t0: Real, params: P
                     f"System.from_elements: `{name}{jax.tree_util.keystr(path)}` of node {node} must be what `held` "
                     f"gives at the start, {y[node]}; received {x[node]}."
                 )
-    known, _ = accelerations(held, jax.tree.map(jnp.asarray, v0), t0, params)
+    known = accelerations(held, jax.tree.map(jnp.asarray, v0), t0, params).here
     told = at(held, q0, jax.tree.map(jnp.zeros_like, v0), t0, params)[1]
     leaves = jax.tree_util.tree_leaves_with_path(v0)
     for (path, x), here, y in zip(leaves, jax.tree.leaves(known), jax.tree.leaves(told), strict=True):

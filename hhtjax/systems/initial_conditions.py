@@ -17,10 +17,11 @@ from jax import lax
 from hhtjax.checks import describe, require_number, require_params
 from hhtjax.description import Array, PyTree, Real, all_concrete, is_array, is_concrete, is_real, known_now
 from hhtjax.description.presentation import shown
-from hhtjax.numerics.dense_lu import diagonal
+from hhtjax.numerics.dense_lu import diagonal, full_matrix
 from hhtjax.numerics.differentiable_while import implicit_root
 from hhtjax.numerics.linear_solve import RANK_TOLERANCE, solve_map
 from hhtjax.systems import kinematics
+from hhtjax.systems.assembly import ElementForce
 from hhtjax.systems.constraints import (
     acceleration_and_multipliers,
     check_redundant,
@@ -33,6 +34,7 @@ from hhtjax.systems.constraints import (
 )
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.friction import directions
+from hhtjax.systems.start_of_elements import require_consistent_elements
 from hhtjax.systems.system import AnySystem, FirstOrderSystem
 from hhtjax.xla import Programs
 
@@ -154,7 +156,7 @@ def examine(system: System, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z
     t = jnp.asarray(t0).astype(q.dtype)
     M, (B, clear) = flat.mass(q, t, params), gradient(flat, q, t, params)
     sizes = kinematics.sizes(flat.blocks, q), flat.located(jnp.abs(v))
-    M = jnp.diag(M) if M.ndim == 1 else M
+    M = full_matrix(M)
     return M, B[:, : flat.positions], violation(flat, q, v, t, params), sizes, clear
 
 
@@ -206,6 +208,8 @@ def require_consistent(
 
     checked: what the caller names q0, and v0 if it is to be looked at, and what they violate.
     """
+    if redundant is None and isinstance(getattr(system, "force", None), ElementForce):
+        return require_consistent_elements(caller, (system, q0, v0, t0, params, z0), checked, CONSISTENT)
     examined = known_now(examine, system, q0, v0, t0, params, z0)
     if examined is None:
         return
