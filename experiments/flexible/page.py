@@ -10,7 +10,7 @@ from experiments.flexible import statics
 from experiments.page import table
 
 HERE = Path(__file__).parent
-TARGETS = {"spin-up": (1e-5, 1e-6, 1e-7), "falling beam": (1e-2, 1e-3, 1e-4)}  # m
+TARGETS = {"spin-up": (1e-4, 1e-5, 2e-6), "falling beam": (1e-2, 1e-3, 1e-4)}  # m
 
 
 def short(x, digits=3):
