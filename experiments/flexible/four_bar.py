@@ -52,7 +52,7 @@ def four_bar(number: int) -> Model:
         return {"L": lengths, "damping": params["damping"]} | STIFF
 
     mass = elements.planar_lumped_mass(
-        pairs, {"L": lengths, "rhoA": SECTION["rhoA"], "rhoI": SECTION["rhoI"]}, 3 * nodes
+        jnp.asarray(pairs), {"L": lengths, "rhoA": SECTION["rhoA"], "rhoI": SECTION["rhoI"]}, 3 * nodes
     )
     system = hhtjax.System.from_elements(
         hhtjax.Elements(elements.planar_beam, pairs, each=section),

@@ -259,9 +259,15 @@ def exponents(rows: list[dict]) -> dict:
     for row in rows:
         found.setdefault(row["scene"], {}).setdefault(row["way"], []).append((row["unknowns"], row["us_per_step"]))
     return {
-        scene: {way: float(np.polyfit(*np.log(np.array(x)).T, 1)[0]) for way, x in ways.items() if len(x) > 1}
+        scene: {way: slope(np.log(np.array(x))) for way, x in ways.items() if len(x) > 1}
         for scene, ways in found.items()
     }
+
+
+def slope(points: np.ndarray) -> float:
+    """Of the line through points (k, 2), by least squares."""
+    x, y = (points - points.mean(axis=0)).T
+    return float(x @ y / (x @ x))
 
 
 def run(report, fast: bool) -> dict:

@@ -67,7 +67,7 @@ def princeton(number: int) -> Model:
     system = hhtjax.System.from_elements(
         hhtjax.Elements(elements.spatial_beam, pairs, each=each | {"L": length / number}),
         hhtjax.Elements(grown({"r": 8.896 * np.array([0.0, -1.0, 1.0]) / np.sqrt(2)}), [[number]]),
-        mass=elements.spatial_lumped_mass(pairs, inertia, number + 1),
+        mass=elements.spatial_lumped_mass(jnp.asarray(pairs), inertia, number + 1),
         held={0: True},
     )
     r = jnp.zeros((number + 1, 3)).at[:, 0].set(jnp.linspace(0.0, length, number + 1))
