@@ -113,7 +113,7 @@ def accuracy(report: Any, parts: dict[str, list[dict]]) -> None:
                 x, y = [row["seconds"] for row in mine], [row["tip_error_m"] for row in mine]
                 axes.loglog(x, y, color=COLOURS[i], marker=MARKERS[i], label=way)
         axes.set(xlabel="time of a run (s)", ylabel="error of the tip (RMS, m)", title=scene)
-    legend(panels[0])
+    panels[0].legend(loc="lower left", fontsize=7)
     report.figure("flexible_accuracy", figure)
 
 

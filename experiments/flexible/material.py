@@ -1,7 +1,7 @@
 """A fit through 1000 unknowns: bending stiffness and damping of a beam, from a noisy record of its tip.
 
 The record is generated: a clamped beam of 400 elements falls under its weight, with steps of 1 ms. It is fitted with
-333 elements and steps of 5 ms. A gradient in the stiffness of each element goes through the same run backwards.
+334 elements and steps of 5 ms. A gradient in the stiffness of each element goes through the same run backwards.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def ellipse(fit: Any, level: float = 5.991) -> np.ndarray:
 
 def run(report: Any, fast: bool) -> dict:
     """The record, the fit and the gradient."""
-    model, finer = (hung(4), hung(6)) if fast else (hung(333), hung(400))
+    model, finer = (hung(4), hung(6)) if fast else (hung(334), hung(400))
     rng = np.random.default_rng(0)
     exact = np.asarray(tip(finer, TRUTH, 5e-3 if fast else 1e-3))
     record = exact + NOISE * rng.normal(size=exact.shape)
