@@ -104,14 +104,14 @@ def slider_crank(fast: bool) -> tuple[list[dict], list[dict]]:
     """Simeon's mechanism up to .1 s, in several ways: the error of its end against time."""
     scene = flexible_slider_crank()
     ways: dict[str, tuple[Any, int, range]] = {
-        "hht": (hhtjax.hht(linearize="predictor"), 1, range(1) if fast else range(8)),
-        "hht, extrapolate=2": (hhtjax.hht(linearize="predictor"), 2, range(0) if fast else range(8)),
-        "extrapolated(5)": (hhtjax.extrapolated(levels=5), 1, range(0) if fast else range(4)),
+        "hht": (hhtjax.hht(linearize="predictor"), 1, range(1) if fast else range(5)),
+        "hht, extrapolate=2": (hhtjax.hht(linearize="predictor"), 2, range(0) if fast else range(4)),
+        "extrapolated(5)": (hhtjax.extrapolated(levels=5), 1, range(0) if fast else range(3)),
     }
     points = []
     for way, (stepper, extrapolate, powers) in ways.items():
         for power in powers:
-            steps = 500 * 2**power
+            steps = 500 * 4**power
             options = {
                 "dt": scene.duration / steps,
                 "num_steps": steps,
