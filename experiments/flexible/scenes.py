@@ -145,16 +145,15 @@ def flexible_four_bar(fast: bool) -> tuple[list[dict], dict]:
     path["deflections_m"] = [four_bar.deflection(r, link, number) for link in range(3)]
     if fast:
         return [], path
-    short = 0.2
-    one = four_bar.run(number, dt, short)
-    other = four_bar.run(number, dt, short, solve=dense)
-    difference = float(max(np.max(np.abs(a - b)) for a, b in zip(*map(jax.tree.leaves, (one.q, other.q)), strict=True)))
+    short = four_bar.run(number, dt, 0.2, solve=dense)
+    pairs = zip(*map(jax.tree.leaves, (run.q, short.q)), strict=True)
+    difference = float(max(np.max(np.abs(a[: len(b)] - b)) for a, b in pairs))
     finer = np.asarray(four_bar.run(number, dt / 4).q["r"])
     meshed = np.asarray(four_bar.run(2 * number, dt / 4).q["r"])
     middle = [four_bar.deflection(x, 1, n) for x, n in ((r, number), (finer, number), (meshed, 2 * number))]
     largest = float(np.max(np.abs(middle[2])))
     rows = [
-        checked("four-bar", "sparse less dense, largest (m or rad)", difference, 0.0, 1e-10, "dense", relative=False),
+        checked("four-bar", "sparse less dense up to .2 s (m or rad)", difference, 0.0, 1e-10, "dense", relative=False),
         checked("four-bar", "largest bend of the coupler (m)", float(np.max(np.abs(middle[0]))), largest, 0.05,
                 "16 elements a link, h/4"),
     ]  # fmt: skip
