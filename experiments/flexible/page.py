@@ -76,7 +76,7 @@ def accuracy(found):
                     for row in found[scene]
                     if row["way"] == way and row["tip_error_m"] is not None and row["tip_error_m"] <= target
                 ]
-                line.append(f"{1e3 * min(near):.3g} ms" if near else "")
+                line.append(f"{short(1e3 * min(near))} ms" if near else "")
             lines.append(line)
     return table([*header, *ways], lines)
 
