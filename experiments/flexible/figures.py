@@ -106,14 +106,14 @@ def accuracy(report: Any, parts: dict[str, list[dict]]) -> None:
     """Error of the tip against seconds, a panel for each scene."""
     figure, panels = subplots(1, len(parts), width=170, height=80)
     names = list(dict.fromkeys(row["way"] for rows in parts.values() for row in rows))
-    for axes, (scene, rows) in zip(panels, parts.items(), strict=True):
+    for axes, (scene, rows) in zip(np.atleast_1d(panels), parts.items(), strict=True):
         for i, way in enumerate(names):
             mine = [row for row in rows if row["way"] == way and row.get("tip_error_m")]
             if mine:
                 x, y = [row["seconds"] for row in mine], [row["tip_error_m"] for row in mine]
                 axes.loglog(x, y, color=COLOURS[i], marker=MARKERS[i], label=way)
         axes.set(xlabel="time of a run (s)", ylabel="error of the tip (RMS, m)", title=scene)
-    panels[0].legend(loc="lower left", fontsize=7)
+    np.atleast_1d(panels)[0].legend(loc="lower left", fontsize=7)
     report.figure("flexible_accuracy", figure)
 
 
