@@ -21,7 +21,7 @@ from experiments.flexible.native_beam import PLAIN, Run, library
 DTS, FINE, SAMPLE, ELEMENTS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4), 5e-5, 0.05, 32  # s, s, s
 STEPPERS = {
     "hhtjax, one solve": hhtjax.hht(linearize="predictor", start="simple"),
-    "hhtjax, Newton": hhtjax.hht(iterations=None, tolerance=1e-7, start="simple"),
+    "hhtjax, Newton": hhtjax.hht(iterations=None, tolerance=1e-6, start="simple"),
 }
 
 

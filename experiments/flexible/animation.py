@@ -10,16 +10,15 @@ from experiments.cardona_geradin1989.animation import save
 from experiments.report import COLOURS
 from hhtjax.plot import subplots
 
-FRAMES = 80
-TRAIL = 40  # frames
+FRAMES = 56
+TRAIL = 28  # frames
 
 
 def four_bar(report: Any, path: dict) -> None:
     """Its links, straight lines between the pins beside them, and the way of the coupler's middle."""
     number, r, last = path["number"], path["r_m"], len(path["r_m"]) - 1
     shown = np.linspace(last * 0.2, last, FRAMES).round().astype(int)
-    figure, axes = subplots(width=80, height=72)
-    figure.set_dpi(90)
+    figure, axes = subplots(width=58, height=52)
     axes.set(xlim=(-0.35, 1.25), ylim=(-0.35, 1.0), aspect="equal", xlabel="x (m)", ylabel="y (m)")
     axes.plot([0, 1], [0, 0], "k^", ms=6)
     chords = [axes.plot([], [], color="0.75", lw=1)[0] for _ in range(3)]

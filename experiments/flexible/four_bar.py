@@ -68,7 +68,7 @@ def four_bar(number: int) -> Model:
     r = np.concatenate([a + s * way for a, way in zip(pins[:-1], ways, strict=True)])
     theta = np.repeat(np.arctan2(ways[:, 1], ways[:, 0]), nodes)
     q0 = {"r": jnp.asarray(r), "theta": jnp.asarray(theta)}
-    return Model(system, q0, at_rest(q0), {"speed": SPEED, "damping": 1e-4}, 9 * nodes - 5)
+    return Model(system, q0, at_rest(q0), {"speed": SPEED, "damping": 1e-3}, 9 * nodes - 5)
 
 
 def deflection(r: np.ndarray, link: int, number: int) -> np.ndarray:
