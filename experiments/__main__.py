@@ -36,6 +36,7 @@ EXPERIMENTS = {
     "reported": "reported.reported",
     "linearization": "linearization.linearization",
     "stability": "stability.stability",
+    "flexible": "flexible.flexible",
     "sweeps": "sweeps.sweeps",
     "export": "export.export",
     "gradient_cost": "benchmarks.gradient_cost",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hhtjax
-from experiments.flexible import beam, native_beam
+from experiments.flexible import aims, beam, four_bar, models, native_beam, scaling, statics
 
 ALPHA, DT, STEPS = -0.05, 1e-3, 300
 HUNG = beam.Beam(10, gravity=9.81, hub="clamped")
@@ -26,8 +26,8 @@ def test_c_source_takes_the_same_steps(described):
     stepper = hhtjax.hht(ALPHA, linearize="predictor", start="simple", solve=hhtjax.banded(5))
     q, v = ours(described, stepper)
     assert q.size == described.unknowns
-    for variant in "-O3 -march=native", native_beam.FAST:
-        end, speed = native_beam.Run(native_beam.library(variant), described, DT, STEPS, ALPHA)()
+    for flags in (native_beam.PLAIN,), (native_beam.FAST,), (native_beam.PLAIN, "plain_beam"):
+        end, speed = native_beam.Run(native_beam.library(*flags), described, DT, STEPS, ALPHA)()
         assert np.max(np.abs(end.ravel()[described.held :] - q)) < 1e-12
         assert np.max(np.abs(speed.ravel()[described.held :] - v)) < 1e-10
 
@@ -97,3 +97,67 @@ def test_exudyn_moves_alike():
         assert row["ns_per_step_and_unknown"] > 0
     with pytest.raises(ValueError, match="`beam` must be pinned or clamped"):
         by_exudyn.cable(beam.Beam(2))
+
+
+def marched(model, steps=100):
+    stepper = hhtjax.hht(ALPHA, linearize="predictor", start="simple")
+    run = hhtjax.simulate(
+        model.system, stepper, model.q0, model.v0, model.params, dt=DT, num_steps=steps, save_every=steps
+    )
+    run.check()
+    return run
+
+
+@native
+@pytest.mark.parametrize("described", [beam.pendulum(6), beam.Beam(6)], ids=["pinned", "spun"])
+def test_elements_take_the_steps_of_the_c_source(described):
+    run = marched(models.beam(described))
+    end, _ = native_beam.Run(native_beam.library(native_beam.PLAIN, "plain_beam"), described, DT, 100, ALPHA)()
+    np.testing.assert_allclose(run.q["r"][-1], end[:, :2], atol=1e-12)
+    np.testing.assert_allclose(run.q["theta"][-1], end[:, 2], atol=1e-12)
+
+
+def test_chain_of_springs_is_the_plain_one():
+    here, plain = marched(models.spring_chain(8)), models.plain_chain(8)
+    there = marched(plain)
+    np.testing.assert_allclose(here.q[-1, 1:], there.q[-1], atol=1e-13)
+
+
+def test_matrix_of_the_lattice():
+    """Beside that of its force: the first step of a run is solved with it."""
+    model, C = models.lattice(4), scaling.stepper().coefficients
+
+    def force(x):
+        return model.system.force({"r": x.reshape(-1, 2)}, model.v0, 0.0, model.params)["r"].ravel()
+
+    K = -jax.jacfwd(force)(model.q0["r"].ravel())
+    wanted = np.eye(32) + (1 - C.alpha_f) * C.beta * scaling.DT**2 * K
+    np.testing.assert_allclose(scaling.step_matrix(model, 4).toarray(), wanted, atol=1e-14)
+
+
+@pytest.mark.parametrize("model", [models.links(3), models.rods_in_space(3), four_bar.four_bar(2)])
+def test_joints_hold_at_first(model):
+    found = model.system.constraint(model.q0, 0.0, model.params)
+    assert found.size >= 4
+    np.testing.assert_allclose(found, 0.0, atol=1e-14)
+
+
+def test_bend_of_a_link():
+    r = np.array([[0.0, 0.0], [0.5, 0.1], [1.0, 0.0]])
+    assert abs(four_bar.deflection(r, 0, 2) - 0.1) < 1e-15
+
+
+def test_cantilever_settles():
+    q, left = statics.settled(statics.cantilever(4))
+    assert left < 1e-6
+    np.testing.assert_allclose(q["r"][-1] - [2.0, 0.0], statics.ELASTICA, atol=2e-3)
+
+
+def test_aims_and_exponents():
+    rows = [{"scene": "beam", "way": "elements", "unknowns": n, "us_per_step": 2 * n} for n in (10, 100)]
+    rows += [{"scene": "spring chain", "way": "elements", "unknowns": n, "us_per_step": n**2} for n in (10, 100)]
+    found = {"rows": rows, "exponents": scaling.exponents(rows)}
+    assert abs(found["exponents"]["spring chain"]["elements"] - 2) < 1e-12
+    wanted = {name: aim for name, aim in aims.AIMS.items() if "exponent" in name}
+    met = [of(found) <= limit for limit, of in wanted.values()]
+    assert met == [True, False]

@@ -17,6 +17,7 @@ LARGEST = {".png": 200_000, ".gif": 400_000}  # bytes
         "cardona_geradin1989",
         "events",
         "export",
+        "flexible",
         "friction",
         "kim2019",
         "reported",

@@ -11,14 +11,14 @@ import numpy as np
 from experiments.benchmarks.native import VARIANTS, compiler, doubles
 from experiments.flexible.beam import Beam, hub_angle, masses, straight
 
-SOURCE = Path(__file__).with_name("beam.c")
-FAST = "-O3 -march=native -ffast-math"
+SOURCES = {name: Path(__file__).with_name(f"{name}.c") for name in ("beam", "plain_beam")}
+PLAIN, FAST = "-O3 -march=native", "-O3 -march=native -ffast-math"
 HELD = 1e30  # the mass of what is held
 
 
 @cache
-def library(variant: str = FAST):
-    """The C source, compiled with the flags of a variant; None where that does not work."""
+def library(variant: str = FAST, source: str = "beam"):
+    """A C source, compiled with the flags of a variant; None where that does not work."""
     name = compiler()
     if name is None:
         return None
@@ -26,7 +26,7 @@ def library(variant: str = FAST):
         path, part = (Path(folder) / f"beam.{kind}" for kind in ("so", "o"))
         # linked on its own: with -ffast-math there, gcc would let the whole process flush small numbers to zero
         for command in (
-            [name, *VARIANTS[variant], "-c", "-fPIC", "-o", part, SOURCE],
+            [name, *VARIANTS[variant], "-c", "-fPIC", "-o", part, SOURCES[source]],
             [name, "-shared", "-o", path, part, "-lm"],
         ):
             if subprocess.run(command, capture_output=True, check=False).returncode:
