@@ -149,11 +149,11 @@ def at(held: Held | None, q: PyTree, v: PyTree | None, t: Real, params: PyTree):
 
 
 def velocity_like(q: PyTree) -> PyTree:
-    """Zeros structured like the velocity of a position: leaves (..., 3, 3) are rotations."""
+    """Zeros structured like the velocity of a position: leaves (N, 3, 3) are rotations."""
 
     def zeros(x: Array) -> Array:
         shape = jnp.shape(x)
-        return jnp.zeros(shape[:-1] if shape[-2:] == (3, 3) else shape, jnp.result_type(x))
+        return jnp.zeros(shape[:-1] if shape[1:] == (3, 3) else shape, jnp.result_type(x))
 
     return jax.tree.map(zeros, q)
 
