@@ -65,7 +65,6 @@ class StepMatrix:
         if self.held is not None:
             known = held_nodes.accelerations(self.held, v, t, params)
             w = jax.tree.map(jnp.where, known.here, known.a, w)
-            seen = ~ravel_pytree(known.moves)[0]
             q, v = held_nodes.at(self.held, q, v, t, params)
 
         def pull(part: Elements):
@@ -80,7 +79,8 @@ class StepMatrix:
         masses = [self._slopes(x, product(x), (q, w), (changes.q, changes.w), params) for x in self.masses]
         values = [self._of_nodes(d, changes), *forces, *masses]
         if self.held is not None:
-            values = self._without_held(values, free, [seen] * len(forces) + [free] * len(masses))
+            inner = (free[self.rows] & free[self.columns])[values[0].size :]
+            values = [values[0], jnp.where(inner, jnp.concatenate(values[1:]), 0)]  # what is held is 1 w = a
         return Numbers(lax.stop_gradient(jnp.concatenate(values)), self.table)
 
     def _changes(self, along: Callable, like: Array) -> Changes:
@@ -116,16 +116,6 @@ class StepMatrix:
         _, tangent = staged(lambda *at: jax.linearize(lambda *at: every(*at, *own), *at))(*at)
         slopes = jax.vmap(lambda way: tangent(*way))(ways)
         return jnp.concatenate([x.ravel() for x in jax.tree.leaves(slopes)])
-
-    def _without_held(self, values: list, free: Array, seen: list) -> list:
-        """The same where rows of what is held are those of its acceleration alone. seen: for each kind of elements, the
-        unknowns that it depends on."""
-        starts = np.cumsum([0, *(x.size for x in values)])
-        found = [values[0]]
-        for i, (x, depends) in enumerate(zip(values[1:], seen, strict=True), 1):
-            rows, columns = (y[starts[i] : starts[i + 1]] for y in (self.rows, self.columns))
-            found.append(jnp.where(free[rows] & depends[columns], x, 0))
-        return found
 
 
 def _within_nodes(v: PyTree) -> tuple[np.ndarray, np.ndarray]:
