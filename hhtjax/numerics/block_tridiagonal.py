@@ -12,6 +12,7 @@ that has been eliminated is then that of a smaller mechanism. Loops over the blo
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -79,6 +80,8 @@ def solve_blocks(factors: BlockFactors, b: Array, trans: int = 0) -> Array:
 def invert_block(A: Array) -> Array:
     """A^-1 by Gauss and Jordan, rows exchanged for the largest pivot."""
     n = len(A)
+    if n == 3:
+        return _by_cofactors(A)
     i = jnp.arange(n)
 
     def eliminate(k, both: Array) -> Array:
@@ -89,6 +92,21 @@ def invert_block(A: Array) -> Array:
 
     both = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1)
     return lax.fori_loop(0, n, eliminate, both)[:, n:]
+
+
+def _by_cofactors(A: Array) -> Array:
+    """The same of three unknowns, without a loop: a planar beam has one for each node. Rows are measured by their
+    largest entries."""
+    row = [1 / reduce(jnp.maximum, [jnp.abs(A[i, j]) for j in range(3)]) for i in range(3)]
+    a = [[A[i, j] * row[i] for j in range(3)] for i in range(3)]
+
+    def cofactor(i: int, j: int) -> Array:
+        (p, q), (r, s) = ((k - 2, k - 1) for k in (i, j))  # the others, in a turn that has the sign in it
+        return a[p][r] * a[q][s] - a[p][s] * a[q][r]
+
+    adjugate = [[cofactor(j, i) for j in range(3)] for i in range(3)]
+    unit = 1 / (a[0][0] * adjugate[0][0] + a[0][1] * adjugate[1][0] + a[0][2] * adjugate[2][0])
+    return jnp.stack([jnp.stack([adjugate[i][j] * (unit * row[j]) for j in range(3)]) for i in range(3)])
 
 
 def block_pivots(lower: Array, middle: Array, upper: Array, limit: float) -> Array:
