@@ -156,7 +156,7 @@ CALLS = {
     "eval_jaxpr": _called("call_jaxpr"),
     "hhtjax_in_turn": lambda self, params, asked, *values: self(params["closed"], *values),
     **{"custom_jvp_call": _called("call_jaxpr"), "custom_vjp_call": _called("call_jaxpr")},
-    **dict.fromkeys(("hhtjax_family", "hhtjax_bilinear"), _called("jaxpr")),
+    **dict.fromkeys(("hhtjax_family", "hhtjax_bilinear", "hhtjax_map"), _called("jaxpr")),
 }
 
 

@@ -208,7 +208,7 @@ TABLE = {
         *("staged(lambda x, y: (x, jnp.sin(x - y), y))(x, y)", "staged(lambda x: structural(np.eye(3)) @ x)(x)", "lax.optimization_barrier(x)"),
         *("jnp.where(largest_in_batch(t > s), x, y)", "stumpff(2, s)", "jnp.stack(stumpff(3, x * x))", "stumpff(2, z * z)[1] * z"),
         *("cross(x, y)", "cross(x, g)", "jax.vmap(cross, (0, None))(X, y)", "jax.vmap(cross, (None, 1))(x, S)", "matvec(S, x)"),
-        "jax.vmap(matvec, (None, 0))(S, X)",
+        *("jax.vmap(matvec, (None, 0))(S, X)", "picked(S * x) * x", "jax.vmap(picked)(jnp.stack([S, s * S]))"),
         *("held(x * y)", "held(np.ones(3)) * x"),
         *("structural(np.array([0.0, 1.0, 0.0])) * x + y", "jax.pure_callback(np.sin, x, x, vmap_method='sequential')"),
         *("jax.nn.one_hot(i, 3) @ x", "lax.convert_element_type(structural(np.zeros(3)), float) - x", "jnp.vectorize(lambda a: a * s)(x)"),

@@ -16,7 +16,7 @@ from zoo import each
 
 from hhtjax.jaxpr import linear_maps, scalar_rules, scalars
 from hhtjax.numerics.dense_lu import matvec
-from hhtjax.primitives import compat, in_turn, largest_in_batch, staged, structural
+from hhtjax.primitives import Linear, compat, in_turn, largest_in_batch, staged, structural
 from hhtjax.primitives.consistent import held
 from hhtjax.rotation import cross, stumpff
 
@@ -30,6 +30,12 @@ SIGNS_OF_XLA = ("z + 0.0", "0.0 + z", "z - -0.0", "fill_value=-0.0")
 UNDEFINED = ("lax.div(m, m)",)  # where m is 0: the XLA of JAX 0.12 takes x / x for 1 in a compiled program
 
 
+PICKED = Linear(  # rows 2, 0, 2 of three
+    lambda x: x[..., np.array([2, 0, 2]), :],
+    lambda y: jnp.stack([y[..., 1, :], jnp.zeros_like(y[..., 0, :]), y[..., 0, :] + y[..., 2, :]], axis=-2),
+)
+
+
 def scope():
     known = {"lax": lax, "jnp": jnp, "np": np, "jax": jax, "staged": staged, "structural": structural}
     known |= {
@@ -39,6 +45,7 @@ def scope():
         "stumpff": stumpff,
         "cross": cross,
         "matvec": matvec,
+        "picked": PICKED,
     }
     exec(HEADER, known)
     return known
