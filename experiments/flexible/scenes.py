@@ -169,7 +169,7 @@ def flexible_four_bar(fast: bool) -> tuple[list[dict], dict]:
 def rope(fast: bool) -> tuple[list[dict], dict]:
     """A cable of 1000 ANCF elements that swings down from the horizontal; against half as many and half the step."""
     described = ROPE._replace(elements=10) if fast else ROPE
-    dt, seconds = 1e-3, 0.05 if fast else 2.0
+    dt, seconds = 1e-3, 0.05 if fast else 1.2
     model = models.cable(described)
     run, took = march(model, dt, round(seconds / dt), round(0.05 / dt))
     path = {"t_s": np.asarray(run.t), "r_m": np.asarray(run.q["r"]), "seconds": took, "unknowns": model.unknowns}
