@@ -77,18 +77,6 @@ def solve_blocks(factors: BlockFactors, b: Array, trans: int = 0) -> Array:
     return lax.scan(backward, zero, (W, y), reverse=True)[1]
 
 
-def blocks_times(blocks: Array, x: Array, trans: int = 0) -> Array:
-    """A x, or A^T x, of x (N, b) and blocks (3, N, b, b)."""
-    lower, middle, upper = blocks
-    zero = jnp.zeros_like(x[:1])
-    if trans:
-        by = lambda A, x: reduce(jnp.add, [A[:, k] * x[:, k, None] for k in range(A.shape[1])])  # noqa: E731
-        before, behind = by(upper, x)[:-1], by(lower, x)[1:]
-        return by(middle, x) + jnp.concatenate([zero, before]) + jnp.concatenate([behind, zero])
-    by = lambda A, x: reduce(jnp.add, [A[:, :, k] * x[:, k, None] for k in range(A.shape[2])])  # noqa: E731
-    return by(lower, jnp.concatenate([zero, x[:-1]])) + by(middle, x) + by(upper, jnp.concatenate([x[1:], zero]))
-
-
 def invert_block(A: Array) -> Array:
     """A^-1 by Gauss and Jordan, rows exchanged for the largest pivot."""
     n = len(A)

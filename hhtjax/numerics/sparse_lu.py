@@ -19,8 +19,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree
-from hhtjax.numerics.batched_cond import call_where
-from hhtjax.numerics.block_tridiagonal import BlockFactors, block_pivots, blocks_times, factorize_blocks, solve_blocks
+from hhtjax.numerics.block_tridiagonal import block_pivots, factorize_blocks, solve_blocks
 from hhtjax.numerics.linear_solve import Structured
 from hhtjax.numerics.low_rank import Completed
 from hhtjax.numerics.sparse_matrix import Pattern, Sparse, gather
@@ -31,7 +30,6 @@ from hhtjax.primitives import part, staged
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-REFINED = 0.02  # times sqrt(eps): part of the terms of a row that a solve leaves, above which it is refined
 LARGEST_BLOCK = 24  # unknowns, up to which a row of blocks is eliminated in a loop
 
 
@@ -132,23 +130,14 @@ class Plan:
         free = np.ones((N, b), bool)
         free.ravel()[self.there[self.free :]] = False
         scale = _row_scale(blocks, free)
-        blocks = blocks * scale[None, :, :, None]
-        factors = part(factorize_blocks)(*blocks)
+        factors = part(factorize_blocks)(*(blocks * scale[None, :, :, None]))
         here = np.full(N * b, self.n, np.int32)
         here[self.there] = np.arange(self.n, dtype=np.int32)
         in_order = np.array_equal(here, np.arange(self.n))
 
-        limit = REFINED * float(jnp.finfo(blocks.dtype).eps) ** 0.5
-
         def solve(x: Array, trans: int = 0) -> Array:
             x = (x if in_order else gather(jnp.append(x, jnp.zeros_like(x[:1])), here)).reshape(N, b)
-            given = x if trans else x * scale
-            x = part(partial(solve_blocks, trans=trans))(factors, given)
-            # pivots within blocks may lose digits where a motion is far from stable: seldom, and then one more solve
-            left = given - blocks_times(blocks, x, trans)
-            more = partial(_refined, factors, trans=trans)
-            terms = jnp.abs(given) + blocks_times(jnp.abs(blocks), jnp.abs(x), trans)
-            x = call_where(more, jnp.any(jnp.abs(left) > limit * terms), x, left)
+            x = part(partial(solve_blocks, trans=trans))(factors, x if trans else x * scale)
             x = (x * scale if trans else x).ravel()
             return x if in_order else gather(x, self.there)
 
@@ -179,11 +168,6 @@ class Plan:
         scale = jnp.where(np.arange(self.n) < self.free, first, 1 / jnp.where(size == 0, 1, size))
         solve = factorize_sparse(_scaled(sparse, scale))
         return lambda b, trans=0: scale * solve(b, trans=1) if trans else solve(scale * b)
-
-
-def _refined(factors: BlockFactors, x: Array, left: Array, trans: int) -> Array:
-    """x, and what it left solved for."""
-    return x + part(partial(solve_blocks, trans=trans))(factors, left)
 
 
 def _row_scale(blocks: Array, free: np.ndarray) -> Array:
