@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description import Array
+from hhtjax.numerics.dense_lu import gauss_jordan
 
 
 class BlockFactors(NamedTuple):
@@ -78,20 +79,8 @@ def solve_blocks(factors: BlockFactors, b: Array, trans: int = 0) -> Array:
 
 
 def invert_block(A: Array) -> Array:
-    """A^-1 by Gauss and Jordan, rows exchanged for the largest pivot."""
-    n = len(A)
-    if n == 3:
-        return _by_cofactors(A)
-    i = jnp.arange(n)
-
-    def eliminate(k, both: Array) -> Array:
-        pivot = jnp.argmax(jnp.where(i >= k, jnp.abs(both[:, k]), -1))
-        both = both[jnp.where(i == k, pivot, jnp.where(i == pivot, k, i))]
-        row = both[k] / both[k, k]
-        return jnp.where((i == k)[:, None], row[None, :], both - both[:, k][:, None] * row[None, :])
-
-    both = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1)
-    return lax.fori_loop(0, n, eliminate, both)[:, n:]
+    """A^-1, with pivots."""
+    return _by_cofactors(A) if len(A) == 3 else gauss_jordan(A, jnp.eye(len(A), dtype=A.dtype))
 
 
 def _by_cofactors(A: Array) -> Array:

@@ -97,6 +97,12 @@ def inverse(A: Array) -> Array:
     size = jnp.sqrt(jnp.where(d == 0, 1, d))
     rest = matvec(jnp.abs(A), 1 / size)
     rows = 1 / jnp.where(d == 0, jnp.where(rest == 0, 1, rest), size)
+    return gauss_jordan(rows[:, None] * A, jnp.diag(rows))
+
+
+def gauss_jordan(A: Array, B: Array) -> Array:
+    """A^-1 B, both (n, n), rows exchanged for the largest pivot."""
+    n = len(A)
     i = jnp.arange(n)
 
     def eliminate(k: Array, both: Array) -> Array:
@@ -105,8 +111,7 @@ def inverse(A: Array) -> Array:
         row = both[k] / both[k, k]
         return jnp.where((i == k)[:, None], row[None, :], both - both[:, k][:, None] * row[None, :])
 
-    both = jnp.concatenate([rows[:, None] * A, jnp.diag(rows)], axis=1)
-    return lax.fori_loop(0, n, eliminate, both)[:, n:]
+    return lax.fori_loop(0, n, eliminate, jnp.concatenate([A, B], axis=1))[:, n:]
 
 
 def differentiable_inverse(A: Array) -> Array:

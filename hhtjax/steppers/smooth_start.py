@@ -49,7 +49,7 @@ from hhtjax.primitives import one_kernel, staged, traced
 from hhtjax.steppers.implicit_solve import linearize_rows, linearized
 from hhtjax.steppers.residual import Coefficients, residual
 from hhtjax.steppers.stepper import State
-from hhtjax.systems.constraints import answers, curvature, gradient_map, jacobian, reaction, violation
+from hhtjax.systems.constraints import answers, curvature, gradient_maps, jacobian, reaction, violation
 
 if TYPE_CHECKING:
     from hhtjax.numerics.linear_solve import Given
@@ -129,7 +129,7 @@ class Layer(NamedTuple):
         """B w."""
         if self.B is not None:
             return matvec(self.B, w)
-        return gradient_map(self.system, self.base.q, self.base.t, self.params)(w)
+        return gradient_maps(self.system, self.base.q, self.base.t, self.params)[0](w)
 
     def pull(self, L: Array) -> Array:
         """B^T L."""

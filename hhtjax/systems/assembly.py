@@ -15,7 +15,7 @@ from hhtjax.checks import require_function
 from hhtjax.description import Array, PyTree, Real, is_concrete, is_real
 from hhtjax.numerics.sparse_matrix import Pattern, Sparse, gather
 from hhtjax.systems import held_nodes
-from hhtjax.systems.elements import Elements, Fixed, Joints, Rows, Sum, parts_of, table_of
+from hhtjax.systems.elements import Elements, Fixed, Joints, Rows, Sum, pairs_of, parts_of, table_of
 from hhtjax.systems.held_nodes import Held, accelerations, velocity_like
 
 NAME = "System.from_elements"
@@ -156,9 +156,7 @@ def _mass_pattern(keys: tuple, n: int):
     i = np.arange(n)
     pairs: list = [(i, i)]
     for data, shape in keys:
-        dofs = np.frombuffer(data, np.int32).reshape(shape)
-        s = dofs.shape[1]
-        pairs.append((np.repeat(dofs, s, axis=1).ravel(), np.tile(dofs, (1, s)).ravel()))
+        pairs.append(pairs_of(np.frombuffer(data, np.int32).reshape(shape)))
     rows, columns = (np.concatenate(x).astype(np.int64) for x in zip(*pairs, strict=True))
     key, inverse = np.unique(rows * n + columns, return_inverse=True)
     pattern = Pattern(n, key // n, key % n)

@@ -92,12 +92,10 @@ def saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree, factori
 
 def _sparse_saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree):
     """The same without matrices."""
-    n, push = system.size, gradient_map(system, q, t, params)
-    zero = jnp.zeros(n, q.dtype)
-    pull = jax.linear_transpose(push, zero)
+    n, (push, pull) = system.size, gradient_maps(system, q, t, params)
 
     def f(z: Array) -> Array:
-        return jnp.concatenate([system.inertia(q, z[:n], t, params) - pull(z[n:])[0], push(z[:n])])
+        return jnp.concatenate([system.inertia(q, z[:n], t, params) - pull(z[n:]), push(z[:n])])
 
     assert system.sparse is not None
     inverse = factorize_map(f, jnp.zeros(n + system.num_constraints, q.dtype), system.sparse)
@@ -109,10 +107,15 @@ def _sparse_saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree)
     return x_and_multipliers
 
 
-def gradient_map(system: FlatSystem, q: Array, t: Array, params: PyTree):
-    """The linear map v -> B v."""
+def gradient_maps(system: FlatSystem, q: Array, t: Array, params: PyTree):
+    """The linear maps v -> B v and L -> B^T L."""
     _, tangent = jax.linearize(lambda q: system.constraint(q, t, params), q)
-    return lambda v: tangent(system.rate(q, v))
+
+    def push(v: Array) -> Array:
+        return tangent(system.rate(q, v))
+
+    pull = jax.linear_transpose(push, jnp.zeros(system.size, q.dtype))
+    return push, lambda L: pull(L)[0]
 
 
 def answers(
@@ -220,8 +223,7 @@ def dependent_row(B: Array) -> Array:
 def sparse_dependent_row(system: FlatSystem, q: Array, t: Array, params: PyTree) -> Array:
     """The same of a system with a sparse solve, of the rows in the order in which this takes them."""
     assert system.sparse is not None
-    push = gradient_map(system, q, t, params)
-    pull = jax.linear_transpose(push, jnp.zeros(system.size, q.dtype))
+    push, pull = gradient_maps(system, q, t, params)
     limit = 1e4 * float(jnp.finfo(q.dtype).eps)
-    pivots = system.sparse.cosine_pivots(lambda L: push(pull(L)[0]), jnp.zeros(system.num_constraints, q.dtype), limit)
+    pivots = system.sparse.cosine_pivots(lambda L: push(pull(L)), jnp.zeros(system.num_constraints, q.dtype), limit)
     return jnp.where(jnp.any(pivots < limit), jnp.argmax(pivots < limit), -1)

@@ -318,6 +318,12 @@ def _at_nodes(places: bytes, number: int) -> Linear:
     return Linear(take, add)
 
 
+def pairs_of(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the matrices (E, s, s) of elements with the unknowns dofs (E, s), in a row."""
+    s = dofs.shape[1]
+    return np.repeat(dofs, s, axis=1).ravel(), np.tile(dofs, (1, s)).ravel()
+
+
 def table_of(places: np.ndarray, number: int, most: int = MOST_SHARED) -> Any:
     """(d, number): which entries of a list come to each place, and its length where there are no more; None where there
     are more than `most`."""

@@ -20,6 +20,7 @@ from hhtjax.jaxpr import TooDense, dependencies
 from hhtjax.numerics.sparse_lu import Plan, plan
 from hhtjax.numerics.sparsity import product, stacked, symmetric, union
 from hhtjax.primitives import traced
+from hhtjax.systems.elements import pairs_of
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -89,8 +90,7 @@ def _pairs(dofs: np.ndarray, n: int) -> csr_array:
     """(n, n): all unknowns of each row of dofs with each other."""
     from scipy.sparse import csr_array
 
-    s = dofs.shape[1]
-    rows, columns = np.repeat(dofs, s, axis=1).ravel(), np.tile(dofs, (1, s)).ravel()
+    rows, columns = pairs_of(dofs)
     return csr_array(csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape=(n, n)) > 0)
 
 
